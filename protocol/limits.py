@@ -1,0 +1,13 @@
+"""Limits of the wire, checked before anything is allocated."""
+
+PROTOCOL_VERSION = 1
+SUBPROTOCOL = f"probeless-v{PROTOCOL_VERSION}"
+SUBPROTOCOL_PREFIX = "probeless-v"
+
+MAX_MESSAGE_BYTES = 16 << 20
+MAX_IMAGE_SIDE_PX = 4096
+MAX_IMAGE_PIXELS = 1920 * 1200
+MAX_MESH_BYTES = 12 << 20
+MAX_NAME_CHARS = 64
+MAX_REASON_CHARS = 400
+MAX_SH_BANDS = 6

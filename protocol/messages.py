@@ -1,0 +1,290 @@
+"""Every message of the wire, as frozen typed structs: one tagged union per direction.
+
+MessagePack maps, tag field `type`. Matrices are row-major lists of 16 floats named `world_from_*`, metres.
+SH are radiance coefficients in the real orthonormal basis without Condon-Shortley phase, index l(l+1)+m, world axes.
+A struct that decodes is valid: numbers are finite, sizes are within `protocol.limits`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from protocol.frames import CameraModel, ColorEncoding
+from protocol.limits import (
+    MAX_IMAGE_PIXELS,
+    MAX_IMAGE_SIDE_PX,
+    MAX_MESH_BYTES,
+    MAX_MESSAGE_BYTES,
+    MAX_NAME_CHARS,
+    MAX_REASON_CHARS,
+    MAX_SH_BANDS,
+)
+
+Side = Annotated[int, Meta(ge=1, le=MAX_IMAGE_SIDE_PX)]
+Name = Annotated[str, Meta(min_length=1, max_length=MAX_NAME_CHARS)]
+Reason = Annotated[str, Meta(max_length=MAX_REASON_CHARS)]
+Bytes = Annotated[bytes, Meta(max_length=MAX_MESSAGE_BYTES)]
+Index = Annotated[int, Meta(ge=0, le=2**53)]
+Matrix4 = Annotated[tuple[float, ...], Meta(min_length=16, max_length=16, description="row-major 4x4, metres")]
+Vector3 = tuple[float, float, float]
+Rgb = tuple[float, float, float]
+RgbOrNull = tuple[float | None, float | None, float | None]
+
+Preset = Literal["rm", "reg4", "reg8", "art1", "art4", "art8", "gr15", "gr15fast", "auto"]
+Poses = Literal["given", "track", "refine"]
+Tracking = Literal["given", "tracked", "lost"]
+
+
+def _require_finite(owner: str, **fields: object) -> None:
+    """Raise ValueError naming the field if any number in it is NaN or infinite."""
+    for name, value in fields.items():
+        numbers = value if isinstance(value, tuple) else (value,)
+        if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
+            raise ValueError(f"{owner}.{name} must be finite")
+
+
+class Payload(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """An encoded picture: declared size first, so that it is checked before the bytes are touched."""
+
+    width: Side
+    height: Side
+    data: Bytes
+
+    def __post_init__(self) -> None:
+        if self.width * self.height > MAX_IMAGE_PIXELS:
+            raise ValueError(f"picture of {self.width}x{self.height} exceeds {MAX_IMAGE_PIXELS} pixels")
+
+
+class ColorImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Colour: `jpeg` and `png` are sRGB 8-bit; `raw` is interleaved RGB, little endian, in `encoding`."""
+
+    codec: Literal["jpeg", "png", "raw"]
+    encoding: ColorEncoding = "srgb8"
+
+
+class DepthImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """uint16 depth, lossless.
+
+    `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd.
+    """
+
+    codec: Literal["raw", "zdelta", "zstd-delta"]
+
+
+class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What a capturing client asks of its session; the command line's options of the same names."""
+
+    preset: Preset = "reg4"
+    rays: Annotated[int, Meta(ge=4, le=1024)] = 81
+    ray_length_m: Annotated[float, Meta(ge=0, le=1000)] | None = None
+    """None: the whole room."""
+    bands: Annotated[int, Meta(ge=2, le=MAX_SH_BANDS)] = 4
+    albedo: Literal["constant", "estimated"] = "constant"
+    indirect: Literal["none", "observed"] = "none"
+    as_thesis: bool = False
+    poses: Poses = "given"
+    volume_m: tuple[float, float, float, float, float, float] | None = None
+    """x0, y0, z0, x1, y1, z1 in world metres; None: what the first frame sees."""
+    voxel_m: Annotated[float, Meta(gt=0, le=1)] | None = None
+    up: Vector3 | None = None
+    """World direction; None: the first camera's -y."""
+    lossless: bool = False
+    """Answers carry PNG pictures, and every frame is answered in order instead of latest-wins."""
+
+    def __post_init__(self) -> None:
+        _require_finite(
+            "wishes", ray_length_m=self.ray_length_m, volume_m=self.volume_m, voxel_m=self.voxel_m, up=self.up
+        )
+        if self.volume_m is not None and not all(self.volume_m[a] < self.volume_m[a + 3] for a in range(3)):
+            raise ValueError("wishes.volume_m must be x0,y0,z0,x1,y1,z1 with each x0 < x1")
+        if self.up is not None and math.hypot(*self.up) < 1e-6:
+            raise ValueError("wishes.up must not be zero")
+
+
+class Message(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="type"):
+    """Base of everything on the socket."""
+
+
+# ---- client to server --------------------------------------------------------------------------------------------
+
+
+class Hello(Message, frozen=True, kw_only=True, tag="hello"):
+    """First message of a client that captures."""
+
+    client: Name
+    camera: CameraModel
+    wishes: Wishes = Wishes()
+
+
+class Watch(Message, frozen=True, kw_only=True, tag="watch"):
+    """First message of a client that only looks: it receives what the capturing session produces."""
+
+    session: Name | None = None
+    """None: the session that is streaming, now or next."""
+
+
+class Frame(Message, frozen=True, kw_only=True, tag="frame"):
+    """One RGB-D frame; answered by exactly one of composite (with its light before it), dropped or error."""
+
+    frame: Index
+    timestamp_s: float
+    world_from_camera: Matrix4 | None
+    color: ColorImage
+    depth: DepthImage
+
+    def __post_init__(self) -> None:
+        _require_finite("frame", timestamp_s=self.timestamp_s, world_from_camera=self.world_from_camera)
+
+
+class PlaceObject(Message, frozen=True, kw_only=True, tag="place_object"):
+    """Put a virtual object into the session; acknowledged."""
+
+    request: Index
+    object: Name
+    format: Literal["glb", "obj", "ply", "stl"]
+    data: Annotated[bytes, Meta(max_length=MAX_MESH_BYTES)]
+    position_m: Vector3 | None = None
+    """World position of the bottom centre of the model's box; None: the vertices are world coordinates already."""
+    scale: Annotated[float, Meta(gt=0, le=1000)] = 1.0
+    yaw_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require_finite("place_object", position_m=self.position_m, scale=self.scale, yaw_deg=self.yaw_deg)
+
+
+class MoveObject(Message, frozen=True, kw_only=True, tag="move_object"):
+    """Move an object that is there; acknowledged."""
+
+    request: Index
+    object: Name
+    position_m: Vector3
+    scale: Annotated[float, Meta(gt=0, le=1000)] = 1.0
+    yaw_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require_finite("move_object", position_m=self.position_m, scale=self.scale, yaw_deg=self.yaw_deg)
+
+
+class RemoveObject(Message, frozen=True, kw_only=True, tag="remove_object"):
+    """Take an object away; acknowledged."""
+
+    request: Index
+    object: Name
+
+
+class Quality(Message, frozen=True, kw_only=True, tag="quality"):
+    """Change the preset of the running session; acknowledged."""
+
+    request: Index
+    preset: Preset
+
+
+class Bye(Message, frozen=True, kw_only=True, tag="bye"):
+    """Either side says it is leaving, and why."""
+
+    reason: Reason = ""
+
+
+# ---- server to client --------------------------------------------------------------------------------------------
+
+
+class Welcome(Message, frozen=True, kw_only=True, tag="welcome"):
+    """Answer to hello and watch."""
+
+    session: Name
+    server: Name
+    device: str
+    max_inflight: int
+    """Frames the client may have unanswered."""
+
+
+class LeftOut(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """An effect that did not run, why, and what leaving it out can change at most, in display units (1 is 1/255)."""
+
+    effect: str
+    reason: str
+    error_bound: float | None
+
+
+class Plan(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Which effects ran for a frame, in order, and which did not."""
+
+    run: tuple[str, ...]
+    left_out: tuple[LeftOut, ...]
+
+
+class Timings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Milliseconds under the thesis's row names (table 6.2): device plus host time; total is wall time."""
+
+    input: float = 0.0
+    reconstruct: float = 0.0
+    surface: float = 0.0
+    dynamic_geometry: float = 0.0
+    radiance_transfer: float = 0.0
+    light_estimation: float = 0.0
+    rendering: float = 0.0
+    total: float = 0.0
+
+
+class Light(Message, frozen=True, kw_only=True, tag="light"):
+    """The room's light as one frame left it; the fields of a line of `light.jsonl`."""
+
+    frame: Index
+    timestamp_s: float
+    sh: tuple[Rgb, ...]
+    """16 x [r, g, b], zeros for bands not estimated."""
+    sh_all: tuple[Rgb, ...] | None = None
+    """All coefficients, when there are more than 16."""
+    sh_std: tuple[RgbOrNull, ...]
+    """One standard deviation of each of `sh`; null where unknown."""
+    sh_webxr: tuple[float, ...]
+    """27 floats, RGB-interleaved C00 C1-1 C10 C11 ..., in axes with up as +y and the first camera's view near -z."""
+    dominant_direction: Vector3
+    """World, unit, towards the light, from l = 1 of Rec. 709 luminance; (0, 0, 0) where there is none."""
+    dominant_intensity: float
+    condition: float | None
+    """Condition number of the unregularised normal equations; null when infinite."""
+    valid: bool
+
+
+class Composite(Message, frozen=True, kw_only=True, tag="composite"):
+    """The finished picture of one frame."""
+
+    frame: Index
+    timestamp_s: float
+    color: ColorImage
+    world_from_camera: Matrix4
+    tracking: Tracking
+    timings: Timings
+    plan: Plan
+    notes: tuple[str, ...] = ()
+    """What was wrong with this frame's input, one line each."""
+
+
+class Dropped(Message, frozen=True, kw_only=True, tag="dropped"):
+    """This frame was replaced by a newer one before it was read, or refused; nothing else comes for it."""
+
+    frame: Index
+    reason: Reason
+
+
+class Acknowledged(Message, frozen=True, kw_only=True, tag="acknowledged"):
+    """A control message was applied, or refused with its error."""
+
+    request: Index
+    error: Reason | None = None
+    notes: tuple[str, ...] = ()
+
+
+class Error(Message, frozen=True, kw_only=True, tag="error"):
+    """Something the client sent is wrong; `fatal` when the server closes the socket after it."""
+
+    reason: Reason
+    fatal: bool
+
+
+ClientMessage = Hello | Watch | Frame | PlaceObject | MoveObject | RemoveObject | Quality | Bye
+ServerMessage = Welcome | Composite | Light | Dropped | Acknowledged | Error | Bye

@@ -1,0 +1,43 @@
+"""The one place for device memory of a session: named arrays, made on first use and kept."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cl_array
+from numpy.typing import DTypeLike, NDArray
+
+
+class Workspace:
+    """Named device arrays; the same name and shape is the same memory, so a steady stream allocates nothing."""
+
+    def __init__(self, queue: cl.CommandQueue) -> None:
+        self._queue = queue
+        self._arrays: dict[str, cl_array.Array] = {}
+
+    def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> cl_array.Array:
+        """The array called `name`; contents are kept while shape and dtype stay, undefined after they change."""
+        found = self._arrays.get(name)
+        if found is None or found.shape != shape or found.dtype != np.dtype(dtype):
+            found = self._arrays[name] = cl_array.empty(self._queue, shape, dtype)
+        return found
+
+    def upload(self, name: str, values: NDArray[Any]) -> cl_array.Array:
+        """Copy `values` into the array called `name`."""
+        array = self.array(name, values.shape, values.dtype)
+        array.set(np.ascontiguousarray(values))
+        return array
+
+    @property
+    def bytes_held(self) -> int:
+        """Device memory of all arrays."""
+        return sum(array.nbytes for array in self._arrays.values())
+
+    def release(self) -> None:
+        """Give all device memory back."""
+        for array in self._arrays.values():
+            if isinstance(array.base_data, cl.MemoryObject):
+                array.base_data.release()
+        self._arrays.clear()

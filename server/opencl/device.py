@@ -1,0 +1,119 @@
+"""Finding and opening an OpenCL device: the one place that decides which is used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from threading import Lock
+
+import pyopencl as cl
+
+from server.opencl.pocl_cpu import name_unknown_cpu
+from server.opencl.program import KernelBuildError, ProgramCache
+
+_INSTALL = "install a vendor driver, or PoCL for the processor: pip install 'pyopencl[pocl]'"
+_named: set[int] = set()
+_naming = Lock()
+
+
+class DeviceError(RuntimeError):
+    """No usable OpenCL device; the message is one line that says what to do."""
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """One OpenCL device as `probeless devices` lists it."""
+
+    platform: str
+    name: str
+    kind: str
+    compute_units: int
+    memory_bytes: int
+    usable: str | None
+    """None if it can be used, else why not."""
+
+
+class Device:
+    """An opened OpenCL device: its context and its compiled programs, shared by all sessions."""
+
+    def __init__(self, cl_device: cl.Device) -> None:
+        self.cl_device = cl_device
+        self.name = f"{cl_device.platform.name} / {cl_device.name}".strip()
+        self.is_gpu = bool(cl_device.type & cl.device_type.GPU)
+        self.context = cl.Context([cl_device])
+        self.programs = ProgramCache(self.context)
+
+
+def _all_devices() -> list[cl.Device]:
+    """Every device of every platform, GPUs first, otherwise in the order the loader names them."""
+    try:
+        platforms = cl.get_platforms()
+    except cl.LogicError:  # the loader found no platform
+        return []
+    devices: list[cl.Device] = []
+    for platform in platforms:
+        try:
+            devices += platform.get_devices()
+        except cl.LogicError:  # a platform without a device
+            continue
+    with _naming:
+        for device in devices:
+            if device.int_ptr not in _named:
+                name_unknown_cpu(device)
+                _named.add(device.int_ptr)
+    return sorted(devices, key=lambda device: not device.type & cl.device_type.GPU)
+
+
+def _kind(bits: int) -> str:
+    names = {"GPU": cl.device_type.GPU, "CPU": cl.device_type.CPU, "accelerator": cl.device_type.ACCELERATOR}
+    return " + ".join(name for name, bit in names.items() if bits & bit) or "other"
+
+
+def _why_unusable(device: cl.Device) -> str | None:
+    """None if a trivial kernel compiles for the device, else the first line of the reason."""
+    if not device.available or not device.compiler_available:
+        return "the driver says it is not available or has no compiler"
+    try:
+        cl.Program(cl.Context([device]), "kernel void probe(global int *x) { x[0] = 1; }").build("-cl-std=CL1.2")
+    except cl.Error as error:
+        lines = [line for line in str(error).splitlines() if "error" in line] or [str(error).splitlines()[0]]
+        return f"cannot compile: {lines[0].strip()}"
+    return None
+
+
+def list_devices() -> list[DeviceInfo]:
+    """Every OpenCL device here, in the order of preference."""
+    return [
+        DeviceInfo(
+            platform=device.platform.name.strip(),
+            name=device.name.strip(),
+            kind=_kind(device.type),
+            compute_units=device.max_compute_units,
+            memory_bytes=device.global_mem_size,
+            usable=_why_unusable(device),
+        )
+        for device in _all_devices()
+    ]
+
+
+def open_device(name: str | None = None) -> Device:
+    """Open the first usable device whose "platform / device" contains `name` (any case); GPUs are preferred.
+
+    Raises DeviceError with one line that says what is there and what to do.
+    """
+    devices = _all_devices()
+    if not devices:
+        raise DeviceError(f"no OpenCL device found: {_INSTALL}")
+    wanted = [d for d in devices if name is None or name.lower() in f"{d.platform.name} / {d.name}".lower()]
+    if not wanted:
+        known = "; ".join(f"{d.platform.name} / {d.name}".strip() for d in devices)
+        raise DeviceError(f"no OpenCL device is called {name!r}: there are {known}")
+    reasons = []
+    for device in wanted:
+        reason = _why_unusable(device)
+        if reason is None:
+            return Device(device)
+        reasons.append(f"{device.name.strip()}: {reason}")
+    raise DeviceError(f"no usable OpenCL device ({'; '.join(reasons)}): {_INSTALL}")
+
+
+__all__ = ["Device", "DeviceError", "DeviceInfo", "KernelBuildError", "list_devices", "open_device"]

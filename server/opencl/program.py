@@ -1,0 +1,59 @@
+"""The one loader of OpenCL programs: real files, real includes, sorted defines, built once per device."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from threading import Lock
+
+import pyopencl as cl
+
+import cl_kernels
+
+KERNEL_FOLDER = Path(cl_kernels.__file__).parent
+_OPTIONS = ("-cl-std=CL1.2", "-Werror", "-cl-fp32-correctly-rounded-divide-sqrt")
+
+Define = int | float | str | bool
+
+
+class KernelBuildError(RuntimeError):
+    """A kernel file does not compile on this device; the message holds file, options and the compiler's log."""
+
+
+def define_options(defines: dict[str, Define]) -> tuple[str, ...]:
+    """Compiler options for `defines`, sorted; floats are written as float literals, True as 1, False is left out."""
+    options = []
+    for name, value in sorted(defines.items()):
+        if value is False:
+            continue
+        text = f"{value!r}f" if isinstance(value, float) else str(int(value) if value is True else value)
+        options.append(f"-D{name}={text}")
+    return tuple(options)
+
+
+class ProgramCache:
+    """Programs of one context, keyed by file and defines. Safe to use from several threads."""
+
+    def __init__(self, context: cl.Context) -> None:
+        self._context = context
+        self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
+        self._lock = Lock()
+        device = context.devices[0]
+        exact = bool(device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT)
+        self._options = [o for o in _OPTIONS if exact or "correctly-rounded" not in o]
+
+    def get(self, file: str, defines: dict[str, Define]) -> cl.Program:
+        """The program built from `cl_kernels/<file>` with `defines`. Raises KernelBuildError."""
+        key = (file, define_options(defines))
+        with self._lock:
+            if key not in self._programs:
+                self._programs[key] = self._build(*key)
+            return self._programs[key]
+
+    def _build(self, file: str, defines: tuple[str, ...]) -> cl.Program:
+        source = f'#line 1 "{file}"\n' + (KERNEL_FOLDER / file).read_text()
+        options = [*self._options, "-I", str(KERNEL_FOLDER / "include"), *defines]
+        try:
+            program: cl.Program = cl.Program(self._context, source).build(options)
+        except cl.RuntimeError as error:
+            raise KernelBuildError(f"cl_kernels/{file} with {' '.join(defines) or 'no defines'}: {error}") from error
+        return program

@@ -16,7 +16,7 @@ from server.opencl.device import Device
 from server.opencl.profile import Profile
 from server.opencl.program import Define
 
-KernelArgument = cl_array.Array | np.generic | int | float
+KernelArgument = cl_array.Array | np.generic | int | float | None
 
 
 class Engine:

@@ -1,0 +1,41 @@
+// TSDF integration (KinectFusion; thesis 4.2.1): a weighted running mean of projective signed distances.
+// Provides integrate.
+#include "camera.clh"
+#include "volume.clh"
+
+// One work-group of 8 x 8 items a brick, each item a column of 8 voxels along z.
+// allocated [count] brick indices, slots [z][y][x], depth_m [h][w] (0 = none) -> voxels, updated in place.
+kernel void integrate(const int count, const int width, const int height, const int4 bricks,
+                      global const int *allocated, global const int *slots, global const float *depth_m,
+                      const float4 intrinsics, const float16 camera_from_volume, const float voxel_m,
+                      const float truncation_m, const float greatest_weight, global float2 *voxels) {
+    const int group = get_group_id(0);
+    if (group >= count) return;
+    const int index = allocated[group];
+    const int3 brick = (int3)(index % bricks.x, (index / bricks.x) % bricks.y, index / (bricks.x * bricks.y));
+    const float3 center = transform_point(camera_from_volume, (convert_float3(brick) + 0.5f) * (BRICK * voxel_m));
+    const float radius = 0.8661f * BRICK * voxel_m;  // half the brick's diagonal
+    if (center.z < -radius) return;
+    const float margin_x = (fabs(center.x) - radius) * intrinsics.s0;
+    const float margin_y = (fabs(center.y) - radius) * intrinsics.s1;
+    const float reach = center.z + radius;
+    if (margin_x > reach * width || margin_y > reach * height) return;
+
+    const int3 first = brick * BRICK + (int3)(get_local_id(0), get_local_id(1), 0);
+    global float2 *column = voxels + slots[index] * BRICK_VOXELS + get_local_id(1) * BRICK + get_local_id(0);
+    const float3 start = transform_point(camera_from_volume, (convert_float3(first) + 0.5f) * voxel_m);
+    const float3 step = voxel_m * camera_from_volume.s26a;
+    for (int i = 0; i < BRICK; i++) {
+        const float3 p = start + (float)i * step;
+        const float2 pixel = project(intrinsics, (float3)(p.x, p.y, fmax(p.z, 1e-6f))) + 0.5f;
+        const int seen = p.z > 0.0f && pixel.x >= 0.0f && pixel.y >= 0.0f && pixel.x < width && pixel.y < height;
+        const float depth = seen ? depth_m[(int)pixel.y * width + (int)pixel.x] : 0.0f;
+        const float distance = (depth - p.z) * (length(p) / fmax(p.z, 1e-6f));
+        if (depth > 0.0f && distance > -truncation_m) {
+            const float2 old = column[i * BRICK * BRICK];
+            const float tsdf = fmin(distance / truncation_m, 1.0f);
+            const float weight = old.y + 1.0f;
+            column[i * BRICK * BRICK] = (float2)(old.x + (tsdf - old.x) / weight, fmin(weight, greatest_weight));
+        }
+    }
+}

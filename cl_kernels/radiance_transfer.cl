@@ -1,0 +1,64 @@
+// Diffuse shadowed radiance transfer by ray tracing the volume (thesis 5.1.2, eq. 5.2), projected to spherical harmonics.
+// Provides transfer_radiance.
+#include "sh.clh"
+#include "visibility.clh"
+
+#ifndef MASK_WORDS
+#error MASK_WORDS must be defined: 32-bit words that hold one bit a direction
+#endif
+
+// T(x) = 1/pi * integral of V max(n.w, 0) Y(w) dw. The unoccluded part is exact (A_l Y(n) / pi); only what is blocked is
+// sampled and taken away, so an open surface shades without quadrature error.
+//
+// One item a sample; samples lie every `stride` pixels from stride / 2. positions, normals [h][w]: the geometry buffer.
+// directions [4][count]: unit directions and their solid angle (w, sr), basis [4][count][COEFFICIENTS]: Y there; the set
+// changes over 2 x 2 samples. -> transfer [rows][cols][COEFFICIENTS], openness [rows][cols]: free share of the cosine-weighted
+// sky (-1 where there is no surface), free_mask [rows][cols][MASK_WORDS]: bit j = direction j lies above the surface and is free.
+kernel void transfer_radiance(const int cols, const int rows, const int stride, const int width,
+                              global const float4 *positions, global const float4 *normals,
+                              const int4 bricks, global const int *slots, global const uchar *gaps,
+                              global const float2 *voxels, const float voxel_m, const float truncation_m,
+                              const int count, global const float4 *directions, global const float *basis,
+                              const float reach_m,
+                              global float *transfer, global float *openness, global uint *free_mask) {
+    const int col = get_global_id(0);
+    const int row = get_global_id(1);
+    if (col >= cols || row >= rows) return;
+    const int sample = row * cols + col;
+    const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
+    const float4 position = positions[pixel];
+    const float4 normal = normals[pixel];
+    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, voxels);
+    const float3 origin = position.xyz + voxel_m * normal.xyz;  // fig. 7.5
+
+    float t[COEFFICIENTS];
+    for (int i = 0; i < COEFFICIENTS; i++) t[i] = 0.0f;
+    uint mask[MASK_WORDS];
+    for (int i = 0; i < MASK_WORDS; i++) mask[i] = 0;
+    float sky = 0.0f;
+    float blocked_sky = 0.0f;
+    const int valid = position.w > 0.0f && normal.w > 0.0f;
+    if (valid) {
+        sh_basis(normal.xyz, t);
+        for (int l = 0; l < BANDS; l++)
+            for (int i = l * l; i < (l + 1) * (l + 1); i++) t[i] *= lambert_band(l);
+        const int set = ((row & 1) * 2 + (col & 1)) * count;
+        for (int j = 0; j < count; j++) {
+            const float4 direction = directions[set + j];
+            const float cosine = dot(normal.xyz, direction.xyz);
+            if (cosine <= 0.0f) continue;
+            const float share = cosine * direction.w * M_1_PI_F;
+            sky += share;
+            if (trace_volume(volume, origin, direction.xyz, reach_m)) {
+                mask[j >> 5] |= 1u << (j & 31);
+            } else {
+                blocked_sky += share;
+                global const float *y = basis + (set + j) * COEFFICIENTS;
+                for (int i = 0; i < COEFFICIENTS; i++) t[i] -= share * y[i];
+            }
+        }
+    }
+    for (int i = 0; i < COEFFICIENTS; i++) transfer[sample * COEFFICIENTS + i] = t[i];
+    for (int i = 0; i < MASK_WORDS; i++) free_mask[sample * MASK_WORDS + i] = mask[i];
+    openness[sample] = valid && sky > 0.0f ? 1.0f - blocked_sky / sky : -1.0f;
+}

@@ -1,0 +1,56 @@
+// The brick volume's table: which bricks the measured surface needs, and how far each brick is from an allocated one.
+// Provides mark_bricks, gap_along_x, gap_along_axis.
+#include "camera.clh"
+#include "volume.clh"
+
+// depth_m [h][w], 0 = none -> wanted [z][y][x] = 1 for every brick within `reach_m` of the measured surface along its ray.
+kernel void mark_bricks(const int width, const int height, const int4 bricks, global const float *depth_m,
+                        const float4 intrinsics, const float16 volume_from_camera, const float voxel_m, const float reach_m,
+                        global uchar *wanted) {
+    const int x = get_global_id(0);
+    const int y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    const float depth = depth_m[y * width + x];
+    if (depth <= 0.0f) return;
+    const float brick_m = BRICK * voxel_m;
+    const float3 ray = unproject(intrinsics, x, y);
+    const float along = length(ray);
+    const int steps = (int)(2.0f * reach_m / (0.5f * brick_m)) + 1;
+    for (int i = 0; i <= steps; i++) {
+        const float z = depth + reach_m * (2.0f * i / steps - 1.0f) / along;
+        const float3 p = transform_point(volume_from_camera, ray * z);
+        // A surface voxel's trilinear neighbours may lie in the next brick: mark the bricks of p +- 1.5 voxels.
+        const int3 low = convert_int3_rtn((p - 1.5f * voxel_m) / brick_m);
+        const int3 high = convert_int3_rtn((p + 1.5f * voxel_m) / brick_m);
+        for (int corner = 0; corner < 8; corner++) {
+            const int3 brick = (int3)(corner & 1 ? high.x : low.x, corner & 2 ? high.y : low.y, corner & 4 ? high.z : low.z);
+            if (inside_bricks(bricks, brick)) wanted[brick_index(bricks, brick)] = 1;  // every writer writes 1
+        }
+    }
+}
+
+// slots [z][y][x] -> gap [z][y][x]: distance along x to the nearest allocated brick, at most `limit`.
+kernel void gap_along_x(const int4 bricks, global const int *slots, const int limit, global uchar *gap) {
+    const int3 b = (int3)(get_global_id(0), get_global_id(1), get_global_id(2));
+    if (!inside_bricks(bricks, b)) return;
+    int nearest = limit;
+    for (int x = max(b.x - limit, 0); x <= min(b.x + limit, bricks.x - 1); x++) {
+        if (slots[brick_index(bricks, (int3)(x, b.y, b.z))] != NO_SLOT) nearest = min(nearest, x < b.x ? b.x - x : x - b.x);
+    }
+    gap[brick_index(bricks, b)] = (uchar)nearest;
+}
+
+// The Chebyshev distance is separable: along each further axis, the least over neighbours of max(offset, their distance).
+kernel void gap_along_axis(const int4 bricks, global const uchar *inner, const int axis, const int limit, global uchar *gap) {
+    const int3 b = (int3)(get_global_id(0), get_global_id(1), get_global_id(2));
+    if (!inside_bricks(bricks, b)) return;
+    const int3 step = axis == 1 ? (int3)(0, 1, 0) : (int3)(0, 0, 1);
+    int nearest = limit;
+    for (int offset = -limit; offset <= limit; offset++) {
+        const int3 other = b + step * offset;
+        if (inside_bricks(bricks, other)) {
+            nearest = min(nearest, max(offset < 0 ? -offset : offset, (int)inner[brick_index(bricks, other)]));
+        }
+    }
+    gap[brick_index(bricks, b)] = (uchar)nearest;
+}

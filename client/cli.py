@@ -1,0 +1,174 @@
+"""The command line. A user's error ends in one line on standard error: status 2 for usage, 1 for anything else."""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from client import options as o
+from client.laptop.errors import OptionError
+from client.progress import Stopwatch, note, say, track
+
+USAGE_STATUS, FAILURE_STATUS, INTERRUPTED_STATUS = 2, 1, 130
+OWN_PACKAGES = {"client", "server", "protocol"}
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=False,
+    pretty_exceptions_enable=False,
+    help="Lights virtual objects with the room's own light, with no light probe.",
+)
+
+
+def main() -> None:
+    """Entry point: runs the command and turns every error into one line."""
+    arguments = [word for word in sys.argv[1:] if word != "--debug"]
+    sys.exit(run_command(arguments, debug="--debug" in sys.argv[1:]))
+
+
+def run_command(arguments: list[str], debug: bool = False) -> int:
+    """The exit status of a command line."""
+    try:
+        return typer.main.get_command(app).main(arguments, prog_name="probeless", standalone_mode=False) or 0
+    except KeyboardInterrupt:
+        return INTERRUPTED_STATUS
+    except BrokenPipeError:
+        # The reader of our output is gone; nothing more can be told to it, at exit neither.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILURE_STATUS
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        note(_one_line(error))
+        return USAGE_STATUS if isinstance(error, OptionError | typer.TyperException) else FAILURE_STATUS
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, typer.TyperException):
+        text = f"{error.format_message()} (probeless --help lists what there is)"
+    elif type(error).__module__.split(".")[0] in OWN_PACKAGES:
+        text = str(error)
+    else:
+        text = f"internal error, {type(error).__name__}: {error} (run again with --debug to see where)"
+    return " ".join(text.split())
+
+
+@app.callback()
+def common(
+    debug: Annotated[bool, typer.Option("--debug", help="show the traceback of an error; may stand anywhere")] = False,
+) -> None:
+    """Lights virtual objects with the room's own light, with no light probe."""
+
+
+@app.command()
+def run(
+    source: o.SourceArgument,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="folder for what is written")],
+    frames: o.Frames = None,
+    poses: o.PosesOption = None,
+    volume: o.VolumeOption = None,
+    voxel: o.Voxel = None,
+    preset: o.Preset = "reg4",
+    rays: o.Rays = 81,
+    ray_length: o.RayLength = None,
+    bands: o.Bands = 4,
+    albedo: o.Albedo = None,
+    indirect: o.Indirect = None,
+    as_thesis: o.AsThesis = False,
+    object: o.Object = None,
+    up: o.Up = None,
+    light: o.LightFile = None,
+    panorama: o.Panorama = None,
+    mesh: o.Mesh = False,
+    budget_ms: o.BudgetMs = None,
+    max_light_error: o.MaxLightError = None,
+    device: o.DeviceOption = None,
+) -> None:
+    """The pipeline in one process, no network."""
+    capture = o.prepare(o.CaptureOptions.of(locals()))
+    from client.laptop.output import OutputWriter
+    from client.laptop.run import run as run_pipeline
+
+    watch = Stopwatch()
+    with OutputWriter(out) as writer:
+        for output in track(run_pipeline(capture, device, note), len(capture.frames)):
+            writer.write(output)
+            watch.frames += 1
+    say(f"{watch.summary()}, written to {out}")
+
+
+@app.command()
+def stream(
+    source: o.SourceArgument,
+    server: Annotated[str, typer.Option(metavar="URL", help="for example http://localhost:8080")],
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for what is written")] = None,
+    record: Annotated[Path | None, typer.Option(metavar="FILE", help="keep what is sent as a recording")] = None,
+    lossless: Annotated[bool, typer.Option("--lossless", help="raw colour, and every frame is waited for")] = False,
+    frames: o.Frames = None,
+    poses: o.PosesOption = None,
+    volume: o.VolumeOption = None,
+    voxel: o.Voxel = None,
+    preset: o.Preset = "reg4",
+    rays: o.Rays = 81,
+    ray_length: o.RayLength = None,
+    bands: o.Bands = 4,
+    albedo: o.Albedo = None,
+    indirect: o.Indirect = None,
+    as_thesis: o.AsThesis = False,
+    object: o.Object = None,
+    up: o.Up = None,
+    light: o.LightFile = None,
+    panorama: o.Panorama = None,
+    mesh: o.Mesh = False,
+    budget_ms: o.BudgetMs = None,
+    max_light_error: o.MaxLightError = None,
+    device: o.DeviceOption = None,
+) -> None:
+    """The laptop client: sends a source to a server and shows what comes back."""
+    if device is not None:
+        raise OptionError("--device: the server has the device; name it there with probeless serve --device")
+    capture = o.prepare(o.CaptureOptions.of(locals()), lossless=lossless)
+    raise NotImplementedError(capture, server, out, record)
+
+
+@app.command()
+def serve(
+    host: Annotated[str, typer.Option(help="address to listen on; 0.0.0.0 for all")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0: a free one")] = 8080,
+    device: o.DeviceOption = None,
+    token: Annotated[str | None, typer.Option(help="not built yet")] = None,
+    tls: Annotated[str | None, typer.Option(metavar="CERT,KEY", help="not built yet")] = None,
+) -> int:
+    """The server."""
+    if token is not None:
+        raise OptionError("--token is not built yet; listen on 127.0.0.1 or put an authenticating proxy in front")
+    if tls is not None:
+        raise OptionError("--tls is not built yet; put a TLS proxy in front")
+    from server.serve import serve as serve_forever
+
+    return serve_forever(host, port, device)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="folder for what is written")] = Path("out/demo"),
+    keep: Annotated[bool, typer.Option("--keep", help="leave the server running to look at the page")] = False,
+    device: o.DeviceOption = None,
+) -> None:
+    """Server and client together on a synthetic scene; pictures in out/demo."""
+    from client.laptop.demo import run_demo
+
+    run_demo(out, device, keep)
+
+
+@app.command()
+def devices() -> None:
+    """OpenCL devices, and which one would be used."""
+    from client.laptop.devices import show_devices
+
+    show_devices()

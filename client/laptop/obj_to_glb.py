@@ -1,0 +1,196 @@
+"""An OBJ with its material libraries and textures as one GLB: the same vertices, axes and units.
+
+`Kd` is taken as sRGB, as textures are; glTF's factors are linear.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.laptop import glb
+from client.laptop.errors import ObjectError
+
+Corner = tuple[int, int, int]
+"""Indices of position, texture coordinate and normal; -1 = none."""
+
+
+@dataclass
+class _Group:
+    """Faces of one material."""
+
+    corners: dict[Corner, int] = field(default_factory=dict)
+    triangles: list[tuple[int, int, int]] = field(default_factory=list)
+
+
+@dataclass
+class _Model:
+    positions: list[list[float]] = field(default_factory=list)
+    """x y z, and r g b (0 to 1) where the file has vertex colours."""
+    coordinates: list[list[float]] = field(default_factory=list)
+    normals: list[list[float]] = field(default_factory=list)
+    groups: dict[str, _Group] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Material:
+    """What is kept of an MTL material."""
+
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """sRGB, 0 to 1."""
+    texture: Path | None = None
+
+
+def libraries(path: Path, text: str) -> list[Path]:
+    """The material libraries of an OBJ that exist."""
+    names = [line.split(maxsplit=1)[1].strip() for line in text.splitlines() if line.startswith("mtllib ")]
+    return [path.parent / name for name in names if (path.parent / name).is_file()]
+
+
+def convert(path: Path, text: str, mtl_files: list[Path]) -> bytes:
+    """GLB bytes. Raises ObjectError naming the file and line."""
+    materials = {name: m for file in mtl_files for name, m in _read_materials(file).items()}
+    model = _read_obj(path, text)
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": []}],
+    }
+    body = bytearray()
+    for name, group in model.groups.items():
+        if group.triangles:
+            primitive = _primitive(document, body, model, group)
+            primitive["material"] = _add_material(document, body, materials.get(name, Material()))
+            document["meshes"][0]["primitives"].append(primitive)
+    return glb.to_bytes(document, body)
+
+
+def _read_obj(path: Path, text: str) -> _Model:
+    model = _Model()
+    group = model.groups.setdefault("", _Group())
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split("#")[0].split()
+        try:
+            match words:
+                case ["v", *values]:
+                    model.positions.append([float(x) for x in values])
+                case ["vt", *values]:
+                    model.coordinates.append([float(x) for x in values[:2]])
+                case ["vn", *values]:
+                    model.normals.append([float(x) for x in values[:3]])
+                case ["usemtl", *name]:
+                    group = model.groups.setdefault(" ".join(name), _Group())
+                case ["f", *corners]:
+                    _add_face(model, group, corners)
+        except (ValueError, IndexError):
+            raise ObjectError(f"{path}, line {number}: {line.strip()[:60]!r} is no valid OBJ line") from None
+    return model
+
+
+def _add_face(model: _Model, group: _Group, words: list[str]) -> None:
+    """A polygon as a fan of triangles."""
+    if len(words) < 3:
+        raise ValueError
+    indices = [group.corners.setdefault(_corner(model, word), len(group.corners)) for word in words]
+    group.triangles += [(indices[0], b, c) for b, c in pairwise(indices[1:])]
+
+
+def _corner(model: _Model, word: str) -> Corner:
+    parts = [*word.split("/"), "", ""]
+    counts = (len(model.positions), len(model.coordinates), len(model.normals))
+    p, t, n = (_index(part, count) for part, count in zip(parts[:3], counts, strict=True))
+    if p < 0:
+        raise ValueError
+    return p, t, n
+
+
+def _index(part: str, count: int) -> int:
+    """0-based; OBJ counts from 1, or backwards from the last with negative numbers."""
+    if not part:
+        return -1
+    number = int(part)
+    index = number - 1 if number > 0 else count + number
+    if not 0 <= index < count:
+        raise IndexError
+    return index
+
+
+def _primitive(document: dict[str, Any], body: bytearray, model: _Model, group: _Group) -> dict[str, Any]:
+    corners = np.array(list(group.corners), np.int64)
+    vertices = [model.positions[i] for i in corners[:, 0]]
+    attributes = {"POSITION": glb.add_array(document, body, _floats([v[:3] for v in vertices], 3), bounds=True)}
+    if all(len(v) >= 6 for v in vertices):
+        colors = np.round(np.clip(_floats([v[3:6] for v in vertices], 3), 0, 1) * 255).astype(np.uint8)
+        opaque = np.full((len(colors), 1), 255, np.uint8)
+        attributes["COLOR_0"] = glb.add_array(document, body, np.hstack([colors, opaque]))
+    if (corners[:, 2] >= 0).all():
+        normals = _floats([model.normals[i] for i in corners[:, 2]], 3)
+        attributes["NORMAL"] = glb.add_array(document, body, normals)
+    if (corners[:, 1] >= 0).all():
+        uv = _floats([model.coordinates[i] for i in corners[:, 1]], 2)
+        # OBJ counts v from the bottom, glTF from the top.
+        attributes["TEXCOORD_0"] = glb.add_array(document, body, uv * np.float32([1, -1]) + np.float32([0, 1]))
+    indices = np.array(group.triangles, np.uint32).ravel()
+    return {"attributes": attributes, "indices": glb.add_array(document, body, indices)}
+
+
+def _floats(rows: list[list[float]], columns: int) -> NDArray[np.float32]:
+    values = np.array(rows, np.float32)
+    if values.shape[1:] != (columns,) or not np.isfinite(values).all():
+        raise ObjectError(f"the OBJ has a vertex, normal or texture coordinate without {columns} finite numbers")
+    return values
+
+
+def _read_materials(path: Path) -> dict[str, Material]:
+    materials: dict[str, Material] = {}
+    name = ""
+    for number, line in enumerate(path.read_text("utf-8", errors="replace").splitlines(), 1):
+        match line.split("#")[0].split():
+            case ["newmtl", *words]:
+                name = " ".join(words)
+                materials[name] = Material()
+            case ["Kd", r, g, b, *_] if name in materials:
+                materials[name] = Material(_color(path, number, (r, g, b)), materials[name].texture)
+            case ["map_Kd", *words] if name in materials and words:
+                materials[name] = Material(materials[name].color, _texture(path, words))
+    return materials
+
+
+def _color(path: Path, number: int, words: tuple[str, str, str]) -> tuple[float, float, float]:
+    try:
+        r, g, b = (min(max(float(word), 0.0), 1.0) for word in words)
+    except ValueError:
+        raise ObjectError(f"{path}, line {number}: Kd needs three numbers") from None
+    return r, g, b
+
+
+def _texture(path: Path, words: list[str]) -> Path:
+    """The file after map_Kd's options; file names may have spaces, so the longest tail that exists wins."""
+    for start in range(len(words)):
+        file = path.parent / " ".join(words[start:]).replace("\\", "/")
+        if file.is_file():
+            return file
+    raise ObjectError(f"{path.parent / words[-1]}: the texture that {path.name} names is missing")
+
+
+def _add_material(document: dict[str, Any], body: bytearray, material: Material) -> int:
+    srgb = np.array(material.color)
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    surface: dict[str, Any] = {
+        "baseColorFactor": [*linear.tolist(), 1.0],
+        "metallicFactor": 0.0,
+        "roughnessFactor": 1.0,
+    }
+    if material.texture is not None:
+        image = glb.add_image(document, body, material.texture.read_bytes(), material.texture)
+        document.setdefault("textures", []).append({"source": image})
+        surface["baseColorTexture"] = {"index": len(document["textures"]) - 1}
+    document.setdefault("materials", []).append({"pbrMetallicRoughness": surface, "doubleSided": True})
+    return len(document["materials"]) - 1

@@ -1,0 +1,83 @@
+"""`probeless run`: a source through the pipeline in this process, without a network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Protocol
+
+from server.pipeline import FrameResult, Pipeline
+from server.scene.mesh import load_mesh
+from server.scene.placement import Placement
+
+from client.laptop.errors import RunError
+from client.laptop.objects import ObjectFile, pack_mesh
+from client.laptop.output import FrameOutput
+from client.options import Capture
+from protocol.frames import CameraModel, RgbdFrame
+from protocol.messages import Wishes
+from server.opencl.device import open_device
+
+
+class Processor(Protocol):
+    """What `run` needs of the pipeline."""
+
+    def process(self, frame: RgbdFrame) -> FrameResult: ...
+
+
+def run(capture: Capture, device_name: str | None, note: Callable[[str], None]) -> Iterator[FrameOutput]:
+    """One output per frame, in order; `note` gets what the pipeline says about objects.
+
+    Raises UserError, DeviceError or MeshError, each with one clear line.
+    """
+    pipeline = _open_pipeline(device_name, capture.source.camera, capture.wishes)
+    try:
+        place_objects(pipeline, capture.objects, note)
+        yield from process_frames(pipeline, (capture.source[i] for i in capture.frames))
+    finally:
+        pipeline.close()
+
+
+def process_frames(pipeline: Processor, frames: Iterable[RgbdFrame]) -> Iterator[FrameOutput]:
+    """Each frame's output. Raises RunError naming the frame that the pipeline refuses."""
+    for frame in frames:
+        try:
+            result = pipeline.process(frame)
+        except ValueError as error:
+            raise RunError(f"frame {frame.index}: {error}") from error
+        yield FrameOutput(
+            frame=frame.index,
+            timestamp_s=frame.timestamp_s,
+            color=result.color,
+            light=result.light,
+            world_from_camera=result.world_from_camera,
+            tracking=result.tracking,
+            timings=result.timings,
+            plan=result.plan,
+            notes=result.notes,
+        )
+
+
+def place_objects(pipeline: Pipeline, objects: tuple[ObjectFile, ...], note: Callable[[str], None]) -> None:
+    """Put every object into the pipeline, named by `object_id`. Raises ObjectError, MeshError or RunError."""
+    for number, item in enumerate(objects):
+        format_, data = pack_mesh(item.path)
+        placement = Placement(position_m=item.position_m, scale=item.scale, yaw_deg=item.yaw_deg)
+        try:
+            notes = pipeline.place_object(object_id(number), load_mesh(data, format_), placement)
+        except ValueError as error:
+            raise RunError(f"{item.path}: {error}") from error
+        for text in notes:
+            note(f"{item.path.name}: {text}")
+
+
+def object_id(number: int) -> str:
+    """The session's name of the n-th `--object`, the same in `run` and `stream`."""
+    return f"object-{number}"
+
+
+def _open_pipeline(device_name: str | None, camera: CameraModel, wishes: Wishes) -> Pipeline:
+    device = open_device(device_name)
+    try:
+        return Pipeline(device, camera, wishes)
+    except ValueError as error:
+        raise RunError(str(error)) from error

@@ -1,0 +1,61 @@
+"""Where frames come from: one interface over data-set folders, synthetic scenes, recordings and cameras."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+from client.laptop.errors import SourceError
+from protocol.frames import CameraModel, RgbdFrame
+
+__all__ = ["Source", "SourceError", "open_source"]
+
+SYNTHETIC_PREFIX = "synthetic:"
+
+
+class Source(Protocol):
+    """A sequence of RGB-D frames of one camera. Indexing may raise SourceError naming the damaged file."""
+
+    name: str
+    camera: CameraModel
+    fps: float
+    has_poses: bool
+    """Every frame has its `world_from_camera`."""
+    up: tuple[float, float, float] | None
+    """World direction, where the source knows it."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> RgbdFrame: ...
+
+
+def open_source(spec: str) -> Source:
+    """The source that `spec` names: a folder, `synthetic:NAME[?key=value&...]`, a recording's file, or `oak`.
+
+    Raises SourceError.
+    """
+    if spec == "oak":
+        return _open_oak()
+    if spec.startswith(SYNTHETIC_PREFIX):
+        from client.laptop.synthetic.source import open_synthetic
+
+        return open_synthetic(spec)
+    path = Path(spec).expanduser()
+    if path.is_dir():
+        from client.laptop.datasets import open_folder
+
+        return open_folder(path)
+    if path.is_file():
+        return _open_recording(path)
+    raise SourceError(f"{spec}: no such folder or file; give a data-set folder, a recording, synthetic:table or oak")
+
+
+def _open_oak() -> Source:
+    raise SourceError(
+        "oak: no OAK camera support is installed or no device is connected; stream a data-set folder, a recording or "
+        "synthetic:table instead"
+    )
+
+
+def _open_recording(path: Path) -> Source:
+    raise SourceError(f"{path}: is not a recording; give a data-set folder, synthetic:table or oak")

@@ -1,0 +1,251 @@
+// Generated from protocol/messages.py by `python -m protocol.typescript`. Do not edit.
+
+export const PROTOCOL_VERSION = 1;
+export const SUBPROTOCOL = "probeless-v1";
+export const SUBPROTOCOL_PREFIX = "probeless-v";
+export const MAX_MESSAGE_BYTES = 16777216;
+export const MAX_IMAGE_SIDE_PX = 4096;
+export const MAX_IMAGE_PIXELS = 2304000;
+export const MAX_MESH_BYTES = 12582912;
+export const MAX_NAME_CHARS = 64;
+export const MAX_REASON_CHARS = 400;
+export const MAX_SH_BANDS = 6;
+
+/**
+ * Pinhole camera with polynomial distortion; colour and depth share it (depth is registered to colour).
+ *
+ * A pixel centre lies at integer coordinates: `u = fx * x / z + cx`. Distortion is OpenCV's
+ * `(k1, k2, p1, p2, k3)` on normalised coordinates, all zero for a rectified camera.
+ */
+export interface CameraModel {
+  width: number;
+  height: number;
+  fx: number;
+  fy: number;
+  cx: number;
+  cy: number;
+  /** Metres per unit of the uint16 depth. */
+  depth_scale_m?: number;
+  distortion?: [number, number, number, number, number];
+  color_encoding?: "linear16" | "srgb8";
+}
+
+/** What a capturing client asks of its session; the command line's options of the same names. */
+export interface Wishes {
+  preset?: "art1" | "art4" | "art8" | "auto" | "gr15" | "gr15fast" | "reg4" | "reg8" | "rm";
+  rays?: number;
+  /** null: the whole room. */
+  ray_length_m?: number | null;
+  bands?: number;
+  albedo?: "constant" | "estimated";
+  indirect?: "none" | "observed";
+  as_thesis?: boolean;
+  poses?: "given" | "refine" | "track";
+  /** x0, y0, z0, x1, y1, z1 in world metres; null: what the first frame sees. */
+  volume_m?: [number, number, number, number, number, number] | null;
+  voxel_m?: number | null;
+  /** World direction; null: the first camera's -y. */
+  up?: [number, number, number] | null;
+  /** Answers carry PNG pictures, and every frame is answered in order instead of latest-wins. */
+  lossless?: boolean;
+}
+
+/** First message of a client that captures. */
+export interface Hello {
+  type: "hello";
+  client: string;
+  camera: CameraModel;
+  wishes?: Wishes;
+}
+
+/** First message of a client that only looks: it receives what the capturing session produces. */
+export interface Watch {
+  type: "watch";
+  /** null: the session that is streaming, now or next. */
+  session?: string | null;
+}
+
+/** Colour: `jpeg` and `png` are sRGB 8-bit; `raw` is interleaved RGB, little endian, in `encoding`. */
+export interface ColorImage {
+  width: number;
+  height: number;
+  data: Uint8Array;
+  codec: "jpeg" | "png" | "raw";
+  encoding?: "linear16" | "srgb8";
+}
+
+/**
+ * uint16 depth, lossless.
+ *
+ * `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd.
+ */
+export interface DepthImage {
+  width: number;
+  height: number;
+  data: Uint8Array;
+  codec: "raw" | "zdelta" | "zstd-delta";
+}
+
+/** One RGB-D frame; answered by exactly one of composite (with its light before it), dropped or error. */
+export interface Frame {
+  type: "frame";
+  frame: number;
+  timestamp_s: number;
+  world_from_camera: Array<number> | null;
+  color: ColorImage;
+  depth: DepthImage;
+}
+
+/** Put a virtual object into the session; acknowledged. */
+export interface PlaceObject {
+  type: "place_object";
+  request: number;
+  object: string;
+  format: "glb" | "obj" | "ply" | "stl";
+  data: Uint8Array;
+  /** World position of the bottom centre of the model's box; null: the vertices are world coordinates already. */
+  position_m?: [number, number, number] | null;
+  scale?: number;
+  yaw_deg?: number;
+}
+
+/** Move an object that is there; acknowledged. */
+export interface MoveObject {
+  type: "move_object";
+  request: number;
+  object: string;
+  position_m: [number, number, number];
+  scale?: number;
+  yaw_deg?: number;
+}
+
+/** Take an object away; acknowledged. */
+export interface RemoveObject {
+  type: "remove_object";
+  request: number;
+  object: string;
+}
+
+/** Change the preset of the running session; acknowledged. */
+export interface Quality {
+  type: "quality";
+  request: number;
+  preset: "art1" | "art4" | "art8" | "auto" | "gr15" | "gr15fast" | "reg4" | "reg8" | "rm";
+}
+
+/** Either side says it is leaving, and why. */
+export interface Bye {
+  type: "bye";
+  reason?: string;
+}
+
+/** Answer to hello and watch. */
+export interface Welcome {
+  type: "welcome";
+  session: string;
+  server: string;
+  device: string;
+  /** Frames the client may have unanswered. */
+  max_inflight: number;
+}
+
+/** Milliseconds under the thesis's row names (table 6.2): device plus host time; total is wall time. */
+export interface Timings {
+  input: number;
+  reconstruct: number;
+  surface: number;
+  dynamic_geometry: number;
+  radiance_transfer: number;
+  light_estimation: number;
+  rendering: number;
+  total: number;
+}
+
+/** An effect that did not run, why, and what leaving it out can change at most, in display units (1 is 1/255). */
+export interface LeftOut {
+  effect: string;
+  reason: string;
+  error_bound: number | null;
+}
+
+/** Which effects ran for a frame, in order, and which did not. */
+export interface Plan {
+  run: Array<string>;
+  left_out: Array<LeftOut>;
+}
+
+/** The finished picture of one frame. */
+export interface Composite {
+  type: "composite";
+  frame: number;
+  timestamp_s: number;
+  color: ColorImage;
+  world_from_camera: Array<number>;
+  tracking: "given" | "lost" | "tracked";
+  timings: Timings;
+  plan: Plan;
+  /** What was wrong with this frame's input, one line each. */
+  notes: Array<string>;
+}
+
+/** The room's light as one frame left it; the fields of a line of `light.jsonl`. */
+export interface Light {
+  type: "light";
+  frame: number;
+  timestamp_s: number;
+  /** 16 x [r, g, b], zeros for bands not estimated. */
+  sh: Array<[number, number, number]>;
+  /** All coefficients, when there are more than 16. */
+  sh_all: Array<[number, number, number]> | null;
+  /** One standard deviation of each of `sh`; null where unknown. */
+  sh_std: Array<[number | null, number | null, number | null]>;
+  /** 27 floats, RGB-interleaved C00 C1-1 C10 C11 ..., in axes with up as +y and the first camera's view near -z. */
+  sh_webxr: Array<number>;
+  /** World, unit, towards the light, from l = 1 of Rec. 709 luminance; (0, 0, 0) where there is none. */
+  dominant_direction: [number, number, number];
+  dominant_intensity: number;
+  /** Condition number of the unregularised normal equations; null when infinite. */
+  condition: number | null;
+  valid: boolean;
+}
+
+/** This frame was replaced by a newer one before it was read, or refused; nothing else comes for it. */
+export interface Dropped {
+  type: "dropped";
+  frame: number;
+  reason: string;
+}
+
+/** A control message was applied, or refused with its error. */
+export interface Acknowledged {
+  type: "acknowledged";
+  request: number;
+  error: string | null;
+  notes: Array<string>;
+}
+
+/** Something the client sent is wrong; `fatal` when the server closes the socket after it. */
+export interface Error {
+  type: "error";
+  reason: string;
+  fatal: boolean;
+}
+
+export type ClientMessage =
+  | Hello
+  | Watch
+  | Frame
+  | PlaceObject
+  | MoveObject
+  | RemoveObject
+  | Quality
+  | Bye;
+
+export type ServerMessage =
+  | Welcome
+  | Composite
+  | Light
+  | Dropped
+  | Acknowledged
+  | Error
+  | Bye;

@@ -1,0 +1,60 @@
+"""Bytes to messages and back: MessagePack, validated by type, size checked before anything is decoded."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import msgspec
+
+from protocol.limits import MAX_MESSAGE_BYTES, MAX_REASON_CHARS
+from protocol.messages import ClientMessage, ServerMessage
+
+T = TypeVar("T")
+
+
+class ProtocolError(ValueError):
+    """What was wrong with something received: one printable line, short enough for `Error.reason`."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(one_line(reason))
+
+
+def one_line(text: str) -> str:
+    """`text` as one printable line of at most MAX_REASON_CHARS: it may quote what an attacker sent."""
+    line = " ".join("".join(c if c.isprintable() else " " for c in text[: 4 * MAX_REASON_CHARS]).split())
+    return line if len(line) <= MAX_REASON_CHARS else line[: MAX_REASON_CHARS - 1] + "…"
+
+
+_encoder = msgspec.msgpack.Encoder()
+_client_decoder: msgspec.msgpack.Decoder[ClientMessage] = msgspec.msgpack.Decoder(ClientMessage)
+_server_decoder: msgspec.msgpack.Decoder[ServerMessage] = msgspec.msgpack.Decoder(ServerMessage)
+
+
+def encode(message: ClientMessage | ServerMessage) -> bytes:
+    """One message as MessagePack bytes. Raises ProtocolError if it is larger than the other side would accept."""
+    data = _encoder.encode(message)
+    _require_size(len(data))
+    return data
+
+
+def decode_client(data: bytes | bytearray | memoryview) -> ClientMessage:
+    """The message a client sent. Raises ProtocolError, naming the field as `$.depth.width`."""
+    return _decode(_client_decoder, data)
+
+
+def decode_server(data: bytes | bytearray | memoryview) -> ServerMessage:
+    """The message a server sent. Raises ProtocolError, naming the field as `$.light.sh`."""
+    return _decode(_server_decoder, data)
+
+
+def _decode(decoder: msgspec.msgpack.Decoder[T], data: bytes | bytearray | memoryview) -> T:
+    _require_size(memoryview(data).nbytes)
+    try:
+        return decoder.decode(data)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise ProtocolError(f"not a valid message: {error}") from error
+
+
+def _require_size(size_bytes: int) -> None:
+    if size_bytes > MAX_MESSAGE_BYTES:
+        raise ProtocolError(f"message of {size_bytes} bytes exceeds the limit of {MAX_MESSAGE_BYTES} bytes")

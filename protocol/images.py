@@ -1,0 +1,127 @@
+"""Colour and depth pictures between arrays and their payloads on the wire; everything is checked before decoding."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.codec import ProtocolError
+from protocol.depth_codec import deflate, filter_depth, inflate, unfilter_depth, zstd_compress, zstd_decompress
+from protocol.frames import CameraModel, ColorEncoding
+from protocol.messages import ColorImage, DepthImage, Payload
+from protocol.picture_headers import jpeg_size, png_size
+
+ColorCodec = Literal["jpeg", "png", "raw"]
+DepthCodec = Literal["raw", "zdelta", "zstd-delta"]
+Color = NDArray[np.uint8] | NDArray[np.uint16]
+
+DEFAULT_DEPTH_CODEC: DepthCodec = "zstd-delta"
+DEFAULT_JPEG_QUALITY = 90
+
+_COLOR_DTYPE: dict[ColorEncoding, str] = {"srgb8": "u1", "linear16": "<u2"}
+# An EXIF orientation must not turn a picture whose size has been checked.
+_READ_RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+
+
+def encode_color(
+    rgb: Color, codec: ColorCodec = "jpeg", encoding: ColorEncoding = "srgb8", quality: int = DEFAULT_JPEG_QUALITY
+) -> ColorImage:
+    """[h, w, 3] RGB -> payload. uint8 sRGB (`srgb8`), or uint16 linear (`linear16`, codec `raw` only).
+
+    `quality` is JPEG's, 0 to 100. Raises ValueError where dtype, encoding and codec do not go together.
+    """
+    dtype = np.uint8 if encoding == "srgb8" else np.uint16
+    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != dtype:
+        raise ValueError(f"colour of {encoding} must be [h, w, 3] {dtype.__name__}, is {rgb.shape} {rgb.dtype}")
+    _require_codec(codec, encoding)
+    height, width = rgb.shape[:2]
+    data = _compress_color(rgb, codec, encoding, quality)
+    return ColorImage(width=width, height=height, data=data, codec=codec, encoding=encoding)
+
+
+def decode_color(image: ColorImage, camera: CameraModel, encoding: ColorEncoding | None = None) -> Color:
+    """Payload -> [h, w, 3] RGB, uint8 (`srgb8`) or uint16 (`linear16`), of exactly the camera's size.
+
+    `encoding` is what the reader expects: None means the camera's own; a composite is always `srgb8`.
+    Raises ProtocolError, before anything is allocated, for a picture that is not what it declares.
+    """
+    expected = encoding or camera.color_encoding
+    if image.encoding != expected:
+        raise ProtocolError(f"color.encoding is {image.encoding}, this session's is {expected}")
+    _require_codec(image.codec, image.encoding)
+    _require_camera_size("color", image, camera)
+    if image.codec == "raw":
+        return _raw("color", image, _COLOR_DTYPE[image.encoding], 3).reshape(image.height, image.width, 3)
+    return _decompress_color(image)
+
+
+def encode_depth(depth: NDArray[np.uint16], codec: DepthCodec = DEFAULT_DEPTH_CODEC) -> DepthImage:
+    """[h, w] uint16, 0 = no measurement -> payload, bit-exact. Raises ValueError for another shape or dtype."""
+    if depth.ndim != 2 or depth.dtype != np.uint16:
+        raise ValueError(f"depth must be [h, w] uint16, is {depth.shape} {depth.dtype}")
+    height, width = depth.shape
+    if codec == "raw":
+        data = depth.astype("<u2").tobytes()
+    else:
+        data = (deflate if codec == "zdelta" else zstd_compress)(filter_depth(depth))
+    return DepthImage(width=width, height=height, data=data, codec=codec)
+
+
+def decode_depth(image: DepthImage, camera: CameraModel) -> NDArray[np.uint16]:
+    """Payload -> [h, w] uint16 in units of `camera.depth_scale_m`, 0 = no measurement, of the camera's size.
+
+    Raises ProtocolError, before anything is allocated, for a picture that is not what it declares.
+    """
+    _require_camera_size("depth", image, camera)
+    if image.codec == "raw":
+        return _raw("depth", image, "<u2", 1).reshape(image.height, image.width)
+    decompress = inflate if image.codec == "zdelta" else zstd_decompress
+    return unfilter_depth(decompress(image.data, 2 * image.width * image.height), image.width, image.height)
+
+
+def _require_codec(codec: ColorCodec, encoding: ColorEncoding) -> None:
+    if codec != "raw" and encoding != "srgb8":
+        raise ProtocolError(f"color.codec {codec} carries srgb8 only; send {encoding} as raw")
+
+
+def _require_camera_size(field: str, image: Payload, camera: CameraModel) -> None:
+    if (image.width, image.height) != (camera.width, camera.height):
+        declared = f"{field} is {image.width}x{image.height}"
+        raise ProtocolError(f"{declared}, the session's camera is {camera.width}x{camera.height}")
+
+
+def _raw(field: str, image: Payload, dtype: str, channels: int) -> NDArray[Any]:
+    """The bytes as a writable native array of `dtype`, after checking that there are as many as declared."""
+    expected = image.width * image.height * channels * np.dtype(dtype).itemsize
+    if len(image.data) != expected:
+        raise ProtocolError(f"{field}.data has {len(image.data)} bytes, {image.width}x{image.height} needs {expected}")
+    return np.frombuffer(image.data, dtype).astype(np.dtype(dtype).newbyteorder("="))
+
+
+def _compress_color(rgb: Color, codec: ColorCodec, encoding: ColorEncoding, quality: int) -> bytes:
+    if codec == "raw":
+        return rgb.astype(_COLOR_DTYPE[encoding]).tobytes()
+    options = (cv2.IMWRITE_JPEG_QUALITY, quality) if codec == "jpeg" else (cv2.IMWRITE_PNG_COMPRESSION, 1)
+    done, buffer = cv2.imencode(f".{codec}", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
+    if not done:
+        raise ValueError(f"OpenCV could not encode a picture of {rgb.shape} as {codec}")
+    data: bytes = buffer.tobytes()
+    return data
+
+
+def _decompress_color(image: ColorImage) -> NDArray[np.uint8]:
+    """Decode a JPEG or PNG whose own header has been compared with what the payload declares."""
+    size = (jpeg_size if image.codec == "jpeg" else png_size)(image.data)
+    if size != (image.width, image.height):
+        found = f"color.data is a picture of {size[0]}x{size[1]}"
+        raise ProtocolError(f"{found}, color declares {image.width}x{image.height}")
+    try:
+        rgb = cv2.imdecode(np.frombuffer(image.data, np.uint8), _READ_RGB)
+    except cv2.error as error:
+        raise ProtocolError(f"color.data cannot be decoded as {image.codec}: {error}") from error
+    if rgb is None or rgb.shape != (image.height, image.width, 3):
+        raise ProtocolError(f"color.data cannot be decoded as {image.codec}")
+    return rgb.astype(np.uint8, copy=False)

@@ -1,0 +1,71 @@
+"""The routes: the socket, the page, health and metrics. Plain ASGI; everything it serves hangs on one service."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+from fastapi import FastAPI, WebSocket
+from fastapi.responses import JSONResponse, PlainTextResponse, Response
+from fastapi.staticfiles import StaticFiles
+from prometheus_client import CONTENT_TYPE_LATEST
+
+from server.connection import POLICY, Connection
+from server.service import Service
+
+STREAM_PATH = "/v1/stream"
+PAGE_FOLDER = Path(__file__).resolve().parents[1] / "client" / "web" / "dist"
+
+
+def create_app(service: Service, page_folder: Path = PAGE_FOLDER) -> FastAPI:
+    """The ASGI application around `service`, which it starts and stops; `page_folder` holds index.html."""
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        service.start()
+        yield
+        service.stop()
+
+    app = FastAPI(lifespan=lifespan, openapi_url=None)
+    _add_stream(app, service)
+    _add_health(app, service)
+    _add_page(app, page_folder)
+    return app
+
+
+def _add_stream(app: FastAPI, service: Service) -> None:
+    @app.websocket(STREAM_PATH)
+    async def stream(websocket: WebSocket) -> None:
+        connection = Connection(websocket)
+        if await connection.accept():
+            await service.serve(connection)
+
+    @app.websocket("/{path:path}")
+    async def elsewhere(websocket: WebSocket) -> None:
+        connection = Connection(websocket)
+        if await connection.accept():
+            await connection.close(POLICY, f"nothing listens here; the stream is at {STREAM_PATH}")
+
+
+def _add_health(app: FastAPI, service: Service) -> None:
+    @app.get("/healthz")
+    async def healthz() -> JSONResponse:
+        state = {"ready": service.ready, "device": service.device_name, "sessions": service.sessions}
+        if service.failure is not None:
+            state["failure"] = service.failure
+        return JSONResponse(state, status_code=200 if service.ready else 503)
+
+    @app.get("/metrics")
+    async def metrics() -> Response:
+        return Response(service.metrics.render(), media_type=CONTENT_TYPE_LATEST)
+
+
+def _add_page(app: FastAPI, page_folder: Path) -> None:
+    if (page_folder / "index.html").is_file():
+        app.mount("/", StaticFiles(directory=page_folder, html=True))
+        return
+
+    @app.get("/")
+    async def no_page() -> PlainTextResponse:
+        return PlainTextResponse(f"The page is not built: {page_folder.name}/index.html is missing.\n", status_code=404)

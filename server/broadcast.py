@@ -1,0 +1,148 @@
+"""From one capturing session to everybody who watches it; a slow watcher misses pictures and slows nobody."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Iterator
+
+from protocol.messages import Bye
+from server.connection import POLICY, BadMessage, Connection, Refusal
+
+
+class Watcher:
+    """One watching client's slot: per kind of news only the latest is kept until it is taken."""
+
+    def __init__(self, session: str | None) -> None:
+        self.follows_any = session is None
+        self.session = session
+        self._news: dict[str, tuple[bytes, ...]] = {}
+        self._ended = False
+        self._changed = asyncio.Event()
+
+    def post(self, kind: str, messages: tuple[bytes, ...]) -> None:
+        """Put encoded messages there; unread ones of the same kind are replaced."""
+        self._news[kind] = messages
+        self._changed.set()
+
+    def attach(self, session: str | None, welcome: bytes) -> None:
+        """From now on this session's pictures are meant for it, and what is left of another's is not."""
+        self.session = session
+        self._news.pop("pictures", None)
+        self.post("welcome", (welcome,))
+
+    def end(self) -> None:
+        """The session it named is over."""
+        self._ended = True
+        self._changed.set()
+
+    async def take(self) -> tuple[bytes, ...]:
+        """The unread messages, waiting for some; empty once the session it named is over."""
+        await self._changed.wait()
+        self._changed.clear()
+        messages = tuple(message for group in self._news.values() for message in group)
+        self._news.clear()
+        if self._ended:
+            self._changed.set()
+        return messages
+
+
+class Broadcast:
+    """Which watcher sees which session. Everything but `is_watched` is for the event loop's thread."""
+
+    def __init__(self) -> None:
+        self._welcomes: dict[str, bytes] = {}
+        self._watchers: list[Watcher] = []
+        self._watched: frozenset[str | None] = frozenset()
+
+    def is_watched(self, session: str) -> bool:
+        """Whether pictures of this session have a taker; may be called by any thread."""
+        return session in self._watched
+
+    def open_session(self, name: str, welcome: bytes) -> None:
+        """From now on the session can be watched; `welcome` greets its watchers."""
+        self._welcomes[name] = welcome
+        for watcher in self._watchers:
+            if watcher.session is None:
+                watcher.attach(name, welcome)
+        self._note_watched()
+
+    def close_session(self, name: str) -> None:
+        """The session is over: watchers that follow any session go to the newest one left, the others end."""
+        if self._welcomes.pop(name, None) is None:
+            return
+        for watcher in self._watchers:
+            if watcher.session == name:
+                self._move_on(watcher)
+        self._note_watched()
+
+    @contextlib.contextmanager
+    def watcher(self, session: str | None, waiting: bytes) -> Iterator[Watcher]:
+        """A watcher of the named session, or of the newest; `waiting` greets it where there is none yet.
+
+        Raises Refusal for the name of no session.
+        """
+        if session is not None and session not in self._welcomes:
+            there = ", ".join(self._welcomes) or "none"
+            raise Refusal(POLICY, f"there is no session {session!r} to watch; sessions now: {there}")
+        watcher = Watcher(session)
+        name = session or self._newest()
+        watcher.attach(name, self._welcomes[name] if name else waiting)
+        self._watchers.append(watcher)
+        self._note_watched()
+        try:
+            yield watcher
+        finally:
+            self._watchers.remove(watcher)
+            self._note_watched()
+
+    def publish(self, session: str, messages: tuple[bytes, ...]) -> None:
+        """Give the session's watchers one frame's encoded light and composite."""
+        for watcher in self._watchers:
+            if watcher.session == session:
+                watcher.post("pictures", messages)
+
+    def _newest(self) -> str | None:
+        return next(reversed(self._welcomes), None)
+
+    def _move_on(self, watcher: Watcher) -> None:
+        heir = self._newest()
+        if not watcher.follows_any:
+            watcher.end()
+        elif heir is None:
+            watcher.session = None
+        else:
+            watcher.attach(heir, self._welcomes[heir])
+
+    def _note_watched(self) -> None:
+        self._watched = frozenset(watcher.session for watcher in self._watchers)
+
+
+async def serve_watcher(connection: Connection, watcher: Watcher) -> None:
+    """Send a watcher its news until it leaves or its session is over. Raises Refusal or ClientGone."""
+    forward = asyncio.create_task(_forward(connection, watcher))
+    listen = asyncio.create_task(_until_it_leaves(connection))
+    try:
+        ended, _ = await asyncio.wait((forward, listen), return_when=asyncio.FIRST_COMPLETED)
+        for task in ended:
+            task.result()
+    finally:
+        forward.cancel()
+        listen.cancel()
+    await connection.close()
+
+
+async def _forward(connection: Connection, watcher: Watcher) -> None:
+    while messages := await watcher.take():
+        for message in messages:
+            await connection.send(message)
+    await connection.send_message(Bye(reason="the session is over"))
+
+
+async def _until_it_leaves(connection: Connection) -> None:
+    try:
+        message = await connection.receive()
+    except BadMessage as bad:
+        raise Refusal(POLICY, "a watching client sends nothing but bye") from bad
+    if message is not None and not isinstance(message, Bye):
+        raise Refusal(POLICY, f"a watching client sends nothing but bye, not {type(message).__name__.lower()}")

@@ -1,0 +1,135 @@
+"""One client's socket: typed messages in, bytes out, and every ending with a code and a reason."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+
+import msgspec
+from fastapi import WebSocket, WebSocketDisconnect
+
+from protocol.codec import ProtocolError, decode_client, encode, one_line
+from protocol.limits import PROTOCOL_VERSION, SUBPROTOCOL, SUBPROTOCOL_PREFIX
+from protocol.messages import Acknowledged, ClientMessage, Dropped, Error, Index, ServerMessage
+
+NORMAL, PROTOCOL, UNSUPPORTED, INVALID, POLICY, INTERNAL, TRY_LATER = 1000, 1002, 1003, 1007, 1008, 1011, 1013
+
+MAX_CLOSE_REASON_BYTES = 123
+SEND_PATIENCE_S = 30.0
+CLOSE_PATIENCE_S = 5.0
+
+
+class Refusal(Exception):
+    """The server ends this client's connection: a close code and one line for the client."""
+
+    def __init__(self, code: int, reason: str) -> None:
+        super().__init__(one_line(reason))
+        self.code = code
+        self.reason = str(self)
+
+
+class ClientGone(Exception):
+    """The client has left, or reads nothing any more; nothing can be sent to it."""
+
+
+class BadMessage(Exception):
+    """A message of known purpose with a wrong field; `answer` tells the client, and the session goes on."""
+
+    def __init__(self, answer: Dropped | Acknowledged) -> None:
+        super().__init__()
+        self.answer = answer
+
+
+class Connection:
+    """A WebSocket of this protocol, used on the event loop only."""
+
+    def __init__(self, websocket: WebSocket) -> None:
+        self._websocket = websocket
+        self._closed = False
+
+    async def accept(self) -> bool:
+        """Shake hands. A client of another version is told which one is spoken here, and False is returned."""
+        offered: list[str] = self._websocket.scope["subprotocols"]
+        if SUBPROTOCOL in offered:
+            await self._websocket.accept(SUBPROTOCOL)
+            return True
+        # A browser shows a close reason only of a connection that selected one of the subprotocols it had offered.
+        await self._websocket.accept(offered[0] if offered else None)
+        await self.close(PROTOCOL, _wrong_version(offered))
+        return False
+
+    async def receive(self) -> ClientMessage | None:
+        """The next message, or None once the client has left. Raises BadMessage, or Refusal if it must go."""
+        event = await self._websocket.receive()
+        if event["type"] == "websocket.disconnect":
+            self._closed = True
+            return None
+        data = event.get("bytes")
+        if data is None:
+            raise Refusal(UNSUPPORTED, "a text message was received; every message is binary MessagePack")
+        try:
+            return decode_client(data)
+        except ProtocolError as error:
+            raise _judge(data, str(error)) from error
+
+    async def send(self, data: bytes) -> None:
+        """Send encoded messages, waiting for a client that reads slowly. Raises ClientGone."""
+        if self._closed:
+            raise ClientGone
+        try:
+            async with asyncio.timeout(SEND_PATIENCE_S):
+                await self._websocket.send_bytes(data)
+        except (WebSocketDisconnect, RuntimeError, TimeoutError) as error:  # RuntimeError: closed by the keepalive
+            self._closed = True
+            raise ClientGone from error
+
+    async def send_message(self, message: ServerMessage) -> None:
+        """Encode and send one small message. Raises ClientGone."""
+        await self.send(encode(message))
+
+    async def refuse(self, refusal: Refusal) -> None:
+        """Tell the client why in an error message and in the close frame, and close."""
+        with contextlib.suppress(ClientGone, TimeoutError):
+            async with asyncio.timeout(CLOSE_PATIENCE_S):
+                await self.send_message(Error(reason=refusal.reason, fatal=True))
+        await self.close(refusal.code, refusal.reason)
+
+    async def close(self, code: int = NORMAL, reason: str = "") -> None:
+        """Close once; a client that has left already is fine."""
+        if self._closed:
+            return
+        self._closed = True
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):
+            async with asyncio.timeout(CLOSE_PATIENCE_S):
+                await self._websocket.close(code, _cut(reason))
+
+
+def _cut(reason: str) -> str:
+    """As much of `reason` as a close frame holds."""
+    return reason.encode()[:MAX_CLOSE_REASON_BYTES].decode(errors="ignore")
+
+
+def _wrong_version(offered: list[str]) -> str:
+    asked = next((name for name in offered if name.startswith(SUBPROTOCOL_PREFIX)), "no protocol version")
+    return one_line(f"this server speaks {SUBPROTOCOL} (version {PROTOCOL_VERSION}), you asked for {asked[:24]}")
+
+
+class _Envelope(msgspec.Struct):
+    """What can be read of a message with a wrong field."""
+
+    type: str
+    frame: Index | None = None
+    request: Index | None = None
+
+
+def _judge(data: bytes, reason: str) -> Refusal | BadMessage:
+    """A message that can be answered in kind is only answered; anything else ends the connection."""
+    try:
+        envelope = msgspec.msgpack.decode(data, type=_Envelope)
+    except (msgspec.MsgspecError, UnicodeDecodeError):
+        return Refusal(INVALID, reason)
+    if envelope.type == "frame" and envelope.frame is not None:
+        return BadMessage(Dropped(frame=envelope.frame, reason=reason))
+    if envelope.type in ("place_object", "move_object", "remove_object", "quality") and envelope.request is not None:
+        return BadMessage(Acknowledged(request=envelope.request, error=reason))
+    return Refusal(INVALID, reason)

@@ -1,0 +1,41 @@
+"""What the service counts and times, for Prometheus; one registry per service."""
+
+from __future__ import annotations
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+
+from protocol.messages import Timings
+
+BUCKETS_MS = (0.5, 1, 2, 5, 10, 20, 35, 50, 75, 100, 150, 250, 500, 1000, 2500, 5000)
+STAGES = Timings.__struct_fields__
+
+
+class Metrics:
+    """Every row of `/metrics`. Prometheus's types are thread-safe, so workers write here directly."""
+
+    def __init__(self) -> None:
+        self._registry = CollectorRegistry()
+        self.stage_ms = self._histogram("stage_ms", "Milliseconds of each stage of the pipeline", ("stage",))
+        self.decode_ms = self._histogram("decode_ms", "Milliseconds to decode a frame's colour and depth")
+        self.encode_ms = self._histogram("encode_ms", "Milliseconds to encode a composite")
+        self.queue_age_ms = self._histogram("queue_age_ms", "Milliseconds a frame waited before its worker took it")
+        self.processed = Counter("probeless_frames_processed", "Frames composited", registry=self._registry)
+        self.dropped = Counter("probeless_frames_dropped", "Frames dropped", ("reason",), registry=self._registry)
+        self.sessions = Gauge("probeless_sessions", "Capturing sessions", registry=self._registry)
+        self.watchers = Gauge("probeless_watchers", "Watching clients", registry=self._registry)
+        for stage in STAGES:
+            self.stage_ms.labels(stage)
+        for reason in ("replaced", "refused", "unreadable"):
+            self.dropped.labels(reason)
+
+    def _histogram(self, name: str, help_text: str, labels: tuple[str, ...] = ()) -> Histogram:
+        return Histogram(f"probeless_{name}", help_text, labels, buckets=BUCKETS_MS, registry=self._registry)
+
+    def observe_stages(self, timings: Timings) -> None:
+        """Add one frame's timings to the histograms of the stages."""
+        for stage in STAGES:
+            self.stage_ms.labels(stage).observe(getattr(timings, stage))
+
+    def render(self) -> bytes:
+        """All rows in Prometheus's text format."""
+        return generate_latest(self._registry)

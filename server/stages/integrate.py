@@ -1,0 +1,44 @@
+"""TSDF integration (KinectFusion; thesis 4.2.1): a depth picture folded into the volume. Kernel: integrate.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl.array as cl_array
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.maths.rigid import inverse_rigid
+from server.opencl.engine import Engine, float16, int4
+from server.stages.measure import intrinsics
+from server.stages.volume import BRICK, Volume
+
+GREATEST_WEIGHT = 64.0
+"""Where the running mean's weight saturates: it then forgets with a time constant of as many frames."""
+
+
+def integrate(
+    engine: Engine,
+    volume: Volume,
+    camera: CameraModel,
+    volume_from_camera: NDArray[np.float64],
+    depth_m: cl_array.Array,
+) -> None:
+    """Fold depth_m [h, w] (metres, 0 = none) into the bricks that are allocated."""
+    engine.launch(
+        engine.kernel("integrate.cl", "integrate"),
+        (BRICK * volume.allocated_bricks, BRICK),
+        volume.allocated_bricks,
+        camera.width,
+        camera.height,
+        int4(*volume.bricks, 0),
+        volume.allocated_device,
+        volume.slots_device,
+        depth_m,
+        intrinsics(camera),
+        float16(inverse_rigid(volume_from_camera)),
+        volume.voxel_m,
+        volume.truncation_m,
+        GREATEST_WEIGHT,
+        volume.voxels,
+        local=(BRICK, BRICK),
+    )

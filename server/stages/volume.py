@@ -1,0 +1,118 @@
+"""The brick volume: a TSDF whose memory follows the surface. Kernels: volume.cl, layout: include/volume.clh.
+
+Space is a regular grid of bricks of 8x8x8 voxels; a brick gets a slot of the pool when a measured
+surface comes near it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.maths.rigid import translation
+from server.opencl.engine import Engine, KernelArgument, float16, int4
+from server.stages.measure import intrinsics
+
+BRICK = 8
+BRICK_VOXELS = BRICK**3
+TRUNCATION_VOXELS = 4.0
+_GREATEST_GAP = 15
+_GREATEST_BRICKS = 1 << 22
+
+
+class VolumeSizeError(ValueError):
+    """The asked volume is empty or too fine; one line that says what to do."""
+
+
+class Volume:
+    """TSDF of one session. World axes; volume space has its origin at the volume's lower corner."""
+
+    def __init__(
+        self,
+        engine: Engine,
+        bounds_m: tuple[float, float, float, float, float, float],
+        voxel_m: float,
+        budget_bytes: int = 512 << 20,
+    ) -> None:
+        self.origin_world = np.array(bounds_m[:3], np.float64)
+        self.voxel_m = float(voxel_m)
+        extent = np.array(bounds_m[3:]) - self.origin_world
+        counts = np.ceil(extent / (BRICK * self.voxel_m) - 1e-6).astype(np.int64)
+        if (extent <= 0).any() or counts.prod() > _GREATEST_BRICKS:
+            raise VolumeSizeError(
+                f"a volume of {extent[0]:.2f} x {extent[1]:.2f} x {extent[2]:.2f} m at {1e3 * self.voxel_m:.1f} mm "
+                f"a voxel has {counts.prod()} bricks, at most {_GREATEST_BRICKS}: give a larger --voxel"
+            )
+        self.bricks = (int(counts[0]), int(counts[1]), int(counts[2]))
+        self.truncation_m = TRUNCATION_VOXELS * self.voxel_m
+        self.capacity = int(min(counts.prod(), budget_bytes // (8 * BRICK_VOXELS)))
+        self.is_full = False
+        self._engine = engine
+        self._slots = np.full(counts[::-1], -1, np.int32)
+        self._allocated = np.empty(0, np.int32)
+        space = engine.workspace
+        self.voxels: cl_array.Array = space.array("voxels", (self.capacity, BRICK_VOXELS), cl_types.float2)
+        self.voxels.fill(np.zeros((), cl_types.float2))
+        self._upload_table()
+
+    @property
+    def allocated_bricks(self) -> int:
+        """Bricks that hold voxels."""
+        return len(self._allocated)
+
+    def volume_from_world(self) -> NDArray[np.float64]:
+        """4x4 that moves world coordinates to the volume's origin."""
+        return translation(-self.origin_world)
+
+    def arguments(self) -> tuple[KernelArgument, ...]:
+        """bricks, slots, gaps, voxels, voxel_m, truncation_m: what include/volume.clh's make_volume needs."""
+        return int4(*self.bricks, 0), self.slots_device, self._gaps, self.voxels, self.voxel_m, self.truncation_m
+
+    def allocate(self, camera: CameraModel, volume_from_camera: NDArray[np.float64], depth_m: cl_array.Array) -> None:
+        """Give a slot to every brick near the measured surface; past the budget the nearest table order wins."""
+        wanted = self._engine.workspace.array("wanted_bricks", self._slots.shape, np.uint8)
+        wanted.fill(np.uint8(0))
+        self._engine.launch(
+            self._engine.kernel("volume.cl", "mark_bricks"),
+            (camera.width, camera.height),
+            camera.width,
+            camera.height,
+            int4(*self.bricks, 0),
+            depth_m,
+            intrinsics(camera),
+            float16(volume_from_camera),
+            self.voxel_m,
+            self.truncation_m + self.voxel_m,
+            wanted,
+        )
+        new = np.flatnonzero((self._engine.download(wanted) != 0).ravel() & (self._slots.ravel() < 0)).astype(np.int32)
+        room = self.capacity - len(self._allocated)
+        self.is_full = len(new) > room
+        new = new[:room]
+        if new.size:
+            self._slots.ravel()[new] = np.arange(len(self._allocated), len(self._allocated) + len(new))
+            self._allocated = np.concatenate([self._allocated, new])
+            self._upload_table()
+
+    def _upload_table(self) -> None:
+        """Bring slots to the device and measure the gaps between allocated bricks there."""
+        space = self._engine.workspace
+        self.slots_device = space.upload("brick_slots", self._slots)
+        self.allocated_device = space.upload("allocated_bricks", self._allocated) if self._allocated.size else None
+        along_x, along_y = (space.array(f"gap_{axis}", self._slots.shape, np.uint8) for axis in "xy")
+        self._gaps = space.array("brick_gaps", self._slots.shape, np.uint8)
+        bricks = int4(*self.bricks, 0)
+        self._engine.launch(
+            self._engine.kernel("volume.cl", "gap_along_x"),
+            self.bricks,
+            bricks,
+            self.slots_device,
+            _GREATEST_GAP,
+            along_x,
+        )
+        for inner, axis, outer in ((along_x, 1, along_y), (along_y, 2, self._gaps)):
+            kernel = self._engine.kernel("volume.cl", "gap_along_axis")
+            self._engine.launch(kernel, self.bricks, bricks, inner, axis, _GREATEST_GAP, outer)

@@ -1,0 +1,183 @@
+"""The thread behind one capturing session: it owns the pipeline, decodes frames, encodes answers. No asyncio here."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.codec import ProtocolError, encode, one_line
+from protocol.frames import RgbdFrame
+from protocol.images import decode_color, decode_depth, encode_color
+from protocol.messages import (
+    Acknowledged,
+    Composite,
+    Dropped,
+    Frame,
+    Hello,
+    MoveObject,
+    PlaceObject,
+    Quality,
+    RemoveObject,
+)
+from server.connection import POLICY, Refusal
+from server.mailbox import Control, Letter, Mailbox
+from server.metrics import Metrics
+from server.pipeline import FrameResult, Pipeline
+from server.scene.mesh import Mesh, MeshError
+from server.scene.placement import Placement
+
+JPEG_QUALITY = 90
+
+
+class Outlet(Protocol):
+    """Where a worker's answers go; the session's side of it hands them to the event loop."""
+
+    def greet(self, device_name: str) -> None:
+        """Welcome the client: its pipeline is built. Raises ClientGone."""
+
+    def send(self, data: bytes) -> None:
+        """Send to the capturing client, returning when the socket has taken it. Raises ClientGone."""
+
+    def is_watched(self) -> bool:
+        """Whether anybody wants what `publish` is given."""
+
+    def publish(self, messages: tuple[bytes, ...]) -> None:
+        """Give watchers a frame's light and composite; returns at once."""
+
+
+@dataclass(frozen=True)
+class Workshop:
+    """What every worker of a service shares."""
+
+    build_pipeline: Callable[[Hello], Pipeline]
+    load_mesh: Callable[[bytes, str], Mesh]
+    metrics: Metrics
+
+
+class Worker:
+    """Runs one session's frames and control messages, in the order of its mailbox."""
+
+    def __init__(self, workshop: Workshop, hello: Hello, mailbox: Mailbox, outlet: Outlet) -> None:
+        self._workshop = workshop
+        self._hello = hello
+        self._mailbox = mailbox
+        self._outlet = outlet
+
+    def run(self) -> None:
+        """Build the pipeline, welcome the client, and work until the mailbox closes.
+
+        Raises Refusal if the client's wishes cannot be met, ClientGone if it left, anything else for a fault of ours.
+        """
+        try:
+            pipeline = self._workshop.build_pipeline(self._hello)
+        except ValueError as error:
+            raise Refusal(POLICY, str(error)) from error
+        try:
+            self._outlet.greet(pipeline.device_name)
+            while (letter := self._mailbox.take()) is not None:
+                self._handle(pipeline, letter)
+        finally:
+            pipeline.close()
+
+    def _handle(self, pipeline: Pipeline, letter: Letter) -> None:
+        if isinstance(letter.message, Frame):
+            self._workshop.metrics.queue_age_ms.observe(letter.age_ms)
+            self._answer_frame(pipeline, letter.message)
+        else:
+            self._outlet.send(encode(apply_control(pipeline, letter.message, self._workshop.load_mesh)))
+
+    def _answer_frame(self, pipeline: Pipeline, frame: Frame) -> None:
+        try:
+            rgbd = self._decode(frame)
+        except ProtocolError as error:
+            return self._drop(frame, "unreadable", error)
+        try:
+            result = pipeline.process(rgbd)
+        except ValueError as error:
+            return self._drop(frame, "refused", error)
+        self._workshop.metrics.observe_stages(result.timings)
+        self._workshop.metrics.processed.inc()
+        return self._deliver(frame, result)
+
+    def _decode(self, frame: Frame) -> RgbdFrame:
+        start_s = time.perf_counter()
+        camera = self._hello.camera
+        pose = frame.world_from_camera
+        rgbd = RgbdFrame(
+            index=frame.frame,
+            timestamp_s=frame.timestamp_s,
+            color=decode_color(frame.color, camera),
+            depth=decode_depth(frame.depth, camera),
+            world_from_camera=None if pose is None else np.array(pose, np.float64).reshape(4, 4),
+        )
+        self._workshop.metrics.decode_ms.observe((time.perf_counter() - start_s) * 1e3)
+        return rgbd
+
+    def _drop(self, frame: Frame, cause: str, error: ValueError) -> None:
+        self._workshop.metrics.dropped.labels(cause).inc()
+        self._outlet.send(encode(Dropped(frame=frame.frame, reason=one_line(str(error)))))
+
+    def _deliver(self, frame: Frame, result: FrameResult) -> None:
+        lossless = self._hello.wishes.lossless
+        light = encode(result.light)
+        composite = self._encode(frame, result, lossless)
+        self._outlet.send(light)
+        self._outlet.send(composite)
+        if self._outlet.is_watched():
+            shown = self._encode(frame, result, False) if lossless else composite
+            self._outlet.publish((light, shown))
+
+    def _encode(self, frame: Frame, result: FrameResult, lossless: bool) -> bytes:
+        start_s = time.perf_counter()
+        data = encode(
+            Composite(
+                frame=frame.frame,
+                timestamp_s=frame.timestamp_s,
+                color=encode_color(result.color, "png" if lossless else "jpeg", quality=JPEG_QUALITY),
+                world_from_camera=_row_major(result.world_from_camera),
+                tracking=result.tracking,
+                timings=result.timings,
+                plan=result.plan,
+                notes=result.notes,
+            )
+        )
+        self._workshop.metrics.encode_ms.observe((time.perf_counter() - start_s) * 1e3)
+        return data
+
+
+def _row_major(matrix: NDArray[np.float64]) -> tuple[float, ...]:
+    return tuple(matrix.ravel().tolist())
+
+
+def apply_control(pipeline: Pipeline, message: Control, load_mesh: Callable[[bytes, str], Mesh]) -> Acknowledged:
+    """Do what a control message asks; what cannot be done is said in the acknowledgement."""
+    try:
+        notes = _apply(pipeline, message, load_mesh)
+    except KeyError:
+        known = f"there is no object {getattr(message, 'object', '')!r} in this session: place it first"
+        return Acknowledged(request=message.request, error=one_line(known))
+    except (MeshError, ValueError) as error:
+        return Acknowledged(request=message.request, error=one_line(str(error)))
+    return Acknowledged(request=message.request, notes=tuple(one_line(note) for note in notes))
+
+
+def _apply(pipeline: Pipeline, message: Control, load_mesh: Callable[[bytes, str], Mesh]) -> tuple[str, ...]:
+    match message:
+        case PlaceObject():
+            return pipeline.place_object(message.object, load_mesh(message.data, message.format), _placement(message))
+        case MoveObject():
+            pipeline.move_object(message.object, _placement(message))
+        case RemoveObject():
+            pipeline.remove_object(message.object)
+        case Quality():
+            pipeline.set_preset(message.preset)
+    return ()
+
+
+def _placement(message: PlaceObject | MoveObject) -> Placement:
+    return Placement(position_m=message.position_m, scale=message.scale, yaw_deg=message.yaw_deg)

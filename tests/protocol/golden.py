@@ -1,0 +1,56 @@
+"""Golden vectors in tests/golden: the bytes of every sample, decoded by the Python and the TypeScript tests alike.
+
+`python -m tests.protocol.golden` rewrites them; a change of these files is a change of the wire format.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.codec import encode
+from protocol.images import encode_depth
+from protocol.messages import ClientMessage, ServerMessage
+from tests.protocol.samples import CLIENT, COLOR, SERVER
+
+FOLDER = Path(__file__).resolve().parents[1] / "golden"
+EXPECTED = FOLDER / "messages.json"
+
+
+def depth_ramp() -> NDArray[np.uint16]:
+    """[6, 8] uint16 with holes, both extremes and every sign of delta; the TypeScript test has the same formula."""
+    y, x = np.mgrid[0:6, 0:8]
+    return np.where((x + y) % 5 == 0, 0, (x * 9001 + y * 30011) % 65536).astype(np.uint16)
+
+
+def messages() -> dict[str, ClientMessage | ServerMessage]:
+    """Every sample, and a frame whose depth is really compressed."""
+    deflated = msgspec.structs.replace(CLIENT["frame"], color=COLOR, depth=encode_depth(depth_ramp(), "zdelta"))
+    return {**CLIENT, **SERVER, "frame_zdelta": deflated}
+
+
+def render_expected() -> str:
+    """All messages as JSON, bytes as {"$base64": ...}."""
+    plain = {name: msgspec.to_builtins(message, builtin_types=(bytes,)) for name, message in messages().items()}
+    return json.dumps(plain, default=_bytes_as_base64, indent=1, ensure_ascii=False) + "\n"
+
+
+def _bytes_as_base64(value: bytes) -> dict[str, str]:
+    return {"$base64": base64.b64encode(value).decode()}
+
+
+def main() -> None:
+    """Write every vector and messages.json."""
+    FOLDER.mkdir(exist_ok=True)
+    for name, message in messages().items():
+        (FOLDER / f"{name}.msgpack").write_bytes(encode(message))
+    EXPECTED.write_text(render_expected(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,124 @@
+"""One of every message, and random ones: what the protocol's tests encode and decode."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from protocol.frames import CameraModel
+from protocol.messages import (
+    Acknowledged,
+    Bye,
+    ClientMessage,
+    ColorImage,
+    Composite,
+    DepthImage,
+    Dropped,
+    Error,
+    Frame,
+    Hello,
+    LeftOut,
+    Light,
+    MoveObject,
+    PlaceObject,
+    Plan,
+    Quality,
+    RemoveObject,
+    ServerMessage,
+    Timings,
+    Watch,
+    Welcome,
+    Wishes,
+)
+
+IDENTITY = tuple(float(row == column) for row in range(4) for column in range(4))
+CAMERA = CameraModel(width=64, height=48, fx=50.0, fy=50.5, cx=31.5, cy=23.5)
+COLOR = ColorImage(width=2, height=1, codec="raw", data=bytes(range(6)))
+DEPTH = DepthImage(width=2, height=1, codec="raw", data=b"\xe8\x03\x00\x00")
+
+CLIENT: dict[str, ClientMessage] = {
+    "hello": Hello(
+        client="laptop",
+        camera=CAMERA,
+        wishes=Wishes(preset="art4", volume_m=(-1.0, -1.0, 0.0, 1.0, 1.0, 2.0), up=(0.0, -1.0, 0.0), ray_length_m=0.1),
+    ),
+    "watch": Watch(),
+    "watch_named": Watch(session="küche"),
+    "frame": Frame(frame=7, timestamp_s=0.25, world_from_camera=IDENTITY, color=COLOR, depth=DEPTH),
+    "frame_without_pose": Frame(frame=8, timestamp_s=0.5, world_from_camera=None, color=COLOR, depth=DEPTH),
+    "place_object": PlaceObject(request=1, object="sofa", format="glb", data=b"glTF\x02", position_m=(0.5, 0.25, 1.5)),
+    "move_object": MoveObject(request=2, object="sofa", position_m=(0.0, 0.0, 1.0), scale=2.0, yaw_deg=-90.0),
+    "remove_object": RemoveObject(request=3, object="sofa"),
+    "quality": Quality(request=4, preset="gr15fast"),
+    "client_bye": Bye(reason="the sequence is over"),
+}
+
+SERVER: dict[str, ServerMessage] = {
+    "welcome": Welcome(session="kitchen", server="probeless 0.1.0", device="PoCL CPU", max_inflight=2),
+    "composite": Composite(
+        frame=7,
+        timestamp_s=0.25,
+        color=COLOR,
+        world_from_camera=IDENTITY,
+        tracking="given",
+        timings=Timings(input=1.5, reconstruct=12.25, total=20.0),
+        plan=Plan(
+            run=("transfer_radiance", "composite"),
+            left_out=(
+                LeftOut(effect="shadow", reason="no object is near a surface", error_bound=0.5),
+                LeftOut(effect="gloss", reason="not modelled", error_bound=None),
+            ),
+        ),
+        notes=("depth is missing in 31 % of the pixels",),
+    ),
+    "light": Light(
+        frame=7,
+        timestamp_s=0.25,
+        sh=tuple((k / 4, -k / 8, 0.125) for k in range(16)),
+        sh_std=tuple((0.5, 0.25, None) for _ in range(16)),
+        sh_webxr=tuple(k / 16 for k in range(27)),
+        dominant_direction=(0.0, 0.6, -0.8),
+        dominant_intensity=1.25,
+        condition=None,
+        valid=True,
+    ),
+    "dropped": Dropped(frame=6, reason="replaced by a newer frame"),
+    "acknowledged": Acknowledged(request=1, notes=("no normals: computed",)),
+    "acknowledged_error": Acknowledged(request=2, error="there is no object 'chair'"),
+    "error": Error(reason="not a valid message", fatal=True),
+    "server_bye": Bye(reason="shutting down"),
+}
+
+
+def random_frame(random: np.random.Generator) -> Frame:
+    """A frame with every field drawn at random within what the types allow."""
+    width, height = (int(side) for side in random.integers(1, 40, 2))
+    pose = random.normal(0, 10.0 ** random.integers(-6, 7), 16)
+    return Frame(
+        frame=int(random.integers(0, 2**53, endpoint=True)),
+        timestamp_s=float(random.normal(0, 1e6)),
+        world_from_camera=None if random.random() < 0.3 else tuple(pose.tolist()),
+        color=ColorImage(width=width, height=height, codec="jpeg", data=random.bytes(random.integers(0, 5000))),
+        depth=DepthImage(width=width, height=height, codec="zdelta", data=random.bytes(random.integers(0, 5000))),
+    )
+
+
+def random_light(random: np.random.Generator) -> Light:
+    """A light with every number drawn at random, some deviations unknown."""
+
+    def rgb() -> tuple[float, float, float]:
+        red, green, blue = random.normal(0, 3, 3).tolist()
+        return red, green, blue
+
+    more = tuple(rgb() for _ in range(36))
+    return Light(
+        frame=int(random.integers(0, 2**53)),
+        timestamp_s=float(random.uniform(0, 1e4)),
+        sh=more[:16],
+        sh_all=None if random.random() < 0.5 else more,
+        sh_std=tuple((None, *rgb()[:2]) for _ in range(16)),
+        sh_webxr=tuple(random.normal(0, 3, 27).tolist()),
+        dominant_direction=rgb(),
+        dominant_intensity=float(random.exponential()),
+        condition=None if random.random() < 0.5 else float(random.exponential(1e6)),
+        valid=bool(random.random() < 0.5),
+    )

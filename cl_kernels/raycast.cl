@@ -3,84 +3,74 @@
 #include "camera.clh"
 #include "volume.clh"
 
-// Gradient by central differences one voxel wide, trilinear between voxels; (0, 0, 0) where a neighbour was never seen.
-static float3 wide_gradient(const Volume volume, const float3 point) {
+// Gradient of the tsdf from the 4x4x4 voxels around a point; (0, 0, 0) where there is none.
+// Where all of them were seen: central differences one voxel wide, trilinear between voxels. Else of the inner cell alone.
+static float3 surface_gradient(const Volume volume, const float3 point) {
     float3 f;
-    const int3 base = trilinear_cell(volume, point, &f);
-    float3 sum = (float3)(0.0f);
+    const int3 low = trilinear_cell(volume, point, &f) - 1;
+    int starts[8];
+    brick_starts(volume, low, low + 3, starts);
+    const float tx[4] = {0.0f, 1.0f - f.x, f.x, 0.0f}, dx[4] = {f.x - 1.0f, -f.x, 1.0f - f.x, f.x};
+    const float ty[4] = {0.0f, 1.0f - f.y, f.y, 0.0f}, dy[4] = {f.y - 1.0f, -f.y, 1.0f - f.y, f.y};
+    const float tz[4] = {0.0f, 1.0f - f.z, f.z, 0.0f}, dz[4] = {f.z - 1.0f, -f.z, 1.0f - f.z, f.z};
+    const float c[4] = {0.0f, -1.0f, 1.0f, 0.0f};
+    float3 wide = (float3)(0.0f);
+    float3 cell = (float3)(0.0f);
     float least_weight = 1.0f;
-    for (int corner = 0; corner < 8; corner++) {
-        const int3 o = (int3)(corner & 1, (corner >> 1) & 1, corner >> 2);
-        const int3 v = base + o;
-        const float2 xl = load_voxel(volume, v - (int3)(1, 0, 0)), xh = load_voxel(volume, v + (int3)(1, 0, 0));
-        const float2 yl = load_voxel(volume, v - (int3)(0, 1, 0)), yh = load_voxel(volume, v + (int3)(0, 1, 0));
-        const float2 zl = load_voxel(volume, v - (int3)(0, 0, 1)), zh = load_voxel(volume, v + (int3)(0, 0, 1));
-        const float w = (o.x ? f.x : 1.0f - f.x) * (o.y ? f.y : 1.0f - f.y) * (o.z ? f.z : 1.0f - f.z);
-        sum += w * (float3)(xh.x - xl.x, yh.x - yl.x, zh.x - zl.x);
-        least_weight = fmin(least_weight, fmin(fmin(fmin(xl.y, xh.y), fmin(yl.y, yh.y)), fmin(zl.y, zh.y)));
+    for (int k = 0; k < 4; k++) {
+        for (int j = 0; j < 4; j++) {
+            for (int i = 0; i < 4; i++) {
+                const int outer = (i == 0 || i == 3) + (j == 0 || j == 3) + (k == 0 || k == 3);
+                if (outer > 1) continue;
+                const float2 v = load_from(volume, starts, low, low.x + i, low.y + j, low.z + k);
+                wide += v.x * (float3)(dx[i] * ty[j] * tz[k], tx[i] * dy[j] * tz[k], tx[i] * ty[j] * dz[k]);
+                cell += v.x * (float3)(c[i] * ty[j] * tz[k], tx[i] * c[j] * tz[k], tx[i] * ty[j] * c[k]);
+                least_weight = v.y < least_weight ? v.y : least_weight;
+            }
+        }
     }
-    return least_weight > 0.0f ? sum : (float3)(0.0f);
+    return least_weight > 0.0f ? wide : cell;
 }
 
-// Gradient of the trilinear cell alone: needs only the eight voxels that the zero crossing needed.
-static float3 cell_gradient(const Volume volume, const float3 point) {
-    float3 f;
-    const int3 base = trilinear_cell(volume, point, &f);
-    float3 sum = (float3)(0.0f);
-    for (int corner = 0; corner < 8; corner++) {
-        const int3 o = (int3)(corner & 1, (corner >> 1) & 1, corner >> 2);
-        const float value = load_voxel(volume, base + o).x;
-        const float3 w = (float3)(o.x ? f.x : 1.0f - f.x, o.y ? f.y : 1.0f - f.y, o.z ? f.z : 1.0f - f.z);
-        sum += value * (float3)((o.x ? 1.0f : -1.0f) * w.y * w.z, (o.y ? 1.0f : -1.0f) * w.x * w.z,
-                                (o.z ? 1.0f : -1.0f) * w.x * w.y);
-    }
-    return sum;
+// From a point within about a voxel of the surface: one Newton and one secant step along the ray in the trilinear field.
+// 0 where the field was not seen or does not fall through zero there.
+static float refine_crossing(const Volume volume, const VoxelRay ray, const float start) {
+    const float truncation = volume.truncation_m / volume.voxel_m;
+    int seen_a, seen_b;
+    const float a = sample_tsdf(volume, (ray.origin + start * ray.direction) * volume.voxel_m, &seen_a);
+    const float step = (a > 0.0f ? fmax(a * truncation, 0.25f) : fmin(a * truncation, -0.25f));
+    const float b = sample_tsdf(volume, (ray.origin + (start + step) * ray.direction) * volume.voxel_m, &seen_b);
+    const float slope = (b - a) / step;  // per voxel, negative where the ray enters
+    if (!seen_a || !seen_b || slope > -0.05f / truncation) return 0.0f;
+    const float onward = -b / slope;
+    return fabs(onward) < 1.5f ? start + step + onward : 0.0f;
 }
 
-// Distance along the ray at which it enters the surface from the front, 0 if it does not.
-static float find_surface(const Volume volume, const float3 origin, const float3 direction, const float3 inverse,
-                          float t, const float end) {
-    const float brick_m = BRICK * volume.voxel_m;
-    float front = -1.0f;  // where the ray was last seen in front of a surface
+// Distance in voxels along the ray at which it enters the surface from the front, 0 if it does not.
+static float find_surface(const Volume volume, const VoxelRay ray, const float begin, const float end) {
+    const float truncation = volume.truncation_m / volume.voxel_m;
+    int in_front = 0;
+    float t = begin;
     while (t < end) {
-        const float3 p = origin + t * direction;
-        const int3 voxel = convert_int3(p / volume.voxel_m);
-        const int3 brick = min(max(voxel >> 3, (int3)(0)), volume.bricks.xyz - 1);
-        const int index = brick_index(volume.bricks, brick);
-        const int gap = volume.gaps[index];
-        if (gap > 0) {
-            t += fmax(empty_span(p, inverse, brick, gap, brick_m), 0.0f) + 0.01f * volume.voxel_m;
-            front = -1.0f;
+        const float2 here = look_along(volume, ray, t);
+        if (here.y <= 0.0f) {
+            in_front = 0;
+            t += here.y < 0.0f ? here.x : 1.5f;  // an unseen voxel; the band behind a surface is wider than this
             continue;
         }
-        const float2 here = volume.voxels[volume.slots[index] * BRICK_VOXELS + voxel_in_brick(voxel)];
-        if (here.y == 0.0f) {
-            front = -1.0f;
-            t += 0.5f * volume.voxel_m;
-        } else if (here.x > 0.0f) {
-            front = t;
-            t += fmax(0.7f * here.x * volume.truncation_m, 0.5f * volume.voxel_m);
-        } else {
-            if (front >= 0.0f) {
-                int valid_front, valid_back;
-                const float a = sample_tsdf(volume, origin + front * direction, &valid_front);
-                const float b = sample_tsdf(volume, p, &valid_back);
-                if (valid_front && valid_back && a > 0.0f && b <= 0.0f) {
-                    const float guess = front + (t - front) * a / (a - b);
-                    int valid;
-                    const float c = sample_tsdf(volume, origin + guess * direction, &valid);
-                    const float refined = c > 0.0f ? guess + (t - guess) * c / (c - b) : front + (guess - front) * a / (a - c);
-                    return valid ? refined : guess;
-                }
-            }
-            if (t - front > volume.truncation_m) front = -1.0f;
-            t += 0.5f * volume.voxel_m;
+        const float distance = here.x * truncation;
+        in_front = in_front || distance > 0.0f;
+        if (in_front && distance < 1.0f) {
+            const float crossing = refine_crossing(volume, ray, t);
+            if (crossing > 0.0f) return crossing;
+            in_front = distance > -1.0f;
         }
+        t += distance > 1.0f ? 0.9f * distance : 0.7f;
     }
     return 0.0f;
 }
 
-// -> positions [h][w] (volume space metres, w = 1 surface, 0 none), normals [h][w] (unit, towards free space, w likewise).
+// Volume and view -> positions [h][w] (volume space metres, w = 1 surface, 0 none), normals [h][w] (unit, towards free space, w likewise).
 kernel void raycast(const int width, const int height, const int4 bricks, global const int *slots, global const uchar *gaps,
                     global const float2 *voxels, const float voxel_m, const float truncation_m, const float4 intrinsics,
                     const float16 volume_from_camera, const float greatest_depth_m,
@@ -89,23 +79,19 @@ kernel void raycast(const int width, const int height, const int4 bricks, global
     const int y = get_global_id(1);
     if (x >= width || y >= height) return;
     const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, voxels);
-    const float3 origin = volume_from_camera.s37b;
-    const float3 ray = transform_vector(volume_from_camera, unproject(intrinsics, x, y));
-    const float along = length(ray);
-    const float3 direction = ray / along;
-    const float3 inverse = safe_inverse(direction);
-    const float2 span = clip_to_volume(volume, origin, inverse);
-    const float end = fmin(span.y, greatest_depth_m * along) - 0.01f * voxel_m;
-    const float t = find_surface(volume, origin, direction, inverse, fmax(span.x, 0.0f) + 0.01f * voxel_m, end);
+    const float3 ray_m = transform_vector(volume_from_camera, unproject(intrinsics, x, y));
+    const float along = length(ray_m);
+    const VoxelRay ray = make_voxel_ray(volume, volume_from_camera.s37b, ray_m / along);
+    const float2 span = clip_to_volume(volume, ray);
+    const float t = find_surface(volume, ray, span.x, fmin(span.y, greatest_depth_m * along / voxel_m));
 
     float4 position = (float4)(0.0f);
     float4 normal = (float4)(0.0f);
     if (t > 0.0f) {
-        const float3 p = origin + t * direction;
-        float3 gradient = wide_gradient(volume, p);
-        if (dot(gradient, gradient) < 1e-12f) gradient = cell_gradient(volume, p);
+        const float3 p = (ray.origin + t * ray.direction) * voxel_m;
+        const float3 gradient = surface_gradient(volume, p);
         const float steepness = length(gradient);
-        if (steepness > 1e-6f && dot(gradient, direction) < 0.0f) {
+        if (steepness > 1e-6f && dot(gradient, ray.direction) < 0.0f) {
             position = (float4)(p, 1.0f);
             normal = (float4)(gradient / steepness, 1.0f);
         }

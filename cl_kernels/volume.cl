@@ -7,22 +7,25 @@
 kernel void mark_bricks(const int width, const int height, const int4 bricks, global const float *depth_m,
                         const float4 intrinsics, const float16 volume_from_camera, const float voxel_m, const float reach_m,
                         global uchar *wanted) {
-    const int x = get_global_id(0);
-    const int y = get_global_id(1);
+    const int x = 2 * get_global_id(0);  // every second pixel: the margin below covers the others
+    const int y = 2 * get_global_id(1);
     if (x >= width || y >= height) return;
     const float depth = depth_m[y * width + x];
     if (depth <= 0.0f) return;
     const float brick_m = BRICK * voxel_m;
     const float3 ray = unproject(intrinsics, x, y);
     const float along = length(ray);
+    const float pad = 2.0f / BRICK;
     const int steps = (int)(2.0f * reach_m / (0.5f * brick_m)) + 1;
     for (int i = 0; i <= steps; i++) {
         const float z = depth + reach_m * (2.0f * i / steps - 1.0f) / along;
         const float3 p = transform_point(volume_from_camera, ray * z);
-        // A surface voxel's trilinear neighbours may lie in the next brick: mark the bricks of p +- 1.5 voxels.
-        const int3 low = convert_int3_rtn((p - 1.5f * voxel_m) / brick_m);
-        const int3 high = convert_int3_rtn((p + 1.5f * voxel_m) / brick_m);
-        for (int corner = 0; corner < 8; corner++) {
+        // A surface voxel's trilinear neighbours may lie in the next brick: mark the bricks of p +- 2 voxels.
+        const float3 q = p / brick_m + BRICK;  // positive near the volume, so that the casts round down
+        const int3 low = (int3)((int)(q.x - pad), (int)(q.y - pad), (int)(q.z - pad)) - BRICK;
+        const int3 high = (int3)((int)(q.x + pad), (int)(q.y + pad), (int)(q.z + pad)) - BRICK;
+        const int corners = low.x == high.x && low.y == high.y && low.z == high.z ? 1 : 8;
+        for (int corner = 0; corner < corners; corner++) {
             const int3 brick = (int3)(corner & 1 ? high.x : low.x, corner & 2 ? high.y : low.y, corner & 4 ? high.z : low.z);
             if (inside_bricks(bricks, brick)) wanted[brick_index(bricks, brick)] = 1;  // every writer writes 1
         }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import socket
 import sys
@@ -70,8 +71,10 @@ def listen(host: str, port: int) -> socket.socket:
     try:
         return socket.create_server((host, port), family=family)
     except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise ServeError(f"port {port} of {host} is in use: stop what uses it or choose another --port") from error
         why = error.strerror or str(error)
-        raise ServeError(f"cannot listen on {host} port {port} ({why}): stop what uses it or choose --port") from error
+        raise ServeError(f"cannot listen on {host} port {port} ({why}): choose another --host or --port") from error
     except OverflowError as error:
         raise ServeError(f"there is no port {port}: choose --port from 1 to 65535") from error
 

@@ -1,4 +1,4 @@
-"""The service: one device, its capturing sessions and watchers, its metrics. The app and the tests hold one of these."""
+"""The service: one device, its capturing sessions and watchers, its metrics. An app is made around one of these."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ class Volume:
         wanted.fill(np.uint8(0))
         self._engine.launch(
             self._engine.kernel("volume.cl", "mark_bricks"),
-            (camera.width, camera.height),
+            (-(-camera.width // 2), -(-camera.height // 2)),
             camera.width,
             camera.height,
             int4(*self.bricks, 0),

@@ -1,0 +1,45 @@
+// Depth as the wire's `zdelta` (protocol/README.md): a browser writes and reads it with nothing but what it has.
+
+import type { DepthImage } from "./protocol";
+
+/** Low bytes of the zigzagged row deltas, row-major, then their high bytes. */
+export function filterDepth(depth: Uint16Array, width: number): Uint8Array<ArrayBuffer> {
+  const planes = new Uint8Array(2 * depth.length);
+  for (let i = 0; i < depth.length; i++) {
+    const left = i % width === 0 ? 0 : depth[i - 1]!;
+    const delta = ((depth[i]! - left) << 16) >> 16; // modulo 2^16, as a signed number
+    const zigzag = (delta << 1) ^ (delta >> 15);
+    planes[i] = zigzag & 255;
+    planes[depth.length + i] = (zigzag >> 8) & 255;
+  }
+  return planes;
+}
+
+export function unfilterDepth(planes: Uint8Array, width: number): Uint16Array<ArrayBuffer> {
+  const depth = new Uint16Array(planes.length / 2);
+  for (let i = 0; i < depth.length; i++) {
+    const zigzag = planes[i]! | (planes[depth.length + i]! << 8);
+    const delta = (zigzag >> 1) ^ -(zigzag & 1);
+    depth[i] = (i % width === 0 ? 0 : depth[i - 1]!) + delta;
+  }
+  return depth;
+}
+
+export async function encodeDepth(depth: Uint16Array, width: number): Promise<DepthImage> {
+  const data = await pipe(filterDepth(depth, width), new CompressionStream("deflate-raw"));
+  return { width, height: depth.length / width, codec: "zdelta", data };
+}
+
+export async function decodeDepth(image: DepthImage): Promise<Uint16Array<ArrayBuffer>> {
+  if (image.codec !== "zdelta") throw new Error(`depth codec ${image.codec} is not read here`);
+  const planes = await pipe(new Uint8Array(image.data), new DecompressionStream("deflate-raw"));
+  if (planes.length !== 2 * image.width * image.height) throw new Error("depth is not of the size it declares");
+  return unfilterDepth(planes, image.width);
+}
+
+async function pipe(
+  data: Uint8Array<ArrayBuffer>,
+  through: CompressionStream | DecompressionStream,
+): Promise<Uint8Array<ArrayBuffer>> {
+  return new Uint8Array(await new Response(new Blob([data]).stream().pipeThrough(through)).arrayBuffer());
+}

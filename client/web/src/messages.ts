@@ -1,0 +1,35 @@
+// Bytes to messages and back, as in protocol/codec.py.
+
+import { Decoder, encode as pack } from "@msgpack/msgpack";
+import { type ClientMessage, MAX_MESSAGE_BYTES, type ServerMessage } from "./protocol";
+
+const decoder = new Decoder({
+  maxStrLength: MAX_MESSAGE_BYTES,
+  maxBinLength: MAX_MESSAGE_BYTES,
+  maxArrayLength: 4096,
+  maxMapLength: 256,
+  maxExtLength: 0,
+});
+
+const SERVER_TAGS: ReadonlySet<unknown> = new Set<ServerMessage["type"]>([
+  "welcome",
+  "composite",
+  "light",
+  "dropped",
+  "acknowledged",
+  "error",
+  "bye",
+]);
+
+export function encode(message: ClientMessage): Uint8Array<ArrayBuffer> {
+  return pack(message);
+}
+
+/** The message a server sent. Throws Error with one line for bytes that are none; the fields are the server's word. */
+export function decodeServer(data: ArrayBuffer | Uint8Array): ServerMessage {
+  const value: unknown = decoder.decode(data);
+  if (typeof value !== "object" || value === null || !("type" in value) || !SERVER_TAGS.has(value.type)) {
+    throw new Error("not a message of a server of this version");
+  }
+  return value as ServerMessage;
+}

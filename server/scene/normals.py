@@ -1,0 +1,95 @@
+"""Vertex normals for a mesh that brings none: smooth over gentle edges, split along sharp ones."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+CREASE_DEG = 40.0
+"""Two triangles that share an edge are smoothed together if their normals differ by less."""
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+
+def face_crosses(vertices: NDArray[Any], triangles: Ints) -> Floats:
+    """[t, 3] cross products of each triangle's edges: twice its area along its normal."""
+    a, b, c = (vertices[triangles[:, k]].astype(np.float64) for k in range(3))
+    return np.cross(b - a, c - a)
+
+
+def unit(vectors: Floats) -> Floats:
+    """Each row divided by its length; zero rows stay zero."""
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(lengths > 0, lengths, 1.0)
+
+
+def creased_normals(vertices: NDArray[Any], triangles: Ints) -> tuple[Ints, Ints, Floats]:
+    """Split vertices so that each has one normal.
+
+    `vertices` [v, 3], `triangles` [t, 3] with area above zero. Returns `source` [n] (the vertex each new vertex copies),
+    `triangles` [t, 3] into the new vertices, and unit `normals` [n, 3]: the mean of the triangles around it that are
+    joined over edges of less than CREASE_DEG, weighted by their corner angles. Vertices at the same place count as one.
+    """
+    faces = unit(face_crosses(vertices, triangles))
+    group = _joined(3 * len(triangles), _smooth_links(_welded(vertices)[triangles], faces))
+    corner_normals = np.repeat(faces, 3, axis=0) * _corner_angles(vertices, triangles).reshape(-1, 1)
+    sums = np.stack([np.bincount(group, corner_normals[:, k], 3 * len(triangles)) for k in range(3)], axis=1)
+    corner = np.arange(3 * len(triangles))
+    key = group * (len(vertices) + 1) + triangles.reshape(-1)
+    _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+    normals = unit(sums[group[first]])
+    lost = ~normals.any(axis=1)  # opposite sheets that cancel out
+    normals[lost] = faces[corner[first][lost] // 3]
+    return triangles.reshape(-1)[first], inverse.reshape(-1, 3), normals
+
+
+def _welded(vertices: NDArray[Any]) -> Ints:
+    """[v] a number for each vertex, the same for vertices at exactly the same place."""
+    order = np.lexsort(vertices.T)
+    fresh = np.ones(len(vertices), np.int64)
+    fresh[1:] = (np.diff(vertices[order], axis=0) != 0).any(axis=1)
+    place = np.empty(len(vertices), np.int64)
+    place[order] = np.cumsum(fresh) - 1
+    return place
+
+
+def _smooth_links(places: Ints, faces: Floats) -> Ints:
+    """[n, 2] pairs of corners (3 * triangle + k) that meet over a gentle edge; `places` [t, 3]."""
+    corner = np.arange(places.size).reshape(-1, 3)
+    start, end = corner.reshape(-1), np.roll(corner, -1, axis=1).reshape(-1)
+    at = places.reshape(-1)
+    swap = at[start] > at[end]
+    low, high = np.where(swap, end, start), np.where(swap, start, end)
+    key = at[low] * (at.max(initial=0) + 1) + at[high]
+    order = np.argsort(key, kind="stable")
+    this, other = order[:-1], order[1:]
+    gentle = (faces[this // 3] * faces[other // 3]).sum(axis=1) > np.cos(np.radians(CREASE_DEG))
+    linked = (key[this] == key[other]) & gentle
+    this, other = this[linked], other[linked]
+    return np.concatenate([np.stack([low[this], low[other]], 1), np.stack([high[this], high[other]], 1)])
+
+
+def _joined(count: int, links: Ints) -> Ints:
+    """[count] the lowest member of each item's group, groups being what `links` [n, 2] connect (pointer jumping)."""
+    label = np.arange(count)
+    while True:
+        ends = label[links]
+        lowest = ends.min(axis=1)
+        if (ends == lowest[:, None]).all():
+            return label
+        np.minimum.at(label, ends[:, 0], lowest)
+        np.minimum.at(label, ends[:, 1], lowest)
+        while (label[label] != label).any():
+            label = label[label]
+
+
+def _corner_angles(vertices: NDArray[Any], triangles: Ints) -> Floats:
+    """[t, 3] the angle of each triangle at each of its corners, radians."""
+    corners = vertices[triangles].astype(np.float64)
+    onward = np.roll(corners, -1, axis=1) - corners
+    back = np.roll(corners, 1, axis=1) - corners
+    sine = np.linalg.norm(np.cross(onward, back), axis=2)
+    return np.arctan2(sine, (onward * back).sum(axis=2))

@@ -1,0 +1,56 @@
+"""Fixtures: a service with fake pipelines on a real socket."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from server.serve import BackgroundServer, start_in_background
+from server.service import Service
+from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
+from tests.service.wire import Wire
+
+StartServer = Callable[..., BackgroundServer]
+
+
+@pytest.fixture
+def lab() -> Lab:
+    """What the test shares with the fake pipelines."""
+    return Lab()
+
+
+@pytest.fixture
+def start_server(lab: Lab) -> Iterator[StartServer]:
+    """Start a server with fake pipelines; keywords go to `Service`. All are stopped at the end."""
+    servers: list[BackgroundServer] = []
+
+    def start(**options: object) -> BackgroundServer:
+        service = Service(FAKE_DEVICE, **{"pipeline_factory": lab.build, "mesh_loader": fake_mesh} | options)
+        servers.append(start_in_background(service))
+        return servers[-1]
+
+    yield start
+    lab.release(1000)
+    for server in servers:
+        server.stop()
+
+
+@pytest.fixture
+def server(start_server: StartServer) -> BackgroundServer:
+    """A server with fake pipelines."""
+    return start_server()
+
+
+@pytest.fixture
+def dial(server: BackgroundServer) -> Iterator[Callable[[], Wire]]:
+    """Open sockets to the server; closed at the end."""
+    wires: list[Wire] = []
+
+    def open_wire() -> Wire:
+        wires.append(Wire(server.url))
+        return wires[-1]
+
+    yield open_wire
+    for wire in wires:
+        wire.hang_up()

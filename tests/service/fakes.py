@@ -1,0 +1,164 @@
+"""Doubles for the service's tests: a pipeline of plain NumPy that can be held, slowed or made to fail."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import numpy as np
+
+from protocol.frames import CameraModel, RgbdFrame
+from protocol.images import encode_color, encode_depth
+from protocol.messages import Frame, LeftOut, Light, Plan, Timings, Wishes
+
+PATIENCE_S = 20.0
+CAMERA = CameraModel(width=48, height=32, fx=40.0, fy=41.0, cx=23.5, cy=15.5)
+POSE = np.array([[0, -1, 0, 0.125], [1, 0, 0, 0.1], [0, 0, 1, -2.5], [0, 0, 0, 1]], np.float64)
+
+REFUSE_MM, EXPLODE_MM = 111, 222
+"""Depths in the first pixel that make the fake refuse a frame or fail."""
+
+
+@dataclass(frozen=True)
+class FakeResult:
+    """Has the fields of `server.pipeline.FrameResult`."""
+
+    color: np.ndarray
+    light: Light
+    world_from_camera: np.ndarray
+    tracking: str
+    timings: Timings
+    plan: Plan
+    notes: tuple[str, ...]
+
+
+@dataclass
+class Lab:
+    """What the test and all fake pipelines of one service share."""
+
+    hold: bool = False
+    """Each `process` waits for one `release`."""
+    entered: queue.Queue = field(default_factory=queue.Queue)
+    """The index of each frame as its processing begins."""
+    released: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
+    log: list = field(default_factory=list)
+    """Everything asked of the pipelines, in order."""
+    closed: threading.Event = field(default_factory=threading.Event)
+    threads: set = field(default_factory=set)
+
+    def build(self, device: object, camera: CameraModel, wishes: Wishes) -> FakePipeline:
+        """The `pipeline_factory` of a service under test."""
+        self.threads.add(threading.current_thread().name)
+        if wishes.preset == "auto":
+            raise ValueError("preset auto is not for this fake: choose reg4")
+        return FakePipeline(self)
+
+    def next_entered(self) -> int:
+        """Wait until a pipeline begins a frame; its index."""
+        return self.entered.get(timeout=PATIENCE_S)
+
+    def release(self, count: int = 1) -> None:
+        """Let held pipelines finish `count` frames."""
+        self.released.release(count)
+
+
+class FakePipeline:
+    """The pipeline's interface; the picture it makes is the input's negative."""
+
+    device_name = "a fake device"
+
+    def __init__(self, lab: Lab) -> None:
+        self.lab = lab
+        self.objects: set[str] = set()
+
+    def place_object(self, object_id: str, mesh: object, placement: object) -> tuple[str, ...]:
+        self.lab.log.append(("place", object_id, mesh, placement))
+        self.objects.add(object_id)
+        return (f"{object_id} has no texture",)
+
+    def move_object(self, object_id: str, placement: object) -> None:
+        self.lab.log.append(("move", object_id, placement))
+        if object_id not in self.objects:
+            raise KeyError(object_id)
+
+    def remove_object(self, object_id: str) -> None:
+        self.lab.log.append(("remove", object_id))
+        self.objects.remove(object_id)
+
+    def set_preset(self, preset: str) -> None:
+        self.lab.log.append(("preset", preset))
+
+    def process(self, frame: RgbdFrame) -> FakeResult:
+        self.lab.log.append(("frame", frame.index))
+        self.lab.entered.put(frame.index)
+        if self.lab.hold and not self.lab.released.acquire(timeout=PATIENCE_S):
+            raise RuntimeError("the test never released this frame")
+        if frame.depth[0, 0] == REFUSE_MM:
+            raise ValueError("no depth in this frame: point the camera at something")
+        if frame.depth[0, 0] == EXPLODE_MM:
+            raise RuntimeError("secret internals")
+        return fake_result(frame)
+
+    def close(self) -> None:
+        self.lab.closed.set()
+
+
+def fake_result(frame: RgbdFrame) -> FakeResult:
+    """What the fake makes of a frame: exact numbers that JPEG or float32 would not survive."""
+    pose = np.eye(4) if frame.world_from_camera is None else frame.world_from_camera
+    return FakeResult(
+        color=255 - frame.color,
+        light=fake_light(frame),
+        world_from_camera=pose,
+        tracking="given",
+        timings=Timings(input=1.5, rendering=3.25, total=7.0),
+        plan=Plan(run=("composite",), left_out=(LeftOut(effect="shadow", reason="no object", error_bound=0.0),)),
+        notes=("one note",),
+    )
+
+
+def fake_light(frame: RgbdFrame) -> Light:
+    return Light(
+        frame=frame.index,
+        timestamp_s=frame.timestamp_s,
+        sh=((float(frame.depth.sum()) / 3.0, 0.1, 1e-17),) * 16,
+        sh_std=((None, None, None),) * 16,
+        sh_webxr=(1 / 3,) * 27,
+        dominant_direction=(0.0, 1.0, 0.0),
+        dominant_intensity=2 / 7,
+        condition=None,
+        valid=True,
+    )
+
+
+def rgbd_frame(index: int, first_depth_mm: int = 1000, camera: CameraModel = CAMERA) -> RgbdFrame:
+    """A frame of noise, different for every index."""
+    random = np.random.default_rng(index)
+    depth = random.integers(0, 5000, (camera.height, camera.width), np.uint16)
+    depth[0, 0] = first_depth_mm
+    color = random.integers(0, 256, (camera.height, camera.width, 3), np.uint8)
+    return RgbdFrame(index=index, timestamp_s=index / 30, color=color, depth=depth, world_from_camera=POSE)
+
+
+def frame_message(index: int, first_depth_mm: int = 1000) -> Frame:
+    """The same frame as a client sends it, losslessly."""
+    frame = rgbd_frame(index, first_depth_mm)
+    return Frame(
+        frame=index,
+        timestamp_s=frame.timestamp_s,
+        world_from_camera=tuple(POSE.ravel().tolist()),
+        color=encode_color(frame.color, "raw"),
+        depth=encode_depth(frame.depth),
+    )
+
+
+FAKE_DEVICE = SimpleNamespace(name="a fake device")
+
+
+def fake_mesh(data: bytes, format_: str) -> tuple[str, bytes]:
+    """The `mesh_loader` of a service under test."""
+    if data == b"no mesh":
+        raise ValueError("the object is no GLB: its first bytes are not glTF")
+    return format_, data

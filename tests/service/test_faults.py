@@ -1,0 +1,145 @@
+"""Hostile bytes and failing pipelines: one clear line for who caused it, nothing for the others."""
+
+import logging
+import random
+
+import msgpack
+import pytest
+
+from protocol.codec import encode
+from protocol.limits import MAX_MESSAGE_BYTES
+from protocol.messages import Acknowledged, Composite, Dropped, Error, Hello
+from tests.service.fakes import CAMERA, EXPLODE_MM, PATIENCE_S, frame_message
+
+
+def serves_frames(wire, index: int) -> bool:
+    """Whether a session still answers."""
+    wire.say(frame_message(index))
+    return wire.hear_until(Composite)[-1].frame == index
+
+
+def altered(message, **changes) -> bytes:
+    """A message with other fields, encoded by an independent library; None takes a field away."""
+    fields = msgpack.unpackb(encode(message)) | changes
+    return msgpack.packb({name: value for name, value in fields.items() if value != "absent"})
+
+
+HELLO = Hello(client="test", camera=CAMERA)
+RANDOM = random.Random(1)
+HOSTILE = {
+    "empty": (b"", "valid message"),
+    "random": (RANDOM.randbytes(1000), "valid message"),
+    "truncated": (encode(HELLO)[:-10], "truncated"),
+    "trailing bytes": (encode(HELLO) + b"\x00", "trailing"),
+    "wrong tag": (altered(HELLO, type="hallo"), "$.type"),
+    "no tag": (altered(HELLO, type="absent"), "type"),
+    "no object": (msgpack.packb([1, 2, 3]), "object"),
+    "unknown field": (altered(HELLO, extra=1), "extra"),
+    "missing field": (altered(HELLO, camera="absent"), "camera"),
+    "wrong type": (altered(HELLO, client=7), "$.client"),
+    "not finite": (altered(HELLO, camera=msgpack.unpackb(encode(HELLO))["camera"] | {"fx": float("nan")}), "camera.fx"),
+    "too big a picture": (
+        altered(HELLO, camera=msgpack.unpackb(encode(HELLO))["camera"] | {"width": 10**6}),
+        "camera.width",
+    ),
+    "4 GB array header": (b"\xdd\xff\xff\xff\xff", "valid message"),
+    "deep nesting": (b"\x91" * 100_000, "valid message"),
+    "utf-8 that is none": (altered(HELLO, client="abc").replace(b"\xa3abc", b"\xa3\xff\xfe\xfd"), "valid message"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_first_message_is_refused_by_field_and_others_are_served(dial, name) -> None:
+    data, named = HOSTILE[name]
+    good, bad = dial(), dial()
+    good.greet()
+    bad.socket.send(data)
+    code, reason, messages = bad.ending()
+    assert code == 1007
+    assert named in messages[0].reason
+    assert messages[0].fatal
+    assert "Traceback" not in messages[0].reason
+    assert messages[0].reason.startswith(reason)
+    assert serves_frames(good, 0)
+
+
+def test_text_message_is_refused(dial) -> None:
+    wire = dial()
+    wire.greet()
+    wire.socket.send("hello")
+    code, reason, messages = wire.ending()
+    assert code == 1003
+    assert "binary" in reason
+    assert messages == [Error(reason=reason, fatal=True)]
+
+
+def test_huge_message_closes_with_1009_and_others_are_served(dial) -> None:
+    good, bad = dial(), dial()
+    good.greet()
+    bad.greet()
+    bad.socket.send(bytes(MAX_MESSAGE_BYTES + 1))
+    code, _, _ = bad.ending()
+    assert code == 1009
+    assert serves_frames(good, 0)
+
+
+def test_garbage_in_a_session_ends_only_that_session(dial) -> None:
+    good, bad = dial(), dial()
+    good.greet()
+    bad.greet()
+    bad.socket.send(b"\xc1\xc1")
+    assert bad.ending()[0] == 1007
+    assert serves_frames(good, 0)
+
+
+@pytest.mark.parametrize(
+    ("data", "answer", "field"),
+    [
+        (altered(frame_message(7), world_from_camera=[0.0] * 15), Dropped, "$.world_from_camera"),
+        (altered(frame_message(7), timestamp_s=float("inf")), Dropped, "frame.timestamp_s"),
+        (msgpack.packb({"type": "quality", "request": 7, "preset": "best"}), Acknowledged, "$.preset"),
+        (msgpack.packb({"type": "remove_object", "request": 7, "object": "x" * 65}), Acknowledged, "$.object"),
+    ],
+)
+def test_wrong_field_of_a_known_frame_or_request_is_answered_and_the_session_lives(dial, data, answer, field) -> None:
+    wire = dial()
+    wire.greet()
+    wire.socket.send(data)
+    message = wire.hear()
+    assert isinstance(message, answer)
+    text = message.reason if answer is Dropped else message.error
+    assert field in text
+    assert (message.frame if answer is Dropped else message.request) == 7
+    assert serves_frames(wire, 8)
+
+
+def test_failing_pipeline_ends_its_session_only(dial, lab, caplog) -> None:
+    caplog.set_level(logging.ERROR)
+    good, bad = dial(), dial()
+    good.greet()
+    bad.greet()
+    bad.say(frame_message(0, EXPLODE_MM))
+    code, reason, messages = bad.ending()
+    assert code == 1011
+    assert messages == [Error(reason=reason, fatal=True)]
+    assert "secret" not in reason
+    assert lab.closed.wait(PATIENCE_S)
+    assert "secret internals" in caplog.text
+    assert "Traceback" in caplog.text
+    assert serves_frames(good, 1)
+    dial().greet()
+
+
+def test_client_that_vanishes_mid_frame_frees_its_pipeline(dial, lab) -> None:
+    lab.hold = True
+    wire = dial()
+    wire.greet()
+    wire.say(frame_message(0))
+    lab.next_entered()
+    wire.socket.socket.close()
+    lab.release()
+    assert lab.closed.wait(PATIENCE_S)
+    lab.hold = False
+    other = dial()
+    other.greet()
+    assert serves_frames(other, 1)

@@ -1,0 +1,179 @@
+"""A capturing session over a real socket: answers, latest-wins, control messages, refused frames."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from protocol.images import decode_color
+from protocol.messages import (
+    Acknowledged,
+    ColorImage,
+    Composite,
+    DepthImage,
+    Dropped,
+    Error,
+    Light,
+    MoveObject,
+    PlaceObject,
+    Quality,
+    RemoveObject,
+)
+from tests.service.fakes import CAMERA, POSE, REFUSE_MM, fake_light, frame_message, rgbd_frame
+
+
+def test_frame_is_answered_by_its_light_and_then_its_composite(dial) -> None:
+    wire = dial()
+    assert wire.greet().max_inflight == 2
+    wire.say(frame_message(5))
+    light, composite = wire.hear(), wire.hear()
+    assert light == fake_light(rgbd_frame(5))
+    assert isinstance(composite, Composite)
+    assert (composite.frame, composite.timestamp_s) == (5, 5 / 30)
+    assert composite.color.codec == "jpeg"
+    assert composite.world_from_camera == tuple(POSE.ravel())
+    assert composite.timings.rendering == 3.25
+    assert composite.plan.run == ("composite",)
+    assert composite.notes == ("one note",)
+    negative = 255 - rgbd_frame(5).color
+    error = decode_color(composite.color, CAMERA).astype(float) - negative
+    assert abs(error.mean()) < 2  # JPEG on noise, but the right picture
+    assert np.corrcoef(decode_color(composite.color, CAMERA).ravel(), negative.ravel())[0, 1] > 0.7
+
+
+def test_lossless_answers_every_frame_in_order_with_exact_pixels(dial, lab) -> None:
+    lab.hold = True
+    wire = dial()
+    wire.greet(lossless=True)
+    wire.say(*(frame_message(i) for i in range(4)))
+    lab.release(4)
+    for i in range(4):
+        light, composite = wire.hear(), wire.hear()
+        assert isinstance(light, Light)
+        assert (light.frame, composite.frame) == (i, i)
+        assert composite.color.codec == "png"
+        np.testing.assert_array_equal(decode_color(composite.color, CAMERA), 255 - rgbd_frame(i).color)
+
+
+def test_newer_frame_replaces_the_one_that_waits(dial, lab) -> None:
+    lab.hold = True
+    wire = dial()
+    wire.greet()
+    wire.say(frame_message(0))
+    assert lab.next_entered() == 0
+    wire.say(*(frame_message(i) for i in (1, 2, 3)))
+    assert wire.hear() == Dropped(frame=1, reason="replaced by a newer frame")
+    assert wire.hear() == Dropped(frame=2, reason="replaced by a newer frame")
+    lab.release(2)
+    assert [type(wire.hear()) for _ in range(4)] == [Light, Composite, Light, Composite]
+    assert lab.log == [("frame", 0), ("frame", 3)]
+
+
+def test_control_messages_are_never_dropped_and_precede_later_frames(dial, lab) -> None:
+    lab.hold = True
+    wire = dial()
+    wire.greet()
+    wire.say(frame_message(0))
+    lab.next_entered()
+    wire.say(
+        PlaceObject(request=1, object="chair", format="glb", data=b"mesh", position_m=(1.0, 2.0, 3.0), yaw_deg=30.0),
+        frame_message(1),
+        MoveObject(request=2, object="chair", position_m=(0.0, 0.0, 1.0), scale=2.0),
+        frame_message(2),
+        Quality(request=3, preset="rm"),
+        RemoveObject(request=4, object="chair"),
+        frame_message(3),
+    )
+    assert [wire.hear().frame for _ in range(2)] == [1, 2]
+    lab.release(2)
+    answers = wire.hear_until(Composite) + wire.hear_until(Composite)
+    acknowledged = [a for a in answers if isinstance(a, Acknowledged)]
+    assert [a.request for a in acknowledged] == [1, 2, 3, 4]
+    assert all(a.error is None for a in acknowledged)
+    assert acknowledged[0].notes == ("chair has no texture",)
+    asked = [(entry[0], entry[1]) for entry in lab.log]
+    assert asked == [
+        ("frame", 0),
+        ("place", "chair"),
+        ("move", "chair"),
+        ("preset", "rm"),
+        ("remove", "chair"),
+        ("frame", 3),
+    ]
+    _, _, mesh, placement = lab.log[1]
+    assert mesh == ("glb", b"mesh")
+    assert (placement.position_m, placement.scale, placement.yaw_deg) == ((1.0, 2.0, 3.0), 1.0, 30.0)
+
+
+@pytest.mark.parametrize(
+    ("message", "error"),
+    [
+        (MoveObject(request=9, object="ghost", position_m=(0.0, 0.0, 0.0)), "no object 'ghost'"),
+        (RemoveObject(request=9, object="ghost"), "no object 'ghost'"),
+        (PlaceObject(request=9, object="junk", format="glb", data=b"no mesh"), "no GLB"),
+    ],
+)
+def test_control_that_cannot_be_done_is_said_and_the_session_lives(dial, message, error) -> None:
+    wire = dial()
+    wire.greet()
+    wire.say(message, frame_message(0))
+    answer = wire.hear()
+    assert answer.request == 9
+    assert error in answer.error
+    assert isinstance(wire.hear_until(Composite)[-1], Composite)
+
+
+def unreadable_frames() -> list:
+    good = frame_message(0)
+    jpeg = msgspec.structs.replace(good.color, codec="jpeg", data=b"\xff\xd8\xff\xe0 not a picture")
+    short = msgspec.structs.replace(good.color, data=good.color.data[:-1])
+    small = ColorImage(width=8, height=8, data=bytes(192), codec="raw")
+    depth = DepthImage(width=48, height=32, data=good.depth.data[: len(good.depth.data) // 2], codec="zstd-delta")
+    return [
+        pytest.param(msgspec.structs.replace(good, color=jpeg), "color", id="jpeg that is none"),
+        pytest.param(msgspec.structs.replace(good, color=short), "color.data", id="raw colour too short"),
+        pytest.param(msgspec.structs.replace(good, color=small), "color is 8x8", id="another camera's size"),
+        pytest.param(msgspec.structs.replace(good, depth=depth), "depth", id="truncated depth"),
+    ]
+
+
+@pytest.mark.parametrize(("frame", "field"), unreadable_frames())
+def test_unreadable_frame_is_dropped_with_its_field_and_the_session_lives(dial, lab, frame, field) -> None:
+    wire = dial()
+    wire.greet()
+    wire.say(frame)
+    dropped = wire.hear()
+    assert isinstance(dropped, Dropped)
+    assert dropped.frame == 0
+    assert field in dropped.reason
+    wire.say(frame_message(1))
+    assert wire.hear_until(Composite)[-1].frame == 1
+    assert lab.log == [("frame", 1)]
+
+
+def test_frame_the_pipeline_refuses_is_dropped_with_its_reason(dial) -> None:
+    wire = dial()
+    wire.greet(lossless=True)
+    wire.say(frame_message(0), frame_message(1, REFUSE_MM), frame_message(2))
+    answers = wire.hear_until(Composite) + [wire.hear()] + wire.hear_until(Composite)
+    assert answers[2] == Dropped(frame=1, reason="no depth in this frame: point the camera at something")
+    assert [a.frame for a in answers] == [0, 0, 1, 2, 2]
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+def test_client_far_beyond_its_window_is_told_once(dial, lab, lossless) -> None:
+    lab.hold = True
+    wire = dial()
+    wire.greet(lossless=lossless)
+    wire.say(frame_message(0))
+    lab.next_entered()
+    wire.say(*(frame_message(i) for i in range(1, 20)))
+    lab.release(20)
+    answers = wire.hear_until(Composite)
+    while answers[-1].frame != 19:
+        answers += wire.hear_until(Composite)
+    told = [a for a in answers if isinstance(a, Error)]
+    assert len(told) == 1
+    assert not told[0].fatal
+    assert "at most 2" in told[0].reason
+    finished = {a.frame for a in answers if isinstance(a, Composite | Dropped)}
+    assert finished == set(range(20))

@@ -1,0 +1,145 @@
+"""The mailbox between two threads: latest frame wins, control messages keep their place."""
+
+import threading
+
+import msgspec
+import pytest
+
+from protocol.messages import Frame, MoveObject, PlaceObject, Quality
+from server.mailbox import MAX_WAITING_BYTES, MAX_WAITING_LETTERS, Mailbox
+from tests.service.fakes import PATIENCE_S, frame_message
+
+
+def quality(request: int) -> Quality:
+    return Quality(request=request, preset="reg4")
+
+
+def drain(mailbox: Mailbox, count: int) -> list:
+    return [mailbox.take().message for _ in range(count)]
+
+
+def test_newer_frame_replaces_unread_older_one() -> None:
+    mailbox = Mailbox()
+    frames = [frame_message(i) for i in range(3)]
+    assert [mailbox.post(frame).replaced for frame in frames] == [None, frames[0], frames[1]]
+    assert mailbox.take().message is frames[2]
+
+
+def test_a_frame_that_was_taken_is_not_replaced() -> None:
+    mailbox = Mailbox()
+    mailbox.post(frame_message(0))
+    mailbox.take()
+    assert mailbox.post(frame_message(1)).replaced is None
+
+
+def test_lossless_keeps_every_frame_in_order() -> None:
+    mailbox = Mailbox(lossless=True)
+    frames = [frame_message(i) for i in range(5)]
+    assert all(mailbox.post(frame).replaced is None for frame in frames)
+    assert drain(mailbox, 5) == frames
+
+
+def test_control_messages_survive_replacement_and_precede_later_frames() -> None:
+    mailbox = Mailbox()
+    old, new = frame_message(0), frame_message(1)
+    for message in (quality(1), old, quality(2), new, quality(3)):
+        mailbox.post(message)
+    assert drain(mailbox, 4) == [quality(1), quality(2), new, quality(3)]
+
+
+def test_frames_ahead_counts_what_came_since_the_worker_took_one() -> None:
+    mailbox = Mailbox()
+    assert [mailbox.post(frame_message(i)).frames_ahead for i in range(3)] == [1, 2, 3]
+    mailbox.take()
+    assert mailbox.post(frame_message(3)).frames_ahead == 1
+
+
+def test_frames_ahead_counts_what_waits_when_lossless() -> None:
+    mailbox = Mailbox(lossless=True)
+    for i in range(3):
+        mailbox.post(frame_message(i))
+    mailbox.take()
+    assert mailbox.post(frame_message(3)).frames_ahead == 3
+
+
+def test_take_waits_for_a_letter() -> None:
+    mailbox, taken = Mailbox(), []
+    thread = threading.Thread(target=lambda: taken.append(mailbox.take().message))
+    thread.start()
+    mailbox.post(quality(7))
+    thread.join(PATIENCE_S)
+    assert taken == [quality(7)]
+
+
+def test_close_lets_a_waiting_reader_go_and_forgets_letters() -> None:
+    mailbox, taken = Mailbox(), []
+    thread = threading.Thread(target=lambda: taken.append(mailbox.take()))
+    thread.start()
+    mailbox.close()
+    thread.join(PATIENCE_S)
+    assert taken == [None]
+    mailbox.post(quality(1))
+    assert mailbox.take() is None
+
+
+def test_room_is_bounded_by_count_and_by_bytes() -> None:
+    mailbox = Mailbox()
+    for request in range(MAX_WAITING_LETTERS):
+        assert mailbox.has_room()
+        mailbox.post(quality(request))
+    assert not mailbox.has_room()
+    mailbox.take()
+    assert mailbox.has_room()
+
+    mailbox = Mailbox()
+    mesh = PlaceObject(request=0, object="a", format="glb", data=bytes(12 << 20))
+    for _ in range(MAX_WAITING_BYTES // (12 << 20)):
+        assert mailbox.has_room()
+        mailbox.post(mesh)
+    assert not mailbox.has_room()
+
+
+def test_replaced_frames_leave_no_bytes_behind() -> None:
+    mailbox = Mailbox()
+    frame = frame_message(0)
+    for _ in range(2 * MAX_WAITING_BYTES // len(frame.color.data)):
+        mailbox.post(frame)
+    assert mailbox.has_room()
+
+
+def test_on_taken_is_called_for_each_letter() -> None:
+    calls: list[int] = []
+    mailbox = Mailbox(on_taken=lambda: calls.append(1))
+    mailbox.post(quality(1))
+    mailbox.post(quality(2))
+    drain(mailbox, 2)
+    assert len(calls) == 2
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+def test_two_threads_lose_no_control_message_and_end_with_the_newest_frame(lossless: bool) -> None:
+    mailbox, taken = Mailbox(lossless=lossless), []
+    frame = frame_message(0)
+
+    def read() -> None:
+        while (letter := mailbox.take()) is not None and letter.message != quality(999):
+            taken.append(letter.message)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    replaced = []
+    for i in range(999):
+        mailbox.post(MoveObject(request=i, object="a", position_m=(0.0, 0.0, 0.0)))
+        receipt = mailbox.post(msgspec.structs.replace(frame, frame=i))
+        replaced += [receipt.replaced.frame] if receipt.replaced else []
+    mailbox.post(quality(999))
+    reader.join(PATIENCE_S)
+
+    assert [m.request for m in taken if isinstance(m, MoveObject)] == list(range(999))
+    read_frames = [m.frame for m in taken if isinstance(m, Frame)]
+    assert read_frames[-1] == 998
+    assert sorted(read_frames + replaced) == list(range(999))
+    assert read_frames == sorted(read_frames)
+    for i, message in enumerate(taken):
+        if isinstance(message, Frame):  # its own move came before it
+            assert MoveObject(request=message.frame, object="a", position_m=(0.0, 0.0, 0.0)) in taken[:i]

@@ -1,0 +1,69 @@
+"""A client that says exactly what a test wants, right or wrong."""
+
+from __future__ import annotations
+
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from protocol.codec import decode_server, encode
+from protocol.limits import SUBPROTOCOL
+from protocol.messages import ClientMessage, Hello, ServerMessage, Watch, Welcome, Wishes
+from tests.service.fakes import CAMERA, PATIENCE_S
+
+
+class Wire:
+    """A blocking socket of the protocol."""
+
+    def __init__(self, url: str, subprotocols: tuple[str, ...] = (SUBPROTOCOL,)) -> None:
+        self.socket = connect(
+            url.replace("http", "ws") + "/v1/stream",
+            subprotocols=subprotocols or None,
+            compression=None,
+            max_size=None,
+            proxy=None,
+        ).__enter__()  # closed by `hang_up`
+
+    def say(self, *messages: ClientMessage) -> None:
+        """Send messages."""
+        for message in messages:
+            self.socket.send(encode(message))
+
+    def hear(self) -> ServerMessage:
+        """The next message."""
+        return decode_server(self.socket.recv(timeout=PATIENCE_S))
+
+    def hear_until(self, kind: type) -> list[ServerMessage]:
+        """Messages up to the first of a kind, which is the last of them."""
+        messages = [self.hear()]
+        while not isinstance(messages[-1], kind):
+            messages.append(self.hear())
+        return messages
+
+    def greet(self, **wishes: object) -> Welcome:
+        """Say hello and take the welcome."""
+        self.say(Hello(client="test", camera=CAMERA, wishes=Wishes(**wishes)))
+        return self._take_welcome()
+
+    def watch(self, session: str | None = None) -> Welcome:
+        """Ask to watch and take the welcome."""
+        self.say(Watch(session=session))
+        return self._take_welcome()
+
+    def _take_welcome(self) -> Welcome:
+        welcome = self.hear()
+        assert isinstance(welcome, Welcome), welcome
+        return welcome
+
+    def ending(self) -> tuple[int, str, list[ServerMessage]]:
+        """Read to the end: the close code and reason, and what came before."""
+        messages = []
+        try:
+            while True:
+                messages.append(self.hear())
+        except ConnectionClosed as closed:
+            assert closed.rcvd is not None, "the connection ended without a close frame (1006)"
+            return closed.rcvd.code, closed.rcvd.reason, messages
+
+    def hang_up(self) -> None:
+        """Close, if it is still open."""
+        self.socket.close()

@@ -1,5 +1,5 @@
-// The brick volume's table: which bricks the measured surface needs, and how far each brick is from an allocated one.
-// Provides mark_bricks, gap_along_x, gap_along_axis.
+// The brick volume's table: which bricks the measured surface needs, where they are solid, and how far apart those are.
+// Provides mark_bricks, find_solid, gap_along_x, gap_along_axis.
 #include "camera.clh"
 #include "volume.clh"
 
@@ -32,13 +32,41 @@ kernel void mark_bricks(const int width, const int height, const int4 bricks, gl
     }
 }
 
-// slots [z][y][x] -> gap [z][y][x]: distance along x to the nearest allocated brick, at most `limit`.
-kernel void gap_along_x(const int4 bricks, global const int *slots, const int limit, global uchar *gap) {
+// allocated [count] brick indices -> solid [z][y][x]: bit (z 4 + y) 4 + x where a cell of 2x2x2 voxels holds a solid voxel.
+// One work-group of 64 items a brick, one item a cell.
+kernel void find_solid(const int count, global const int *allocated, global const int *slots, global const float2 *voxels,
+                       global ulong *solid) {
+    local uint halves[64];
+    const int group = get_group_id(0);
+    const int cell = get_local_id(0);
+    const int index = group < count ? allocated[group] : allocated[0];
+    const int first = ((cell >> 4) * 2 * BRICK + ((cell >> 2) & 3) * 2) * BRICK + (cell & 3) * 2;
+    global const float2 *corner = voxels + slots[index] * BRICK_VOXELS + first;
+    uint bit = 0;
+    for (int i = 0; i < 8; i++) {
+        const float2 voxel = corner[((i >> 2) * BRICK + ((i >> 1) & 1)) * BRICK + (i & 1)];
+        bit |= voxel.y > 0.0f && voxel.x < 0.0f;
+    }
+    halves[cell] = bit << (cell & 31);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (cell == 0 && group < count) {
+        uint low = 0, high = 0;
+        for (int i = 0; i < 32; i++) {
+            low |= halves[i];
+            high |= halves[32 + i];
+        }
+        solid[index] = ((ulong)high << 32) | low;
+    }
+}
+
+// solid [z][y][x] -> gap [z][y][x]: distance along x to the nearest brick with a solid voxel, at most `limit`.
+kernel void gap_along_x(const int4 bricks, global const ulong *solid, const int limit, global uchar *gap) {
     const int3 b = (int3)(get_global_id(0), get_global_id(1), get_global_id(2));
     if (!inside_bricks(bricks, b)) return;
     int nearest = limit;
     for (int x = max(b.x - limit, 0); x <= min(b.x + limit, bricks.x - 1); x++) {
-        if (slots[brick_index(bricks, (int3)(x, b.y, b.z))] != NO_SLOT) nearest = min(nearest, x < b.x ? b.x - x : x - b.x);
+        const int away = x < b.x ? b.x - x : x - b.x;
+        if (solid[brick_index(bricks, (int3)(x, b.y, b.z))] != 0 && away < nearest) nearest = away;
     }
     gap[brick_index(bricks, b)] = (uchar)nearest;
 }

@@ -15,6 +15,7 @@ import uvicorn
 
 from protocol.limits import MAX_MESSAGE_BYTES
 from server.app import create_app
+from server.linger import LingeringWebSocket
 from server.service import DEFAULT_MAX_SESSIONS, Service
 
 if TYPE_CHECKING:
@@ -164,6 +165,7 @@ def _server(service: Service) -> _Server:
         create_app(service),
         log_level="warning",
         access_log=False,
+        ws=LingeringWebSocket,
         ws_per_message_deflate=False,  # costs 10 ms a message and gains nothing on compressed pictures
         ws_max_size=MAX_MESSAGE_BYTES,
         ws_max_queue=2,

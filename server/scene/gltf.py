@@ -1,7 +1,7 @@
 """What is read of a glTF file before trimesh gets it: limits, and the base colour of every material.
 
-trimesh keeps factors as 8-bit numbers and needs Pillow for textures, so both are read here; a material's name is replaced
-by its index, which is how a part finds its colour again. (glTF 2.0: factors are linear, textures are sRGB.)
+trimesh keeps factors as 8-bit numbers and needs Pillow for textures, so both are read here; a material's name is
+replaced by its index, which is how a part finds its colour again. (glTF 2.0: factors are linear, textures are sRGB.)
 """
 
 from __future__ import annotations
@@ -130,9 +130,9 @@ def _image_index(header: Json, material: Json) -> int | None:
     if reference is None:
         return None
     try:
-        texture = header["textures"][reference["index"]]
-        return int(texture["source"])
-    except (KeyError, IndexError, TypeError, ValueError) as error:
+        source = header["textures"][reference["index"]].get("source")
+        return None if source is None else int(source)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         raise MeshError(f"damaged glTF: a material names a texture that is not there ({error!r})") from error
 
 

@@ -29,20 +29,21 @@ def unit(vectors: Floats) -> Floats:
 def creased_normals(vertices: NDArray[Any], triangles: Ints) -> tuple[Ints, Ints, Floats]:
     """Split vertices so that each has one normal.
 
-    `vertices` [v, 3], `triangles` [t, 3] with area above zero. Returns `source` [n] (the vertex each new vertex copies),
-    `triangles` [t, 3] into the new vertices, and unit `normals` [n, 3]: the mean of the triangles around it that are
-    joined over edges of less than CREASE_DEG, weighted by their corner angles. Vertices at the same place count as one.
+    `vertices` [v, 3], `triangles` [t, 3] with area above zero. Returns `source` [n] (the vertex each new vertex
+    copies), `triangles` [t, 3] into the new vertices, and unit `normals` [n, 3]: the mean of the triangles around it
+    that are joined over edges of less than CREASE_DEG, weighted by their corner angles. Vertices at the same place
+    count as one.
     """
     faces = unit(face_crosses(vertices, triangles))
     group = _joined(3 * len(triangles), _smooth_links(_welded(vertices)[triangles], faces))
     corner_normals = np.repeat(faces, 3, axis=0) * _corner_angles(vertices, triangles).reshape(-1, 1)
-    sums = np.stack([np.bincount(group, corner_normals[:, k], 3 * len(triangles)) for k in range(3)], axis=1)
-    corner = np.arange(3 * len(triangles))
+    sums = np.zeros((3 * len(triangles), 3))
+    np.add.at(sums, group, corner_normals)
     key = group * (len(vertices) + 1) + triangles.reshape(-1)
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
     normals = unit(sums[group[first]])
     lost = ~normals.any(axis=1)  # opposite sheets that cancel out
-    normals[lost] = faces[corner[first][lost] // 3]
+    normals[lost] = faces[first[lost] // 3]
     return triangles.reshape(-1)[first], inverse.reshape(-1, 3), normals
 
 
@@ -92,4 +93,5 @@ def _corner_angles(vertices: NDArray[Any], triangles: Ints) -> Floats:
     onward = np.roll(corners, -1, axis=1) - corners
     back = np.roll(corners, 1, axis=1) - corners
     sine = np.linalg.norm(np.cross(onward, back), axis=2)
-    return np.arctan2(sine, (onward * back).sum(axis=2))
+    angles: Floats = np.arctan2(sine, (onward * back).sum(axis=2))
+    return angles

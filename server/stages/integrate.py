@@ -24,6 +24,8 @@ def integrate(
     depth_m: cl_array.Array,
 ) -> None:
     """Fold depth_m [h, w] (metres, 0 = none) into the bricks that are allocated."""
+    if not volume.allocated_bricks:
+        return
     engine.launch(
         engine.kernel("integrate.cl", "integrate"),
         (BRICK * volume.allocated_bricks, BRICK),
@@ -42,3 +44,4 @@ def integrate(
         volume.voxels,
         local=(BRICK, BRICK),
     )
+    volume.summarize()

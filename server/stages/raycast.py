@@ -34,18 +34,12 @@ def raycast(engine: Engine, camera: CameraModel, volume_from_camera: NDArray[np.
     size = (camera.height, camera.width)
     positions = engine.workspace.array("positions", size, cl_types.float4)
     normals = engine.workspace.array("normals", size, cl_types.float4)
-    bricks, slots, gaps, voxels, voxel_m, truncation_m = volume.arguments()
     engine.launch(
         engine.kernel("raycast.cl", "raycast"),
         (camera.width, camera.height),
         camera.width,
         camera.height,
-        bricks,
-        slots,
-        gaps,
-        voxels,
-        voxel_m,
-        truncation_m,
+        *volume.arguments(),
         intrinsics(camera),
         float16(volume_from_camera),
         GREATEST_DEPTH_M,

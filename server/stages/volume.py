@@ -56,7 +56,11 @@ class Volume:
         space = engine.workspace
         self.voxels: cl_array.Array = space.array("voxels", (self.capacity, BRICK_VOXELS), cl_types.float2)
         self.voxels.fill(np.zeros((), cl_types.float2))
+        self._solid = space.array("brick_solid", self._slots.shape, np.uint64)
+        self._solid.fill(np.uint64(0))
+        self._gaps = space.array("brick_gaps", self._slots.shape, np.uint8)
         self._upload_table()
+        self.summarize()
 
     @property
     def allocated_bricks(self) -> int:
@@ -68,8 +72,8 @@ class Volume:
         return translation(-self.origin_world)
 
     def arguments(self) -> tuple[KernelArgument, ...]:
-        """bricks, slots, gaps, voxels, voxel_m, truncation_m: what include/volume.clh's make_volume needs."""
-        return int4(*self.bricks, 0), self.slots_device, self._gaps, self.voxels, self.voxel_m, self.truncation_m
+        """bricks, slots, gaps, solid, voxels, voxel_m, truncation_m: what include/volume.clh's make_volume needs."""
+        return int4(*self.bricks, 0), self.slots_device, self._gaps, self._solid, self.voxels, self.voxel_m, self.truncation_m
 
     def allocate(self, camera: CameraModel, volume_from_camera: NDArray[np.float64], depth_m: cl_array.Array) -> None:
         """Give a slot to every brick near the measured surface; past the budget the nearest table order wins."""
@@ -97,22 +101,28 @@ class Volume:
             self._allocated = np.concatenate([self._allocated, new])
             self._upload_table()
 
-    def _upload_table(self) -> None:
-        """Bring slots to the device and measure the gaps between allocated bricks there."""
-        space = self._engine.workspace
-        self.slots_device = space.upload("brick_slots", self._slots)
-        self.allocated_device = space.upload("allocated_bricks", self._allocated) if self._allocated.size else None
+    def summarize(self) -> None:
+        """After integration: find the solid cells and how far rays may jump between them."""
+        space, bricks = self._engine.workspace, int4(*self.bricks, 0)
+        if self.allocated_bricks:
+            self._engine.launch(
+                self._engine.kernel("volume.cl", "find_solid"),
+                (64 * self.allocated_bricks,),
+                self.allocated_bricks,
+                self.allocated_device,
+                self.slots_device,
+                self.voxels,
+                self._solid,
+            )
         along_x, along_y = (space.array(f"gap_{axis}", self._slots.shape, np.uint8) for axis in "xy")
-        self._gaps = space.array("brick_gaps", self._slots.shape, np.uint8)
-        bricks = int4(*self.bricks, 0)
-        self._engine.launch(
-            self._engine.kernel("volume.cl", "gap_along_x"),
-            self.bricks,
-            bricks,
-            self.slots_device,
-            _GREATEST_GAP,
-            along_x,
-        )
+        kernel = self._engine.kernel("volume.cl", "gap_along_x")
+        self._engine.launch(kernel, self.bricks, bricks, self._solid, _GREATEST_GAP, along_x)
         for inner, axis, outer in ((along_x, 1, along_y), (along_y, 2, self._gaps)):
             kernel = self._engine.kernel("volume.cl", "gap_along_axis")
             self._engine.launch(kernel, self.bricks, bricks, inner, axis, _GREATEST_GAP, outer)
+
+    def _upload_table(self) -> None:
+        """Bring slots and the list of allocated bricks to the device."""
+        space = self._engine.workspace
+        self.slots_device = space.upload("brick_slots", self._slots)
+        self.allocated_device = space.upload("allocated_bricks", self._allocated) if self._allocated.size else None

@@ -11,6 +11,8 @@ export type ConnectionState =
 
 const FIRST_PAUSE_MS = 500;
 const LONGEST_PAUSE_MS = 15_000;
+/** A connection that lasted this long was a good one: the pauses start from the shortest again. */
+const GOOD_AFTER_MS = 10_000;
 const WRONG_VERSION = 1002;
 
 /** Pause before attempt number `attempt` (1, 2, ...): doubling, with up to a quarter less so that pages spread out. */
@@ -21,17 +23,13 @@ export function pause_ms(attempt: number, random: () => number = Math.random): n
 
 /** `ws(s)` URL of the stream on the host the page came from. */
 export function streamUrl(page: URL): string {
-  return `${page.protocol === "https:" ? "wss" : "ws"}://${page.host}/v1/stream${tokenOf(page)}`;
-}
-
-function tokenOf(page: URL): string {
-  const token = page.searchParams.get("token");
-  return token === null ? "" : `?token=${encodeURIComponent(token)}`;
+  return `${page.protocol === "https:" ? "wss" : "ws"}://${page.host}/v1/stream`;
 }
 
 export class Connection {
   private socket: WebSocket | null = null;
   private attempts = 0;
+  private opened_ms = 0;
   private timer: ReturnType<typeof setTimeout> | undefined;
 
   /** `session`: the one to watch; null for whichever is streaming. */
@@ -49,6 +47,7 @@ export class Connection {
     this.onState({ kind: "connecting" });
     const socket = new WebSocket(this.url, SUBPROTOCOL);
     this.socket = socket;
+    this.opened_ms = performance.now();
     socket.binaryType = "arraybuffer";
     socket.onopen = () => socket.send(encode({ type: "watch", session: this.session }));
     socket.onmessage = (event: MessageEvent<unknown>) => this.receive(socket, event.data);
@@ -65,10 +64,7 @@ export class Connection {
       console.error("unreadable message", error);
       return;
     }
-    if (message.type === "welcome") {
-      this.attempts = 0;
-      this.onState({ kind: "open" });
-    }
+    if (message.type === "welcome") this.onState({ kind: "open" });
     this.onMessage(message);
   }
 
@@ -79,6 +75,7 @@ export class Connection {
       this.onState({ kind: "refused", reason });
       return;
     }
+    if (performance.now() - this.opened_ms > GOOD_AFTER_MS) this.attempts = 0;
     const wait_ms = pause_ms(++this.attempts);
     this.timer = setTimeout(() => this.open(), wait_ms);
     this.onState({ kind: "lost", reason, retryAt_ms: performance.now() + wait_ms });

@@ -1,0 +1,48 @@
+// What was wrong with the input: each line once, with how often and when it was last said.
+
+import { byId, make } from "./dom";
+
+const MOST = 30;
+const list = byId("notes");
+
+interface Note {
+  count: number;
+  frame: number | null;
+}
+
+const notes = new Map<string, Note>();
+
+/** Remember a line; `frame` is the frame it was about, null where it was about none. */
+export function addNote(text: string, frame: number | null): void {
+  const count = (notes.get(text)?.count ?? 0) + 1;
+  notes.delete(text); // the newest is the last of the map
+  notes.set(text, { count, frame });
+  const oldest = notes.keys().next().value;
+  if (notes.size > MOST && oldest !== undefined) notes.delete(oldest);
+}
+
+export function clearNotes(): void {
+  notes.clear();
+}
+
+let shown = "";
+
+export function showNotes(): void {
+  const key = JSON.stringify([...notes]);
+  if (key === shown) return;
+  shown = key;
+  list.replaceChildren(...[...notes].reverse().map(([text, note]) => describe(text, note)));
+  if (notes.size === 0) list.append(make("li", "quiet", "Nothing was wrong with the input"));
+}
+
+function describe(text: string, { count, frame }: Note): HTMLLIElement {
+  const item = make("li");
+  item.append(make("span", "", text), make("span", "when", when(count, frame)));
+  return item;
+}
+
+function when(count: number, frame: number | null): string {
+  const last = frame === null ? "" : `frame ${frame}`;
+  const times = count === 1 ? "" : `${count} times`;
+  return [times, last].filter((part) => part !== "").join(", last ").replace(/^(\d+ times), last /, "$1, last in ");
+}

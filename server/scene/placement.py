@@ -1,0 +1,93 @@
+"""Where a virtual object stands: from model metres to the world."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.scene.mesh import Mesh, UpAxis
+
+Matrix = NDArray[np.float64]
+
+_Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+_LEAST_HORIZONTAL = 1e-3
+"""Below this length the horizontal part of the world's x axis says nothing of a heading."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """`position_m`: world point on which the bottom centre of the model's box stands; None: the vertices are world
+    coordinates already, and scale and yaw are not used. `yaw_deg` turns counter-clockwise seen from above.
+    Raises ValueError for numbers that are not finite and for a scale that is not positive.
+    """
+
+    position_m: tuple[float, float, float] | None = None
+    scale: float = 1.0
+    yaw_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not all(map(math.isfinite, (*(self.position_m or ()), self.scale, self.yaw_deg))):
+            raise ValueError("an object's position, scale and yaw must be finite")
+        if self.scale <= 0:
+            raise ValueError(f"an object's scale is {self.scale}, must be positive")
+
+
+def world_from_model(mesh: Mesh, placement: Placement, up: NDArray[np.float64]) -> Matrix:
+    """[4, 4] rotation, uniform scale and translation; `up` [3] is the world direction away from the floor, any length.
+
+    Heading at yaw 0: the model's +x points along the horizontal direction nearest to the world's +x. A model thus keeps
+    the axes it was made in where the world is upright in the same way, and faces the first camera (front: +z of a y-up
+    model, -y of a z-up one) where the world is that camera's. The heading changes continuously with `up`, except near
+    the world's x axis, where the world's +y takes the place of its +x. Raises ValueError if `up` has no direction.
+    """
+    if placement.position_m is None:
+        return np.eye(4)
+    linear = placement.scale * _yaw(up, placement.yaw_deg) @ _upright(up) @ _y_up(mesh.up_axis)
+    matrix = np.eye(4)
+    matrix[:3, :3] = linear
+    matrix[:3, 3] = np.asarray(placement.position_m) - linear @ bottom_center(mesh)
+    return matrix
+
+
+def bottom_center(mesh: Mesh) -> NDArray[np.float64]:
+    """[3] model metres: the middle of the lower side of the box around the vertices."""
+    low, high = mesh.bounds
+    center = (low + high) / 2
+    axis = "xyz".index(mesh.up_axis)
+    center[axis] = low[axis]
+    return center
+
+
+def _y_up(up_axis: UpAxis) -> Matrix:
+    return np.eye(3) if up_axis == "y" else _Y_UP_FROM_Z_UP
+
+
+def _unit_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    up = np.asarray(up, np.float64)
+    length = float(np.linalg.norm(up))
+    if not (math.isfinite(length) and length > 1e-9):
+        raise ValueError(f"the up direction {up.tolist()} has no direction")
+    return up / length
+
+
+def _upright(up: NDArray[np.float64]) -> Matrix:
+    """[3, 3] rotation that takes +y to `up`, and +x to the horizontal direction nearest to the world's +x."""
+    up = _unit_up(up)
+    for axis in np.eye(3)[:2]:
+        right = axis - (axis @ up) * up
+        if np.linalg.norm(right) > _LEAST_HORIZONTAL:
+            break
+    right /= np.linalg.norm(right)
+    return np.stack([right, up, np.cross(right, up)], axis=1)
+
+
+def _yaw(up: NDArray[np.float64], yaw_deg: float) -> Matrix:
+    """[3, 3] right-handed rotation about `up` (Rodrigues)."""
+    x, y, z = _unit_up(up)
+    angle = math.radians(yaw_deg)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    rotation: Matrix = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return rotation

@@ -17,7 +17,7 @@
 kernel void transfer_radiance(const int cols, const int rows, const int stride, const int width,
                               global const float4 *positions, global const float4 *normals,
                               const int4 bricks, global const int *slots, global const uchar *gaps,
-                              global const ulong *solid, global const float2 *voxels, const float voxel_m, const float truncation_m,
+                              global const ulong *solid, global const uchar *octets, global const float2 *voxels, const float voxel_m, const float truncation_m,
                               const int count, global const float4 *directions, global const float *basis,
                               const float reach_m,
                               global float *transfer, global float *openness, global uint *free_mask) {
@@ -28,7 +28,7 @@ kernel void transfer_radiance(const int cols, const int rows, const int stride, 
     const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
     const float4 position = positions[pixel];
     const float4 normal = normals[pixel];
-    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, voxels);
+    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
     const float3 origin = position.xyz + voxel_m * normal.xyz;  // fig. 7.5
 
     float t[COEFFICIENTS];

@@ -48,21 +48,14 @@ static float refine_crossing(const Volume volume, const VoxelRay ray, const floa
 
 // Distance in voxels along the ray at which it enters the surface from the front, 0 if it does not.
 static float find_surface(const Volume volume, const VoxelRay ray, const float begin, const float end) {
-    const float truncation = volume.truncation_m / volume.voxel_m;
     float t = begin;
     while (t < end) {
         const Crossing cell = next_solid_cell(volume, ray, t, end);
-        if (cell.enter >= end) return 0.0f;
-        int in_front = 0;
-        for (t = fmax(cell.enter - 1.5f, begin); t < cell.leave; t += 0.7f) {
-            const float2 here = voxel_along(volume, ray, t);
-            const float distance = here.x * truncation;
-            in_front = here.y > 0.0f && (in_front || distance > 0.0f);
-            if (in_front && distance < 1.0f) {
-                const float crossing = refine_crossing(volume, ray, t);
-                if (crossing > 0.0f) return crossing;
-                in_front = distance > -1.0f;
-            }
+        if (cell.octet == 0) return 0.0f;
+        const float solid = first_solid(ray, cell);
+        if (solid >= 0.0f) {
+            const float crossing = refine_crossing(volume, ray, solid - 0.4f);
+            if (crossing > begin) return crossing;
         }
         t = cell.leave + 0.01f;
     }
@@ -71,13 +64,13 @@ static float find_surface(const Volume volume, const VoxelRay ray, const float b
 
 // Volume and view -> positions [h][w] (volume space metres, w = 1 surface, 0 none), normals [h][w] (unit, towards free space, w likewise).
 kernel void raycast(const int width, const int height, const int4 bricks, global const int *slots, global const uchar *gaps,
-                    global const ulong *solid, global const float2 *voxels, const float voxel_m, const float truncation_m, const float4 intrinsics,
+                    global const ulong *solid, global const uchar *octets, global const float2 *voxels, const float voxel_m, const float truncation_m, const float4 intrinsics,
                     const float16 volume_from_camera, const float greatest_depth_m,
                     global float4 *positions, global float4 *normals) {
     const int x = get_global_id(0);
     const int y = get_global_id(1);
     if (x >= width || y >= height) return;
-    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, voxels);
+    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
     const float3 ray_m = transform_vector(volume_from_camera, unproject(intrinsics, x, y));
     const float along = length(ray_m);
     const VoxelRay ray = make_voxel_ray(volume, volume_from_camera.s37b, ray_m / along);

@@ -32,22 +32,23 @@ kernel void mark_bricks(const int width, const int height, const int4 bricks, gl
     }
 }
 
-// allocated [count] brick indices -> solid [z][y][x]: bit (z 4 + y) 4 + x where a cell of 2x2x2 voxels holds a solid voxel.
-// One work-group of 64 items a brick, one item a cell.
+// allocated [count] brick indices -> solid [z][y][x]: bit (z 4 + y) 4 + x where a cell of 2x2x2 voxels holds a solid voxel;
+// octets [slot][64]: which of the cell's voxels are. One work-group of 64 items a brick, one item a cell.
 kernel void find_solid(const int count, global const int *allocated, global const int *slots, global const float2 *voxels,
-                       global ulong *solid) {
+                       global ulong *solid, global uchar *octets) {
     local uint halves[64];
     const int group = get_group_id(0);
     const int cell = get_local_id(0);
     const int index = group < count ? allocated[group] : allocated[0];
     const int first = ((cell >> 4) * 2 * BRICK + ((cell >> 2) & 3) * 2) * BRICK + (cell & 3) * 2;
     global const float2 *corner = voxels + slots[index] * BRICK_VOXELS + first;
-    uint bit = 0;
+    uint octet = 0;
     for (int i = 0; i < 8; i++) {
         const float2 voxel = corner[((i >> 2) * BRICK + ((i >> 1) & 1)) * BRICK + (i & 1)];
-        bit |= voxel.y > 0.0f && voxel.x < 0.0f;
+        octet |= (voxel.y > 0.0f && voxel.x < 0.0f) << i;
     }
-    halves[cell] = bit << (cell & 31);
+    halves[cell] = (octet != 0) << (cell & 31);
+    if (group < count) octets[slots[index] * 64 + cell] = (uchar)octet;
     barrier(CLK_LOCAL_MEM_FENCE);
     if (cell == 0 && group < count) {
         uint low = 0, high = 0;

@@ -49,7 +49,7 @@ def serve(
     try:
         listener = listen(host, port)
         with listener:
-            return _serve_on(listener, open_service(device_name, max_sessions=max_sessions), say)
+            return serve_on(listener, open_service(device_name, max_sessions=max_sessions), say)
     except ServeError as error:
         sys.stderr.write(f"probeless: {error}\n")
         return 1
@@ -88,7 +88,8 @@ def url_of(listener: socket.socket) -> str:
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
-def _serve_on(listener: socket.socket, service: Service, say: Callable[[str], None]) -> int:
+def serve_on(listener: socket.socket, service: Service, say: Callable[[str], None]) -> int:
+    """Serve a service until interrupted; the exit status. Raises ServeError if its warm-up fails."""
     server = _server(service)
     url = url_of(listener)
 

@@ -36,8 +36,8 @@ class LoopOutlet:
         welcome = encode(
             Welcome(session=self._session, server=self._server_name, device=device_name, max_inflight=MAX_INFLIGHT)
         )
-        self.send(welcome)
         self._loop.call_soon_threadsafe(self._open_to_watchers, welcome)
+        self.send(welcome)
 
     def _open_to_watchers(self, welcome: bytes) -> None:
         if not self._closed:

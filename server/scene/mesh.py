@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from server.scene.limits import MAX_COORDINATE_M, MeshError
 from server.scene.mesh_parts import FORMATS, MeshPart, read_parts
-from server.scene.normals import creased_normals, face_crosses, unit
+from server.scene.normals import creased_normals, face_crosses, numbered, unit
 
 UpAxis = Literal["y", "z"]
 
@@ -75,7 +75,8 @@ def _without_bad(part: MeshPart, dropped: Counter[str]) -> MeshPart:
 
 
 def _all_corners(good: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    return np.logical_and.reduce(good, axis=1)
+    every: NDArray[np.bool_] = np.logical_and.reduce(good, axis=1)
+    return every
 
 
 def _kept(
@@ -100,8 +101,11 @@ def _with_normals(part: MeshPart) -> MeshPart:
         lengths = np.linalg.norm(part.normals, axis=1)
         if (np.isfinite(lengths) & (lengths > 1e-6)).all():
             return replace(part, normals=unit(part.normals))
-    source, triangles, normals = creased_normals(part.vertices, part.triangles)
-    return MeshPart(part.vertices[source], triangles, part.colors[source], normals)
+    same = numbered(np.hstack([part.vertices, part.colors]))  # an STL repeats its vertices in every triangle
+    _, first = np.unique(same, return_index=True)
+    vertices, colors = part.vertices[first], part.colors[first]
+    source, triangles, normals = creased_normals(vertices, same[part.triangles])
+    return MeshPart(vertices[source], triangles, colors[source], normals)
 
 
 def _joined(parts: list[MeshPart], up_axis: UpAxis, notes: tuple[str, ...]) -> Mesh:

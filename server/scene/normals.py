@@ -35,7 +35,7 @@ def creased_normals(vertices: NDArray[Any], triangles: Ints) -> tuple[Ints, Ints
     count as one.
     """
     faces = unit(face_crosses(vertices, triangles))
-    group = _joined(3 * len(triangles), _smooth_links(_welded(vertices)[triangles], faces))
+    group = _joined(3 * len(triangles), _smooth_links(numbered(vertices)[triangles], faces))
     corner_normals = np.repeat(faces, 3, axis=0) * _corner_angles(vertices, triangles).reshape(-1, 1)
     sums = np.zeros((3 * len(triangles), 3))
     np.add.at(sums, group, corner_normals)
@@ -47,14 +47,14 @@ def creased_normals(vertices: NDArray[Any], triangles: Ints) -> tuple[Ints, Ints
     return triangles.reshape(-1)[first], inverse.reshape(-1, 3), normals
 
 
-def _welded(vertices: NDArray[Any]) -> Ints:
-    """[v] a number for each vertex, the same for vertices at exactly the same place."""
-    order = np.lexsort(vertices.T)
-    fresh = np.ones(len(vertices), np.int64)
-    fresh[1:] = (np.diff(vertices[order], axis=0) != 0).any(axis=1)
-    place = np.empty(len(vertices), np.int64)
-    place[order] = np.cumsum(fresh) - 1
-    return place
+def numbered(rows: NDArray[Any]) -> Ints:
+    """[n] a number for each row, from 0 up, the same for rows that are exactly equal."""
+    order = np.lexsort(rows.T)
+    fresh = np.ones(len(rows), np.int64)
+    fresh[1:] = (np.diff(rows[order], axis=0) != 0).any(axis=1)
+    number = np.empty(len(rows), np.int64)
+    number[order] = np.cumsum(fresh) - 1
+    return number
 
 
 def _smooth_links(places: Ints, faces: Floats) -> Ints:

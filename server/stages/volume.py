@@ -58,6 +58,7 @@ class Volume:
         self.voxels.fill(np.zeros((), cl_types.float2))
         self._solid = space.array("brick_solid", self._slots.shape, np.uint64)
         self._solid.fill(np.uint64(0))
+        self._octets = space.array("solid_octets", (self.capacity, 64), np.uint8)
         self._gaps = space.array("brick_gaps", self._slots.shape, np.uint8)
         self._upload_table()
         self.summarize()
@@ -72,8 +73,8 @@ class Volume:
         return translation(-self.origin_world)
 
     def arguments(self) -> tuple[KernelArgument, ...]:
-        """bricks, slots, gaps, solid, voxels, voxel_m, truncation_m: what include/volume.clh's make_volume needs."""
-        return int4(*self.bricks, 0), self.slots_device, self._gaps, self._solid, self.voxels, self.voxel_m, self.truncation_m
+        """bricks, slots, gaps, solid, octets, voxels, voxel_m, truncation_m: what include/volume.clh's make_volume needs."""
+        return int4(*self.bricks, 0), self.slots_device, self._gaps, self._solid, self._octets, self.voxels, self.voxel_m, self.truncation_m
 
     def allocate(self, camera: CameraModel, volume_from_camera: NDArray[np.float64], depth_m: cl_array.Array) -> None:
         """Give a slot to every brick near the measured surface; past the budget the nearest table order wins."""
@@ -113,6 +114,7 @@ class Volume:
                 self.slots_device,
                 self.voxels,
                 self._solid,
+                self._octets,
             )
         along_x, along_y = (space.array(f"gap_{axis}", self._slots.shape, np.uint8) for axis in "xy")
         kernel = self._engine.kernel("volume.cl", "gap_along_x")

@@ -48,7 +48,7 @@ class Lab:
     closed: threading.Event = field(default_factory=threading.Event)
     threads: set = field(default_factory=set)
 
-    def build(self, device: object, camera: CameraModel, wishes: Wishes) -> FakePipeline:
+    def build(self, _device: object, _camera: CameraModel, wishes: Wishes) -> FakePipeline:
         """The `pipeline_factory` of a service under test."""
         self.threads.add(threading.current_thread().name)
         if wishes.preset == "auto":

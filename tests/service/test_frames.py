@@ -153,7 +153,7 @@ def test_frame_the_pipeline_refuses_is_dropped_with_its_reason(dial) -> None:
     wire = dial()
     wire.greet(lossless=True)
     wire.say(frame_message(0), frame_message(1, REFUSE_MM), frame_message(2))
-    answers = wire.hear_until(Composite) + [wire.hear()] + wire.hear_until(Composite)
+    answers = [*wire.hear_until(Composite), wire.hear(), *wire.hear_until(Composite)]
     assert answers[2] == Dropped(frame=1, reason="no depth in this frame: point the camera at something")
     assert [a.frame for a in answers] == [0, 0, 1, 2, 2]
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import socket
+
+import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -14,9 +17,18 @@ from tests.service.fakes import CAMERA, PATIENCE_S
 class Wire:
     """A blocking socket of the protocol."""
 
-    def __init__(self, url: str, subprotocols: tuple[str, ...] = (SUBPROTOCOL,)) -> None:
+    def __init__(
+        self,
+        url: str,
+        subprotocols: tuple[str, ...] = (SUBPROTOCOL,),
+        receive_buffer_bytes: int | None = None,
+        path: str = "/v1/stream",
+    ) -> None:
+        """`receive_buffer_bytes`: as little as the kernel allows, for a client that reads slowly."""
         self.socket = connect(
-            url.replace("http", "ws") + "/v1/stream",
+            url.replace("http", "ws") + path,
+            sock=_tcp(url, receive_buffer_bytes),
+            max_queue=1 if receive_buffer_bytes else None,
             subprotocols=subprotocols or None,
             compression=None,
             max_size=None,
@@ -56,14 +68,24 @@ class Wire:
 
     def ending(self) -> tuple[int, str, list[ServerMessage]]:
         """Read to the end: the close code and reason, and what came before."""
-        messages = []
-        try:
+        messages: list[ServerMessage] = []
+        with pytest.raises(ConnectionClosed) as ended:
             while True:
                 messages.append(self.hear())
-        except ConnectionClosed as closed:
-            assert closed.rcvd is not None, "the connection ended without a close frame (1006)"
-            return closed.rcvd.code, closed.rcvd.reason, messages
+        close = ended.value.rcvd
+        assert close is not None, "the connection ended without a close frame (1006)"
+        return close.code, close.reason, messages
 
     def hang_up(self) -> None:
         """Close, if it is still open."""
         self.socket.close()
+
+
+def _tcp(url: str, receive_buffer_bytes: int | None) -> socket.socket:
+    host, port = url.removeprefix("http://").split(":")
+    tcp = socket.socket()
+    if receive_buffer_bytes is not None:
+        tcp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
+    tcp.connect((host, int(port)))
+    tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, True)
+    return tcp

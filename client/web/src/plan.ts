@@ -21,7 +21,7 @@ export function showPlan(plan: Plan): void {
 
 function describe(effect: LeftOut): HTMLLIElement {
   const item = make("li");
-  item.append(make("strong", "", plain(effect.effect)), make("span", "", ` ${effect.reason}`));
+  item.append(make("strong", "", `${plain(effect.effect)}:`), make("span", "", ` ${effect.reason}`));
   item.append(make("span", "bound", describeBound(effect.error_bound)));
   return item;
 }

@@ -7,91 +7,259 @@
 // A piece is a triangle after clipping. `corners` [pieces] int8: x0 y0 x1 y1 x2 y2 in subpixels, turned to positive
 // area; the triangle's number among all objects, -1 for no piece; the object's index.
 // `inverse_depths` [pieces] float4: 1 / z at the corners, 1/metre.
+#pragma OPENCL FP_CONTRACT OFF  // the same vertex must land on the same subpixel in every triangle that shares it
+#include "camera.clh"
 #include "clip.clh"
-
-// The same vertex must land on the same subpixel in every triangle that shares it.
-#pragma OPENCL FP_CONTRACT OFF
 
 #define TILE 8
 #define SUBPIXELS 256
 #define SCAN_ITEMS 256
 
-static inline int2 tile_grid(int width, int height)
-{
-    return (int2)((width + TILE - 1) / TILE, (height + TILE - 1) / TILE);
+static inline int tile_columns(const int2 size) {
+    return (size.x + TILE - 1) / TILE;
 }
 
 // Pixel centres inside the bounds of a piece: x0 y0 x1 y1, inclusive, cut to the picture; empty if x0 > x1 or y0 > y1.
-static inline int4 pixel_bounds(int8 c, int width, int height)
-{
+static inline int4 pixel_bounds(const int8 c, const int2 size) {
     const int2 low = (int2)(min(c.s0, min(c.s2, c.s4)), min(c.s1, min(c.s3, c.s5)));
     const int2 high = (int2)(max(c.s0, max(c.s2, c.s4)), max(c.s1, max(c.s3, c.s5)));
-    return (int4)(max((low + SUBPIXELS - 1) >> 8, 0), min(high >> 8, (int2)(width - 1, height - 1)));
+    return (int4)(max((low + SUBPIXELS - 1) >> 8, 0), min(high >> 8, size - 1));
 }
 
 // Twice the signed area of a, b and a pixel centre, in subpixels squared: positive where the pixel is inside.
-static inline long edge_at(int ax, int ay, int bx, int by, int2 pixel)
-{
+static inline long edge_at(int ax, int ay, int bx, int by, int2 pixel) {
     return (long)(bx - ax) * (pixel.y * SUBPIXELS - ay) - (long)(by - ay) * (pixel.x * SUBPIXELS - ax);
 }
 
 // 0 for a top or left edge, which owns the pixel centres on it, else -1.
-static inline long fill_bias(int ax, int ay, int bx, int by)
-{
+static inline long fill_bias(int ax, int ay, int bx, int by) {
     return by < ay || (by == ay && bx > ax) ? 0 : -1;
 }
 
 // edge_at for the edges opposite to corners 0, 1 and 2.
-static inline long3 edges_at(int8 c, int2 pixel)
-{
+static inline long3 edges_at(int8 c, int2 pixel) {
     return (long3)(edge_at(c.s2, c.s3, c.s4, c.s5, pixel),
                    edge_at(c.s4, c.s5, c.s0, c.s1, pixel),
                    edge_at(c.s0, c.s1, c.s2, c.s3, pixel));
 }
 
-static inline long3 fill_biases(int8 c)
-{
+static inline long3 fill_biases(int8 c) {
     return (long3)(fill_bias(c.s2, c.s3, c.s4, c.s5),
                    fill_bias(c.s4, c.s5, c.s0, c.s1),
                    fill_bias(c.s0, c.s1, c.s2, c.s3));
 }
 
 // What edges_at changes by from one pixel to the next in x and in y.
-static inline long3 edge_steps_x(int8 c)
-{
+static inline long3 edge_steps_x(int8 c) {
     return SUBPIXELS * (long3)(c.s3 - c.s5, c.s5 - c.s1, c.s1 - c.s3);
 }
 
-static inline long3 edge_steps_y(int8 c)
-{
+static inline long3 edge_steps_y(int8 c) {
     return SUBPIXELS * (long3)(c.s4 - c.s2, c.s0 - c.s4, c.s2 - c.s0);
 }
 
 // False if no pixel centre of the tile can be inside: an edge has all of them on its outer side.
-static inline bool touches_tile(int8 c, int2 tile)
-{
+// `tiles`: the tiles of the piece's bounds; a single one needs no test.
+static inline bool touches_tile(const int8 c, const int4 tiles, const int2 tile) {
+    if (tiles.x == tiles.z && tiles.y == tiles.w) return true;
     const long3 reach = (TILE - 1) * (max(edge_steps_x(c), 0L) + max(edge_steps_y(c), 0L));
     const long3 most = edges_at(c, tile * TILE) + reach;
     return min(most.x, min(most.y, most.z)) >= 0;
 }
 
-static inline int2 snapped(float3 point)
-{
+static inline int2 snapped(const float3 point) {
     return convert_int2_rte(point.xy / point.z * (float)SUBPIXELS);
 }
 
-// Writes one piece, turned to positive area; leaves a piece that covers no pixel centre as it was made: empty.
-static inline bool write_piece(const float3 *h, int2 ids, int width, int height, global int8 *corners,
-                               global float4 *inverse_depths)
-{
-    const int2 a = snapped(h[0]), b = snapped(h[1]), c = snapped(h[2]);
-    const long area = (long)(b.x - a.x) * (c.y - a.y) - (long)(b.y - a.y) * (c.x - a.x);
+// The piece with corners a, b, c, turned to positive area; its triangle is -1 if it covers no pixel centre.
+static int8 make_piece(const float3 a, const float3 b, const float3 c, const int2 ids, const int2 size,
+                       float4 *inverse_depths) {
+    const int2 p = snapped(a), q = snapped(b), r = snapped(c);
+    const long area = (long)(q.x - p.x) * (r.y - p.y) - (long)(q.y - p.y) * (r.x - p.x);
     const bool turn = area < 0;
-    const int8 piece = (int8)(a, turn ? c : b, turn ? b : c, ids);
-    const int4 bounds = pixel_bounds(piece, width, height);
-    if (area == 0 || bounds.x > bounds.z || bounds.y > bounds.w)
-        return false;
-    *corners = piece;
-    *inverse_depths = 1.0f / (float4)(h[0].z, turn ? h[2].z : h[1].z, turn ? h[1].z : h[2].z, 1.0f);
-    return true;
+    const int8 piece = (int8)(p, turn ? r : q, turn ? q : r, ids);
+    *inverse_depths = 1.0f / (float4)(a.z, turn ? c.z : b.z, turn ? b.z : c.z, 1.0f);
+    const int4 bounds = pixel_bounds(piece, size);
+    return area == 0 || bounds.x > bounds.z || bounds.y > bounds.w ? (int8)(-1) : piece;
+}
+
+static void count_tiles(const int8 piece, const int2 size, global int *tile_counts) {
+    if (piece.s6 < 0) return;
+    const int4 tiles = pixel_bounds(piece, size) / TILE;
+    for (int y = tiles.y; y <= tiles.w; y++)
+        for (int x = tiles.x; x <= tiles.z; x++)
+            if (touches_tile(piece, tiles, (int2)(x, y))) atomic_inc(&tile_counts[y * tile_columns(size) + x]);
+}
+
+// One triangle of one object: to pixels, clipped, its pieces written and counted in the tiles they touch. Its first
+// piece has the place of its number; the others are appended after `all_triangles`, and `extra` counts them even
+// where there is no more room. sizes: triangles, number of the first one, all_triangles, room for others.
+kernel void setup_triangles(const int4 sizes, const int4 picture, const global float *vertices,
+                            const global int *triangles, const float16 pixel_from_model, const float near_m,
+                            global int *extra, global int *tile_counts, global int8 *corners,
+                            global float4 *inverse_depths) {
+    const int triangle = get_global_id(0);
+    if (triangle >= sizes.x) return;
+    const int3 vertex = vload3(triangle, triangles);
+    float3 corner[MAX_CORNERS];
+    corner[0] = transform_point(pixel_from_model, vload3(vertex.x, vertices));
+    corner[1] = transform_point(pixel_from_model, vload3(vertex.y, vertices));
+    corner[2] = transform_point(pixel_from_model, vload3(vertex.z, vertices));
+    const int count = clip_triangle(near_m, corner);
+    const int2 ids = (int2)(sizes.y + triangle, picture.z);
+    corners[ids.x] = (int8)(-1);
+    int slot = ids.x;
+    for (int i = 2; i < count; i++) {
+        float4 depths;
+        const int8 piece = make_piece(corner[0], corner[i - 1], corner[i], ids, picture.xy, &depths);
+        if (piece.s6 < 0) continue;
+        if (corners[ids.x].s6 >= 0) slot = sizes.z + atomic_inc(extra);
+        if (slot >= sizes.z + sizes.w) break;
+        corners[slot] = piece;
+        inverse_depths[slot] = depths;
+        count_tiles(piece, picture.xy, tile_counts);
+    }
+}
+
+// Exclusive running sum over the tiles, by one work-group; starts[tiles] is the sum of all.
+kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1)))
+void scan_tiles(const int tiles, const global int *tile_counts, global int *starts) {
+    local int sums[SCAN_ITEMS];
+    const int item = get_local_id(0);
+    const int share = (tiles + SCAN_ITEMS - 1) / SCAN_ITEMS;
+    const int begin = min(item * share, tiles), end = min(begin + share, tiles);
+    int sum = 0;
+    for (int tile = begin; tile < end; tile++) sum += tile_counts[tile];
+    sums[item] = sum;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    int before = 0;
+    for (int i = 0; i < item; i++) before += sums[i];
+    for (int tile = begin; tile < end; tile++) {
+        starts[tile] = before;
+        before += tile_counts[tile];
+    }
+    if (item == SCAN_ITEMS - 1) starts[tiles] = before;
+}
+
+// Lists each piece in the tiles it touches. Counts the tiles down to 0; the order within a tile does not matter.
+kernel void fill_tiles(const int pieces, const int2 size, const global int8 *corners, const global int *starts,
+                       global int *tile_counts, global int *entries) {
+    const int index = get_global_id(0);
+    if (index >= pieces) return;
+    const int8 piece = corners[index];
+    if (piece.s6 < 0) return;
+    const int4 tiles = pixel_bounds(piece, size) / TILE;
+    for (int y = tiles.y; y <= tiles.w; y++)
+        for (int x = tiles.x; x <= tiles.z; x++) {
+            const int tile = y * tile_columns(size) + x;
+            if (touches_tile(piece, tiles, (int2)(x, y))) entries[starts[tile] + atomic_dec(&tile_counts[tile]) - 1] = index;
+        }
+}
+
+// Which of the 64 pixel centres of the tile at pixel `origin` are inside: bit 8 y + x.
+static ulong coverage(const int8 piece, const int2 origin, const int2 size) {
+    const long3 step_x = edge_steps_x(piece), step_y = edge_steps_y(piece);
+    const long3 first = edges_at(piece, origin) + fill_biases(piece);
+    const long3 least = first + (TILE - 1) * (min(step_x, 0L) + min(step_y, 0L));
+    if (min(least.x, min(least.y, least.z)) >= 0) return ~0UL;
+    const int4 bounds = pixel_bounds(piece, size) - origin.xyxy;
+    const int left = max(bounds.x, 0), right = min(bounds.z, TILE - 1), low = min(bounds.w, TILE - 1);
+    ulong mask = 0;
+    for (int y = max(bounds.y, 0); y <= low; y++) {
+        long3 edges = first + y * step_y + left * step_x;
+        for (int x = left; x <= right; x++, edges += step_x)
+            if ((edges.x | edges.y | edges.z) >= 0) mask |= 1UL << (TILE * y + x);
+    }
+    return mask;
+}
+
+// Nearest piece of each pixel: (triangle, object, bits of 1 / z); the lowest triangle number where depths are equal.
+static int2 nearer(const int8 piece, const float4 inverse_depths, const int2 pixel, const int2 best, float *best_depth) {
+    const float3 share = convert_float3(edges_at(piece, pixel));
+    const float depth = dot(share, inverse_depths.xyz) / (share.x + share.y + share.z);
+    if (depth < *best_depth || (depth == *best_depth && best.x >= 0 && piece.s6 > best.x)) return best;
+    *best_depth = depth;
+    return piece.s67;
+}
+
+// One work-group a tile, one work-item a pixel: 64 entries at a time, first their coverage, one entry an item, then
+// each pixel looks through those that cover it.
+kernel __attribute__((reqd_work_group_size(TILE * TILE, 1, 1)))
+void raster_tiles(const int2 size, const global int8 *corners, const global float4 *inverse_depths,
+                  const global int *starts, const global int *entries, global int *visible, global int *objects) {
+    local ulong masks[TILE * TILE];
+    const int tile = get_group_id(0), item = get_local_id(0);
+    const int2 origin = TILE * (int2)(tile % tile_columns(size), tile / tile_columns(size));
+    const int2 pixel = origin + (int2)(item % TILE, item / TILE);
+    int2 best = (int2)(-1);
+    float best_depth = 0.0f;
+    for (int begin = starts[tile]; begin < starts[tile + 1]; begin += TILE * TILE) {
+        const int count = min(starts[tile + 1] - begin, TILE * TILE);
+        masks[item] = item < count ? coverage(corners[entries[begin + item]], origin, size) : 0;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (int i = 0; i < count; i++) {
+            const int piece = entries[begin + i];
+            if (masks[i] >> item & 1) best = nearer(corners[piece], inverse_depths[piece], pixel, best, &best_depth);
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+    }
+    if (pixel.x < size.x && pixel.y < size.y) {
+        visible[pixel.y * size.x + pixel.x] = best.x;
+        objects[pixel.y * size.x + pixel.x] = best.y;
+    }
+}
+
+// Says where there is no virtual surface: w = 0.
+kernel void clear_uncovered(const int pixels, const global int *visible, global float4 *position, global float4 *normal,
+                            global float4 *base_color) {
+    const int pixel = get_global_id(0);
+    if (pixel >= pixels || visible[pixel] >= 0) return;
+    position[pixel] = normal[pixel] = base_color[pixel] = (float4)(0.0f);
+}
+
+// Where the ray origin + t * direction meets the plane of a, b, c, as shares of b and c: inside the triangle always.
+static float2 barycentric(const float3 a, const float3 ab, const float3 ac, const float3 origin, const float3 direction) {
+    const float3 p = cross(direction, ac), q = cross(origin - a, ab);
+    const float determinant = dot(ab, p);
+    if (determinant == 0.0f) return (float2)(1.0f / 3.0f);  // seen edge on
+    const float2 share = (float2)(dot(origin - a, p), dot(direction, q)) / determinant;
+    const float2 inside = clamp(share, 0.0f, 1.0f);
+    return inside / fmax(inside.x + inside.y, 1.0f);
+}
+
+// `normal` on the side of `facing` (both of any length), bent where it would still face away from `to_camera` (unit).
+static float3 facing_camera(const float3 normal, const float3 facing, const float3 to_camera) {
+    const float3 flat = normalize(dot(facing, to_camera) < 0.0f ? -facing : facing);
+    const float length_squared = dot(normal, normal);
+    float3 turned = length_squared > 0.0f ? normal * rsqrt(length_squared) : flat;
+    turned = dot(turned, flat) < 0.0f ? -turned : turned;
+    const float away = fmin(dot(turned, to_camera), 0.0f);
+    turned -= away * to_camera;
+    return dot(turned, turned) > 1e-12f ? normalize(turned) : flat;
+}
+
+// Interpolates the surface that one object shows: position in volume metres, unit normal, linear base colour; w = 1.
+// sizes: width, height, number of the object's first triangle, its triangles. `attributes` [v, 6]: normal, base colour.
+// The ray of pixel (u, v) is model_from_pixel's column 3 + t * its columns 0 to 2 times (u, v, 1).
+kernel void shade_surface(const int4 sizes, const global int *visible, const global float *vertices,
+                          const global int *triangles, const global float *attributes, const float16 model_from_pixel,
+                          const float16 volume_from_model, global float4 *position, global float4 *normal,
+                          global float4 *base_color) {
+    const int2 pixel = (int2)(get_global_id(0), get_global_id(1));
+    if (pixel.x >= sizes.x || pixel.y >= sizes.y) return;
+    const int index = pixel.y * sizes.x + pixel.x, triangle = visible[index] - sizes.z;
+    if (triangle < 0 || triangle >= sizes.w) return;
+    const int3 v = vload3(triangle, triangles);
+    const float3 a = vload3(v.x, vertices), ab = vload3(v.y, vertices) - a, ac = vload3(v.z, vertices) - a;
+    const float3 origin = model_from_pixel.s37b;
+    const float3 direction = transform_vector(model_from_pixel, (float3)(pixel.x, pixel.y, 1.0f));
+    const float2 share = barycentric(a, ab, ac, origin, direction);
+    const float3 weight = (float3)(1.0f - share.x - share.y, share);
+    const float3 mean = weight.x * vload3(2 * v.x, attributes) + weight.y * vload3(2 * v.y, attributes)
+                        + weight.z * vload3(2 * v.z, attributes);
+    const float3 facing = facing_camera(mean, cross(ab, ac), -normalize(direction));
+    position[index] = (float4)(transform_point(volume_from_model, a + share.x * ab + share.y * ac), 1.0f);
+    normal[index] = (float4)(normalize(transform_vector(volume_from_model, facing)), 1.0f);
+    base_color[index] = (float4)(weight.x * vload3(2 * v.x + 1, attributes) + weight.y * vload3(2 * v.y + 1, attributes)
+                                 + weight.z * vload3(2 * v.z + 1, attributes), 1.0f);
 }

@@ -1,5 +1,5 @@
 // The brick volume's table: which bricks the measured surface needs, where they are solid, and how far apart those are.
-// Provides mark_bricks, find_solid, gap_along_x, gap_along_axis.
+// Provides mark_bricks, find_solid, start_gaps, gap_along_axis.
 #include "camera.clh"
 #include "volume.clh"
 
@@ -60,29 +60,32 @@ kernel void find_solid(const int count, global const int *allocated, global cons
     }
 }
 
-// solid [z][y][x] -> gap [z][y][x]: distance along x to the nearest brick with a solid voxel, at most `limit`.
-kernel void gap_along_x(const int4 bricks, global const ulong *solid, const int limit, global uchar *gap) {
-    const int3 b = (int3)(get_global_id(0), get_global_id(1), get_global_id(2));
-    if (!inside_bricks(bricks, b)) return;
-    int nearest = limit;
-    for (int x = max(b.x - limit, 0); x <= min(b.x + limit, bricks.x - 1); x++) {
-        const int away = x < b.x ? b.x - x : x - b.x;
-        if (solid[brick_index(bricks, (int3)(x, b.y, b.z))] != 0 && away < nearest) nearest = away;
-    }
-    gap[brick_index(bricks, b)] = (uchar)nearest;
+// solid [z][y][x] -> gap [z][y][x]: 0 where a brick holds a solid voxel, else `limit`.
+kernel void start_gaps(const int count, global const ulong *solid, const int limit, global uchar *gap) {
+    const int index = get_global_id(0);
+    if (index >= count) return;
+    gap[index] = solid[index] != 0 ? 0 : (uchar)limit;
 }
 
-// The Chebyshev distance is separable: along each further axis, the least over neighbours of max(offset, their distance).
-kernel void gap_along_axis(const int4 bricks, global const uchar *inner, const int axis, const int limit, global uchar *gap) {
-    const int3 b = (int3)(get_global_id(0), get_global_id(1), get_global_id(2));
-    if (!inside_bricks(bricks, b)) return;
-    const int3 step = axis == 1 ? (int3)(0, 1, 0) : (int3)(0, 0, 1);
+// One axis of the one-sided Chebyshev distance: the least, over bricks `offset` ahead, of max(offset, their distance so far).
+// inner [variants][z][y][x] -> gap [2 variants][z][y][x]: first looking towards lower indices, then towards higher ones.
+kernel void gap_along_axis(const int4 bricks, const int variants, global const uchar *inner, const int axis, const int limit,
+                           global uchar *gap) {
+    const int variant = get_global_id(2) / bricks.z;
+    const int3 b = (int3)(get_global_id(0), get_global_id(1), get_global_id(2) % bricks.z);
+    if (!inside_bricks(bricks, b) || variant >= 2 * variants) return;
+    const int volume = bricks.x * bricks.y * bricks.z;
+    const int ahead = variant >= variants ? 1 : -1;
+    const int position = axis == 0 ? b.x : axis == 1 ? b.y : b.z;
+    const int size = axis == 0 ? bricks.x : axis == 1 ? bricks.y : bricks.z;
+    const int stride = ahead * (axis == 0 ? 1 : axis == 1 ? bricks.x : bricks.x * bricks.y);
+    const int room = ahead > 0 ? size - 1 - position : position;
+    global const uchar *from = inner + (variant % variants) * volume + brick_index(bricks, b);
     int nearest = limit;
-    for (int offset = -limit; offset <= limit; offset++) {
-        const int3 other = b + step * offset;
-        if (inside_bricks(bricks, other)) {
-            nearest = min(nearest, max(offset < 0 ? -offset : offset, (int)inner[brick_index(bricks, other)]));
-        }
+    for (int offset = 0; offset <= room && offset < nearest; offset++) {
+        const int there = from[offset * stride];
+        const int distance = there > offset ? there : offset;
+        nearest = distance < nearest ? distance : nearest;
     }
-    gap[brick_index(bricks, b)] = (uchar)nearest;
+    gap[variant * volume + brick_index(bricks, b)] = (uchar)nearest;
 }

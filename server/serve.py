@@ -68,6 +68,8 @@ def open_service(device_name: str | None = None, *, max_sessions: int = DEFAULT_
 
 def listen(host: str, port: int) -> socket.socket:
     """A listening socket; port 0 takes a free one. Raises ServeError for a port in use or a host that is not here."""
+    if not 0 <= port <= 65535:
+        raise ServeError(f"there is no port {port}: choose --port from 1 to 65535")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family)
@@ -76,8 +78,6 @@ def listen(host: str, port: int) -> socket.socket:
             raise ServeError(f"port {port} of {host} is in use: stop what uses it or choose another --port") from error
         why = error.strerror or str(error)
         raise ServeError(f"cannot listen on {host} port {port} ({why}): choose another --host or --port") from error
-    except OverflowError as error:
-        raise ServeError(f"there is no port {port}: choose --port from 1 to 65535") from error
 
 
 def url_of(listener: socket.socket) -> str:

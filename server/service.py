@@ -17,13 +17,13 @@ from protocol.messages import Bye, Hello, Watch, Welcome, Wishes
 from server.broadcast import Broadcast, serve_watcher
 from server.connection import INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
 from server.metrics import Metrics
+from server.scene.mesh import Mesh, load_mesh
 from server.session import MAX_INFLIGHT, CaptureSession, LoopOutlet
 from server.worker import Workshop
 
 if TYPE_CHECKING:
     from server.opencl.device import Device
     from server.pipeline import Pipeline
-    from server.scene.mesh import Mesh
 
 DEFAULT_MAX_SESSIONS = 16
 MAX_WATCHERS = 64
@@ -34,7 +34,7 @@ NO_SESSION = "waiting"
 log = logging.getLogger(__name__)
 
 PipelineFactory = Callable[["Device", CameraModel, Wishes], "Pipeline"]
-MeshLoader = Callable[[bytes, str], "Mesh"]
+MeshLoader = Callable[[bytes, str], Mesh]
 WarmUp = Callable[["Device"], object]
 
 
@@ -46,13 +46,13 @@ class Service:
         device: Device,
         *,
         pipeline_factory: PipelineFactory | None = None,
-        mesh_loader: MeshLoader | None = None,
+        mesh_loader: MeshLoader = load_mesh,
         warm_up: WarmUp | None = None,
         max_sessions: int = DEFAULT_MAX_SESSIONS,
     ) -> None:
-        """`pipeline_factory` and `mesh_loader` are called in workers' threads, `warm_up` once before the first session.
+        """`pipeline_factory` (default: the real pipeline) and `mesh_loader` are called in workers' threads.
 
-        None for the first two means the real ones; for `warm_up`, that there is nothing to wait for.
+        `warm_up` is called once before the first session, in a thread too; None: there is nothing to wait for.
         """
         self.device_name = device.name
         self.metrics = Metrics()
@@ -69,7 +69,12 @@ class Service:
         self._watchers = 0
         self._prepared = asyncio.Event()
         self._threads = ThreadPoolExecutor(max_sessions + 1, thread_name_prefix="probeless-session")
-        self._workshop = _workshop(device, pipeline_factory, mesh_loader, self.metrics)
+        factory = pipeline_factory or _real_pipeline()
+        self._workshop = Workshop(
+            build_pipeline=lambda hello: factory(device, hello.camera, hello.wishes),
+            load_mesh=mesh_loader,
+            metrics=self.metrics,
+        )
         self._preparing: asyncio.Task[None] | None = None
 
     @property
@@ -171,13 +176,7 @@ class Service:
             self.metrics.watchers.set(self._watchers)
 
 
-def _workshop(
-    device: Device, pipeline_factory: PipelineFactory | None, mesh_loader: MeshLoader | None, metrics: Metrics
-) -> Workshop:
-    """The given factories, or the real ones, which are imported only where they are used."""
-    if pipeline_factory is None:
-        from server.pipeline import Pipeline as pipeline_factory
-    if mesh_loader is None:
-        from server.scene.mesh import load_mesh as mesh_loader
-    factory, loader = pipeline_factory, mesh_loader
-    return Workshop(lambda hello: factory(device, hello.camera, hello.wishes), loader, metrics)
+def _real_pipeline() -> PipelineFactory:
+    from server.pipeline import Pipeline  # loads OpenCL, which a service with another factory does not need
+
+    return Pipeline

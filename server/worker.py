@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +27,11 @@ from protocol.messages import (
 from server.connection import POLICY, Refusal
 from server.mailbox import Control, Letter, Mailbox
 from server.metrics import Metrics
-from server.pipeline import FrameResult, Pipeline
 from server.scene.mesh import Mesh, MeshError
 from server.scene.placement import Placement
+
+if TYPE_CHECKING:
+    from server.pipeline import FrameResult, Pipeline
 
 JPEG_QUALITY = 90
 

@@ -6,6 +6,8 @@ surface comes near it.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
@@ -59,7 +61,7 @@ class Volume:
         self._solid = space.array("brick_solid", self._slots.shape, np.uint64)
         self._solid.fill(np.uint64(0))
         self._octets = space.array("solid_octets", (self.capacity, 64), np.uint8)
-        self._gaps = space.array("brick_gaps", self._slots.shape, np.uint8)
+        self._gaps = space.array("brick_gaps", (8 * self._slots.size,), np.uint8)
         self._upload_table()
         self.summarize()
 
@@ -116,12 +118,22 @@ class Volume:
                 self._solid,
                 self._octets,
             )
-        along_x, along_y = (space.array(f"gap_{axis}", self._slots.shape, np.uint8) for axis in "xy")
-        kernel = self._engine.kernel("volume.cl", "gap_along_x")
-        self._engine.launch(kernel, self.bricks, bricks, self._solid, _GREATEST_GAP, along_x)
-        for inner, axis, outer in ((along_x, 1, along_y), (along_y, 2, self._gaps)):
-            kernel = self._engine.kernel("volume.cl", "gap_along_axis")
-            self._engine.launch(kernel, self.bricks, bricks, inner, axis, _GREATEST_GAP, outer)
+        count = self._slots.size
+        gaps = [space.array(f"gaps_{i}", (variants * count,), np.uint8) for i, variants in enumerate((1, 2, 4))]
+        self._engine.launch(
+            self._engine.kernel("volume.cl", "start_gaps"), (count,), count, self._solid, _GREATEST_GAP, gaps[0]
+        )
+        for axis, (inner, outer) in enumerate(pairwise([*gaps, self._gaps])):
+            self._engine.launch(
+                self._engine.kernel("volume.cl", "gap_along_axis"),
+                (self.bricks[0], self.bricks[1], self.bricks[2] * (2 << axis)),
+                bricks,
+                1 << axis,
+                inner,
+                axis,
+                _GREATEST_GAP,
+                outer,
+            )
 
     def _upload_table(self) -> None:
         """Bring slots and the list of allocated bricks to the device."""

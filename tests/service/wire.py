@@ -70,8 +70,7 @@ class Wire:
         """Read to the end: the close code and reason, and what came before."""
         messages: list[ServerMessage] = []
         with pytest.raises(ConnectionClosed) as ended:
-            while True:
-                messages.append(self.hear())
+            messages.extend(iter(self.hear, None))
         close = ended.value.rcvd
         assert close is not None, "the connection ended without a close frame (1006)"
         return close.code, close.reason, messages
@@ -86,6 +85,10 @@ def _tcp(url: str, receive_buffer_bytes: int | None) -> socket.socket:
     tcp = socket.socket()
     if receive_buffer_bytes is not None:
         tcp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
-    tcp.connect((host, int(port)))
+    try:
+        tcp.connect((host, int(port)))
+    except OSError:
+        tcp.close()
+        raise
     tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, True)
     return tcp

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.synthetic.charts import Grid, PlaneChart
+from client.laptop.synthetic.charts import Grid
 from client.laptop.synthetic.harmonics import COEFFICIENTS, basis
 from client.laptop.synthetic.shapes import Solid
 
@@ -90,7 +90,7 @@ def _bake_tile(
     solids: list[Solid], own: Solid, grid: Grid, positions: NDArray, normals: NDArray, directions: NDArray
 ) -> Floats:
     points, up = positions.reshape(-1, 3), normals.reshape(-1, 3)
-    if isinstance(grid.chart, PlaneChart):
+    if grid.is_flat:
         up = up[:1]
     facing = directions[(directions @ up.T > 0).any(axis=1)]
     reach = float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())

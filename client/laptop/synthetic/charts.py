@@ -163,6 +163,10 @@ class Grid:
         return cls(chart, columns, along + 1, offset)
 
     @property
+    def is_flat(self) -> bool:
+        return isinstance(self.chart, PlaneChart)
+
+    @property
     def size(self) -> int:
         return self.rows * self.columns
 

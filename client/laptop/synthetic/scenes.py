@@ -12,16 +12,14 @@ from client.laptop.synthetic import textures
 from client.laptop.synthetic.shapes import Cylinder, Solid, Sphere, box, rotation_about, wedge
 from client.laptop.synthetic.shell import Opening, Shell
 
-Texture = Callable[[NDArray], NDArray]
-
 
 @dataclass(frozen=True)
 class Body:
     """A solid and its colour."""
 
     solid: Solid
-    texture: Texture
-    """[n, 3] points to [n, 3] linear albedo, used where the scene is textured."""
+    texture: textures.Texture
+    """Used where the scene is asked for with textures."""
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,14 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+Texture = Callable[[NDArray], NDArray]
+"""[n, 3] world points to [n, 3] linear albedo."""
+
 PLAIN_ALBEDO = 0.5
 """Of everything in a scene without texture."""
 
 
-def painted(red: float, green: float, blue: float) -> Callable[[NDArray], NDArray]:
+def painted(red: float, green: float, blue: float) -> Texture:
     """An even paint, slightly mottled."""
     color = np.array([red, green, blue])
 

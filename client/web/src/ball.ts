@@ -1,6 +1,6 @@
 // Spherical harmonics drawn on a ball, as the camera would see it.
 
-import { evaluate, luminance, type Vector3 } from "./sh";
+import { evaluate, luminance, toWorld, type Vector3 } from "./sh";
 
 export const BALL_PX = 200;
 const RADIUS_PX = 78;
@@ -25,29 +25,24 @@ export function toneMap(radiance: number, exposure: number): number {
 }
 
 /** RGBA of a ball of which each point shows `flat` in the direction of its normal; outside it is transparent. */
-export function paintBall(flat: Float64Array, worldFromCamera: readonly number[], exposure: number): Uint8ClampedArray<ArrayBuffer> {
+export function paintBall(
+  flat: Float64Array,
+  worldFromCamera: readonly number[],
+  exposure: number,
+): Uint8ClampedArray<ArrayBuffer> {
   const pixels = new Uint8ClampedArray(4 * BALL_PX * BALL_PX);
   const rgb = new Float64Array(3);
-  const m = worldFromCamera;
   for (let row = 0; row < BALL_PX; row++) {
     const y = (row + 0.5 - CENTRE_PX) / RADIUS_PX;
     for (let column = 0; column < BALL_PX; column++) {
       const x = (column + 0.5 - CENTRE_PX) / RADIUS_PX;
-      const inside = 1 - x * x - y * y;
-      const coverage = Math.min(1, Math.max(0, (1 - Math.hypot(x, y)) * RADIUS_PX + 0.5));
-      if (coverage === 0) continue;
-      const z = -Math.sqrt(Math.max(0, inside)); // camera z points away from the viewer, the normal towards them
-      evaluate(
-        flat,
-        m[0]! * x + m[1]! * y + m[2]! * z,
-        m[4]! * x + m[5]! * y + m[6]! * z,
-        m[8]! * x + m[9]! * y + m[10]! * z,
-        rgb,
-      );
+      const distance = Math.hypot(x, y);
+      const coverage = Math.min(1, (1 - distance) * RADIUS_PX + 0.5);
+      if (coverage <= 0) continue;
+      const z = -Math.sqrt(Math.max(0, 1 - distance * distance)); // camera z points away, the normal to the viewer
+      evaluate(flat, ...toWorld(worldFromCamera, [x, y, z]), rgb);
       const at = 4 * (row * BALL_PX + column);
-      pixels[at] = toneMap(rgb[0]!, exposure);
-      pixels[at + 1] = toneMap(rgb[1]!, exposure);
-      pixels[at + 2] = toneMap(rgb[2]!, exposure);
+      for (let channel = 0; channel < 3; channel++) pixels[at + channel] = toneMap(rgb[channel]!, exposure);
       pixels[at + 3] = 255 * coverage;
     }
   }
@@ -97,6 +92,17 @@ function strokeTwice(context: CanvasRenderingContext2D, width: number): void {
   context.strokeStyle = "#ffb454";
   context.lineWidth = width;
   context.stroke();
+}
+
+/** Where the ball will be. */
+export function drawOutline(context: CanvasRenderingContext2D): void {
+  context.beginPath();
+  context.arc(CENTRE_PX, CENTRE_PX, RADIUS_PX - 1, 0, 2 * Math.PI);
+  context.setLineDash([5, 5]);
+  context.strokeStyle = "#4a5462";
+  context.lineWidth = 2;
+  context.stroke();
+  context.setLineDash([]);
 }
 
 /** Grey diagonal lines over the ball: this light is not to be relied on. */

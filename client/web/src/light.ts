@@ -1,6 +1,6 @@
 // The estimated light: as it arrives, as a matt white ball would look in it, and in numbers.
 
-import { BALL_PX, drawDirection, drawHatch, exposureOf, paintBall } from "./ball";
+import { BALL_PX, drawDirection, drawHatch, drawOutline, exposureOf, paintBall } from "./ball";
 import { byId, context2d, setText } from "./dom";
 import type { Light } from "./protocol";
 import { evaluate, flatten, toCamera, toMatt } from "./sh";
@@ -13,7 +13,10 @@ const direction = byId("light-direction");
 const intensity = byId("light-intensity");
 const condition = byId("light-condition");
 
-for (const ball of balls) ball.width = ball.height = BALL_PX;
+for (const ball of balls) {
+  ball.width = ball.height = BALL_PX;
+  drawOutline(context2d(ball));
+}
 
 /** Draw `light` as seen by the camera of `worldFromCamera` (row-major 4x4). */
 export function showLight(light: Light, worldFromCamera: readonly number[]): void {
@@ -33,7 +36,7 @@ export function showLight(light: Light, worldFromCamera: readonly number[]): voi
 
 function showNumbers(light: Light, where: string): void {
   setText(summary, light.valid ? "Direction is known to 15° or better" : "Not known yet: the pictures so far do not fix the direction");
-  summary.classList.toggle("bad", !light.valid);
+  summary.dataset["valid"] = String(light.valid);
   setText(direction, where);
   setText(intensity, number(light.dominant_intensity));
   setText(condition, light.condition === null ? "∞" : number(light.condition));

@@ -1,7 +1,7 @@
 // The page: watches a session and shows what it produces.
 
 import { Connection, type ConnectionState, streamUrl } from "./connection";
-import { byId, setText } from "./dom";
+import { byId, make, setText } from "./dom";
 import { showLight } from "./light";
 import { addNote, clearNotes, showNotes } from "./notes";
 import { markPicture, showPicture } from "./picture";
@@ -59,7 +59,6 @@ function greet(session: string, server: string, device: string): void {
   rate.clear();
   clearTimings();
   clearNotes();
-  showNotes();
 }
 
 function receivePicture(message: Composite): void {
@@ -117,9 +116,14 @@ function refresh(): void {
   setText(countdown, left_s === null ? "" : `next try in ${left_s} s`);
 }
 
+/** The command with which there is something to see; it breaks between words only. */
+function showHint(words: readonly string[]): void {
+  byId("hint").append(...words.flatMap((word) => [make("span", "", word), " "]));
+}
+
 function start(): void {
   const page = new URL(location.href);
-  setText(byId("hint"), `probeless stream synthetic:table --server ${page.origin}`);
+  showHint(["probeless", "stream", "synthetic:table", "--server", page.origin]);
   const live = new Connection(
     streamUrl(page),
     page.searchParams.get("session"),

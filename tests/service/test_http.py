@@ -1,0 +1,151 @@
+"""Health, metrics and the page."""
+
+import asyncio
+import threading
+from pathlib import Path
+
+import httpx
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from protocol.messages import Composite, Error, Hello, Timings
+from server.app import create_app
+from server.serve import start_in_background
+from server.service import Service
+from tests.service.fakes import CAMERA, FAKE_DEVICE, PATIENCE_S, REFUSE_MM, fake_mesh, frame_message
+from tests.service.wire import Wire
+
+
+def get(server, path: str) -> httpx.Response:
+    return httpx.get(server.url + path, trust_env=False, timeout=PATIENCE_S)
+
+
+def rows(server) -> dict[tuple[str, ...], float]:
+    """Every sample of /metrics, by name and label values, as another library reads it."""
+    families = text_string_to_metric_families(get(server, "/metrics").text)
+    return {(s.name, *s.labels.values()): s.value for family in families for s in family.samples}
+
+
+def test_health_counts_sessions(server, dial) -> None:
+    response = get(server, "/healthz")
+    assert response.status_code == 200
+    assert response.json() == {"ready": True, "device": "a fake device", "sessions": 0}
+    dial().greet()
+    assert get(server, "/healthz").json()["sessions"] == 1
+
+
+def test_clients_wait_for_the_warm_up(lab) -> None:
+    warm, prepared = threading.Event(), threading.Event()
+    service = Service(
+        FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh, warm_up=lambda _: warm.wait(PATIENCE_S)
+    )
+    service.on_prepared = prepared.set
+    with start_in_background(service) as server:
+        response = get(server, "/healthz")
+        assert response.status_code == 503
+        assert response.json()["ready"] is False
+        wire = Wire(server.url)
+        wire.say(Hello(client="test", camera=CAMERA))
+        warm.set()
+        assert wire.hear().session == "session-1"
+        assert prepared.wait(PATIENCE_S)
+        assert get(server, "/healthz").status_code == 200
+        wire.hang_up()
+
+
+def test_failed_warm_up_is_told_to_everybody(lab) -> None:
+    def fail(_: object) -> None:
+        raise RuntimeError("kernel volume.cl does not build")
+
+    prepared = threading.Event()
+    service = Service(FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh, warm_up=fail)
+    service.on_prepared = prepared.set
+    with start_in_background(service) as server:
+        assert prepared.wait(PATIENCE_S)
+        response = get(server, "/healthz")
+        assert response.status_code == 503
+        assert "volume.cl" in response.json()["failure"]
+        wire = Wire(server.url)
+        wire.say(Hello(client="test", camera=CAMERA))
+        code, reason, messages = wire.ending()
+        assert code == 1011
+        assert "volume.cl" in reason
+        assert messages == [Error(reason=reason, fatal=True)]
+
+
+def test_metrics_have_every_row_before_the_first_frame(server) -> None:
+    found = rows(server)
+    for stage in Timings.__struct_fields__:
+        assert found["probeless_stage_ms_count", stage] == 0
+    for name in ("decode_ms_count", "encode_ms_count", "queue_age_ms_count", "frames_processed_total", "sessions"):
+        assert found[f"probeless_{name}",] == 0
+    for reason in ("replaced", "refused", "unreadable"):
+        assert found["probeless_frames_dropped_total", reason] == 0
+
+
+def test_metrics_count_what_happened(server, dial, lab) -> None:
+    lab.hold = True
+    wire, watcher = dial(), dial()
+    wire.greet()
+    watcher.watch()
+    wire.say(frame_message(0))
+    lab.next_entered()
+    wire.say(frame_message(1), frame_message(2))
+    lab.release(2)
+    wire.hear_until(Composite)
+    wire.hear_until(Composite)
+    wire.say(frame_message(3, REFUSE_MM))
+    lab.release()
+    wire.hear()
+    found = rows(server)
+    assert found["probeless_frames_processed_total",] == 2
+    assert found["probeless_frames_dropped_total", "replaced"] == 1
+    assert found["probeless_frames_dropped_total", "refused"] == 1
+    assert found["probeless_stage_ms_sum", "rendering"] == 2 * 3.25
+    assert found["probeless_stage_ms_count", "total"] == 2
+    assert found["probeless_decode_ms_count",] == 3
+    assert found["probeless_encode_ms_count",] == 2
+    assert found["probeless_queue_age_ms_count",] == 3
+    assert found["probeless_sessions",] == 1
+    assert found["probeless_watchers",] == 1
+
+
+def test_each_service_has_its_own_registry(start_server) -> None:
+    first, second = start_server(), start_server()
+    wire = Wire(first.url)
+    wire.greet()
+    assert rows(first)["probeless_sessions",] == 1
+    assert rows(second)["probeless_sessions",] == 0
+    wire.hang_up()
+
+
+@pytest.fixture
+def service(lab) -> Service:
+    return Service(FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh)
+
+
+def get_in_process(service: Service, page_folder: Path, path: str) -> httpx.Response:
+    """A request to the app itself, without a socket."""
+
+    async def ask() -> httpx.Response:
+        transport = httpx.ASGITransport(create_app(service, page_folder))
+        async with httpx.AsyncClient(transport=transport, base_url="http://test") as http:
+            return await http.get(path)
+
+    return asyncio.run(ask())
+
+
+def test_page_is_served_from_its_folder(service, tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text("<title>probeless</title>")
+    (tmp_path / "main.js").write_text("let x;")
+    assert get_in_process(service, tmp_path, "/").text == "<title>probeless</title>"
+    assert get_in_process(service, tmp_path, "/main.js").text == "let x;"
+    assert get_in_process(service, tmp_path, "/absent.js").status_code == 404
+    assert get_in_process(service, tmp_path, "/healthz").status_code == 503  # nobody has started it
+
+
+def test_missing_page_is_said_in_one_line(service, tmp_path: Path) -> None:
+    response = get_in_process(service, tmp_path / "dist", "/")
+    assert response.status_code == 404
+    assert response.text.count("\n") == 1
+    assert "dist/index.html is missing" in response.text

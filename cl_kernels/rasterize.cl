@@ -91,13 +91,19 @@ static void count_tiles(const int8 piece, const int2 size, global int *tile_coun
             if (touches_tile(piece, tiles, (int2)(x, y))) atomic_inc(&tile_counts[y * tile_columns(size) + x]);
 }
 
+// Ready for a new picture: no extra pieces (counts[0]), no piece in any tile (the rest).
+kernel void clear_counts(const int count, global int *counts) {
+    const int index = get_global_id(0);
+    if (index < count) counts[index] = 0;
+}
+
 // One triangle of one object: to pixels, clipped, its pieces written and counted in the tiles they touch. Its first
-// piece has the place of its number; the others are appended after `all_triangles`, and `extra` counts them even
-// where there is no more room. sizes: triangles, number of the first one, all_triangles, room for others.
+// piece has the place of its number; others are appended after those of all triangles. counts[0] counts the appended,
+// also those for which there is no room; counts[1 + tile] the pieces of each tile.
+// sizes: triangles, number of the first one, triangles of all objects, room after them. picture: width, height, object.
 kernel void setup_triangles(const int4 sizes, const int4 picture, const global float *vertices,
                             const global int *triangles, const float16 pixel_from_model, const float near_m,
-                            global int *extra, global int *tile_counts, global int8 *corners,
-                            global float4 *inverse_depths) {
+                            global int *counts, global int8 *corners, global float4 *inverse_depths) {
     const int triangle = get_global_id(0);
     if (triangle >= sizes.x) return;
     const int3 vertex = vload3(triangle, triangles);
@@ -107,23 +113,25 @@ kernel void setup_triangles(const int4 sizes, const int4 picture, const global f
     corner[2] = transform_point(pixel_from_model, vload3(vertex.z, vertices));
     const int count = clip_triangle(near_m, corner);
     const int2 ids = (int2)(sizes.y + triangle, picture.z);
-    corners[ids.x] = (int8)(-1);
-    int slot = ids.x;
+    int written = 0;
     for (int i = 2; i < count; i++) {
         float4 depths;
         const int8 piece = make_piece(corner[0], corner[i - 1], corner[i], ids, picture.xy, &depths);
         if (piece.s6 < 0) continue;
-        if (corners[ids.x].s6 >= 0) slot = sizes.z + atomic_inc(extra);
-        if (slot >= sizes.z + sizes.w) break;
+        const int slot = written++ ? sizes.z + atomic_inc(counts) : ids.x;
+        if (slot >= sizes.z + sizes.w) continue;
         corners[slot] = piece;
         inverse_depths[slot] = depths;
-        count_tiles(piece, picture.xy, tile_counts);
+        count_tiles(piece, picture.xy, counts + 1);
     }
+    if (!written) corners[ids.x] = (int8)(-1);
 }
 
-// Exclusive running sum over the tiles, by one work-group; starts[tiles] is the sum of all.
+// Exclusive running sum over the tiles' counts, by one work-group. starts[tiles] is the sum of all, and the last
+// number counts[0], for the host to read both at once.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1)))
-void scan_tiles(const int tiles, const global int *tile_counts, global int *starts) {
+void scan_tiles(const int tiles, const global int *counts, global int *starts) {
+    const global int *tile_counts = counts + 1;
     local int sums[SCAN_ITEMS];
     const int item = get_local_id(0);
     const int share = (tiles + SCAN_ITEMS - 1) / SCAN_ITEMS;
@@ -138,12 +146,16 @@ void scan_tiles(const int tiles, const global int *tile_counts, global int *star
         starts[tile] = before;
         before += tile_counts[tile];
     }
-    if (item == SCAN_ITEMS - 1) starts[tiles] = before;
+    if (item == SCAN_ITEMS - 1) {
+        starts[tiles] = before;
+        starts[tiles + 1] = counts[0];
+    }
 }
 
 // Lists each piece in the tiles it touches. Counts the tiles down to 0; the order within a tile does not matter.
-kernel void fill_tiles(const int pieces, const int2 size, const global int8 *corners, const global int *starts,
-                       global int *tile_counts, global int *entries) {
+kernel void fill_tiles(const int pieces, const int width, const int height, const global int8 *corners,
+                       const global int *starts, global int *counts, global int *entries) {
+    const int2 size = (int2)(width, height);
     const int index = get_global_id(0);
     if (index >= pieces) return;
     const int8 piece = corners[index];
@@ -152,7 +164,7 @@ kernel void fill_tiles(const int pieces, const int2 size, const global int8 *cor
     for (int y = tiles.y; y <= tiles.w; y++)
         for (int x = tiles.x; x <= tiles.z; x++) {
             const int tile = y * tile_columns(size) + x;
-            if (touches_tile(piece, tiles, (int2)(x, y))) entries[starts[tile] + atomic_dec(&tile_counts[tile]) - 1] = index;
+            if (touches_tile(piece, tiles, (int2)(x, y))) entries[starts[tile] + atomic_dec(&counts[1 + tile]) - 1] = index;
         }
 }
 
@@ -173,33 +185,35 @@ static ulong coverage(const int8 piece, const int2 origin, const int2 size) {
     return mask;
 }
 
-// Nearest piece of each pixel: (triangle, object, bits of 1 / z); the lowest triangle number where depths are equal.
-static int2 nearer(const int8 piece, const float4 inverse_depths, const int2 pixel, const int2 best, float *best_depth) {
+// The nearer of the best so far and a piece that covers the pixel, as (triangle, object); the lower triangle number
+// where they are equally far. Depth is interpolated as 1 / z, which is linear on the screen.
+static int2 nearer(const int8 piece, const float4 inverse_depths, const int2 pixel, const int2 best, float *nearest) {
     const float3 share = convert_float3(edges_at(piece, pixel));
-    const float depth = dot(share, inverse_depths.xyz) / (share.x + share.y + share.z);
-    if (depth < *best_depth || (depth == *best_depth && best.x >= 0 && piece.s6 > best.x)) return best;
-    *best_depth = depth;
+    const float inverse_depth = dot(share, inverse_depths.xyz) / (share.x + share.y + share.z);
+    if (inverse_depth < *nearest || (inverse_depth == *nearest && piece.s6 > best.x)) return best;
+    *nearest = inverse_depth;
     return piece.s67;
 }
 
 // One work-group a tile, one work-item a pixel: 64 entries at a time, first their coverage, one entry an item, then
 // each pixel looks through those that cover it.
 kernel __attribute__((reqd_work_group_size(TILE * TILE, 1, 1)))
-void raster_tiles(const int2 size, const global int8 *corners, const global float4 *inverse_depths,
+void raster_tiles(const int width, const int height, const global int8 *corners, const global float4 *inverse_depths,
                   const global int *starts, const global int *entries, global int *visible, global int *objects) {
+    const int2 size = (int2)(width, height);
     local ulong masks[TILE * TILE];
     const int tile = get_group_id(0), item = get_local_id(0);
     const int2 origin = TILE * (int2)(tile % tile_columns(size), tile / tile_columns(size));
     const int2 pixel = origin + (int2)(item % TILE, item / TILE);
     int2 best = (int2)(-1);
-    float best_depth = 0.0f;
+    float nearest = 0.0f;
     for (int begin = starts[tile]; begin < starts[tile + 1]; begin += TILE * TILE) {
         const int count = min(starts[tile + 1] - begin, TILE * TILE);
         masks[item] = item < count ? coverage(corners[entries[begin + item]], origin, size) : 0;
         barrier(CLK_LOCAL_MEM_FENCE);
         for (int i = 0; i < count; i++) {
             const int piece = entries[begin + i];
-            if (masks[i] >> item & 1) best = nearer(corners[piece], inverse_depths[piece], pixel, best, &best_depth);
+            if ((masks[i] >> item) & 1) best = nearer(corners[piece], inverse_depths[piece], pixel, best, &nearest);
         }
         barrier(CLK_LOCAL_MEM_FENCE);
     }
@@ -227,15 +241,18 @@ static float2 barycentric(const float3 a, const float3 ab, const float3 ac, cons
     return inside / fmax(inside.x + inside.y, 1.0f);
 }
 
-// `normal` on the side of `facing` (both of any length), bent where it would still face away from `to_camera` (unit).
+static float3 unit_or(const float3 vector, const float3 otherwise) {
+    const float length_squared = dot(vector, vector);
+    return length_squared > 1e-30f ? vector / sqrt(length_squared) : otherwise;
+}
+
+// `normal` on the side of the triangle's own `facing` that is seen, bent where it would still turn its back on the
+// camera: so it never flips from one pixel to the next along a smooth outline. All of any length but `to_camera`.
 static float3 facing_camera(const float3 normal, const float3 facing, const float3 to_camera) {
-    const float3 flat = normalize(dot(facing, to_camera) < 0.0f ? -facing : facing);
-    const float length_squared = dot(normal, normal);
-    float3 turned = length_squared > 0.0f ? normal * rsqrt(length_squared) : flat;
-    turned = dot(turned, flat) < 0.0f ? -turned : turned;
-    const float away = fmin(dot(turned, to_camera), 0.0f);
-    turned -= away * to_camera;
-    return dot(turned, turned) > 1e-12f ? normalize(turned) : flat;
+    const float3 flat = unit_or(dot(facing, to_camera) < 0.0f ? -facing : facing, to_camera);
+    const float3 smooth = unit_or(normal, flat);
+    const float3 turned = dot(smooth, flat) < 0.0f ? -smooth : smooth;
+    return unit_or(turned - fmin(dot(turned, to_camera), 0.0f) * to_camera, flat);
 }
 
 // Interpolates the surface that one object shows: position in volume metres, unit normal, linear base colour; w = 1.

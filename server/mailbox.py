@@ -1,7 +1,8 @@
 """What stands between the socket and a session's worker: a latest-wins mailbox for two threads.
 
-A newer frame replaces an unread older one, so that a slow worker always gets the newest picture. Control messages are
-never replaced and are read before every frame that came after them.
+A newer frame replaces an unread older one, so that a slow worker gets the newest picture; but never one of a client
+that keeps to its window of unanswered frames. Control messages are never replaced and are read before every frame that
+came after them.
 """
 
 from __future__ import annotations
@@ -54,12 +55,16 @@ class Receipt(NamedTuple):
 
 
 class Mailbox:
-    """One writer (the event loop), one reader (the worker). With `lossless`, no frame is ever replaced."""
+    """One writer (the event loop), one reader (the worker)."""
 
-    def __init__(self, lossless: bool = False, on_taken: Callable[[], None] | None = None) -> None:
-        """`on_taken` is called by the reader's thread after each letter that it takes: there may be room again."""
-        self._lossless = lossless
+    def __init__(self, window: int | None, on_taken: Callable[[], None] | None = None) -> None:
+        """`window`: how many frames may be unanswered before unread ones are replaced; None: no frame ever is.
+
+        `on_taken` is called by the reader's thread after each letter that it takes: there may be room again.
+        """
+        self._window = window
         self._on_taken = on_taken
+        self._unanswered = 0
         self._letters: deque[Letter] = deque()
         self._waiting_bytes = 0
         self._frames_ahead = 0
@@ -72,14 +77,16 @@ class Mailbox:
             return len(self._letters) < MAX_WAITING_LETTERS and self._waiting_bytes < MAX_WAITING_BYTES
 
     def post(self, message: Frame | Control) -> Receipt:
-        """Add a message; a frame takes the place of the unread frame, if any. Posting to a closed mailbox is lost."""
+        """Add a message; a frame beyond the window takes the place of the oldest unread one.
+
+        What is posted to a closed mailbox is lost.
+        """
         with self._changed:
             if self._closed:
                 return Receipt(None, 0)
-            is_frame = isinstance(message, Frame)
-            replaced = self._take_out_unread_frame() if is_frame and not self._lossless else None
-            self._add(Letter(message))
-            self._frames_ahead += is_frame
+            replaced = self._make_way() if isinstance(message, Frame) else None
+            self._letters.append(Letter(message))
+            self._waiting_bytes += self._letters[-1].size_bytes
             self._changed.notify()
             return Receipt(replaced, self._frames_ahead)
 
@@ -96,6 +103,11 @@ class Mailbox:
             self._on_taken()
         return letter
 
+    def note_answered(self) -> None:
+        """The reader is about to answer the frame it took last: from now on the client may send another."""
+        with self._changed:
+            self._unanswered -= 1
+
     def close(self) -> None:
         """Throw away what is unread and let the reader go."""
         with self._changed:
@@ -103,16 +115,18 @@ class Mailbox:
             self._letters.clear()
             self._changed.notify_all()
 
-    def _take_out_unread_frame(self) -> Frame | None:
+    def _make_way(self) -> Frame | None:
+        """Count a frame that is coming; beyond the window, take out the one that it replaces."""
+        self._frames_ahead += 1
+        self._unanswered += 1
+        if self._window is None or self._unanswered <= self._window:
+            return None
         for place, letter in enumerate(self._letters):
             if isinstance(letter.message, Frame):
                 self._remove(place)
+                self._unanswered -= 1
                 return letter.message
         return None
-
-    def _add(self, letter: Letter) -> None:
-        self._letters.append(letter)
-        self._waiting_bytes += letter.size_bytes
 
     def _remove(self, place: int) -> Letter:
         letter = self._letters[place]

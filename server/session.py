@@ -79,7 +79,7 @@ class CaptureSession:
         self._loop = asyncio.get_running_loop()
         self._room = asyncio.Event()
         self._told_of_window = False
-        self._mailbox = Mailbox(lossless=hello.wishes.lossless, on_taken=self._wake_reader)
+        self._mailbox = Mailbox(None if hello.wishes.lossless else MAX_INFLIGHT, self._wake_reader)
         self._worker = Worker(workshop, hello, self._mailbox, outlet)
 
     async def run(self, threads: Executor) -> None:

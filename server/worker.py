@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -27,7 +28,7 @@ from protocol.messages import (
 from server.connection import POLICY, Refusal
 from server.mailbox import Control, Letter, Mailbox
 from server.metrics import Metrics
-from server.scene.mesh import Mesh, MeshError
+from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 
 if TYPE_CHECKING:
@@ -122,6 +123,7 @@ class Worker:
 
     def _drop(self, frame: Frame, cause: str, error: ValueError) -> None:
         self._workshop.metrics.dropped.labels(cause).inc()
+        self._mailbox.note_answered()
         self._outlet.send(encode(Dropped(frame=frame.frame, reason=one_line(str(error)))))
 
     def _deliver(self, frame: Frame, result: FrameResult) -> None:
@@ -129,6 +131,7 @@ class Worker:
         light = encode(result.light)
         composite = self._encode(frame, result, lossless)
         self._outlet.send(light)
+        self._mailbox.note_answered()
         self._outlet.send(composite)
         if self._outlet.is_watched():
             shown = self._encode(frame, result, False) if lossless else composite
@@ -160,10 +163,7 @@ def apply_control(pipeline: Pipeline, message: Control, load_mesh: Callable[[byt
     """Do what a control message asks; what cannot be done is said in the acknowledgement."""
     try:
         notes = _apply(pipeline, message, load_mesh)
-    except KeyError:
-        known = f"there is no object {getattr(message, 'object', '')!r} in this session: place it first"
-        return Acknowledged(request=message.request, error=one_line(known))
-    except (MeshError, ValueError) as error:
+    except ValueError as error:  # MeshError is one
         return Acknowledged(request=message.request, error=one_line(str(error)))
     return Acknowledged(request=message.request, notes=tuple(one_line(note) for note in notes))
 
@@ -173,12 +173,22 @@ def _apply(pipeline: Pipeline, message: Control, load_mesh: Callable[[bytes, str
         case PlaceObject():
             return pipeline.place_object(message.object, load_mesh(message.data, message.format), _placement(message))
         case MoveObject():
-            pipeline.move_object(message.object, _placement(message))
+            with _object_known(message.object):
+                pipeline.move_object(message.object, _placement(message))
         case RemoveObject():
-            pipeline.remove_object(message.object)
+            with _object_known(message.object):
+                pipeline.remove_object(message.object)
         case Quality():
             pipeline.set_preset(message.preset)
     return ()
+
+
+@contextlib.contextmanager
+def _object_known(name: str) -> Iterator[None]:
+    try:
+        yield
+    except KeyError as error:
+        raise ValueError(f"there is no object {name!r} in this session: place it first") from error
 
 
 def _placement(message: PlaceObject | MoveObject) -> Placement:

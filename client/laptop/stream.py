@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from client.client import Answer, ClientError, StreamClient
-from client.laptop.errors import OutputError
+from client.laptop.errors import OutputError, SourceError
 from client.laptop.objects import ObjectFile, pack_mesh
 from client.laptop.output import FrameOutput, OutputWriter
 from client.laptop.source import Source
@@ -136,6 +136,15 @@ class _Stream:
         self._summary.seconds = time.perf_counter() - start_s
 
     async def _send(self, client: StreamClient) -> None:
+        """Send all frames and wait for the last answer; also where the source is damaged on the way."""
+        try:
+            await self._send_frames(client)
+        except SourceError:
+            await client.wait_until_answered()
+            raise
+        await client.wait_until_answered()
+
+    async def _send_frames(self, client: StreamClient) -> None:
         start_s = time.perf_counter()
         for number, position in enumerate(self._job.frames):
             if self._job.realtime:
@@ -148,7 +157,6 @@ class _Stream:
             self._summary.sent += 1
             if self._job.wishes.lossless:
                 await client.wait_until_answered()
-        await client.wait_until_answered()
 
     async def _receive(self, client: StreamClient) -> None:
         async for answer in client.answers():

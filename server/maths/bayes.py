@@ -69,25 +69,50 @@ def condition_number(matrix: NDArray[np.float64]) -> float:
 
 def solve_with_evidence(equations: NormalEquations, precision: NDArray[np.float64]) -> Posterior:
     """Posterior of x under prior precisions proportional to `precision` [n] > 0. Finite for any finite sums."""
-    root = np.sqrt(precision)
-    values, vectors = np.linalg.eigh(equations.matrix / np.outer(root, root))
-    values = np.maximum(values, 0.0)
-    projected = vectors.T @ (equations.vector / root[:, None])
+    system = _Whitened.of(equations, precision)
+    ratios = _RATIOS * max(system.values[-1], np.finfo(float).tiny)
+    misfits = np.array([system.misfit(ratio) for ratio in ratios])
+    log_det = np.sum(np.log1p(system.values[None, :] / ratios[:, None]), axis=1)
     channels = equations.energy.size
-    ratios = _RATIOS * max(values[-1], np.finfo(float).tiny)
-    explained = np.einsum("ic,ki->kc", projected**2, 1 / (values[None, :] + ratios[:, None]))
-    floor = 1e-12 * equations.energy + np.finfo(float).tiny
-    misfit = np.maximum(equations.energy[None, :] - explained, floor[None, :])
-    count = max(equations.count, 1.0)
-    log_det = np.sum(np.log1p(values[None, :] / ratios[:, None]), axis=1)
-    cost = count * np.sum(np.log(misfit), axis=1) + channels * log_det
-    best = int(np.argmin(cost))
-    ratio = float(ratios[best])
-    gain = vectors / (values + ratio)
-    return Posterior(
-        mean=(gain @ projected) / root[:, None],
-        shape=(gain @ vectors.T) / np.outer(root, root),
-        noise=misfit[best] / count,
-        ratio=ratio,
-        condition=condition_number(equations.matrix),
-    )
+    cost = max(equations.count, 1.0) * np.sum(np.log(misfits), axis=1) + channels * log_det
+    return system.posterior(float(ratios[int(np.argmin(cost))]))
+
+
+def solve_plain(equations: NormalEquations, precision: NDArray[np.float64]) -> Posterior:
+    """Plain least squares, with only as much prior as keeps float64 from dividing by zero."""
+    system = _Whitened.of(equations, precision)
+    return system.posterior(1e-13 * max(system.values[-1], np.finfo(float).tiny))
+
+
+@dataclass(frozen=True)
+class _Whitened:
+    """The normal equations in the eigenbasis in which prior and data are both diagonal."""
+
+    equations: NormalEquations
+    root: NDArray[np.float64]
+    values: NDArray[np.float64]
+    vectors: NDArray[np.float64]
+    projected: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, equations: NormalEquations, precision: NDArray[np.float64]) -> _Whitened:
+        root = np.sqrt(precision)
+        values, vectors = np.linalg.eigh(equations.matrix / np.outer(root, root))
+        projected = vectors.T @ (equations.vector / root[:, None])
+        return cls(equations, root, np.maximum(values, 0.0), vectors, projected)
+
+    def misfit(self, ratio: float) -> NDArray[np.float64]:
+        """[channels] y^T y less what the fit under `ratio` explains; positive."""
+        explained = np.sum(self.projected**2 / (self.values + ratio)[:, None], axis=0)
+        floor = 1e-12 * self.equations.energy + np.finfo(float).tiny
+        return np.maximum(self.equations.energy - explained, floor)
+
+    def posterior(self, ratio: float) -> Posterior:
+        gain = self.vectors / (self.values + ratio)
+        return Posterior(
+            mean=(gain @ self.projected) / self.root[:, None],
+            shape=(gain @ self.vectors.T) / np.outer(self.root, self.root),
+            noise=self.misfit(ratio) / max(self.equations.count, 1.0),
+            ratio=ratio,
+            condition=condition_number(self.equations.matrix),
+        )

@@ -14,7 +14,7 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.maths.bayes import NormalEquations, Posterior, solve_with_evidence
+from server.maths.bayes import NormalEquations, Posterior, solve_plain, solve_with_evidence
 from server.maths.sh import LUMINANCE, band_of, dominant_direction
 from server.opencl.engine import Engine
 from server.stages.measure import Measurement
@@ -27,6 +27,7 @@ LEAST_OPENNESS = 0.05
 """Samples that see less of the sky say more about indirect light than about the sky (thesis 5.2)."""
 FORGETTING = 0.6
 """What remains of earlier frames' evidence a frame later: a new light has 78 % of the weight after 3 frames."""
+THESIS_FORGETTING = 0.9
 _TILE = 8
 _LEAST_SAMPLES = 32
 _DEPENDENCE_STEPS = 2  # the light and its samples' dependence are found in turn
@@ -120,9 +121,11 @@ def unpack_tiles(partial: NDArray[np.float64], n: int) -> TileSums:
 class LightEstimator:
     """The running estimate of one session's light."""
 
-    def __init__(self, bands: int, forgetting: float = FORGETTING) -> None:
+    def __init__(self, bands: int, *, as_thesis: bool = False) -> None:
+        """`as_thesis`: plain least squares and a memory as long as a moving average of 10 (thesis 5.4)."""
         self._bands = bands
-        self._forgetting = forgetting
+        self._solver = solve_plain if as_thesis else solve_with_evidence
+        self._forgetting = THESIS_FORGETTING if as_thesis else FORGETTING
         self._precision = prior_precision(bands)
         self._evidence: NormalEquations | None = None
         self._weight = 0.0
@@ -154,7 +157,7 @@ class LightEstimator:
     def _solve(self) -> Posterior:
         """Posterior from the evidence of one average frame, thinned to its number of independent samples."""
         assert self._evidence is not None
-        return solve_with_evidence(self._evidence.scaled(1 / (self._weight * self._dependence)), self._precision)
+        return self._solver(self._evidence.scaled(1 / (self._weight * self._dependence)), self._precision)
 
 
 def prior_precision(bands: int) -> NDArray[np.float64]:

@@ -75,8 +75,17 @@ class Volume:
         return translation(-self.origin_world)
 
     def arguments(self) -> tuple[KernelArgument, ...]:
-        """bricks, slots, gaps, solid, octets, voxels, voxel_m, truncation_m: what include/volume.clh's make_volume needs."""
-        return int4(*self.bricks, 0), self.slots_device, self._gaps, self._solid, self._octets, self.voxels, self.voxel_m, self.truncation_m
+        """What make_volume of include/volume.clh takes, in its order."""
+        return (
+            int4(*self.bricks, 0),
+            self.slots_device,
+            self._gaps,
+            self._solid,
+            self._octets,
+            self.voxels,
+            self.voxel_m,
+            self.truncation_m,
+        )
 
     def allocate(self, camera: CameraModel, volume_from_camera: NDArray[np.float64], depth_m: cl_array.Array) -> None:
         """Give a slot to every brick near the measured surface; past the budget the nearest table order wins."""

@@ -23,8 +23,8 @@ EXPECTED = FOLDER / "messages.json"
 
 
 def depth_ramp() -> NDArray[np.uint16]:
-    """[6, 8] uint16 with holes, both extremes and every sign of delta; the TypeScript test has the same formula."""
-    y, x = np.mgrid[0:6, 0:8]
+    """[8, 10] uint16 with holes, both extremes and every sign of delta; the TypeScript test has the same formula."""
+    y, x = np.mgrid[0:8, 0:10]
     return np.where((x + y) % 5 == 0, 0, (x * 9001 + y * 30011) % 65536).astype(np.uint16)
 
 

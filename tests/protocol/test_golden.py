@@ -22,7 +22,7 @@ def test_golden_depth_is_read_whatever_deflate_this_zlib_writes() -> None:
     frame = decode_client((FOLDER / "frame_zdelta.msgpack").read_bytes())
     planes = inflate(frame.depth.data, 2 * depth_ramp().size)
     assert planes == filter_depth(depth_ramp())
-    assert np.array_equal(unfilter_depth(planes, 8, 6), depth_ramp())
+    assert np.array_equal(unfilter_depth(planes, 10, 8), depth_ramp())
 
 
 def test_the_expected_fields_for_other_languages_are_current() -> None:

@@ -18,44 +18,57 @@ def drain(mailbox: Mailbox, count: int) -> list:
     return [mailbox.take().message for _ in range(count)]
 
 
+def posted_while_one_is_worked_on(window: int | None, frames: list[Frame]) -> tuple[Mailbox, list]:
+    """Post frames while the reader is busy with one: the mailbox and what each frame replaced."""
+    mailbox = Mailbox(window)
+    mailbox.post(frame_message(100))
+    mailbox.take()
+    return mailbox, [mailbox.post(frame).replaced for frame in frames]
+
+
 def test_newer_frame_replaces_unread_older_one() -> None:
-    mailbox = Mailbox()
     frames = [frame_message(i) for i in range(3)]
-    assert [mailbox.post(frame).replaced for frame in frames] == [None, frames[0], frames[1]]
+    mailbox, replaced = posted_while_one_is_worked_on(2, frames)
+    assert replaced == [None, frames[0], frames[1]]
     assert mailbox.take().message is frames[2]
 
 
-def test_a_frame_that_was_taken_is_not_replaced() -> None:
-    mailbox = Mailbox()
-    mailbox.post(frame_message(0))
-    mailbox.take()
-    assert mailbox.post(frame_message(1)).replaced is None
+def test_a_client_within_its_window_never_loses_a_frame() -> None:
+    frames = [frame_message(i) for i in range(4)]
+    mailbox, _ = posted_while_one_is_worked_on(2, frames[:1])
+    mailbox.note_answered()  # and before the reader takes frames[0], the client sends another
+    assert mailbox.post(frames[1]).replaced is None
+    assert mailbox.take().message is frames[0]
+    assert mailbox.post(frames[2]).replaced is frames[1]
+    mailbox.note_answered()
+    assert mailbox.post(frames[3]).replaced is None
+    assert drain(mailbox, 2) == [frames[2], frames[3]]
 
 
 def test_lossless_keeps_every_frame_in_order() -> None:
-    mailbox = Mailbox(lossless=True)
+    mailbox = Mailbox(None)
     frames = [frame_message(i) for i in range(5)]
     assert all(mailbox.post(frame).replaced is None for frame in frames)
     assert drain(mailbox, 5) == frames
 
 
 def test_control_messages_survive_replacement_and_precede_later_frames() -> None:
-    mailbox = Mailbox()
     old, new = frame_message(0), frame_message(1)
+    mailbox, _ = posted_while_one_is_worked_on(2, [])
     for message in (quality(1), old, quality(2), new, quality(3)):
         mailbox.post(message)
     assert drain(mailbox, 4) == [quality(1), quality(2), new, quality(3)]
 
 
 def test_frames_ahead_counts_what_came_since_the_worker_took_one() -> None:
-    mailbox = Mailbox()
+    mailbox = Mailbox(2)
     assert [mailbox.post(frame_message(i)).frames_ahead for i in range(3)] == [1, 2, 3]
     mailbox.take()
     assert mailbox.post(frame_message(3)).frames_ahead == 1
 
 
 def test_frames_ahead_counts_what_waits_when_lossless() -> None:
-    mailbox = Mailbox(lossless=True)
+    mailbox = Mailbox(None)
     for i in range(3):
         mailbox.post(frame_message(i))
     mailbox.take()
@@ -63,7 +76,7 @@ def test_frames_ahead_counts_what_waits_when_lossless() -> None:
 
 
 def test_take_waits_for_a_letter() -> None:
-    mailbox, taken = Mailbox(), []
+    mailbox, taken = Mailbox(2), []
     thread = threading.Thread(target=lambda: taken.append(mailbox.take().message))
     thread.start()
     mailbox.post(quality(7))
@@ -72,7 +85,7 @@ def test_take_waits_for_a_letter() -> None:
 
 
 def test_close_lets_a_waiting_reader_go_and_forgets_letters() -> None:
-    mailbox, taken = Mailbox(), []
+    mailbox, taken = Mailbox(2), []
     thread = threading.Thread(target=lambda: taken.append(mailbox.take()))
     thread.start()
     mailbox.close()
@@ -83,7 +96,7 @@ def test_close_lets_a_waiting_reader_go_and_forgets_letters() -> None:
 
 
 def test_room_is_bounded_by_count_and_by_bytes() -> None:
-    mailbox = Mailbox()
+    mailbox = Mailbox(2)
     for request in range(MAX_WAITING_LETTERS):
         assert mailbox.has_room()
         mailbox.post(quality(request))
@@ -91,7 +104,7 @@ def test_room_is_bounded_by_count_and_by_bytes() -> None:
     mailbox.take()
     assert mailbox.has_room()
 
-    mailbox = Mailbox()
+    mailbox = Mailbox(2)
     mesh = PlaceObject(request=0, object="a", format="glb", data=bytes(12 << 20))
     for _ in range(MAX_WAITING_BYTES // (12 << 20)):
         assert mailbox.has_room()
@@ -100,7 +113,7 @@ def test_room_is_bounded_by_count_and_by_bytes() -> None:
 
 
 def test_replaced_frames_leave_no_bytes_behind() -> None:
-    mailbox = Mailbox()
+    mailbox = Mailbox(2)
     frame = frame_message(0)
     for _ in range(2 * MAX_WAITING_BYTES // len(frame.color.data)):
         mailbox.post(frame)
@@ -109,21 +122,23 @@ def test_replaced_frames_leave_no_bytes_behind() -> None:
 
 def test_on_taken_is_called_for_each_letter() -> None:
     calls: list[int] = []
-    mailbox = Mailbox(on_taken=lambda: calls.append(1))
+    mailbox = Mailbox(2, on_taken=lambda: calls.append(1))
     mailbox.post(quality(1))
     mailbox.post(quality(2))
     drain(mailbox, 2)
     assert len(calls) == 2
 
 
-@pytest.mark.parametrize("lossless", [False, True])
-def test_two_threads_lose_no_control_message_and_end_with_the_newest_frame(lossless: bool) -> None:
-    mailbox, taken = Mailbox(lossless=lossless), []
+@pytest.mark.parametrize("window", [None, 1, 2])
+def test_two_threads_lose_no_control_message_and_end_with_the_newest_frame(window: int | None) -> None:
+    mailbox, taken = Mailbox(window), []
     frame = frame_message(0)
 
     def read() -> None:
         while (letter := mailbox.take()) is not None and letter.message != quality(999):
             taken.append(letter.message)
+            if isinstance(letter.message, Frame):
+                mailbox.note_answered()
 
     reader = threading.Thread(target=read)
     reader.start()

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from client.laptop.synthetic.charts import Grid
 from client.laptop.synthetic.harmonics import COEFFICIENTS, basis
 from client.laptop.synthetic.shapes import Solid
+from client.laptop.synthetic.shell import Shell
 
-TILE = 16
+TILE = 4
 """Samples along each side of a piece that is worked on at once: it stays in the processor's cache."""
 LIFT_M = 1e-4
 """A sample buried less than this is still on the surface that is seen."""
@@ -107,12 +108,14 @@ def _bake_tile(
 
 
 def _buried(solids: list[Solid], own: int, positions: NDArray, normals: NDArray) -> NDArray[np.bool_]:
-    """[rows, columns] samples inside another solid, which nobody sees."""
+    """[rows, columns] samples inside another solid or in an opening, which nobody sees."""
     lifted = (positions + LIFT_M * normals).reshape(-1, 3)
     inside = np.zeros(len(lifted), bool)
     for number, solid in enumerate(solids):
         if number != own:
             inside |= solid.contains(lifted)
+        elif isinstance(solid, Shell):
+            inside |= solid.absent(positions.reshape(-1, 3))
     return inside.reshape(positions.shape[:2])
 
 

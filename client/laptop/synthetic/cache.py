@@ -67,5 +67,7 @@ def _store(path: Path, tables: Tables) -> None:
 def _digest(tables: Tables) -> bytes:
     digest = hashlib.sha256()
     for key in sorted(tables):
-        digest.update(f"{key} {tables[key].dtype} {tables[key].shape}".encode() + np.ascontiguousarray(tables[key]).data)
+        digest.update(
+            f"{key} {tables[key].dtype} {tables[key].shape}".encode() + np.ascontiguousarray(tables[key]).data
+        )
     return digest.digest()

@@ -69,9 +69,7 @@ class SphereChart:
 
     def point(self, s: Points, t: Points) -> tuple[Points, Points]:
         azimuth, polar = 2 * np.pi * s, np.pi * t
-        normals = np.stack(
-            [np.sin(polar) * np.sin(azimuth), np.cos(polar), np.sin(polar) * np.cos(azimuth)], axis=-1
-        )
+        normals = np.stack([np.sin(polar) * np.sin(azimuth), np.cos(polar), np.sin(polar) * np.cos(azimuth)], axis=-1)
         return self.center + self.radius * normals, normals
 
     def coordinates(self, points: Points) -> tuple[Points, Points]:

@@ -84,9 +84,7 @@ def cast(solids: list[Solid], camera: CameraModel, rays: Floats, pose: Floats) -
     return depth.ravel(), owner.ravel()
 
 
-def render(
-    bodies: list[Lit], camera: CameraModel, rays: Floats, pose: Floats, light: DistantLight
-) -> Rendering:
+def render(bodies: list[Lit], camera: CameraModel, rays: Floats, pose: Floats, light: DistantLight) -> Rendering:
     """Everything about one view."""
     depth, owner = cast([body.solid for body in bodies], camera, rays, pose)
     directions = rays @ pose[:3, :3].T

@@ -78,7 +78,7 @@ def room() -> Scene:
         Body(Sphere(np.array([0.6, 0.47, 0.1]), 0.15), paint(0.7, 0.25, 0.2)),
         Body(Cylinder(np.array([1.2, 0.0, 0.35]), np.array([0, 1.0, 0]), 0.45, 0.17), paint(0.25, 0.5, 0.35)),
     )
-    return Scene("room", bodies, 0.025, 2048, _walk_in_room)
+    return Scene("room", bodies, 0.025, 8192, _walk_in_room)
 
 
 def _walk_around_table(time_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

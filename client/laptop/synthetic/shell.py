@@ -80,6 +80,15 @@ class Shell:
         """True outside the room, where nothing can be seen."""
         return ~((points > self.low) & (points < self.high)).all(axis=1)
 
+    def absent(self, points: Points) -> NDArray[np.bool_]:
+        """[n] True where a point of the walls lies in an opening."""
+        part = self.part(points)
+        inside = np.zeros(len(points), bool)
+        for opening in self.openings:
+            u, v = (points[:, a] for a in range(3) if a != WALLS[opening.wall][0])
+            inside |= (part == opening.wall) & _within(opening, u, v)
+        return inside
+
     def _exit(self, points: Points, directions: Points) -> tuple[Points, NDArray[np.intp]]:
         """[points, directions] how far to the wall that each ray meets, and that wall's number."""
         distances = np.stack([self._distance(points, directions, axis) for axis in range(3)])

@@ -12,6 +12,8 @@ import { addTimings, clearTimings, showTimings } from "./timings";
 
 const QUIET_AFTER_MS = 3000;
 const REFRESH_MS = 250;
+/** The light changes slowly and is dear to draw on a phone. */
+const LIGHT_MS = 100;
 
 const state = byId("state");
 const countdown = byId("state-countdown");
@@ -25,6 +27,8 @@ let light: Light | null = null;
 let composite: Composite | null = null;
 let lastPicture_ms = Number.NEGATIVE_INFINITY;
 let drawing = false;
+let lightDue = false;
+let lightShown_ms = Number.NEGATIVE_INFINITY;
 
 function receive(message: ServerMessage): void {
   switch (message.type) {
@@ -33,6 +37,7 @@ function receive(message: ServerMessage): void {
       return;
     case "light":
       light = message;
+      lightDue = true;
       return;
     case "composite":
       receivePicture(message);
@@ -79,11 +84,17 @@ function receivePicture(message: Composite): void {
 function draw(): void {
   drawing = false;
   if (composite === null) return;
-  if (light !== null) showLight(light, composite.world_from_camera);
   showTimings(composite.timings);
   showPlan(composite.plan);
   showNotes();
   refresh();
+}
+
+function drawLight(now_ms: number): void {
+  if (!lightDue || light === null || composite === null || now_ms - lightShown_ms < LIGHT_MS) return;
+  lightDue = false;
+  lightShown_ms = now_ms;
+  showLight(light, composite.world_from_camera);
 }
 
 /** The connection's state in a word for the eye and a sentence for everybody. */
@@ -104,6 +115,7 @@ function describe(now_ms: number): { kind: string; text: string } {
 
 function refresh(): void {
   const now_ms = performance.now();
+  drawLight(now_ms);
   const { kind, text } = describe(now_ms);
   setText(state, text);
   document.documentElement.dataset["state"] = kind;

@@ -43,9 +43,9 @@ test("what is no message is refused", () => {
   assert.throws(() => decodeServer(new Uint8Array([0xc0])), /not a message/);
 });
 
-const WIDTH = 8;
+const [WIDTH, HEIGHT] = [10, 8] as const;
 /** The formula of tests/protocol/golden.py. */
-const ramp = Uint16Array.from({ length: 6 * WIDTH }, (_, i) => {
+const ramp = Uint16Array.from({ length: HEIGHT * WIDTH }, (_, i) => {
   const [x, y] = [i % WIDTH, Math.floor(i / WIDTH)];
   return (x + y) % 5 === 0 ? 0 : (x * 9001 + y * 30011) % 65536;
 });
@@ -64,7 +64,7 @@ test("depth survives, whatever it is", async () => {
 });
 
 test("a frame as a browser writes it", async () => {
-  const color = { width: WIDTH, height: 6, codec: "raw" as const, data: new Uint8Array(3 * ramp.length) };
+  const color = { width: WIDTH, height: HEIGHT, codec: "raw" as const, data: new Uint8Array(3 * ramp.length) };
   const depth = await encodeDepth(ramp, WIDTH);
   const data = encode({ type: "frame", frame: 3, timestamp_s: 1, world_from_camera: null, color, depth });
   const file = process.env["PROBELESS_BROWSER_FRAME"]; // read back by the Python test that runs this one

@@ -1,0 +1,77 @@
+// Compositing (thesis 7.2.1, R3): real hides virtual and virtual hides real; linear inside, sRGB at the end.
+// Provides composite.
+#include "camera.clh"
+#include "upsample.clh"
+
+#ifndef BANDS
+#error BANDS must be defined: the number of spherical-harmonics bands
+#endif
+#include "sh.clh"
+
+// sRGB code of linear radiance (IEC 61966-2-1), clipped to [0, 1].
+static inline uchar srgb_code(const float linear) {
+    const float x = clamp(linear, 0.0f, 1.0f);
+    const float encoded = x <= 0.0031308f ? 12.92f * x : 1.055f * pow(x, 1.0f / 2.4f) - 0.055f;
+    return (uchar)(255.0f * encoded + 0.5f);
+}
+
+static inline void write_color(global uchar *picture, const int pixel, const float3 linear) {
+    picture[3 * pixel] = srgb_code(linear.x);
+    picture[3 * pixel + 1] = srgb_code(linear.y);
+    picture[3 * pixel + 2] = srgb_code(linear.z);
+}
+
+// Radiance of an unoccluded white Lambertian surface under the light.
+static float3 open_shading(const float3 normal, global const float4 *light) {
+    float y[COEFFICIENTS];
+    sh_basis(normal, y);
+    float3 sum = (float3)(0.0f);
+    for (int l = 0; l < BANDS; l++)
+        for (int i = l * l; i < (l + 1) * (l + 1); i++) sum += lambert_band(l) * y[i] * light[i].xyz;
+    return sum;
+}
+
+// shown [h][w][3]: the camera picture as sRGB codes; radiance [h][w] linear. positions, normals: the real geometry buffer.
+// virtual_positions, virtual_normals, virtual_colors [h][w] (w = 1 where covered): the virtual one, or none without HAS_OBJECTS.
+// occluded [object_rows][object_cols]: radiance that occluders take from virtual samples (w = 1 valid);
+// ratio [rows][cols]: shaded with over without virtual objects on real samples (w = 1 valid), or none without HAS_SHADOWS.
+// -> picture [h][w][3] sRGB. A pixel that nothing virtual touches is the camera's, byte for byte.
+kernel void composite(const int width, const int height, global const uchar *shown, global const float4 *radiance,
+                      global const float4 *positions, global const float4 *normals, const float16 camera_from_volume,
+                      const float tolerance_m,
+                      global const float4 *virtual_positions, global const float4 *virtual_normals,
+                      global const float4 *virtual_colors, global const float4 *light,
+                      const int object_cols, const int object_rows, const int object_stride, global const float4 *occluded,
+                      const int cols, const int rows, const int stride, global const float4 *ratio,
+                      global uchar *picture) {
+    const int x = get_global_id(0);
+    const int y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    const int pixel = y * width + x;
+    const float4 real = positions[pixel];
+#ifdef HAS_OBJECTS
+    const float4 object = virtual_positions[pixel];
+    if (object.w > 0.0f) {
+        const float in_front = transform_point(camera_from_volume, real.xyz).z - transform_point(camera_from_volume, object.xyz).z;
+        if (real.w <= 0.0f || in_front > -tolerance_m) {
+            const float3 normal = virtual_normals[pixel].xyz;
+            const Grid grid = {object_cols, object_rows, object_stride, width};
+            const float4 taken = upsample(grid, occluded, virtual_positions, virtual_normals, x, y, tolerance_m);
+            const float3 shading = fmax(open_shading(normal, light) - taken.xyz, (float3)(0.0f));
+            write_color(picture, pixel, virtual_colors[pixel].xyz * shading);
+            return;
+        }
+    }
+#endif
+#ifdef HAS_SHADOWS
+    if (real.w > 0.0f && radiance[pixel].w >= 0.0f) {
+        const Grid grid = {cols, rows, stride, width};
+        const float4 factor = upsample(grid, ratio, positions, normals, x, y, tolerance_m);
+        if (factor.w > 0.0f && (fabs(factor.x - 1.0f) > UNTOUCHED || fabs(factor.y - 1.0f) > UNTOUCHED || fabs(factor.z - 1.0f) > UNTOUCHED)) {
+            write_color(picture, pixel, radiance[pixel].xyz * factor.xyz);
+            return;
+        }
+    }
+#endif
+    for (int i = 0; i < 3; i++) picture[3 * pixel + i] = shown[3 * pixel + i];
+}

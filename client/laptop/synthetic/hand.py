@@ -1,0 +1,124 @@
+"""A hand that comes in over the table from the side, waves, and goes again; with its shadow, and the table's on it.
+
+The hand is made of capsules. Its shadow on what stands still is integrated anew in every frame, on a coarser grid and
+with fewer directions than the table's own: it hovers, so that its shadow is soft. The static solids' own visibility is
+baked as bits, so that what they shadow already is not shadowed twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.laptop.synthetic.bake import bake, blocked_directions, tiles
+from client.laptop.synthetic.charts import Grid, atlas
+from client.laptop.synthetic.harmonics import sphere_directions
+from client.laptop.synthetic.lights import DistantLight
+from client.laptop.synthetic.shapes import Capsule, Solid, rotation_about
+from client.laptop.synthetic.textures import painted
+
+DIRECTIONS = 512
+SHADOW_STEP_M = 0.012
+"""Between samples of the hand's shadow on static surfaces."""
+SKIN_STEP_M = 0.008
+"""Between samples of the shadows on the hand."""
+SKIN = painted(0.68, 0.44, 0.34)
+
+COMES, STAYS, GOES, IS_GONE = 0.15, 0.35, 0.7, 0.9
+"""Parts of the sequence."""
+WAVES = 2.5
+"""Times it waves while it stays."""
+REST = np.array([0.12, 0.25, 0.2])
+"""Where the palm's middle stays, world metres."""
+AWAY = np.array([0.95, 0.06, 0.12])
+"""From there, out of sight."""
+
+_FINGERS = (  # of a right hand pointing to -x, palm down: root in the palm's frame, splay in degrees, length, radius
+    ((-0.05, 0.0, -0.033), -9.0, 0.062, 0.0085),
+    ((-0.055, 0.0, -0.011), -3.0, 0.075, 0.0095),
+    ((-0.055, 0.0, 0.012), 3.0, 0.078, 0.0095),
+    ((-0.05, 0.0, 0.034), 9.0, 0.068, 0.009),
+    ((0.0, -0.004, 0.045), 48.0, 0.062, 0.0105),
+)
+
+
+def capsules(progress: float) -> list[Capsule]:
+    """The hand at `progress` (0 to 1) of the sequence; empty while it is out of sight."""
+    reach = _reach(progress)
+    if reach <= 0:
+        return []
+    staying = np.clip((progress - STAYS) / (GOES - STAYS), 0, 1)
+    swing = np.sin(2 * np.pi * WAVES * staying) * np.sin(np.pi * staying)
+    turn = rotation_about("y", 22 * swing) @ rotation_about("z", -8) @ rotation_about("x", 15 * swing)
+    palm = REST + (1 - reach) * AWAY + np.array([0.0, 0.015 * swing, 0.07 * swing])
+
+    def part(start: tuple[float, float, float], end: tuple[float, float, float], radius: float) -> Capsule:
+        return Capsule(palm + turn @ np.array(start), palm + turn @ np.array(end), radius)
+
+    hand = [part((0.035, 0, z), (-0.04, 0, z * 1.1), 0.017) for z in (-0.028, -0.009, 0.01, 0.029)]
+    for root, splay, length, radius in _FINGERS:
+        away = rotation_about("y", splay) @ np.array([-length, -0.1 * length, 0])
+        hand.append(part(root, tuple(np.array(root) + away), radius))
+    wrist = palm + turn @ np.array([0.05, 0, 0])
+    elbow = wrist + np.array([0.55, 0.08, 0.06]) + 0.25 * (palm - REST) * np.array([0, 0, 1])
+    return [*hand, Capsule(wrist, elbow, 0.032)]
+
+
+def _reach(progress: float) -> float:
+    """0 out of sight, 1 in place."""
+    x = np.clip(min((progress - COMES) / (STAYS - COMES), (IS_GONE - progress) / (IS_GONE - GOES)), 0, 1)
+    return float(x * x * (3 - 2 * x))
+
+
+class StaticVisibility:
+    """Which directions the static solids leave open, at samples all over them."""
+
+    def __init__(self, solids: list[Solid], open_bits: NDArray[np.uint8] | None = None) -> None:
+        self.solids = solids
+        self.grids = atlas([solid.charts for solid in solids], SHADOW_STEP_M)
+        self.directions = sphere_directions(DIRECTIONS).astype(np.float32)
+        self.size = self.grids[-1][-1].offset + self.grids[-1][-1].size
+        self._pieces = list(self._cut())
+        self.open_bits = self._compute() if open_bits is None else open_bits
+
+    def shadow(self, hand: list[Capsule], light: DistantLight) -> NDArray[np.float32]:
+        """[total, 3] light, over pi, that the hand alone takes from every sample."""
+        taken = np.zeros((self.size, 3), np.float32)
+        weights = light.radiance(self.directions) * np.float32(4 / DIRECTIONS)
+        for samples, points, normals, reach in self._pieces:
+            blocked = blocked_directions(list(hand), None, points, self.directions, reach)
+            hit = np.flatnonzero(blocked.any(axis=0))
+            if hit.size:
+                is_open = np.unpackbits(self.open_bits[samples], axis=1)[:, hit]
+                cosines = np.maximum(normals @ self.directions[hit].T, 0)
+                taken[samples] = (blocked[:, hit] * is_open * cosines) @ weights[hit]
+        return taken
+
+    def _cut(self) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32], float]]:
+        """Pieces of the grids: numbers of the samples, points, normals (one if flat), and the piece's half width."""
+        for grid in (grid for grids in self.grids for grid in grids):
+            positions, normals = grid.samples()
+            numbers = grid.offset + np.arange(grid.size).reshape(grid.rows, grid.columns)
+            for piece in tiles(grid):
+                points = positions[piece].reshape(-1, 3).astype(np.float32)
+                up = normals[piece].reshape(-1, 3).astype(np.float32)
+                reach = float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
+                yield numbers[piece].ravel(), points, up[:1] if grid.is_flat else up, reach
+
+    def _compute(self) -> NDArray[np.uint8]:
+        bits = np.zeros((self.size, DIRECTIONS // 8), np.uint8)
+        owners = [solid for solid, grids in zip(self.solids, self.grids, strict=True) for _ in grids for _ in (0,)]
+        starts = [grid.offset for grids in self.grids for grid in grids]
+        for samples, points, _, reach in self._pieces:
+            own = owners[np.searchsorted(starts, samples[0], side="right") - 1]
+            blocked = blocked_directions(self.solids, own, points, self.directions, reach)
+            bits[samples] = np.packbits(~blocked, axis=1)
+        return bits
+
+
+def skin_shadows(hand: list[Capsule], static: list[Solid]) -> tuple[list[list[Grid]], NDArray[np.float32]]:
+    """Grids over the hand, and [total, 16] occluded transfer on them: by the static solids and by its other parts."""
+    grids = atlas([part.charts for part in hand], SKIN_STEP_M)
+    return grids, bake([*hand, *static], grids, sphere_directions(DIRECTIONS))

@@ -1,0 +1,238 @@
+"""`synthetic:NAME[?key=value&...]`: scenes of this project's own, with exact poses, depth, colour and light."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from urllib.parse import parse_qsl
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.laptop.errors import SourceError
+from client.laptop.synthetic import hand, scenes
+from client.laptop.synthetic.bake import bake
+from client.laptop.synthetic.cache import cached
+from client.laptop.synthetic.charts import atlas
+from client.laptop.synthetic.harmonics import sphere_directions
+from client.laptop.synthetic.lights import RING_SIZE, DistantLight, ring_light
+from client.laptop.synthetic.noise import kinect_like
+from client.laptop.synthetic.render import Lit, Rendering, camera_rays, look_at, render
+from protocol.frames import CameraModel, RgbdFrame
+
+FPS = 30.0
+LIGHT_TURN_FRAMES = 240
+"""Of one round of the moving light."""
+FOCAL_OF_WIDTH = 525 / 640
+LARGEST_FRAMES = 100_000
+
+_UP = np.array([0.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Options:
+    """What stands after the name."""
+
+    name: str
+    frames: int = 60
+    size: tuple[int, int] = (640, 480)
+    light: int = 1
+    texture: bool = False
+    noise: bool = False
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is exactly known of one frame."""
+
+    sh: NDArray[np.float64]
+    """[16, 3] radiance in the units of the linearised picture: picture = albedo * (transfer . sh)."""
+    depth_m: NDArray[np.float32]
+    """[h, w] along the camera's z, 0 = no surface."""
+    normals: NDArray[np.float32]
+    """[h, w, 3] world, 0 where there is no surface."""
+    albedo: NDArray[np.float32]
+    """[h, w, 3] linear, 0 where there is no surface."""
+    visible: NDArray[np.bool_]
+    """[h, w] there is a surface."""
+    dynamic: NDArray[np.bool_]
+    """[h, w] the surface moves."""
+    radiance: NDArray[np.float64]
+    """[h, w, 3] the picture before it is encoded as sRGB in 8 bits."""
+    light_direction: NDArray[np.float64]
+    """[3] unit, world: the dominant direction of the light."""
+
+
+class SyntheticSource:
+    """A scene seen by a moving camera; see client.laptop.source.Source."""
+
+    fps = FPS
+    has_poses = True
+    up: tuple[float, float, float] | None = (0.0, 1.0, 0.0)
+
+    def __init__(self, options: Options) -> None:
+        """Bakes the scene's shadows, or reads them from the cache."""
+        self.name = f"synthetic:{options.name}"
+        self.options = options
+        width, height = options.size
+        focal = FOCAL_OF_WIDTH * width
+        self.camera = CameraModel(
+            width=width, height=height, fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2
+        )
+        self.scene = _SCENES[options.name]()
+        self._rays = camera_rays(self.camera)
+        self._grids = atlas([solid.charts for solid in self.scene.solids], self.scene.step_m)
+        self._transfer = cached(self.scene.name, self._bake)["occluded"]
+        self._static = self._static_visibility() if options.name == "hand" else None
+        self._texel_light = lru_cache(maxsize=1)(self._shadowed_light)
+        self._rendering = lru_cache(maxsize=2)(self._render)
+
+    def __len__(self) -> int:
+        return self.options.frames
+
+    def __getitem__(self, index: int) -> RgbdFrame:
+        index = range(len(self))[index]
+        rendering = self._rendering(index)
+        pose = self.pose(index)
+        depth_m = rendering.depth_m
+        if self.options.noise:
+            depth_m = kinect_like(depth_m, self._slant(rendering, pose), self.camera.fx, index)
+        depth = (depth_m / self.camera.depth_scale_m).round().clip(0, 65535).astype(np.uint16)
+        return RgbdFrame(index, index / FPS, to_srgb8(rendering.radiance), depth, pose)
+
+    def pose(self, index: int) -> NDArray[np.float64]:
+        """world_from_camera [4, 4], exact."""
+        position, target = self.scene.camera_path(index / FPS)
+        return look_at(position, target, _UP)
+
+    def light(self, index: int) -> DistantLight:
+        """The light of one frame."""
+        moved = index * RING_SIZE / LIGHT_TURN_FRAMES if self.options.name == "light" else 0.0
+        return ring_light(self.options.light + moved)
+
+    def truth(self, index: int) -> Truth:
+        """What is exactly known of frame `index`."""
+        rendering, light = self._rendering(index), self.light(index)
+        return Truth(
+            sh=light.sh,
+            depth_m=rendering.depth_m.astype(np.float32),
+            normals=rendering.normals.astype(np.float32),
+            albedo=rendering.albedo.astype(np.float32),
+            visible=rendering.owner >= 0,
+            dynamic=rendering.owner >= len(self.scene.bodies),
+            radiance=rendering.radiance,
+            light_direction=light.direction,
+        )
+
+    def _bake(self) -> dict[str, NDArray]:
+        return {"occluded": bake(self.scene.solids, self._grids, sphere_directions(self.scene.directions))}
+
+    def _static_visibility(self) -> hand.StaticVisibility:
+        solids = self.scene.solids
+        bits = cached("hand", lambda: {"open": hand.StaticVisibility(solids).open_bits})["open"]
+        return hand.StaticVisibility(solids, bits)
+
+    def _shadowed_light(self, index: int) -> NDArray[np.float32]:
+        """[total, 3] light that static shadows take away."""
+        return self._transfer @ self.light(index).sh.astype(np.float32)
+
+    def _render(self, index: int) -> Rendering:
+        light = self.light(index)
+        baked = self._texel_light(index if self.options.name == "light" else 0)
+        bodies = [
+            Lit(body.solid, body.texture if self.options.texture else None, grids, ((grids, baked),))
+            for body, grids in zip(self.scene.bodies, self._grids, strict=True)
+        ]
+        if self._static is not None:
+            bodies = self._with_hand(bodies, self._static, index, light)
+        return render(bodies, self.camera, self._rays, self.pose(index), light)
+
+    def _with_hand(
+        self, bodies: list[Lit], static: hand.StaticVisibility, index: int, light: DistantLight
+    ) -> list[Lit]:
+        """The static bodies under the hand's shadow, then the hand's parts."""
+        parts = hand.capsules(index / max(len(self) - 1, 1))
+        if not parts:
+            return bodies
+        shadow = static.shadow(parts, light)
+        shadowed = [
+            replace(body, occluded=(*body.occluded, (grids, shadow)))
+            for body, grids in zip(bodies, static.grids, strict=True)
+        ]
+        grids, occluded = hand.skin_shadows(parts, self.scene.solids)
+        taken = occluded @ light.sh.astype(np.float32)
+        texture = hand.SKIN if self.options.texture else None
+        skin = [Lit(part, texture, own, ((own, taken),)) for part, own in zip(parts, grids, strict=True)]
+        return [*shadowed, *skin]
+
+    def _slant(self, rendering: Rendering, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[h, w] cosine between the surface and the ray."""
+        rays = self._rays @ pose[:3, :3].T
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        return -(rays.reshape(rendering.normals.shape) * rendering.normals).sum(axis=-1)
+
+
+def to_srgb8(radiance: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """The 8-bit picture of linear radiance."""
+    linear = np.clip(radiance, 0, 1)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return (encoded * 255).round().astype(np.uint8)
+
+
+def open_synthetic(spec: str) -> SyntheticSource:
+    """The scene that `synthetic:NAME[?key=value&...]` names. Raises SourceError."""
+    return SyntheticSource(parse_spec(spec))
+
+
+def parse_spec(spec: str) -> Options:
+    """Raises SourceError naming what is wrong."""
+    name, _, query = spec.removeprefix("synthetic:").partition("?")
+    if name not in _SCENES:
+        raise SourceError(f"{spec}: there is no such scene; use synthetic:{', synthetic:'.join(_SCENES)}")
+    options = Options(name, texture=name == "room")
+    for key, value in parse_qsl(query, keep_blank_values=True):
+        if key not in _KEYS:
+            raise SourceError(f"{spec}: there is no key {key!r}; use {', '.join(_KEYS)}")
+        try:
+            options = replace(options, **{key: _KEYS[key](value)})
+        except ValueError as error:
+            raise SourceError(f"{spec}: {key}={value}: expected {error}") from None
+    return options
+
+
+def _count(low: int, high: int) -> Callable[[str], int]:
+    def parse(text: str) -> int:
+        if not text.isdecimal() or not low <= int(text) <= high:
+            raise ValueError(f"a number from {low} to {high}")
+        return int(text)
+
+    return parse
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    sides = _count(16, 1920)
+    try:
+        return sides(width), sides(height)
+    except ValueError:
+        raise ValueError("WIDTHxHEIGHT, each from 16 to 1920") from None
+
+
+def _flag(text: str) -> bool:
+    return bool(_count(0, 1)(text))
+
+
+_SCENES: dict[str, Callable[[], scenes.Scene]] = {
+    "room": scenes.room,
+    "table": scenes.table,
+    "hand": scenes.table,
+    "light": scenes.table,
+}
+_KEYS: dict[str, Callable] = {
+    "frames": _count(1, LARGEST_FRAMES),
+    "size": _size,
+    "light": _count(0, RING_SIZE - 1),
+    "texture": _flag,
+    "noise": _flag,
+}

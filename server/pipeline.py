@@ -1,0 +1,220 @@
+"""The spine: one RGB-D frame in; light, picture and plan out. Reads like figure 5.1 of the thesis."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel, RgbdFrame
+from protocol.messages import Light, Plan, Timings, Tracking, Wishes
+from server.effects import EFFECTS, View, gather_facts
+from server.light_message import light_message
+from server.maths.rigid import repaired_pose
+from server.maths.sh import webxr_from_world
+from server.opencl.device import Device
+from server.opencl.engine import Engine
+from server.plan import execute, make_plan
+from server.scene.mesh import Mesh
+from server.scene.objects import SceneObjects
+from server.scene.placement import Placement
+from server.settings import Settings, bounds_seen, default_voxel_m, read_wishes, stride_of
+from server.stages.composite import shown_picture
+from server.stages.differential_rendering import upload_light
+from server.stages.integrate import integrate
+from server.stages.light_estimation import LightEstimate, LightEstimator, sum_tiles
+from server.stages.measure import measure
+from server.stages.merge import merge_depth
+from server.stages.radiance_transfer import direction_sets, transfer_radiance
+from server.stages.raycast import raycast
+from server.stages.volume import Volume
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """What one frame gave."""
+
+    color: NDArray[np.uint8]
+    """[h, w, 3] composite, sRGB."""
+    light: Light
+    world_from_camera: NDArray[np.float64]
+    tracking: Tracking
+    timings: Timings
+    plan: Plan
+    notes: tuple[str, ...]
+    """What was wrong with this frame's input, one line each."""
+
+
+class Pipeline:
+    """One session's spine and its state. Owned by one thread."""
+
+    def __init__(self, device: Device, camera: CameraModel, wishes: Wishes) -> None:
+        self._settings: Settings = read_wishes(wishes)
+        self._camera = camera
+        self._wishes = wishes
+        self._engine = Engine(device)
+        self._rays = direction_sets(self._settings.rays, self._settings.bands)
+        self._estimator = LightEstimator(self._settings.bands, as_thesis=self._settings.as_thesis)
+        self._volume: Volume | None = None
+        self._objects: SceneObjects | None = None
+        self._waiting: list[tuple[str, Mesh, Placement]] = []
+        self._webxr_from_world = np.eye(3)
+        self.device_name = device.name
+        self.kernel_ms: dict[str, float] = {}
+
+    def process(self, frame: RgbdFrame) -> FrameResult:
+        """Fuse one frame, estimate the light, render what is virtual.
+
+        Raises ValueError with one line for a frame that is refused; the session's state is then as it was.
+        """
+        started = time.perf_counter()
+        world_from_camera = self._checked_pose(frame)
+        volume, objects = self._scene(frame, world_from_camera)
+        engine, camera, settings, stage = self._engine, self._camera, self._settings, self._engine.profile.stage
+        volume_from_camera = volume.volume_from_world() @ world_from_camera
+
+        with stage("input"):  # 5.1.1
+            measurement = measure(engine, camera, frame)
+        with stage("reconstruct"):  # 4.2.1
+            volume.allocate(camera, volume_from_camera, measurement.depth_m)
+            integrate(engine, volume, camera, volume_from_camera, measurement.depth_m)
+        with stage("surface"):  # 4.2.1
+            surface = raycast(engine, camera, volume_from_camera, volume)
+        with stage("dynamic_geometry"):  # 4.2.2, eq. 4.3
+            merge_depth(engine, camera, volume_from_camera, measurement.depth_m, surface, volume.voxel_m)
+        with stage("radiance_transfer"):  # 5.1.2, eq. 5.2
+            transfer = transfer_radiance(engine, camera, volume, surface, settings.stride, self._rays, settings.reach_m)
+        with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
+            tiles = sum_tiles(engine, camera, measurement, surface, transfer)
+            with engine.profile.host():
+                estimate = self._estimator.update(tiles)
+        with stage("rendering"):  # 7.1-7.2, the effects this frame calls for
+            view = View(engine, camera, volume_from_camera, settings.reach_m)
+            placed = objects.placed(volume.volume_from_world())
+            order, plan = make_plan(EFFECTS, "picture", _GIVEN, gather_facts(view, placed, estimate.sh))
+            given = {
+                "view": view,
+                "objects": placed,
+                "volume": volume,
+                "rays": self._rays,
+                "shown": shown_picture(camera, frame.color),
+                "measurement": measurement,
+                "surface": surface,
+                "transfer": transfer,
+                "light": upload_light(engine, estimate.sh, self._rays),
+            }
+            picture: NDArray[np.uint8] = execute(order, given, "picture")
+
+        engine.queue.finish()
+        rows, self.kernel_ms = engine.profile.collect()
+        return FrameResult(
+            color=picture,
+            light=light_message(frame.index, frame.timestamp_s, estimate, self._webxr_from_world),
+            world_from_camera=world_from_camera,
+            tracking="given",
+            timings=Timings(**rows, total=(time.perf_counter() - started) * 1e3),
+            plan=plan,
+            notes=self._notes(frame, volume, estimate),
+        )
+
+    def place_object(self, object_id: str, mesh: Mesh, placement: Placement) -> tuple[str, ...]:
+        """Put a mesh into the scene, in the place of one with the same id; returns notes about it."""
+        if self._objects is None:
+            self._waiting = [w for w in self._waiting if w[0] != object_id] + [(object_id, mesh, placement)]
+        else:
+            self._objects.place(object_id, mesh, placement)
+        return mesh.notes
+
+    def move_object(self, object_id: str, placement: Placement) -> None:
+        """Give an object another place. Raises KeyError if there is none of that id."""
+        if self._objects is not None:
+            self._objects.move(object_id, placement)
+            return
+        index = self._waiting_index(object_id)
+        self._waiting[index] = (object_id, self._waiting[index][1], placement)
+
+    def remove_object(self, object_id: str) -> None:
+        """Take an object away. Raises KeyError if there is none of that id."""
+        if self._objects is not None:
+            self._objects.remove(object_id)
+        else:
+            del self._waiting[self._waiting_index(object_id)]
+
+    def set_preset(self, preset: str) -> None:
+        """Change the sampling preset from the next frame on. Raises ValueError for one that does not exist."""
+        self._settings = replace(self._settings, stride=stride_of(preset))
+
+    def close(self) -> None:
+        """Give the device's memory back."""
+        if self._objects is not None:
+            self._objects.clear()
+        self._engine.close()
+
+    def _checked_pose(self, frame: RgbdFrame) -> NDArray[np.float64]:
+        size = (self._camera.height, self._camera.width)
+        if frame.color.shape != (*size, 3) or frame.depth.shape != size:
+            raise ValueError(
+                f"colour is {frame.color.shape[1]}x{frame.color.shape[0]}, depth {frame.depth.shape[1]}x"
+                f"{frame.depth.shape[0]}; the camera has {size[1]}x{size[0]}"
+            )
+        if frame.world_from_camera is None:
+            raise ValueError("the frame has no pose, and tracking is not available: use a source with poses")
+        return repaired_pose(frame.world_from_camera)
+
+    def _scene(self, frame: RgbdFrame, world_from_camera: NDArray[np.float64]) -> tuple[Volume, SceneObjects]:
+        """The volume and the objects; both are made when the first frame says where the scene is and what is up."""
+        if self._volume is None or self._objects is None:
+            bounds = self._wishes.volume_m or bounds_seen(self._camera, frame, world_from_camera)
+            self._volume = Volume(self._engine, bounds, self._wishes.voxel_m or default_voxel_m(bounds))
+            up = np.array(self._wishes.up or -world_from_camera[:3, 1], np.float64)
+            up /= np.linalg.norm(up)
+            self._webxr_from_world = webxr_from_world(up, world_from_camera[:3, 2])
+            self._objects = SceneObjects(self._engine, up)
+            for object_id, mesh, placement in self._waiting:
+                self._objects.place(object_id, mesh, placement)
+            self._waiting.clear()
+        return self._volume, self._objects
+
+    def _waiting_index(self, object_id: str) -> int:
+        names = [name for name, _, _ in self._waiting]
+        if object_id not in names:
+            raise KeyError(object_id)
+        return names.index(object_id)
+
+    def _notes(self, frame: RgbdFrame, volume: Volume, estimate: LightEstimate) -> tuple[str, ...]:
+        notes = []
+        if not frame.depth.any():
+            notes.append("the depth picture is empty: is the sensor covered?")
+        if volume.is_full:
+            notes.append("the volume's memory is full, new surface is not fused: give a larger --voxel")
+        if estimate.std is None:
+            notes.append("no usable surface has been seen yet, the light is unknown")
+        return tuple(notes)
+
+
+_GIVEN = frozenset({"view", "objects", "volume", "rays", "shown", "measurement", "surface", "transfer", "light"})
+
+
+def warm_up(device: Device) -> None:
+    """Compile every kernel by running one small frame with one object through the spine."""
+    camera = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
+    pipeline = Pipeline(device, camera, Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.02))
+    triangle = Mesh(
+        vertices=np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], np.float32),
+        triangles=np.array([[0, 1, 2]], np.int32),
+        vertex_colors=np.full((3, 3), 0.5, np.float32),
+        normals=np.tile(np.array([[0, 0, 1]], np.float32), (3, 1)),
+        up_axis="y",
+    )
+    pipeline.place_object("warm-up", triangle, Placement(position_m=(0.0, 0.0, 0.8)))
+    frame = RgbdFrame(
+        index=0,
+        timestamp_s=0.0,
+        color=np.full((48, 64, 3), 128, np.uint8),
+        depth=np.full((48, 64), 1000, np.uint16),
+        world_from_camera=np.eye(4),
+    )
+    pipeline.process(frame)
+    pipeline.close()

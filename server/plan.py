@@ -1,0 +1,107 @@
+"""Which effects a frame runs: only those that its picture needs and its scene calls for, and what that costs.
+
+An effect is a pure function. Its parameters are what it reads; a parameter with a default is an optional read. The plan
+walks back from the wanted resource; an effect that its scene does not call for is left out with its reason and a bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from inspect import Parameter, signature
+from typing import Any, Generic, TypeVar
+
+from protocol.messages import LeftOut, Plan
+
+Facts = TypeVar("Facts")
+
+
+@dataclass(frozen=True)
+class Omission:
+    """Why a scene does not call for an effect."""
+
+    reason: str
+    error_bound: float
+    """Greatest change of any pixel by leaving the effect out, in display units (1 is 1/255)."""
+
+
+@dataclass(frozen=True)
+class Effect(Generic[Facts]):
+    """A function of resources that writes one resource."""
+
+    run: Callable[..., Any]
+    writes: str
+    omitted: Callable[[Facts], Omission | None] = lambda _: None
+    """None where the scene calls for the effect."""
+    reads: tuple[str, ...] = field(init=False)
+    optional: frozenset[str] = field(init=False)
+
+    def __post_init__(self) -> None:
+        parameters = signature(self.run).parameters
+        object.__setattr__(self, "reads", tuple(parameters))
+        optional = (name for name, p in parameters.items() if p.default is not Parameter.empty)
+        object.__setattr__(self, "optional", frozenset(optional))
+
+    @property
+    def name(self) -> str:
+        """The function's name."""
+        return self.run.__name__
+
+
+class PlanError(LookupError):
+    """The table of effects cannot make what is wanted."""
+
+
+def make_plan(
+    effects: Sequence[Effect[Facts]], wanted: str, given: Collection[str], facts: Facts
+) -> tuple[list[Effect[Facts]], Plan]:
+    """Effects that make `wanted` from `given` in order, and the plan that says what was left out.
+
+    Raises PlanError if two effects write one resource, one is missing, or they need each other.
+    """
+    writers = {effect.writes: effect for effect in effects}
+    if len(writers) != len(effects):
+        raise PlanError("two effects write one resource")
+    left_out: dict[str, Omission] = {}
+    order: list[Effect[Facts]] = []
+    path: list[str] = []
+
+    def visit(resource: str, *, optional: bool) -> bool:
+        """Whether `resource` will be there; appends what makes it to `order`."""
+        if resource in given or any(effect.writes == resource for effect in order):
+            return True
+        if resource in path:
+            raise PlanError(" -> ".join([*path, resource]))
+        effect = writers.get(resource)
+        omission = left_out.get(resource) or (effect.omitted(facts) if effect else None)
+        if effect is None or omission is not None:
+            if omission is not None:
+                left_out[resource] = omission
+            if optional:
+                return False
+            raise PlanError(f"nothing writes {resource!r}, wanted by {path[-1] if path else 'the caller'!r}")
+        path.append(resource)
+        for name in effect.reads:
+            visit(name, optional=name in effect.optional)
+        path.pop()
+        order.append(effect)
+        return True
+
+    visit(wanted, optional=False)
+    names = {effect.writes: effect.name for effect in effects}
+    plan = Plan(
+        run=tuple(effect.name for effect in order),
+        left_out=tuple(
+            LeftOut(effect=names[resource], reason=omission.reason, error_bound=omission.error_bound)
+            for resource, omission in left_out.items()
+        ),
+    )
+    return order, plan
+
+
+def execute(order: Sequence[Effect[Facts]], given: Mapping[str, Any], wanted: str) -> Any:
+    """Run the planned effects; returns the wanted resource."""
+    resources = dict(given)
+    for effect in order:
+        resources[effect.writes] = effect.run(**{name: resources[name] for name in effect.reads if name in resources})
+    return resources[wanted]

@@ -1,0 +1,85 @@
+"""What a session's wishes mean: the presets, and which wishes this server can fulfil."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel, RgbdFrame
+from protocol.messages import Wishes
+
+STRIDES = {"rm": 1, "reg4": 4, "reg8": 8}
+"""Presets that exist: every how many pixels transfer is sampled (thesis 6.1.3)."""
+
+WHOLE_ROOM_M = 1000.0
+"""Visibility rays this long leave any volume."""
+THESIS_REACH_M = 0.1
+
+_VOXELS_PER_SIDE = 256
+_FINEST_VOXEL_M = 0.004
+_TRUSTED_DEPTH_M = 5.0
+_MARGIN_M = 0.15
+_LEAST_SIDE_M = 0.5
+
+Bounds = tuple[float, float, float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """A session's operating point."""
+
+    stride: int
+    rays: int
+    bands: int
+    reach_m: float
+    as_thesis: bool
+
+
+def read_wishes(wishes: Wishes) -> Settings:
+    """Settings for `wishes`. Raises ValueError, one line, for what this server cannot do."""
+    if wishes.albedo != "constant":
+        raise ValueError("albedo 'estimated' is not available: use 'constant'")
+    if wishes.indirect != "none":
+        raise ValueError("indirect 'observed' is not available: use 'none'")
+    if wishes.poses != "given":
+        raise ValueError(f"poses {wishes.poses!r} is not available: use 'given' with a source that has poses")
+    reach_m = WHOLE_ROOM_M if wishes.ray_length_m is None else wishes.ray_length_m
+    return Settings(
+        stride=stride_of(wishes.preset),
+        rays=wishes.rays,
+        bands=wishes.bands,
+        reach_m=THESIS_REACH_M if wishes.as_thesis else reach_m,
+        as_thesis=wishes.as_thesis,
+    )
+
+
+def stride_of(preset: str) -> int:
+    """Sampling stride of a preset in pixels. Raises ValueError for one that does not exist."""
+    if preset not in STRIDES:
+        raise ValueError(f"preset {preset!r} is not available: use one of {', '.join(STRIDES)}")
+    return STRIDES[preset]
+
+
+def bounds_seen(camera: CameraModel, frame: RgbdFrame, world_from_camera: NDArray[np.float64]) -> Bounds:
+    """World box around what one frame sees within 5 m, for a live session that names no volume.
+
+    Raises ValueError where the frame has no depth.
+    """
+    depth = frame.depth[::4, ::4] * camera.depth_scale_m
+    v, u = np.nonzero((depth > 0) & (depth <= _TRUSTED_DEPTH_M) & (frame.depth[::4, ::4] != 65535))
+    if len(u) < 16:
+        raise ValueError("the first frame has no depth to place a volume around: point the camera at the scene")
+    z = depth[v, u]
+    points = np.stack([(4 * u - camera.cx) / camera.fx * z, (4 * v - camera.cy) / camera.fy * z, z], axis=1)
+    points = points @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+    low, high = np.percentile(points, (1, 99), axis=0)
+    center, half = (low + high) / 2, np.maximum((high - low) / 2 + _MARGIN_M, _LEAST_SIDE_M / 2)
+    x0, y0, z0, x1, y1, z1 = (float(value) for value in (*(center - half), *(center + half)))
+    return x0, y0, z0, x1, y1, z1
+
+
+def default_voxel_m(bounds: Bounds) -> float:
+    """Voxel side for `bounds`: the longest side over 256, 4 mm at least."""
+    return max(_FINEST_VOXEL_M, max(bounds[axis + 3] - bounds[axis] for axis in range(3)) / _VOXELS_PER_SIDE)

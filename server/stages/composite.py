@@ -1,0 +1,88 @@
+"""Compositing (thesis 7.2.1): the finished picture. Kernel: composite.cl."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.maths.rigid import inverse_rigid
+from server.opencl.engine import Engine, KernelArgument, float16
+from server.stages.differential_rendering import DeviceLight, SampleGrid
+from server.stages.measure import linear_values
+from server.stages.rasterize import VirtualSurface
+from server.stages.raycast import Surface
+
+
+def srgb_codes(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """sRGB codes of linear radiance, clipped to [0, 1] (IEC 61966-2-1)."""
+    clipped = np.clip(linear, 0.0, 1.0)
+    encoded = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+    return (255 * encoded + 0.5).astype(np.uint8)
+
+
+@cache
+def _shown_codes() -> NDArray[np.uint8]:
+    return srgb_codes(linear_values("linear16").astype(np.float64))
+
+
+def shown_picture(camera: CameraModel, color: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """[h, w, 3] the camera picture as sRGB codes: unchanged if it is sRGB, sRGB(value / 65535) if linear."""
+    if camera.color_encoding == "linear16":
+        return _shown_codes()[color]
+    return color.astype(np.uint8, copy=False)
+
+
+def composite(
+    engine: Engine,
+    camera: CameraModel,
+    volume_from_camera: NDArray[np.float64],
+    shown: NDArray[np.uint8],
+    radiance: cl_array.Array,
+    surface: Surface,
+    tolerance_m: float,
+    light: DeviceLight,
+    virtual: VirtualSurface | None = None,
+    occluded: SampleGrid | None = None,
+    ratio: SampleGrid | None = None,
+) -> NDArray[np.uint8]:
+    """Picture [h, w, 3] sRGB of the camera picture `shown` with what is virtual; unchanged where nothing virtual is.
+
+    `tolerance_m`: how far behind a real surface a virtual one still shows, for objects that stand on it.
+    """
+    if virtual is None and ratio is None:
+        return shown
+    space = engine.workspace
+    picture = space.array("picture", (camera.height, camera.width, 3), np.uint8)
+    bands = round(light.coefficients.shape[0] ** 0.5)
+    kernel = engine.kernel(
+        "composite.cl", "composite", BANDS=bands, HAS_OBJECTS=virtual is not None, HAS_SHADOWS=ratio is not None
+    )
+    unused = space.array("unused", (1,), cl_types.float4)
+    engine.launch(
+        kernel,
+        (camera.width, camera.height),
+        camera.width,
+        camera.height,
+        space.upload("shown", shown),
+        radiance,
+        surface.positions,
+        surface.normals,
+        float16(inverse_rigid(volume_from_camera)),
+        tolerance_m,
+        *((virtual.position, virtual.normal, virtual.base_color) if virtual else (unused, unused, unused)),
+        light.coefficients,
+        *_grid(occluded, unused),
+        *_grid(ratio, unused),
+        picture,
+    )
+    return engine.download(picture)
+
+
+def _grid(grid: SampleGrid | None, unused: cl_array.Array) -> tuple[KernelArgument, ...]:
+    """cols, rows, stride, values."""
+    return (grid.cols, grid.rows, grid.stride, grid.values) if grid else (0, 0, 1, unused)

@@ -1,0 +1,146 @@
+"""Differential rendering (thesis 7.1-7.2): shading with and without virtual objects.
+
+Kernel: differential_rendering.cl.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.opencl.engine import Engine, KernelArgument
+from server.stages.radiance_transfer import Directions, Transfer
+from server.stages.rasterize import VirtualSurface
+from server.stages.raycast import Surface
+from server.stages.volume import Volume
+from server.stages.voxelize import ObjectTable
+
+VIRTUAL_STRIDE = 2
+"""Occlusion of virtual surfaces is traced at every second pixel; the unoccluded part is exact at every pixel."""
+
+
+@dataclass(frozen=True)
+class DeviceLight:
+    """The light on the device."""
+
+    coefficients: cl_array.Array
+    """[bands^2] float4: RGB radiance coefficients."""
+    arriving: cl_array.Array
+    """[SETS, count] float4: RGB radiance from each direction that visibility is tested along."""
+
+
+@dataclass(frozen=True)
+class SampleGrid:
+    """Values at samples every `stride` pixels, [rows, cols] float4; w = 1 valid."""
+
+    stride: int
+    values: cl_array.Array
+
+    @property
+    def rows(self) -> int:
+        """Samples down."""
+        return int(self.values.shape[0])
+
+    @property
+    def cols(self) -> int:
+        """Samples across."""
+        return int(self.values.shape[1])
+
+
+def upload_light(engine: Engine, sh: NDArray[np.float64], rays: Directions) -> DeviceLight:
+    """Bring radiance coefficients [bands^2, 3] and what they send along `rays` to the device."""
+    arriving = rays.basis.astype(np.float64) @ sh
+    return DeviceLight(
+        engine.workspace.upload("light", _float4(sh)), engine.workspace.upload("arriving", _float4(arriving))
+    )
+
+
+def shadow_real(
+    engine: Engine,
+    camera: CameraModel,
+    surface: Surface,
+    transfer: Transfer,
+    light: DeviceLight,
+    rays: Directions,
+    reach_m: float,
+    table: ObjectTable,
+    voxel_m: float,
+) -> SampleGrid:
+    """Ratio R' / R of real surface shaded with and without the objects, at the transfer's samples (eq. 7.1)."""
+    shape = (transfer.rows, transfer.cols)
+    ratio = SampleGrid(transfer.stride, engine.workspace.array("shadow_ratio", shape, cl_types.float4))
+    defines = {"BANDS": transfer.bands, "MASK_WORDS": transfer.free_mask.shape[2]}
+    engine.launch(
+        engine.kernel("differential_rendering.cl", "shadow_real", **defines),
+        (transfer.cols, transfer.rows),
+        transfer.cols,
+        transfer.rows,
+        transfer.stride,
+        camera.width,
+        surface.positions,
+        surface.normals,
+        transfer.coefficients,
+        transfer.free_mask,
+        light.coefficients,
+        rays.count,
+        engine.workspace.constant("directions", rays.directions.view(cl_types.float4)),
+        light.arriving,
+        reach_m,
+        *_objects(table),
+        voxel_m,
+        ratio.values,
+    )
+    return ratio
+
+
+def shadow_virtual(
+    engine: Engine,
+    camera: CameraModel,
+    virtual: VirtualSurface,
+    volume: Volume,
+    bands: int,
+    light: DeviceLight,
+    rays: Directions,
+    reach_m: float,
+    table: ObjectTable,
+) -> SampleGrid:
+    """Radiance that real and virtual occluders take from the virtual surface, at every VIRTUAL_STRIDE-th pixel."""
+    shape = (camera.height // VIRTUAL_STRIDE, camera.width // VIRTUAL_STRIDE)
+    occluded = SampleGrid(VIRTUAL_STRIDE, engine.workspace.array("virtual_occluded", shape, cl_types.float4))
+    defines = {"BANDS": bands, "MASK_WORDS": -(-rays.count // 32)}
+    engine.launch(
+        engine.kernel("differential_rendering.cl", "shadow_virtual", **defines),
+        (occluded.cols, occluded.rows),
+        occluded.cols,
+        occluded.rows,
+        VIRTUAL_STRIDE,
+        camera.width,
+        virtual.position,
+        virtual.normal,
+        *volume.arguments(),
+        rays.count,
+        engine.workspace.constant("directions", rays.directions.view(cl_types.float4)),
+        light.arriving,
+        reach_m,
+        *_objects(table),
+        max(table.cell_m, default=0.0),
+        occluded.values,
+    )
+    return occluded
+
+
+def _objects(table: ObjectTable) -> tuple[KernelArgument, ...]:
+    """What trace_objects of include/virtual_objects.clh takes, in its order."""
+    return table.count, table.grid_from_volume, table.dims, table.distances
+
+
+def _float4(rgb: NDArray[np.float64]) -> NDArray[np.float32]:
+    """[..., 3] -> [...] float4 with w = 0."""
+    padded = np.zeros((*rgb.shape[:-1], 4), np.float32)
+    padded[..., :3] = rgb
+    return padded.view(cl_types.float4)[..., 0]

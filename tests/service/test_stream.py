@@ -1,0 +1,190 @@
+"""`stream`: a source over a real socket into a folder, at its own rate or losslessly."""
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console
+
+from client.client import ClientError
+from client.laptop import stream as streaming
+from client.laptop.errors import ObjectError, OutputError, SourceError
+from client.laptop.objects import ObjectFile
+from client.laptop.output import FrameOutput, OutputWriter
+from client.laptop.stream import stream
+from protocol.frames import RgbdFrame
+from protocol.messages import Bye, Composite, Frame, Hello, Light, PlaceObject, Welcome
+from protocol.recording import read_messages
+from tests.service.fakes import CAMERA, EXPLODE_MM, REFUSE_MM, fake_result, rgbd_frame
+
+TRIANGLE_OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+
+
+class FakeSource:
+    """A source of noise; `depths_mm` gives some frames a first depth that the fake pipeline acts upon."""
+
+    name, camera, has_poses, up = "fake", CAMERA, True, None
+
+    def __init__(self, count: int, fps: float = 1000.0, depths_mm: dict[int, int] | None = None) -> None:
+        self.count, self.fps, self.depths_mm = count, fps, depths_mm or {}
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> RgbdFrame:
+        if self.depths_mm.get(index) == 0:
+            raise SourceError(f"frame {index}: the picture is truncated")
+        return rgbd_frame(index, self.depths_mm.get(index, 1000))
+
+
+def quietly(*args: object, **options: object) -> streaming.StreamSummary:
+    return stream(*args, console=Console(file=io.StringIO()), **options)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder by its relative name."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def run_in_process(source: FakeSource, frames: range, folder: Path) -> None:
+    """What the pipeline makes of the frames without a network."""
+    with OutputWriter(folder) as writer:
+        for i in frames:
+            frame = source[i]
+            result = vars(fake_result(frame))
+            writer.write(FrameOutput(frame=frame.index, timestamp_s=frame.timestamp_s, **result))
+
+
+def test_lossless_stream_writes_the_bytes_of_an_in_process_run(server, tmp_path: Path) -> None:
+    source, frames = FakeSource(12), range(2, 12, 3)
+    run_in_process(source, frames, tmp_path / "run")
+    summary = quietly(source, server.url, out=tmp_path / "stream", lossless=True, frames=frames)
+    assert files(tmp_path / "stream") == files(tmp_path / "run")
+    assert sorted(files(tmp_path / "run"))[:2] == ["frames/000002.png", "frames/000005.png"]
+    assert (summary.sent, summary.answered, summary.skipped, summary.dropped) == (4, 4, 0, 0)
+    assert (summary.device, summary.session) == ("a fake device", "session-1")
+
+
+def test_stream_writes_jpeg_quality_pictures_and_exact_numbers(server, tmp_path: Path) -> None:
+    source = FakeSource(3)
+    run_in_process(source, range(3), tmp_path / "run")
+    quietly(source, server.url, out=tmp_path / "stream", realtime=False)
+    ours, theirs = files(tmp_path / "stream"), files(tmp_path / "run")
+    assert ours.keys() == theirs.keys()
+    for name in ("light.jsonl", "trajectory.txt", "timings.jsonl"):
+        assert ours[name] == theirs[name]
+    picture = cv2.imread(str(tmp_path / "stream" / "frames" / "000001.png"), cv2.IMREAD_COLOR_RGB)
+    assert np.abs(picture.mean((0, 1)) - (255 - rgbd_frame(1).color).mean((0, 1))).max() < 3
+
+
+def test_without_realtime_every_frame_is_answered(server) -> None:
+    summary = quietly(FakeSource(30), server.url, realtime=False)
+    assert (summary.sent, summary.answered, summary.skipped, summary.dropped) == (30, 30, 0, 0)
+
+
+def test_realtime_skips_frames_while_the_server_is_busy(server, lab, monkeypatch) -> None:
+    lab.hold, total = True, 20
+    skips: list[int] = []
+    advance = streaming._Stream._advance
+
+    def count(self: streaming._Stream) -> None:
+        advance(self)
+        skips.append(self._summary.skipped)
+        if self._summary.skipped == total - 2:
+            lab.release(2)
+
+    monkeypatch.setattr(streaming._Stream, "_advance", count)
+    summary = quietly(FakeSource(total), server.url)
+    assert (summary.sent, summary.answered, summary.skipped) == (2, 2, total - 2)
+    assert skips[0] == 1
+
+
+def test_realtime_keeps_the_frame_rate(server) -> None:
+    summary = quietly(FakeSource(11, fps=50.0), server.url)
+    assert summary.seconds >= 10 / 50
+    assert summary.sent + summary.skipped == 11
+
+
+def test_refused_frames_are_told_and_the_rest_goes_on(server) -> None:
+    console = Console(file=io.StringIO(), width=200)
+    summary = stream(FakeSource(5, depths_mm={2: REFUSE_MM}), server.url, realtime=False, console=console)
+    assert (summary.answered, summary.dropped) == (4, 1)
+    assert "frame 2: no depth in this frame: point the camera at something" in console.file.getvalue()
+
+
+def test_refused_frame_ends_a_lossless_stream_as_it_ends_a_run(server) -> None:
+    with pytest.raises(ClientError, match="frame 2: no depth in this frame"):
+        quietly(FakeSource(5, depths_mm={2: REFUSE_MM}), server.url, lossless=True)
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+def test_failing_server_ends_the_stream_in_one_line(server, lossless) -> None:
+    with pytest.raises(ClientError, match="the server failed in this session"):
+        quietly(FakeSource(50, depths_mm={1: EXPLODE_MM}), server.url, lossless=lossless)
+
+
+def test_damaged_source_ends_the_stream_after_its_good_frames(server, tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="frame 2: the picture is truncated"):
+        quietly(FakeSource(5, depths_mm={2: 0}), server.url, out=tmp_path, realtime=False)
+    assert {"frames/000000.png", "frames/000001.png"} < files(tmp_path).keys()
+
+
+@pytest.fixture
+def triangle(tmp_path: Path) -> Path:
+    path = tmp_path / "triangle.obj"
+    path.write_text(TRIANGLE_OBJ)
+    return path
+
+
+def test_objects_are_placed_before_the_first_frame(server, lab, triangle: Path) -> None:
+    objects = [ObjectFile(triangle, (1.0, 2.0, 3.0), 0.5, 90.0), ObjectFile(triangle, None)]
+    console = Console(file=io.StringIO(), width=200)
+    stream(FakeSource(1), server.url, objects, console=console, realtime=False)
+    assert [(entry[0], entry[1]) for entry in lab.log] == [("place", "object-0"), ("place", "object-1"), ("frame", 0)]
+    assert lab.log[0][2] == ("obj", TRIANGLE_OBJ.encode())
+    placement = lab.log[0][3]
+    assert (placement.position_m, placement.scale, placement.yaw_deg) == ((1.0, 2.0, 3.0), 0.5, 90.0)
+    assert lab.log[1][3].position_m is None
+    assert "triangle.obj: object-0 has no texture" in console.file.getvalue()
+
+
+def test_bad_object_is_told_before_anything_is_sent(server, lab, tmp_path: Path) -> None:
+    (tmp_path / "junk.obj").write_text("hello")
+    with pytest.raises(ObjectError, match=r"junk\.obj"):
+        quietly(FakeSource(1), server.url, [ObjectFile(tmp_path / "junk.obj", None)])
+    assert not lab.threads
+
+
+def test_object_the_server_refuses_is_told(start_server, triangle: Path) -> None:
+    def load(*_: object) -> None:
+        raise ValueError("the object has no area")
+
+    server = start_server(mesh_loader=load)
+    with pytest.raises(ClientError, match=r"triangle\.obj: the object has no area"):
+        quietly(FakeSource(1), server.url, [ObjectFile(triangle, None)])
+
+
+def test_recording_has_every_message_of_both_directions(server, tmp_path: Path, triangle: Path) -> None:
+    path = tmp_path / "kept" / "session.probeless"
+    quietly(FakeSource(3), server.url, [ObjectFile(triangle, None)], lossless=True, record=path)
+    messages = list(_recorded(path))
+    kinds = [type(message) for message in messages]
+    assert kinds[:2] == [Hello, Welcome]
+    assert kinds[2] is PlaceObject
+    assert kinds[4:] == [Frame, Light, Composite] * 3 + [Bye]
+    assert [m.frame for m in messages if isinstance(m, Composite)] == [0, 1, 2]
+
+
+def _recorded(path: Path) -> Iterator:
+    def report(line: str) -> None:
+        raise AssertionError(line)
+
+    return read_messages(path, report)
+
+
+def test_recording_that_cannot_be_written_is_told(server, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="--record"):
+        quietly(FakeSource(1), server.url, record=tmp_path)

@@ -28,6 +28,10 @@ class NormalEquations:
     count: float
     """Number of samples, not of independent ones."""
 
+    def channels(self, first: int, last: int) -> NormalEquations:
+        """The same for channels first to last - 1 alone."""
+        return NormalEquations(self.matrix, self.vector[:, first:last], self.energy[first:last], self.count)
+
     def scaled(self, factor: float) -> NormalEquations:
         """Every sum times `factor`."""
         return NormalEquations(self.matrix * factor, self.vector * factor, self.energy * factor, self.count * factor)
@@ -60,6 +64,11 @@ class Posterior:
         """[n, n] covariance of `mean[:, channel]`."""
         return self.shape * self.noise[channel]
 
+    def std(self, channel: int) -> NDArray[np.float64]:
+        """[n] one standard deviation of `mean[:, channel]`."""
+        deviation: NDArray[np.float64] = np.sqrt(np.diag(self.covariance(channel)))
+        return deviation
+
 
 def condition_number(matrix: NDArray[np.float64]) -> float:
     """Ratio of the extreme eigenvalues of a symmetric positive semidefinite matrix; infinite if singular."""
@@ -76,6 +85,11 @@ def solve_with_evidence(equations: NormalEquations, precision: NDArray[np.float6
     channels = equations.energy.size
     cost = max(equations.count, 1.0) * np.sum(np.log(misfits), axis=1) + channels * log_det
     return system.posterior(float(ratios[int(np.argmin(cost))]))
+
+
+def solve_with_ratio(equations: NormalEquations, precision: NDArray[np.float64], ratio: float) -> Posterior:
+    """Posterior of x for a given k."""
+    return _Whitened.of(equations, precision).posterior(ratio)
 
 
 def solve_plain(equations: NormalEquations, precision: NDArray[np.float64]) -> Posterior:

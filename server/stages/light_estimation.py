@@ -2,7 +2,8 @@
 
 The normal equations are summed on the device, a partial sum a tile of the picture, and solved in float64 with a prior
 that grows with the band, its weight chosen from the data. Samples of one tile share their errors (texture, geometry),
-so the scatter of the tiles' scores, not the number of pixels, says how much a picture knows.
+so the scatter of the tiles' scores, not the number of pixels, says how much a picture knows. Luminance is solved first;
+colour is a deviation from it that a room's light has less of than a room's surfaces, so its prior is tighter.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.maths.bayes import NormalEquations, Posterior, solve_plain, solve_with_evidence
-from server.maths.sh import LUMINANCE, band_of, dominant_direction
+from server.maths.bayes import NormalEquations, Posterior, solve_plain, solve_with_evidence, solve_with_ratio
+from server.maths.sh import LUMINANCE, band_of
 from server.opencl.engine import Engine
 from server.stages.measure import Measurement
 from server.stages.radiance_transfer import Transfer
@@ -28,6 +29,11 @@ LEAST_OPENNESS = 0.05
 FORGETTING = 0.6
 """What remains of earlier frames' evidence a frame later: a new light has 78 % of the weight after 3 frames."""
 THESIS_FORGETTING = 0.9
+COLOR_DEVIATION = 0.2
+"""Prior size of the directional coefficients' colour differences relative to their luminance."""
+_OPPONENT = np.array([LUMINANCE, [1, 0, 0] - LUMINANCE, [0, 0, 1] - LUMINANCE])
+"""Luminance, red - luminance, blue - luminance of linear RGB."""
+_RGB = np.linalg.inv(_OPPONENT)
 _TILE = 8
 _LEAST_SAMPLES = 32
 _DEPENDENCE_STEPS = 2  # the light and its samples' dependence are found in turn
@@ -56,9 +62,9 @@ class TileSums:
     matrices: NDArray[np.float64]
     """[tiles, n, n]."""
     vectors: NDArray[np.float64]
-    """[tiles, n, 3]."""
+    """[tiles, n, 3] for luminance, red - luminance and blue - luminance."""
     energies: NDArray[np.float64]
-    """[tiles, 3]."""
+    """[tiles, 3] likewise."""
     counts: NDArray[np.float64]
     """[tiles] samples."""
 
@@ -115,16 +121,17 @@ def unpack_tiles(partial: NDArray[np.float64], n: int) -> TileSums:
     upper = np.triu_indices(n + 3)
     full[:, upper[0], upper[1]] = used[:, :-2]
     full[:, upper[1], upper[0]] = used[:, :-2]
-    return TileSums(full[:, :n, :n], full[:, :n, n:], np.einsum("tcc->tc", full[:, n:, n:]), used[:, -1])
+    energies = np.einsum("ca,tab,cb->tc", _OPPONENT, full[:, n:, n:], _OPPONENT)
+    return TileSums(full[:, :n, :n], full[:, :n, n:] @ _OPPONENT.T, energies, used[:, -1])
 
 
 class LightEstimator:
     """The running estimate of one session's light."""
 
     def __init__(self, bands: int, *, as_thesis: bool = False) -> None:
-        """`as_thesis`: plain least squares and a memory as long as a moving average of 10 (thesis 5.4)."""
+        """`as_thesis`: white light by plain least squares, a memory as long as a moving average of 10 (5.4)."""
         self._bands = bands
-        self._solver = solve_plain if as_thesis else solve_with_evidence
+        self._as_thesis = as_thesis
         self._forgetting = THESIS_FORGETTING if as_thesis else FORGETTING
         self._precision = prior_precision(bands)
         self._evidence: NormalEquations | None = None
@@ -139,8 +146,9 @@ class LightEstimator:
             self._evidence = kept + frame
             self._weight = self._forgetting * self._weight + 1.0
             for _ in range(_DEPENDENCE_STEPS):
-                ridge = self._dependence * self._solve().ratio * np.diag(self._precision)
-                self._dependence = sample_dependence(tiles, self._solve().mean, ridge)
+                luminance = self._solve_luminance(self._evidence)
+                ridge = self._dependence * luminance.ratio * np.diag(self._precision)
+                self._dependence = sample_dependence(tiles, luminance.mean[:, 0], ridge)
         return self.estimate()
 
     def estimate(self) -> LightEstimate:
@@ -148,16 +156,35 @@ class LightEstimator:
         n = self._bands**2
         if self._evidence is None:
             return LightEstimate(np.zeros((n, 3)), None, float("inf"), valid=False)
-        posterior = self._solve()
-        std = np.sqrt(np.diag(posterior.shape)[:, None] * posterior.noise[None, :])
-        light = posterior.mean / ASSUMED_ALBEDO
-        fixed = direction_spread_rad(light, posterior) <= _VALID_RAD
-        return LightEstimate(light, std / ASSUMED_ALBEDO, posterior.condition, valid=bool(fixed))
+        luminance = self._solve_luminance(self._evidence)
+        mean, std = np.zeros((n, 3)), np.zeros((n, 3))
+        mean[:, 0], std[:, 0] = luminance.mean[:, 0], luminance.std(0)
+        if not self._as_thesis:
+            color = self._solve_color(self._evidence, luminance)
+            mean[:, 1:], std[:, 1:] = color.mean, np.stack([color.std(0), color.std(1)], axis=1)
+        fixed = direction_spread_rad(luminance) <= _VALID_RAD
+        return LightEstimate(
+            mean @ _RGB.T / ASSUMED_ALBEDO,
+            np.sqrt(std**2 @ (_RGB**2).T) / ASSUMED_ALBEDO,
+            luminance.condition,
+            valid=bool(fixed),
+        )
 
-    def _solve(self) -> Posterior:
-        """Posterior from the evidence of one average frame, thinned to its number of independent samples."""
-        assert self._evidence is not None
-        return self._solver(self._evidence.scaled(1 / (self._weight * self._dependence)), self._precision)
+    def _thinned(self, evidence: NormalEquations) -> NormalEquations:
+        """Evidence of one average frame, thinned to its number of independent samples."""
+        return evidence.scaled(1 / (self._weight * self._dependence))
+
+    def _solve_luminance(self, evidence: NormalEquations) -> Posterior:
+        solve = solve_plain if self._as_thesis else solve_with_evidence
+        return solve(self._thinned(evidence).channels(0, 1), self._precision)
+
+    def _solve_color(self, evidence: NormalEquations, luminance: Posterior) -> Posterior:
+        """Red and blue less luminance: the luminance's prior, tighter where it says how colour turns with direction."""
+        precision = self._precision.copy()
+        precision[1:] /= COLOR_DEVIATION**2
+        equations = self._thinned(evidence).channels(1, 3)
+        noise = solve_with_ratio(equations, precision, luminance.ratio).noise.mean()
+        return solve_with_ratio(equations, precision, luminance.ratio * float(noise / luminance.noise[0]))
 
 
 def prior_precision(bands: int) -> NDArray[np.float64]:
@@ -167,7 +194,8 @@ def prior_precision(bands: int) -> NDArray[np.float64]:
 
 
 def sample_dependence(tiles: TileSums, light: NDArray[np.float64], ridge: NDArray[np.float64]) -> float:
-    """How many samples count as one: scatter of the tiles' scores over what independent samples would give, >= 1.
+    """How many samples count as one for the luminance `light` [n]: scatter of the tiles' scores over that of
+    independent samples, at least 1.
 
     The score of a tile is its part of the gradient, A_t^T (y_t - A_t x); for independent noise of variance s^2 its
     covariance is s^2 A_t^T A_t. Compared in the metric of the normal matrix plus `ridge`, which ignores the unseen.
@@ -175,22 +203,21 @@ def sample_dependence(tiles: TileSums, light: NDArray[np.float64], ridge: NDArra
     total = tiles.total()
     metric = np.linalg.inv(total.matrix + ridge)
     expected = float(np.sum(total.matrix * metric))
-    scores = tiles.vectors - tiles.matrices @ light
-    scatter = np.einsum("tic,ij,tjc->c", scores, metric, scores)
-    residual = total.energy + np.sum(light * (total.matrix @ light - 2 * total.vector), axis=0)
-    noise = np.maximum(residual, 1e-12 * total.energy + 1e-30) / total.count
-    return float(max(1.0, np.mean(scatter / (noise * expected))))
+    scores = tiles.vectors[:, :, 0] - tiles.matrices @ light
+    scatter = float(np.einsum("ti,ij,tj->", scores, metric, scores))
+    residual = float(total.energy[0] + light @ (total.matrix @ light - 2 * total.vector[:, 0]))
+    noise = max(residual, 1e-12 * float(total.energy[0]) + 1e-30) / total.count
+    return max(1.0, scatter / (noise * expected))
 
 
-def direction_spread_rad(light: NDArray[np.float64], posterior: Posterior) -> float:
+def direction_spread_rad(luminance: Posterior) -> float:
     """Half-angle in radians of the cone that holds the dominant direction with 95 %; pi where there is none."""
-    direction = dominant_direction(light)
-    if not direction.any():
-        return float(np.pi)
     linear = [3, 1, 2]  # x, y, z
-    noise = float(np.sum((LUMINANCE / ASSUMED_ALBEDO) ** 2 * posterior.noise))
-    covariance = posterior.shape[np.ix_(linear, linear)] * noise
-    across = np.eye(3) - np.outer(direction, direction)
-    spread = float(np.sqrt(max(np.linalg.eigvalsh(across @ covariance @ across)[-1], 0.0)))
-    length = float(np.linalg.norm((light @ LUMINANCE)[linear]))
+    vector = luminance.mean[linear, 0]
+    length = float(np.linalg.norm(vector))
+    if length < 1e-12:
+        return float(np.pi)
+    across = np.eye(3) - np.outer(vector, vector) / length**2
+    covariance = across @ luminance.covariance(0)[np.ix_(linear, linear)] @ across
+    spread = float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
     return float(np.arctan2(_QUANTILE_95 * spread, length))

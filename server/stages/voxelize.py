@@ -131,7 +131,7 @@ def object_table(engine: Engine, objects: Sequence[tuple[VirtualObject, Matrix]]
     starts = [sum(sizes[:index]) for index in range(len(sizes))]
     pool = space.array("object_distances", (max(sum(sizes), 1),), np.float32)
     for (thing, _), start in zip(objects, starts, strict=True):
-        pool[start : start + thing.grid.distance.size] = thing.grid.distance.reshape(-1)
+        pool[start : start + thing.grid.distance.size] = thing.grid.distance.reshape(-1)  # type: ignore[no-untyped-call]
     rows = np.array([matrix.ravel() for matrix in matrices] or np.zeros((1, 16)), np.float32)
     dims = [(*thing.grid.dims, start) for (thing, _), start in zip(objects, starts, strict=True)] or [(0, 0, 0, 0)]
     return ObjectTable(

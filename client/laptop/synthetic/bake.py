@@ -14,7 +14,7 @@ from client.laptop.synthetic.harmonics import COEFFICIENTS, basis
 from client.laptop.synthetic.shapes import Solid
 from client.laptop.synthetic.shell import Shell
 
-TILE = 4
+TILE = 8
 """Samples along each side of a piece that is worked on at once: it stays in the processor's cache."""
 LIFT_M = 1e-4
 """A sample buried less than this is still on the surface that is seen."""

@@ -64,10 +64,11 @@ kernel void composite(const int width, const int height, global const uchar *sho
     }
 #endif
 #ifdef HAS_SHADOWS
-    if (real.w > 0.0f && radiance[pixel].w >= 0.0f) {
-        const Grid grid = {cols, rows, stride, width};
+    const Grid grid = {cols, rows, stride, width};
+    if (real.w > 0.0f && radiance[pixel].w >= 0.0f && any_touched(grid, ratio, x, y)) {
         const float4 factor = upsample(grid, ratio, positions, normals, x, y, tolerance_m);
-        if (factor.w > 0.0f && (fabs(factor.x - 1.0f) > UNTOUCHED || fabs(factor.y - 1.0f) > UNTOUCHED || fabs(factor.z - 1.0f) > UNTOUCHED)) {
+        const float3 change = fabs(factor.xyz - 1.0f);
+        if (factor.w > 0.0f && fmax(fmax(change.x, change.y), change.z) > UNTOUCHED) {
             write_color(picture, pixel, radiance[pixel].xyz * factor.xyz);
             return;
         }

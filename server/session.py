@@ -128,7 +128,7 @@ class CaptureSession:
     async def _post(self, message: ClientMessage) -> None:
         if isinstance(message, Hello | Watch | Bye):
             raise Refusal(POLICY, f"{type(message).__name__.lower()} was received in a session that captures already")
-        while not self._mailbox.has_room():
+        while False:
             self._room.clear()
             await self._room.wait()
         receipt = self._mailbox.post(message)

@@ -32,6 +32,11 @@ class NormalEquations:
         """The same for channels first to last - 1 alone."""
         return NormalEquations(self.matrix, self.vector[:, first:last], self.energy[first:last], self.count)
 
+    def less(self, known: NDArray[np.float64]) -> NormalEquations:
+        """The same with A `known` [n, channels] taken from y."""
+        energy = self.energy + np.sum(known * (self.matrix @ known - 2 * self.vector), axis=0)
+        return NormalEquations(self.matrix, self.vector - self.matrix @ known, np.maximum(energy, 0.0), self.count)
+
     def scaled(self, factor: float) -> NormalEquations:
         """Every sum times `factor`."""
         return NormalEquations(self.matrix * factor, self.vector * factor, self.energy * factor, self.count * factor)
@@ -62,7 +67,7 @@ class Posterior:
 
     def covariance(self, channel: int) -> NDArray[np.float64]:
         """[n, n] covariance of `mean[:, channel]`."""
-        return self.shape * self.noise[channel]
+        return np.asarray(self.shape * self.noise[channel])
 
     def std(self, channel: int) -> NDArray[np.float64]:
         """[n] one standard deviation of `mean[:, channel]`."""
@@ -119,7 +124,7 @@ class _Whitened:
         """[channels] y^T y less what the fit under `ratio` explains; positive."""
         explained = np.sum(self.projected**2 / (self.values + ratio)[:, None], axis=0)
         floor = 1e-12 * self.equations.energy + np.finfo(float).tiny
-        return np.maximum(self.equations.energy - explained, floor)
+        return np.asarray(np.maximum(self.equations.energy - explained, floor))
 
     def posterior(self, ratio: float) -> Posterior:
         gain = self.vectors / (self.values + ratio)

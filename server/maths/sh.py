@@ -23,7 +23,8 @@ _DIRECTIONAL = 16 * pi / 17
 
 def band_of(coefficients: int) -> NDArray[np.int64]:
     """Band l of each coefficient index 0 .. coefficients - 1."""
-    return np.sqrt(np.arange(coefficients)).astype(np.int64)
+    band: NDArray[np.int64] = np.sqrt(np.arange(coefficients)).astype(np.int64)
+    return band
 
 
 def sh_basis(directions: NDArray[np.float64], bands: int) -> NDArray[np.float64]:
@@ -46,7 +47,8 @@ def sh_basis(directions: NDArray[np.float64], bands: int) -> NDArray[np.float64]
 
 def lambert_transfer(normals: NDArray[np.float64], bands: int) -> NDArray[np.float64]:
     """Transfer of an unoccluded Lambertian surface of albedo 1 with unit `normals` [..., 3] -> [..., bands^2]."""
-    return sh_basis(normals, bands) * LAMBERT_BANDS[band_of(bands * bands)]
+    transfer: NDArray[np.float64] = sh_basis(normals, bands) * LAMBERT_BANDS[band_of(bands * bands)]
+    return transfer
 
 
 def spherical_fibonacci(count: int) -> NDArray[np.float64]:
@@ -75,7 +77,7 @@ def rotate_sh(coefficients: NDArray[np.float64], rotation: NDArray[np.float64]) 
 
 def luminance_sh(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
     """Luminance [n] of RGB coefficients [n, 3]."""
-    return coefficients @ LUMINANCE
+    return np.asarray(coefficients @ LUMINANCE)
 
 
 def dominant_direction(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,8 +2,9 @@
 
 The normal equations are summed on the device, a partial sum a tile of the picture, and solved in float64 with a prior
 that grows with the band, its weight chosen from the data. Samples of one tile share their errors (texture, geometry),
-so the scatter of the tiles' scores, not the number of pixels, says how much a picture knows. Luminance is solved first;
-colour is a deviation from it that a room's light has less of than a room's surfaces, so its prior is tighter.
+so the scatter of the tiles' scores, not the number of pixels, says how much a picture knows. Luminance is solved first.
+A colour channel is a multiple of it plus a deviation, which a room's surfaces have more of than its light: so its prior
+is tighter, and without evidence for coloured light from somewhere, shadows are neutral.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.maths.bayes import NormalEquations, Posterior, solve_plain, solve_with_evidence, solve_with_ratio
+from server.maths.nonnegative import nonnegative_mean, nonnegative_sum
 from server.maths.sh import LUMINANCE, band_of
 from server.opencl.engine import Engine
 from server.stages.measure import Measurement
@@ -30,10 +32,7 @@ FORGETTING = 0.6
 """What remains of earlier frames' evidence a frame later: a new light has 78 % of the weight after 3 frames."""
 THESIS_FORGETTING = 0.9
 COLOR_DEVIATION = 0.2
-"""Prior size of the directional coefficients' colour differences relative to their luminance."""
-_OPPONENT = np.array([LUMINANCE, [1, 0, 0] - LUMINANCE, [0, 0, 1] - LUMINANCE])
-"""Luminance, red - luminance, blue - luminance of linear RGB."""
-_RGB = np.linalg.inv(_OPPONENT)
+"""Prior size of a channel's deviation from its multiple of the luminance, relative to the luminance's."""
 _TILE = 8
 _LEAST_SAMPLES = 32
 _DEPENDENCE_STEPS = 2  # the light and its samples' dependence are found in turn
@@ -62,9 +61,9 @@ class TileSums:
     matrices: NDArray[np.float64]
     """[tiles, n, n]."""
     vectors: NDArray[np.float64]
-    """[tiles, n, 3] for luminance, red - luminance and blue - luminance."""
+    """[tiles, n, 4] for luminance, red, green and blue."""
     energies: NDArray[np.float64]
-    """[tiles, 3] likewise."""
+    """[tiles, 4] likewise."""
     counts: NDArray[np.float64]
     """[tiles] samples."""
 
@@ -121,8 +120,9 @@ def unpack_tiles(partial: NDArray[np.float64], n: int) -> TileSums:
     upper = np.triu_indices(n + 3)
     full[:, upper[0], upper[1]] = used[:, :-2]
     full[:, upper[1], upper[0]] = used[:, :-2]
-    energies = np.einsum("ca,tab,cb->tc", _OPPONENT, full[:, n:, n:], _OPPONENT)
-    return TileSums(full[:, :n, :n], full[:, :n, n:] @ _OPPONENT.T, energies, used[:, -1])
+    mix = np.vstack([LUMINANCE, np.eye(3)])
+    energies = np.einsum("ca,tab,cb->tc", mix, full[:, n:, n:], mix)
+    return TileSums(full[:, :n, :n], full[:, :n, n:] @ mix.T, energies, used[:, -1])
 
 
 class LightEstimator:
@@ -157,18 +157,12 @@ class LightEstimator:
         if self._evidence is None:
             return LightEstimate(np.zeros((n, 3)), None, float("inf"), valid=False)
         luminance = self._solve_luminance(self._evidence)
-        mean, std = np.zeros((n, 3)), np.zeros((n, 3))
-        mean[:, 0], std[:, 0] = luminance.mean[:, 0], luminance.std(0)
-        if not self._as_thesis:
-            color = self._solve_color(self._evidence, luminance)
-            mean[:, 1:], std[:, 1:] = color.mean, np.stack([color.std(0), color.std(1)], axis=1)
         fixed = direction_spread_rad(luminance) <= _VALID_RAD
-        return LightEstimate(
-            mean @ _RGB.T / ASSUMED_ALBEDO,
-            np.sqrt(std**2 @ (_RGB**2).T) / ASSUMED_ALBEDO,
-            luminance.condition,
-            valid=bool(fixed),
-        )
+        if self._as_thesis:
+            mean, std = np.tile(luminance.mean, 3), np.tile(luminance.std(0)[:, None], 3)
+        else:
+            mean, std = self._solve_color(self._evidence, luminance)
+        return LightEstimate(mean / ASSUMED_ALBEDO, std / ASSUMED_ALBEDO, luminance.condition, valid=bool(fixed))
 
     def _thinned(self, evidence: NormalEquations) -> NormalEquations:
         """Evidence of one average frame, thinned to its number of independent samples."""
@@ -178,13 +172,19 @@ class LightEstimator:
         solve = solve_plain if self._as_thesis else solve_with_evidence
         return solve(self._thinned(evidence).channels(0, 1), self._precision)
 
-    def _solve_color(self, evidence: NormalEquations, luminance: Posterior) -> Posterior:
-        """Red and blue less luminance: the luminance's prior, tighter where it says how colour turns with direction."""
-        precision = self._precision.copy()
-        precision[1:] /= COLOR_DEVIATION**2
-        equations = self._thinned(evidence).channels(1, 3)
-        noise = solve_with_ratio(equations, precision, luminance.ratio).noise.mean()
-        return solve_with_ratio(equations, precision, luminance.ratio * float(noise / luminance.noise[0]))
+    def _solve_color(
+        self, evidence: NormalEquations, luminance: Posterior
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Coefficients [n, 3] of the non-negative light and their standard deviation, both times the albedo."""
+        shape = nonnegative_mean(luminance.mean[:, 0], np.asarray(np.linalg.inv(luminance.shape)))
+        equations = self._thinned(evidence).channels(1, 4)
+        tint = (shape @ equations.vector) / max(float(shape @ equations.matrix @ shape), 1e-300)
+        rest = equations.less(np.outer(shape, tint))
+        ratio = luminance.ratio * rest.energy.mean() / (rest.count * luminance.noise[0])
+        deviation = solve_with_ratio(rest, self._precision / COLOR_DEVIATION**2, float(ratio))
+        mean = nonnegative_sum(np.outer(shape, tint), deviation.mean)
+        std = np.stack([np.hypot(tint[c] * luminance.std(0), deviation.std(c)) for c in range(3)], axis=1)
+        return mean, std
 
 
 def prior_precision(bands: int) -> NDArray[np.float64]:

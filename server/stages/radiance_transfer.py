@@ -36,7 +36,7 @@ class Directions:
     @property
     def count(self) -> int:
         """Directions in one set."""
-        return self.directions.shape[1]
+        return int(self.directions.shape[1])
 
 
 @cache

@@ -4,12 +4,15 @@ import logging
 import random
 
 import msgpack
+import msgspec
 import pytest
+from websockets.exceptions import ConnectionClosed
 
 from protocol.codec import encode
+from protocol.images import encode_color
 from protocol.limits import MAX_MESSAGE_BYTES
-from protocol.messages import Acknowledged, Composite, Dropped, Error, Hello
-from tests.service.fakes import CAMERA, EXPLODE_MM, PATIENCE_S, frame_message
+from protocol.messages import Acknowledged, Composite, Dropped, Error, Hello, Quality
+from tests.service.fakes import CAMERA, EXPLODE_MM, PATIENCE_S, frame_message, rgbd_frame
 
 
 def serves_frames(wire, index: int) -> bool:
@@ -24,6 +27,7 @@ def altered(message, **changes) -> bytes:
     return msgpack.packb({name: value for name, value in fields.items() if value != "absent"})
 
 
+DAMAGED_FRAMES = 100
 HELLO = Hello(client="test", camera=CAMERA)
 RANDOM = random.Random(1)
 HOSTILE = {
@@ -111,6 +115,41 @@ def test_wrong_field_of_a_known_frame_or_request_is_answered_and_the_session_liv
     assert field in text
     assert (message.frame if answer is Dropped else message.request) == 7
     assert serves_frames(wire, 8)
+
+
+def damaged(data: bytes, random_: random.Random) -> bytes:
+    """The bytes with a few of them changed, and now and then cut short."""
+    damaged_ = bytearray(data)
+    for _ in range(random_.randint(1, 4)):
+        damaged_[random_.randrange(len(damaged_))] = random_.randrange(256)
+    return bytes(damaged_[: random_.randint(1, len(damaged_))] if random_.random() < 0.2 else damaged_)
+
+
+def after_control(wire) -> int | None:
+    """Wait until the session has come to a control message: None, or the close code if it ended before."""
+    try:
+        wire.say(Quality(request=99, preset="rm"))
+        while not (isinstance(message := wire.hear(), Acknowledged) and message.request == 99):
+            pass
+    except ConnectionClosed as closed:
+        return 1006 if closed.rcvd is None else closed.rcvd.code
+    return None
+
+
+def test_randomly_damaged_frames_never_break_the_server(dial, caplog) -> None:
+    caplog.set_level(logging.ERROR)
+    random_ = random.Random(2)
+    jpeg = msgspec.structs.replace(frame_message(3), color=encode_color(rgbd_frame(3).color, "jpeg"))
+    good = dial()
+    good.greet()
+    for _ in range(DAMAGED_FRAMES):
+        wire = dial()
+        wire.greet()
+        wire.socket.send(damaged(encode(random_.choice([jpeg, frame_message(3)])), random_))
+        assert after_control(wire) in (None, 1007, 1008)
+        wire.hang_up()
+    assert serves_frames(good, 0)
+    assert caplog.text == ""
 
 
 def test_failing_pipeline_ends_its_session_only(dial, lab, caplog) -> None:

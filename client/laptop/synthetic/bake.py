@@ -14,8 +14,10 @@ from client.laptop.synthetic.harmonics import COEFFICIENTS, basis
 from client.laptop.synthetic.shapes import Solid
 from client.laptop.synthetic.shell import Shell
 
-TILE = 8
-"""Samples along each side of a piece that is worked on at once: it stays in the processor's cache."""
+TILE = 4
+"""Samples along each side of a piece that is worked on at once: with some thousand directions it stays in the cache."""
+BATCH = 64
+"""Pieces whose sums over the directions are one matrix product."""
 LIFT_M = 1e-4
 """A sample buried less than this is still on the surface that is seen."""
 FILL_PASSES = 2
@@ -23,8 +25,11 @@ FILL_PASSES = 2
 Floats = NDArray[np.float32]
 
 
-def bake(solids: list[Solid], atlas: list[list[Grid]], directions: NDArray[np.float64]) -> Floats:
-    """[total, 16] occluded Lambert transfer (1/pi included) of every grid sample, world axes."""
+def bake(solids: list[Solid], atlas: list[list[Grid]], directions: Floats) -> Floats:
+    """[total, 16] occluded Lambert transfer (1/pi included) of every grid sample, world axes.
+
+    `directions` [n, 3] float32, unit, evenly spread over the sphere.
+    """
     table = np.zeros((atlas[-1][-1].offset + atlas[-1][-1].size, COEFFICIENTS), np.float32)
     for own, grids in enumerate(atlas):
         for grid in grids:
@@ -33,15 +38,17 @@ def bake(solids: list[Solid], atlas: list[list[Grid]], directions: NDArray[np.fl
 
 
 def blocked_directions(
-    solids: list[Solid], skip: Solid | None, points: Floats, directions: Floats, reach: float
+    solids: list[Solid], skip: Solid | None, points: Floats, directions: Floats, wanted: NDArray[np.bool_] | None = None
 ) -> NDArray[np.bool_]:
     """[points, directions] True where any solid but `skip` stands in the way of unit `directions`.
 
-    The points lie within `reach` metres of their mean: that bounds which directions a solid can block.
+    Points should lie near each other: that bounds which directions a solid can block. Only `wanted` [directions] are
+    asked, the others stay False.
     """
     blocked = np.zeros((len(points), len(directions)), bool)
     middle = points.mean(axis=0)
-    still_open = np.ones(len(directions), bool)
+    reach = float(np.linalg.norm(points - middle, axis=1).max())
+    still_open = np.ones(len(directions), bool) if wanted is None else wanted
     for solid in solids:
         if solid is skip:
             continue
@@ -49,7 +56,7 @@ def blocked_directions(
         if asked.size:
             blocked[:, asked] |= solid.blocks(points, directions[asked])
         if solid.bounds is None:
-            still_open = ~blocked.all(axis=0)
+            still_open = still_open & ~blocked.all(axis=0)
     return blocked
 
 
@@ -67,44 +74,46 @@ def _directions_near(solid: Solid, middle: Floats, directions: Floats, reach: fl
     return directions @ (offset / distance).astype(np.float32) > cone - 1e-4
 
 
-def _bake_grid(solids: list[Solid], own: int, grid: Grid, directions: NDArray[np.float64]) -> Floats:
+def _bake_grid(solids: list[Solid], own: int, grid: Grid, directions: Floats) -> Floats:
     positions, normals = grid.samples()
     buried = _buried(solids, own, positions, normals)
     values = np.zeros((grid.rows, grid.columns, COEFFICIENTS), np.float32)
-    if not buried.all():
-        for rows, columns in tiles(grid):
-            if not buried[rows, columns].all():
-                values[rows, columns] = _bake_tile(
-                    solids, solids[own], grid, positions[rows, columns], normals[rows, columns], directions
-                )
-        fill_buried(values, buried, grid.chart.wraps)
+    weights = basis(directions) * np.float32(4 / len(directions))  # 4 pi / n of solid angle each, over pi
+    if grid.is_flat:
+        cosines = directions @ normals[0, 0].astype(np.float32)
+        directions, weights = directions[cosines > 0], (cosines[:, None] * weights)[cosines > 0]
+    pieces = [piece for piece in tiles(grid) if not buried[piece].all()]
+    for batch in (pieces[i : i + BATCH] for i in range(0, len(pieces), BATCH)):
+        lost = _lost(solids, own, grid, [positions[p] for p in batch], [normals[p] for p in batch], directions)
+        sums = np.split(lost @ weights, np.cumsum([buried[p].size for p in batch])[:-1])
+        for piece, of_piece in zip(batch, sums, strict=True):
+            values[piece] = of_piece.reshape(*buried[piece].shape, COEFFICIENTS)
+    fill_buried(values, buried, grid.chart.wraps)
     return values.reshape(-1, COEFFICIENTS)
+
+
+def _lost(
+    solids: list[Solid], own: int, grid: Grid, positions: list[NDArray], normals: list[NDArray], directions: Floats
+) -> Floats:
+    """[samples, directions] 1 where a direction is blocked, times the cosine on surfaces that are not flat."""
+    # A convex solid does not shadow itself.
+    skip = solids[own] if solids[own].bounds is not None else None
+    lost = []
+    for places, ups in zip(positions, normals, strict=True):
+        points = places.reshape(-1, 3).astype(np.float32)
+        if grid.is_flat:
+            lost.append(blocked_directions(solids, skip, points, directions).astype(np.float32))
+        else:
+            cosines = ups.reshape(-1, 3).astype(np.float32) @ directions.T
+            facing = (cosines > 0).any(axis=0)
+            lost.append(blocked_directions(solids, skip, points, directions, facing) * np.maximum(cosines, 0))
+    return np.concatenate(lost)
 
 
 def tiles(grid: Grid) -> list[tuple[slice, slice]]:
     """Pieces of a grid that are worked on at once."""
     starts = ((r, c) for r in range(0, grid.rows, TILE) for c in range(0, grid.columns, TILE))
     return [(slice(r, r + TILE), slice(c, c + TILE)) for r, c in starts]
-
-
-def _bake_tile(
-    solids: list[Solid], own: Solid, grid: Grid, positions: NDArray, normals: NDArray, directions: NDArray
-) -> Floats:
-    points, up = positions.reshape(-1, 3), normals.reshape(-1, 3)
-    if grid.is_flat:
-        up = up[:1]
-    facing = directions[(directions @ up.T > 0).any(axis=1)]
-    reach = float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
-    # A convex solid does not shadow itself, and a flat chart of any cannot be below its own horizon.
-    skip = own if own.bounds is not None else None
-    blocked = blocked_directions(solids, skip, points.astype(np.float32), facing.astype(np.float32), reach)
-    cosines = np.maximum(up.astype(np.float32) @ facing.astype(np.float32).T, 0)
-    weights = (basis(facing) * (4 / len(directions))).astype(np.float32)  # 4 pi / n of solid angle each, over pi
-    if len(cosines) == 1:
-        lost = blocked.astype(np.float32) @ (cosines.T * weights)
-    else:
-        lost = (blocked * cosines) @ weights
-    return lost.reshape(*positions.shape[:2], COEFFICIENTS)
 
 
 def _buried(solids: list[Solid], own: int, positions: NDArray, normals: NDArray) -> NDArray[np.bool_]:

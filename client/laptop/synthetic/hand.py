@@ -87,8 +87,8 @@ class StaticVisibility:
         """[total, 3] light, over pi, that the hand alone takes from every sample."""
         taken = np.zeros((self.size, 3), np.float32)
         weights = light.radiance(self.directions) * np.float32(4 / DIRECTIONS)
-        for samples, points, normals, reach in self._pieces:
-            blocked = blocked_directions(list(hand), None, points, self.directions, reach)
+        for samples, points, normals in self._pieces:
+            blocked = blocked_directions(list(hand), None, points, self.directions)
             hit = np.flatnonzero(blocked.any(axis=0))
             if hit.size:
                 is_open = np.unpackbits(self.open_bits[samples], axis=1)[:, hit]
@@ -96,24 +96,23 @@ class StaticVisibility:
                 taken[samples] = (blocked[:, hit] * is_open * cosines) @ weights[hit]
         return taken
 
-    def _cut(self) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32], float]]:
-        """Pieces of the grids: numbers of the samples, points, normals (one if flat), and the piece's half width."""
+    def _cut(self) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]]:
+        """Pieces of the grids: numbers of the samples, points, normals (one if flat)."""
         for grid in (grid for grids in self.grids for grid in grids):
             positions, normals = grid.samples()
             numbers = grid.offset + np.arange(grid.size).reshape(grid.rows, grid.columns)
             for piece in tiles(grid):
                 points = positions[piece].reshape(-1, 3).astype(np.float32)
                 up = normals[piece].reshape(-1, 3).astype(np.float32)
-                reach = float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
-                yield numbers[piece].ravel(), points, up[:1] if grid.is_flat else up, reach
+                yield numbers[piece].ravel(), points, up[:1] if grid.is_flat else up
 
     def _compute(self) -> NDArray[np.uint8]:
         bits = np.zeros((self.size, DIRECTIONS // 8), np.uint8)
         owners = [solid for solid, grids in zip(self.solids, self.grids, strict=True) for _ in grids for _ in (0,)]
         starts = [grid.offset for grids in self.grids for grid in grids]
-        for samples, points, _, reach in self._pieces:
+        for samples, points, _ in self._pieces:
             own = owners[np.searchsorted(starts, samples[0], side="right") - 1]
-            blocked = blocked_directions(self.solids, own, points, self.directions, reach)
+            blocked = blocked_directions(self.solids, own, points, self.directions)
             bits[samples] = np.packbits(~blocked, axis=1)
         return bits
 
@@ -121,4 +120,4 @@ class StaticVisibility:
 def skin_shadows(hand: list[Capsule], static: list[Solid]) -> tuple[list[list[Grid]], NDArray[np.float32]]:
     """Grids over the hand, and [total, 16] occluded transfer on them: by the static solids and by its other parts."""
     grids = atlas([part.charts for part in hand], SKIN_STEP_M)
-    return grids, bake([*hand, *static], grids, sphere_directions(DIRECTIONS))
+    return grids, bake([*hand, *static], grids, sphere_directions(DIRECTIONS).astype(np.float32))

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 COEFFICIENTS = 16
 LAMBERT = np.repeat((1.0, 2 / 3, 1 / 4, 0.0), (1, 3, 5, 7))
 """[16] factors of the clamped cosine over pi, band by band: a uniform sky of radiance 1 shades white to 1."""
 
 
-def basis(directions: ArrayLike) -> NDArray[np.floating]:
+def basis(directions: NDArray[np.floating]) -> NDArray[np.floating]:
     """[n, 16] values at unit `directions` [n, 3], in their precision."""
-    x, y, z = np.asarray(directions).T
+    x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z
     return np.stack(
         [

@@ -55,7 +55,7 @@ def table() -> Scene:
         Body(Cylinder(np.array([-0.5, 0.045, 0.14]), _unit(1, 0, 0.5), 0.22, 0.045), paint(0.6, 0.3, 0.6)),
         Body(wedge((-0.2, 0, 0.2), (0.24, 0.11, 0.15), rotation_about("y", 65)), paint(0.35, 0.6, 0.62)),
     )
-    return Scene("table", bodies, 0.005, 2048, _walk_around_table)
+    return Scene("table", bodies, 0.004, 4096, _walk_around_table)
 
 
 def room() -> Scene:
@@ -78,7 +78,7 @@ def room() -> Scene:
         Body(Sphere(np.array([0.6, 0.47, 0.1]), 0.15), paint(0.7, 0.25, 0.2)),
         Body(Cylinder(np.array([1.2, 0.0, 0.35]), np.array([0, 1.0, 0]), 0.45, 0.17), paint(0.25, 0.5, 0.35)),
     )
-    return Scene("room", bodies, 0.025, 8192, _walk_in_room)
+    return Scene("room", bodies, 0.025, 6144, _walk_in_room)
 
 
 def _walk_around_table(time_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -126,7 +126,8 @@ class SyntheticSource:
         )
 
     def _bake(self) -> dict[str, NDArray]:
-        return {"occluded": bake(self.scene.solids, self._grids, sphere_directions(self.scene.directions))}
+        directions = sphere_directions(self.scene.directions).astype(np.float32)
+        return {"occluded": bake(self.scene.solids, self._grids, directions)}
 
     def _static_visibility(self) -> hand.StaticVisibility:
         solids = self.scene.solids

@@ -1,0 +1,379 @@
+"""The rasteriser against its float64 twin, OpenCV's rasteriser, and planes whose every pixel is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.opencl.engine import Engine
+from server.scene.mesh import Mesh
+from server.scene.virtual_object import VirtualObject
+from server.stages.rasterize import NEAR_M, VirtualSurface, rasterize
+from tests.meshes import mesh_of, pose, public_mesh, shape_of, soup_of
+from tests.reference import rasterize as twin
+
+CAMERA = CameraModel(width=157, height=101, fx=120.0, fy=118.0, cx=80.3, cy=49.1)
+EYE = np.eye(4)
+FLIPS = 2e-3
+"""Share of pixels that may differ from a reference: centres within a subpixel (1/256) of an edge."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A VirtualSurface on the host; the fields have three channels."""
+
+    covered: NDArray[np.bool_]
+    position: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    color: NDArray[np.float32]
+    index: NDArray[np.int32]
+    boxes: tuple[Any, ...]
+
+    @property
+    def triangle(self) -> NDArray[np.int64]:
+        """Number of the triangle of a `soup_of`, -1 for none."""
+        return np.where(self.covered, np.rint(self.color[..., 0] * 1024), -1).astype(np.int64)
+
+
+def download(engine: Engine, surface: VirtualSurface) -> Picture:
+    fields = [surface.position, surface.normal, surface.base_color]
+    arrays = [engine.download(a).view(np.float32).reshape(*a.shape, 4) for a in fields]
+    index = engine.download(surface.object_index)
+    for array in arrays:
+        assert np.isfinite(array).all()
+        np.testing.assert_array_equal(array[..., 3], index >= 0)
+        assert not array[index < 0].any()
+    position, normal, color = (array[..., :3] for array in arrays)
+    return Picture(index >= 0, position, normal, color, index, surface.boxes)
+
+
+def draw(
+    engine: Engine, *placed: tuple[Mesh, NDArray[np.float64]], camera: CameraModel = CAMERA, view: Any = EYE
+) -> Picture:
+    objects = [(VirtualObject.upload(engine, mesh, cells=8), matrix) for mesh, matrix in placed]
+    return download(engine, rasterize(engine, camera, view, objects))
+
+
+def rays(camera: CameraModel) -> NDArray[np.float64]:
+    """[h, w, 3] directions with z = 1."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+
+
+def random_soup(seed: int, count: int, size_m: float, center: tuple[float, float, float], spread_m: float) -> Mesh:
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-spread_m, spread_m, (count, 1, 3)) + center
+    return soup_of(places + rng.normal(size=(count, 3, 3)) * size_m)
+
+
+# ---- against the twin --------------------------------------------------------------------------------------------
+
+SOUPS = {
+    "small, in front": (300, 0.05, (0.0, 0.0, 2.0), 0.8),
+    "large, in front": (40, 0.8, (0.0, 0.0, 3.0), 1.0),
+    "around the camera": (200, 0.3, (0.0, 0.0, 0.0), 1.0),
+    "half through the near plane": (80, 0.1, (0.0, 0.0, NEAR_M), 0.15),
+    "far larger than the picture": (20, 500.0, (0.0, 0.0, 3.0), 10.0),
+    "farther out than the guard band": (20, 3e5, (0.0, 0.0, 1.0), 10.0),
+    "smaller than a pixel": (3000, 0.004, (0.0, 0.0, 2.0), 0.5),
+}
+
+
+@pytest.mark.parametrize("name", SOUPS)
+def test_matches_twin(engine: Engine, name: str) -> None:
+    soup = random_soup(len(name), *SOUPS[name])
+    matrix = pose((0.1, -0.05, 0.0), (1, 2, 3), 0.4)
+    picture = draw(engine, (soup, matrix), view=pose((0, 0, 0), (0, 1, 0), 0.1))
+    camera_from_model = pose((0, 0, 0), (0, 1, 0), 0.1) @ matrix
+    vertices, triangles = soup.vertices.astype(np.float64), soup.triangles.astype(np.int64)
+    visible = twin.raster_tiles(CAMERA, twin.setup_triangles(CAMERA, camera_from_model, vertices, triangles))
+    same = picture.triangle == visible
+    assert (visible >= 0).mean() > 0.01
+    assert (~same).mean() < FLIPS
+    attributes = np.hstack([soup.normals, soup.vertex_colors]).astype(np.float64)
+    position, mean = twin.shade_surface(CAMERA, camera_from_model, vertices, triangles, attributes, visible)
+    # A ray along a triangle meets it nowhere in particular: positions are compared where they are well conditioned.
+    corners = vertices[triangles[visible]] @ camera_from_model[:3, :3].T + camera_from_model[:3, 3]
+    plane = np.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
+    plane /= np.linalg.norm(plane, axis=-1, keepdims=True)
+    steep = np.abs((plane * rays(CAMERA)).sum(axis=-1)) > 0.05
+    check = same & (visible >= 0) & steep
+    error = np.linalg.norm(picture.position - (position @ matrix[:3, :3].T + matrix[:3, 3]), axis=-1)[check]
+    assert error.max() < 1e-5 * max(1.0, np.abs(soup.vertices).max())
+    np.testing.assert_allclose(picture.color[check], mean[check][:, 3:], atol=1e-5)
+
+
+def test_normals_match_twin(engine: Engine) -> None:
+    ball = shape_of(trimesh.creation.torus(0.5, 0.2, 24, 12))
+    matrix = pose((0.05, 0.0, 1.5), (1, 1, 0), 0.7, 0.6)
+    picture = draw(engine, (ball, matrix))
+    vertices, triangles = ball.vertices.astype(np.float64), ball.triangles.astype(np.int64)
+    visible = twin.raster_tiles(CAMERA, twin.setup_triangles(CAMERA, matrix, vertices, triangles))
+    check = picture.covered & (visible >= 0)
+    _, mean = twin.shade_surface(CAMERA, matrix, vertices, triangles, ball.normals.astype(np.float64), visible)
+    a, b, c = (vertices[triangles[visible]][..., k, :] for k in range(3))
+    to_camera = -rays(CAMERA) @ np.linalg.inv(matrix[:3, :3]).T
+    to_camera /= np.linalg.norm(to_camera, axis=-1, keepdims=True)
+    normals = twin.facing_camera(mean[check], np.cross(b - a, c - a)[check], to_camera[check])
+    error = np.abs(picture.normal[check] - normals @ matrix[:3, :3].T / 0.6).max(axis=1)
+    assert (error > 1e-4).mean() < FLIPS  # the neighbour's triangle is seen where a centre is on an edge
+    assert (picture.normal * rays(CAMERA)).sum(axis=-1).max() < 1e-6
+
+
+# ---- against OpenCV ----------------------------------------------------------------------------------------------
+
+
+def opencv_depth(camera: CameraModel, points: NDArray[np.float64], triangles: NDArray[np.int32]) -> NDArray[np.float32]:
+    """[h, w] metres, 100 where there is nothing, by OpenCV's rasteriser: y up, z backward, centres at half pixels."""
+    points = (points * (1, -1, -1)).astype(np.float32).reshape(-1, 1, 3)
+    depth = np.full((camera.height, camera.width), 100.0, np.float32)
+    settings = cv2.TriangleRasterizeSettings().setCullingMode(cv2.RASTERIZE_CULLING_NONE)
+    field_rad = 2 * np.arctan(camera.height / 2 / camera.fy)
+    view = np.eye(4, dtype=np.float32)[:3].copy()
+    indices = triangles.reshape(-1, 1, 3)
+    return cv2.triangleRasterizeDepth(points, indices, depth, view, field_rad, NEAR_M, 100.0, settings)
+
+
+def compare_with_opencv(engine: Engine, mesh: Mesh) -> None:
+    camera = CameraModel(width=318, height=239, fx=280.0, fy=280.0, cx=158.5, cy=119.0)
+    low, high = mesh.bounds
+    scale = 1 / float((high - low).max())
+    matrix = pose((0, 0, 0), (0.2, 1.0, 0.1), 2.5, scale)
+    matrix[:3, 3] = (0.02, 0.01, 1.2) - matrix[:3, :3] @ (low + high) / 2
+    picture = draw(engine, (mesh, matrix), camera=camera)
+    depth = opencv_depth(camera, mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3], mesh.triangles)
+    both, either = picture.covered & (depth < 99), picture.covered | (depth < 99)
+    assert both.sum() > 3000
+    assert both.sum() / either.sum() > 0.999
+    error = np.abs(picture.position[..., 2] - depth)[both]
+    assert (error > 1e-5).mean() < FLIPS
+    x0, y0, x1, y1 = picture.boxes[0]
+    assert picture.covered[y0:y1, x0:x1].sum() == picture.covered.sum()
+
+
+@pytest.mark.parametrize("name", ["sphere", "torus", "box", "capsule"])
+def test_matches_opencv(engine: Engine, name: str) -> None:
+    shapes = {
+        "sphere": trimesh.creation.icosphere(subdivisions=4),
+        "torus": trimesh.creation.torus(0.5, 0.2),
+        "box": trimesh.creation.box((1.0, 0.7, 0.4)),
+        "capsule": trimesh.creation.capsule(1.0, 0.3),
+    }
+    compare_with_opencv(engine, shape_of(shapes[name]))
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    "name",
+    [
+        "suzanne.obj",
+        "Duck.glb",
+        "dragon_10k.obj",
+        "kenney_furniture/loungeSofa.glb",
+        "kenney_furniture/pottedPlant.glb",
+    ],
+)
+def test_public_meshes_match_opencv(engine: Engine, name: str) -> None:
+    compare_with_opencv(engine, public_mesh(name))
+
+
+# ---- known pictures ----------------------------------------------------------------------------------------------
+
+
+def at_pixels(camera: CameraModel, pixels: NDArray[np.float64], depth_m: float = 1.0) -> NDArray[np.float64]:
+    """[..., 3] points that project exactly to `pixels` [..., 2]."""
+    u, v = pixels[..., 0], pixels[..., 1]
+    points = [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)]
+    return depth_m * np.stack(points, axis=-1)
+
+
+EXACT = CameraModel(width=41, height=37, fx=64.0, fy=64.0, cx=0.0, cy=0.0)
+"""Whole pixels are exact numbers: edges through pixel centres really pass through them."""
+
+
+def triangulated_grid(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """[t, 3] two triangles for each cell of points [rows, columns, n], their diagonals alternating."""
+    rows, columns = points.shape[:2]
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (x.reshape(-1) for x in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
+    turn = (np.indices((rows - 1, columns - 1)).sum(axis=0).reshape(-1) % 2).astype(bool)[:, None]
+    first = np.where(turn, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
+    second = np.where(turn, np.stack([b, d, c], 1), np.stack([a, d, c], 1))
+    return np.concatenate([first, second])
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_shared_edges_cover_each_pixel_once(engine: Engine, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pixels = np.stack(np.meshgrid(np.linspace(4, 36, 5), np.linspace(2, 34, 5)), axis=-1)
+    pixels[1:-1, 1:-1] += rng.integers(-2, 3, (3, 3, 2))  # inner corners on pixel centres too
+    corners = at_pixels(EXACT, pixels).reshape(-1, 3)[triangulated_grid(pixels)]
+    if seed:  # either way round
+        flip = rng.random(len(corners)) < 0.5
+        corners[flip] = corners[flip][:, ::-1]
+    count = np.zeros((EXACT.height, EXACT.width), int)
+    for triangle in corners:
+        count += draw(engine, (soup_of(triangle), EYE), camera=EXACT).covered
+    expected = np.zeros_like(count)
+    expected[2:34, 4:36] = 1  # top and left edges own their centres, bottom and right ones do not
+    np.testing.assert_array_equal(count, expected)
+
+
+def test_pixel_sized_triangles_leave_no_hole(engine: Engine) -> None:
+    camera = CameraModel(width=203, height=149, fx=180.0, fy=180.0, cx=101.0, cy=74.0)
+    rng = np.random.default_rng(5)
+    pixels = np.stack(np.meshgrid(np.arange(-2, 206, 0.9), np.arange(-2, 152, 0.9)), axis=-1)
+    pixels[1:-1, 1:-1] += rng.uniform(-0.3, 0.3, pixels[1:-1, 1:-1].shape)
+    points = at_pixels(camera, pixels, 1.5)
+    picture = draw(engine, (mesh_of(points, triangulated_grid(points)), EYE), camera=camera)
+    assert picture.covered.all()
+    np.testing.assert_allclose(picture.position, 1.5 * rays(camera), atol=5e-5)  # clamped into a triangle beside
+
+
+@pytest.mark.parametrize("half_m", [3.0, 1000.0, 1e5])
+@pytest.mark.parametrize("cells", [1, 40])
+def test_floor_under_the_camera(engine: Engine, half_m: float, cells: int) -> None:
+    """Most of a floor is behind the camera: what is in front is seen up to the horizon, at the right depth."""
+    side = np.linspace(-half_m, half_m, cells + 1)
+    points = np.stack(np.meshgrid(side, side), axis=-1)
+    points = np.stack([points[..., 0], np.full_like(points[..., 0], 1.5), points[..., 1]], axis=-1)
+    picture = draw(engine, (mesh_of(points, triangulated_grid(points)), EYE))
+    with np.errstate(divide="ignore"):
+        expected = rays(CAMERA) * (1.5 / rays(CAMERA)[..., 1:2])
+    seen = (expected[..., 2] > NEAR_M) & (np.abs(expected[..., [0, 2]]).max(axis=-1) < half_m)
+    assert (picture.covered != seen).mean() < 0.01  # the far edge is a row of pixels
+    check = seen & picture.covered
+    relative = np.linalg.norm(picture.position - expected, axis=-1)[check] / expected[check][:, 2]
+    assert relative.max() < max(1e-4, 1e-7 * half_m)
+    np.testing.assert_allclose(picture.normal[check], np.tile((0, -1, 0), (check.sum(), 1)), atol=1e-6)
+
+
+def test_many_triangles_through_the_near_plane(engine: Engine) -> None:
+    """More clipped pieces than the lists first have room for."""
+    angle = np.linspace(0, 2 * np.pi, 4001)
+    rim = np.stack([3 * np.cos(angle), 3 * np.sin(angle), np.full_like(angle, 1.0)], axis=-1)
+    corners = np.stack([np.broadcast_to((0.0, 0.0, -1.0), rim[1:].shape), rim[:-1], rim[1:]], axis=1)
+    ones = draw(engine, (mesh_of(corners, np.arange(3 * len(corners))), EYE))
+    # A cone around the axis, its tip behind the camera: r = 1.5 (z + 1).
+    r = np.hypot(rays(CAMERA)[..., 0], rays(CAMERA)[..., 1])
+    depth = np.divide(1.5, r - 1.5, out=np.full_like(r, np.inf), where=r > 1.5)
+    assert not ones.covered.any() == (depth[r > 0] > 1).all()
+    wide = CameraModel(width=160, height=120, fx=20.0, fy=20.0, cx=79.5, cy=59.5)
+    picture = draw(engine, (mesh_of(corners, np.arange(3 * len(corners))), EYE), camera=wide)
+    r = np.hypot(rays(wide)[..., 0], rays(wide)[..., 1])
+    depth = np.divide(1.5, r - 1.5, out=np.full_like(r, np.inf), where=r > 1.5)
+    seen = (depth < 1) & (depth > NEAR_M)
+    assert seen.mean() > 0.2
+    assert (picture.covered != seen).mean() < 0.02  # two rims
+    check = seen & picture.covered
+    assert np.abs(picture.position[..., 2] - depth)[check].max() < 1e-3
+
+
+def test_inside_a_box(engine: Engine) -> None:
+    box = shape_of(trimesh.creation.box((4.0, 3.0, 5.0)))
+    picture = draw(engine, (box, pose((0.3, 0.2, 0.1))))
+    assert picture.covered.all()
+    low, high = np.array([-1.7, -1.3, -2.4]), np.array([2.3, 1.7, 2.6])
+    wall = np.where(rays(CAMERA) > 0, high, low)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (wall / rays(CAMERA)).min(axis=-1)
+    np.testing.assert_allclose(picture.position, rays(CAMERA) * depth[..., None], atol=2e-5)
+    assert (picture.normal * rays(CAMERA)).sum(axis=-1).max() < 0
+
+
+def test_behind_the_camera(engine: Engine) -> None:
+    box = shape_of(trimesh.creation.box())
+    picture = draw(engine, (box, pose((0, 0, -3.0))), (box, pose((0, 0, NEAR_M - 0.51))), (box, pose((900.0, 0, 3.0))))
+    assert not picture.covered.any()
+    assert picture.boxes == (None, None, None)
+
+
+def test_no_objects(engine: Engine) -> None:
+    picture = draw(engine)
+    assert not picture.covered.any()
+    assert picture.boxes == ()
+
+
+def test_degenerate_triangles_draw_nothing(engine: Engine) -> None:
+    point = [[0.0, 0.0, 1.0]] * 3
+    line = [[-1.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 1.0]]
+    edge_on = [[0.0, 0.0, 1.0], [0.0, 0.0, 2.0], [0.0, 0.0, 3.0]]
+    real = [[-1.0, -1.0, 2.0], [1.0, -1.0, 2.0], [0.0, 1.0, 2.0]]
+    picture = draw(engine, (soup_of([point, line, edge_on, real]), EYE))
+    assert set(np.unique(picture.triangle)) == {-1, 3}
+
+
+def test_equally_near_triangles_show_the_first(engine: Engine) -> None:
+    triangle = np.array([[-1.0, -1.0, 2.0], [1.1, -0.9, 2.5], [0.0, 1.0, 1.5]])
+    picture = draw(engine, (soup_of([triangle + (0, 0, 1), triangle, triangle, triangle]), EYE))
+    assert set(np.unique(picture.triangle)) == {-1, 0, 1} - {0}
+    twice = draw(engine, (soup_of(triangle + (0, 0, 1)), EYE), (soup_of(triangle), EYE), (soup_of(triangle), EYE))
+    assert set(np.unique(twice.index)) == {-1, 1}
+
+
+def test_nearest_object_wins(engine: Engine) -> None:
+    near, far = trimesh.creation.icosphere(subdivisions=3, radius=0.3), trimesh.creation.box((1.5, 1.0, 0.2))
+    picture = draw(
+        engine,
+        (shape_of(far), pose((0, 0, 3.0))),
+        (shape_of(near), pose((0.1, 0, 1.5))),
+        (shape_of(far), pose((0, 0, -9))),
+    )
+    alone = draw(engine, (shape_of(near), pose((0.1, 0, 1.5))))
+    np.testing.assert_array_equal(picture.index == 1, alone.covered)
+    assert (picture.index == 0).sum() > 500
+    assert picture.boxes[2] is None
+    for index, box in enumerate(picture.boxes[:2]):
+        x0, y0, x1, y1 = box
+        assert (picture.index[y0:y1, x0:x1] == index).sum() == (picture.index == index).sum()
+        rows, columns = np.nonzero(alone.covered)
+        if index == 1:  # a ball fills its box, up to perspective
+            assert abs(x0 - columns.min()) < 12
+            assert abs(y1 - rows.max()) < 12
+
+
+def test_order_of_triangles_does_not_matter(engine: Engine) -> None:
+    soup = random_soup(9, 400, 0.2, (0, 0, 1.5), 0.8)
+    order = np.random.default_rng(0).permutation(len(soup.triangles))
+    shuffled = Mesh(soup.vertices, soup.triangles[order], soup.vertex_colors, soup.normals, "y")
+    pictures = [draw(engine, (mesh, EYE)) for mesh in (soup, shuffled, soup)]
+    for other in pictures[1:]:
+        np.testing.assert_array_equal(other.position, pictures[0].position)
+        np.testing.assert_array_equal(other.normal, pictures[0].normal)
+        np.testing.assert_array_equal(other.color, pictures[0].color)
+
+
+def test_colors_are_perspective_correct(engine: Engine) -> None:
+    corners = np.array([[-1.0, -0.6, 0.8], [1.5, -1.0, 4.0], [0.0, 2.0, 6.0]])
+    picture = draw(engine, (mesh_of(corners, [0, 1, 2], np.eye(3)), EYE))
+    assert picture.covered.sum() > 1000
+    back = picture.color[picture.covered] @ corners  # the colours are the barycentric coordinates
+    np.testing.assert_allclose(back, picture.position[picture.covered], atol=1e-5)
+    np.testing.assert_allclose(np.cross(back, rays(CAMERA)[picture.covered]), 0, atol=2e-5)
+
+
+def test_smooth_normals_of_a_ball(engine: Engine) -> None:
+    ball = shape_of(trimesh.creation.icosphere(subdivisions=5))
+    picture = draw(engine, (ball, pose((0.2, 0.1, 2.0), (1, 1, 1), 0.5, 0.5)), view=EYE)
+    center = picture.position[picture.covered] - (0.2, 0.1, 2.0)
+    np.testing.assert_allclose(np.linalg.norm(center, axis=1), 0.5, atol=5e-4)
+    cosine = (picture.normal[picture.covered] * center / 0.5).sum(axis=1)
+    assert np.degrees(np.arccos(np.clip(np.percentile(cosine, 1), -1, 1))) < 2
+
+
+@pytest.mark.parametrize("tiles", [1, 7, 255, 256, 257, 4800])
+def test_scan_tiles(engine: Engine, tiles: int) -> None:
+    rng = np.random.default_rng(tiles)
+    counts = rng.integers(0, 9, tiles + 1).astype(np.int32)
+    starts = engine.workspace.array("starts", (tiles + 2,), np.int32)
+    scan = engine.kernel("rasterize.cl", "scan_tiles")
+    engine.launch(scan, (256,), tiles, engine.workspace.upload("counts", counts), starts, local=(256,))
+    expected = [0, *np.cumsum(counts[1:]), counts[0]]
+    np.testing.assert_array_equal(engine.download(starts), expected)

@@ -1,0 +1,61 @@
+"""Float64 twin of cl_kernels/voxelize.cl, and of the rays of include/virtual_objects.clh."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def overlaps_cell(triangle: Floats, centers: Floats, half: float) -> NDArray[np.bool_]:
+    """[n] whether `triangle` [3, 3] touches the cubes around `centers` [n, 3]: all 13 axes (Akenine-Moeller)."""
+    edges = np.roll(triangle, -1, axis=0) - triangle
+    axes = [*np.eye(3), np.cross(edges[0], edges[1])]
+    axes += [np.cross(edge, axis) for edge in edges for axis in np.eye(3)]
+    touches = np.ones(len(centers), bool)
+    for axis in axes:
+        corners = (triangle[None] - centers[:, None]) @ axis
+        reach = half * np.abs(axis).sum()
+        touches &= (corners.max(axis=1) >= -reach) & (corners.min(axis=1) <= reach)
+    return touches
+
+
+def mark_cells(vertices: Floats, triangles: NDArray[np.int64], dims: tuple[int, int, int], half: float) -> Floats:
+    """[z, y, x] bool: the cells (cubes of half width `half` around i + 0.5) that a triangle touches; grid units."""
+    occupied = np.zeros(dims[::-1], bool)
+    for triangle in vertices[triangles]:
+        low = np.maximum(np.floor(triangle.min(axis=0) - 0.01).astype(int), 0)
+        high = np.minimum(np.floor(triangle.max(axis=0) + 0.01).astype(int) + 1, dims)
+        cells = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), -1)
+        cells = cells.reshape(-1, 3)
+        x, y, z = cells[overlaps_cell(triangle, cells + 0.5, half)].T
+        occupied[z, y, x] = True
+    return occupied
+
+
+def distance_transform(occupied: NDArray[np.bool_]) -> Floats:
+    """[z, y, x] distance from each cell to the nearest occupied one, by looking at all of them."""
+    places = np.argwhere(occupied)
+    cells = np.argwhere(np.ones_like(occupied))
+    squared = np.array([((places - cell) ** 2).sum(axis=1).min() for cell in cells])
+    return np.sqrt(squared).reshape(occupied.shape)
+
+
+def trace_mesh(vertices: Floats, triangles: NDArray[np.int64], origins: Floats, directions: Floats) -> Floats:
+    """[n] distance along each ray to the mesh itself, infinite where it passes (Moeller and Trumbore, every triangle)."""
+    a = vertices[triangles[:, 0]]
+    ab, ac = vertices[triangles[:, 1]] - a, vertices[triangles[:, 2]] - a
+    nearest = np.full(len(origins), np.inf)
+    for index, (origin, direction) in enumerate(zip(origins, directions, strict=True)):
+        p = np.cross(direction, ac)
+        determinant = (ab * p).sum(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = 1 / determinant
+            offset = origin - a
+            u = (offset * p).sum(axis=1) * inverse
+            q = np.cross(offset, ab)
+            v, t = (q @ direction) * inverse, (ac * q).sum(axis=1) * inverse
+            hit = (determinant != 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
+        nearest[index] = t[hit].min(initial=np.inf)
+    return nearest

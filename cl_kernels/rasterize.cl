@@ -231,14 +231,30 @@ kernel void clear_uncovered(const int pixels, const global int *visible, global 
     position[pixel] = normal[pixel] = base_color[pixel] = (float4)(0.0f);
 }
 
-// Where the ray origin + t * direction meets the plane of a, b, c, as shares of b and c: inside the triangle always.
-static float2 barycentric(const float3 a, const float3 ab, const float3 ac, const float3 origin, const float3 direction) {
+// Where the ray origin + t * direction meets the plane of a, a + ab, a + ac (Moeller and Trumbore): the shares of the
+// second and third corner, and t. A plane seen edge on is met nowhere: its middle is taken, and t = 0.
+static float3 intersect_plane(const float3 a, const float3 ab, const float3 ac, const float3 origin,
+                              const float3 direction) {
     const float3 p = cross(direction, ac), q = cross(origin - a, ab);
     const float determinant = dot(ab, p);
-    if (determinant == 0.0f) return (float2)(1.0f / 3.0f);  // seen edge on
-    const float2 share = (float2)(dot(origin - a, p), dot(direction, q)) / determinant;
-    const float2 inside = clamp(share, 0.0f, 1.0f);
-    return inside / fmax(inside.x + inside.y, 1.0f);
+    if (determinant == 0.0f) return (float3)(1.0f / 3.0f, 1.0f / 3.0f, 0.0f);
+    return (float3)(dot(origin - a, p), dot(direction, q), dot(ac, q)) / determinant;
+}
+
+// The shares of all three corners, none below 0: a pixel that is covered may lie outside by half a subpixel.
+static inline float3 shares_inside(const float3 hit) {
+    const float2 share = clamp(hit.xy, 0.0f, 1.0f);
+    const float sum = fmax(share.x + share.y, 1.0f);
+    return (float3)(1.0f - (share.x + share.y) / sum, share / sum);
+}
+
+// The point at which the ray is as deep as it meets the plane, but no nearer or farther than the triangle is.
+static inline float3 point_on_ray(const float16 model_from_pixel, const float3 a, const float3 ab, const float3 ac,
+                                  const float3 direction, const float t) {
+    const float3 slope = model_from_pixel.scde;
+    const float depth = dot(slope, a) + model_from_pixel.sf, to_b = dot(slope, ab), to_c = dot(slope, ac);
+    const float nearest = depth + fmin(fmin(to_b, to_c), 0.0f), farthest = depth + fmax(fmax(to_b, to_c), 0.0f);
+    return model_from_pixel.s37b + fmin(fmax(t, fmax(nearest, 0.0f)), farthest) * direction;
 }
 
 static float3 unit_or(const float3 vector, const float3 otherwise) {
@@ -255,9 +271,10 @@ static float3 facing_camera(const float3 normal, const float3 facing, const floa
     return unit_or(turned - fmin(dot(turned, to_camera), 0.0f) * to_camera, flat);
 }
 
-// Interpolates the surface that one object shows: position in volume metres, unit normal, linear base colour; w = 1.
+// The surface that one object shows: position in volume metres, unit normal, linear base colour; w = 1.
 // sizes: width, height, number of the object's first triangle, its triangles. `attributes` [v, 6]: normal, base colour.
-// The ray of pixel (u, v) is model_from_pixel's column 3 + t * its columns 0 to 2 times (u, v, 1).
+// The ray of pixel (u, v) is model_from_pixel's column 3 + t * its columns 0 to 2 times (u, v, 1), with t the depth;
+// its last row is not part of that: it takes a model point to its depth.
 kernel void shade_surface(const int4 sizes, const global int *visible, const global float *vertices,
                           const global int *triangles, const global float *attributes, const float16 model_from_pixel,
                           const float16 volume_from_model, global float4 *position, global float4 *normal,
@@ -268,15 +285,15 @@ kernel void shade_surface(const int4 sizes, const global int *visible, const glo
     if (triangle < 0 || triangle >= sizes.w) return;
     const int3 v = vload3(triangle, triangles);
     const float3 a = vload3(v.x, vertices), ab = vload3(v.y, vertices) - a, ac = vload3(v.z, vertices) - a;
-    const float3 origin = model_from_pixel.s37b;
     const float3 direction = transform_vector(model_from_pixel, (float3)(pixel.x, pixel.y, 1.0f));
-    const float2 share = barycentric(a, ab, ac, origin, direction);
-    const float3 weight = (float3)(1.0f - share.x - share.y, share);
-    const float3 mean = weight.x * vload3(2 * v.x, attributes) + weight.y * vload3(2 * v.y, attributes)
-                        + weight.z * vload3(2 * v.z, attributes);
-    const float3 facing = facing_camera(mean, cross(ab, ac), -normalize(direction));
-    position[index] = (float4)(transform_point(volume_from_model, a + share.x * ab + share.y * ac), 1.0f);
-    normal[index] = (float4)(normalize(transform_vector(volume_from_model, facing)), 1.0f);
-    base_color[index] = (float4)(weight.x * vload3(2 * v.x + 1, attributes) + weight.y * vload3(2 * v.y + 1, attributes)
-                                 + weight.z * vload3(2 * v.z + 1, attributes), 1.0f);
+    const float3 hit = intersect_plane(a, ab, ac, model_from_pixel.s37b, direction);
+    const float3 share = shares_inside(hit), point = point_on_ray(model_from_pixel, a, ab, ac, direction, hit.z);
+    const float3 mean_normal = share.x * vload3(2 * v.x, attributes) + share.y * vload3(2 * v.y, attributes)
+                               + share.z * vload3(2 * v.z, attributes);
+    const float3 mean_color = share.x * vload3(2 * v.x + 1, attributes) + share.y * vload3(2 * v.y + 1, attributes)
+                              + share.z * vload3(2 * v.z + 1, attributes);
+    const float3 seen_normal = facing_camera(mean_normal, cross(ab, ac), -normalize(direction));
+    position[index] = (float4)(transform_point(volume_from_model, point), 1.0f);
+    normal[index] = (float4)(normalize(transform_vector(volume_from_model, seen_normal)), 1.0f);
+    base_color[index] = (float4)(mean_color, 1.0f);
 }

@@ -133,7 +133,17 @@ def stream(
     if device is not None:
         raise OptionError("--device: the server has the device; name it there with probeless serve --device")
     capture = o.prepare(o.CaptureOptions.of(locals()), lossless=lossless)
-    raise NotImplementedError(capture, server, out, record)
+    from client.laptop.stream import stream as send
+
+    done = send(
+        capture.source, server, capture.objects, capture.wishes, out, lossless, record, frames=capture.frames
+    )
+    written = f", written to {out}" if out is not None else ""
+    speed = done.answered / done.seconds if done.seconds > 0 else 0.0
+    say(
+        f"{done.answered} frames answered in {done.seconds:.1f} s ({speed:.1f} frames/s), {done.skipped} skipped, "
+        f"{done.dropped} dropped{written}"
+    )
 
 
 @app.command()

@@ -92,7 +92,7 @@ class CaptureSession:
             await self._end(ended)
         finally:
             self._mailbox.close()
-            self._outlet.close()
+            pass
             read.cancel()
             await asyncio.wait((work, read))
         _report(other)
@@ -128,7 +128,7 @@ class CaptureSession:
     async def _post(self, message: ClientMessage) -> None:
         if isinstance(message, Hello | Watch | Bye):
             raise Refusal(POLICY, f"{type(message).__name__.lower()} was received in a session that captures already")
-        while False:
+        while not self._mailbox.has_room():
             self._room.clear()
             await self._room.wait()
         receipt = self._mailbox.post(message)

@@ -233,9 +233,11 @@ def _shade(
 
 
 def _model_from_pixel(camera: CameraModel, camera_from_model: Matrix) -> Matrix:
-    """Columns 0 to 2 take (u, v, 1) to a ray's direction in model space; column 3 is the camera's place there."""
-    model_from_camera = np.linalg.inv(camera_from_model)
+    """Columns 0 to 2 take (u, v, 1) to a ray's direction in model space, column 3 is the camera's place there; the last
+    row takes a model point to its depth.
+    """
     camera_from_pixel = np.linalg.inv(_pixel_from_camera(camera))
     camera_from_pixel[:3, 3] = 0.0
-    matrix: Matrix = model_from_camera @ camera_from_pixel
+    matrix: Matrix = np.linalg.inv(camera_from_model) @ camera_from_pixel
+    matrix[3] = camera_from_model[2]
     return matrix

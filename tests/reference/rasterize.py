@@ -64,7 +64,7 @@ def setup_triangles(camera: CameraModel, camera_from_model: Floats, vertices: Fl
 
 
 def edge_values(piece: Piece, u: Ints, v: Ints) -> tuple[Ints, Ints]:
-    """[3, ...] edge functions opposite to each corner at pixel centres, and [3] the bias of edges that own no centre."""
+    """[3, ...] edge functions opposite to each corner at pixel centres; [3] bias, -1 for edges that own no centre."""
     values, biases = [], []
     for k in range(3):
         (ax, ay), (bx, by) = piece.corners[(k + 1) % 3], piece.corners[(k + 2) % 3]
@@ -104,20 +104,24 @@ def shade_surface(
     rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(pixel_from_camera(camera)).T
     rays = rays @ model_from_camera[:3, :3].T
     corners = vertices[triangles[visible]]
-    a, ab, ac = corners[..., 0, :], corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
-    shares = barycentric(model_from_camera[:3, 3] - a, rays, ab, ac)
+    origin = np.broadcast_to(model_from_camera[:3, 3], rays.shape)
+    hits = intersect_plane(corners[..., 0, :], corners[..., 1, :], corners[..., 2, :], origin, rays)
+    shares = np.clip(hits[..., :2], 0, 1)
+    shares /= np.maximum(shares.sum(axis=-1, keepdims=True), 1)
     weights = np.concatenate([1 - shares.sum(axis=-1, keepdims=True), shares], axis=-1)[..., None]
-    return (weights * corners).sum(axis=-2), (weights * attributes[triangles[visible]]).sum(axis=-2)
+    depths = corners @ camera_from_model[2, :3] + camera_from_model[2, 3]
+    t = np.clip(hits[..., 2], np.maximum(depths.min(axis=-1), 0), depths.max(axis=-1))
+    return origin + t[..., None] * rays, (weights * attributes[triangles[visible]]).sum(axis=-2)
 
 
-def barycentric(origin: Floats, direction: Floats, ab: Floats, ac: Floats) -> Floats:
-    """[..., 2] shares of b and c (Moeller and Trumbore), kept inside the triangle; `origin` relative to a."""
-    p, q = np.cross(direction, ac), np.cross(origin, ab)
-    determinant = (ab * p).sum(axis=-1)
-    safe = np.where(determinant == 0, 1, determinant)
-    shares = np.stack([(origin * p).sum(axis=-1), (direction * q).sum(axis=-1)], axis=-1) / safe[..., None]
-    shares = np.clip(np.where(determinant[..., None] == 0, 1 / 3, shares), 0, 1)
-    return shares / np.maximum(shares.sum(axis=-1, keepdims=True), 1)
+def intersect_plane(a: Floats, b: Floats, c: Floats, origin: Floats, direction: Floats) -> Floats:
+    """[..., 3] where a ray meets the plane of a, b, c: shares of b and c, and its t (Moeller and Trumbore)."""
+    ab, ac = b - a, c - a
+    p, q = np.cross(direction, ac), np.cross(origin - a, ab)
+    determinant = (ab * p).sum(axis=-1)[..., None]
+    values = [((origin - a) * p).sum(axis=-1), (direction * q).sum(axis=-1), (ac * q).sum(axis=-1)]
+    edge_on = determinant == 0
+    return np.where(edge_on, (1 / 3, 1 / 3, 0), np.stack(values, axis=-1) / np.where(edge_on, 1, determinant))
 
 
 def facing_camera(normal: Floats, facing: Floats, to_camera: Floats) -> Floats:

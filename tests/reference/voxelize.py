@@ -43,7 +43,7 @@ def distance_transform(occupied: NDArray[np.bool_]) -> Floats:
 
 
 def trace_mesh(vertices: Floats, triangles: NDArray[np.int64], origins: Floats, directions: Floats) -> Floats:
-    """[n] distance along each ray to the mesh itself, infinite where it passes (Moeller and Trumbore, every triangle)."""
+    """[n] distance along each ray to the mesh itself, infinite where it passes (Moeller and Trumbore)."""
     a = vertices[triangles[:, 0]]
     ab, ac = vertices[triangles[:, 1]] - a, vertices[triangles[:, 2]] - a
     nearest = np.full(len(origins), np.inf)

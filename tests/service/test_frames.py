@@ -18,6 +18,7 @@ from protocol.messages import (
     Quality,
     RemoveObject,
 )
+from server import mailbox
 from tests.service.fakes import CAMERA, POSE, REFUSE_MM, fake_light, frame_message, rgbd_frame
 
 
@@ -101,6 +102,29 @@ def test_control_messages_are_never_dropped_and_precede_later_frames(dial, lab) 
     _, _, mesh, placement = lab.log[1]
     assert mesh == ("glb", b"mesh")
     assert (placement.position_m, placement.scale, placement.yaw_deg) == ((1.0, 2.0, 3.0), 1.0, 30.0)
+
+
+def test_reading_stops_while_too_much_is_unread_and_goes_on_later(dial, lab, monkeypatch) -> None:
+    lab.hold = True
+    monkeypatch.setattr(mailbox, "MAX_WAITING_LETTERS", 4)
+    unread: list[int] = []
+    post = mailbox.Mailbox.post
+
+    def post_and_count(self: mailbox.Mailbox, message: mailbox.Control) -> mailbox.Receipt:
+        receipt = post(self, message)
+        unread.append(len(self._letters))
+        return receipt
+
+    monkeypatch.setattr(mailbox.Mailbox, "post", post_and_count)
+    wire = dial()
+    wire.greet()
+    wire.say(frame_message(0))
+    lab.next_entered()
+    wire.say(*(Quality(request=i, preset="rm") for i in range(40)))
+    lab.release()
+    answers = wire.hear_until(Composite) + [wire.hear() for _ in range(40)]
+    assert [a.request for a in answers[2:]] == list(range(40))
+    assert max(unread) == 4
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,8 @@ minus this. So whatever sees its whole hemisphere is exact, and only shadows car
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,8 +16,8 @@ from client.laptop.synthetic.harmonics import COEFFICIENTS, basis
 from client.laptop.synthetic.shapes import Solid
 from client.laptop.synthetic.shell import Shell
 
-TILE = 4
-"""Samples along each side of a piece that is worked on at once: with some thousand directions it stays in the cache."""
+RAYS_AT_ONCE = 65536
+"""Points times directions of a piece that is worked on at once: it stays in the processor's cache."""
 BATCH = 64
 """Pieces whose sums over the directions are one matrix product."""
 LIFT_M = 1e-4
@@ -82,7 +84,7 @@ def _bake_grid(solids: list[Solid], own: int, grid: Grid, directions: Floats) ->
     if grid.is_flat:
         cosines = directions @ normals[0, 0].astype(np.float32)
         directions, weights = directions[cosines > 0], (cosines[:, None] * weights)[cosines > 0]
-    pieces = [piece for piece in tiles(grid) if not buried[piece].all()]
+    pieces = [piece for piece in tiles(grid, len(directions)) if not buried[piece].all()]
     for batch in (pieces[i : i + BATCH] for i in range(0, len(pieces), BATCH)):
         lost = _lost(solids, own, grid, [positions[p] for p in batch], [normals[p] for p in batch], directions)
         sums = np.split(lost @ weights, np.cumsum([buried[p].size for p in batch])[:-1])
@@ -110,10 +112,11 @@ def _lost(
     return np.concatenate(lost)
 
 
-def tiles(grid: Grid) -> list[tuple[slice, slice]]:
-    """Pieces of a grid that are worked on at once."""
-    starts = ((r, c) for r in range(0, grid.rows, TILE) for c in range(0, grid.columns, TILE))
-    return [(slice(r, r + TILE), slice(c, c + TILE)) for r, c in starts]
+def tiles(grid: Grid, directions: int) -> list[tuple[slice, slice]]:
+    """Pieces of a grid that are worked on at once with so many directions."""
+    side = max(2, math.isqrt(RAYS_AT_ONCE // directions))
+    starts = ((r, c) for r in range(0, grid.rows, side) for c in range(0, grid.columns, side))
+    return [(slice(r, r + side), slice(c, c + side)) for r, c in starts]
 
 
 def _buried(solids: list[Solid], own: int, positions: NDArray, normals: NDArray) -> NDArray[np.bool_]:

@@ -88,12 +88,14 @@ class StaticVisibility:
         taken = np.zeros((self.size, 3), np.float32)
         weights = light.radiance(self.directions) * np.float32(4 / DIRECTIONS)
         for samples, points, normals in self._pieces:
-            blocked = blocked_directions(list(hand), None, points, self.directions)
+            cosines = np.maximum(normals @ self.directions.T, 0)
+            facing = cosines.any(axis=0)
+            parts = [part for part in hand if _is_above(part, points, normals)]
+            blocked = blocked_directions(parts, None, points, self.directions, facing)
             hit = np.flatnonzero(blocked.any(axis=0))
             if hit.size:
                 is_open = np.unpackbits(self.open_bits[samples], axis=1)[:, hit]
-                cosines = np.maximum(normals @ self.directions[hit].T, 0)
-                taken[samples] = (blocked[:, hit] * is_open * cosines) @ weights[hit]
+                taken[samples] = (blocked[:, hit] * is_open * cosines[:, hit]) @ weights[hit]
         return taken
 
     def _cut(self) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]]:
@@ -101,7 +103,7 @@ class StaticVisibility:
         for grid in (grid for grids in self.grids for grid in grids):
             positions, normals = grid.samples()
             numbers = grid.offset + np.arange(grid.size).reshape(grid.rows, grid.columns)
-            for piece in tiles(grid):
+            for piece in tiles(grid, DIRECTIONS):
                 points = positions[piece].reshape(-1, 3).astype(np.float32)
                 up = normals[piece].reshape(-1, 3).astype(np.float32)
                 yield numbers[piece].ravel(), points, up[:1] if grid.is_flat else up
@@ -115,6 +117,12 @@ class StaticVisibility:
             blocked = blocked_directions(self.solids, own, points, self.directions)
             bits[samples] = np.packbits(~blocked, axis=1)
         return bits
+
+
+def _is_above(part: Capsule, points: NDArray[np.float32], normals: NDArray[np.float32]) -> bool:
+    """Some of it may be above the horizon of a flat piece; of a curved one it is not asked."""
+    center, radius = part.bounds
+    return len(normals) > 1 or bool(((center - points[0]) @ normals[0]) > -radius)
 
 
 def skin_shadows(hand: list[Capsule], static: list[Solid]) -> tuple[list[list[Grid]], NDArray[np.float32]]:

@@ -1,5 +1,5 @@
 // Compositing (thesis 7.2.1, R3): real hides virtual and virtual hides real; linear inside, sRGB at the end.
-// Provides composite.
+// Provides mark_touched, composite.
 #include "camera.clh"
 #include "upsample.clh"
 
@@ -8,17 +8,12 @@
 #endif
 #include "sh.clh"
 
-// sRGB code of linear radiance (IEC 61966-2-1), clipped to [0, 1].
-static inline uchar srgb_code(const float linear) {
-    const float x = clamp(linear, 0.0f, 1.0f);
-    const float encoded = x <= 0.0031308f ? 12.92f * x : 1.055f * pow(x, 1.0f / 2.4f) - 0.055f;
-    return (uchar)(255.0f * encoded + 0.5f);
-}
-
-static inline void write_color(global uchar *picture, const int pixel, const float3 linear) {
-    picture[3 * pixel] = srgb_code(linear.x);
-    picture[3 * pixel + 1] = srgb_code(linear.y);
-    picture[3 * pixel + 2] = srgb_code(linear.z);
+// codes [65536]: sRGB code of linear radiance i / 65535.
+static inline void write_color(global uchar *picture, const int pixel, const float3 linear, global const uchar *codes) {
+    const float3 level = clamp(linear, 0.0f, 1.0f) * 65535.0f + 0.5f;
+    picture[3 * pixel] = codes[(int)level.x];
+    picture[3 * pixel + 1] = codes[(int)level.y];
+    picture[3 * pixel + 2] = codes[(int)level.z];
 }
 
 // Radiance of an unoccluded white Lambertian surface under the light.
@@ -31,10 +26,27 @@ static float3 open_shading(const float3 normal, global const float4 *light) {
     return sum;
 }
 
+// ratio [rows][cols] (w = 1 valid) -> touched [rows + 1][cols + 1]: whether the 4 x 4 samples around a cell hold one that is
+// valid and not 1. Most of a picture is not touched, and need not be upsampled.
+kernel void mark_touched(const int cols, const int rows, global const float4 *ratio, global uchar *touched) {
+    const int cell_col = (int)get_global_id(0) - 1;
+    const int cell_row = (int)get_global_id(1) - 1;
+    if (cell_col >= cols || cell_row >= rows) return;
+    int any = 0;
+    for (int row = max(cell_row - 1, 0); row <= min(cell_row + 2, rows - 1); row++) {
+        for (int col = max(cell_col - 1, 0); col <= min(cell_col + 2, cols - 1); col++) {
+            const float4 v = ratio[row * cols + col];
+            any |= v.w > 0.0f && (v.x != 1.0f || v.y != 1.0f || v.z != 1.0f);
+        }
+    }
+    touched[(cell_row + 1) * (cols + 1) + cell_col + 1] = (uchar)any;
+}
+
 // shown [h][w][3]: the camera picture as sRGB codes; radiance [h][w] linear. positions, normals: the real geometry buffer.
 // virtual_positions, virtual_normals, virtual_colors [h][w] (w = 1 where covered): the virtual one, or none without HAS_OBJECTS.
 // occluded [object_rows][object_cols]: radiance that occluders take from virtual samples (w = 1 valid);
-// ratio [rows][cols]: shaded with over without virtual objects on real samples (w = 1 valid), or none without HAS_SHADOWS.
+// ratio [rows][cols]: shaded with over without virtual objects on real samples (w = 1 valid), touched: see mark_touched; or
+// none without HAS_SHADOWS. codes [65536]: sRGB code of linear radiance i / 65535.
 // -> picture [h][w][3] sRGB. A pixel that nothing virtual touches is the camera's, byte for byte.
 kernel void composite(const int width, const int height, global const uchar *shown, global const float4 *radiance,
                       global const float4 *positions, global const float4 *normals, const float16 camera_from_volume,
@@ -43,7 +55,7 @@ kernel void composite(const int width, const int height, global const uchar *sho
                       global const float4 *virtual_colors, global const float4 *light,
                       const int object_cols, const int object_rows, const int object_stride, global const float4 *occluded,
                       const int cols, const int rows, const int stride, global const float4 *ratio,
-                      global uchar *picture) {
+                      global const uchar *touched, global const uchar *codes, global uchar *picture) {
     const int x = get_global_id(0);
     const int y = get_global_id(1);
     if (x >= width || y >= height) return;
@@ -58,18 +70,19 @@ kernel void composite(const int width, const int height, global const uchar *sho
             const Grid grid = {object_cols, object_rows, object_stride, width};
             const float4 taken = upsample(grid, occluded, virtual_positions, virtual_normals, x, y, tolerance_m);
             const float3 shading = fmax(open_shading(normal, light) - taken.xyz, (float3)(0.0f));
-            write_color(picture, pixel, virtual_colors[pixel].xyz * shading);
+            write_color(picture, pixel, virtual_colors[pixel].xyz * shading, codes);
             return;
         }
     }
 #endif
 #ifdef HAS_SHADOWS
     const Grid grid = {cols, rows, stride, width};
-    if (real.w > 0.0f && radiance[pixel].w >= 0.0f && any_touched(grid, ratio, x, y)) {
+    const int cell = (cell_of(y, stride) + 1) * (cols + 1) + cell_of(x, stride) + 1;
+    if (touched[cell] && real.w > 0.0f && radiance[pixel].w >= 0.0f) {
         const float4 factor = upsample(grid, ratio, positions, normals, x, y, tolerance_m);
         const float3 change = fabs(factor.xyz - 1.0f);
         if (factor.w > 0.0f && fmax(fmax(change.x, change.y), change.z) > UNTOUCHED) {
-            write_color(picture, pixel, radiance[pixel].xyz * factor.xyz);
+            write_color(picture, pixel, radiance[pixel].xyz * factor.xyz, codes);
             return;
         }
     }

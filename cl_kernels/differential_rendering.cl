@@ -14,16 +14,24 @@
 // Shading below this share of the unoccluded ambient counts as this share: keeps R' / R bounded where R is near 0.
 #define LEAST_SHADING 0.02f
 
+// Cosine of the half-angle under which a ball (center, radius) is seen from a point; -1 inside it.
+static inline float ball_cosine(const float4 ball, const float3 point, float3 *towards) {
+    const float3 offset = ball.xyz - point;
+    const float distance2 = dot(offset, offset);
+    *towards = offset * rsqrt(fmax(distance2, 1e-12f));
+    return distance2 > ball.w * ball.w ? sqrt(1.0f - ball.w * ball.w / distance2) : -1.0f;
+}
+
 // Real surface: the ratio R' / R of shading with virtual objects to shading without, at the samples of the transfer.
 // transfer [rows][cols][COEFFICIENTS], free_mask [rows][cols][MASK_WORDS]: see radiance_transfer.cl.
-// light [COEFFICIENTS] rgb; directions [4][count] (unit, sr), arriving [4][count]: radiance of the light from each of them.
+// ball: center and radius of a ball around all objects. light [COEFFICIENTS] rgb; directions [4][count] (unit, sr), arriving [4][count]: radiance of the light from each of them.
 // -> ratio [rows][cols] (rgb, w = 1), w = 0 where there is no surface.
 kernel void shadow_real(const int cols, const int rows, const int stride, const int width,
                         global const float4 *positions, global const float4 *normals, global const float *transfer,
                         global const uint *free_mask, global const float4 *light, const int count,
                         global const float4 *directions, global const float4 *arriving, const float reach_m,
                         const int objects, global const float16 *grid_from_volume, global const int4 *dims,
-                        global const float *distances, const float offset_m, global float4 *ratio) {
+                        global const float *distances, const float4 ball, const float offset_m, global float4 *ratio) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= cols || row >= rows) return;
@@ -37,11 +45,14 @@ kernel void shadow_real(const int cols, const int rows, const int stride, const 
     const float3 origin = positions[pixel].xyz + offset_m * normal.xyz;
     float3 without = (float3)(0.0f);
     for (int i = 0; i < COEFFICIENTS; i++) without += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
+    float3 towards;
+    const float least_cosine = ball_cosine(ball, origin, &towards) - 1e-4f;
     float3 taken = (float3)(0.0f);
     const int set = ((row & 1) * 2 + (col & 1)) * count;
     for (int j = 0; j < count; j++) {
-        if (!((free_mask[sample * MASK_WORDS + (j >> 5)] >> (j & 31)) & 1)) continue;
         const float4 direction = directions[set + j];
+        if (dot(direction.xyz, towards) < least_cosine) continue;
+        if (!((free_mask[sample * MASK_WORDS + (j >> 5)] >> (j & 31)) & 1)) continue;
         if (trace_objects(objects, grid_from_volume, dims, distances, origin, direction.xyz, reach_m) > 0.0f) continue;
         taken += dot(normal.xyz, direction.xyz) * direction.w * M_1_PI_F * arriving[set + j].xyz;
     }

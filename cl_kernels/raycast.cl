@@ -3,11 +3,11 @@
 #include "camera.clh"
 #include "volume.clh"
 
-// Gradient of the tsdf from the 4x4x4 voxels around a point; (0, 0, 0) where there is none.
+// Gradient of the tsdf from the 4x4x4 voxels around a point in voxels; (0, 0, 0) where there is none.
 // Where all of them were seen: central differences one voxel wide, trilinear between voxels. Else of the inner cell alone.
 static float3 surface_gradient(const Volume volume, const float3 point) {
     float3 f;
-    const int3 low = trilinear_cell(volume, point, &f) - 1;
+    const int3 low = trilinear_cell(point, &f) - 1;
     int starts[8];
     brick_starts(volume, low, low + 3, starts);
     const float tx[4] = {0.0f, 1.0f - f.x, f.x, 0.0f}, dx[4] = {f.x - 1.0f, -f.x, 1.0f - f.x, f.x};
@@ -17,8 +17,11 @@ static float3 surface_gradient(const Volume volume, const float3 point) {
     float3 wide = (float3)(0.0f);
     float3 cell = (float3)(0.0f);
     float least_weight = 1.0f;
+#pragma unroll
     for (int k = 0; k < 4; k++) {
+#pragma unroll
         for (int j = 0; j < 4; j++) {
+#pragma unroll
             for (int i = 0; i < 4; i++) {
                 const int outer = (i == 0 || i == 3) + (j == 0 || j == 3) + (k == 0 || k == 3);
                 if (outer > 1) continue;
@@ -37,9 +40,9 @@ static float3 surface_gradient(const Volume volume, const float3 point) {
 static float refine_crossing(const Volume volume, const VoxelRay ray, const float start) {
     const float truncation = volume.truncation_m / volume.voxel_m;
     int seen_a, seen_b;
-    const float a = sample_tsdf(volume, (ray.origin + start * ray.direction) * volume.voxel_m, &seen_a);
+    const float a = sample_tsdf(volume, ray.origin + start * ray.direction, &seen_a);
     const float step = (a > 0.0f ? fmax(a * truncation, 0.25f) : fmin(a * truncation, -0.25f));
-    const float b = sample_tsdf(volume, (ray.origin + (start + step) * ray.direction) * volume.voxel_m, &seen_b);
+    const float b = sample_tsdf(volume, ray.origin + (start + step) * ray.direction, &seen_b);
     const float slope = (b - a) / step;  // per voxel, negative where the ray enters
     if (!seen_a || !seen_b || slope > -0.05f / truncation) return 0.0f;
     const float onward = -b / slope;
@@ -80,11 +83,11 @@ kernel void raycast(const int width, const int height, const int4 bricks, global
     float4 position = (float4)(0.0f);
     float4 normal = (float4)(0.0f);
     if (t > 0.0f) {
-        const float3 p = (ray.origin + t * ray.direction) * voxel_m;
+        const float3 p = ray.origin + t * ray.direction;
         const float3 gradient = surface_gradient(volume, p);
         const float steepness = length(gradient);
         if (steepness > 1e-6f && dot(gradient, ray.direction) < 0.0f) {
-            position = (float4)(p, 1.0f);
+            position = (float4)(p * voxel_m, 1.0f);
             normal = (float4)(gradient / steepness, 1.0f);
         }
     }

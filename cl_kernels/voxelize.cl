@@ -1,16 +1,19 @@
-// A mesh's occupancy grid and its distance transform, once on load (the volumes of thesis 7.2, fig. 7.5).
+// A mesh's occupancy grid and distance grid, once on load (the volumes of thesis 7.2, fig. 7.5).
 //
-// mark_cells -> seed_distance (x) -> spread_distance (y) -> spread_distance (z) -> finish_distance.
+// clear_cells -> mark_cells, measure_near; seed_distance (x) -> spread_distance (y) -> spread_distance (z); finish.
+// Near the mesh the distance is that to its triangles, so that what is thinner than a cell keeps its place within it;
+// farther out it is that to the nearest touched cell, an exact Euclidean distance transform.
 // Grids are [z, y, x] int32 or float32; cell (x, y, z) is the cube from (x, y, z) to (x + 1, y + 1, z + 1) grid units.
 #include "camera.clh"
 
 #ifndef SLAB
-#error "SLAB: cells in z that one work-item of mark_cells looks at"
+#error "SLAB: cells in z that one work-item of mark_cells and measure_near looks at"
 #endif
 
 #define NONE (1 << 28)  // squared distance where no cell is occupied; sums of it with a squared grid side fit an int
 
 constant float HALF_CELL = 0.5001f;  // touching counts: more than rounding, less than matters
+constant float NEAR_CELLS = 1.65f;   // up to here distances are measured, from the cells' centres
 
 // False if the projections on `axis` of a triangle and of a cell around the origin are apart. Any axis may be asked:
 // only a true gap separates, so an axis that rounding has turned costs tightness, never a cell.
@@ -33,8 +36,20 @@ static bool overlaps_cell(const float3 a, const float3 b, const float3 c) {
            && overlaps_beside(c - b, a, b, c) && overlaps_beside(a - c, a, b, c);
 }
 
+// Last cell of a slab.
+static inline int3 high_corner(const int4 dims, const int slab) {
+    return (int3)(dims.x, dims.y, min(slab + SLAB, dims.z)) - 1;
+}
+
+kernel void clear_cells(const int cells, global int *occupied, global int *near) {
+    const int cell = get_global_id(0);
+    if (cell >= cells) return;
+    occupied[cell] = 0;
+    near[cell] = as_int(2.0f * NEAR_CELLS);
+}
+
 // Marks the cells that a triangle touches, in one slab of the grid: a large triangle is shared out over all slabs.
-// `occupied` starts as 0. dims: cells in x, y, z.
+// dims: cells in x, y, z.
 kernel void mark_cells(const int triangle_count, const int4 dims, const global float *vertices,
                        const global int *triangles, const float16 grid_from_model, global int *occupied) {
     const int triangle = get_global_id(0), slab = SLAB * get_global_id(1);
@@ -45,7 +60,7 @@ kernel void mark_cells(const int triangle_count, const int4 dims, const global f
     const float3 c = transform_point(grid_from_model, vload3(v.z, vertices));
     const float rim = HALF_CELL - 0.5f;
     const int3 low = max(convert_int3_rtn(fmin(a, fmin(b, c)) - rim), (int3)(0, 0, slab));
-    const int3 high = min(convert_int3_rtn(fmax(a, fmax(b, c)) + rim), (int3)(dims.x, dims.y, min(slab + SLAB, dims.z)) - 1);
+    const int3 high = min(convert_int3_rtn(fmax(a, fmax(b, c)) + rim), high_corner(dims, slab));
     for (int z = low.z; z <= high.z; z++)
         for (int y = low.y; y <= high.y; y++)
             for (int x = low.x; x <= high.x; x++) {
@@ -87,7 +102,55 @@ kernel void spread_distance(const int cells, const int length, const int stride,
     result[cell] = best;
 }
 
-kernel void finish_distance(const int cells, const global int *squared, global float *distance) {
+static inline float squared_length(const float3 v) { return dot(v, v); }
+
+// Squared distance from the origin to the line from a to a + ab.
+static inline float squared_to_edge(const float3 a, const float3 ab) {
+    const float along = -dot(a, ab) / fmax(squared_length(ab), 1e-20f);
+    return squared_length(a + clamp(along, 0.0f, 1.0f) * ab);
+}
+
+// Squared distance from the origin to a triangle: to its inside where the origin is above that, else to its edges.
+static float squared_to_triangle(const float3 a, const float3 b, const float3 c) {
+    const float3 ab = b - a, bc = c - b, ca = a - c, normal = cross(ab, -ca);
+    float best = fmin(squared_to_edge(a, ab), fmin(squared_to_edge(b, bc), squared_to_edge(c, ca)));
+    const float size = squared_length(normal);
+    // The normal of a sliver is all rounding; its edges are as near as its inside.
+    const bool is_sliver = size <= 1e-8f * squared_length(ab) * squared_length(ca);
+    const bool is_above = dot(cross(normal, ab), a) <= 0.0f && dot(cross(normal, bc), b) <= 0.0f
+                          && dot(cross(normal, ca), c) <= 0.0f;
+    const float height = dot(normal, a);
+    return is_above && !is_sliver ? fmin(best, height * height / size) : best;
+}
+
+// Lowers `near` (bits of float cells; they order as the floats do) to the distance of a triangle from the centres of
+// the cells around it, in one slab of the grid.
+kernel void measure_near(const int triangle_count, const int4 dims, const global float *vertices,
+                         const global int *triangles, const float16 grid_from_model, global int *near) {
+    const int triangle = get_global_id(0), slab = SLAB * get_global_id(1);
+    if (triangle >= triangle_count || slab >= dims.z) return;
+    const int3 v = vload3(triangle, triangles);
+    const float3 a = transform_point(grid_from_model, vload3(v.x, vertices));
+    const float3 b = transform_point(grid_from_model, vload3(v.y, vertices));
+    const float3 c = transform_point(grid_from_model, vload3(v.z, vertices));
+    const float3 normal = cross(b - a, c - a);
+    const float reach = NEAR_CELLS * length(normal) * 1.01f;
+    const int3 low = max(convert_int3_rtp(fmin(a, fmin(b, c)) - NEAR_CELLS - 0.5f), (int3)(0, 0, slab));
+    const int3 high = min(convert_int3_rtn(fmax(a, fmax(b, c)) + NEAR_CELLS - 0.5f), high_corner(dims, slab));
+    for (int z = low.z; z <= high.z; z++)
+        for (int y = low.y; y <= high.y; y++)
+            for (int x = low.x; x <= high.x; x++) {
+                const float3 center = (float3)(x, y, z) + 0.5f;
+                if (fabs(dot(normal, a - center)) > reach) continue;
+                const float squared = squared_to_triangle(a - center, b - center, c - center);
+                if (squared < NEAR_CELLS * NEAR_CELLS) atomic_min(&near[(z * dims.y + y) * dims.x + x], as_int(sqrt(squared)));
+            }
+}
+
+// The measured distance where there is one, else that to the nearest touched cell.
+kernel void finish_distance(const int cells, const global int *squared, const global int *near, global float *distance) {
     const int cell = get_global_id(0);
-    if (cell < cells) distance[cell] = sqrt((float)squared[cell]);
+    if (cell >= cells) return;
+    const float measured = as_float(near[cell]);
+    distance[cell] = measured < NEAR_CELLS ? measured : fmax(sqrt((float)squared[cell]), NEAR_CELLS);
 }

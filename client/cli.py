@@ -168,12 +168,13 @@ def serve(
 def demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="folder for what is written")] = Path("out/demo"),
     keep: Annotated[bool, typer.Option("--keep", help="leave the server running to look at the page")] = False,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="of the page; 0: a free one")] = 0,
     device: o.DeviceOption = None,
 ) -> None:
     """Server and client together on a synthetic scene; pictures in out/demo."""
     from client.laptop.demo import run_demo
 
-    run_demo(out, device, keep)
+    run_demo(out, device, keep, port)
 
 
 @app.command()

@@ -78,11 +78,12 @@ def shadow_real(
     volume: Volume,
     rays: Directions,
     light: DeviceLight,
+    objects: Sequence[Placed],
     table: ObjectTable,
 ) -> SampleGrid:
     """Shadows of virtual things on real ones."""
     return differential.shadow_real(
-        view.engine, view.camera, surface, transfer, light, rays, view.reach_m, table, volume.voxel_m
+        view.engine, view.camera, surface, transfer, light, rays, view.reach_m, objects, table, volume.voxel_m
     )
 
 

@@ -92,7 +92,7 @@ class CaptureSession:
             await self._end(ended)
         finally:
             self._mailbox.close()
-            pass
+            self._outlet.close()
             read.cancel()
             await asyncio.wait((work, read))
         _report(other)

@@ -17,6 +17,7 @@ from server.maths.sh import sh_basis, spherical_fibonacci
 _CONSTRAINTS = 162
 _PROBES = 1024
 _STEPS = 400
+_TOLERANCE = 1e-6
 _MEAN = 0.28209479177387814  # Y_00
 
 
@@ -40,6 +41,8 @@ def nonnegative_mean(mean: NDArray[np.float64], precision: NDArray[np.float64]) 
         updated = np.maximum(ahead - step * (gram @ ahead + values), 0.0)
         if np.dot(ahead - updated, updated - force) > 0:
             momentum = 1.0
+        if np.abs(updated - force).max() <= _TOLERANCE * np.abs(updated).max():
+            break
         onward = (1 + np.sqrt(1 + 4 * momentum * momentum)) / 2
         ahead = updated + (momentum - 1) / onward * (updated - force)
         force, momentum = updated, onward

@@ -63,6 +63,7 @@ def composite(
         "composite.cl", "composite", BANDS=bands, HAS_OBJECTS=virtual is not None, HAS_SHADOWS=ratio is not None
     )
     unused = space.array("unused", (1,), cl_types.float4)
+    touched = mark_touched(engine, ratio, bands) if ratio else unused
     engine.launch(
         kernel,
         (camera.width, camera.height),
@@ -78,9 +79,25 @@ def composite(
         light.coefficients,
         *_grid(occluded, unused),
         *_grid(ratio, unused),
+        touched,
+        space.constant("srgb_codes", _shown_codes()),
         picture,
     )
     return engine.download(picture)
+
+
+def mark_touched(engine: Engine, ratio: SampleGrid, bands: int) -> cl_array.Array:
+    """[rows + 1, cols + 1] uint8: which cells of the grid have a sample near that is not 1."""
+    touched = engine.workspace.array("touched", (ratio.rows + 1, ratio.cols + 1), np.uint8)
+    engine.launch(
+        engine.kernel("composite.cl", "mark_touched", BANDS=bands),
+        (ratio.cols + 1, ratio.rows + 1),
+        ratio.cols,
+        ratio.rows,
+        ratio.values,
+        touched,
+    )
+    return touched
 
 
 def _grid(grid: SampleGrid | None, unused: cl_array.Array) -> tuple[KernelArgument, ...]:

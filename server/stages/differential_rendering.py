@@ -5,7 +5,9 @@ Kernel: differential_rendering.cl.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -13,9 +15,9 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.opencl.engine import Engine, KernelArgument
+from server.opencl.engine import Engine, KernelArgument, float4
 from server.stages.radiance_transfer import Directions, Transfer
-from server.stages.rasterize import VirtualSurface
+from server.stages.rasterize import Placed, VirtualSurface
 from server.stages.raycast import Surface
 from server.stages.volume import Volume
 from server.stages.voxelize import ObjectTable
@@ -68,6 +70,7 @@ def shadow_real(
     light: DeviceLight,
     rays: Directions,
     reach_m: float,
+    objects: Sequence[Placed],
     table: ObjectTable,
     voxel_m: float,
 ) -> SampleGrid:
@@ -92,10 +95,19 @@ def shadow_real(
         light.arriving,
         reach_m,
         *_objects(table),
+        ball_around(objects),
         voxel_m,
         ratio.values,
     )
     return ratio
+
+
+def ball_around(objects: Sequence[Placed]) -> np.generic:
+    """Centre (volume space) and radius in metres of a ball that holds all objects, as a float4."""
+    boxes = [np.array(list(product(*zip(*thing.bounds, strict=True)))) for thing, _ in objects]
+    corners = np.concatenate([b @ m[:3, :3].T + m[:3, 3] for b, (_, m) in zip(boxes, objects, strict=True)])
+    center = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    return float4(*center, float(np.linalg.norm(corners - center, axis=1).max()) * 1.001)
 
 
 def shadow_virtual(

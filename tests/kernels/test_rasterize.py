@@ -234,7 +234,7 @@ def test_pixel_sized_triangles_leave_no_hole(engine: Engine) -> None:
     points = at_pixels(camera, pixels, 1.5)
     picture = draw(engine, (mesh_of(points, triangulated_grid(points)), EYE), camera=camera)
     assert picture.covered.all()
-    np.testing.assert_allclose(picture.position, 1.5 * rays(camera), atol=5e-5)  # clamped into a triangle beside
+    np.testing.assert_allclose(picture.position, 1.5 * rays(camera), atol=2e-6)
 
 
 @pytest.mark.parametrize("half_m", [30.0, 1000.0, 1e5])
@@ -269,7 +269,7 @@ def test_many_triangles_through_the_near_plane(engine: Engine) -> None:
     assert seen.mean() > 0.2
     assert (picture.covered != seen).mean() < 0.02  # two rims
     check = seen & picture.covered
-    assert np.abs(picture.position[..., 2] - depth)[check].max() < 1e-3
+    assert np.abs(picture.position[..., 2] - depth)[check].max() < 1e-3  # 4000 chords for a circle
 
 
 def test_inside_a_box(engine: Engine) -> None:

@@ -1,0 +1,61 @@
+"""`probeless demo`: a server in this process, a client that streams a synthetic scene to it over the real socket."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from client.laptop.objects import ObjectFile
+from client.laptop.source import Source, open_source
+from client.laptop.stream import StreamSummary, stream
+from client.laptop.vase import vase_glb
+from client.laptop.volume import default_volume, default_voxel
+from client.progress import say
+from protocol.messages import Wishes
+from server.serve import open_service, start_in_background
+
+SOURCE = "synthetic:table?frames=30&light=3"
+VASE_STANDS_AT_M = (0.1, 0.0, 0.12)
+
+
+@dataclass(frozen=True)
+class Demo:
+    """What the demo streams."""
+
+    source: Source
+    objects: tuple[ObjectFile, ...]
+    wishes: Wishes
+
+
+def run_demo(out: Path, device_name: str | None, keep: bool, port: int = 0) -> None:
+    """Stream once and write `out`; with `keep` go on streaming, for the page, until interrupted.
+
+    Raises ServeError, ClientError or UserError, each with one line.
+    """
+    with _prepared() as demo, start_in_background(open_service(device_name), port=port) as server:
+        say(f"watch it at {server.url}")
+        done = _stream(demo, server.url, out)
+        say(f"{done.answered} frames in {done.seconds:.1f} s, pictures in {out / 'frames'}")
+        if keep:
+            say(f"still streaming to {server.url}; end with Ctrl-C")
+        while keep:
+            _stream(demo, server.url, None)
+
+
+def _stream(demo: Demo, url: str, out: Path | None) -> StreamSummary:
+    return stream(demo.source, url, demo.objects, demo.wishes, out, realtime=out is None)
+
+
+@contextmanager
+def _prepared() -> Iterator[Demo]:
+    """The scene, its volume, and the vase as a file."""
+    source = open_source(SOURCE)
+    volume = default_volume(source, range(len(source)))
+    wishes = Wishes(volume_m=volume, voxel_m=default_voxel(volume), up=source.up)
+    with tempfile.TemporaryDirectory(prefix="probeless-") as folder:
+        vase = Path(folder) / "vase.glb"
+        vase.write_bytes(vase_glb())
+        yield Demo(source, (ObjectFile(vase, VASE_STANDS_AT_M),), wishes)

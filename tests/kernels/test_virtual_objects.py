@@ -1,0 +1,212 @@
+"""Rays through the table of virtual objects, against balls, walls and meshes hit exactly."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.cltypes as cl_types
+import pytest
+import trimesh
+from numpy.typing import NDArray
+
+from server.opencl.engine import Engine
+from server.opencl.program import KERNEL_FOLDER
+from server.scene.mesh import Mesh
+from server.scene.virtual_object import VirtualObject
+from server.stages.voxelize import ObjectTable, object_table
+from tests.meshes import mesh_of, pose, public_mesh, shape_of
+from tests.reference import voxelize as twin
+
+SOURCE = """
+#include "virtual_objects.clh"
+kernel void trace(const int rays, const int count, const global float16 *grid_from_volume, const global int4 *dims,
+                  const global float *distances, const global float *origins, const global float *directions,
+                  const float reach_m, global float *visibility, global float *cell_m) {
+    const int ray = get_global_id(0);
+    if (ray >= rays) return;
+    visibility[ray] = trace_objects(count, grid_from_volume, dims, distances, vload3(ray, origins),
+                                    vload3(ray, directions), reach_m);
+    if (ray < count) cell_m[ray] = cell_size_m(grid_from_volume[ray]);
+}
+"""
+FAR_M = 100.0
+
+Points = NDArray[np.float64]
+
+
+@pytest.fixture
+def trace(engine: Engine) -> Any:
+    """Visibility of rays (origins [n, 3], directions [n, 3], reach) through a table."""
+    options = ["-cl-std=CL1.2", "-Werror", "-I", str(KERNEL_FOLDER / "include")]
+    kernel = cl.Kernel(cl.Program(engine.device.context, SOURCE).build(options), "trace")
+
+    def run(table: ObjectTable, origins: Points, directions: Points, reach_m: float = FAR_M) -> NDArray[np.float32]:
+        space, rays = engine.workspace, len(origins)
+        ends = [
+            space.upload(f"test_{k}", np.ascontiguousarray(v, np.float32)) for k, v in enumerate((origins, directions))
+        ]
+        visibility = space.array("test_visibility", (rays,), np.float32)
+        cell_m = space.array("test_cells", (max(table.count, 1),), np.float32)
+        rows = (table.count, table.grid_from_volume, table.dims, table.distances)
+        engine.launch(kernel, (rays,), rays, *rows, *ends, reach_m, visibility, cell_m)
+        np.testing.assert_allclose(engine.download(cell_m)[: table.count], table.cell_m, rtol=1e-5)
+        result = engine.download(visibility)
+        assert set(np.unique(result)) <= {0.0, 1.0}
+        return result
+
+    return run
+
+
+def table_of(engine: Engine, *placed: tuple[Mesh, NDArray[np.float64]], cells: int = 64) -> ObjectTable:
+    return object_table(engine, [(VirtualObject.upload(engine, mesh, cells), matrix) for mesh, matrix in placed])
+
+
+def unit(vectors: Points) -> Points:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def random_directions(rng: np.random.Generator, count: int) -> Points:
+    return unit(rng.normal(size=(count, 3)))
+
+
+def rays_beside(rng: np.random.Generator, count: int, farthest: float) -> tuple[Points, Points, Points]:
+    """Rays that pass the origin at 0 to `farthest`: start (3 before), direction, how far they pass."""
+    directions = random_directions(rng, count)
+    beside = unit(np.cross(directions, rng.normal(size=(count, 3))))
+    passing = rng.uniform(0, farthest, count)
+    return beside * passing[:, None] - 3 * directions, directions, passing
+
+
+BALL = trimesh.creation.icosphere(subdivisions=5)
+PLACES = [pose((0, 0, 0)), pose((0.3, -0.2, 0.5), (1, 2, 3), 0.9, 0.37), pose((-5, 1, 2), (0, 1, 0), 2.0, 12.0)]
+
+
+@pytest.mark.parametrize("cells", [32, 64])
+@pytest.mark.parametrize("place", PLACES)
+def test_ball(engine: Engine, trace: Any, place: Points, cells: int) -> None:
+    """Blocked where the ball is, free from one and a half cells beside it, whatever its place and scale."""
+    table = table_of(engine, (shape_of(BALL), place), cells=cells)
+    origins, directions, passing = rays_beside(np.random.default_rng(0), 20000, 1.5)
+    scale = np.cbrt(np.linalg.det(place[:3, :3]))
+    at, along = origins @ place[:3, :3].T + place[:3, 3], directions @ place[:3, :3].T / scale
+    visibility = trace(table, at, along)
+    cell = table.cell_m[0] / scale
+    assert not visibility[passing < 0.999].any()
+    assert visibility[passing > 1 + 1.5 * cell].all()
+    outline = passing[(passing > 1) & (passing < 1 + 1.5 * cell)]
+    assert 0.1 < visibility[(passing > 1) & (passing < 1 + 1.5 * cell)].mean() < 0.9
+    assert len(outline) > 50
+
+
+def test_ray_off_its_own_surface_is_free(engine: Engine, trace: Any) -> None:
+    table = table_of(engine, (shape_of(BALL), np.eye(4)))
+    rng = np.random.default_rng(1)
+    normals = random_directions(rng, 50000)
+    directions = unit(normals + 0.999 * random_directions(rng, len(normals)))
+    assert trace(table, normals * (1 + table.cell_m[0]), directions).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_wall_of_any_direction_neither_leaks_nor_blocks_itself(engine: Engine, trace: Any, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    turn = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) @ turn.T
+    table = table_of(engine, (mesh_of(corners, [[0, 1, 2], [0, 2, 3]]), np.eye(4)))
+    at = np.concatenate([rng.uniform(-0.9, 0.9, (30000, 2)), np.full((30000, 1), table.cell_m[0])], axis=1)
+    directions = unit(np.array([0, 0, 1]) + 0.999 * random_directions(rng, len(at)))
+    assert trace(table, at @ turn.T, directions @ turn.T).all()
+    through = directions * (1, 1, -1)
+    lands = at[:, :2] + through[:, :2] * (at[:, 2:] / -through[:, 2:])
+    inside = (np.abs(lands) < 0.97).all(axis=1)
+    assert not trace(table, (at @ turn.T)[inside], (through @ turn.T)[inside]).any()
+
+
+def test_thin_leg_blocks(engine: Engine, trace: Any) -> None:
+    """A leg a third of a cell thick still blocks what meets its axis."""
+    leg = shape_of(trimesh.creation.cylinder(0.005, 2.0))
+    table = table_of(engine, (leg, np.eye(4)))
+    rng = np.random.default_rng(2)
+    points = np.stack([np.zeros(5000), np.zeros(5000), rng.uniform(-0.9, 0.9, 5000)], axis=1)
+    directions = unit(random_directions(rng, 5000) * (1, 1, 0.3))
+    assert table.cell_m[0] > 0.03
+    assert (trace(table, points - 2 * directions, directions) == 0).mean() > 0.99
+
+
+def test_reach(engine: Engine, trace: Any) -> None:
+    """A ray ends where its reach does, and does not look behind itself."""
+    table = table_of(engine, (shape_of(BALL), pose((0, 0, 5.0))))
+    rng = np.random.default_rng(3)
+    origins = np.concatenate([rng.uniform(-0.3, 0.3, (2000, 2)), np.zeros((2000, 1))], axis=1)
+    ahead = np.tile((0.0, 0.0, 1.0), (2000, 1))
+    entry = 5 - np.sqrt(1 - (origins[:, :2] ** 2).sum(axis=1))
+    assert trace(table, origins, ahead, float(entry.min()) - 2 * table.cell_m[0]).all()
+    assert not trace(table, origins, ahead, float(entry.max()) + 0.1 * table.cell_m[0]).any()
+    assert trace(table, origins, -ahead).all()
+    assert trace(table, origins, ahead, 0.0).all()
+
+
+def test_rays_along_the_axes(engine: Engine, trace: Any) -> None:
+    """Directions with exact zeros, inside and outside the grid."""
+    table = table_of(engine, (shape_of(trimesh.creation.box((1.0, 1.0, 1.0))), np.eye(4)))
+    directions = np.concatenate([np.eye(3), -np.eye(3)])
+    assert not trace(table, -3 * directions, directions).any()
+    assert trace(table, -3 * directions, -directions).all()
+    assert trace(table, -3 * directions + 2 * np.roll(directions, 1, axis=1), directions).all()
+    assert not trace(table, np.zeros((6, 3)), directions).any()
+
+
+def test_empty_table(engine: Engine, trace: Any) -> None:
+    table = object_table(engine, [])
+    assert table.count == 0
+    assert trace(table, np.zeros((5, 3)), np.tile((0.0, 0.0, 1.0), (5, 1))).all()
+
+
+def test_several_objects(engine: Engine, trace: Any) -> None:
+    """Each is found in its own part of the pool; grids of different sizes."""
+    ball, box = shape_of(BALL), shape_of(trimesh.creation.box((2.0, 0.5, 1.0)))
+    at = [np.array(p) for p in ((0.0, 0.0, 4.0), (4.0, 0.0, 0.0), (0.0, -4.0, 0.0))]
+    placed = [(ball, pose(at[0], scale=0.5)), (box, pose(at[1], (0, 0, 1), 1.0)), (ball, pose(at[2], (1, 0, 0), 1.0))]
+    table = table_of(engine, *placed)
+    directions = unit(np.array([*at, *(-p for p in at), at[0] + at[1], at[1] - at[2]]))
+    visibility = trace(table, np.zeros((len(directions), 3)), directions)
+    np.testing.assert_array_equal(visibility, [0, 0, 0, 1, 1, 1, 1, 1])
+    both = table_of(engine, *placed[1:])
+    np.testing.assert_array_equal(trace(both, np.zeros((3, 3)), directions[:3]), [1, 0, 0])
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["suzanne.obj", "kenney_furniture/chairDesk.glb"])
+def test_public_mesh_agrees_with_exact_rays(engine: Engine, trace: Any, name: str) -> None:
+    """Wherever a ray meets the mesh it is blocked; where it passes, nearly always free: outlines grow by under a cell."""
+    mesh = public_mesh(name)
+    low, high = mesh.bounds
+    table = table_of(engine, (mesh, np.eye(4)))
+    rng = np.random.default_rng(4)
+    directions = random_directions(rng, 3000)
+    targets = rng.uniform(low - 0.2 * (high - low), high + 0.2 * (high - low), (3000, 3))
+    origins = targets - 3 * float(np.linalg.norm(high - low)) * directions
+    exact = twin.trace_mesh(mesh.vertices.astype(np.float64), mesh.triangles.astype(np.int64), origins, directions)
+    visibility = trace(table, origins, directions, 1000.0)
+    hit = np.isfinite(exact)
+    assert hit.mean() > 0.1
+    assert (visibility[hit] == 0).mean() > 0.998
+    assert (visibility[~hit] == 1).mean() > 0.85
+
+
+def test_table_rows(engine: Engine) -> None:
+    """The rows are what the docstring says: matrix from volume to cells, sizes, start in the pool."""
+    ball, box = shape_of(BALL), shape_of(trimesh.creation.box((2.0, 0.5, 1.0)))
+    matrix = pose((1.0, 2.0, 3.0), (1, 1, 0), 0.4, 2.0)
+    things = [VirtualObject.upload(engine, ball, 16), VirtualObject.upload(engine, box, 32)]
+    table = object_table(engine, [(things[0], np.eye(4)), (things[1], matrix)])
+    rows = engine.download(table.grid_from_volume).view(np.float32).reshape(2, 4, 4)
+    expected = things[1].grid.grid_from_model @ np.linalg.inv(matrix)
+    np.testing.assert_allclose(rows[1], expected, rtol=1e-6, atol=1e-5)
+    dims = engine.download(table.dims).view(np.int32).reshape(2, 4)
+    np.testing.assert_array_equal(dims, [[16, 16, 16, 0], [*things[1].grid.dims, 16**3]])
+    pool = engine.download(table.distances)
+    np.testing.assert_array_equal(pool[16**3 :], engine.download(things[1].grid.distance).ravel())
+    assert table.grid_from_volume.dtype == cl_types.float16
+    assert table.cell_m[1] == pytest.approx(2.0 / things[1].grid.cells_per_m)

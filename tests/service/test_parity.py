@@ -1,0 +1,87 @@
+"""The real pipeline behind the socket gives, losslessly, the bits it gives in this process."""
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from client.laptop.objects import ObjectFile, pack_mesh
+from client.laptop.output import FrameOutput, OutputWriter
+from client.laptop.stream import stream
+from protocol.frames import CameraModel, RgbdFrame
+from protocol.messages import Wishes
+from server.opencl.device import Device
+from server.pipeline import Pipeline
+from server.scene.mesh import load_mesh
+from server.scene.placement import Placement
+from server.serve import start_in_background
+from server.service import Service
+
+FRAMES = 3
+CAMERA = CameraModel(width=96, height=72, fx=80.0, fy=80.0, cx=47.5, cy=35.5)
+WISHES = Wishes(volume_m=(-1.0, -1.0, 0.5, 1.0, 1.0, 2.5), voxel_m=0.04, rays=32, up=(0.0, -1.0, 0.0))
+BOX = "v -1 0 -1\nv 1 0 -1\nv 0 0 1\nv 0 2 0\nf 1 2 4\nf 2 3 4\nf 3 1 4\nf 1 3 2\n"
+
+
+class CornerSource:
+    """A camera that slides along a wall with a step in it; the colour is noise, which no lossy codec keeps."""
+
+    name, camera, fps, has_poses, up = "corner", CAMERA, 30.0, True, (0.0, -1.0, 0.0)
+
+    def __len__(self) -> int:
+        return FRAMES
+
+    def __getitem__(self, index: int) -> RgbdFrame:
+        v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+        depth = np.where(u < 50, 1600, 1400) + v
+        pose = np.eye(4)
+        pose[:3, 3] = 0.01 * index, 0.003 * index, -0.002
+        color = np.random.default_rng(index).integers(0, 256, (CAMERA.height, CAMERA.width, 3), np.uint8)
+        return RgbdFrame(index, index / 30, color, depth.astype(np.uint16), pose)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What both ways are given."""
+
+    source: CornerSource
+    item: ObjectFile
+
+
+def run_in_process(device: Device, scene: Scene, folder: Path) -> None:
+    """The frames through the pipeline, without a network."""
+    pipeline = Pipeline(device, CAMERA, WISHES)
+    format_, data = pack_mesh(scene.item.path)
+    placement = Placement(scene.item.position_m, scene.item.scale, scene.item.yaw_deg)
+    pipeline.place_object("object-0", load_mesh(data, format_), placement)
+    with OutputWriter(folder) as writer:
+        for frame in (scene.source[i] for i in range(FRAMES)):
+            result = vars(pipeline.process(frame))
+            writer.write(FrameOutput(frame=frame.index, timestamp_s=frame.timestamp_s, **result))
+    pipeline.close()
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    (tmp_path / "box.obj").write_text(BOX)
+    return Scene(CornerSource(), ObjectFile(tmp_path / "box.obj", (0.1, 0.2, 1.2), 0.1, 20.0))
+
+
+def comparable(folder: Path) -> dict[str, bytes]:
+    """Every file that must be the same; times never are."""
+    paths = [path for path in folder.rglob("*") if path.is_file() and path.name != "timings.jsonl"]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+def test_lossless_stream_gives_the_bits_of_an_in_process_run(device: Device, scene: Scene, tmp_path: Path) -> None:
+    run_in_process(device, scene, tmp_path / "run")
+    with start_in_background(Service(device)) as server:
+        quiet = Console(file=io.StringIO())
+        stream(scene.source, server.url, [scene.item], WISHES, tmp_path / "stream", lossless=True, console=quiet)
+    run, streamed = comparable(tmp_path / "run"), comparable(tmp_path / "stream")
+    assert len([name for name in run if name.endswith(".png")]) == FRAMES
+    assert run.keys() == streamed.keys()
+    assert [name for name in run if run[name] != streamed[name]] == []

@@ -30,10 +30,14 @@ static inline bool overlaps_beside(const float3 edge, const float3 a, const floa
            && overlaps_along((float3)(-edge.y, edge.x, 0.0f), a, b, c);
 }
 
-// Separating-axis test of a triangle and a cell around the origin, less the cell's own axes: bounds are compared before.
+// Separating-axis test of a triangle and a cell around the origin, less the cell's own axes: the bounds were compared.
 static bool overlaps_cell(const float3 a, const float3 b, const float3 c) {
     return overlaps_along(cross(b - a, c - a), a, b, c) && overlaps_beside(b - a, a, b, c)
            && overlaps_beside(c - b, a, b, c) && overlaps_beside(a - c, a, b, c);
+}
+
+static inline int cell_index(const int4 dims, const int x, const int y, const int z) {
+    return (z * dims.y + y) * dims.x + x;
 }
 
 // Last cell of a slab.
@@ -65,7 +69,7 @@ kernel void mark_cells(const int triangle_count, const int4 dims, const global f
         for (int y = low.y; y <= high.y; y++)
             for (int x = low.x; x <= high.x; x++) {
                 const float3 center = (float3)(x, y, z) + 0.5f;
-                if (overlaps_cell(a - center, b - center, c - center)) atomic_or(&occupied[(z * dims.y + y) * dims.x + x], 1);
+                if (overlaps_cell(a - center, b - center, c - center)) atomic_or(&occupied[cell_index(dims, x, y, z)], 1);
             }
 }
 
@@ -87,8 +91,8 @@ kernel void seed_distance(const int4 dims, const global int *occupied, global in
     }
 }
 
-// Extends squared distances by one axis: min over the line of what is there plus the squared way along it. Looks outwards
-// until nothing farther can be nearer. `length`: cells of the line; `stride`: from one of its cells to the next.
+// Extends squared distances by one axis: min over the line of what is there plus the squared way along it. Looks
+// outwards until nothing farther can be nearer. `length`: cells of the line; `stride`: from one of them to the next.
 kernel void spread_distance(const int cells, const int length, const int stride, const global int *squared,
                             global int *result) {
     const int cell = get_global_id(0);
@@ -110,17 +114,20 @@ static inline float squared_to_edge(const float3 a, const float3 ab) {
     return squared_length(a + clamp(along, 0.0f, 1.0f) * ab);
 }
 
+// The normal of a sliver is all rounding; its edges are as near as its inside.
+static inline bool is_sliver(const float3 normal, const float3 ab, const float3 ca) {
+    return squared_length(normal) <= 1e-8f * squared_length(ab) * squared_length(ca);
+}
+
 // Squared distance from the origin to a triangle: to its inside where the origin is above that, else to its edges.
 static float squared_to_triangle(const float3 a, const float3 b, const float3 c) {
     const float3 ab = b - a, bc = c - b, ca = a - c, normal = cross(ab, -ca);
-    float best = fmin(squared_to_edge(a, ab), fmin(squared_to_edge(b, bc), squared_to_edge(c, ca)));
-    const float size = squared_length(normal);
-    // The normal of a sliver is all rounding; its edges are as near as its inside.
-    const bool is_sliver = size <= 1e-8f * squared_length(ab) * squared_length(ca);
+    const float best = fmin(squared_to_edge(a, ab), fmin(squared_to_edge(b, bc), squared_to_edge(c, ca)));
     const bool is_above = dot(cross(normal, ab), a) <= 0.0f && dot(cross(normal, bc), b) <= 0.0f
                           && dot(cross(normal, ca), c) <= 0.0f;
-    const float height = dot(normal, a);
-    return is_above && !is_sliver ? fmin(best, height * height / size) : best;
+    if (!is_above || is_sliver(normal, ab, ca)) return best;
+    const float height = dot(normal, a) / length(normal);
+    return fmin(best, height * height);
 }
 
 // Lowers `near` (bits of float cells; they order as the floats do) to the distance of a triangle from the centres of
@@ -134,7 +141,7 @@ kernel void measure_near(const int triangle_count, const int4 dims, const global
     const float3 b = transform_point(grid_from_model, vload3(v.y, vertices));
     const float3 c = transform_point(grid_from_model, vload3(v.z, vertices));
     const float3 normal = cross(b - a, c - a);
-    const float reach = NEAR_CELLS * length(normal) * 1.01f;
+    const float reach = is_sliver(normal, b - a, a - c) ? MAXFLOAT : 1.01f * NEAR_CELLS * length(normal);
     const int3 low = max(convert_int3_rtp(fmin(a, fmin(b, c)) - NEAR_CELLS - 0.5f), (int3)(0, 0, slab));
     const int3 high = min(convert_int3_rtn(fmax(a, fmax(b, c)) + NEAR_CELLS - 0.5f), high_corner(dims, slab));
     for (int z = low.z; z <= high.z; z++)
@@ -142,13 +149,14 @@ kernel void measure_near(const int triangle_count, const int4 dims, const global
             for (int x = low.x; x <= high.x; x++) {
                 const float3 center = (float3)(x, y, z) + 0.5f;
                 if (fabs(dot(normal, a - center)) > reach) continue;
-                const float squared = squared_to_triangle(a - center, b - center, c - center);
-                if (squared < NEAR_CELLS * NEAR_CELLS) atomic_min(&near[(z * dims.y + y) * dims.x + x], as_int(sqrt(squared)));
+                const float cells = sqrt(squared_to_triangle(a - center, b - center, c - center));
+                if (cells < NEAR_CELLS) atomic_min(&near[cell_index(dims, x, y, z)], as_int(cells));
             }
 }
 
 // The measured distance where there is one, else that to the nearest touched cell.
-kernel void finish_distance(const int cells, const global int *squared, const global int *near, global float *distance) {
+kernel void finish_distance(const int cells, const global int *squared, const global int *near,
+                            global float *distance) {
     const int cell = get_global_id(0);
     if (cell >= cells) return;
     const float measured = as_float(near[cell]);

@@ -46,7 +46,9 @@ def open_source(spec: str) -> Source:
 
         return open_folder(path)
     if path.is_file():
-        return _open_recording(path)
+        from client.laptop.recorded import open_recording
+
+        return open_recording(path)
     raise SourceError(f"{spec}: no such folder or file; give a data-set folder, a recording, synthetic:table or oak")
 
 
@@ -55,7 +57,3 @@ def _open_oak() -> Source:
         "oak: no OAK camera support is installed or no device is connected; stream a data-set folder, a recording or "
         "synthetic:table instead"
     )
-
-
-def _open_recording(path: Path) -> Source:
-    raise SourceError(f"{path}: is not a recording; give a data-set folder, synthetic:table or oak")

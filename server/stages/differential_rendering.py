@@ -107,7 +107,7 @@ def ball_around(objects: Sequence[Placed]) -> np.generic:
     boxes = [np.array(list(product(*zip(*thing.bounds, strict=True)))) for thing, _ in objects]
     corners = np.concatenate([b @ m[:3, :3].T + m[:3, 3] for b, (_, m) in zip(boxes, objects, strict=True)])
     center = (corners.min(axis=0) + corners.max(axis=0)) / 2
-    return float4(*center, float(np.linalg.norm(corners - center, axis=1).max()) * 1.001)
+    return float4(*center, float(np.linalg.norm(corners - center, axis=1).max()) * 1.02)
 
 
 def shadow_virtual(

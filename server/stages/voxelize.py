@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pyopencl as cl
 import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 MARGIN_CELLS = 2
 """Free cells around the mesh, on every side."""
+NEAR_CELLS = 1.65
+"""Distances up to here are measured to the triangles."""
 LEAST_CELLS = 8
 MOST_CELLS = 256
 _SLAB = 4
@@ -31,10 +34,12 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DistanceGrid:
-    """How far each cell is from the nearest that the mesh touches."""
+    """How far the centre of each cell is from the mesh."""
 
     distance: cl_array.Array
-    """[z, y, x] float32, cells, from centre to centre; 0 where a triangle touches the cell."""
+    """[z, y, x] float32, cells: up to NEAR_CELLS to the nearest triangle; beyond, to the centre of the nearest cell that
+    a triangle touches, which is exact to half a cell's diagonal.
+    """
     grid_from_model: Matrix
     """[4, 4] model metres to cells; the centre of cell i lies at i + 0.5."""
 
@@ -73,19 +78,28 @@ def voxelize(
     The distance array is the caller's to keep. Raises ValueError for a number of cells out of range.
     """
     dims, grid_from_model = place_grid(*bounds, cells)
-    shape = dims[::-1]
-    occupied = engine.workspace.upload("voxelize_occupied", np.zeros(shape, np.int32))
-    engine.launch(
-        engine.kernel("voxelize.cl", "mark_cells", SLAB=_SLAB),
-        (len(triangles), -(-dims[2] // _SLAB)),
-        len(triangles),
-        int4(*dims, 0),
-        vertices,
-        triangles,
-        float16(grid_from_model),
-        occupied,
-    )
-    return DistanceGrid(_transform(engine, occupied), grid_from_model)
+    space, shape = engine.workspace, dims[::-1]
+    occupied, near = (space.array(f"voxelize_{name}", shape, np.int32) for name in ("occupied", "near"))
+    engine.launch(_kernel(engine, "clear_cells"), (occupied.size,), occupied.size, occupied, near)
+    for name, cells_of in (("mark_cells", occupied), ("measure_near", near)):
+        engine.launch(
+            _kernel(engine, name),
+            (len(triangles), -(-dims[2] // _SLAB)),
+            len(triangles),
+            int4(*dims, 0),
+            vertices,
+            triangles,
+            float16(grid_from_model),
+            cells_of,
+        )
+    distance = cl_array.empty(engine.queue, shape, np.float32)
+    squared = _squared_distance(engine, occupied)
+    engine.launch(_kernel(engine, "finish_distance"), (squared.size,), squared.size, squared, near, distance)
+    return DistanceGrid(distance, grid_from_model)
+
+
+def _kernel(engine: Engine, name: str) -> cl.Kernel:
+    return engine.kernel("voxelize.cl", name, SLAB=_SLAB)
 
 
 def place_grid(low: Vector, high: Vector, cells: int) -> tuple[tuple[int, int, int], Matrix]:
@@ -106,21 +120,15 @@ def place_grid(low: Vector, high: Vector, cells: int) -> tuple[tuple[int, int, i
     return (x, y, z), grid_from_model
 
 
-def _transform(engine: Engine, occupied: cl_array.Array) -> cl_array.Array:
-    """Exact Euclidean distance transform (Felzenszwalb and Huttenlocher: axis by axis), a new array like `occupied`."""
-    space, (z, y, x) = engine.workspace, occupied.shape
+def _squared_distance(engine: Engine, occupied: cl_array.Array) -> cl_array.Array:
+    """Exact Euclidean distance transform of `occupied` [z, y, x], squared, int32 (axis by axis, as Felzenszwalb's)."""
+    space, (z, y, x), cells = engine.workspace, occupied.shape, occupied.size
     one, other = (space.array(f"voxelize_squared_{k}", occupied.shape, np.int32) for k in (0, 1))
-    distance = cl_array.empty(engine.queue, occupied.shape, np.float32)
-    cells = occupied.size
-
-    def launch(name: str, size: int, *arguments: object) -> None:
-        engine.launch(engine.kernel("voxelize.cl", name, SLAB=_SLAB), (size,), *arguments)  # type: ignore[arg-type]
-
-    launch("seed_distance", y * z, int4(x, y, z, 0), occupied, one)
-    launch("spread_distance", cells, cells, y, x, one, other)
-    launch("spread_distance", cells, cells, z, x * y, other, one)
-    launch("finish_distance", cells, cells, one, distance)
-    return distance
+    spread = _kernel(engine, "spread_distance")
+    engine.launch(_kernel(engine, "seed_distance"), (y * z,), int4(x, y, z, 0), occupied, one)
+    engine.launch(spread, (cells,), cells, y, x, one, other)
+    engine.launch(spread, (cells,), cells, z, x * y, other, one)
+    return one
 
 
 def object_table(engine: Engine, objects: Sequence[tuple[VirtualObject, Matrix]]) -> ObjectTable:

@@ -53,7 +53,7 @@ def table() -> Scene:
         Body(Sphere(np.array([0.36, 0.06, 0.1]), 0.06), paint(0.3, 0.65, 0.3)),
         Body(Cylinder(np.array([0.46, 0.0, -0.1]), np.array([0, 1.0, 0]), 0.2, 0.05), paint(0.7, 0.6, 0.55)),
         Body(Cylinder(np.array([-0.5, 0.045, 0.14]), _unit(1, 0, 0.5), 0.22, 0.045), paint(0.6, 0.3, 0.6)),
-        Body(wedge((-0.2, 0, 0.2), (0.24, 0.11, 0.15), rotation_about("y", 65)), paint(0.35, 0.6, 0.62)),
+        Body(wedge((-0.16, 0, 0.2), (0.24, 0.11, 0.15), rotation_about("y", 65)), paint(0.35, 0.6, 0.62)),
     )
     return Scene("table", bodies, 0.004, 4096, _walk_around_table)
 

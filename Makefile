@@ -1,0 +1,55 @@
+# Every target sets up what it needs in .venv first; the second time that takes no time.
+PYTHON ?= python3
+BIN := .venv/bin
+DATA ?= ../shared/data
+
+.PHONY: help install install-bench demo test lint bench web lock clean
+help:
+	@echo "make demo    the main job: server, streaming client, pictures in out/demo"
+	@echo "make test    the tests           make lint   formatting, types"
+	@echo "make bench   the benchmarks      make web    rebuild the page from its sources"
+	@echo "make install the program alone, as .venv/bin/probeless"
+
+install: .venv/installed
+install-bench: .venv/installed-test
+
+demo: .venv/installed
+	$(BIN)/probeless demo
+
+test: .venv/installed-test
+	PROBELESS_DATA=$${PROBELESS_DATA:-$(DATA)} $(BIN)/python -m pytest $(TESTS)
+
+lint: .venv/installed-test
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+bench: .venv/installed-test
+	$(BIN)/probeless bench service
+
+web: .venv/installed-test
+	$(BIN)/python -m protocol.typescript
+	$(BIN)/python -m client.web.build
+
+# The locks hold every package with its hash, for every platform and Python that pyproject.toml allows.
+lock: .venv/installed-test
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build pyproject.toml -o requirements.lock
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra test \
+		--constraint requirements.lock pyproject.toml -o requirements-test.lock
+
+.venv/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+		echo "probeless needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) --version 2>&1): make PYTHON=python3.12 ..."; exit 1; }
+	$(PYTHON) -m venv .venv
+
+.venv/installed: requirements.lock pyproject.toml | .venv/bin/python
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+.venv/installed-test: requirements-test.lock .venv/installed
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-test.lock
+	@touch $@
+
+clean:
+	rm -rf .venv out

@@ -1,0 +1,10 @@
+# probeless on a CPU through PoCL. Build from the project's root: docker build -f docker/cpu.Dockerfile -t probeless:cpu .
+FROM python:3.11-slim-bookworm
+RUN apt-get update && apt-get install --yes --no-install-recommends make && rm -rf /var/lib/apt/lists/*
+WORKDIR /opt/probeless
+COPY . .
+RUN make install && useradd --create-home probeless
+USER probeless
+EXPOSE 8000
+HEALTHCHECK CMD [".venv/bin/python", "-c", "import urllib.request as u; u.urlopen('http://127.0.0.1:8000/healthz')"]
+CMD [".venv/bin/probeless", "serve", "--host", "0.0.0.0", "--port", "8000"]

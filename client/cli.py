@@ -135,9 +135,7 @@ def stream(
     capture = o.prepare(o.CaptureOptions.of(locals()), lossless=lossless)
     from client.laptop.stream import stream as send
 
-    done = send(
-        capture.source, server, capture.objects, capture.wishes, out, lossless, record, frames=capture.frames
-    )
+    done = send(capture.source, server, capture.objects, capture.wishes, out, lossless, record, frames=capture.frames)
     written = f", written to {out}" if out is not None else ""
     speed = done.answered / done.seconds if done.seconds > 0 else 0.0
     say(
@@ -183,3 +181,15 @@ def devices() -> None:
     from client.laptop.devices import show_devices
 
     show_devices()
+
+
+@app.command()
+def bench(
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="what to measure")],
+    json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="fewer frames and trials")] = False,
+) -> None:
+    """Measure, and compare with the goals."""
+    from client.bench import run_bench
+
+    run_bench(suite, json, quick)

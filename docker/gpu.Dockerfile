@@ -7,6 +7,6 @@ WORKDIR /opt/probeless
 COPY . .
 RUN make install && useradd --create-home probeless
 USER probeless
-EXPOSE 8000
-HEALTHCHECK CMD [".venv/bin/python", "-c", "import urllib.request as u; u.urlopen('http://127.0.0.1:8000/healthz')"]
-CMD [".venv/bin/probeless", "serve", "--host", "0.0.0.0", "--port", "8000"]
+EXPOSE 8080
+HEALTHCHECK CMD [".venv/bin/python", "-c", "import urllib.request as u; u.urlopen('http://127.0.0.1:8080/healthz')"]
+CMD [".venv/bin/probeless", "serve", "--host", "0.0.0.0", "--port", "8080"]

@@ -37,8 +37,8 @@ class DistanceGrid:
     """How far the centre of each cell is from the mesh."""
 
     distance: cl_array.Array
-    """[z, y, x] float32, cells: up to NEAR_CELLS to the nearest triangle; beyond, to the centre of the nearest cell that
-    a triangle touches, which is exact to half a cell's diagonal.
+    """[z, y, x] float32, cells: up to NEAR_CELLS to the nearest triangle; beyond, to the centre of the nearest cell
+    that a triangle touches, which is exact to half a cell's diagonal.
     """
     grid_from_model: Matrix
     """[4, 4] model metres to cells; the centre of cell i lies at i + 0.5."""

@@ -86,18 +86,17 @@ PLACES = [pose((0, 0, 0)), pose((0.3, -0.2, 0.5), (1, 2, 3), 0.9, 0.37), pose((-
 @pytest.mark.parametrize("cells", [32, 64])
 @pytest.mark.parametrize("place", PLACES)
 def test_ball(engine: Engine, trace: Any, place: Points, cells: int) -> None:
-    """Blocked where the ball is, free from one and a half cells beside it, whatever its place and scale."""
+    """Blocked where the ball is and half a cell beside it, free from one cell, whatever its place and scale."""
     table = table_of(engine, (shape_of(BALL), place), cells=cells)
     origins, directions, passing = rays_beside(np.random.default_rng(0), 20000, 1.5)
     scale = np.cbrt(np.linalg.det(place[:3, :3]))
     at, along = origins @ place[:3, :3].T + place[:3, 3], directions @ place[:3, :3].T / scale
     visibility = trace(table, at, along)
     cell = table.cell_m[0] / scale
-    assert not visibility[passing < 0.999].any()
-    assert visibility[passing > 1 + 1.5 * cell].all()
-    outline = passing[(passing > 1) & (passing < 1 + 1.5 * cell)]
-    assert 0.1 < visibility[(passing > 1) & (passing < 1 + 1.5 * cell)].mean() < 0.9
-    assert len(outline) > 50
+    assert not visibility[passing < 1 + 0.5 * cell].any()
+    assert visibility[passing > 1 + 1.0 * cell].all()
+    outline = (passing > 1 + 0.5 * cell) & (passing < 1 + cell)
+    assert 0.3 < visibility[outline].mean() < 0.8
 
 
 def test_ray_off_its_own_surface_is_free(engine: Engine, trace: Any) -> None:
@@ -131,7 +130,7 @@ def test_thin_leg_blocks(engine: Engine, trace: Any) -> None:
     points = np.stack([np.zeros(5000), np.zeros(5000), rng.uniform(-0.9, 0.9, 5000)], axis=1)
     directions = unit(random_directions(rng, 5000) * (1, 1, 0.3))
     assert table.cell_m[0] > 0.03
-    assert (trace(table, points - 2 * directions, directions) == 0).mean() > 0.99
+    assert not trace(table, points - 2 * directions, directions).any()
 
 
 def test_reach(engine: Engine, trace: Any) -> None:
@@ -179,7 +178,7 @@ def test_several_objects(engine: Engine, trace: Any) -> None:
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["suzanne.obj", "kenney_furniture/chairDesk.glb"])
 def test_public_mesh_agrees_with_exact_rays(engine: Engine, trace: Any, name: str) -> None:
-    """Wherever a ray meets the mesh it is blocked; where it passes, nearly always free: outlines grow by under a cell."""
+    """Where a ray meets the mesh it is blocked; where it passes, mostly free: outlines grow by under a cell."""
     mesh = public_mesh(name)
     low, high = mesh.bounds
     table = table_of(engine, (mesh, np.eye(4)))
@@ -191,7 +190,7 @@ def test_public_mesh_agrees_with_exact_rays(engine: Engine, trace: Any, name: st
     visibility = trace(table, origins, directions, 1000.0)
     hit = np.isfinite(exact)
     assert hit.mean() > 0.1
-    assert (visibility[hit] == 0).mean() > 0.998
+    assert not visibility[hit].any()
     assert (visibility[~hit] == 1).mean() > 0.85
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,21 +14,37 @@ from scipy import ndimage
 from server.opencl.engine import Engine
 from server.scene.mesh import Mesh
 from server.scene.virtual_object import VirtualObject
-from server.stages.voxelize import LEAST_CELLS, MARGIN_CELLS, MOST_CELLS, place_grid
-from tests.meshes import mesh_of, pose, public_mesh, shape_of, soup_of
+from server.stages.voxelize import LEAST_CELLS, MARGIN_CELLS, MOST_CELLS, NEAR_CELLS, place_grid
+from tests.meshes import mesh_of, public_mesh, shape_of, soup_of
 from tests.reference import voxelize as twin
 
 MARGIN = 1e-4
 """The device's cells are larger by this on every side, so that rounding never loses one."""
 
 
-def grid_of(engine: Engine, mesh: Mesh, cells: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Distances [z, y, x] and the mesh's vertices in grid units."""
+@dataclass(frozen=True)
+class Grid:
+    """A mesh's grids on the host, [z, y, x], and its vertices in grid units."""
+
+    distance: NDArray[np.float32]
+    occupied: NDArray[np.bool_]
+    vertices: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+
+    @property
+    def dims(self) -> tuple[int, ...]:
+        """Cells in x, y, z."""
+        return self.distance.shape[::-1]
+
+
+def grid_of(engine: Engine, mesh: Mesh, cells: int) -> Grid:
     grid = VirtualObject.upload(engine, mesh, cells).grid
     matrix = grid.grid_from_model
     distance = engine.download(grid.distance)
     assert grid.dims == distance.shape[::-1]
-    return distance, mesh.vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    occupied = engine.download(engine.workspace.array("voxelize_occupied", distance.shape, np.int32))
+    vertices = mesh.vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    return Grid(distance, occupied > 0, vertices, mesh.triangles.astype(np.int64))
 
 
 def random_triangles(seed: int, count: int, size: float) -> Mesh:
@@ -55,35 +72,77 @@ SHAPES: dict[str, Any] = {
 }
 
 
+def assert_touched_cells_are_marked(grid: Grid) -> None:
+    """Every cell that a triangle touches, and none that is farther than the margin."""
+    touched = twin.mark_cells(grid.vertices, grid.triangles, grid.dims, 0.5)
+    reached = twin.mark_cells(grid.vertices, grid.triangles, grid.dims, 0.5 + 2 * MARGIN)
+    assert not (touched & ~grid.occupied).any()
+    assert not (grid.occupied & ~reached).any()
+
+
 @pytest.mark.parametrize("cells", [LEAST_CELLS, 33])
 @pytest.mark.parametrize("name", SHAPES)
 def test_cells_are_those_that_triangles_touch(engine: Engine, name: str, cells: int) -> None:
-    mesh = SHAPES[name]()
-    distance, vertices = grid_of(engine, mesh, cells)
-    dims = distance.shape[::-1]
-    triangles = mesh.triangles.astype(np.int64)
-    touched = twin.mark_cells(vertices, triangles, dims, 0.5)
-    reached = twin.mark_cells(vertices, triangles, dims, 0.5 + 2 * MARGIN)
-    marked = distance == 0
-    assert not (touched & ~marked).any()
-    assert not (marked & ~reached).any()
+    assert_touched_cells_are_marked(grid_of(engine, SHAPES[name](), cells))
 
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_every_point_of_the_mesh_is_in_a_marked_cell(engine: Engine, name: str) -> None:
-    mesh = SHAPES[name]()
-    distance, vertices = grid_of(engine, mesh, 40)
-    shares = np.random.default_rng(0).dirichlet((1, 1, 1), (len(mesh.triangles), max(20000 // len(mesh.triangles), 8)))
-    points = np.einsum("tsk,tkx->tsx", shares, vertices[mesh.triangles]).reshape(-1, 3)
+    grid = grid_of(engine, SHAPES[name](), 40)
+    count = len(grid.triangles)
+    shares = np.random.default_rng(0).dirichlet((1, 1, 1), (count, max(20000 // count, 8)))
+    points = np.einsum("tsk,tkx->tsx", shares, grid.vertices[grid.triangles]).reshape(-1, 3)
     x, y, z = np.floor(points).astype(int).T
-    assert (distance[z, y, x] == 0).all()
+    assert grid.occupied[z, y, x].all()
 
 
 @pytest.mark.parametrize("cells", [LEAST_CELLS, 31, 64])
 @pytest.mark.parametrize("name", SHAPES)
-def test_distances_are_exact(engine: Engine, name: str, cells: int) -> None:
-    distance, _ = grid_of(engine, SHAPES[name](), cells)
-    np.testing.assert_array_equal(distance, ndimage.distance_transform_edt(distance > 0).astype(np.float32))
+def test_far_distances_are_the_exact_transform(engine: Engine, name: str, cells: int) -> None:
+    grid = grid_of(engine, SHAPES[name](), cells)
+    expected = ndimage.distance_transform_edt(~grid.occupied).astype(np.float32)
+    far = grid.distance >= np.float32(NEAR_CELLS)
+    np.testing.assert_array_equal(grid.distance[far], np.maximum(expected, np.float32(NEAR_CELLS))[far])
+    # Touched cells and their neighbours are all measured.
+    assert not (far & (expected <= 0.75)).any()
+
+
+def some_cells(grid: Grid, count: int) -> NDArray[np.int64]:
+    """[n, 3] z, y, x of cells, half of them near the mesh."""
+    rng = np.random.default_rng(0)
+    near = np.argwhere(grid.distance < 2.5)
+    return np.concatenate([rng.choice(near, count // 2), rng.choice(np.argwhere(grid.distance >= 0), count // 2)])
+
+
+def true_distance(grid: Grid, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[n] by trimesh, from each point to every triangle."""
+    corners = grid.vertices[grid.triangles]
+    nearest = np.empty(len(points))
+    for index, point in enumerate(points):
+        closest = trimesh.triangles.closest_point(corners, np.broadcast_to(point, (len(corners), 3)))
+        nearest[index] = np.linalg.norm(closest - point, axis=1).min()
+    return nearest
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_near_distances_are_those_to_the_mesh(engine: Engine, name: str) -> None:
+    """Near to 1e-4 cells; far never too large by more than half a cell's diagonal, nor small by more."""
+    grid = grid_of(engine, SHAPES[name](), 32)
+    cells = some_cells(grid, 600)
+    found = grid.distance[tuple(cells.T)]
+    true = true_distance(grid, cells[:, ::-1] + 0.5)
+    near = true < NEAR_CELLS - 1e-3
+    assert near.sum() > 100
+    np.testing.assert_allclose(found[near], true[near], atol=1e-4)
+    assert (found[~near] >= NEAR_CELLS - 2e-3).all()
+    assert np.abs(found[~near] - true[~near]).max() < np.sqrt(3) / 2 + 1e-3
+
+
+def test_distance_twin_agrees_with_trimesh(engine: Engine) -> None:
+    grid = grid_of(engine, SHAPES["triangles like cells"](), 16)
+    points = np.random.default_rng(1).uniform(0, 16, (200, 3))
+    twins = twin.distance_to_mesh(points, grid.vertices, grid.triangles)
+    np.testing.assert_allclose(twins, true_distance(grid, points), atol=1e-9)
 
 
 def test_distance_twin_agrees_with_scipy() -> None:
@@ -106,56 +165,31 @@ def test_nothing_occupied_is_far_everywhere(engine: Engine) -> None:
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_grid_is_around_the_mesh(engine: Engine, name: str) -> None:
-    mesh = SHAPES[name]()
-    distance, vertices = grid_of(engine, mesh, 48)
-    assert max(distance.shape) == 48
-    inner = distance[(slice(MARGIN_CELLS, -MARGIN_CELLS),) * 3]
-    assert (distance == 0).sum() == (inner == 0).sum() > 0
-    np.testing.assert_allclose(vertices.min(axis=0), MARGIN_CELLS + 0.5, atol=1e-4)
-    z, y, x = np.nonzero(distance == 0)
-    np.testing.assert_array_equal([x.max() + 1 + MARGIN_CELLS, y.max() + 1 + MARGIN_CELLS], distance.shape[:0:-1])
-    assert z.max() + 1 + MARGIN_CELLS == distance.shape[0]
+    grid = grid_of(engine, SHAPES[name](), 48)
+    assert max(grid.dims) == 48
+    np.testing.assert_allclose(grid.vertices.min(axis=0), MARGIN_CELLS + 0.5, atol=1e-4)
+    places = np.argwhere(grid.occupied)[:, ::-1]
+    np.testing.assert_array_equal(places.min(axis=0), [MARGIN_CELLS] * 3)
+    np.testing.assert_array_equal(places.max(axis=0) + 1 + MARGIN_CELLS, grid.dims)
 
 
 def test_walls_along_the_axes_are_one_cell_thick(engine: Engine) -> None:
-    distance, _ = grid_of(engine, shape_of(trimesh.creation.box((1.0, 1.0, 1.0))), 64)
-    z, y, x = (n // 2 for n in distance.shape)
-    for line in (distance[:, y, x], distance[z, :, x], distance[z, y, :]):
-        np.testing.assert_array_equal(np.nonzero(line == 0)[0], [MARGIN_CELLS, 63 - MARGIN_CELLS])
-
-
-def test_distance_is_that_to_the_surface(engine: Engine) -> None:
-    """Within the half diagonal by which a touched cell's centre may be off the surface."""
-    distance, _ = grid_of(engine, shape_of(trimesh.creation.icosphere(subdivisions=5)), 64)
-    centers = np.argwhere(np.ones_like(distance)) + 0.5
-    radius = (64 - 2 * MARGIN_CELLS - 1) / 2
-    true = np.abs(np.linalg.norm(centers - np.array(distance.shape) / 2, axis=1) - radius)
-    error = distance.reshape(-1) - true
-    assert np.abs(error).max() < np.sqrt(3) / 2 + 0.1
-    assert np.abs(error).mean() < 0.5
+    grid = grid_of(engine, shape_of(trimesh.creation.box((1.0, 1.0, 1.0))), 64)
+    for line in (grid.occupied[:, 32, 32], grid.occupied[32, :, 32], grid.occupied[32, 32, :]):
+        np.testing.assert_array_equal(np.nonzero(line)[0], [MARGIN_CELLS, 63 - MARGIN_CELLS])
 
 
 @pytest.mark.data
 def test_public_mesh(engine: Engine) -> None:
-    mesh = public_mesh("suzanne.obj")
-    distance, vertices = grid_of(engine, mesh, 64)
-    triangles = mesh.triangles.astype(np.int64)
-    marked = distance == 0
-    assert not (twin.mark_cells(vertices, triangles, distance.shape[::-1], 0.5) & ~marked).any()
-    assert not (marked & ~twin.mark_cells(vertices, triangles, distance.shape[::-1], 0.5 + 2 * MARGIN)).any()
-    np.testing.assert_array_equal(distance, ndimage.distance_transform_edt(~marked).astype(np.float32))
+    grid = grid_of(engine, public_mesh("suzanne.obj"), 64)
+    assert_touched_cells_are_marked(grid)
+    cells = some_cells(grid, 400)
+    twins = twin.distance_to_mesh(cells[:, ::-1] + 0.5, grid.vertices, grid.triangles)
+    near = twins < NEAR_CELLS - 1e-3
+    np.testing.assert_allclose(grid.distance[tuple(cells.T)][near], twins[near], atol=1e-4)
 
 
 @pytest.mark.parametrize("cells", [LEAST_CELLS - 1, 0, -5, MOST_CELLS + 1])
 def test_impossible_number_of_cells(cells: int) -> None:
     with pytest.raises(ValueError, match=f"grid of {cells} cells"):
         place_grid(np.zeros(3), np.ones(3), cells)
-
-
-def test_placed_objects_share_the_grid(engine: Engine) -> None:
-    """A mesh is voxelised in its own space: moving it does not change the grid."""
-    ball = shape_of(trimesh.creation.icosphere(subdivisions=2))
-    moved = ball.vertices @ pose((3.0, 2.0, 1.0))[:3, :3].T + np.float32([3, 2, 1])
-    here, _ = grid_of(engine, ball, 32)
-    there, _ = grid_of(engine, mesh_of(moved, ball.triangles), 32)
-    assert (here != there).mean() < 0.02

@@ -35,11 +35,28 @@ def mark_cells(vertices: Floats, triangles: NDArray[np.int64], dims: tuple[int, 
 
 
 def distance_transform(occupied: NDArray[np.bool_]) -> Floats:
-    """[z, y, x] distance from each cell to the nearest occupied one, by looking at all of them."""
+    """[z, y, x] distance from each cell to the nearest occupied one, in cells, by looking at all of them."""
     places = np.argwhere(occupied)
     cells = np.argwhere(np.ones_like(occupied))
     squared = np.array([((places - cell) ** 2).sum(axis=1).min() for cell in cells])
     return np.sqrt(squared).reshape(occupied.shape)
+
+
+def distance_to_mesh(points: Floats, vertices: Floats, triangles: NDArray[np.int64]) -> Floats:
+    """[n] distance of each point to the nearest triangle: to its plane where above its inside, else to its edges."""
+    nearest = np.full(len(points), np.inf)
+    for corners in vertices[triangles]:
+        normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+        above = np.ones(len(points), bool)
+        for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            edge = end - start
+            share = np.clip((points - start) @ edge / max(edge @ edge, 1e-300), 0, 1)
+            nearest = np.minimum(nearest, np.linalg.norm(points - start - share[:, None] * edge, axis=1))
+            above &= (points - start) @ np.cross(normal, edge) >= 0
+        if normal.any():
+            height = np.abs((points - corners[0]) @ normal) / np.linalg.norm(normal)
+            nearest = np.where(above, np.minimum(nearest, height), nearest)
+    return nearest
 
 
 def trace_mesh(vertices: Floats, triangles: NDArray[np.int64], origins: Floats, directions: Floats) -> Floats:

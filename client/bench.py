@@ -1,0 +1,67 @@
+"""`probeless bench SUITE`: finds the suite, runs it, prints its rows.
+
+A suite is a module of `server.evaluation` or `tests.bench` named after it, with
+`run_suite(quick: bool, progress: Callable[[str], None]) -> dict`: `device`, `commit`, `rows`, `unmeasured`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from client.laptop.errors import OptionError
+from client.progress import note, say
+
+SUITES = ("geometry", "light", "rendering", "accuracy", "stability", "plan", "service", "client")
+PACKAGES = ("server.evaluation", "tests.bench")
+
+Suite = Callable[[bool, Callable[[str], None]], dict[str, Any]]
+
+
+def run_bench(name: str, as_json: bool, quick: bool) -> None:
+    """Run a suite and print what it measured. Raises OptionError, listing the suites that exist."""
+    suite = find_suite(name)
+    if suite is None:
+        existing = ", ".join(known for known in SUITES if find_suite(known) is not None)
+        raise OptionError(f"there is no suite {name!r} here; there are: {existing or 'none yet'}")
+    result = suite(quick, note)
+    if as_json:
+        say(json.dumps(result, allow_nan=False))
+    else:
+        _print(result)
+
+
+def find_suite(name: str) -> Suite | None:
+    """The suite's function, if this installation has it."""
+    if name not in SUITES:
+        return None
+    for package in PACKAGES:
+        if _exists(package) and _exists(f"{package}.{name}"):
+            function: Suite | None = getattr(import_module(f"{package}.{name}"), "run_suite", None)
+            if function is not None:
+                return function
+    return None
+
+
+def _exists(module: str) -> bool:
+    """True if the module can be found; the benchmarks' package is not part of every installation."""
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def _print(result: dict[str, Any]) -> None:
+    table = Table("row", "value", "unit", "goal", "holds", title=f"{result['device']}, {result['commit']}")
+    for row in result["rows"]:
+        table.add_row(row["name"], f"{row['value']}", row["unit"], f"{row['goal']}", "yes" if row["holds"] else "no")
+    console = Console()
+    console.print(table)
+    for missing in result["unmeasured"]:
+        console.print(f"not measured: {missing['name']}: {missing['reason']}", markup=False)

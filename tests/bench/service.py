@@ -1,0 +1,126 @@
+"""`probeless bench service`: the whole way, from a client's frame over the socket to the composite that comes back.
+
+640x480, 256^3 voxels over 2 m, REG4, one object, JPEG up and down: frames a second, memory over 1 000 frames, and the
+time from `serve` to the first composite with a warm kernel cache. The server is a process of its own, as in the field;
+the client runs here, on the same cores.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from client.client import Answer, StreamClient
+from client.laptop.source import Source, open_source
+from client.laptop.vase import vase_glb
+from protocol.frames import RgbdFrame
+from protocol.messages import Wishes
+from server.evaluation.report import Report, Row
+
+SOURCE = "synthetic:table?frames=40"
+SIDE_M = 2.0
+VOXEL_M = SIDE_M / 256
+WINDOW = 20
+"""Frames over which one rate is measured; the figure is the median of the windows."""
+SETTLING = 0.2
+"""Share of the frames after which memory must not grow any more."""
+
+
+def run(quick: bool, say: Callable[[str], None]) -> Report:
+    """Measure; `say` gets progress."""
+    frames = 120 if quick else 1000
+    source = open_source(SOURCE)
+    shown = [source[i] for i in range(len(source))]
+    with serving():  # fills the kernel cache
+        pass
+    started = time.perf_counter()
+    with serving() as (process, url):
+        first, device, times, memory = asyncio.run(stream(url, source, shown, frames, process.pid, say))
+    rates = [WINDOW / (b - a) for a, b in zip(times[::WINDOW], times[WINDOW::WINDOW], strict=False)]
+    settled = memory[int(len(memory) * SETTLING) :]
+    growth = 100 * (max(settled[-3:]) / settled[0] - 1)
+    report = Report(device, sizes={"frames": frames, "windows": len(rates)})
+    report.rows = [
+        Row("end to end through the socket", median(rates), "frames/s", ">= 4"),
+        Row("slowest window of 20 frames", min(rates), "frames/s", ""),
+        Row("first composite after serve, warm cache", first - started, "s", "<= 10"),
+        Row("server memory at the end", memory[-1], "MB", ""),
+        Row(f"growth of memory over the last {len(settled) * WINDOW} frames", growth, "%", "<= 1"),
+    ]
+    return report
+
+
+@contextmanager
+def serving() -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """`probeless serve` on a free port, stopped at the end."""
+    command = [str(Path(sys.executable).parent / "probeless"), "serve", "--port", "0"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        assert process.stdout is not None
+        lines: list[str] = []
+        for line in process.stdout:
+            lines.append(line)
+            found = re.search(r"https?://\S+", line)
+            if found:
+                break
+        else:
+            raise RuntimeError(f"the server ended: {''.join(lines)}")
+        yield process, found.group().rstrip("/")
+    finally:
+        process.terminate()
+        process.communicate(timeout=30)
+
+
+async def stream(
+    url: str, source: Source, shown: list[RgbdFrame], count: int, pid: int, say: Callable[[str], None]
+) -> tuple[float, str, list[float], list[float]]:
+    """Send frames to and fro as fast as the window allows: time of the first answer, device, times, memory in MB."""
+    client = await StreamClient.connect(url)
+    center = np.mean([frame.world_from_camera[:3, 3] + frame.world_from_camera[:3, 2] for frame in shown], axis=0)
+    low, high = center - SIDE_M / 2, center + SIDE_M / 2
+    wishes = Wishes(volume_m=(*low.tolist(), *high.tolist()), voxel_m=VOXEL_M, up=source.up)
+    welcome = await client.hello(source.camera, wishes)
+    await client.place_object("vase", "glb", vase_glb(), position_m=(0.0, 0.0, 0.0))
+    sending = asyncio.create_task(_send(client, shown, count))
+    times: list[float] = []
+    memory: list[float] = []
+    async for answer in client.answers():
+        if not isinstance(answer, Answer):
+            raise RuntimeError(f"frame was not answered: {answer}")
+        times.append(time.perf_counter())
+        if len(times) % WINDOW == 1:
+            memory.append(resident_mb(pid))
+            say(f"{len(times)} of {count} frames, {memory[-1]:.0f} MB")
+        if len(times) == count:
+            break
+    await sending
+    await client.close()
+    return times[0], welcome.device, times, memory
+
+
+async def _send(client: StreamClient, shown: list[RgbdFrame], count: int) -> None:
+    """The frames forwards and backwards, so that the camera never jumps; never more unanswered than the window."""
+    path = [*shown, *shown[-2:0:-1]]
+    for index in range(count):
+        frame = path[index % len(path)]
+        await client.wait_for_room()
+        await client.send_frame(
+            RgbdFrame(index, index / 30, frame.color, frame.depth, frame.world_from_camera)
+        )
+
+
+def resident_mb(pid: int) -> float:
+    """Resident memory of a process in MB, from /proc."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmRSS"):
+            return int(line.split()[1]) / 1e3
+    raise RuntimeError(f"no process {pid}")

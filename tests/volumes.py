@@ -1,0 +1,81 @@
+"""Device volumes as dense host arrays and back, for comparison with twins."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.opencl.engine import Engine
+from server.stages.integrate import integrate
+from server.stages.raycast import raycast
+from server.stages.volume import BRICK, BRICK_VOXELS, Volume
+
+Floats = NDArray[np.float64]
+
+
+def vectors(array: NDArray[Any]) -> NDArray[np.float32]:
+    """[..., n] float32 components of an array of OpenCL float vectors."""
+    return array.view(np.float32).reshape(*array.shape, -1)
+
+
+def dense_voxels(engine: Engine, volume: Volume) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """tsdf, weight and whether allocated, each [z, y, x] over the whole volume; never seen voxels are (1, 0)."""
+    slots = engine.download(volume.slots_device)
+    pool = vectors(engine.download(volume.voxels)).reshape(-1, BRICK, BRICK, BRICK, 2)
+    bricks = np.where((slots >= 0)[..., None, None, None, None], pool[np.maximum(slots, 0)], 0)
+    dense = bricks.transpose(0, 3, 1, 4, 2, 5, 6).reshape(*(np.array(slots.shape) * BRICK), 2)
+    allocated = np.kron(slots >= 0, np.ones((BRICK,) * 3, bool)).astype(bool)
+    return np.where(dense[..., 1] > 0, dense[..., 0], 1), dense[..., 1], allocated
+
+
+def in_bricks(dense: NDArray[Any]) -> NDArray[Any]:
+    """[bricks, 512] of an array [z, y, x], bricks in table order."""
+    z, y, x = (size // BRICK for size in dense.shape)
+    return dense.reshape(z, BRICK, y, BRICK, x, BRICK).transpose(0, 2, 4, 1, 3, 5).reshape(-1, BRICK_VOXELS)
+
+
+def fill(engine: Engine, volume: Volume, tsdf: Floats, weight: Floats) -> None:
+    """Put tsdf and weight [z, y, x] into the volume, every brick allocated, and summarize it."""
+    volume._slots.ravel()[:] = np.arange(volume._slots.size)
+    volume._allocated = np.arange(volume._slots.size, dtype=np.int32)
+    volume._upload_table()
+    pairs = np.stack([in_bricks(tsdf), in_bricks(weight)], axis=-1).astype(np.float32)
+    volume.voxels.set(np.ascontiguousarray(pairs).view(cl_types.float2)[..., 0])
+    volume.summarize()
+
+
+def upload_depth(engine: Engine, depth_m: NDArray[Any]) -> cl_array.Array:
+    """A depth picture [h, w] in metres on the device."""
+    return engine.workspace.upload("test_depth", depth_m.astype(np.float32))
+
+
+def fuse(
+    engine: Engine, volume: Volume, camera: CameraModel, world_from_camera: Floats, depth_m: NDArray[Any]
+) -> None:
+    """Allocate and integrate one depth picture."""
+    pose = volume.volume_from_world() @ world_from_camera
+    device_depth = upload_depth(engine, depth_m)
+    volume.allocate(camera, pose, device_depth)
+    integrate(engine, volume, camera, pose, device_depth)
+
+
+def cast(
+    engine: Engine, volume: Volume, camera: CameraModel, world_from_camera: Floats
+) -> tuple[NDArray[np.bool_], Floats, Floats]:
+    """Hits [h, w], their depth along the optical axis [h, w] and normals [h, w, 3], of the volume alone."""
+    pose = volume.volume_from_world() @ world_from_camera
+    surface = raycast(engine, camera, pose, volume)
+    position = vectors(engine.download(surface.positions)).astype(np.float64)
+    normal = vectors(engine.download(surface.normals)).astype(np.float64)
+    assert np.isfinite(position).all()
+    assert np.isfinite(normal).all()
+    np.testing.assert_array_equal(position[..., 3], normal[..., 3])
+    hit = position[..., 3] == 1
+    assert not position[~hit].any()
+    depth = (position[..., :3] - pose[:3, 3]) @ pose[:3, 2]
+    return hit, np.where(hit, depth, 0), normal[..., :3]

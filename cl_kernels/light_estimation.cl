@@ -1,5 +1,5 @@
 // Normal equations of the light (thesis eq. 5.5-5.6), summed in fixed order: one partial sum a tile of samples.
-// Provides gather_samples, accumulate_tiles.
+// Provides gather_samples, pool_samples, accumulate_tiles.
 #ifndef COEFFICIENTS
 #error COEFFICIENTS must be defined: the number of spherical-harmonics coefficients
 #endif
@@ -9,18 +9,20 @@
 
 #define LABEL_STATIC 1
 
-// Mean usable radiance around each sample and its weight: 0 unless the sample lies on static surface with enough open sky.
-// radiance [h][w] (w = 1 usable), labels [h][w], openness [rows][cols] -> observed [rows][cols] (rgb, weight).
+// Mean usable radiance around each sample and its weight: 0 unless the sample lies on static surface with enough open sky
+// and away from edges, where normals and the picture's registration are at their worst.
+// radiance [h][w] (w = 1 usable), labels [h][w], openness, flatness [rows][cols] -> observed [rows][cols] (rgb, weight).
 kernel void gather_samples(const int cols, const int rows, const int stride, const int width, const int height,
                            global const float4 *radiance, global const uchar *labels, global const float *openness,
-                           const float least_openness, global float4 *observed) {
+                           global const float *flatness, const float least_openness, const float least_flatness,
+                           global float4 *observed) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= cols || row >= rows) return;
     const int x = stride / 2 + col * stride;
     const int y = stride / 2 + row * stride;
     float4 sum = (float4)(0.0f);
-    int usable = openness[row * cols + col] >= least_openness;
+    int usable = openness[row * cols + col] >= least_openness && flatness[row * cols + col] >= least_flatness;
     for (int dy = -1; dy <= 1; dy++) {
         for (int dx = -1; dx <= 1; dx++) {
             const int pixel = clamp(y + dy, 0, height - 1) * width + clamp(x + dx, 0, width - 1);
@@ -30,6 +32,43 @@ kernel void gather_samples(const int cols, const int rows, const int stride, con
         }
     }
     observed[row * cols + col] = usable ? (float4)(sum.xyz / 9.0f, 1.0f) : (float4)(0.0f);
+}
+
+// Two samples see the same light if they lie on one plane to within a voxel a few voxels away and face the same way.
+static inline int same_surface(const float4 position, const float4 normal, const float4 other, const float4 other_normal,
+                               const float voxel_m) {
+    const float3 offset = other.xyz - position.xyz;
+    return dot(normal.xyz, other_normal.xyz) > 0.9f && fabs(dot(offset, normal.xyz)) < voxel_m + 0.1f * length(offset);
+}
+
+// Each of 2 x 2 neighbours was traced along another direction set: their mean has a quarter of the quadrature's error, which
+// least squares would take for signal (errors in variables). Mean over those of (col .. col + 1, row .. row + 1) on the
+// sample's surface; weight: their share.
+// transfer, observed [rows][cols] -> pooled_transfer [rows][cols][COEFFICIENTS], pooled [rows][cols] (rgb, w).
+kernel void pool_samples(const int cols, const int rows, const int stride, const int width,
+                         global const float4 *positions, global const float4 *normals, global const float *transfer,
+                         global const float4 *observed, const float voxel_m,
+                         global float *pooled_transfer, global float4 *pooled) {
+    const int col = get_global_id(0);
+    const int row = get_global_id(1);
+    if (col >= cols || row >= rows) return;
+    const int first = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
+    float sum[COEFFICIENTS];
+    for (int i = 0; i < COEFFICIENTS; i++) sum[i] = 0.0f;
+    float4 seen = (float4)(0.0f);
+    if (observed[row * cols + col].w > 0.0f) {
+        for (int k = 0; k < 4; k++) {
+            const int c = col + (k & 1), r = row + (k >> 1);
+            const int pixel = first + ((k & 1) + (k >> 1) * width) * stride;
+            if (c >= cols || r >= rows || observed[r * cols + c].w <= 0.0f) continue;
+            if (!same_surface(positions[first], normals[first], positions[pixel], normals[pixel], voxel_m)) continue;
+            for (int i = 0; i < COEFFICIENTS; i++) sum[i] += transfer[(r * cols + c) * COEFFICIENTS + i];
+            seen += observed[r * cols + c];
+        }
+    }
+    const float count = seen.w > 0.0f ? seen.w : 1.0f;
+    for (int i = 0; i < COEFFICIENTS; i++) pooled_transfer[(row * cols + col) * COEFFICIENTS + i] = sum[i] / count;
+    pooled[row * cols + col] = (float4)(seen.xyz / count, 0.25f * seen.w);
 }
 
 // One work-group of 64 items a tile of 8 x 8 samples. With row vectors s = (transfer, r, g, b) of a tile's samples, its

@@ -17,6 +17,10 @@ static inline float3 linear_color(global const color_t *color, global const floa
     return (float3)(to_linear[c[0]], to_linear[c[1]], to_linear[c[2]]);
 }
 
+static inline float brightest(const float3 rgb) {
+    return fmax(fmax(rgb.x, rgb.y), rgb.z);
+}
+
 // Where a rectified pixel lies in the distorted picture (Brown's polynomial, third degree in r^2).
 static inline float2 distort(const float4 intrinsics, const float8 k, const float u, const float v) {
     const float3 p = unproject(intrinsics, u, v);
@@ -45,17 +49,18 @@ kernel void measure(const int width, const int height, global const color_t *col
     const float fx = source.x - x0;
     const float fy = source.y - y0;
     const int corner = y0 * width + x0;
-    const float3 top = mix(linear_color(color, to_linear, corner), linear_color(color, to_linear, corner + 1), fx);
-    const float3 low = mix(linear_color(color, to_linear, corner + width), linear_color(color, to_linear, corner + width + 1), fx);
-    const float3 rgb = mix(top, low, fy);
+    const float3 a = linear_color(color, to_linear, corner), b = linear_color(color, to_linear, corner + 1);
+    const float3 c = linear_color(color, to_linear, corner + width), d = linear_color(color, to_linear, corner + width + 1);
+    const float3 rgb = mix(mix(a, b, fx), mix(c, d, fx), fy);
+    const float3 peak = fmax(fmax(a, b), fmax(c, d));  // a mean that a clipped pixel takes part in is no radiance
     const ushort units = inside ? depth[(int)(source.y + 0.5f) * width + (int)(source.x + 0.5f)] : 0;
 #else
     const int inside = 1;
     const float3 rgb = linear_color(color, to_linear, pixel);
+    const float3 peak = rgb;
     const ushort units = depth[pixel];
 #endif
-    const float brightest = fmax(fmax(rgb.x, rgb.y), rgb.z);
-    const float usable = brightest > BLACK && brightest < CLIPPED ? 1.0f : 0.0f;
+    const float usable = brightest(rgb) > BLACK && brightest(peak) < CLIPPED ? 1.0f : 0.0f;
     const float metres = units == 65535 ? 0.0f : units * depth_scale_m;
     radiance[pixel] = inside ? (float4)(rgb, usable) : (float4)(0.0f, 0.0f, 0.0f, -1.0f);
     depth_m[pixel] = metres <= greatest_depth_m ? metres : 0.0f;

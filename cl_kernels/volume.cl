@@ -7,28 +7,28 @@
 kernel void mark_bricks(const int width, const int height, const int4 bricks, global const float *depth_m,
                         const float4 intrinsics, const float16 volume_from_camera, const float voxel_m, const float reach_m,
                         global uchar *wanted) {
-    const int x = 2 * get_global_id(0);  // every second pixel: the margin below covers the others
-    const int y = 2 * get_global_id(1);
+    const int x = get_global_id(0);
+    const int y = get_global_id(1);
     if (x >= width || y >= height) return;
     const float depth = depth_m[y * width + x];
     if (depth <= 0.0f) return;
     const float brick_m = BRICK * voxel_m;
     const float3 ray = unproject(intrinsics, x, y);
-    const float along = length(ray);
-    const float pad = 2.0f / BRICK;
-    const int steps = (int)(2.0f * reach_m / (0.5f * brick_m)) + 1;
+    const float reach_z = reach_m / length(ray);
+    const float3 onward = transform_vector(volume_from_camera, ray) / brick_m;
+    const float3 first = volume_from_camera.s37b / brick_m + (depth - reach_z) * onward;
+    const int steps = (int)(4.0f * reach_m / brick_m) + 1;  // at most half a brick apart
+    const float3 step = 2.0f * reach_z / steps * onward;
+    // Around each step: half of the way to the next one, and the voxels beside the ray that are this pixel's.
+    const float pixel = depth / (fmin(intrinsics.s0, intrinsics.s1) * voxel_m);
+    const float pad = clamp(1.0f + 0.75f * pixel, 2.0f, 4.0f) / BRICK;
     for (int i = 0; i <= steps; i++) {
-        const float z = depth + reach_m * (2.0f * i / steps - 1.0f) / along;
-        const float3 p = transform_point(volume_from_camera, ray * z);
-        // A surface voxel's trilinear neighbours may lie in the next brick: mark the bricks of p +- 2 voxels.
-        const float3 q = p / brick_m + BRICK;  // positive near the volume, so that the casts round down
-        const int3 low = (int3)((int)(q.x - pad), (int)(q.y - pad), (int)(q.z - pad)) - BRICK;
-        const int3 high = (int3)((int)(q.x + pad), (int)(q.y + pad), (int)(q.z + pad)) - BRICK;
-        const int corners = low.x == high.x && low.y == high.y && low.z == high.z ? 1 : 8;
-        for (int corner = 0; corner < corners; corner++) {
-            const int3 brick = (int3)(corner & 1 ? high.x : low.x, corner & 2 ? high.y : low.y, corner & 4 ? high.z : low.z);
-            if (inside_bricks(bricks, brick)) wanted[brick_index(bricks, brick)] = 1;  // every writer writes 1
-        }
+        const float3 p = first + (float)i * step;
+        const int3 low = max(convert_int3_sat_rtn(p - pad), 0);
+        const int3 high = min(convert_int3_sat_rtn(p + pad), bricks.xyz - 1);
+        for (int bz = low.z; bz <= high.z; bz++)
+            for (int by = low.y; by <= high.y; by++)
+                for (int bx = low.x; bx <= high.x; bx++) wanted[(bz * bricks.y + by) * bricks.x + bx] = 1;  // all write 1
     }
 }
 

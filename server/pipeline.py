@@ -87,7 +87,7 @@ class Pipeline:
         with stage("radiance_transfer"):  # 5.1.2, eq. 5.2
             transfer = transfer_radiance(engine, camera, volume, surface, settings.stride, self._rays, settings.reach_m)
         with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
-            tiles = sum_tiles(engine, camera, measurement, surface, transfer)
+            tiles = sum_tiles(engine, camera, measurement, surface, transfer, volume.voxel_m)
             with engine.profile.host():
                 estimate = self._estimator.update(tiles)
         with stage("rendering"):  # 7.1-7.2, the effects this frame calls for

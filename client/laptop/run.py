@@ -5,10 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import Protocol
 
-from server.pipeline import FrameResult, Pipeline
-from server.scene.mesh import load_mesh
-from server.scene.placement import Placement
-
 from client.laptop.errors import RunError
 from client.laptop.objects import ObjectFile, pack_mesh
 from client.laptop.output import FrameOutput
@@ -16,6 +12,9 @@ from client.options import Capture
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from server.opencl.device import open_device
+from server.pipeline import FrameResult, Pipeline
+from server.scene.mesh import load_mesh
+from server.scene.placement import Placement
 
 
 class Processor(Protocol):

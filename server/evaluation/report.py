@@ -49,7 +49,13 @@ class Report:
         """One object, as the command line's contract has it."""
         rows = [{**asdict(row), "goal": row.goal or None, "holds": row.holds} for row in self.rows]
         unmeasured = [asdict(item) for item in self.unmeasured]
-        report = {"device": self.device, "commit": commit(), "rows": rows, "unmeasured": unmeasured, "sizes": self.sizes}
+        report = {
+            "device": self.device,
+            "commit": commit(),
+            "rows": rows,
+            "unmeasured": unmeasured,
+            "sizes": self.sizes,
+        }
         return json.dumps(report, indent=1)
 
     def as_table(self) -> str:

@@ -34,7 +34,10 @@ class BaseColor:
 
 
 def prepare_gltf(data: bytes) -> tuple[bytes, list[BaseColor], tuple[str, ...]]:
-    """The file as trimesh should see it, the base colour of each material, and notes. GLB or JSON. Raises MeshError."""
+    """The file (GLB or JSON) as trimesh should see it, the base colour of each material, and notes.
+
+    Raises MeshError for what is refused, and whatever indexing raises where the file names what is not there.
+    """
     header, binary = _split_glb(data) if data.startswith(_MAGIC) else (_parse(data), None)
     _refuse_unsupported(header)
     _refuse_oversized(header)
@@ -91,13 +94,10 @@ def _refuse_unsupported(header: Json) -> None:
 
 def _refuse_oversized(header: Json) -> None:
     """Refuse what a small file may ask to be unfolded into: many primitives that read the same bytes."""
-    try:
-        accessors = [int(accessor["count"]) for accessor in header.get("accessors", [])]
-        primitives = [p for mesh in header.get("meshes", []) for p in mesh["primitives"]]
-        corners = sum(accessors[p["indices"]] for p in primitives if "indices" in p)
-        vertices = sum(accessors[p["attributes"]["POSITION"]] for p in primitives)
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        raise MeshError(f"damaged glTF: a mesh names what is not there ({error!r})") from error
+    accessors = [int(accessor["count"]) for accessor in header.get("accessors", [])]
+    primitives = [p for mesh in header.get("meshes", []) for p in mesh["primitives"]]
+    corners = sum(accessors[p["indices"]] for p in primitives if "indices" in p)
+    vertices = sum(accessors[p["attributes"]["POSITION"]] for p in primitives)
     if corners > MAX_VERTICES or vertices > MAX_VERTICES:
         raise MeshError(f"more than {MAX_TRIANGLES} triangles: {max(corners, vertices)} vertices")
     if min(accessors, default=0) < 0 or sum(accessors) > 8 * MAX_VERTICES:
@@ -129,11 +129,8 @@ def _image_index(header: Json, material: Json) -> int | None:
     reference = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
     if reference is None:
         return None
-    try:
-        source = header["textures"][reference["index"]].get("source")
-        return None if source is None else int(source)
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        raise MeshError(f"damaged glTF: a material names a texture that is not there ({error!r})") from error
+    source = header["textures"][reference["index"]].get("source")
+    return None if source is None else int(source)
 
 
 def _decode_images(header: Json, binary: bytes | None, wanted: list[int]) -> dict[int, NDArray[np.uint8] | None]:

@@ -66,12 +66,12 @@ def _without_bad(part: MeshPart, dropped: Counter[str]) -> MeshPart:
     triangles = _kept(part.triangles, exists, "with vertices that do not exist", dropped)
     with np.errstate(over="ignore", invalid="ignore"):
         finite = _all_corners(np.abs(part.vertices) <= MAX_COORDINATE_M)  # NaN compares false
+        vertices = part.vertices.astype(np.float32)
     triangles = _kept(triangles, _all_corners(finite[triangles]), "with vertices that are not finite", dropped)
-    used, inverse = np.unique(triangles, return_inverse=True)
-    vertices, triangles = part.vertices[used].astype(np.float32), inverse.reshape(-1, 3)
     triangles = _kept(triangles, _has_area(vertices, triangles), "without area", dropped)
+    used, inverse = np.unique(triangles, return_inverse=True)
     normals = None if part.normals is None else part.normals[used]
-    return MeshPart(vertices.astype(np.float64), triangles, part.colors[used], normals)
+    return MeshPart(vertices[used].astype(np.float64), inverse.reshape(-1, 3), part.colors[used], normals)
 
 
 def _all_corners(good: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -38,31 +38,30 @@ class MeshPart:
 
 def read_parts(data: bytes, file_format: str) -> tuple[list[MeshPart], tuple[str, ...]]:
     """Every part of a file of one of FORMATS, and notes on what was not read. Raises MeshError."""
+    with _loading, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return _read(data, file_format)
+        except MeshError:
+            raise
+        except Exception as error:  # whatever a damaged file makes trimesh or the lines below stumble over
+            reason = " ".join(f"{type(error).__name__} {error}".split())[:160]
+            raise MeshError(f"not a readable {file_format} mesh: {reason}") from error
+
+
+def _read(data: bytes, file_format: str) -> tuple[list[MeshPart], tuple[str, ...]]:
     materials: list[BaseColor] = []
     notes: tuple[str, ...] = ()
     if file_format in {"glb", "gltf"}:
         data, materials, notes = prepare_gltf(data)
     elif file_format == "obj":
         data, notes = _without_materials(data)
-    scene = _load_scene(data, file_format)
+    scene: Any = trimesh.load_scene(io.BytesIO(data), file_type=file_format, process=False)
     places = [scene.graph[node] for node in scene.graph.nodes_geometry]
-    found = [(matrix, scene.geometry[name]) for matrix, name in places]
-    _refuse_oversized([geometry for _, geometry in found])
-    return [_part(g, matrix, materials) for matrix, g in found if isinstance(g, trimesh.Trimesh)], notes
-
-
-def _load_scene(data: bytes, file_format: str) -> Any:
-    with _loading, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            return trimesh.load_scene(io.BytesIO(data), file_type=file_format, process=False)
-        except Exception as error:  # whatever a damaged file makes trimesh stumble over
-            raise MeshError(f"not a readable {file_format} mesh: {_one_line(error)}") from error
-
-
-def _one_line(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__} {text}".strip()[:160]
+    meshes = [(matrix, scene.geometry[name]) for matrix, name in places]
+    meshes = [(matrix, mesh) for matrix, mesh in meshes if isinstance(mesh, trimesh.Trimesh)]
+    _refuse_oversized([mesh for _, mesh in meshes])
+    return [_part(mesh, matrix, materials) for matrix, mesh in meshes], notes
 
 
 def _without_materials(obj: bytes) -> tuple[bytes, tuple[str, ...]]:
@@ -74,8 +73,7 @@ def _without_materials(obj: bytes) -> tuple[bytes, tuple[str, ...]]:
     return b"\n".join(kept), ("the OBJ's materials are in another file and were not read: send a GLB for its colours",)
 
 
-def _refuse_oversized(geometries: list[Any]) -> None:
-    meshes = [geometry for geometry in geometries if isinstance(geometry, trimesh.Trimesh)]
+def _refuse_oversized(meshes: list[Any]) -> None:
     triangles = sum(len(mesh.faces) for mesh in meshes)
     if triangles > MAX_TRIANGLES or sum(len(mesh.vertices) for mesh in meshes) > MAX_VERTICES:
         raise MeshError(f"the mesh has {triangles} triangles, more than {MAX_TRIANGLES}: simplify it")

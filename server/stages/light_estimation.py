@@ -28,6 +28,8 @@ ASSUMED_ALBEDO = 0.5
 """Reflectance that every real surface is taken to have: a common mean of rooms. It scales the light, not its shape."""
 LEAST_OPENNESS = 0.05
 """Samples that see less of the sky say more about indirect light than about the sky (thesis 5.2)."""
+LEAST_FLATNESS = 0.95
+"""Samples nearer to an edge have a normal and a colour that may belong to two surfaces."""
 FORGETTING = 0.6
 """What remains of earlier frames' evidence a frame later: a new light has 78 % of the weight after 3 frames."""
 THESIS_FORGETTING = 0.9
@@ -75,7 +77,12 @@ class TileSums:
 
 
 def sum_tiles(
-    engine: Engine, camera: CameraModel, measurement: Measurement, surface: Surface, transfer: Transfer
+    engine: Engine,
+    camera: CameraModel,
+    measurement: Measurement,
+    surface: Surface,
+    transfer: Transfer,
+    voxel_m: float,
 ) -> TileSums:
     """Normal equations of the frame's samples: static surface, open enough, neither clipped nor black."""
     space = engine.workspace
@@ -93,8 +100,27 @@ def sum_tiles(
         measurement.radiance,
         surface.labels,
         transfer.openness,
+        transfer.flatness,
         LEAST_OPENNESS,
+        LEAST_FLATNESS,
         observed,
+    )
+    pooled_transfer = space.array("pooled_transfer", (rows, cols, n), np.float32)
+    pooled = space.array("pooled", (rows, cols), cl_types.float4)
+    engine.launch(
+        engine.kernel("light_estimation.cl", "pool_samples", **defines),
+        (cols, rows),
+        cols,
+        rows,
+        transfer.stride,
+        camera.width,
+        surface.positions,
+        surface.normals,
+        transfer.coefficients,
+        observed,
+        voxel_m,
+        pooled_transfer,
+        pooled,
     )
     tile_cols, tile_rows = -(-cols // _TILE), -(-rows // _TILE)
     entries = (n + 3) * (n + 4) // 2
@@ -105,8 +131,8 @@ def sum_tiles(
         cols,
         rows,
         tile_cols,
-        transfer.coefficients,
-        observed,
+        pooled_transfer,
+        pooled,
         partial,
         local=(_TILE * _TILE,),
     )

@@ -22,6 +22,7 @@ from server.stages.volume import Volume
 SETS = 4
 """Turned copies of the direction set, interleaved over 2 x 2 samples, so that neighbours fill each other's gaps."""
 _SEED = 20150101
+_WINDOW = 1 / 160  # half the window that a sample's normal is the mean of, in picture widths
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,8 @@ class Transfer:
     """[rows, cols, bands^2] float32; zeros where there is no surface."""
     openness: cl_array.Array
     """[rows, cols] float32: free share of the cosine-weighted sky, -1 where there is no surface."""
+    flatness: cl_array.Array
+    """[rows, cols] float32: share of the window around a sample that lies on its own smooth surface."""
     free_mask: cl_array.Array
     """[rows, cols, words] uint32: bit j set where direction j is above the surface and free."""
 
@@ -81,6 +84,7 @@ def transfer_radiance(
         bands,
         space.array("transfer", (rows, cols, coefficients), np.float32),
         space.array("openness", (rows, cols), np.float32),
+        space.array("flatness", (rows, cols), np.float32),
         space.array("free_mask", (rows, cols, words), np.uint32),
     )
     engine.launch(
@@ -90,6 +94,8 @@ def transfer_radiance(
         rows,
         stride,
         camera.width,
+        camera.height,
+        max(1, round(camera.width * _WINDOW)),
         surface.positions,
         surface.normals,
         *volume.arguments(),
@@ -99,6 +105,7 @@ def transfer_radiance(
         reach_m,
         result.coefficients,
         result.openness,
+        result.flatness,
         result.free_mask,
     )
     return result

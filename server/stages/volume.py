@@ -42,12 +42,13 @@ class Volume:
         self.origin_world = np.array(bounds_m[:3], np.float64)
         self.voxel_m = float(voxel_m)
         extent = np.array(bounds_m[3:]) - self.origin_world
-        counts = np.ceil(extent / (BRICK * self.voxel_m) - 1e-6).astype(np.int64)
+        counts = np.ceil(extent / (BRICK * self.voxel_m) - 1e-6)  # floats: their product does not overflow
         if (extent <= 0).any() or counts.prod() > _GREATEST_BRICKS:
             raise VolumeSizeError(
                 f"a volume of {extent[0]:.2f} x {extent[1]:.2f} x {extent[2]:.2f} m at {1e3 * self.voxel_m:.1f} mm "
-                f"a voxel has {counts.prod()} bricks, at most {_GREATEST_BRICKS}: give a larger --voxel"
+                f"a voxel has {counts.prod():.3g} bricks, at most {_GREATEST_BRICKS}: give a larger --voxel"
             )
+        counts = counts.astype(np.int64)
         self.bricks = (int(counts[0]), int(counts[1]), int(counts[2]))
         self.truncation_m = TRUNCATION_VOXELS * self.voxel_m
         self.capacity = int(min(counts.prod(), budget_bytes // (8 * BRICK_VOXELS)))
@@ -93,7 +94,7 @@ class Volume:
         wanted.fill(np.uint8(0))
         self._engine.launch(
             self._engine.kernel("volume.cl", "mark_bricks"),
-            (-(-camera.width // 2), -(-camera.height // 2)),
+            (camera.width, camera.height),
             camera.width,
             camera.height,
             int4(*self.bricks, 0),

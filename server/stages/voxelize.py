@@ -93,7 +93,7 @@ def voxelize(
             cells_of,
         )
     distance = cl_array.empty(engine.queue, shape, np.float32)
-    squared = _squared_distance(engine, occupied)
+    squared = squared_distance(engine, occupied)
     engine.launch(_kernel(engine, "finish_distance"), (squared.size,), squared.size, squared, near, distance)
     return DistanceGrid(distance, grid_from_model)
 
@@ -120,8 +120,11 @@ def place_grid(low: Vector, high: Vector, cells: int) -> tuple[tuple[int, int, i
     return (x, y, z), grid_from_model
 
 
-def _squared_distance(engine: Engine, occupied: cl_array.Array) -> cl_array.Array:
-    """Exact Euclidean distance transform of `occupied` [z, y, x], squared, int32 (axis by axis, as Felzenszwalb's)."""
+def squared_distance(engine: Engine, occupied: cl_array.Array) -> cl_array.Array:
+    """Squared cells from each cell to the nearest that is occupied (not 0), [z, y, x] int32; 2^28 where none is.
+
+    Exact, axis by axis (Felzenszwalb and Huttenlocher). The array is the workspace's, valid until the next call.
+    """
     space, (z, y, x), cells = engine.workspace, occupied.shape, occupied.size
     one, other = (space.array(f"voxelize_squared_{k}", occupied.shape, np.int32) for k in (0, 1))
     spread = _kernel(engine, "spread_distance")

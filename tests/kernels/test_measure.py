@@ -102,19 +102,20 @@ def test_undistorts_as_opencv(engine: Engine, distortion: str) -> None:
     assert not depth[~inside].any()
 
 
-def test_removes_the_distortion_of_a_straight_line(engine: Engine) -> None:
-    """A straight line, drawn where the lens puts it, is straight again: the direction of the map is right."""
-    camera = camera_of("barrel", "linear16", width=201, height=151, fx=120.0, fy=120.0, cx=100.0, cy=75.0)
+@pytest.mark.parametrize("distortion", ["barrel", "pincushion"])
+def test_a_ramp_seen_through_the_lens_is_straight_again(engine: Engine, distortion: str) -> None:
+    """Every pixel of the distorted picture shows its own ray's slope: OpenCV's inverse map says which."""
+    camera = camera_of(distortion, "linear16", width=161, height=119, fx=130.0, fy=128.0, cx=79.2, cy=60.4)
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    line = np.stack([np.linspace(-0.7, 0.7, 500), np.linspace(-0.45, -0.35, 500), np.ones(500)], axis=-1)
-    bent, _ = cv2.projectPoints(line, np.zeros(3), np.zeros(3), matrix, np.array(camera.distortion))
-    picture = np.zeros((camera.height, camera.width, 3), np.uint16)
-    cv2.polylines(picture, [np.rint(bent[:, 0] * 16).astype(np.int32)], False, (40000,) * 3, 2, cv2.LINE_8, 4)
+    pixels = np.mgrid[: camera.height, : camera.width][::-1].reshape(2, -1).T.astype(np.float64)
+    rays = cv2.undistortPoints(pixels[:, None], matrix, np.array(camera.distortion))[:, 0]
+    picture = np.rint(65535 * (0.5 + 0.4 * rays)).reshape(camera.height, camera.width, 2)[..., [0, 1, 1]]
     radiance, _ = measured(engine, camera, frame_of(picture, np.zeros(picture.shape[:2]), camera))
-    v, u = np.nonzero(radiance[..., 0] > 0.3)
-    straight = camera.cy + camera.fy * np.interp((u - camera.cx) / camera.fx, line[:, 0], line[:, 1])
-    assert len(u) > 200
-    assert np.abs(v - straight).max() < 1.6  # half the line's width, and the drawing's rounding
+    v, u = np.mgrid[: camera.height, : camera.width]
+    expected = np.stack([0.5 + 0.4 * (u - camera.cx) / camera.fx, 0.5 + 0.4 * (v - camera.cy) / camera.fy], -1)
+    inside = radiance[..., 3] >= 0
+    # Between two pixels the inverse map is not quite linear, and OpenCV finds it by a few iterations.
+    assert np.abs(radiance[..., :2] - expected)[inside].max() < 0.4 / camera.fx * 0.1
 
 
 def test_depth_that_is_none(engine: Engine) -> None:
@@ -153,10 +154,11 @@ def test_no_radiance_is_made_of_a_clipped_pixel(engine: Engine) -> None:
     color = np.full((camera.height, camera.width, 3), 100)
     color[30:34, 40:44] = 255
     radiance, _ = measured(engine, camera, frame_of(color, np.zeros(color.shape[:2]), camera))
-    brighter = radiance[..., 0] > radiance[0, 0, 0] * 1.001
+    brighter = radiance[..., 0] > np.median(radiance[..., 0]) * 1.001
     assert brighter.sum() >= 16
     assert not radiance[brighter, 3].any()
-    assert radiance[~brighter & (radiance[..., 3] >= 0), 3].all()
+    away = np.abs(twin.distorted_pixels(camera) - (41.5, 31.5)).max(-1) > 2.5
+    assert radiance[away & (radiance[..., 3] >= 0), 3].all()
 
 
 def test_extreme_distortion_is_outside_not_undefined(engine: Engine) -> None:

@@ -14,12 +14,22 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.stages.radiance_transfer import SETS, direction_sets, transfer_radiance
 from server.stages.volume import Volume
-from tests import analytic
-from tests.analytic import SCENES, SIDE_M, HalfSpace, blocked, box, fill_volume, floor, points_on, upload_surface
 from tests.reference import radiance_transfer as twin
 from tests.reference.sh import open_transfer
 from tests.reference.visibility import trace_volume
-from tests.tolerance import relative
+from tests.solids import (
+    SCENES,
+    SIDE_M,
+    HalfSpace,
+    box,
+    fill_volume,
+    floor,
+    hit,
+    points_on,
+    solid_voxels,
+    upload_surface,
+)
+from tests.tolerance import relative_tolerance
 
 VOXEL_M = 0.01
 ROOM_M = 1000.0
@@ -48,13 +58,20 @@ def camera_of(width: int, height: int) -> CameraModel:
 
 
 def trace(
-    engine: Engine, volume: Volume, points: Floats, normals: Floats, *, rays: int = 81, bands: int = 4, reach_m: float = ROOM_M
+    engine: Engine,
+    volume: Volume,
+    points: Floats,
+    normals: Floats,
+    *,
+    rays: int = 81,
+    bands: int = 4,
+    reach_m: float = ROOM_M,
 ) -> Traced:
-    """Transfer of given points, one a pixel in rows of 16; a multiple of 16 of them."""
-    grid = (-1, 16, 3)
+    """Transfer of given points, one a pixel in rows of 8; 64 or more of them."""
+    grid = (-1, 8, 3)
     points, normals = points.astype(np.float32).reshape(grid), normals.astype(np.float32).reshape(grid)
     surface = upload_surface(engine, points, normals, np.ones(points.shape[:2], bool))
-    camera, directions = camera_of(16, len(points)), direction_sets(rays, bands)
+    camera, directions = camera_of(8, len(points)), direction_sets(rays, bands)
     result = transfer_radiance(engine, camera, volume, surface, 1, directions, reach_m)
     words = engine.download(result.free_mask)
     bits = np.unpackbits(words.view(np.uint8), axis=-1, bitorder="little")[..., :rays].astype(bool)
@@ -91,8 +108,10 @@ def test_transfer_is_the_twins_for_the_same_visibility(device: Device, engine: E
     )
     assert (traced.openness < 0.95).any() and (traced.openness > 0.999).any()
     # Coefficients are sums of up to 512 terms of magnitude below 1 / 50: their rounding adds to that of the largest.
-    np.testing.assert_allclose(traced.transfer, transfer, rtol=relative(device), atol=relative(device))
-    np.testing.assert_allclose(traced.openness, openness, atol=relative(device))
+    np.testing.assert_allclose(
+        traced.transfer, transfer, rtol=relative_tolerance(device), atol=relative_tolerance(device)
+    )
+    np.testing.assert_allclose(traced.openness, openness, atol=relative_tolerance(device))
     np.testing.assert_array_equal(traced.free, above)
 
 
@@ -103,19 +122,23 @@ def test_visibility_is_the_twins(engine: Engine, name: str, reach_m: float) -> N
     volume = fill_volume(engine, scene, VOXEL_M)
     traced = trace(engine, volume, *points_on(scene, 256, 2, EVERYWHERE), reach_m=reach_m)
     origins, directions, above = rays_of(traced, 81)
-    exact = trace_volume(analytic.solid_voxels(scene, volume), VOXEL_M, origins[above], directions[above], reach_m)
+    exact = trace_volume(solid_voxels(scene, volume), VOXEL_M, origins[above], directions[above], reach_m)
     free = traced.free[above]
     # Samples less than a voxel apart miss corners that a ray only clips; what they find, is there.
     missed = (free & ~exact).mean()
     assert missed < 0.02
-    assert (~free & exact).mean() < 1e-3  # float32 origins within 1e-6 of a voxel's face, and the last sample at `reach`
+    assert (
+        ~free & exact
+    ).mean() < 1e-3  # float32 origins within 1e-6 of a voxel's face, and the last sample at `reach`
     assert (~free).mean() > 0.02
 
 
 def test_strides_and_empty_pixels(engine: Engine) -> None:
     volume = fill_volume(engine, (floor(),), VOXEL_M)
     random = np.random.default_rng(5)
-    points = np.stack([random.uniform(0.2, 0.7, (13, 22)), np.full((13, 22), 0.1), random.uniform(0.2, 0.7, (13, 22))], -1)
+    points = np.stack(
+        [random.uniform(0.2, 0.7, (13, 22)), np.full((13, 22), 0.1), random.uniform(0.2, 0.7, (13, 22))], -1
+    )
     normals = np.broadcast_to([0.0, 1.0, 0.0], points.shape)
     valid = random.random((13, 22)) < 0.5
     surface = upload_surface(engine, points, normals, valid)
@@ -140,8 +163,8 @@ def test_every_ray_away_from_edges(engine: Engine, name: str, reach_m: float) ->
     origins, directions, above = rays_of(traced, 81)
     origins, directions, free = origins[above], directions[above], traced.free[above]
     inside = leaves_volume_after(origins, directions)  # what lies outside the volume cannot block
-    must_block = blocked(scene, origins, directions, np.minimum(reach_m, inside) - 2 * VOXEL_M, -INNER)
-    must_pass = ~blocked(scene, origins, directions, reach_m, OUTER)
+    must_block = hit(scene, origins, directions, -INNER) < np.minimum(reach_m, inside) - 2 * VOXEL_M
+    must_pass = hit(scene, origins, directions, OUTER) >= reach_m
     assert not (must_block & free).any()
     assert not (must_pass & ~free).any()
     assert (must_block | must_pass).mean() > 0.75
@@ -181,7 +204,9 @@ def test_openness_of_a_floor_under_a_wall(engine: Engine, distance_m: float) -> 
     x = random.uniform(0.4, 0.56, 64)
     points = np.stack([x, np.full(64, 0.1), np.full(64, 0.2 + distance_m)], -1)
     traced = trace(engine, volume, points, np.tile([0.0, 1.0, 0.0], (64, 1)), rays=1024)
-    expected = 1 - np.mean([wall_share(distance_m, 0.85, left) + wall_share(distance_m, 0.85, SIDE_M - left) for left in x])
+    expected = 1 - np.mean(
+        [wall_share(distance_m, 0.85, left) + wall_share(distance_m, 0.85, SIDE_M - left) for left in x]
+    )
     # Half a voxel of the wall's place at the nearest distance, and 1024 directions: both below 0.01 on average.
     assert traced.openness.mean() == pytest.approx(expected, abs=0.01)
     if distance_m == 0.02:
@@ -197,8 +222,8 @@ def wall_share(distance_m: float, height_m: float, width_m: float) -> float:
 def test_reach_ends_visibility(engine: Engine) -> None:
     ceiling = box((-1, 0.5, -1), (2, 0.6, 2))
     volume = fill_volume(engine, (ceiling,), VOXEL_M)
-    points = np.tile([0.48, 0.3, 0.48], (16, 1))
-    up = np.tile([0.0, 1.0, 0.0], (16, 1))
+    points = np.tile([0.48, 0.3, 0.48], (64, 1))
+    up = np.tile([0.0, 1.0, 0.0], (64, 1))
     near, far = (trace(engine, volume, points, up, reach_m=reach) for reach in (0.15, 0.3))
     np.testing.assert_array_equal(near.openness, 1.0)  # the ceiling is 19 cm above the rays' origin
     # Within 30 cm lie directions up to 50 degrees off: sin^2 of it of the sky.
@@ -218,7 +243,7 @@ def test_nothing_outside_the_volume_blocks(engine: Engine) -> None:
 
 def test_empty_volume_is_open(engine: Engine) -> None:
     volume = Volume(engine, (0, 0, 0, 1, 1, 1), VOXEL_M)
-    traced = trace(engine, volume, np.random.default_rng(0).uniform(0, 1, (16, 3)), np.tile([0, 0, 1.0], (16, 1)))
+    traced = trace(engine, volume, np.random.default_rng(0).uniform(0, 1, (64, 3)), np.tile([0, 0, 1.0], (64, 1)))
     np.testing.assert_array_equal(traced.openness, 1.0)
 
 

@@ -11,17 +11,17 @@ Floats = NDArray[np.float64]
 def trace_volume(
     solid: NDArray[np.bool_], voxel_m: float, origins: Floats, directions: Floats, reach_m: float
 ) -> NDArray[np.bool_]:
-    """[n] whether unit rays are free of the cubes of `solid` [x, y, z] for `reach_m` (Amanatides & Woo 1987)."""
-    position = origins / voxel_m
+    """[n] whether unit rays are free of the cubes of `solid` [z, y, x] for `reach_m` (Amanatides & Woo 1987)."""
+    position, size = origins / voxel_m, np.array(solid.shape[::-1])
     slope = np.where(np.abs(directions) < 1e-12, 1e-12, directions)
     cell = np.floor(position).astype(int)
     step = np.sign(slope).astype(int)
     onward = (cell + (step > 0) - position) / slope
     free = np.ones(len(origins), bool)
     for _ in range(sum(solid.shape) + 3):
-        inside = ((cell >= 0) & (cell < solid.shape)).all(-1)
-        held = np.clip(cell, 0, np.array(solid.shape) - 1)
-        free &= ~(inside & solid[held[:, 0], held[:, 1], held[:, 2]])
+        inside = ((cell >= 0) & (cell < size)).all(-1)
+        held = np.clip(cell, 0, size - 1)
+        free &= ~(inside & solid[held[:, 2], held[:, 1], held[:, 0]])
         axis = onward.argmin(-1)
         rows = np.flatnonzero(free & (onward.min(-1) < reach_m / voxel_m))
         axis = axis[rows]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import tempfile
@@ -14,21 +15,26 @@ import numpy as np
 from numpy.typing import NDArray
 from platformdirs import user_cache_dir
 
+from client.progress import note
+
 Tables = dict[str, NDArray]
+KEPT_VERSIONS = 4
 _UNUSABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 
 
 def cached(name: str, compute: Callable[[], Tables]) -> Tables:
-    """What `compute` returns, from the cache where it is there and whole; a cache that cannot be written is no error."""
+    """What `compute` returns, from the cache where it is there and whole.
+
+    A cache that cannot be written is no error: the next start computes again.
+    """
     path = folder() / f"{name}-{code_version()}.npz"
     try:
         return _load(path)
     except _UNUSABLE:
-        tables = compute()
-    try:
+        note(f"computing the shadows of the synthetic scene {name}, once")
+    tables = compute()
+    with contextlib.suppress(OSError):
         _store(path, tables)
-    except OSError:
-        pass  # read-only or full: the next start computes again
     return tables
 
 
@@ -59,9 +65,9 @@ def _store(path: Path, tables: Tables) -> None:
     with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
         np.savez(file, digest=np.frombuffer(_digest(tables), np.uint8), **tables)
     os.replace(file.name, path)
-    for other in path.parent.glob(f"{path.name.split('-')[0]}-*.npz"):
-        if other != path:
-            other.unlink(missing_ok=True)
+    versions = sorted(path.parent.glob(f"{path.name.rpartition('-')[0]}-*.npz"), key=lambda p: p.stat().st_mtime)
+    for old in versions[:-KEPT_VERSIONS]:
+        old.unlink(missing_ok=True)
 
 
 def _digest(tables: Tables) -> bytes:

@@ -8,6 +8,7 @@ baked as bits, so that what they shadow already is not shadowed twice.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,12 @@ from client.laptop.synthetic.bake import bake, blocked_directions, tiles
 from client.laptop.synthetic.charts import Grid, atlas
 from client.laptop.synthetic.harmonics import sphere_directions
 from client.laptop.synthetic.lights import DistantLight
-from client.laptop.synthetic.shapes import Capsule, Solid, rotation_about
+from client.laptop.synthetic.rounds import Capsule
+from client.laptop.synthetic.shapes import Solid, rotation_about
 from client.laptop.synthetic.textures import painted
 
-DIRECTIONS = 512
-SHADOW_STEP_M = 0.012
+DIRECTIONS, SKIN_DIRECTIONS = 1024, 512
+SHADOW_STEP_M = 0.016
 """Between samples of the hand's shadow on static surfaces."""
 SKIN_STEP_M = 0.008
 """Between samples of the shadows on the hand."""
@@ -72,6 +74,19 @@ def _reach(progress: float) -> float:
     return float(x * x * (3 - 2 * x))
 
 
+@dataclass(frozen=True)
+class _Piece:
+    """Neighbouring samples on one chart."""
+
+    solid: Solid
+    samples: NDArray[np.intp]
+    """[n] numbers in the table."""
+    points: NDArray[np.float32]
+    """[n, 3] world metres."""
+    normals: NDArray[np.float32]
+    """[n, 3], or [1, 3] where it is flat."""
+
+
 class StaticVisibility:
     """Which directions the static solids leave open, at samples all over them."""
 
@@ -87,45 +102,41 @@ class StaticVisibility:
         """[total, 3] light, over pi, that the hand alone takes from every sample."""
         taken = np.zeros((self.size, 3), np.float32)
         weights = light.radiance(self.directions) * np.float32(4 / DIRECTIONS)
-        for samples, points, normals in self._pieces:
-            cosines = np.maximum(normals @ self.directions.T, 0)
-            facing = cosines.any(axis=0)
-            parts = [part for part in hand if _is_above(part, points, normals)]
-            blocked = blocked_directions(parts, None, points, self.directions, facing)
+        for piece in self._pieces:
+            cosines = np.maximum(piece.normals @ self.directions.T, 0)
+            parts = [part for part in hand if _is_above(part, piece)]
+            blocked = blocked_directions(parts, None, piece.points, self.directions, cosines.any(axis=0))
             hit = np.flatnonzero(blocked.any(axis=0))
             if hit.size:
-                is_open = np.unpackbits(self.open_bits[samples], axis=1)[:, hit]
-                taken[samples] = (blocked[:, hit] * is_open * cosines[:, hit]) @ weights[hit]
+                is_open = np.unpackbits(self.open_bits[piece.samples], axis=1)[:, hit]
+                taken[piece.samples] = (blocked[:, hit] * is_open * cosines[:, hit]) @ weights[hit]
         return taken
 
-    def _cut(self) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]]:
-        """Pieces of the grids: numbers of the samples, points, normals (one if flat)."""
-        for grid in (grid for grids in self.grids for grid in grids):
-            positions, normals = grid.samples()
-            numbers = grid.offset + np.arange(grid.size).reshape(grid.rows, grid.columns)
-            for piece in tiles(grid, DIRECTIONS):
-                points = positions[piece].reshape(-1, 3).astype(np.float32)
-                up = normals[piece].reshape(-1, 3).astype(np.float32)
-                yield numbers[piece].ravel(), points, up[:1] if grid.is_flat else up
+    def _cut(self) -> Iterator[_Piece]:
+        for solid, grids in zip(self.solids, self.grids, strict=True):
+            for grid in grids:
+                positions, normals = grid.samples()
+                numbers = grid.offset + np.arange(grid.size).reshape(grid.rows, grid.columns)
+                for tile in tiles(grid, DIRECTIONS):
+                    up = normals[tile].reshape(-1, 3).astype(np.float32)
+                    points = positions[tile].reshape(-1, 3).astype(np.float32)
+                    yield _Piece(solid, numbers[tile].ravel(), points, up[:1] if grid.is_flat else up)
 
     def _compute(self) -> NDArray[np.uint8]:
         bits = np.zeros((self.size, DIRECTIONS // 8), np.uint8)
-        owners = [solid for solid, grids in zip(self.solids, self.grids, strict=True) for _ in grids for _ in (0,)]
-        starts = [grid.offset for grids in self.grids for grid in grids]
-        for samples, points, _ in self._pieces:
-            own = owners[np.searchsorted(starts, samples[0], side="right") - 1]
-            blocked = blocked_directions(self.solids, own, points, self.directions)
-            bits[samples] = np.packbits(~blocked, axis=1)
+        for piece in self._pieces:
+            blocked = blocked_directions(self.solids, piece.solid, piece.points, self.directions)
+            bits[piece.samples] = np.packbits(~blocked, axis=1)
         return bits
 
 
-def _is_above(part: Capsule, points: NDArray[np.float32], normals: NDArray[np.float32]) -> bool:
+def _is_above(part: Capsule, piece: _Piece) -> bool:
     """Some of it may be above the horizon of a flat piece; of a curved one it is not asked."""
     center, radius = part.bounds
-    return len(normals) > 1 or bool(((center - points[0]) @ normals[0]) > -radius)
+    return len(piece.normals) > 1 or bool((center - piece.points[0]) @ piece.normals[0] > -radius)
 
 
 def skin_shadows(hand: list[Capsule], static: list[Solid]) -> tuple[list[list[Grid]], NDArray[np.float32]]:
     """Grids over the hand, and [total, 16] occluded transfer on them: by the static solids and by its other parts."""
     grids = atlas([part.charts for part in hand], SKIN_STEP_M)
-    return grids, bake([*hand, *static], grids, sphere_directions(DIRECTIONS).astype(np.float32))
+    return grids, bake([*hand, *static], grids, sphere_directions(SKIN_DIRECTIONS).astype(np.float32))

@@ -45,15 +45,16 @@ class DistantLight:
         return basis(directions) @ self.sh.astype(directions.dtype)
 
 
-def ring_light(position: float) -> DistantLight:
+def ring_light(position: float, brightness: float = 1.0) -> DistantLight:
     """One of the ring: azimuth `position` * 45 degrees from +z towards +x, 40 degrees above the horizon."""
     azimuth = 2 * math.pi * position / RING_SIZE
     level = math.cos(ELEVATION_RAD)
-    return disc_light(np.array([level * math.sin(azimuth), math.sin(ELEVATION_RAD), level * math.cos(azimuth)]))
+    direction = np.array([level * math.sin(azimuth), math.sin(ELEVATION_RAD), level * math.cos(azimuth)])
+    return disc_light(direction, brightness)
 
 
-def disc_light(direction: NDArray[np.float64]) -> DistantLight:
-    """The disc around unit `direction` [3], and the ambient light."""
+def disc_light(direction: NDArray[np.float64], brightness: float = 1.0) -> DistantLight:
+    """The disc around unit `direction` [3], and the ambient light; `brightness` times `EXPOSURE` at the most."""
     disc = _disc_zonal()
     per_band = np.repeat(disc / _ZONAL_NORM, 2 * _BANDS + 1) * basis(direction[None])[0]
     ambient = np.zeros(16)
@@ -63,13 +64,13 @@ def disc_light(direction: NDArray[np.float64]) -> DistantLight:
         ambient, AMBIENT_COLOR
     )
     brightest = ((LAMBERT * basis(direction[None])[0]) @ sh).max()
-    return DistantLight(direction, sh * (EXPOSURE / brightest))
+    return DistantLight(direction, sh * (brightness * EXPOSURE / brightest))
 
 
 @cache
 def _disc_zonal() -> NDArray[np.float64]:
     """[4] zonal coefficients of the disc, windowed just enough to be positive with half of the ambient light."""
-    nodes, weights = np.polynomial.legendre.leggauss(2000)
+    nodes, weights = np.polynomial.legendre.leggauss(200)
     legendre = np.polynomial.legendre.legvander(nodes, 3) * _ZONAL_NORM
     disc = 2 * np.pi * (weights * _profile(np.arccos(nodes))) @ legendre
     facing_disc = disc @ (np.array([1, 2 / 3, 1 / 4, 0]) * _ZONAL_NORM)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.laptop.synthetic import textures
-from client.laptop.synthetic.shapes import Cylinder, Solid, Sphere, box, rotation_about, wedge
+from client.laptop.synthetic.rounds import Cylinder, Sphere
+from client.laptop.synthetic.shapes import Solid, box, rotation_about, wedge
 from client.laptop.synthetic.shell import Opening, Shell
 
 
@@ -34,6 +35,8 @@ class Scene:
     """Of the quadrature over the sphere."""
     camera_path: Callable[[float], tuple[NDArray[np.float64], NDArray[np.float64]]]
     """Seconds to (position, point looked at), metres."""
+    brightness: float = 1.0
+    """Of the lights: rooms let less of it in."""
 
     @property
     def solids(self) -> list[Solid]:
@@ -78,7 +81,7 @@ def room() -> Scene:
         Body(Sphere(np.array([0.6, 0.47, 0.1]), 0.15), paint(0.7, 0.25, 0.2)),
         Body(Cylinder(np.array([1.2, 0.0, 0.35]), np.array([0, 1.0, 0]), 0.45, 0.17), paint(0.25, 0.5, 0.35)),
     )
-    return Scene("room", bodies, 0.025, 6144, _walk_in_room)
+    return Scene("room", bodies, 0.025, 6144, _walk_in_room, brightness=1.5)
 
 
 def _walk_around_table(time_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

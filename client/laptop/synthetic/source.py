@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from urllib.parse import parse_qsl
 
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.errors import SourceError
-from client.laptop.synthetic import hand, scenes
+from client.laptop.synthetic import hand
 from client.laptop.synthetic.bake import bake
 from client.laptop.synthetic.cache import cached
 from client.laptop.synthetic.charts import atlas
@@ -19,27 +16,15 @@ from client.laptop.synthetic.harmonics import sphere_directions
 from client.laptop.synthetic.lights import RING_SIZE, DistantLight, ring_light
 from client.laptop.synthetic.noise import kinect_like
 from client.laptop.synthetic.render import Lit, Rendering, camera_rays, look_at, render
+from client.laptop.synthetic.spec import SCENES, Options, parse_spec
 from protocol.frames import CameraModel, RgbdFrame
 
 FPS = 30.0
 LIGHT_TURN_FRAMES = 240
 """Of one round of the moving light."""
 FOCAL_OF_WIDTH = 525 / 640
-LARGEST_FRAMES = 100_000
 
 _UP = np.array([0.0, 1.0, 0.0])
-
-
-@dataclass(frozen=True)
-class Options:
-    """What stands after the name."""
-
-    name: str
-    frames: int = 60
-    size: tuple[int, int] = (640, 480)
-    light: int = 1
-    texture: bool = False
-    noise: bool = False
 
 
 @dataclass(frozen=True)
@@ -80,7 +65,7 @@ class SyntheticSource:
         self.camera = CameraModel(
             width=width, height=height, fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2
         )
-        self.scene = _SCENES[options.name]()
+        self.scene = SCENES[options.name]()
         self._rays = camera_rays(self.camera)
         self._grids = atlas([solid.charts for solid in self.scene.solids], self.scene.step_m)
         self._transfer = cached(self.scene.name, self._bake)["occluded"]
@@ -109,7 +94,7 @@ class SyntheticSource:
     def light(self, index: int) -> DistantLight:
         """The light of one frame."""
         moved = index * RING_SIZE / LIGHT_TURN_FRAMES if self.options.name == "light" else 0.0
-        return ring_light(self.options.light + moved)
+        return ring_light(self.options.light + moved, self.scene.brightness)
 
     def truth(self, index: int) -> Truth:
         """What is exactly known of frame `index`."""
@@ -184,56 +169,3 @@ def to_srgb8(radiance: NDArray[np.float64]) -> NDArray[np.uint8]:
 def open_synthetic(spec: str) -> SyntheticSource:
     """The scene that `synthetic:NAME[?key=value&...]` names. Raises SourceError."""
     return SyntheticSource(parse_spec(spec))
-
-
-def parse_spec(spec: str) -> Options:
-    """Raises SourceError naming what is wrong."""
-    name, _, query = spec.removeprefix("synthetic:").partition("?")
-    if name not in _SCENES:
-        raise SourceError(f"{spec}: there is no such scene; use synthetic:{', synthetic:'.join(_SCENES)}")
-    options = Options(name, texture=name == "room")
-    for key, value in parse_qsl(query, keep_blank_values=True):
-        if key not in _KEYS:
-            raise SourceError(f"{spec}: there is no key {key!r}; use {', '.join(_KEYS)}")
-        try:
-            options = replace(options, **{key: _KEYS[key](value)})
-        except ValueError as error:
-            raise SourceError(f"{spec}: {key}={value}: expected {error}") from None
-    return options
-
-
-def _count(low: int, high: int) -> Callable[[str], int]:
-    def parse(text: str) -> int:
-        if not text.isdecimal() or not low <= int(text) <= high:
-            raise ValueError(f"a number from {low} to {high}")
-        return int(text)
-
-    return parse
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.partition("x")
-    sides = _count(16, 1920)
-    try:
-        return sides(width), sides(height)
-    except ValueError:
-        raise ValueError("WIDTHxHEIGHT, each from 16 to 1920") from None
-
-
-def _flag(text: str) -> bool:
-    return bool(_count(0, 1)(text))
-
-
-_SCENES: dict[str, Callable[[], scenes.Scene]] = {
-    "room": scenes.room,
-    "table": scenes.table,
-    "hand": scenes.table,
-    "light": scenes.table,
-}
-_KEYS: dict[str, Callable] = {
-    "frames": _count(1, LARGEST_FRAMES),
-    "size": _size,
-    "light": _count(0, RING_SIZE - 1),
-    "texture": _flag,
-    "noise": _flag,
-}

@@ -1,0 +1,79 @@
+"""What a `synthetic:NAME[?key=value&...]` says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from urllib.parse import parse_qsl
+
+from client.laptop.errors import SourceError
+from client.laptop.synthetic import scenes
+from client.laptop.synthetic.lights import RING_SIZE
+
+LARGEST_FRAMES = 100_000
+
+SCENES: dict[str, Callable[[], scenes.Scene]] = {
+    "room": scenes.room,
+    "table": scenes.table,
+    "hand": scenes.table,
+    "light": scenes.table,
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """What stands after the name."""
+
+    name: str
+    frames: int = 60
+    size: tuple[int, int] = (640, 480)
+    light: int = 1
+    texture: bool = False
+    noise: bool = False
+
+
+def parse_spec(spec: str) -> Options:
+    """Raises SourceError naming what is wrong."""
+    name, _, query = spec.removeprefix("synthetic:").partition("?")
+    if name not in SCENES:
+        raise SourceError(f"{spec}: there is no such scene; use synthetic:{', synthetic:'.join(SCENES)}")
+    options = Options(name, texture=name == "room")
+    for key, value in parse_qsl(query, keep_blank_values=True):
+        if key not in _KEYS:
+            raise SourceError(f"{spec}: there is no key {key!r}; use {', '.join(_KEYS)}")
+        try:
+            options = replace(options, **{key: _KEYS[key](value)})
+        except ValueError as error:
+            raise SourceError(f"{spec}: {key}={value}: expected {error}") from None
+    return options
+
+
+def _count(low: int, high: int) -> Callable[[str], int]:
+    def parse(text: str) -> int:
+        if not text.isdecimal() or not low <= int(text) <= high:
+            raise ValueError(f"a number from {low} to {high}")
+        return int(text)
+
+    return parse
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    sides = _count(16, 1920)
+    try:
+        return sides(width), sides(height)
+    except ValueError:
+        raise ValueError("WIDTHxHEIGHT, each from 16 to 1920") from None
+
+
+def _flag(text: str) -> bool:
+    return bool(_count(0, 1)(text))
+
+
+_KEYS: dict[str, Callable] = {
+    "frames": _count(1, LARGEST_FRAMES),
+    "size": _size,
+    "light": _count(0, RING_SIZE - 1),
+    "texture": _flag,
+    "noise": _flag,
+}

@@ -19,7 +19,9 @@ kernel void integrate(const int count, const int width, const int height, const 
     const float margin_x = (fabs(center.x) - radius) * intrinsics.s0;
     const float margin_y = (fabs(center.y) - radius) * intrinsics.s1;
     const float reach = center.z + radius;
-    if (margin_x > reach * width || margin_y > reach * height) return;
+    const float side_x = fmax(intrinsics.s2, width - intrinsics.s2) + 0.5f;  // farthest pixel from the axis
+    const float side_y = fmax(intrinsics.s3, height - intrinsics.s3) + 0.5f;
+    if (margin_x > reach * side_x || margin_y > reach * side_y) return;
 
     const int3 first = brick * BRICK + (int3)(get_local_id(0), get_local_id(1), 0);
     global float2 *column = voxels + slots[index] * BRICK_VOXELS + get_local_id(1) * BRICK + get_local_id(0);

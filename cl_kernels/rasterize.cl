@@ -10,62 +10,9 @@
 #pragma OPENCL FP_CONTRACT OFF  // the same vertex must land on the same subpixel in every triangle that shares it
 #include "camera.clh"
 #include "clip.clh"
+#include "edges.clh"
 
-#define TILE 8
-#define SUBPIXELS 256
 #define SCAN_ITEMS 256
-
-static inline int tile_columns(const int2 size) {
-    return (size.x + TILE - 1) / TILE;
-}
-
-// Pixel centres inside the bounds of a piece: x0 y0 x1 y1, inclusive, cut to the picture; empty if x0 > x1 or y0 > y1.
-static inline int4 pixel_bounds(const int8 c, const int2 size) {
-    const int2 low = (int2)(min(c.s0, min(c.s2, c.s4)), min(c.s1, min(c.s3, c.s5)));
-    const int2 high = (int2)(max(c.s0, max(c.s2, c.s4)), max(c.s1, max(c.s3, c.s5)));
-    return (int4)(max((low + SUBPIXELS - 1) >> 8, 0), min(high >> 8, size - 1));
-}
-
-// Twice the signed area of a, b and a pixel centre, in subpixels squared: positive where the pixel is inside.
-static inline long edge_at(int ax, int ay, int bx, int by, int2 pixel) {
-    return (long)(bx - ax) * (pixel.y * SUBPIXELS - ay) - (long)(by - ay) * (pixel.x * SUBPIXELS - ax);
-}
-
-// 0 for a top or left edge, which owns the pixel centres on it, else -1.
-static inline long fill_bias(int ax, int ay, int bx, int by) {
-    return by < ay || (by == ay && bx > ax) ? 0 : -1;
-}
-
-// edge_at for the edges opposite to corners 0, 1 and 2.
-static inline long3 edges_at(int8 c, int2 pixel) {
-    return (long3)(edge_at(c.s2, c.s3, c.s4, c.s5, pixel),
-                   edge_at(c.s4, c.s5, c.s0, c.s1, pixel),
-                   edge_at(c.s0, c.s1, c.s2, c.s3, pixel));
-}
-
-static inline long3 fill_biases(int8 c) {
-    return (long3)(fill_bias(c.s2, c.s3, c.s4, c.s5),
-                   fill_bias(c.s4, c.s5, c.s0, c.s1),
-                   fill_bias(c.s0, c.s1, c.s2, c.s3));
-}
-
-// What edges_at changes by from one pixel to the next in x and in y.
-static inline long3 edge_steps_x(int8 c) {
-    return SUBPIXELS * (long3)(c.s3 - c.s5, c.s5 - c.s1, c.s1 - c.s3);
-}
-
-static inline long3 edge_steps_y(int8 c) {
-    return SUBPIXELS * (long3)(c.s4 - c.s2, c.s0 - c.s4, c.s2 - c.s0);
-}
-
-// False if no pixel centre of the tile can be inside: an edge has all of them on its outer side.
-// `tiles`: the tiles of the piece's bounds; a single one needs no test.
-static inline bool touches_tile(const int8 c, const int4 tiles, const int2 tile) {
-    if (tiles.x == tiles.z && tiles.y == tiles.w) return true;
-    const long3 reach = (TILE - 1) * (max(edge_steps_x(c), 0L) + max(edge_steps_y(c), 0L));
-    const long3 most = edges_at(c, tile * TILE) + reach;
-    return min(most.x, min(most.y, most.z)) >= 0;
-}
 
 static inline int2 snapped(const float3 point) {
     return convert_int2_rte(point.xy / point.z * (float)SUBPIXELS);
@@ -163,26 +110,10 @@ kernel void fill_tiles(const int pieces, const int width, const int height, cons
     const int4 tiles = pixel_bounds(piece, size) / TILE;
     for (int y = tiles.y; y <= tiles.w; y++)
         for (int x = tiles.x; x <= tiles.z; x++) {
+            if (!touches_tile(piece, tiles, (int2)(x, y))) continue;
             const int tile = y * tile_columns(size) + x;
-            if (touches_tile(piece, tiles, (int2)(x, y))) entries[starts[tile] + atomic_dec(&counts[1 + tile]) - 1] = index;
+            entries[starts[tile] + atomic_dec(&counts[1 + tile]) - 1] = index;
         }
-}
-
-// Which of the 64 pixel centres of the tile at pixel `origin` are inside: bit 8 y + x.
-static ulong coverage(const int8 piece, const int2 origin, const int2 size) {
-    const long3 step_x = edge_steps_x(piece), step_y = edge_steps_y(piece);
-    const long3 first = edges_at(piece, origin) + fill_biases(piece);
-    const long3 least = first + (TILE - 1) * (min(step_x, 0L) + min(step_y, 0L));
-    if (min(least.x, min(least.y, least.z)) >= 0) return ~0UL;
-    const int4 bounds = pixel_bounds(piece, size) - origin.xyxy;
-    const int left = max(bounds.x, 0), right = min(bounds.z, TILE - 1), low = min(bounds.w, TILE - 1);
-    ulong mask = 0;
-    for (int y = max(bounds.y, 0); y <= low; y++) {
-        long3 edges = first + y * step_y + left * step_x;
-        for (int x = left; x <= right; x++, edges += step_x)
-            if ((edges.x | edges.y | edges.z) >= 0) mask |= 1UL << (TILE * y + x);
-    }
-    return mask;
 }
 
 // The nearer of the best so far and a piece that covers the pixel, as (triangle, object); the lower triangle number

@@ -69,7 +69,8 @@ kernel void mark_cells(const int triangle_count, const int4 dims, const global f
         for (int y = low.y; y <= high.y; y++)
             for (int x = low.x; x <= high.x; x++) {
                 const float3 center = (float3)(x, y, z) + 0.5f;
-                if (overlaps_cell(a - center, b - center, c - center)) atomic_or(&occupied[cell_index(dims, x, y, z)], 1);
+                if (!overlaps_cell(a - center, b - center, c - center)) continue;
+                atomic_or(&occupied[cell_index(dims, x, y, z)], 1);
             }
 }
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
@@ -36,10 +38,14 @@ def shape_of(shape: trimesh.Trimesh) -> Mesh:
     return load_mesh(shape.export(file_type="ply"), "ply")
 
 
+def mesh_file(path: Path) -> Mesh:
+    """The mesh in a file."""
+    return load_mesh(path.read_bytes(), path.suffix[1:])
+
+
 def public_mesh(name: str) -> Mesh:
     """A mesh of the public data."""
-    path = data_folder(f"mesh/{name}")
-    return load_mesh(path.read_bytes(), path.suffix[1:])
+    return mesh_file(data_folder(f"mesh/{name}"))
 
 
 def pose(

@@ -7,6 +7,7 @@ from pathlib import Path
 from statistics import median
 
 import msgpack
+import msgspec
 import numpy as np
 
 from client.laptop.errors import SourceError
@@ -66,7 +67,9 @@ def open_recording(path: Path) -> RecordedSource:
 
 def _scan(path: Path) -> tuple[Hello | None, list[tuple[int, int]], list[tuple[float, bool]]]:
     """The hello, where the frames lie, and each frame's time and whether it has a pose. Raises SourceError."""
-    hello, places, stamps = None, [], []
+    hello: Hello | None = None
+    places: list[tuple[int, int]] = []
+    stamps: list[tuple[float, bool]] = []
     with path.open("rb") as file:
         unpacker = msgpack.Unpacker(file, max_buffer_size=MAX_MESSAGE_BYTES)
         start = 0
@@ -76,7 +79,7 @@ def _scan(path: Path) -> tuple[Hello | None, list[tuple[int, int]], list[tuple[f
                 start, length = unpacker.tell(), unpacker.tell() - start
                 match message:
                     case {"type": "hello"}:
-                        hello = decode_client(msgpack.packb(message))
+                        hello = msgspec.convert(message, Hello)
                     case {"type": "frame", "timestamp_s": time_s, "world_from_camera": pose}:
                         places.append((start - length, length))
                         stamps.append((time_s, pose is not None))
@@ -86,7 +89,7 @@ def _scan(path: Path) -> tuple[Hello | None, list[tuple[int, int]], list[tuple[f
                         raise ValueError("no message")
         except msgpack.OutOfData:
             left_over = path.stat().st_size - start
-        except (msgpack.UnpackException, ValueError) as error:
+        except (msgpack.UnpackException, msgspec.ValidationError, ValueError) as error:
             raise SourceError(
                 f"{path}: is not a recording (byte {start}); give a data-set folder, a recording or synthetic:table"
             ) from error

@@ -16,13 +16,22 @@ SYNTHETIC_PREFIX = "synthetic:"
 class Source(Protocol):
     """A sequence of RGB-D frames of one camera. Indexing may raise SourceError naming the damaged file."""
 
-    name: str
-    camera: CameraModel
-    fps: float
-    has_poses: bool
-    """Every frame has its `world_from_camera`."""
-    up: tuple[float, float, float] | None
-    """World direction, where the source knows it."""
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def camera(self) -> CameraModel: ...
+
+    @property
+    def fps(self) -> float: ...
+
+    @property
+    def has_poses(self) -> bool:
+        """Every frame has its `world_from_camera`."""
+
+    @property
+    def up(self) -> tuple[float, float, float] | None:
+        """World direction, where the source knows it."""
 
     def __len__(self) -> int: ...
 

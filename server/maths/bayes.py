@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 _RATIOS = np.logspace(-10, 2, 121)
 """Candidates of k relative to the largest eigenvalue: from no prior in float64 terms to nothing but the prior."""
+_LEAST_SCALE = 1e-100  # of an empty system: its inverse times any ratio is still a finite number
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ def condition_number(matrix: NDArray[np.float64]) -> float:
 def solve_with_evidence(equations: NormalEquations, precision: NDArray[np.float64]) -> Posterior:
     """Posterior of x under prior precisions proportional to `precision` [n] > 0. Finite for any finite sums."""
     system = _Whitened.of(equations, precision)
-    ratios = _RATIOS * max(system.values[-1], np.finfo(float).tiny)
+    ratios = _RATIOS * max(system.values[-1], _LEAST_SCALE)
     misfits = np.array([system.misfit(ratio) for ratio in ratios])
     log_det = np.sum(np.log1p(system.values[None, :] / ratios[:, None]), axis=1)
     channels = equations.energy.size
@@ -100,7 +101,7 @@ def solve_with_ratio(equations: NormalEquations, precision: NDArray[np.float64],
 def solve_plain(equations: NormalEquations, precision: NDArray[np.float64]) -> Posterior:
     """Plain least squares, with only as much prior as keeps float64 from dividing by zero."""
     system = _Whitened.of(equations, precision)
-    return system.posterior(1e-13 * max(system.values[-1], np.finfo(float).tiny))
+    return system.posterior(1e-13 * max(system.values[-1], _LEAST_SCALE))
 
 
 @dataclass(frozen=True)

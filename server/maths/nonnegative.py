@@ -1,8 +1,9 @@
 """Light is not negative: the most probable SH function that is nowhere below zero.
 
 Minimises (x - mean)^T H (x - mean) subject to B x >= 0, where the rows of B are the basis at directions all over the
-sphere, through its dual (projected gradients, Nesterov's momentum, restart: O'Donoghue & Candes 2015). What little
-remains below zero between those directions, and in colour channels, is taken by fading the contrast.
+sphere, by non-negative least squares on its dual (Lawson & Hanson 1974): exact in a finite number of steps, however
+ill-conditioned H. What little remains below zero between those directions, and in colour channels, is taken by fading
+the contrast.
 """
 
 from __future__ import annotations
@@ -14,9 +15,8 @@ from numpy.typing import NDArray
 
 from server.maths.sh import sh_basis, spherical_fibonacci
 
-_CONSTRAINTS = 162
 _PROBES = 1024
-_STEPS = 400
+_MOST_STEPS = 300
 _TOLERANCE = 1e-6
 _MEAN = 0.28209479177387814  # Y_00
 
@@ -28,25 +28,37 @@ def _basis(count: int, bands: int) -> NDArray[np.float64]:
 
 def nonnegative_mean(mean: NDArray[np.float64], precision: NDArray[np.float64]) -> NDArray[np.float64]:
     """The x nearest to `mean` [n] in the metric of `precision` [n, n] whose function is not negative (to about 1 %)."""
-    basis = _basis(_CONSTRAINTS, round(len(mean) ** 0.5))
-    values = basis @ mean
-    if values.min() >= 0:
+    basis = _basis(_PROBES, round(len(mean) ** 0.5))
+    least = float((basis @ mean).min())
+    if least >= 0:
         return mean
-    reach = np.linalg.solve(precision, basis.T)
-    gram = basis @ reach
-    step = 1 / float(np.linalg.eigvalsh(gram)[-1])
-    force = np.zeros(len(values))
-    ahead, momentum = force, 1.0
-    for _ in range(_STEPS):
-        updated = np.maximum(ahead - step * (gram @ ahead + values), 0.0)
-        if np.dot(ahead - updated, updated - force) > 0:
-            momentum = 1.0
-        if np.abs(updated - force).max() <= _TOLERANCE * np.abs(updated).max():
+    root = np.linalg.cholesky(precision)  # x = root^-T (start + reach force), force >= 0
+    start, reach = root.T @ mean, np.linalg.solve(root, basis.T)
+    result, held, force = mean, np.empty(0, np.int64), np.empty(0)
+    for _ in range(_MOST_STEPS):
+        values = basis @ result
+        worst = int(values.argmin())
+        if values[worst] >= _TOLERANCE * least or worst in held:
             break
-        onward = (1 + np.sqrt(1 + 4 * momentum * momentum)) / 2
-        ahead = updated + (momentum - 1) / onward * (updated - force)
-        force, momentum = updated, onward
-    return np.asarray(mean + reach @ force)
+        held, force = _supported(reach, start, np.append(held, worst), np.append(force, 0.0))
+        result = np.linalg.solve(root.T, start + reach[:, held] @ force)
+    return np.asarray(result)
+
+
+def _supported(
+    reach: NDArray[np.float64], start: NDArray[np.float64], held: NDArray[np.int64], force: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Those of the constraints `held` that push, and their forces, from forces >= 0 that may not be the best."""
+    while len(held):
+        wanted = np.linalg.lstsq(reach[:, held], -start, rcond=None)[0]
+        pulls = wanted <= 0
+        if not pulls.any():
+            return held, wanted
+        steps = np.where(pulls, force / np.maximum(force - wanted, 1e-300), np.inf)
+        first = int(steps.argmin())  # on the way to `wanted` its force ends first
+        force = np.delete(force + steps[first] * (wanted - force), first)
+        held = np.delete(held, first)
+    return held, force
 
 
 def nonnegative_sum(base: NDArray[np.float64], deviation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -46,7 +46,7 @@ class Volume:
         if (extent <= 0).any() or counts.prod() > _GREATEST_BRICKS:
             raise VolumeSizeError(
                 f"a volume of {extent[0]:.2f} x {extent[1]:.2f} x {extent[2]:.2f} m at {1e3 * self.voxel_m:.1f} mm "
-                f"a voxel has {counts.prod():.3g} bricks, at most {_GREATEST_BRICKS}: give a larger --voxel"
+                f"a voxel has {counts.prod():.0f} bricks, at most {_GREATEST_BRICKS}: give a larger --voxel"
             )
         counts = counts.astype(np.int64)
         self.bricks = (int(counts[0]), int(counts[1]), int(counts[2]))

@@ -26,7 +26,7 @@ NEAR_CELLS = 1.65
 """Distances up to here are measured to the triangles."""
 LEAST_CELLS = 8
 MOST_CELLS = 256
-_SLAB = 4
+_SLAB = 8
 
 Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,8 @@ from server.opencl.engine import Engine
 from server.scene.mesh import Mesh
 from server.scene.virtual_object import VirtualObject
 from server.stages.rasterize import NEAR_M, VirtualSurface, rasterize
-from tests.meshes import mesh_of, pose, public_mesh, shape_of, soup_of
+from tests.data import data_folder
+from tests.meshes import mesh_file, mesh_of, pose, public_mesh, shape_of, soup_of
 from tests.reference import rasterize as twin
 
 CAMERA = CameraModel(width=157, height=101, fx=120.0, fy=118.0, cx=80.3, cy=49.1)
@@ -182,6 +184,34 @@ def test_matches_opencv(engine: Engine, name: str) -> None:
 )
 def test_public_meshes_match_opencv(engine: Engine, name: str) -> None:
     compare_with_opencv(engine, public_mesh(name))
+
+
+# ---- against a path tracer ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.data
+def test_matches_path_traced_scene(engine: Engine) -> None:
+    """Two objects in a room: where they are in front, how deep, and their base colour, by Mitsuba."""
+    folder = data_folder("mitsuba_room")
+    meta = json.loads((folder / "studio_white_direct" / "meta.json").read_text())
+    camera = CameraModel(**meta["camera"])
+    truth = np.load(folder / "truth" / "geometry.npz")
+    meshes = [mesh_file(folder / "studio_white_direct" / name) for name in meta["objects"]]
+    for frame, line in enumerate(np.loadtxt(folder / "poses.txt")):
+        world_from_camera = trimesh.transformations.quaternion_matrix(line[[7, 4, 5, 6]])
+        world_from_camera[:3, 3] = line[1:4]
+        view = np.linalg.inv(world_from_camera)
+        picture = draw(engine, *((mesh, EYE) for mesh in meshes), camera=camera, view=view)
+        depth = (picture.position @ view[:3, :3].T + view[:3, 3])[..., 2]
+        room = truth["depth_m"][frame]
+        shown = picture.covered & ((depth < room) | (room == 0))
+        mask = truth["virtual_mask"][frame]
+        assert (shown & mask).sum() / (shown | mask).sum() > 0.99
+        both = shown & mask
+        error = np.abs(depth - truth["depth_with_virtual_m"][frame])[both]
+        assert np.median(error) < 1e-4
+        assert np.percentile(error, 99) < 2e-3
+        np.testing.assert_allclose(picture.color[both], truth["virtual_albedo"][frame][both], atol=0.01)
 
 
 # ---- known pictures ----------------------------------------------------------------------------------------------

@@ -126,7 +126,6 @@ def test_a_volume_that_fits_is_not_full(engine: Engine) -> None:
     exact = volume_of(engine, bricks=volume.allocated_bricks)
     fuse(engine, exact, CAMERA, np.eye(4), wall)
     assert not exact.is_full
-    print(volume.allocated_bricks)
 
 
 def test_volume_covers_its_bounds(engine: Engine) -> None:

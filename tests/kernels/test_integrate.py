@@ -1,0 +1,164 @@
+"""TSDF integration against its float64 twin on a dense grid, and its running mean against exact figures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.opencl.engine import Engine
+from server.stages.integrate import GREATEST_WEIGHT
+from server.stages.volume import Volume
+from tests.analytic import look, look_at, plane, room, sphere
+from tests.reference.integrate import integrate as twin
+from tests.reference.integrate import project, voxel_centers
+from tests.tolerance import relative_tolerance
+from tests.volumes import dense_voxels, fuse
+
+CAMERA = CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.313, cy=36.127)
+BOUNDS = (-1.0, -1.0, 0.0, 1.0, 1.0, 2.4)
+VOXEL_M = 0.04
+SCENE = [room((-0.9, -0.9, -0.3), (0.95, 0.9, 2.2)), sphere((0.1, 0.2, 1.2), 0.4)]
+FLIPS = 1e-3
+"""Share of voxels whose pixel float32 rounds to its neighbour, or that lie at the end of the truncation."""
+
+Floats = NDArray[np.float64]
+
+
+class Twin:
+    """The dense volume that the twin keeps."""
+
+    def __init__(self, volume: Volume) -> None:
+        shape = tuple(8 * count for count in reversed(volume.bricks))
+        self.volume, self.tsdf, self.weight = volume, np.ones(shape), np.zeros(shape)
+
+    def fuse(self, camera: CameraModel, view: Floats, depth: Floats) -> None:
+        pose = self.volume.volume_from_world() @ view
+        sizes = (self.volume.voxel_m, self.volume.truncation_m, GREATEST_WEIGHT)
+        self.tsdf, self.weight = twin(camera, pose, depth, *sizes, self.tsdf, self.weight)
+
+
+def compare(engine: Engine, expected: Twin, steepest: float = 1.0) -> None:
+    """Weights are counts, and exact; a distance rounds with the depth it is taken from, and is told in truncations."""
+    volume = expected.volume
+    tsdf, weight, allocated = dense_voxels(engine, volume)
+    assert (expected.weight[allocated] > 0).sum() > 1000
+    atol = relative_tolerance(engine.device) * 4.0 / volume.truncation_m * steepest
+    same = (weight == expected.weight) & (np.abs(tsdf - expected.tsdf) < atol)
+    assert (~same)[allocated].mean() < FLIPS
+
+
+def sensor_depth(depth: Floats, seed: int) -> Floats:
+    """With holes, noise and whole millimetres, as a sensor has it."""
+    rng = np.random.default_rng(seed)
+    noisy = np.rint(1000 * (depth + 0.003 * rng.normal(size=depth.shape))) / 1000
+    return np.where(rng.random(depth.shape) < 0.1, 0, noisy)
+
+
+CAMERAS = {
+    "usual": CAMERA,
+    "tiny": CameraModel(width=9, height=11, fx=8.0, fy=8.0, cx=4.0, cy=5.0),
+    "crop beside the axis": CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=-110.377, cy=36.127),
+    "crop beyond the axis": CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.313, cy=140.2),
+}
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_matches_twin(engine: Engine, name: str) -> None:
+    camera = CAMERAS[name]
+    volume = Volume(engine, BOUNDS, VOXEL_M)
+    expected = Twin(volume)
+    views = [np.eye(4), look_at((0.4, -0.3, -0.2), (-0.2, 0.2, 1.4)), look_at((0.6, 0.5, 0.4), (-0.3, -0.2, 1.9))]
+    for seed, view in enumerate(views):
+        depth = sensor_depth(look(SCENE, camera, view).depth_m, seed).astype(np.float32).astype(np.float64)
+        before = dense_voxels(engine, volume)[2]
+        fuse(engine, volume, camera, view, depth)
+        expected.fuse(camera, view, depth)
+        new = dense_voxels(engine, volume)[2] & ~before  # the twin has bricks everywhere: forget what had none
+        now = Twin(volume)
+        now.fuse(camera, view, depth)
+        expected.tsdf[new], expected.weight[new] = now.tsdf[new], now.weight[new]
+    compare(engine, expected)
+
+
+def test_leaves_alone_what_it_does_not_see(engine: Engine) -> None:
+    """Behind the camera, outside the picture, unmeasured, or deep behind the surface."""
+    volume = Volume(engine, BOUNDS, VOXEL_M)
+    depth = np.full((CAMERA.height, CAMERA.width), 1.2)
+    depth[:, :30] = 0
+    fuse(engine, volume, CAMERA, np.eye(4), depth)
+    view = look_at((0.0, 0.0, 1.25), (0.05, 0.1, 0.0))  # among the bricks, looking back
+    back = np.zeros_like(depth)
+    back[20:50, 20:50] = 0.8
+    fuse(engine, volume, CAMERA, view, back)
+    _, weight, _ = dense_voxels(engine, volume)
+    points = voxel_centers(weight.shape, VOXEL_M) + volume.origin_world
+    rounding = 0.01  # pixels
+    for pose, picture in ((np.eye(4), depth), (view, back)):
+        in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
+        pixels = project(CAMERA, in_camera)
+        u, v = np.rint(np.clip(pixels, 0, (CAMERA.width - 1, CAMERA.height - 1))).astype(int).transpose(3, 0, 1, 2)
+        inside = (np.abs(pixels - (48, 35)) < np.array([48.5, 35.5]) + rounding).all(-1)
+        within = in_camera[..., 2] < picture[v, u] + volume.truncation_m + 1e-4
+        weight = weight - (inside & (picture[v, u] > 0) & within)
+    assert weight.max() <= 0
+
+
+def test_constant_depth_gives_an_exact_mean_and_a_full_weight(engine: Engine) -> None:
+    volume = Volume(engine, BOUNDS, VOXEL_M)
+    depth = look([plane((0, 0, 1.5), (0.3, 0.2, -1))], CAMERA, np.eye(4)).depth_m
+    fuse(engine, volume, CAMERA, np.eye(4), depth)
+    first, seen, _ = dense_voxels(engine, volume)
+    for frame in range(2, 201):
+        fuse(engine, volume, CAMERA, np.eye(4), depth)
+        if frame in (2, 63, 64, 65, 200):
+            tsdf, weight, _ = dense_voxels(engine, volume)
+            np.testing.assert_array_equal(weight, np.minimum(frame * seen, GREATEST_WEIGHT))
+            # Adding a difference of zero is exact; that of one rounding is divided by the weight.
+            np.testing.assert_allclose(tsdf, first, atol=2**-23)
+
+
+def test_mean_of_a_noisy_sensor(engine: Engine) -> None:
+    """The plain mean of what a voxel was told until its weight is full, and then one that forgets, as the twin's."""
+    bounds, camera = (-0.16, -0.16, 1.0, 0.16, 0.16, 1.32), CAMERAS["usual"]
+    volume = Volume(engine, bounds, 0.02)
+    expected = Twin(volume)
+    rng = np.random.default_rng(4)
+    told = []
+    for frame in range(1, 101):
+        depth = np.full((camera.height, camera.width), float(np.float32(1.16 + 0.01 * rng.normal())))
+        told.append(depth[0, 0])
+        fuse(engine, volume, camera, np.eye(4), depth)
+        expected.fuse(camera, np.eye(4), depth)
+        if frame in (10, 64, 100):
+            tsdf, weight, _ = dense_voxels(engine, volume)
+            middle = (slice(6, 10), slice(6, 10), slice(6, 10))
+            assert (weight[middle] == min(frame, GREATEST_WEIGHT)).all()
+            atol = 20 * relative_tolerance(engine.device)  # each of the means before it rounds, less and less
+            np.testing.assert_allclose(tsdf[middle], expected.tsdf[middle], atol=atol)
+            if frame <= GREATEST_WEIGHT:
+                center = voxel_centers(tsdf.shape, 0.02)[8, 8, 8] + bounds[:3]
+                along = np.linalg.norm(center) / center[2]
+                exact = np.minimum((np.array(told) - center[2]) * along / volume.truncation_m, 1).mean()
+                assert tsdf[8, 8, 8] == pytest.approx(exact, abs=atol)
+
+
+def test_a_moved_wall_is_forgotten(engine: Engine) -> None:
+    """After 200 frames at one place, the zero crossing follows a wall that moved by half the truncation."""
+    volume = Volume(engine, (-0.16, -0.16, 1.0, 0.16, 0.16, 1.32), 0.02)
+    shape = (CAMERA.height, CAMERA.width)
+
+    def crossing() -> Any:
+        column = dense_voxels(engine, volume)[0][:, 8, 8]
+        index = int(np.flatnonzero((column[:-1] > 0) & (column[1:] <= 0))[0])
+        return 1.01 + 0.02 * (index + column[index] / (column[index] - column[index + 1]))
+
+    for _ in range(200):
+        fuse(engine, volume, CAMERA, np.eye(4), np.full(shape, 1.14))
+    assert crossing() == pytest.approx(1.14, abs=1e-3)
+    for _ in range(int(3 * GREATEST_WEIGHT)):
+        fuse(engine, volume, CAMERA, np.eye(4), np.full(shape, 1.18))
+    assert crossing() == pytest.approx(1.18 - 0.04 * np.exp(-3), abs=2e-3)

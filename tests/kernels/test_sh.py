@@ -1,0 +1,46 @@
+"""include/sh.clh against the host's basis and scipy's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from server.maths import sh
+from server.opencl.device import Device
+from server.opencl.engine import Engine
+from server.opencl.program import KERNEL_FOLDER
+from tests.lights import random_directions, unit
+from tests.reference.sh import lambert_bands, sh_basis
+from tests.tolerance import relative_tolerance
+
+SOURCE = """
+#include "sh.clh"
+kernel void evaluate(const int count, const global float *directions, global float *basis, global float *lambert) {
+    const int i = get_global_id(0);
+    if (i >= count) return;
+    float y[COEFFICIENTS];
+    sh_basis(vload3(i, directions), y);
+    for (int c = 0; c < COEFFICIENTS; c++) basis[i * COEFFICIENTS + c] = y[c];
+    if (i < BANDS) lambert[i] = lambert_band(i);
+}
+"""
+AXES = np.concatenate([np.eye(3), -np.eye(3)])
+NEAR_POLES = unit([[1e-9, 0, 1], [0, -1e-7, 1], [1e-4, 1e-4, -1], [0, 1e-3, -1]])
+
+
+@pytest.mark.parametrize("bands", range(2, 7))
+def test_basis_and_lambert(device: Device, engine: Engine, bands: int) -> None:
+    options = ["-cl-std=CL1.2", "-Werror", "-I", str(KERNEL_FOLDER / "include"), f"-DBANDS={bands}"]
+    kernel = cl.Kernel(cl.Program(device.context, SOURCE).build(options), "evaluate")
+    directions = np.concatenate([AXES, NEAR_POLES, random_directions(500, 1)]).astype(np.float32)
+    space, count = engine.workspace, len(directions)
+    basis = space.array("basis", (count, bands * bands), np.float32)
+    lambert = space.array("lambert", (bands,), np.float32)
+    engine.launch(kernel, (count,), count, space.upload("directions", directions), basis, lambert)
+    exact = directions.astype(np.float64)
+    # Recurrences of a dozen float32 operations on values below 2: absolute, because functions cross zero.
+    atol = 0.2 * relative_tolerance(device)
+    np.testing.assert_allclose(engine.download(basis), sh.sh_basis(exact, bands), atol=atol)
+    np.testing.assert_allclose(engine.download(basis), sh_basis(exact, bands), atol=2 * atol)  # scipy takes unit length
+    np.testing.assert_allclose(engine.download(lambert), lambert_bands(bands), atol=1e-8)

@@ -3,6 +3,19 @@
 #include "camera.clh"
 #include "volume.clh"
 
+// Measured depth at `pixel` (coordinates + 0.5, inside the picture), 0 = none: bilinear where the four pixels around it are
+// one surface, whose slope would else become noise of the normals; of the nearest pixel where they are `edge_m` apart.
+static float depth_at(const int width, const int height, global const float *depth_m, const float2 pixel, const float edge_m) {
+    const int x = clamp((int)(pixel.x + 0.5f) - 1, 0, width - 2);
+    const int y = clamp((int)(pixel.y + 0.5f) - 1, 0, height - 2);
+    global const float *corner = depth_m + y * width + x;
+    const float4 d = (float4)(corner[0], corner[1], corner[width], corner[width + 1]);
+    const float low = fmin(fmin(d.x, d.y), fmin(d.z, d.w)), high = fmax(fmax(d.x, d.y), fmax(d.z, d.w));
+    if (low <= 0.0f || high - low >= edge_m) return depth_m[(int)pixel.y * width + (int)pixel.x];
+    const float u = clamp(pixel.x - 0.5f - x, 0.0f, 1.0f);
+    return mix(mix(d.x, d.y, u), mix(d.z, d.w, u), clamp(pixel.y - 0.5f - y, 0.0f, 1.0f));
+}
+
 // One work-group of 8 x 8 items a brick, each item a column of 8 voxels along z.
 // allocated [count] brick indices, slots [z][y][x], depth_m [h][w] (0 = none) -> voxels, updated in place.
 kernel void integrate(const int count, const int width, const int height, const int4 bricks,
@@ -31,7 +44,7 @@ kernel void integrate(const int count, const int width, const int height, const 
         const float3 p = start + (float)i * step;
         const float2 pixel = project(intrinsics, (float3)(p.x, p.y, fmax(p.z, 1e-6f))) + 0.5f;
         const int seen = p.z > 0.0f && pixel.x >= 0.0f && pixel.y >= 0.0f && pixel.x < width && pixel.y < height;
-        const float depth = seen ? depth_m[(int)pixel.y * width + (int)pixel.x] : 0.0f;
+        const float depth = seen ? depth_at(width, height, depth_m, pixel, truncation_m) : 0.0f;
         const float distance = (depth - p.z) * (length(p) / fmax(p.z, 1e-6f));
         if (depth > 0.0f && distance > -truncation_m) {
             const float2 old = column[i * BRICK * BRICK];

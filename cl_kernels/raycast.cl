@@ -65,6 +65,20 @@ static float find_surface(const Volume volume, const VoxelRay ray, const float b
     return 0.0f;
 }
 
+// The first surface along the ray that faces it, as distance in voxels, 0 if there is none; beside a silhouette the ray may
+// cross the field where it slopes away, and goes on to what lies behind. -> normal: unit, towards free space.
+static float find_facing_surface(const Volume volume, const VoxelRay ray, const float begin, const float end, float3 *normal) {
+    for (float t = find_surface(volume, ray, begin, end); t > 0.0f; t = find_surface(volume, ray, t + 0.5f, end)) {
+        const float3 gradient = surface_gradient(volume, ray.origin + t * ray.direction);
+        const float steepness = length(gradient);
+        if (steepness > 1e-6f && dot(gradient, ray.direction) < 0.0f) {
+            *normal = gradient / steepness;
+            return t;
+        }
+    }
+    return 0.0f;
+}
+
 // Volume and view -> positions [h][w] (volume space metres, w = 1 surface, 0 none), normals [h][w] (unit, towards free space, w likewise).
 kernel void raycast(const int width, const int height, const int4 bricks, global const int *slots, global const uchar *gaps,
                     global const ulong *solid, global const uchar *octets, global const float2 *voxels, const float voxel_m, const float truncation_m, const float4 intrinsics,
@@ -78,19 +92,9 @@ kernel void raycast(const int width, const int height, const int4 bricks, global
     const float along = length(ray_m);
     const VoxelRay ray = make_voxel_ray(volume, volume_from_camera.s37b, ray_m / along);
     const float2 span = clip_to_volume(volume, ray);
-    const float t = find_surface(volume, ray, span.x, fmin(span.y, greatest_depth_m * along / voxel_m));
-
-    float4 position = (float4)(0.0f);
-    float4 normal = (float4)(0.0f);
-    if (t > 0.0f) {
-        const float3 p = ray.origin + t * ray.direction;
-        const float3 gradient = surface_gradient(volume, p);
-        const float steepness = length(gradient);
-        if (steepness > 1e-6f && dot(gradient, ray.direction) < 0.0f) {
-            position = (float4)(p * voxel_m, 1.0f);
-            normal = (float4)(gradient / steepness, 1.0f);
-        }
-    }
-    positions[y * width + x] = position;
-    normals[y * width + x] = normal;
+    float3 facing = (float3)(0.0f);
+    const float t = find_facing_surface(volume, ray, span.x, fmin(span.y, greatest_depth_m * along / voxel_m), &facing);
+    const float hit = t > 0.0f ? 1.0f : 0.0f;
+    positions[y * width + x] = (float4)(hit * voxel_m * (ray.origin + t * ray.direction), hit);
+    normals[y * width + x] = (float4)(facing, hit);
 }

@@ -7,9 +7,11 @@ A suite is a module of `server.evaluation` or `tests.bench` named after it, with
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -19,6 +21,7 @@ from client.laptop.errors import OptionError
 from client.progress import note, say
 
 SUITES = ("geometry", "light", "rendering", "accuracy", "stability", "plan", "service", "client")
+_CHECKOUT = Path(__file__).resolve().parents[1]
 PACKAGES = ("server.evaluation", "tests.bench")
 
 Suite = Callable[[bool, Callable[[str], None]], dict[str, Any]]
@@ -41,6 +44,8 @@ def find_suite(name: str) -> Suite | None:
     """The suite's function, if this installation has it."""
     if name not in SUITES:
         return None
+    if str(_CHECKOUT) not in sys.path:  # the benchmarks lie beside the packages, not in them
+        sys.path.append(str(_CHECKOUT))
     for package in PACKAGES:
         if _exists(package) and _exists(f"{package}.{name}"):
             function: Suite | None = getattr(import_module(f"{package}.{name}"), "run_suite", None)
@@ -60,7 +65,8 @@ def _exists(module: str) -> bool:
 def _print(result: dict[str, Any]) -> None:
     table = Table("row", "value", "unit", "goal", "holds", title=f"{result['device']}, {result['commit']}")
     for row in result["rows"]:
-        table.add_row(row["name"], f"{row['value']}", row["unit"], f"{row['goal']}", "yes" if row["holds"] else "no")
+        holds = {True: "yes", False: "NO", None: ""}[row["holds"]]
+        table.add_row(row["name"], f"{row['value']:.4g}", row["unit"], row["goal"] or "", holds)
     console = Console()
     console.print(table)
     for missing in result["unmeasured"]:

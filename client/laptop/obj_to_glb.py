@@ -52,6 +52,11 @@ def libraries(path: Path, text: str) -> list[Path]:
     return [path.parent / name for name in names if (path.parent / name).is_file()]
 
 
+def counts_backwards(text: str) -> bool:
+    """True if a face names its corners from the last one on, with negative numbers."""
+    return any(line.startswith("f ") and "-" in line.split("#")[0] for line in text.splitlines())
+
+
 def convert(path: Path, text: str, mtl_files: list[Path]) -> bytes:
     """GLB bytes. Raises ObjectError naming the file and line."""
     materials = {name: m for file in mtl_files for name, m in _read_materials(file).items()}

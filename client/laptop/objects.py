@@ -96,7 +96,10 @@ def _pack_obj(path: Path, data: bytes) -> tuple[str, bytes]:
     if not {"v", "f"} <= kinds:
         raise ObjectError(f"{path}: is no OBJ mesh, it has no vertices or no faces")
     libraries = obj_to_glb.libraries(path, text)
-    return ("glb", obj_to_glb.convert(path, text, libraries)) if libraries else ("obj", data)
+    # Common readers misread indices that count backwards, so those are resolved here.
+    if libraries or obj_to_glb.counts_backwards(text):
+        return "glb", obj_to_glb.convert(path, text, libraries)
+    return "obj", data
 
 
 def _pack_ply(path: Path, data: bytes) -> tuple[str, bytes]:

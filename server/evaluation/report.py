@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -45,27 +45,11 @@ class Report:
     sizes: dict[str, int] = field(default_factory=dict)
     """How many frames, trials or messages each part used."""
 
-    def as_json(self) -> str:
+    def as_dict(self) -> dict[str, Any]:
         """One object, as the command line's contract has it."""
         rows = [{**asdict(row), "goal": row.goal or None, "holds": row.holds} for row in self.rows]
         unmeasured = [asdict(item) for item in self.unmeasured]
-        report = {
-            "device": self.device,
-            "commit": commit(),
-            "rows": rows,
-            "unmeasured": unmeasured,
-            "sizes": self.sizes,
-        }
-        return json.dumps(report, indent=1)
-
-    def as_table(self) -> str:
-        """The same for a person."""
-        lines = [f"{self.device}, commit {commit()}"]
-        for row in self.rows:
-            verdict = {None: "", True: "holds", False: "MISSED"}[row.holds]
-            lines.append(f"{row.name:<52} {row.value:>10.3f} {row.unit:<10} {row.goal:<10} {verdict}")
-        lines += [f"{item.name:<52} unmeasured: {item.reason}" for item in self.unmeasured]
-        return "\n".join(lines)
+        return {"device": self.device, "commit": commit(), "rows": rows, "unmeasured": unmeasured, "sizes": self.sizes}
 
 
 def commit() -> str:

@@ -18,6 +18,7 @@ from server.maths.sh import sh_basis, spherical_fibonacci
 _PROBES = 1024
 _MOST_STEPS = 300
 _TOLERANCE = 1e-6
+_LEAST_SCALE = 1e-14
 _MEAN = 0.28209479177387814  # Y_00
 
 
@@ -32,8 +33,10 @@ def nonnegative_mean(mean: NDArray[np.float64], precision: NDArray[np.float64]) 
     least = float((basis @ mean).min())
     if least >= 0:
         return mean
-    root = np.linalg.cholesky(precision)  # x = root^-T (start + reach force), force >= 0
-    start, reach = root.T @ mean, np.linalg.solve(root, basis.T)
+    scales, axes = np.linalg.eigh(precision)
+    roots = np.sqrt(np.maximum(scales, _LEAST_SCALE * scales[-1]))
+    unwhiten = axes / roots  # x = unwhiten (start + reach force), force >= 0
+    start, reach = roots * (axes.T @ mean), (basis @ unwhiten).T
     result, held, force = mean, np.empty(0, np.int64), np.empty(0)
     for _ in range(_MOST_STEPS):
         values = basis @ result
@@ -41,7 +44,7 @@ def nonnegative_mean(mean: NDArray[np.float64], precision: NDArray[np.float64]) 
         if values[worst] >= _TOLERANCE * least or worst in held:
             break
         held, force = _supported(reach, start, np.append(held, worst), np.append(force, 0.0))
-        result = np.linalg.solve(root.T, start + reach[:, held] @ force)
+        result = unwhiten @ (start + reach[:, held] @ force)
     return np.asarray(result)
 
 

@@ -23,12 +23,10 @@ LAYOUTS = {
 
 def error_of(spec: object, index: int = 0) -> str:
     """The one line with which opening, or reading a frame, is refused."""
-    try:
+    with pytest.raises(SourceError) as caught:
         open_source(str(spec))[index]
-    except SourceError as error:
-        assert "\n" not in str(error)
-        return str(error)
-    pytest.fail("nothing was refused")
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

@@ -14,6 +14,7 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.stages.radiance_transfer import SETS, direction_sets, transfer_radiance
 from server.stages.volume import Volume
+from tests.lights import unit
 from tests.reference import radiance_transfer as twin
 from tests.reference.sh import open_transfer
 from tests.reference.visibility import trace_volume
@@ -33,6 +34,7 @@ from tests.tolerance import relative_tolerance
 
 VOXEL_M = 0.01
 ROOM_M = 1000.0
+STRIDE = 4
 OUTER = 0.87 * VOXEL_M
 """A solid voxel's centre is behind the surface, so no point of it is farther out than half its diagonal."""
 INNER = 1.31 * VOXEL_M
@@ -44,17 +46,44 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Traced:
-    """A result on the host, with what it was asked for."""
+    """A result on the host, and the geometry buffer [h, w, 4] it was asked for: a block of STRIDE^2 pixels a sample."""
 
     transfer: Floats
     openness: Floats
+    flatness: Floats
     free: NDArray[np.bool_]
-    points: Floats
+    positions: Floats
     normals: Floats
+
+    @property
+    def origins(self) -> Floats:
+        """[rows, cols, 3] where rays begin: a voxel off the surface."""
+        pixels = np.s_[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE, :3]
+        return self.positions[pixels] + VOXEL_M * self.normals[pixels]
 
 
 def camera_of(width: int, height: int) -> CameraModel:
     return CameraModel(width=width, height=height, fx=100.0, fy=100.0, cx=0.0, cy=0.0)
+
+
+def transfer_of(
+    engine: Engine,
+    volume: Volume,
+    positions: Floats,
+    normals: Floats,
+    stride: int,
+    *,
+    rays: int = 81,
+    bands: int = 4,
+    reach_m: float = ROOM_M,
+) -> Traced:
+    """Transfer of a geometry buffer [h, w, 4]."""
+    surface = upload_surface(engine, positions[..., :3], normals[..., :3], positions[..., 3] > 0)
+    camera = camera_of(positions.shape[1], positions.shape[0])
+    result = transfer_radiance(engine, camera, volume, surface, stride, direction_sets(rays, bands), reach_m)
+    bits = np.unpackbits(engine.download(result.free_mask).view(np.uint8), axis=-1, bitorder="little")
+    found = (engine.download(a) for a in (result.coefficients, result.openness, result.flatness))
+    return Traced(*found, bits[..., :rays].astype(bool), positions, normals)
 
 
 def trace(
@@ -67,24 +96,31 @@ def trace(
     bands: int = 4,
     reach_m: float = ROOM_M,
 ) -> Traced:
-    """Transfer of given points, one a pixel in rows of 8; 64 or more of them."""
-    grid = (-1, 8, 3)
-    points, normals = points.astype(np.float32).reshape(grid), normals.astype(np.float32).reshape(grid)
-    surface = upload_surface(engine, points, normals, np.ones(points.shape[:2], bool))
-    camera, directions = camera_of(8, len(points)), direction_sets(rays, bands)
-    result = transfer_radiance(engine, camera, volume, surface, 1, directions, reach_m)
-    words = engine.download(result.free_mask)
-    bits = np.unpackbits(words.view(np.uint8), axis=-1, bitorder="little")[..., :rays].astype(bool)
-    return Traced(engine.download(result.coefficients), engine.download(result.openness), bits, points, normals)
+    """Transfer of given points, 8 in a row; each fills a block of pixels, so that it has no neighbour to be mixed with."""
+    blocks = [
+        np.repeat(np.repeat(np.insert(a.reshape(-1, 8, 3), 3, 1, -1), STRIDE, 0), STRIDE, 1) for a in (points, normals)
+    ]
+    positions, normals = (block.astype(np.float32).astype(np.float64) for block in blocks)
+    return transfer_of(engine, volume, positions, normals, STRIDE, rays=rays, bands=bands, reach_m=reach_m)
 
 
 def rays_of(traced: Traced, count: int, bands: int = 4) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Origins and directions [rows, cols, count, 3] of every ray, and whether it lies above the surface."""
-    rows, cols = np.indices(traced.points.shape[:2])
+    rows, cols = np.indices(traced.openness.shape)
     directions = direction_sets(count, bands).directions.astype(np.float64)[(rows % 2) * 2 + cols % 2, :, :3]
-    origins = np.broadcast_to((traced.points + VOXEL_M * traced.normals)[:, :, None], directions.shape)
-    cosines = (directions * traced.normals[:, :, None]).sum(-1)
-    return origins.astype(np.float64), directions, cosines > 0
+    origins = np.broadcast_to(traced.origins[:, :, None], directions.shape)
+    normals = traced.normals[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE, None, :3]
+    return origins, directions, (directions * normals).sum(-1) > 1e-6
+
+
+def twin_of(traced: Traced, stride: int, rays: int, bands: int) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+    """The twin's result for the visibility that the device found."""
+    free = iter(traced.free[traced.openness >= 0])
+    sets = direction_sets(rays, bands)
+    directions, basis = sets.directions.astype(float), sets.basis.astype(float)
+    return twin.transfer_radiance(
+        traced.positions, traced.normals, stride, 1, directions, basis, VOXEL_M, lambda *_: next(free)
+    )
 
 
 # ---- against the twin --------------------------------------------------------------------------------------------
@@ -95,24 +131,48 @@ def test_transfer_is_the_twins_for_the_same_visibility(device: Device, engine: E
     scene = SCENES["ball above a floor"]
     points, normals = points_on(scene, 96, 1, EVERYWHERE)
     traced = trace(engine, fill_volume(engine, scene, VOXEL_M), points, normals, rays=rays, bands=bands)
-    free = iter(traced.free.reshape(-1, rays))
-    sets = direction_sets(rays, bands)
-    transfer, openness, above = twin.transfer_radiance(
-        np.insert(traced.points, 3, 1, -1).astype(float),
-        np.insert(traced.normals, 3, 1, -1).astype(float),
-        1,
-        sets.directions.astype(float),
-        sets.basis.astype(float),
-        VOXEL_M,
-        lambda *_: next(free),
-    )
-    assert (traced.openness < 0.95).any() and (traced.openness > 0.999).any()
+    assert (traced.openness < 0.95).any()
+    assert (traced.openness > 0.999).any()
+    assert_twins(device, traced, STRIDE, rays, bands)
+
+
+@pytest.mark.parametrize("stride", [1, 4, 8])
+def test_normals_are_smoothed_within_surfaces(device: Device, engine: Engine, stride: int) -> None:
+    """A picture of a ball before a floor, with noisy normals and holes."""
+    scene = SCENES["ball above a floor"]
+    v, u = np.mgrid[:48, :64]
+    rays = unit(np.stack([(u - 31.5) / 50, -(v - 23.5) / 50 - 0.3, np.ones_like(u)], -1).reshape(-1, 3))
+    eye = np.array([0.5, 0.6, -0.3])
+    t = hit(scene, np.tile(eye, (len(rays), 1)), rays)
+    seen = np.isfinite(t)
+    points = eye + np.where(seen, t, 0)[:, None] * rays
+    normals = normal_at(scene, np.where(seen[:, None], points, 0.5))
+    random = np.random.default_rng(4)
+    noisy = unit(normals + 0.1 * random.normal(size=normals.shape))
+    valid = seen & (random.random(len(rays)) < 0.9)
+    buffers = [
+        np.insert(a, 3, valid, -1).reshape(48, 64, 4).astype(np.float32).astype(np.float64) for a in (points, noisy)
+    ]
+    buffers = [np.where(valid.reshape(48, 64, 1), buffer, 0) for buffer in buffers]
+    traced = transfer_of(engine, fill_volume(engine, scene, VOXEL_M), *buffers, stride)
+    assert_twins(device, traced, stride, 81, 4, edges=0.02)
+    here = traced.flatness > 0.9
+    found = unit(traced.transfer[..., [3, 1, 2]])[here & (traced.openness == 1)]
+    exact = normals.reshape(48, 64, 3)[stride // 2 :: stride, stride // 2 :: stride][here & (traced.openness == 1)]
+    before = noisy.reshape(48, 64, 3)[stride // 2 :: stride, stride // 2 :: stride][here & (traced.openness == 1)]
+    assert np.mean((found - exact) ** 2) < np.mean((before - exact) ** 2) / 4  # nine of them: a ninth of the variance
+
+
+def assert_twins(device: Device, traced: Traced, stride: int, rays: int, bands: int, edges: float = 0.0) -> None:
+    """Equal to the twin but for a share `edges` of samples with a neighbour on the brink of being another surface."""
+    transfer, openness, flatness, free = twin_of(traced, stride, rays, bands)
+    agree = np.abs(traced.flatness - flatness) < 1e-6
+    assert (~agree).mean() <= edges
     # Coefficients are sums of up to 512 terms of magnitude below 1 / 50: their rounding adds to that of the largest.
-    np.testing.assert_allclose(
-        traced.transfer, transfer, rtol=relative_tolerance(device), atol=relative_tolerance(device)
-    )
-    np.testing.assert_allclose(traced.openness, openness, atol=relative_tolerance(device))
-    np.testing.assert_array_equal(traced.free, above)
+    tolerance = 2 * relative_tolerance(device)
+    np.testing.assert_allclose(traced.transfer[agree], transfer[agree], rtol=tolerance, atol=tolerance)
+    np.testing.assert_allclose(traced.openness[agree], openness[agree], atol=tolerance)
+    assert (traced.free[agree] & ~free[agree]).sum() <= 1e-4 * free.sum()  # directions in the surface to rounding
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -133,23 +193,23 @@ def test_visibility_is_the_twins(engine: Engine, name: str, reach_m: float) -> N
     assert (~free).mean() > 0.02
 
 
-def test_strides_and_empty_pixels(engine: Engine) -> None:
+@pytest.mark.parametrize("stride", [1, 4, 8])
+def test_strides_and_empty_pixels(engine: Engine, stride: int) -> None:
     volume = fill_volume(engine, (floor(),), VOXEL_M)
     random = np.random.default_rng(5)
-    points = np.stack(
-        [random.uniform(0.2, 0.7, (13, 22)), np.full((13, 22), 0.1), random.uniform(0.2, 0.7, (13, 22))], -1
-    )
-    normals = np.broadcast_to([0.0, 1.0, 0.0], points.shape)
     valid = random.random((13, 22)) < 0.5
-    surface = upload_surface(engine, points, normals, valid)
-    for stride in (1, 4, 8):
-        result = transfer_radiance(engine, camera_of(22, 13), volume, surface, stride, direction_sets(81, 4), ROOM_M)
-        here = valid[stride // 2 :: stride, stride // 2 :: stride][: 13 // stride, : 22 // stride]
-        openness, transfer = engine.download(result.openness), engine.download(result.coefficients)
-        np.testing.assert_array_equal(openness, np.where(here, 1.0, -1.0))
-        assert not transfer[~here].any()
-        assert not engine.download(result.free_mask)[~here].any()
-        np.testing.assert_allclose(transfer[here], np.tile(open_transfer(normals[0, 0], 4), (here.sum(), 1)), atol=1e-6)
+    x, z = random.uniform(0.2, 0.7, (2, 13, 22))
+    positions = np.where(valid[..., None], np.stack([x, 0 * x + 0.1, z, 0 * x + 1], -1), 0)
+    normals = np.where(valid[..., None], [0.0, 1.0, 0.0, 1.0], 0)
+    traced = transfer_of(engine, volume, positions, normals, stride)
+    here = valid[stride // 2 :: stride, stride // 2 :: stride][: 13 // stride, : 22 // stride]
+    np.testing.assert_array_equal(traced.openness, np.where(here, 1.0, -1.0))
+    np.testing.assert_array_equal(traced.flatness[~here], 0)
+    assert not traced.transfer[~here].any()
+    assert not traced.free[~here].any()
+    np.testing.assert_allclose(
+        traced.transfer[here], np.tile(open_transfer(np.eye(3)[1], 4), (here.sum(), 1)), atol=1e-6
+    )
 
 
 # ---- against closed forms ----------------------------------------------------------------------------------------
@@ -194,7 +254,9 @@ def test_flat_wall_does_not_darken_itself(engine: Engine, plane: HalfSpace) -> N
     for rays in (32, 81, 169):
         traced = trace(engine, volume, points, normals, rays=rays)
         np.testing.assert_array_equal(traced.openness, 1.0)
-        np.testing.assert_allclose(traced.transfer, open_transfer(traced.normals.astype(float), 4), atol=2e-6)
+        np.testing.assert_allclose(
+            traced.transfer, np.broadcast_to(open_transfer(plane.normal, 4), traced.transfer.shape), atol=2e-6
+        )
 
 
 @pytest.mark.parametrize("distance_m", [0.02, 0.05, 0.1, 0.2, 0.4])
@@ -236,8 +298,7 @@ def test_nothing_outside_the_volume_blocks(engine: Engine) -> None:
     points = random.uniform(-2, 3, (64, 3))
     points = np.where((np.abs(points - 0.5) < 0.5).all(-1)[:, None], points + 3, points)
     traced = trace(engine, volume, points, np.tile([0.0, 1.0, 0.0], (64, 1)))
-    downward = points[:, 1] > 0.2
-    np.testing.assert_array_equal(traced.openness.ravel()[downward], 1.0)
+    np.testing.assert_array_equal(traced.openness.ravel()[points[:, 1] > 0.2], 1.0)
     assert np.isfinite(traced.transfer).all()
 
 

@@ -26,24 +26,26 @@ def case(seed: int, n: int = 16, *, hard: bool = True) -> tuple[Floats, Floats]:
     """A mean that is negative somewhere and the precision of an ill-conditioned fit (condition 1e4 if hard)."""
     random = np.random.default_rng(seed)
     mean = random.normal(size=n) / (1 + np.sqrt(np.arange(n)))
-    mean[0] = 1.5
+    mean[0] = 0.5
     rotation = np.linalg.qr(random.normal(size=(n, n)))[0]
     return mean, rotation * np.logspace(0, 4 if hard else 1, n) @ rotation.T
 
 
 def constraints(n: int) -> Floats:
-    return nonnegative._basis(nonnegative._CONSTRAINTS, round(n**0.5))
+    return nonnegative._basis(nonnegative._PROBES, round(n**0.5))
 
 
-@pytest.mark.parametrize("n", [4, 9, 16, 36])
-@pytest.mark.parametrize("seed", range(5))
-def test_result_is_not_negative(seed: int, n: int) -> None:
-    mean, precision = case(seed, n)
-    found = nonnegative_mean(mean, precision)
-    size = values(found).max()
-    assert size > 0
-    assert values(mean).min() < -0.02 * size
-    assert values(found).min() > -0.02 * size
+@pytest.mark.parametrize("n", [4, 9, 16, 25, 36])
+@pytest.mark.parametrize("hard", [False, True])
+def test_result_is_not_negative(n: int, hard: bool) -> None:
+    negative = 0
+    for seed in range(10):
+        mean, precision = case(seed, n, hard=hard)
+        negative += values(mean).min() < -0.02 * np.abs(mean).max()
+        found = values(nonnegative_mean(mean, precision))
+        # Zero at 1024 directions: between them, 6 degrees apart, a band of degree l dips by about (l + 1)^2 / 2000.
+        assert found.min() > -0.01 * max(1, n / 20) * max(found.max(), 0.05)
+    assert negative >= 8
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -60,7 +62,7 @@ def test_result_is_the_nearest(seed: int) -> None:
     )
     assert best.success
     found = nonnegative_mean(mean, precision)
-    np.testing.assert_allclose(found, best.x, atol=2e-3)
+    np.testing.assert_allclose(found, best.x, atol=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -77,11 +79,9 @@ def test_optimality_of_an_ill_conditioned_fit(seed: int) -> None:
     def cost(x: Floats) -> float:
         return float((x - mean) @ precision @ (x - mean))
 
-    size = values(best).max()
-    # 400 steps stop a little outside the constraints, where the cost is a little lower.
-    assert (basis @ found).min() > -0.01 * size
-    assert cost(found) == pytest.approx(cost(best), rel=0.05)
-    assert np.abs(values(found) - values(best)).max() < 0.05 * size
+    assert (basis @ found).min() > -1e-5 * np.abs(values(mean)).max()
+    assert cost(found) == pytest.approx(cost(best), rel=1e-6)
+    np.testing.assert_allclose(found, best, atol=1e-4)
 
 
 def test_a_feasible_mean_is_kept() -> None:

@@ -33,7 +33,12 @@ def test_constants_of_the_conventions() -> None:
     x, y, z = DIRECTIONS.T
     basis = sh.sh_basis(DIRECTIONS, 3)
     published = {0: 0.282095 + 0 * x, 1: 0.488603 * y, 2: 0.488603 * z, 3: 0.488603 * x, 4: 1.092548 * x * y}
-    published |= {5: 1.092548 * y * z, 6: 0.315392 * (3 * z * z - 1), 7: 1.092548 * x * z, 8: 0.546274 * (x * x - y * y)}
+    published |= {
+        5: 1.092548 * y * z,
+        6: 0.315392 * (3 * z * z - 1),
+        7: 1.092548 * x * z,
+        8: 0.546274 * (x * x - y * y),
+    }
     for index, values in published.items():
         np.testing.assert_allclose(basis[:, index], values, atol=1e-6)
 
@@ -54,11 +59,12 @@ def test_lambert_bands_are_the_textbooks() -> None:
 
 
 def test_lambert_transfer_integrates_the_clamped_cosine() -> None:
-    points, weights = sphere_rule(400, 800)
+    points, weights = sphere_rule(200, 400)
+    basis = sh_basis(points, 6)
     for normal in np.concatenate([AXES, random_directions(4, 2)]):
-        integral = (weights * np.maximum(points @ normal, 0) / np.pi) @ sh_basis(points, 6)
-        # The cosine's crease is not a polynomial: the rule's error falls with the square of its 1/400 spacing.
-        np.testing.assert_allclose(sh.lambert_transfer(normal, 6), integral, atol=2e-5)
+        integral = (weights * np.maximum(points @ normal, 0) / np.pi) @ basis
+        # The cosine's crease is not a polynomial: the rule's error falls with the square of its 1/200 spacing.
+        np.testing.assert_allclose(sh.lambert_transfer(normal, 6), integral, atol=5e-5)
 
 
 def test_white_under_a_uniform_sky_shades_to_its_radiance() -> None:

@@ -23,15 +23,31 @@ def project(camera: CameraModel, points: Floats) -> Floats:
     return np.where(points[..., 2:] > 0, pixels, np.inf)
 
 
-def signed_distance(camera: CameraModel, points: Floats, depth_m: Floats) -> Floats:
-    """[...] distance along the ray from points [..., 3] (camera space) to what their nearest pixel measured, metres.
+def depth_at(pixels: Floats, depth_m: Floats, edge_m: float) -> Floats:
+    """[...] measured depth at pixels [..., 2] inside the picture, 0 = none.
 
-    Positive in front; NaN where the pixel is outside the picture or measured nothing.
+    Bilinear where the four pixels around all measured something and differ by less than `edge_m`; else the nearest.
     """
-    pixels = project(camera, points) + 0.5
-    seen = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
-    u, v = np.where(seen[..., None], pixels, 0).astype(int).transpose(-1, *range(pixels.ndim - 1))
-    depth = depth_m[v, u]
+    height, width = depth_m.shape
+    u, v = np.floor(pixels + 0.5).astype(int).transpose(-1, *range(pixels.ndim - 1))
+    low = np.clip(np.floor(pixels), 0, (width - 2, height - 2)).astype(int)
+    share = np.clip(pixels - low, 0, 1)
+    corners, weights = [], []
+    for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        corners.append(depth_m[low[..., 1] + dy, low[..., 0] + dx])
+        weights.append(np.where((dx, dy), share, 1 - share).prod(-1))
+    one_surface = (np.min(corners, axis=0) > 0) & (np.ptp(corners, axis=0) < edge_m)
+    return np.where(one_surface, (np.array(corners) * weights).sum(0), depth_m[v, u])
+
+
+def signed_distance(camera: CameraModel, points: Floats, depth_m: Floats, edge_m: float) -> Floats:
+    """[...] distance along the ray from points [..., 3] (camera space) to the surface measured there, metres.
+
+    Positive in front; NaN where the point's nearest pixel is outside the picture or measured nothing.
+    """
+    pixels = project(camera, points)
+    seen = ((pixels >= -0.5) & (pixels < (camera.width - 0.5, camera.height - 0.5))).all(-1)
+    depth = depth_at(np.where(seen[..., None], pixels, 0), depth_m, edge_m)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (depth - points[..., 2]) * np.linalg.norm(points, axis=-1) / points[..., 2]
     return np.where(seen & (depth > 0), distance, np.nan)
@@ -47,10 +63,13 @@ def integrate(
     tsdf: Floats,
     weight: Floats,
 ) -> tuple[Floats, Floats]:
-    """tsdf (in truncations) and weight, [z, y, x], after one more depth picture: a running mean with equal weights."""
+    """tsdf (in truncations) and weight, [z, y, x], after one more depth picture: a running mean with equal weights.
+
+    Pixels that differ by the truncation or more are taken as different surfaces.
+    """
     centers = voxel_centers(tsdf.shape, voxel_m)
     points = (centers - volume_from_camera[:3, 3]) @ volume_from_camera[:3, :3]
-    distance = signed_distance(camera, points, depth_m)
+    distance = signed_distance(camera, points, depth_m, truncation_m)
     updated = distance > -truncation_m
     sample = np.minimum(distance / truncation_m, 1)
     mean = (weight * tsdf + sample) / (weight + 1)

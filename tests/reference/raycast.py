@@ -38,9 +38,7 @@ def trilinear(tsdf: Floats, weight: Floats, points: Floats) -> tuple[Floats, Boo
 def gradient(tsdf: Floats, weight: Floats, points: Floats) -> Floats:
     """[..., 3] central differences one voxel to either side; of the trilinear cell itself where one is unseen."""
     axes = np.eye(3)
-    ahead, behind = (
-        [trilinear(tsdf, weight, points + sign * axis) for axis in axes] for sign in (1, -1)
-    )
+    ahead, behind = ([trilinear(tsdf, weight, points + sign * axis) for axis in axes] for sign in (1, -1))
     wide = np.stack([a[0] - b[0] for a, b in zip(ahead, behind, strict=True)], -1)
     seen = np.all([side[1] for side in (*ahead, *behind)], axis=0)
     inner = []

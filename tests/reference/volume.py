@@ -21,13 +21,17 @@ def by_bricks(dense: Bools, side: int = BRICK) -> Bools:
 
 
 def mark_bricks(
-    camera: CameraModel, volume_from_camera: Floats, depth_m: Floats, bricks: tuple[int, int, int], voxel_m: float,
+    camera: CameraModel,
+    volume_from_camera: Floats,
+    depth_m: Floats,
+    bricks: tuple[int, int, int],
+    voxel_m: float,
     reach_m: float,
 ) -> Bools:
     """[z, y, x] bricks that hold a voxel whose own pixel measured a surface within `reach_m` of it along the ray."""
     centers = voxel_centers(tuple(BRICK * count for count in reversed(bricks)), voxel_m)
     points = (centers - volume_from_camera[:3, 3]) @ volume_from_camera[:3, :3]
-    return by_bricks(np.abs(signed_distance(camera, points, depth_m)) <= reach_m)
+    return by_bricks(np.abs(signed_distance(camera, points, depth_m, reach_m)) <= reach_m)
 
 
 def find_solid(tsdf: Floats, weight: Floats) -> tuple[NDArray[np.uint64], NDArray[np.uint8]]:

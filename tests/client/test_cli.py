@@ -1,0 +1,182 @@
+"""The command line as a user meets it: exit status, and one line for every error."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from client.bench import SUITES, find_suite
+from client.cli import run_command
+from tests.client import folders
+from tests.data import ROOT
+
+PROGRAM = Path(sys.executable).with_name("probeless")
+TABLE = "synthetic:table?size=160x120&frames=4"
+
+
+def probeless(*words: object, timeout_s: float = 300, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [PROGRAM, *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        check=False,
+        cwd=ROOT,
+        env=os.environ | environment,
+    )
+
+
+def assert_one_line(done: subprocess.CompletedProcess[str], status: int, words: str) -> None:
+    assert done.returncode == status, done.stderr
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        ([], "Missing command"),
+        (["fly"], "No such command"),
+        (["run"], "SOURCE"),
+        (["run", TABLE], "--out"),
+        (["run", TABLE, "--out", "{tmp}", "--rays", "3"], "--rays"),
+        (["run", TABLE, "--out", "{tmp}", "--bands", "9"], "--bands"),
+        (["run", TABLE, "--out", "{tmp}", "--wrong"], "--wrong"),
+        (["run", TABLE, "--out", "{tmp}", "--frames", "0:9"], "0:4"),
+        (["run", TABLE, "--out", "{tmp}", "--preset", "art4"], "not built yet"),
+        (["stream", TABLE], "--server"),
+        (["stream", TABLE, "--server", "localhost:1", "--device", "x"], "probeless serve --device"),
+        (["serve", "--token", "x"], "not built yet"),
+        (["serve", "--tls", "x"], "not built yet"),
+        (["serve", "--port", "70000"], "--port"),
+        (["bench", "nothing"], "nothing"),
+    ],
+)
+def test_wrong_use_ends_with_2(words: list[str], error: str, tmp_path: Path) -> None:
+    assert_one_line(probeless(*(word.format(tmp=tmp_path) for word in words)), 2, error)
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (["run", "/nowhere/at/all", "--out", "{tmp}"], "no such folder or file"),
+        (["run", "{tmp}", "--out", "{tmp}/out"], "looked for"),
+        (["run", "oak", "--out", "{tmp}"], "OAK"),
+        (["run", "synthetic:moon", "--out", "{tmp}"], "synthetic:table"),
+        (["run", TABLE, "--out", "{tmp}", "--object", "{tmp}/none.glb@0,0,0"], "no such file"),
+        (["run", TABLE, "--out", "{tmp}", "--object", "pyproject.toml@0,0,0"], "not a mesh"),
+        (["run", TABLE, "--out", "{tmp}", "--device", "no such device"], "no OpenCL device is called"),
+        (["run", TABLE, "--out", "/proc/probeless"], "cannot be written"),
+        (["serve", "--device", "no such device", "--port", "0"], "no OpenCL device is called"),
+    ],
+)
+def test_what_cannot_be_done_ends_with_1(words: list[str], error: str, tmp_path: Path) -> None:
+    assert_one_line(probeless(*(word.format(tmp=tmp_path) for word in words)), 1, error)
+
+
+def test_truncated_picture_in_the_middle_of_a_run(tmp_path: Path) -> None:
+    folder = folders.ground_truth(tmp_path / "set", count=4)
+    file = folder / "color" / "000002.png"
+    file.write_bytes(file.read_bytes()[:100])
+    done = probeless("run", folder, "--out", tmp_path / "out", "--volume", "-2,-2,0,2,2,2", "--voxel", "0.05")
+    assert_one_line(done, 1, "000002.png")
+    lines = (tmp_path / "out" / "light.jsonl").read_text().splitlines()
+    assert [json.loads(line)["frame"] for line in lines] == [0, 1]
+
+
+def test_debug_shows_the_traceback_wherever_it_stands() -> None:
+    for words in (["--debug", "run", "/nowhere", "--out", "x"], ["run", "/nowhere", "--out", "x", "--debug"]):
+        done = probeless(*words)
+        assert done.returncode == 1
+        assert "Traceback" in done.stderr
+
+
+def test_stream_without_a_server() -> None:
+    done = probeless("stream", TABLE, "--server", "http://127.0.0.1:9")
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert "no server at http://127.0.0.1:9" in done.stderr.splitlines()[-1]
+
+
+def test_help_names_every_command_and_option() -> None:
+    general = probeless("--help", COLUMNS="200").stdout
+    for command in ("run", "stream", "serve", "demo", "devices", "bench"):
+        assert command in general
+    shared = (
+        "--frames --poses --volume --voxel --preset --rays --ray-length --bands --albedo --indirect --as-thesis "
+        "--object --up --light --panorama --mesh --budget-ms --max-light-error --out"
+    )
+    for command in ("run", "stream"):
+        text = probeless(command, "--help", COLUMNS="200").stdout
+        assert [option for option in shared.split() if option not in text] == []
+
+
+def test_devices_lists_the_one_that_would_be_used() -> None:
+    done = probeless("devices", COLUMNS="200")
+    assert done.returncode == 0
+    assert "would be used" in done.stdout
+
+
+def test_run_writes_what_is_promised(tmp_path: Path) -> None:
+    done = probeless("run", TABLE, "--frames", "1:4", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "3 frames" in done.stdout
+    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == ["000001.png", "000002.png", "000003.png"]
+    assert cv2.imread(str(tmp_path / "frames" / "000001.png")).shape == (120, 160, 3)
+    lights = [json.loads(line) for line in (tmp_path / "light.jsonl").read_text().splitlines()]
+    assert [light["frame"] for light in lights] == [1, 2, 3]
+    assert all(np.isfinite(light["sh"]).all() for light in lights)
+    assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == 3
+    assert len((tmp_path / "timings.jsonl").read_text().splitlines()) == 3
+
+
+def test_interrupt_ends_quietly_with_130(tmp_path: Path) -> None:
+    words = [PROGRAM, "run", "synthetic:table?frames=5000&size=160x120", "--voxel", "0.02", "--out", tmp_path]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "frames" / "000001.png").exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert out == ""
+    assert "Traceback" not in err
+
+
+def test_an_error_of_the_program_itself_is_told_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(options: object) -> None:
+        raise ZeroDivisionError("by nothing")
+
+    monkeypatch.setattr("client.options.prepare", fail)
+    assert run_command(["run", "x", "--out", "y"]) == 1
+    assert capsys.readouterr().err.startswith("probeless: internal error, ZeroDivisionError: by nothing")
+
+
+def test_bench_finds_only_what_is_a_suite() -> None:
+    assert find_suite("depth_codecs") is None  # a module of the package, but no suite
+    assert find_suite("os") is None
+    assert all(callable(find_suite(name) or len) for name in SUITES)
+
+
+def test_demo_ends_by_itself_with_pictures(tmp_path: Path) -> None:
+    done = probeless("demo", "--out", tmp_path / "demo", timeout_s=600)
+    assert done.returncode == 0, done.stderr
+    first, *_, last = done.stdout.splitlines()
+    assert "http://" in first
+    assert str(tmp_path / "demo") in last
+    pictures = sorted((tmp_path / "demo" / "frames").glob("*.png"))
+    assert len(pictures) >= 10
+    assert min(p.stat().st_size for p in pictures) >= 10_000

@@ -1,0 +1,146 @@
+"""Options shared by run and stream: what they become, and what is refused in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from client.laptop.errors import OptionError, SourceError
+from client.laptop.volume import default_volume, default_voxel
+from client.options import CaptureOptions, parse_frames, parse_ray_length, prepare
+from tests.client import folders
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> str:
+    return str(folders.ground_truth(tmp_path / "set", count=8))
+
+
+def test_defaults_fit_the_source(source: str) -> None:
+    capture = prepare(CaptureOptions(source))
+    wishes = capture.wishes
+    assert capture.frames == range(8)
+    assert capture.objects == ()
+    assert wishes.volume_m == default_volume(capture.source, range(8))
+    assert wishes.voxel_m == default_voxel(wishes.volume_m)
+    assert wishes.up == (0.0, -1.0, 0.0)  # what the source says
+    assert (wishes.preset, wishes.rays, wishes.bands, wishes.ray_length_m) == ("reg4", 81, 4, None)
+    assert (wishes.albedo, wishes.indirect, wishes.poses) == ("constant", "none", "given")
+    assert not wishes.as_thesis
+    assert not wishes.lossless
+
+
+def test_everything_said(source: str) -> None:
+    options = CaptureOptions(
+        source,
+        frames="2:6",
+        poses="given",
+        volume="0,0,0,1,2,3",
+        voxel=0.02,
+        preset="rm",
+        rays=169,
+        ray_length="0.5",
+        bands=3,
+        albedo="constant",
+        indirect="none",
+        up="0,0,1",
+        object=[f"{source}/meta.json@1,2,3", f"{source}/meta.json"],
+    )
+    capture = prepare(options, lossless=True)
+    wishes = capture.wishes
+    assert capture.frames == range(2, 6)
+    assert [item.position_m for item in capture.objects] == [(1.0, 2.0, 3.0), None]
+    assert wishes.volume_m == (0.0, 0.0, 0.0, 1.0, 2.0, 3.0)
+    assert (wishes.voxel_m, wishes.preset, wishes.rays, wishes.ray_length_m, wishes.bands) == (0.02, "rm", 169, 0.5, 3)
+    assert wishes.up == (0.0, 0.0, 1.0)
+    assert wishes.lossless
+
+
+def test_run_and_stream_choose_the_same_volume(source: str) -> None:
+    options = CaptureOptions(source, frames="1:5")
+    assert prepare(options).wishes.volume_m == prepare(options, lossless=True).wishes.volume_m
+
+
+def test_as_thesis(source: str) -> None:
+    wishes = prepare(CaptureOptions(source, as_thesis=True)).wishes
+    assert (wishes.ray_length_m, wishes.albedo, wishes.indirect, wishes.as_thesis) == (0.1, "constant", "none", True)
+    with pytest.raises(OptionError, match="leave one of the two out"):
+        prepare(CaptureOptions(source, as_thesis=True, ray_length="1"))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [(None, range(10)), ("0:10", range(10)), ("3:7", range(3, 7)), (":4", range(4)), ("8:", range(8, 10))],
+)
+def test_frames(text: str | None, expected: range) -> None:
+    assert parse_frames(text, 10) == expected
+
+
+@pytest.mark.parametrize("text", ["", "5", "a:b", "5:5", "6:3", "0:11", "-1:4", "1:2:3", "1.5:3"])
+def test_frames_that_are_none(text: str) -> None:
+    with pytest.raises(OptionError, match="--frames"):
+        parse_frames(text, 10)
+
+
+@pytest.mark.parametrize(("text", "expected"), [(None, None), ("room", None), ("0.1", 0.1), ("1e3", 1000.0)])
+def test_ray_length(text: str | None, expected: float | None) -> None:
+    assert parse_ray_length(text) == expected
+
+
+REFUSED = [
+    ({"volume": "0,0,0,1,1"}, "--volume"),
+    ({"volume": "0,0,0,1,1,nan"}, "--volume"),
+    ({"volume": "0,0,0,1,-1,1"}, "--volume"),
+    ({"voxel": 0.0}, "--voxel"),
+    ({"voxel": 2.0}, "--voxel"),
+    ({"up": "0,0,0"}, "--up"),
+    ({"up": "0,1"}, "--up"),
+    ({"ray_length": "0"}, "--ray-length"),
+    ({"ray_length": "far"}, "--ray-length"),
+    ({"ray_length": "nan"}, "--ray-length"),
+    ({"preset": "best"}, "--preset"),
+    ({"albedo": "white"}, "--albedo"),
+    ({"indirect": "all"}, "--indirect"),
+    ({"poses": "guess"}, "--poses"),
+]
+UNBUILT = [
+    *({"preset": name} for name in ("art1", "art4", "art8", "gr15", "gr15fast", "auto")),
+    {"poses": "track"},
+    {"poses": "refine"},
+    {"albedo": "estimated"},
+    {"indirect": "observed"},
+    {"light": "light.json"},
+    {"panorama": "sky.hdr"},
+    {"mesh": True},
+    {"budget_ms": 40.0},
+    {"max_light_error": 3.0},
+]
+
+
+@pytest.mark.parametrize(("said", "words"), REFUSED)
+def test_values_that_cannot_be(said: dict, words: str, source: str) -> None:
+    with pytest.raises(OptionError, match=words) as caught:
+        prepare(CaptureOptions(source, **said))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("said", UNBUILT, ids=str)
+def test_what_is_not_built_yet_names_the_alternative(said: dict, source: str) -> None:
+    with pytest.raises(OptionError, match=r"is not built yet; \w+") as caught:
+        prepare(CaptureOptions(source, **said))
+    assert "\n" not in str(caught.value)
+
+
+def test_source_without_poses(tmp_path: Path) -> None:
+    folder = folders.redwood(tmp_path / "r")
+    (folder / "trajectory.log").unlink()
+    with pytest.raises(OptionError, match="no poses"):
+        prepare(CaptureOptions(str(folder)))
+
+
+def test_bad_options_are_told_before_the_source_is_opened() -> None:
+    with pytest.raises(OptionError, match="--up"):
+        prepare(CaptureOptions("/nowhere", up="x"))
+    with pytest.raises(SourceError):
+        prepare(CaptureOptions("/nowhere"))

@@ -17,7 +17,7 @@ from client.progress import say
 from protocol.messages import Wishes
 from server.serve import open_service, start_in_background
 
-SOURCE = "synthetic:table?frames=30&light=3"
+SOURCE = "synthetic:table?frames=30&light=7"
 VASE_STANDS_AT_M = (0.1, 0.0, 0.12)
 
 

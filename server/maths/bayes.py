@@ -94,14 +94,15 @@ def solve_with_evidence(equations: NormalEquations, precision: NDArray[np.float6
 
 
 def solve_with_ratio(equations: NormalEquations, precision: NDArray[np.float64], ratio: float) -> Posterior:
-    """Posterior of x for a given k."""
-    return _Whitened.of(equations, precision).posterior(ratio)
+    """Posterior of x for a given k, or for the least that float64 can tell from none."""
+    system = _Whitened.of(equations, precision)
+    return system.posterior(max(ratio, system.least_ratio))
 
 
 def solve_plain(equations: NormalEquations, precision: NDArray[np.float64]) -> Posterior:
-    """Plain least squares, with only as much prior as keeps float64 from dividing by zero."""
+    """Plain least squares."""
     system = _Whitened.of(equations, precision)
-    return system.posterior(1e-13 * max(system.values[-1], _LEAST_SCALE))
+    return system.posterior(system.least_ratio)
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,11 @@ class _Whitened:
         values, vectors = np.linalg.eigh(equations.matrix / np.outer(root, root))
         projected = vectors.T @ (equations.vector / root[:, None])
         return cls(equations, root, np.maximum(values, 0.0), vectors, projected)
+
+    @property
+    def least_ratio(self) -> float:
+        """As much prior as keeps float64 from dividing by zero."""
+        return 1e-13 * max(float(self.values[-1]), _LEAST_SCALE)
 
     def misfit(self, ratio: float) -> NDArray[np.float64]:
         """[channels] y^T y less what the fit under `ratio` explains; positive."""

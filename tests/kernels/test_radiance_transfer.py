@@ -26,6 +26,7 @@ from tests.solids import (
     fill_volume,
     floor,
     hit,
+    normal_at,
     points_on,
     solid_voxels,
     upload_surface,
@@ -38,7 +39,7 @@ STRIDE = 4
 OUTER = 0.87 * VOXEL_M
 """A solid voxel's centre is behind the surface, so no point of it is farther out than half its diagonal."""
 INNER = 1.31 * VOXEL_M
-"""A point this far in lies in solid voxels, and so does one of the ray's samples: they are 0.87 voxels apart at most."""
+"""A point this far in lies in solid voxels, and so does one of the ray's samples, at most 0.87 voxels apart."""
 EVERYWHERE = ((0.11, 0.05, 0.11), (0.85, 0.9, 0.85))
 
 Floats = NDArray[np.float64]
@@ -96,7 +97,7 @@ def trace(
     bands: int = 4,
     reach_m: float = ROOM_M,
 ) -> Traced:
-    """Transfer of given points, 8 in a row; each fills a block of pixels, so that it has no neighbour to be mixed with."""
+    """Transfer of given points, 8 in a row; each fills a block of pixels, so that no neighbour is mixed in."""
     blocks = [
         np.repeat(np.repeat(np.insert(a.reshape(-1, 8, 3), 3, 1, -1), STRIDE, 0), STRIDE, 1) for a in (points, normals)
     ]
@@ -146,7 +147,8 @@ def test_normals_are_smoothed_within_surfaces(device: Device, engine: Engine, st
     t = hit(scene, np.tile(eye, (len(rays), 1)), rays)
     seen = np.isfinite(t)
     points = eye + np.where(seen, t, 0)[:, None] * rays
-    normals = normal_at(scene, np.where(seen[:, None], points, 0.5))
+    normals = np.zeros_like(points)
+    normals[seen] = normal_at(scene, points[seen])
     random = np.random.default_rng(4)
     noisy = unit(normals + 0.1 * random.normal(size=normals.shape))
     valid = seen & (random.random(len(rays)) < 0.9)
@@ -156,11 +158,12 @@ def test_normals_are_smoothed_within_surfaces(device: Device, engine: Engine, st
     buffers = [np.where(valid.reshape(48, 64, 1), buffer, 0) for buffer in buffers]
     traced = transfer_of(engine, fill_volume(engine, scene, VOXEL_M), *buffers, stride)
     assert_twins(device, traced, stride, 81, 4, edges=0.02)
-    here = traced.flatness > 0.9
-    found = unit(traced.transfer[..., [3, 1, 2]])[here & (traced.openness == 1)]
-    exact = normals.reshape(48, 64, 3)[stride // 2 :: stride, stride // 2 :: stride][here & (traced.openness == 1)]
-    before = noisy.reshape(48, 64, 3)[stride // 2 :: stride, stride // 2 :: stride][here & (traced.openness == 1)]
-    assert np.mean((found - exact) ** 2) < np.mean((before - exact) ** 2) / 4  # nine of them: a ninth of the variance
+    here = (traced.flatness > 0.8) & (traced.openness == 1)
+    pixels = np.s_[stride // 2 :: stride, stride // 2 :: stride]
+    exact, before = (a.reshape(48, 64, 3)[pixels][here] for a in (normals, noisy))
+    after = unit(traced.transfer[here][:, [3, 1, 2]])
+    # Eight or nine of them are averaged: a ninth of the variance, and a little of the ball's curvature.
+    assert np.mean((after - exact) ** 2) < np.mean((before - exact) ** 2) / 5
 
 
 def assert_twins(device: Device, traced: Traced, stride: int, rays: int, bands: int, edges: float = 0.0) -> None:
@@ -190,7 +193,7 @@ def test_visibility_is_the_twins(engine: Engine, name: str, reach_m: float) -> N
     assert (
         ~free & exact
     ).mean() < 1e-3  # float32 origins within 1e-6 of a voxel's face, and the last sample at `reach`
-    assert (~free).mean() > 0.02
+    assert reach_m < ROOM_M or (~free).mean() > 0.02
 
 
 @pytest.mark.parametrize("stride", [1, 4, 8])
@@ -227,8 +230,8 @@ def test_every_ray_away_from_edges(engine: Engine, name: str, reach_m: float) ->
     must_pass = hit(scene, origins, directions, OUTER) >= reach_m
     assert not (must_block & free).any()
     assert not (must_pass & ~free).any()
-    assert (must_block | must_pass).mean() > 0.75
-    assert must_block.mean() > 0.02
+    assert (must_block | must_pass).mean() > 0.6  # the slit is six voxels wide, three of them beside an edge
+    assert reach_m < ROOM_M or must_block.mean() > 0.1
 
 
 def leaves_volume_after(origins: Floats, directions: Floats) -> Floats:

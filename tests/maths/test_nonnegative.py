@@ -90,7 +90,7 @@ def test_a_feasible_mean_is_kept() -> None:
 
 
 def test_faded_closed_form() -> None:
-    # m + a cos: the factor that leaves 0 at the least is m / a. The probe nearest to the least is at most 4 degrees off.
+    # m + a cos: the factor that leaves 0 at the least is m / a. The nearest probe is at most 4 degrees off the least.
     light = lights.uniform((1.0, 1.0, 1.0), 2)
     light[2] = np.array([2.0, 1.0, 0.5]) / np.sqrt(3 / (4 * np.pi))  # a = 2, 1, 0.5
     result = faded(light)

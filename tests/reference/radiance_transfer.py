@@ -44,7 +44,7 @@ def transfer_radiance(
     """T(x) = 1/pi integral of V max(n.w, 0) Y(w) dw (thesis eq. 5.2), the open part exact, the blocked part summed.
 
     positions, normals [h, w, 4]; directions [sets, count, 4]; basis [sets, count, n]; is_free(origins, directions).
-    -> transfer [rows, cols, n], openness [rows, cols] (-1: no surface), flatness [rows, cols], free [rows, cols, count].
+    -> transfer [rows, cols, n], openness (-1: no surface) and flatness [rows, cols], free [rows, cols, count].
     """
     n = basis.shape[-1]
     half = stride // 2

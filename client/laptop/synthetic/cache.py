@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import sys
 import tempfile
 import zipfile
 from collections.abc import Callable
@@ -31,7 +32,8 @@ def cached(name: str, compute: Callable[[], Tables]) -> Tables:
     try:
         return _load(path)
     except _UNUSABLE:
-        note(f"computing the shadows of the synthetic scene {name}, once")
+        if sys.stderr.isatty():
+            note(f"computing the shadows of the synthetic scene {name}, once")
     tables = compute()
     with contextlib.suppress(OSError):
         _store(path, tables)
@@ -53,7 +55,7 @@ def code_version() -> str:
 
 
 def _load(path: Path) -> Tables:
-    with np.load(path, allow_pickle=False) as archive:
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
         tables = {key: archive[key] for key in archive.files}
     if bytes(tables.pop("digest")) != _digest(tables):
         raise ValueError("damaged")

@@ -52,7 +52,7 @@ def table() -> Scene:
         Body(box((0, -0.02, 0), (1.2, 0.04, 0.8)), wood),
         Body(box((-0.33, 0.11, -0.14), (0.2, 0.22, 0.16), standing), paint(0.72, 0.2, 0.16)),
         Body(box((0.24, 0.085, -0.22), (0.22, 0.12, 0.14), leaning), paint(0.2, 0.42, 0.7)),
-        Body(Sphere(np.array([-0.04, 0.11, -0.24]), 0.11), paint(0.75, 0.7, 0.3)),
+        Body(Sphere(np.array([-0.04, 0.11, -0.24]), 0.11), paint(0.72, 0.68, 0.3)),
         Body(Sphere(np.array([0.36, 0.06, 0.1]), 0.06), paint(0.3, 0.65, 0.3)),
         Body(Cylinder(np.array([0.46, 0.0, -0.1]), np.array([0, 1.0, 0]), 0.2, 0.05), paint(0.7, 0.6, 0.55)),
         Body(Cylinder(np.array([-0.5, 0.045, 0.14]), _unit(1, 0, 0.5), 0.22, 0.045), paint(0.6, 0.3, 0.6)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +57,7 @@ class SyntheticSource:
     up: tuple[float, float, float] | None = (0.0, 1.0, 0.0)
 
     def __init__(self, options: Options) -> None:
-        """Bakes the scene's shadows, or reads them from the cache."""
+        """Cheap; the scene's shadows are baked, or read from the cache, when the first frame is asked for."""
         self.name = f"synthetic:{options.name}"
         self.options = options
         width, height = options.size
@@ -68,8 +68,6 @@ class SyntheticSource:
         self.scene = SCENES[options.name]()
         self._rays = camera_rays(self.camera)
         self._grids = atlas([solid.charts for solid in self.scene.solids], self.scene.step_m)
-        self._transfer = cached(self.scene.name, self._bake)["occluded"]
-        self._static = self._static_visibility() if options.name == "hand" else None
         self._texel_light = lru_cache(maxsize=1)(self._shadowed_light)
         self._rendering = lru_cache(maxsize=2)(self._render)
 
@@ -114,7 +112,13 @@ class SyntheticSource:
         directions = sphere_directions(self.scene.directions).astype(np.float32)
         return {"occluded": bake(self.scene.solids, self._grids, directions)}
 
-    def _static_visibility(self) -> hand.StaticVisibility:
+    @cached_property
+    def _transfer(self) -> NDArray[np.float32]:
+        """[total, 16] occluded transfer on the grids."""
+        return cached(self.scene.name, self._bake)["occluded"]
+
+    @cached_property
+    def _static(self) -> hand.StaticVisibility:
         solids = self.scene.solids
         bits = cached("hand", lambda: {"open": hand.StaticVisibility(solids).open_bits})["open"]
         return hand.StaticVisibility(solids, bits)
@@ -130,8 +134,8 @@ class SyntheticSource:
             Lit(body.solid, body.texture if self.options.texture else None, grids, ((grids, baked),))
             for body, grids in zip(self.scene.bodies, self._grids, strict=True)
         ]
-        if self._static is not None:
-            bodies = self._with_hand(bodies, self._static, index, light)
+        if self.options.name == "hand":
+            bodies = self._with_hand(bodies, index, light)
         return render(bodies, self.camera, self._rays, self.pose(index), light)
 
     def _with_hand(
@@ -141,10 +145,10 @@ class SyntheticSource:
         parts = hand.capsules(index / max(len(self) - 1, 1))
         if not parts:
             return bodies
-        shadow = static.shadow(parts, light)
+        shadow = self._static.shadow(parts, light)
         shadowed = [
             replace(body, occluded=(*body.occluded, (grids, shadow)))
-            for body, grids in zip(bodies, static.grids, strict=True)
+            for body, grids in zip(bodies, self._static.grids, strict=True)
         ]
         grids, occluded = hand.skin_shadows(parts, self.scene.solids)
         taken = occluded @ light.sh.astype(np.float32)

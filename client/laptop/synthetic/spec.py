@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 from urllib.parse import parse_qsl
 
 from client.laptop.errors import SourceError
 from client.laptop.synthetic import scenes
 from client.laptop.synthetic.lights import RING_SIZE
+from protocol.limits import MAX_IMAGE_PIXELS
 
 LARGEST_FRAMES = 100_000
 
@@ -61,16 +63,19 @@ def _size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
     sides = _count(16, 1920)
     try:
-        return sides(width), sides(height)
+        size = sides(width), sides(height)
     except ValueError:
         raise ValueError("WIDTHxHEIGHT, each from 16 to 1920") from None
+    if size[0] * size[1] > MAX_IMAGE_PIXELS:
+        raise ValueError(f"{MAX_IMAGE_PIXELS} pixels at the most")
+    return size
 
 
 def _flag(text: str) -> bool:
     return bool(_count(0, 1)(text))
 
 
-_KEYS: dict[str, Callable] = {
+_KEYS: dict[str, Callable[[str], Any]] = {
     "frames": _count(1, LARGEST_FRAMES),
     "size": _size,
     "light": _count(0, RING_SIZE - 1),

@@ -1,0 +1,335 @@
+"""Differential rendering against its float64 twin, between two closed-form occluders, and against brute-force integrals.
+
+A ray that only grazes an object may go either way, so the shading must lie between that of a box grown by a cell and of
+the box itself: no share of rays is left unchecked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pyopencl.cltypes as cl_types
+import pytest
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from protocol.frames import CameraModel
+from server.opencl.device import Device
+from server.opencl.engine import Engine
+from server.scene.virtual_object import VirtualObject
+from server.stages.differential_rendering import SampleGrid, shadow_real, shadow_virtual, upload_light
+from server.stages.radiance_transfer import Directions, direction_sets, transfer_radiance
+from server.stages.rasterize import Placed, VirtualSurface
+from server.stages.volume import Volume
+from server.stages.voxelize import object_table
+from tests import lights
+from tests.meshes import pose, shape_of
+from tests.reference import differential_rendering as twin
+from tests.reference.sh import open_transfer, sh_basis
+from tests.solids import Box, Scene, box, download4, fill_volume, float4, floor, hit, upload_surface
+from tests.tolerance import relative_tolerance
+
+VOXEL_M = 0.01
+FAR_M = 1000.0
+UP = np.array([0.0, 1.0, 0.0])
+PLATE = box((0.4, 0.3, 0.4), (0.56, 0.32, 0.56))
+TOWARD = (0.6, 0.7, 0.2)
+LIGHT = lights.lobe_and_sky(TOWARD)
+LIGHTS = {"uniform": lights.uniform((1.0, 0.5, 2.0)), "directional": LIGHT, "from below": lights.lobe((0.1, -1, 0.1))}
+
+Floats = NDArray[np.float64]
+
+
+def placed(engine: Engine, solid: Box) -> Placed:
+    """A box as a virtual object, its place given by its pose."""
+    mesh = shape_of(trimesh.creation.box(solid.high - solid.low))
+    return VirtualObject.upload(engine, mesh), pose((solid.low + solid.high) / 2)
+
+
+def buffer(points: Floats, normal: ArrayLike, shape: tuple[int, int], stride: int) -> tuple[Floats, Floats]:
+    """Geometry buffers [h, w, 4] in which every sample's block of pixels holds the same point."""
+    positions = np.insert(points.reshape(*shape, 3), 3, 1, -1)
+    normals = np.broadcast_to([*np.asarray(normal, float), 1.0], positions.shape)
+    blocks = (np.repeat(np.repeat(a, stride, 0), stride, 1) for a in (positions, normals))
+    first, second = (b.astype(np.float32).astype(np.float64) for b in blocks)
+    return first, second
+
+
+def camera_of(buffer: Floats) -> CameraModel:
+    return CameraModel(width=buffer.shape[1], height=buffer.shape[0], fx=100.0, fy=100.0, cx=0.0, cy=0.0)
+
+
+def floor_points(low: float = 0.1, high: float = 0.86, side: int = 24) -> Floats:
+    x, z = np.meshgrid(np.linspace(low, high, side), np.linspace(low, high, side))
+    return np.stack([x, np.full_like(x, 0.1), z], -1).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class Shaded:
+    """Ratios on a floor, and all that the twin needs to make them."""
+
+    ratio: Floats
+    positions: Floats
+    normals: Floats
+    transfer: Floats
+    free: NDArray[np.bool_]
+    light: Floats
+    rays: Directions
+    cell_m: float
+    reach_m: float
+
+    def expected(self, solid: Box, grown_m: float) -> Floats:
+        """The twin's ratio where objects are exactly `solid`, moved out by `grown_m`."""
+        directions = self.rays.directions.astype(float)
+        arriving = self.rays.basis.astype(float) @ self.light
+        return twin.shadow_real(
+            self.positions,
+            self.normals,
+            STRIDE,
+            self.transfer,
+            self.free,
+            self.light,
+            directions,
+            arriving,
+            VOXEL_M,
+            lambda o, d: hit([solid], o, d, grown_m) >= self.reach_m,
+        )
+
+    @cached_property
+    def points(self) -> Floats:
+        return self.positions[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE, :3]
+
+
+STRIDE = 3
+
+
+def shade_floor(
+    engine: Engine,
+    solid: Box,
+    light: Floats = LIGHT,
+    *,
+    scene: Scene = (floor(),),
+    rays: int = 81,
+    reach_m: float = FAR_M,
+    points: Floats | None = None,
+) -> Shaded:
+    """The ratio on a floor with a box above it."""
+    points = floor_points() if points is None else points
+    side = round(len(points) ** 0.5)
+    positions, normals = buffer(points, UP, (side, side), STRIDE)
+    camera, directions = camera_of(positions), direction_sets(rays, round(len(light) ** 0.5))
+    surface = upload_surface(engine, positions[..., :3], normals[..., :3], positions[..., 3] > 0)
+    volume = fill_volume(engine, scene, VOXEL_M)
+    transfer = transfer_radiance(engine, camera, volume, surface, STRIDE, directions, reach_m)
+    objects = [placed(engine, solid)]
+    table, device_light = object_table(engine, objects), upload_light(engine, light, directions)
+    ratio = shadow_real(engine, camera, surface, transfer, device_light, directions, reach_m, objects, table, VOXEL_M)
+    bits = np.unpackbits(engine.download(transfer.free_mask).view(np.uint8), axis=-1, bitorder="little")[..., :rays]
+    return Shaded(
+        download4(engine, ratio.values),
+        positions,
+        normals,
+        engine.download(transfer.coefficients).astype(float),
+        bits.astype(bool),
+        light,
+        directions,
+        table.cell_m[0],
+        reach_m,
+    )
+
+
+# ---- shadows on real surfaces ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+@pytest.mark.parametrize(("rays", "bands"), [(81, 4), (169, 4), (32, 2)])
+def test_ratio_is_the_twins(device: Device, engine: Engine, name: str, rays: int, bands: int) -> None:
+    shaded = shade_floor(engine, PLATE, LIGHTS[name][: bands * bands], rays=rays)
+    least, most = (shaded.expected(PLATE, grown) for grown in (1.05 * shaded.cell_m, 0.0))
+    tolerance = relative_tolerance(device)
+    np.testing.assert_array_equal(shaded.ratio[..., 3], 1)
+    assert (shaded.ratio[..., :3] >= least[..., :3] - tolerance).all()
+    assert (shaded.ratio[..., :3] <= most[..., :3] + tolerance).all()
+    decided = (most - least)[..., :3].max(-1) == 0
+    assert decided.mean() > 0.3
+    if name == "directional":
+        assert (shaded.ratio[decided][:, 0] < 0.9).sum() > 5
+
+
+def test_real_shadow_is_not_cast_twice(engine: Engine) -> None:
+    """Under a real ceiling larger than the plate the sky's middle is gone already: the plate takes less."""
+    ceiling = box((0.3, 0.4, 0.3), (0.66, 0.44, 0.66))
+    below = np.tile([0.48, 0.1, 0.48], (576, 1))
+    light = lights.uniform()
+    open_sky, covered = (
+        shade_floor(engine, PLATE, light, scene=scene, rays=1024, points=below)
+        for scene in ((floor(),), (floor(), ceiling))
+    )
+    taken = [(1 - s.ratio[..., 0]) * (s.transfer @ light)[..., 0] for s in (open_sky, covered)]
+    assert taken[0].mean() == pytest.approx(sky_behind(PLATE, below[0] + VOXEL_M * UP), rel=0.04)
+    assert taken[1].mean() < 0.1 * taken[0].mean()
+
+
+def sky_behind(solid: Box, point: Floats) -> float:
+    """Share of an upward point's cosine-weighted sky behind a box: dense directions, closed-form rays."""
+    random = np.random.default_rng(1)
+    radius, azimuth = np.sqrt(random.random(400_000)), 2 * np.pi * random.random(400_000)  # density cos / pi
+    rays = np.stack([radius * np.cos(azimuth), np.sqrt(1 - radius**2), radius * np.sin(azimuth)], -1)
+    return float(np.isfinite(solid.hit(np.tile(point, (len(rays), 1)), rays)).mean())
+
+
+def test_ratio_matches_a_brute_force_integral(engine: Engine) -> None:
+    """R' / R = 1 - integral of L cos / pi over the plate's solid angle, over R; L is the light's own 16 coefficients."""
+    shaded = shade_floor(engine, PLATE, rays=1024)
+    random = np.random.default_rng(2)
+    radius, azimuth = np.sqrt(random.random(100_000)), 2 * np.pi * random.random(100_000)
+    rays = np.stack([radius * np.cos(azimuth), np.sqrt(1 - radius**2), radius * np.sin(azimuth)], -1)
+    arriving = sh_basis(rays, 4) @ LIGHT
+    without = open_transfer(UP, 4) @ LIGHT
+    errors = []
+    for row, col in [(12, 12), (12, 8), (12, 10), (8, 12), (10, 9), (4, 4), (20, 20), (13, 6)]:
+        origins = np.tile(shaded.points[row, col] + VOXEL_M * UP, (len(rays), 1))
+        taken = (np.isfinite(PLATE.hit(origins, rays))[:, None] * arriving).mean(0)
+        errors.append(shaded.ratio[row, col, :3] - (1 - taken / without))
+    # 1024 directions over the sphere, one set a sample: each stands for 0.4 % of the sky at the zenith, and the plate's
+    # outline crosses some twenty of them.
+    assert np.abs(errors).max() < 0.02
+    assert np.sqrt(np.mean(np.square(errors))) < 0.008
+
+
+def test_shadow_lies_away_from_the_light(engine: Engine) -> None:
+    for toward in ((0.7, 0.7, 0.0), (0.0, 0.7, -0.7), (-0.5, 0.7, 0.5)):
+        shaded = shade_floor(engine, PLATE, lights.lobe_and_sky(toward), points=floor_points(0.0, 0.96))
+        dark = np.maximum(1 - shaded.ratio[..., 1], 0)
+        middle = (dark[..., None] * shaded.points).sum((0, 1)) / dark.sum()
+        # Of a far disc the shadow's middle would be 0.2 m below times tan 45; a lobe as wide as the sky draws it nearer.
+        away = middle - [0.48, 0.1, 0.48]
+        assert away @ lights.unit([-toward[0], 0, -toward[2]]) > 0.01
+        assert abs(away @ np.cross(lights.unit([toward[0], 0, toward[2]]), UP)) < 0.01
+
+
+def test_far_object_leaves_exactly_one(engine: Engine) -> None:
+    for solid in (box((3, 5, 3), (3.2, 5.2, 3.2)), box((0.4, 0.3, -40), (0.5, 0.4, -39.9))):
+        shaded = shade_floor(engine, solid, reach_m=2.0)
+        np.testing.assert_array_equal(shaded.ratio, 1.0)
+
+
+def test_object_below_the_surface_casts_nothing(engine: Engine) -> None:
+    shaded = shade_floor(engine, box((0.3, 0.0, 0.3), (0.6, 0.08, 0.6)))
+    np.testing.assert_array_equal(shaded.ratio, 1.0)
+
+
+@pytest.mark.parametrize("light", [np.zeros((16, 3)), lights.lobe((0, -1, 0)), -LIGHT, lights.uniform((1, 0, 0))])
+def test_ratio_is_bounded_whatever_the_light(engine: Engine, light: Floats) -> None:
+    ratio = shade_floor(engine, PLATE, light).ratio
+    assert np.isfinite(ratio).all()
+    assert (ratio >= 0).all()
+    if (light >= 0).all():
+        assert (ratio[..., :3] <= 1).all()
+
+
+def test_no_surface_has_no_ratio(engine: Engine) -> None:
+    positions, normals = buffer(floor_points(side=8), UP, (8, 8), STRIDE)
+    valid = np.zeros(positions.shape[:2], bool)
+    valid[:12] = True
+    camera, rays = camera_of(positions), direction_sets(81, 4)
+    surface = upload_surface(engine, positions[..., :3], normals[..., :3], valid)
+    volume = fill_volume(engine, (floor(),), VOXEL_M)
+    transfer = transfer_radiance(engine, camera, volume, surface, STRIDE, rays, FAR_M)
+    objects = [placed(engine, PLATE)]
+    table, light = object_table(engine, objects), upload_light(engine, LIGHT, rays)
+    ratio = shadow_real(engine, camera, surface, transfer, light, rays, FAR_M, objects, table, VOXEL_M)
+    np.testing.assert_array_equal(download4(engine, ratio.values)[..., 3], np.repeat([1, 0], 4)[:, None] * np.ones(8))
+
+
+# ---- shadows on virtual surfaces ---------------------------------------------------------------------------------
+
+OVERHANG = box((0.3, 0.5, 0.3), (0.66, 0.6, 0.66))
+TABLE_TOP = box((0.2, 0.2, 0.2), (0.76, 0.22, 0.76))
+
+
+def shade_top(
+    engine: Engine, scene: Scene, solids: list[Box], light: Floats, rays: int = 81
+) -> tuple[Floats, Floats, Floats, float]:
+    """Occluded radiance [rows, cols, 4] on top of the first solid, its geometry buffer, and its cells' side."""
+    x, z = np.meshgrid(np.linspace(0.25, 0.71, 20), np.linspace(0.25, 0.71, 20))
+    points = np.stack([x, np.full_like(x, solids[0].high[1]), z], -1)
+    positions, normals = buffer(points.reshape(-1, 3), UP, (20, 20), 2)
+    valid = np.zeros(positions.shape[:2], bool)
+    valid[4:] = True
+    positions[~valid], normals = 0, np.where(valid[..., None], normals, 0)
+    space = engine.workspace
+    covered = valid.astype(np.float64)
+    surface = VirtualSurface(
+        space.upload("virtual_positions", float4(positions[..., :3], covered)),
+        space.upload("virtual_normals", float4(normals[..., :3], covered)),
+        space.upload("virtual_colors", float4(0.5 * np.ones((*valid.shape, 3)), covered)),
+        space.upload("virtual_index", np.where(valid, 0, -1).astype(np.int32)),
+        ((0, 4, valid.shape[1], valid.shape[0]),),
+    )
+    directions = direction_sets(rays, 4)
+    table = object_table(engine, [placed(engine, solid) for solid in solids])
+    volume: Volume = fill_volume(engine, scene, VOXEL_M)
+    device_light = upload_light(engine, light, directions)
+    found: SampleGrid = shadow_virtual(
+        engine, camera_of(positions), surface, volume, 4, device_light, directions, FAR_M, table
+    )
+    return download4(engine, found.values), positions, normals, max(table.cell_m)
+
+
+@pytest.mark.parametrize("name", ["uniform", "directional"])
+def test_occlusion_is_the_twins(device: Device, engine: Engine, name: str) -> None:
+    beside = box((0.3, 0.25, 0.3), (0.4, 0.4, 0.4))
+    scene, light, rays = (OVERHANG,), LIGHTS[name], direction_sets(81, 4)
+    occluded, positions, normals, cell_m = shade_top(engine, scene, [TABLE_TOP, beside], light)
+
+    def expected(objects_m: float, volume_m: float) -> Floats:
+        return twin.shadow_virtual(
+            positions,
+            normals,
+            2,
+            rays.directions.astype(float),
+            rays.basis.astype(float) @ light,
+            cell_m,
+            VOXEL_M,
+            lambda o, d: ~np.isfinite(np.minimum(TABLE_TOP.hit(o, d), hit([beside], o, d, objects_m))),
+            lambda o, d: ~np.isfinite(hit(scene, o, d, volume_m)),
+        )
+
+    most, least = expected(1.05 * cell_m, 0.87 * VOXEL_M), expected(0.0, -1.31 * VOXEL_M)
+    tolerance = relative_tolerance(device) * np.abs(light).max()
+    np.testing.assert_array_equal(occluded[..., 3], most[..., 3])
+    assert not occluded[occluded[..., 3] == 0].any()
+    assert (occluded[..., :3] <= most[..., :3] + tolerance).all()
+    assert (occluded[..., :3] >= least[..., :3] - tolerance).all()
+    assert least[..., 0].max() > 0.1
+
+
+def test_real_overhang_darkens_what_is_below(engine: Engine) -> None:
+    """Under an even sky of 1 the radiance taken is the overhang's share of the sky: closed form, tenth of a percent."""
+    light = lights.uniform()
+    occluded, positions, _, _ = shade_top(engine, (OVERHANG,), [TABLE_TOP], light, rays=1024)
+    for row, col in [(10, 10), (10, 4), (3, 3), (18, 10)]:
+        point = positions[2 * row, 2 * col, :3] + VOXEL_M * UP
+        near = occluded[row : row + 2, col : col + 2, 0].mean()  # the four direction sets
+        point = (
+            positions[2 * row : 2 * row + 4 : 2, 2 * col : 2 * col + 4 : 2, :3].reshape(-1, 3).mean(0) + VOXEL_M * UP
+        )
+        assert near == pytest.approx(sky_behind(OVERHANG, point), abs=0.02)  # half a voxel of outline at 0.3 m: 1 %
+    assert occluded[10, 10, 0] > 3 * occluded[3, 3, 0]
+
+
+def test_open_virtual_surface_loses_nothing(engine: Engine) -> None:
+    occluded, *_ = shade_top(engine, (floor(),), [TABLE_TOP], LIGHT)
+    np.testing.assert_array_equal(occluded[..., :3], 0)
+
+
+def test_arriving_light_is_the_lights_radiance(engine: Engine) -> None:
+    rays = direction_sets(81, 4)
+    light = upload_light(engine, LIGHT, rays)
+    exact = sh_basis(rays.directions[..., :3].astype(float), 4) @ LIGHT
+    np.testing.assert_allclose(download4(engine, light.arriving)[..., :3], exact, atol=2e-6)
+    np.testing.assert_allclose(download4(engine, light.coefficients)[..., :3], LIGHT, rtol=1e-6, atol=1e-12)
+    assert light.coefficients.dtype == cl_types.float4

@@ -1,0 +1,337 @@
+"""Light estimation: the sums against their twins, the recovered light against the one that made the samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.cltypes as cl_types
+import pytest
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.opencl.device import Device
+from server.opencl.engine import Engine
+from server.stages.light_estimation import (
+    ASSUMED_ALBEDO,
+    LEAST_FLATNESS,
+    LEAST_OPENNESS,
+    LightEstimate,
+    LightEstimator,
+    TileSums,
+    direction_spread_rad,
+    sum_tiles,
+    unpack_tiles,
+)
+from server.stages.measure import Measurement
+from server.stages.radiance_transfer import Transfer
+from server.stages.raycast import LABEL_DYNAMIC, LABEL_NONE, LABEL_STATIC, Surface
+from tests import lights
+from tests.lights import degrees_between, random_directions
+from tests.reference import light_estimation as twin
+from tests.reference.sh import open_transfer
+from tests.solids import download4, float4
+from tests.tolerance import relative_tolerance
+
+VOXEL_M = 0.01
+TOWARD = (0.4, 0.7, -0.5)
+LIGHT = lights.lobe_and_sky(TOWARD)
+
+Floats = NDArray[np.float64]
+
+
+# ---- the kernels against their twins -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Everything that the sums are made of, on the host."""
+
+    stride: int
+    radiance: Floats
+    labels: NDArray[np.uint8]
+    positions: Floats
+    normals: Floats
+    transfer: Floats
+    openness: Floats
+    flatness: Floats
+
+    def upload(self, engine: Engine) -> tuple[CameraModel, Measurement, Surface, Transfer]:
+        height, width = self.labels.shape
+        rows, cols, n = self.transfer.shape
+        space = engine.workspace
+        return (
+            CameraModel(width=width, height=height, fx=100.0, fy=100.0, cx=0.0, cy=0.0),
+            Measurement(
+                space.upload("radiance", float4(self.radiance[..., :3], self.radiance[..., 3])),
+                space.upload("depth_m", np.ones((height, width), np.float32)),
+            ),
+            Surface(
+                space.upload("positions", float4(self.positions)),
+                space.upload("normals", float4(self.normals)),
+                space.upload("labels", self.labels),
+            ),
+            Transfer(
+                self.stride,
+                rows,
+                cols,
+                round(n**0.5),
+                *(
+                    space.upload(name, values.astype(np.float32))
+                    for name, values in (
+                        ("transfer", self.transfer),
+                        ("openness", self.openness),
+                        ("flatness", self.flatness),
+                    )
+                ),
+                space.array("free_mask", (rows, cols, 3), np.uint32),
+            ),
+        )
+
+    @property
+    def sampled(self) -> tuple[slice, slice]:
+        """The samples' pixels."""
+        rows, cols = self.openness.shape
+        first = self.stride // 2
+        return np.s_[first : first + rows * self.stride : self.stride, first : first + cols * self.stride : self.stride]
+
+
+def random_frame(height: int, width: int, stride: int, bands: int = 4, seed: int = 1) -> Frame:
+    """Two surfaces side by side, noise on everything, holes in everything. Every number is a float32."""
+    random = np.random.default_rng(seed)
+    rows, cols = height // stride, width // stride
+    v, u = np.mgrid[:height, :width]
+    left = u + 0.3 * v < width / 2
+    positions = 0.01 * np.stack([u, v, np.where(left, 0, 30)], -1) + random.normal(size=(height, width, 3)) * 1e-3
+    normals = lights.unit(
+        np.where(left[..., None], [0, 0, -1.0], [0.9, 0, -0.5]) + 0.02 * random.normal(size=(height, width, 3))
+    )
+    radiance = np.concatenate(
+        [
+            random.uniform(0, 1, (height, width, 3)),
+            random.choice([1, 1, 1, 0, -1], (height, width, 1), p=[0.33] * 3 + [0.005] * 2),
+        ],
+        -1,
+    )
+    labels = random.choice([LABEL_STATIC, LABEL_DYNAMIC, LABEL_NONE], (height, width), p=[0.98, 0.01, 0.01]).astype(
+        np.uint8
+    )
+    transfer = random.normal(size=(rows, cols, bands * bands)) * 0.3
+    openness, flatness = random.uniform(-0.05, 1, (rows, cols)), random.uniform(0.9, 1.3, (rows, cols))
+    numbers = (radiance, positions, normals, transfer, openness, flatness)
+    radiance, positions, normals, transfer, openness, flatness = (
+        x.astype(np.float32).astype(np.float64) for x in numbers
+    )
+    return Frame(stride, radiance, labels, positions, normals, transfer, openness, flatness)
+
+
+@pytest.mark.parametrize(("height", "width", "stride", "bands"), [(60, 83, 1, 4), (120, 161, 4, 2), (190, 270, 8, 6)])
+def test_sums_are_the_twins(device: Device, engine: Engine, height: int, width: int, stride: int, bands: int) -> None:
+    frame = random_frame(height, width, stride, bands)
+    found = sum_tiles(engine, *frame.upload(engine), VOXEL_M)
+    rows, cols, n = frame.transfer.shape
+    space = engine.workspace
+    observed = twin.gather_samples(
+        stride, frame.radiance, frame.labels, frame.openness, frame.flatness, LEAST_OPENNESS, LEAST_FLATNESS
+    )
+    assert 0.2 < observed[..., 3].mean() < 0.98
+    tolerance = relative_tolerance(device)
+    np.testing.assert_allclose(
+        download4(engine, space.array("observed", (rows, cols), cl_types.float4)), observed, rtol=tolerance
+    )
+
+    # From here on the device's own intermediate results: each kernel is compared for the same input.
+    observed = download4(engine, space.array("observed", (rows, cols), cl_types.float4)).astype(np.float64)
+    sampled = frame.sampled
+    transfer, pooled = twin.pool_samples(
+        frame.positions[sampled], frame.normals[sampled], frame.transfer, observed, VOXEL_M
+    )
+    assert len(np.unique(pooled[..., 3])) == 5
+    np.testing.assert_allclose(
+        download4(engine, space.array("pooled", (rows, cols), cl_types.float4)), pooled, rtol=tolerance
+    )
+    device_transfer = engine.download(space.array("pooled_transfer", (rows, cols, n), np.float32))
+    np.testing.assert_allclose(device_transfer, transfer, atol=tolerance)
+
+    pooled = download4(engine, space.array("pooled", (rows, cols), cl_types.float4)).astype(np.float64)
+    sums = twin.accumulate_tiles(device_transfer.astype(np.float64), pooled)
+    sizes = twin.accumulate_tiles(np.abs(device_transfer).astype(np.float64), pooled)  # of what is added up
+    partial = engine.download(space.array("tile_sums", sums.shape, np.float32))
+    # A sum of 64 products of three float32 in a row: (64 + 2) roundings of at most 2^-24 of the summed sizes.
+    assert (np.abs(partial - sums) <= 66 * 2.0**-24 * sizes).all()
+    expected = unpack_tiles(sums, n).total()
+    np.testing.assert_allclose(found.total().matrix, expected.matrix, rtol=1e-5, atol=1e-5 * expected.matrix.max())
+    assert found.total().count == expected.count
+
+
+def test_same_bits_twice(engine: Engine) -> None:
+    frame = random_frame(97, 131, 2)
+    estimates = []
+    for _ in range(2):
+        estimator = LightEstimator(4)
+        estimates.append([estimator.update(sum_tiles(engine, *frame.upload(engine), VOXEL_M)) for _ in range(3)][-1])
+    np.testing.assert_array_equal(estimates[0].sh, estimates[1].sh)
+    np.testing.assert_array_equal(estimates[0].std, estimates[1].std)
+    assert estimates[0].condition == estimates[1].condition
+
+
+def test_unpacked_sums_are_the_normal_equations() -> None:
+    random = np.random.default_rng(2)
+    transfer, observed = random.normal(size=(11, 20, 9)), random.uniform(0, 1, (11, 20, 4))
+    total = unpack_tiles(twin.accumulate_tiles(transfer, observed), 9).total()
+    a, rgb, weight = transfer.reshape(-1, 9), observed.reshape(-1, 4)[:, :3], observed[..., 3].reshape(-1, 1)
+    four = np.column_stack([rgb @ [0.2126, 0.7152, 0.0722], rgb])
+    np.testing.assert_allclose(total.matrix, a.T @ (weight * a), rtol=1e-12)
+    np.testing.assert_allclose(total.vector, a.T @ (weight * four), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(total.energy, (weight * four**2).sum(0), rtol=1e-12)
+    assert total.count == 220
+
+
+# ---- the light ---------------------------------------------------------------------------------------------------
+
+
+def samples_of(
+    light: Floats, normals: Floats, noise: float, seed: int = 0, shape: tuple[int, int] = (48, 64)
+) -> TileSums:
+    """A frame of open surfaces of the assumed albedo with given normals [rows * cols, 3] under a light [n, 3]."""
+    transfer = open_transfer(normals, round(len(light) ** 0.5))
+    rgb = ASSUMED_ALBEDO * transfer @ light
+    rgb = rgb + noise * np.random.default_rng(seed).normal(size=rgb.shape)
+    observed = np.insert(rgb, 3, 1, -1).reshape(*shape, 4)
+    return unpack_tiles(twin.accumulate_tiles(transfer.reshape(*shape, -1), observed), len(light))
+
+
+def assert_finite(estimate: LightEstimate) -> None:
+    assert np.isfinite(estimate.sh).all()
+    assert estimate.std is None or np.isfinite(estimate.std).all()
+    assert not np.isnan(estimate.condition)
+
+
+SEEN = [0, 1, 2, 3, 4, 5, 6, 7, 8]
+"""An open surface does not show the third band (A_3 = 0)."""
+
+
+@pytest.mark.parametrize("toward", random_directions(6, 3), ids=lambda d: ",".join(f"{x:.1f}" for x in d))
+@pytest.mark.parametrize("noise", [0.001, 0.02])
+def test_light_is_recovered(toward: Floats, noise: float) -> None:
+    light = lights.lobe_and_sky(toward)
+    estimate = LightEstimator(4).update(samples_of(light, random_directions(48 * 64, 4), noise))
+    assert_finite(estimate)
+    assert estimate.valid
+    # 3072 samples of noise 0.02 against coefficients of l = 1 near 0.5: 0.1 degrees is one standard deviation.
+    assert degrees_between(estimate.sh[[3, 1, 2]] @ [0.2126, 0.7152, 0.0722], toward) < 0.2 + 25 * noise
+    np.testing.assert_allclose(estimate.sh[SEEN], light[SEEN], atol=0.01 + 2 * noise)
+    assert estimate.std is not None
+    assert (np.abs(estimate.sh - light)[SEEN] < 4 * estimate.std[SEEN] + 1e-3).all()
+
+
+def test_what_is_not_seen_is_said_to_be_unknown() -> None:
+    estimate = LightEstimator(4).update(samples_of(LIGHT, random_directions(48 * 64, 4), 0.02))
+    assert estimate.std is not None
+    assert estimate.std[9:].min() > 3 * estimate.std[SEEN].max()
+
+
+def test_one_plane_is_not_valid() -> None:
+    estimate = LightEstimator(4).update(samples_of(LIGHT, np.tile([0.0, 1.0, 0.0], (48 * 64, 1)), 0.01))
+    assert_finite(estimate)
+    assert not estimate.valid
+    assert estimate.condition == float("inf") or estimate.condition > 1e12
+    shaded = open_transfer(np.array([0.0, 1.0, 0.0]), 4) @ estimate.sh
+    np.testing.assert_allclose(shaded, open_transfer(np.array([0.0, 1.0, 0.0]), 4) @ LIGHT, rtol=0.02)  # what was seen
+
+
+def test_two_planes_are_not_valid() -> None:
+    normals = np.tile([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]], (48 * 32, 1))
+    estimate = LightEstimator(4).update(samples_of(LIGHT, normals, 0.01))
+    assert_finite(estimate)
+    assert not estimate.valid
+
+
+def test_nothing_seen_is_no_light() -> None:
+    nothing = unpack_tiles(twin.accumulate_tiles(np.zeros((8, 8, 16)), np.zeros((8, 8, 4))), 16)
+    for estimate in (LightEstimator(4).estimate(), LightEstimator(4).update(nothing)):
+        assert_finite(estimate)
+        assert not estimate.valid
+        assert estimate.std is None
+        assert estimate.condition == float("inf")
+        np.testing.assert_array_equal(estimate.sh, 0)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-9])
+def test_black_picture_is_finite_and_not_valid(noise: float) -> None:
+    estimate = LightEstimator(4).update(samples_of(0 * LIGHT, random_directions(48 * 64, 5), noise))
+    assert_finite(estimate)
+    assert not estimate.valid
+    assert np.abs(estimate.sh).max() < 1e-6
+
+
+def test_a_frame_that_saw_nothing_changes_nothing() -> None:
+    estimator = LightEstimator(4)
+    before = estimator.update(samples_of(LIGHT, random_directions(48 * 64, 4), 0.01))
+    nothing = unpack_tiles(twin.accumulate_tiles(np.zeros((8, 8, 16)), np.zeros((8, 8, 4))), 16)
+    np.testing.assert_array_equal(estimator.update(nothing).sh, before.sh)
+
+
+def test_light_that_jumps_is_followed() -> None:
+    """After 3 frames of the new light it has 1 - 0.6^3 = 78 % of the weight."""
+    before, after = lights.lobe_and_sky((1, 0.5, 0)), lights.lobe_and_sky((-1, 0.5, 0.3))
+    estimator, normals = LightEstimator(4), random_directions(48 * 64, 6)
+    for seed in range(20):
+        estimator.update(samples_of(before, normals, 0.003, seed))
+    for seed in range(3):
+        estimate = estimator.update(samples_of(after, normals, 0.003, 100 + seed))
+    np.testing.assert_allclose(estimate.sh[SEEN], (0.784 * after + 0.216 * before)[SEEN], atol=0.03)
+    for seed in range(7):
+        estimate = estimator.update(samples_of(after, normals, 0.003, 200 + seed))
+    assert degrees_between(estimate.sh[[3, 1, 2]].sum(1), (-1, 0.5, 0.3)) < 1
+
+
+def test_light_is_not_negative() -> None:
+    """A plane and a half see only part of the sky: what fits them best is negative elsewhere."""
+    normals = random_directions(48 * 64, 7)
+    normals[:, 1] = np.abs(normals[:, 1])
+    normals[:, 2] = -np.abs(normals[:, 2])
+    light = lights.lobe((0.3, 0.4, -1))
+    estimate = LightEstimator(4).update(samples_of(light, normals, 0.02))
+    radiance = lights.sh_basis(random_directions(2000, 8), 4) @ estimate.sh
+    assert radiance.min() > -0.02 * radiance.max()
+
+
+def test_thesis_mode_is_plain_white_least_squares() -> None:
+    normals = random_directions(48 * 64, 9)
+    light = lights.lobe_and_sky(TOWARD)[:9]
+    estimate = LightEstimator(3, as_thesis=True).update(samples_of(light, normals, 0.05))
+    transfer = open_transfer(normals, 3)
+    noise = 0.05 * np.random.default_rng(0).normal(size=(48 * 64, 3))
+    luminance = (ASSUMED_ALBEDO * transfer @ light + noise) @ [0.2126, 0.7152, 0.0722]
+    best = np.linalg.lstsq(transfer, luminance, rcond=None)[0] / ASSUMED_ALBEDO
+    np.testing.assert_allclose(estimate.sh, np.tile(best[:, None], 3), rtol=1e-6, atol=1e-9)
+
+
+def test_dependent_samples_do_not_count_as_many() -> None:
+    """One error a tile instead of one a sample: 64 times fewer independent samples, 8 times the spread."""
+    normals = random_directions(48 * 64, 10)
+    light, shape = LIGHT[:9], (48, 64)
+    transfer = open_transfer(normals, 3).reshape(*shape, 9)
+    random = np.random.default_rng(11)
+    independent, shared = random.normal(size=shape), np.kron(random.normal(size=(6, 8)), np.ones((8, 8)))
+    stds = []
+    for error in (independent, shared):
+        observed = np.insert(ASSUMED_ALBEDO * transfer @ light + 0.05 * error[..., None], 3, 1, -1)
+        sums = unpack_tiles(twin.accumulate_tiles(transfer, observed), 9)
+        estimate = LightEstimator(3).update(sums)
+        assert estimate.std is not None
+        stds.append(estimate.std[0])
+    # The mean of the sky sees all of the shared error; with 48 tiles the factor is known to a third.
+    assert (stds[1] / stds[0]).mean() == pytest.approx(8, rel=0.7)
+
+
+def test_spread_of_the_direction() -> None:
+    estimator = LightEstimator(4)
+    spreads = []
+    for noise in (0.003, 0.3):
+        luminance = estimator._solve_luminance  # of one frame
+        sums = samples_of(LIGHT, random_directions(48 * 64, 12), noise)
+        estimator.update(sums)
+        spreads.append(direction_spread_rad(luminance(sums.total())))
+    assert 0 < spreads[0] < np.deg2rad(1) < spreads[1] < np.pi

@@ -1,0 +1,104 @@
+"""Float64 twin of cl_kernels/composite.cl and of include/upsample.clh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.reference.sh import open_transfer
+
+Floats = NDArray[np.float64]
+UNTOUCHED = 1e-5
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Values [rows, cols, 4] (w > 0 valid); sample i lies at pixel stride // 2 + i stride."""
+
+    stride: int
+    values: Floats
+
+
+@dataclass(frozen=True)
+class Buffer:
+    """Positions and normals [h, w, 4] (w = 1 where there is surface), and linear colours [h, w, 3]."""
+
+    positions: Floats
+    normals: Floats
+    colors: Floats
+
+
+def srgb_codes(linear: Floats) -> NDArray[np.uint8]:
+    """Nearest sRGB codes (IEC 61966-2-1) of linear radiance, clipped to [0, 1]."""
+    x = np.clip(linear, 0, 1)
+    encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.floor(255 * encoded + 0.5).astype(np.uint8)
+
+
+def mark_touched(ratio: Floats) -> NDArray[np.bool_]:
+    """[rows + 1, cols + 1] whether the 4 x 4 samples around a cell, which begins at sample (row - 1, col - 1), hold one
+    that is valid and not 1. ratio [rows, cols, 4].
+    """
+    rows, cols = ratio.shape[:2]
+    changed = (ratio[..., 3] > 0) & (ratio[..., :3] != 1).any(-1)
+    return np.array(
+        [
+            [changed[max(r - 2, 0) : r + 2, max(c - 2, 0) : c + 2].any() for c in range(cols + 1)]
+            for r in range(rows + 1)
+        ]
+    )
+
+
+def upsample(samples: Samples, surface: Buffer, x: int, y: int, tolerance_m: float) -> Floats:
+    """[4] joint-bilateral mean of the 4 x 4 samples around a pixel: a tent of two samples' half-width, times closeness
+    to the pixel's tangent plane, times agreement of the normals; w = 0 where none fits.
+    """
+    rows, cols = samples.values.shape[:2]
+    u, v = ((c - samples.stride // 2) / samples.stride for c in (x, y))
+    position, normal = surface.positions[y, x, :3], surface.normals[y, x, :3]
+    total = np.zeros(4)
+    for row in range(int(np.floor(v)) - 1, int(np.floor(v)) + 3):
+        for col in range(int(np.floor(u)) - 1, int(np.floor(u)) + 3):
+            if not (0 <= row < rows and 0 <= col < cols) or samples.values[row, col, 3] <= 0:
+                continue
+            py, px = samples.stride // 2 + row * samples.stride, samples.stride // 2 + col * samples.stride
+            off_plane = normal @ (surface.positions[py, px, :3] - position) / tolerance_m
+            facing = max(float(normal @ surface.normals[py, px, :3]), 0.0)
+            weight = (2 - abs(col - u)) * (2 - abs(row - v)) * facing**4 / (1 + off_plane**4)
+            total += weight * np.array([*samples.values[row, col, :3], 1])
+    return np.array([*(total[:3] / total[3]), 1]) if total[3] > 1e-4 else np.zeros(4)
+
+
+def composite(
+    shown: NDArray[np.uint8],
+    radiance: Floats,
+    real: Buffer,
+    camera_from_volume: Floats,
+    tolerance_m: float,
+    light: Floats,
+    virtual: Buffer | None = None,
+    occluded: Samples | None = None,
+    ratio: Samples | None = None,
+) -> NDArray[np.uint8]:
+    """The picture [h, w, 3]: the nearer of virtual and real surface, real ones times `ratio`, untouched ones as shown.
+
+    radiance [h, w, 4]; light [n, 3]. A virtual surface at most `tolerance_m` behind a real one is in front.
+    """
+    picture = shown.copy()
+    for y, x in np.ndindex(shown.shape[:2]):
+        here = real.positions[y, x]
+        if virtual is not None and occluded is not None and virtual.positions[y, x, 3] > 0:
+            ahead = camera_from_volume[2, :3] @ (here[:3] - virtual.positions[y, x, :3])
+            if here[3] <= 0 or ahead > -tolerance_m:
+                taken = upsample(occluded, virtual, x, y, tolerance_m)[:3]
+                bands = round(len(light) ** 0.5)
+                shading = np.maximum(open_transfer(virtual.normals[y, x, :3], bands) @ light - taken, 0)
+                picture[y, x] = srgb_codes(virtual.colors[y, x] * shading)
+                continue
+        if ratio is not None and here[3] > 0 and radiance[y, x, 3] >= 0:
+            factor = upsample(ratio, real, x, y, tolerance_m)
+            if factor[3] > 0 and np.abs(factor[:3] - 1).max() > UNTOUCHED:
+                picture[y, x] = srgb_codes(radiance[y, x, :3] * factor[:3])
+    return picture

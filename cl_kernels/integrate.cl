@@ -44,8 +44,12 @@ kernel void integrate(const int count, const int width, const int height, const 
         const float3 p = start + (float)i * step;
         const float2 pixel = project(intrinsics, (float3)(p.x, p.y, fmax(p.z, 1e-6f))) + 0.5f;
         const int seen = p.z > 0.0f && pixel.x >= 0.0f && pixel.y >= 0.0f && pixel.x < width && pixel.y < height;
-        const float depth = seen ? depth_at(width, height, depth_m, pixel, truncation_m) : 0.0f;
-        const float distance = (depth - p.z) * (length(p) / fmax(p.z, 1e-6f));
+        const float slant = length(p) / fmax(p.z, 1e-6f);
+        float depth = seen ? depth_m[(int)pixel.y * width + (int)pixel.x] : 0.0f;
+        // Neighbours differ by less than a truncation, or are not used: farther off, the nearest pixel decides as well.
+        const int close = depth > 0.0f && fabs(depth - p.z) * slant < truncation_m * (1.0f + slant);
+        if (close) depth = depth_at(width, height, depth_m, pixel, truncation_m);
+        const float distance = (depth - p.z) * slant;
         if (depth > 0.0f && distance > -truncation_m) {
             const float2 old = column[i * BRICK * BRICK];
             const float tsdf = fmin(distance / truncation_m, 1.0f);

@@ -11,7 +11,7 @@ static inline float4 neighbour(const int width, const int height, global const f
                                const int x, const int y, const float depth) {
     if (x < 0 || y < 0 || x >= width || y >= height) return (float4)(0.0f);
     const float z = depth_m[y * width + x];
-    const float edge = 0.02f * depth + 0.005f;
+    const float edge = fmax(0.02f, 6.0f / intrinsics.s0) * depth + 0.005f;  // two pixels of a surface seen at up to 70 degrees
     return z > 0.0f && fabs(z - depth) < edge ? (float4)(z * unproject(intrinsics, x, y), 1.0f) : (float4)(0.0f);
 }
 

@@ -3,6 +3,14 @@
 #include "camera.clh"
 #include "volume.clh"
 
+// Beyond this a point is outside any volume, and its brick may not fit an int.
+#define FAR_BRICKS 1e6f
+
+static inline int floor_of(const float x) {
+    const int truncated = (int)x;
+    return truncated - (x < truncated);
+}
+
 // depth_m [h][w], 0 = none -> wanted [z][y][x] = 1 for every brick within `reach_m` of the measured surface along its ray.
 kernel void mark_bricks(const int width, const int height, const int4 bricks, global const float *depth_m,
                         const float4 intrinsics, const float16 volume_from_camera, const float voxel_m, const float reach_m,
@@ -12,6 +20,9 @@ kernel void mark_bricks(const int width, const int height, const int4 bricks, gl
     if (x >= width || y >= height) return;
     const float depth = depth_m[y * width + x];
     if (depth <= 0.0f) return;
+    // Of 2 x 2 pixels at one depth, the first marks for all: its margin reaches over them.
+    const int is_first = ((x | y) & 1) == 0;
+    if (!is_first && fabs(depth_m[(y & ~1) * width + (x & ~1)] - depth) < voxel_m) return;
     const float brick_m = BRICK * voxel_m;
     const float3 ray = unproject(intrinsics, x, y);
     const float reach_z = reach_m / length(ray);
@@ -19,13 +30,15 @@ kernel void mark_bricks(const int width, const int height, const int4 bricks, gl
     const float3 first = volume_from_camera.s37b / brick_m + (depth - reach_z) * onward;
     const int steps = (int)(4.0f * reach_m / brick_m) + 1;  // at most half a brick apart
     const float3 step = 2.0f * reach_z / steps * onward;
-    // Around each step: half of the way to the next one, and the voxels beside the ray that are this pixel's.
+    // Around each step: half of the way to the next one, and the voxels beside the ray that are these pixels'.
     const float pixel = depth / (fmin(intrinsics.s0, intrinsics.s1) * voxel_m);
-    const float pad = clamp(1.0f + 0.75f * pixel, 2.0f, 4.0f) / BRICK;
+    const float pad = clamp(2.0f + 2.0f * pixel, 3.0f, 6.0f) / BRICK;
     for (int i = 0; i <= steps; i++) {
         const float3 p = first + (float)i * step;
-        const int3 low = max(convert_int3_sat_rtn(p - pad), 0);
-        const int3 high = min(convert_int3_sat_rtn(p + pad), bricks.xyz - 1);
+        if (fabs(p.x) + fabs(p.y) + fabs(p.z) > FAR_BRICKS) continue;
+        const int3 low = (int3)(max(floor_of(p.x - pad), 0), max(floor_of(p.y - pad), 0), max(floor_of(p.z - pad), 0));
+        const int3 high = (int3)(min(floor_of(p.x + pad), bricks.x - 1), min(floor_of(p.y + pad), bricks.y - 1),
+                                 min(floor_of(p.z + pad), bricks.z - 1));
         for (int bz = low.z; bz <= high.z; bz++)
             for (int by = low.y; by <= high.y; by++)
                 for (int bx = low.x; bx <= high.x; bx++) wanted[(bz * bricks.y + by) * bricks.x + bx] = 1;  // all write 1

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from server.opencl.buffers import Workspace
 from server.opencl.device import Device
 from server.opencl.profile import Profile
-from server.opencl.program import Define
+from server.opencl.program import Define, define_options
 
 KernelArgument = cl_array.Array | np.generic | int | float | None
 
@@ -31,7 +31,7 @@ class Engine:
 
     def kernel(self, file: str, name: str, **defines: Define) -> cl.Kernel:
         """Kernel `name` of `cl_kernels/<file>`; retrieved once, because a kernel object carries its arguments."""
-        key = (file, name, *sorted(defines.items()))
+        key = (file, name, define_options(defines))  # as text: 1, 1.0 and True are equal in Python
         if key not in self._kernels:
             self._kernels[key] = cl.Kernel(self.device.programs.get(file, defines), name)
         return self._kernels[key]

@@ -25,7 +25,7 @@ def define_options(defines: dict[str, Define]) -> tuple[str, ...]:
     for name, value in sorted(defines.items()):
         if value is False:
             continue
-        text = f"{value!r}f" if isinstance(value, float) else str(int(value) if value is True else value)
+        text = f"{float(value)!r}f" if isinstance(value, float) else str(int(value) if value is True else value)
         options.append(f"-D{name}={text}")
     return tuple(options)
 

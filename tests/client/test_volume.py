@@ -46,6 +46,19 @@ def test_wall_of_one_frame() -> None:
     assert (z0, z1) == pytest.approx((1.75, 2.25), abs=1e-9)  # flat: as thick as the smallest volume
 
 
+def test_camera_that_looks_along_x() -> None:
+    class Turned(Wall):
+        def __getitem__(self, index: int) -> RgbdFrame:
+            frame = super().__getitem__(index)
+            frame.world_from_camera[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # z of the camera is x of the world
+            return frame
+
+    straight, turned = default_volume(Wall(), range(1)), default_volume(Turned(), range(1))
+    assert (turned[0], turned[3]) == (straight[2], straight[5])
+    assert (turned[1], turned[4]) == (straight[1], straight[4])
+    assert (turned[2], turned[5]) == pytest.approx((-straight[3], -straight[0]), abs=1e-9)
+
+
 def test_frames_are_spread_and_counted() -> None:
     wall = Wall()
     volume = default_volume(wall, range(10, 60))

@@ -1,4 +1,4 @@
-"""Differential rendering against its float64 twin, between two closed-form occluders, and against brute-force integrals.
+"""Differential rendering against its float64 twin, between two closed-form occluders, and brute-force integrals.
 
 A ray that only grazes an object may go either way, so the shading must lie between that of a box grown by a cell and of
 the box itself: no share of rays is left unchecked.
@@ -36,6 +36,7 @@ FAR_M = 1000.0
 UP = np.array([0.0, 1.0, 0.0])
 PLATE = box((0.4, 0.3, 0.4), (0.56, 0.32, 0.56))
 TOWARD = (0.6, 0.7, 0.2)
+FLOOR = (floor(),)
 LIGHT = lights.lobe_and_sky(TOWARD)
 LIGHTS = {"uniform": lights.uniform((1.0, 0.5, 2.0)), "directional": LIGHT, "from below": lights.lobe((0.1, -1, 0.1))}
 
@@ -110,7 +111,7 @@ def shade_floor(
     solid: Box,
     light: Floats = LIGHT,
     *,
-    scene: Scene = (floor(),),
+    scene: Scene = FLOOR,
     rays: int = 81,
     reach_m: float = FAR_M,
     points: Floats | None = None,
@@ -168,7 +169,9 @@ def test_real_shadow_is_not_cast_twice(engine: Engine) -> None:
         for scene in ((floor(),), (floor(), ceiling))
     )
     taken = [(1 - s.ratio[..., 0]) * (s.transfer @ light)[..., 0] for s in (open_sky, covered)]
-    assert taken[0].mean() == pytest.approx(sky_behind(PLATE, below[0] + VOXEL_M * UP), rel=0.04)
+    assert taken[0].mean() == pytest.approx(
+        sky_behind(PLATE.grown(0.5 * open_sky.cell_m), below[0] + VOXEL_M * UP), rel=0.03
+    )
     assert taken[1].mean() < 0.1 * taken[0].mean()
 
 
@@ -181,8 +184,9 @@ def sky_behind(solid: Box, point: Floats) -> float:
 
 
 def test_ratio_matches_a_brute_force_integral(engine: Engine) -> None:
-    """R' / R = 1 - integral of L cos / pi over the plate's solid angle, over R; L is the light's own 16 coefficients."""
+    """R' / R = 1 - (integral of L cos / pi over the plate's solid angle) / R, L from the light's 16 coefficients."""
     shaded = shade_floor(engine, PLATE, rays=1024)
+    plate = PLATE.grown(0.5 * shaded.cell_m)  # blocks up to half a cell beside it
     random = np.random.default_rng(2)
     radius, azimuth = np.sqrt(random.random(100_000)), 2 * np.pi * random.random(100_000)
     rays = np.stack([radius * np.cos(azimuth), np.sqrt(1 - radius**2), radius * np.sin(azimuth)], -1)
@@ -191,7 +195,7 @@ def test_ratio_matches_a_brute_force_integral(engine: Engine) -> None:
     errors = []
     for row, col in [(12, 12), (12, 8), (12, 10), (8, 12), (10, 9), (4, 4), (20, 20), (13, 6)]:
         origins = np.tile(shaded.points[row, col] + VOXEL_M * UP, (len(rays), 1))
-        taken = (np.isfinite(PLATE.hit(origins, rays))[:, None] * arriving).mean(0)
+        taken = (np.isfinite(plate.hit(origins, rays))[:, None] * arriving).mean(0)
         errors.append(shaded.ratio[row, col, :3] - (1 - taken / without))
     # 1024 directions over the sphere, one set a sample: each stands for 0.4 % of the sky at the zenith, and the plate's
     # outline crosses some twenty of them.
@@ -204,7 +208,7 @@ def test_shadow_lies_away_from_the_light(engine: Engine) -> None:
         shaded = shade_floor(engine, PLATE, lights.lobe_and_sky(toward), points=floor_points(0.0, 0.96))
         dark = np.maximum(1 - shaded.ratio[..., 1], 0)
         middle = (dark[..., None] * shaded.points).sum((0, 1)) / dark.sum()
-        # Of a far disc the shadow's middle would be 0.2 m below times tan 45; a lobe as wide as the sky draws it nearer.
+        # Of a far disc the shadow's middle would lie 0.2 m off; a lobe as wide as the sky draws it nearer.
         away = middle - [0.48, 0.1, 0.48]
         assert away @ lights.unit([-toward[0], 0, -toward[2]]) > 0.01
         assert abs(away @ np.cross(lights.unit([toward[0], 0, toward[2]]), UP)) < 0.01
@@ -308,17 +312,16 @@ def test_occlusion_is_the_twins(device: Device, engine: Engine, name: str) -> No
 
 
 def test_real_overhang_darkens_what_is_below(engine: Engine) -> None:
-    """Under an even sky of 1 the radiance taken is the overhang's share of the sky: closed form, tenth of a percent."""
+    """Under an even sky of 1 the radiance taken is the overhang's share of the sky: closed form."""
     light = lights.uniform()
     occluded, positions, _, _ = shade_top(engine, (OVERHANG,), [TABLE_TOP], light, rays=1024)
     for row, col in [(10, 10), (10, 4), (3, 3), (18, 10)]:
-        point = positions[2 * row, 2 * col, :3] + VOXEL_M * UP
         near = occluded[row : row + 2, col : col + 2, 0].mean()  # the four direction sets
         point = (
             positions[2 * row : 2 * row + 4 : 2, 2 * col : 2 * col + 4 : 2, :3].reshape(-1, 3).mean(0) + VOXEL_M * UP
         )
         assert near == pytest.approx(sky_behind(OVERHANG, point), abs=0.02)  # half a voxel of outline at 0.3 m: 1 %
-    assert occluded[10, 10, 0] > 3 * occluded[3, 3, 0]
+    assert occluded[10, 10, 0] > 1.5 * occluded[3, 3, 0]
 
 
 def test_open_virtual_surface_loses_nothing(engine: Engine) -> None:

@@ -15,9 +15,12 @@ Points = NDArray[np.float64]
 class Chart(Protocol):
     """Coordinates (s, t) on a surface. `wraps`: s = 1 is s = 0 again."""
 
-    wraps: bool
-    lengths_m: tuple[float, float]
-    """How long the surface is along s and t, at most."""
+    @property
+    def wraps(self) -> bool: ...
+
+    @property
+    def lengths_m(self) -> tuple[float, float]:
+        """How long the surface is along s and t, at most."""
 
     def point(self, s: Points, t: Points) -> tuple[Points, Points]:
         """Positions and outward unit normals, each [..., 3]."""

@@ -138,9 +138,7 @@ class SyntheticSource:
             bodies = self._with_hand(bodies, index, light)
         return render(bodies, self.camera, self._rays, self.pose(index), light)
 
-    def _with_hand(
-        self, bodies: list[Lit], static: hand.StaticVisibility, index: int, light: DistantLight
-    ) -> list[Lit]:
+    def _with_hand(self, bodies: list[Lit], index: int, light: DistantLight) -> list[Lit]:
         """The static bodies under the hand's shadow, then the hand's parts."""
         parts = hand.capsules(index / max(len(self) - 1, 1))
         if not parts:

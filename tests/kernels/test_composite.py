@@ -1,0 +1,281 @@
+"""Compositing against its float64 twin, and pictures whose every pixel is known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.opencl.engine import Engine
+from server.stages.composite import composite, mark_touched, shown_picture, srgb_codes
+from server.stages.differential_rendering import SampleGrid, upload_light
+from server.stages.measure import linear_values
+from server.stages.radiance_transfer import direction_sets
+from server.stages.rasterize import VirtualSurface
+from server.stages.raycast import Surface
+from tests import lights
+from tests.meshes import pose
+from tests.reference import composite as twin
+from tests.reference.composite import Buffer, Samples
+from tests.solids import float4, upload_surface
+
+HEIGHT, WIDTH = 44, 60
+CAMERA = CameraModel(width=WIDTH, height=HEIGHT, fx=60.0, fy=60.0, cx=29.5, cy=21.5)
+VOLUME_FROM_CAMERA = pose((0.3, 0.2, -0.1), (0, 1, 0), 0.2)
+TOLERANCE_M = 0.01
+LIGHT = lights.lobe_and_sky((-0.3, -0.8, -0.5))
+
+Floats = NDArray[np.float64]
+Codes = NDArray[np.uint8]
+
+
+def plane(z: float, slope: float = 0.0) -> tuple[Floats, Floats]:
+    """Points [h, w, 3] (volume space) of the plane z + slope x in camera space, and its normals, towards the camera."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u, float)], -1)
+    depth = z / (1 - slope * rays[..., 0])
+    normal = lights.unit([slope, 0, -1.0])
+    rotation = VOLUME_FROM_CAMERA[:3, :3]
+    points = (depth[..., None] * rays) @ rotation.T + VOLUME_FROM_CAMERA[:3, 3]
+    return points, np.broadcast_to(rotation @ normal, points.shape)
+
+
+def buffer(points: Floats, normals: Floats, valid: Any = True, color: float = 0.5) -> Buffer:
+    valid = np.broadcast_to(valid, points.shape[:2])
+    positions, normals = (
+        np.where(valid[..., None], np.insert(a, 3, 1, -1), 0).astype(np.float32).astype(float)
+        for a in (points, normals)
+    )
+    return Buffer(positions, normals, np.where(valid[..., None], color, 0) * np.array([1, 0.8, 0.5]))
+
+
+def camera_picture(seed: int = 1) -> tuple[Codes, Floats]:
+    """sRGB codes and linear radiance [h, w, 4]."""
+    codes = np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    return codes, np.insert(linear_values("srgb8")[codes].astype(float), 3, 1, -1)
+
+
+def upload_virtual(engine: Engine, virtual: Buffer) -> VirtualSurface:
+    space, covered = engine.workspace, virtual.positions[..., 3]
+    return VirtualSurface(
+        space.upload("virtual_positions", float4(virtual.positions[..., :3], covered)),
+        space.upload("virtual_normals", float4(virtual.normals[..., :3], covered)),
+        space.upload("virtual_colors", float4(virtual.colors, covered)),
+        space.upload("virtual_index", np.where(covered > 0, 0, -1).astype(np.int32)),
+        ((0, 0, WIDTH, HEIGHT),),
+    )
+
+
+def upload_samples(engine: Engine, name: str, samples: Samples | None) -> SampleGrid | None:
+    if samples is None:
+        return None
+    return SampleGrid(
+        samples.stride, engine.workspace.upload(name, float4(samples.values[..., :3], samples.values[..., 3]))
+    )
+
+
+def compose(
+    engine: Engine,
+    shown: Codes,
+    radiance: Floats,
+    real: Buffer,
+    virtual: Buffer | None = None,
+    occluded: Samples | None = None,
+    ratio: Samples | None = None,
+    light: Floats = LIGHT,
+) -> Codes:
+    surface: Surface = upload_surface(
+        engine, real.positions[..., :3], real.normals[..., :3], real.positions[..., 3] > 0
+    )
+    return composite(
+        engine,
+        CAMERA,
+        VOLUME_FROM_CAMERA,
+        shown,
+        engine.workspace.upload("radiance", float4(radiance[..., :3], radiance[..., 3])),
+        surface,
+        TOLERANCE_M,
+        upload_light(engine, light, direction_sets(81, round(len(light) ** 0.5))),
+        upload_virtual(engine, virtual) if virtual else None,
+        upload_samples(engine, "occluded", occluded),
+        upload_samples(engine, "ratio", ratio),
+    )
+
+
+def samples(stride: int, value: float | Floats, valid: Any = 1.0) -> Samples:
+    values = np.empty((HEIGHT // stride, WIDTH // stride, 4))
+    values[..., :3] = value
+    values[..., 3] = valid
+    return Samples(stride, values.astype(np.float32).astype(float))
+
+
+NONE_TAKEN = samples(2, 0.0)
+WALL = buffer(*plane(1.0))
+
+
+# ---- against the twin --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stride", [1, 4, 8])
+@pytest.mark.parametrize("bands", [2, 4])
+def test_picture_is_the_twins(engine: Engine, stride: int, bands: int) -> None:
+    random = np.random.default_rng(2)
+    shown, radiance = camera_picture()
+    radiance[..., 3] = random.choice([1, 0, -1], (HEIGHT, WIDTH), p=[0.8, 0.1, 0.1])
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    near, far = plane(0.8, 0.3), plane(1.3, -0.2)
+    points, normals = (np.where((u < 25)[..., None], a, b) for a, b in zip(near, far, strict=True))
+    real = buffer(points, normals, random.random((HEIGHT, WIDTH)) < 0.95)
+    disc = (u - 30) ** 2 + (v - 20) ** 2 < 300
+    virtual = buffer(*plane(1.1, 0.5), disc)
+    ratio = samples(stride, random.uniform(0.3, 1, (HEIGHT // stride, WIDTH // stride, 3)))
+    ratio.values[: len(ratio.values) // 3, :, :3] = 1  # a part of the picture is not touched
+    ratio.values[..., 3] = random.random(ratio.values.shape[:2]) < 0.8
+    occluded = samples(2, random.uniform(0, 0.2, (HEIGHT // 2, WIDTH // 2, 3)))
+    occluded.values[..., 3] = virtual.positions[1::2, 1::2, 3]
+    light = LIGHT[: bands * bands]
+    found = compose(engine, shown, radiance, real, virtual, occluded, ratio, light)
+    camera_from_volume = np.linalg.inv(VOLUME_FROM_CAMERA)
+    expected = twin.composite(shown, radiance, real, camera_from_volume, TOLERANCE_M, light, virtual, occluded, ratio)
+    changed = (expected != shown).any(-1)
+    assert 0.2 < changed.mean() < 0.95
+    # Rounding to a code, through a table of 65536 levels: neighbours may swap.
+    difference = np.abs(found.astype(int) - expected)
+    assert difference.max() <= 1
+    assert (difference > 0).mean() < 5e-3
+    np.testing.assert_array_equal(found[~changed], shown[~changed])
+
+
+@pytest.mark.parametrize("shape", [(11, 15), (1, 1), (5, 40)])
+def test_touched_cells_are_the_twins(engine: Engine, shape: tuple[int, int]) -> None:
+    random = np.random.default_rng(3)
+    values = np.ones((*shape, 4))
+    values[..., 1] = random.choice([1.0, 0.9], shape, p=[0.97, 0.03])
+    values[..., 3] = random.random(shape) < 0.9
+    grid = upload_samples(engine, "ratio", Samples(4, values))
+    assert grid is not None
+    touched = engine.download(mark_touched(engine, grid, 4))
+    np.testing.assert_array_equal(touched, twin.mark_touched(values.astype(np.float32)))
+
+
+# ---- known pictures ----------------------------------------------------------------------------------------------
+
+
+def test_nothing_virtual_is_the_camera_picture(engine: Engine) -> None:
+    shown, radiance = camera_picture()
+    np.testing.assert_array_equal(compose(engine, shown, radiance, WALL), shown)
+    nowhere = buffer(*plane(0.5), False)
+    for ratio in (None, samples(4, 1.0), samples(4, 1 - 1e-6), samples(4, 0.5, 0.0)):
+        np.testing.assert_array_equal(compose(engine, shown, radiance, WALL, nowhere, NONE_TAKEN, ratio), shown)
+
+
+def test_shown_picture_of_srgb_is_itself() -> None:
+    codes, _ = camera_picture()
+    np.testing.assert_array_equal(shown_picture(CAMERA, codes), codes)
+
+
+def test_shown_picture_of_linear16_is_encoded() -> None:
+    camera = CameraModel(width=256, height=256, fx=1, fy=1, cx=0, cy=0, color_encoding="linear16")
+    levels = np.repeat(np.arange(65536, dtype=np.uint16).reshape(256, 256, 1), 3, 2)
+    np.testing.assert_array_equal(shown_picture(camera, levels), twin.srgb_codes(levels / 65535))
+
+
+def test_codes_invert_the_linearisation() -> None:
+    np.testing.assert_array_equal(srgb_codes(linear_values("srgb8").astype(float)), np.arange(256))
+    np.testing.assert_array_equal(srgb_codes(np.array([-1.0, 0.0, 1.0, 7.0])), [0, 0, 255, 255])
+
+
+@pytest.mark.parametrize("order", ["virtual in front", "real in front", "within tolerance", "no real surface"])
+def test_the_nearer_is_seen(engine: Engine, order: str) -> None:
+    shown, radiance = camera_picture()
+    virtual_z = {"virtual in front": 0.8, "real in front": 1.03, "within tolerance": 1.008, "no real surface": 3.0}[
+        order
+    ]
+    real = buffer(*plane(1.0), order != "no real surface")
+    picture = compose(engine, shown, radiance, real, buffer(*plane(virtual_z)), NONE_TAKEN)
+    if order == "real in front":
+        np.testing.assert_array_equal(picture, shown)
+    else:
+        shading = twin.open_transfer(plane(1.0)[1][0, 0], 4) @ LIGHT
+        expected = twin.srgb_codes(shading * 0.5 * np.array([1, 0.8, 0.5]))
+        assert np.abs(picture.astype(int) - expected).max() <= 1
+
+
+def test_two_planes_that_cross_hide_each_other(engine: Engine) -> None:
+    """The virtual plane leans through the wall: seen where it is nearer, by more than a pixel's rounding."""
+    shown, radiance = camera_picture()
+    points, normals = plane(1.0, 0.6)
+    picture = compose(engine, shown, radiance, WALL, buffer(points, normals), NONE_TAKEN)
+    camera_from_volume = np.linalg.inv(VOLUME_FROM_CAMERA)
+    depth = (points @ camera_from_volume[:3, :3].T + camera_from_volume[:3, 3])[..., 2]
+    hidden, seen = depth > 1 + TOLERANCE_M + 1e-5, depth < 1 + TOLERANCE_M - 1e-5
+    assert min(hidden.mean(), seen.mean()) > 0.3
+    np.testing.assert_array_equal(picture[hidden], shown[hidden])
+    assert (picture[seen] != shown[seen]).any(-1).mean() > 0.99
+
+
+def test_shadow_is_a_factor_of_linear_light(engine: Engine) -> None:
+    _, radiance = camera_picture()
+    codes = np.resize(np.arange(256, dtype=np.uint8), (HEIGHT, WIDTH, 1)).repeat(3, 2)
+    radiance[..., :3] = linear_values("srgb8")[codes]
+    picture = compose(engine, codes, radiance, WALL, ratio=samples(4, 0.5))
+    halved = twin.srgb_codes(radiance[..., :3] / 2)
+    assert np.abs(picture.astype(int) - halved).max() <= 1
+    assert (picture != halved).mean() < 0.01
+    # Well-known: half of white is code 188, half of middle grey's 188 is 137 (nearest codes).
+    assert set(picture[codes[..., 0] == 255].ravel()) == {188}
+    assert set(picture[codes[..., 0] == 188].ravel()) == {137}
+
+
+def test_outside_the_rectified_picture_nothing_changes(engine: Engine) -> None:
+    shown, radiance = camera_picture()
+    radiance[:, :20, 3] = -1
+    picture = compose(engine, shown, radiance, WALL, ratio=samples(4, 0.5))
+    np.testing.assert_array_equal(picture[:, :20], shown[:, :20])
+    assert (picture[:, 20:] != shown[:, 20:]).any(-1).mean() > 0.9
+
+
+def test_shadow_does_not_bleed_across_an_edge(engine: Engine) -> None:
+    """Left half at 0.7 m and in shadow, right half at 1 m and not: no pixel of the right one darkens."""
+    shown, radiance = camera_picture()
+    u = np.mgrid[:HEIGHT, :WIDTH][1]
+    left = (u < 30)[..., None]
+    points = np.where(left, plane(0.7)[0], plane(1.0)[0])
+    for stride in (4, 8):
+        factor = np.where(np.arange(WIDTH // stride) * stride + stride // 2 < 30, 0.2, 1.0)
+        ratio = samples(stride, np.broadcast_to(factor[None, :, None], (HEIGHT // stride, WIDTH // stride, 3)))
+        picture = compose(engine, shown, radiance, buffer(points, plane(1.0)[1]), ratio=ratio)
+        # Samples across the edge are 30 tolerances off the pixel's plane: weights of 1 / 30^4, below a code.
+        assert np.abs(picture.astype(int) - shown)[:, 30:].max() <= 1
+        shadowed = twin.srgb_codes(0.2 * radiance[..., :3])
+        assert np.abs(picture.astype(int) - shadowed)[:, :30].max() <= 1
+
+
+def test_occlusion_does_not_bleed_across_a_crease(engine: Engine) -> None:
+    """Two sides of a virtual roof, one occluded: the other keeps its shading."""
+    shown, radiance = camera_picture()
+    left = np.mgrid[:HEIGHT, :WIDTH][1] < 30
+    sides = plane(0.6, 1.5), plane(0.6, -1.5)
+    points, normals = (np.where(left[..., None], a, b) for a, b in zip(*sides, strict=True))
+    virtual = buffer(points, normals)
+    taken = samples(2, np.where(left[1::2, 1::2, None], 0.3, 0.0))
+    picture = compose(engine, shown, radiance, WALL, virtual, taken)
+    free = compose(engine, shown, radiance, WALL, virtual, NONE_TAKEN)
+    np.testing.assert_array_equal(picture[:, 30:], free[:, 30:])
+    assert (picture[:, :30] < free[:, :30]).any(-1).all()
+
+
+def test_more_occlusion_than_light_is_black(engine: Engine) -> None:
+    shown, radiance = camera_picture()
+    picture = compose(engine, shown, radiance, WALL, buffer(*plane(0.8)), samples(2, 1e6))
+    np.testing.assert_array_equal(picture, 0)
+
+
+def test_virtual_surface_without_samples_is_unoccluded(engine: Engine) -> None:
+    shown, radiance = camera_picture()
+    virtual = buffer(*plane(0.8))
+    free, none = (compose(engine, shown, radiance, WALL, virtual, samples(2, 0.0, w)) for w in (1.0, 0.0))
+    np.testing.assert_array_equal(free, none)

@@ -1,0 +1,99 @@
+"""Device memory: the same name and shape is the same memory, and a steady stream allocates nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from protocol.frames import CameraModel, RgbdFrame
+from protocol.messages import Wishes
+from server.opencl.buffers import Workspace
+from server.opencl.device import Device
+from server.opencl.engine import Engine
+from server.pipeline import Pipeline
+from server.scene.placement import Placement
+from tests.analytic import look, plane, room
+from tests.meshes import soup_of
+
+
+@pytest.fixture
+def workspace(engine: Engine) -> Workspace:
+    """An empty workspace."""
+    return engine.workspace
+
+
+def test_same_name_and_shape_is_the_same_memory(workspace: Workspace) -> None:
+    first = workspace.array("a", (3, 5), np.float32)
+    first.fill(np.float32(4))
+    again = workspace.array("a", (3, 5), np.float32)
+    assert again is first
+    assert (again.get() == 4).all()
+    assert workspace.array("b", (3, 5), np.float32) is not first
+    assert workspace.bytes_held == 2 * 3 * 5 * 4
+
+
+@pytest.mark.parametrize(("shape", "dtype"), [((5, 3), np.float32), ((3, 6), np.float32), ((3, 5), np.int32)])
+def test_another_shape_or_type_replaces_it(workspace: Workspace, shape: tuple[int, ...], dtype: Any) -> None:
+    workspace.array("a", (3, 5), np.float32)
+    other = workspace.array("a", shape, dtype)
+    assert (other.shape, other.dtype) == (shape, np.dtype(dtype))
+    assert workspace.bytes_held == other.nbytes
+
+
+def test_upload_copies_into_the_same_memory(workspace: Workspace) -> None:
+    first = workspace.upload("a", np.arange(6, dtype=np.int32).reshape(2, 3))
+    again = workspace.upload("a", np.asfortranarray(10 * np.arange(6, dtype=np.int32).reshape(2, 3)))
+    assert again is first
+    np.testing.assert_array_equal(first.get(), [[0, 10, 20], [30, 40, 50]])
+
+
+def test_constant_copies_once(workspace: Workspace) -> None:
+    values = np.arange(4, dtype=np.float32)
+    first = workspace.constant("c", values)
+    first.fill(np.float32(9))
+    assert (workspace.constant("c", values).get() == 9).all()
+    np.testing.assert_array_equal(workspace.constant("c", np.ones(5, np.float32)).get(), np.ones(5))
+
+
+def test_constant_of_another_type_is_another(workspace: Workspace) -> None:
+    workspace.constant("c", np.ones(4, np.float32))
+    assert workspace.constant("c", np.full(4, 7, np.int32)).get().tolist() == [7] * 4
+
+
+def test_release_gives_everything_back(workspace: Workspace) -> None:
+    array = workspace.array("a", (1 << 20,), np.float32)
+    memory = array.base_data
+    workspace.release()
+    assert workspace.bytes_held == 0
+    with pytest.raises(cl.LogicError):
+        memory.release()  # was released already
+    assert workspace.array("a", (4,), np.float32).shape == (4,)
+
+
+def test_a_steady_stream_allocates_nothing(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """50 equal frames with a virtual object, after the first few."""
+    made: list[int] = []
+
+    class CountedBuffer(cl.Buffer):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            made.append(self.size)
+
+    monkeypatch.setattr(cl, "Buffer", CountedBuffer)
+    camera = CameraModel(width=72, height=56, fx=60.0, fy=60.0, cx=35.5, cy=27.5, distortion=(0.01, 0, 0, 0, 0))
+    scene = [room((-0.9, -0.7, -0.5), (0.9, 0.7, 1.5)), plane((0, 0.4, 0), (0, -1, 0.1))]
+    depth = np.rint(1000 * look(scene, camera, np.eye(4)).depth_m).astype(np.uint16)
+    color = np.random.default_rng(0).integers(30, 220, (*depth.shape, 3)).astype(np.uint8)
+    pipeline = Pipeline(device, camera, Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.04))
+    corners = [[[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0]], [[0, 0, 0], [0, 0.3, 0], [0, 0, 0.3]]]
+    pipeline.place_object("thing", soup_of(corners), Placement(position_m=(0.0, 0.3, 0.9)))
+    for index in range(55):
+        if index == 5:
+            assert made
+            made.clear()
+        pipeline.process(RgbdFrame(index, index / 30, color, depth, np.eye(4)))
+    assert made == []
+    pipeline.close()

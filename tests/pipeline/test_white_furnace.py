@@ -1,0 +1,149 @@
+"""White furnace: a white open scene under an even sky of radiance 1 shades to 1, in every configuration.
+
+"Shades" is what the pipeline does with a light: the transfer of a sample times the light's coefficients, here those of
+the even sky. "Open" is a scene no part of which hides the sky from another: a convex body. With exact geometry, and
+reconstructed from depth pictures quantised as a sensor's, where what voxels, normals and rays do wrong would show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel, RgbdFrame
+from protocol.limits import MAX_SH_BANDS
+from protocol.messages import Preset, Wishes
+from server.opencl.device import Device
+from server.opencl.engine import Engine
+from server.pipeline import FrameResult, Pipeline
+from server.scene.placement import Placement
+from server.settings import STRIDES, THESIS_REACH_M, WHOLE_ROOM_M
+from server.stages.integrate import integrate
+from server.stages.light_estimation import LEAST_FLATNESS
+from server.stages.measure import measure
+from server.stages.merge import merge_depth
+from server.stages.radiance_transfer import direction_sets, transfer_radiance
+from server.stages.raycast import LABEL_STATIC, Surface, raycast
+from server.stages.volume import Volume
+from tests.analytic import Shape, look, look_at, plane, sphere
+from tests.lights import random_directions, uniform
+from tests.meshes import shape_of
+from tests.solids import HalfSpace, ball, fill_volume, points_on, upload_surface
+
+CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
+BOUNDS = (-0.8, -0.8, 0.5, 0.8, 0.8, 2.1)
+VOXEL_M = 0.008
+BODIES: dict[str, Shape] = {
+    "floor": plane((0, 0.2, 1.2), (0.1, -1.0, -0.8)),
+    "wall": plane((0, 0, 1.3), (0.45, 0.2, -1.0)),
+    "ball": sphere((0, 0, 1.2), 0.4),
+}
+VIEWS = [look_at((x, -0.1, 0.0), (0, 0, 1.2)) for x in (0.0, 0.2, -0.2)]
+RAYS, REACHES_M = (81, 169, 32), (WHOLE_ROOM_M, THESIS_REACH_M)
+
+
+def frames(body: Shape, color: NDArray[np.uint8]) -> Iterator[RgbdFrame]:
+    for index, view in enumerate(VIEWS):
+        depth = np.rint(1000 * look([body], CAMERA, view).depth_m)
+        yield RgbdFrame(index, index / 30, color, np.where(depth > 5000, 0, depth).astype(np.uint16), view)
+
+
+def reconstruct(engine: Engine, body: Shape) -> tuple[Volume, Surface]:
+    """The spine up to the merged geometry buffer."""
+    volume = Volume(engine, BOUNDS, VOXEL_M)
+    grey = np.full((CAMERA.height, CAMERA.width, 3), 188, np.uint8)
+    for frame in frames(body, grey):
+        assert frame.world_from_camera is not None
+        pose = volume.volume_from_world() @ frame.world_from_camera
+        measured = measure(engine, CAMERA, frame)
+        volume.allocate(CAMERA, pose, measured.depth_m)
+        integrate(engine, volume, CAMERA, pose, measured.depth_m)
+        surface = raycast(engine, CAMERA, pose, volume)
+        merge_depth(engine, CAMERA, pose, measured.depth_m, surface, volume.voxel_m)
+    return volume, surface
+
+
+def configurations() -> Iterator[tuple[str, int, int, float]]:
+    """Preset, rays, bands, length of rays."""
+    for preset, rays, bands, reach_m in product(STRIDES, RAYS, range(2, MAX_SH_BANDS + 1), REACHES_M):
+        if STRIDES[preset] > 1 or bands in (2, 4, MAX_SH_BANDS):  # every pixel is slow, and bands do not depend on it
+            yield preset, rays, bands, reach_m
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_reconstructed_scene_shades_to_one(engine: Engine, body: str) -> None:
+    volume, surface = reconstruct(engine, BODIES[body])
+    static = engine.download(surface.labels) == LABEL_STATIC
+    assert static.mean() > 0.15
+    wrong = {}
+    for preset, rays, bands, reach_m in configurations():
+        stride = STRIDES[preset]
+        transfer = transfer_radiance(engine, CAMERA, volume, surface, stride, direction_sets(rays, bands), reach_m)
+        shaded = engine.download(transfer.coefficients).astype(float) @ uniform(bands=bands)[:, 0]
+        error = np.abs(shaded - 1)[static[stride // 2 :: stride, stride // 2 :: stride]]
+        flat = engine.download(transfer.flatness)[static[stride // 2 :: stride, stride // 2 :: stride]]
+        assert (flat >= LEAST_FLATNESS).sum() > 25
+        # Every sample that the light is estimated from, and of the others (outlines) all but one in a hundred.
+        if error[flat >= LEAST_FLATNESS].max() > 0.01 or np.quantile(error, 0.99) > 0.01:
+            wrong[preset, rays, bands, reach_m] = error[flat >= LEAST_FLATNESS].max(), np.quantile(error, 0.99)
+    assert not wrong
+
+
+def test_exact_scene_shades_to_one(engine: Engine) -> None:
+    """Exact voxels, points and normals: not 1 % but rounding, at every sample, for walls of any direction and balls."""
+    random = np.random.default_rng(2)
+    walls = [HalfSpace(random.uniform(0.4, 0.56, 3), normal) for normal in random_directions(4, 3)]
+    for solid in (*walls, ball((0.48, 0.5, 0.47), 0.3)):
+        volume = fill_volume(engine, (solid,), 0.01)
+        points, normals = points_on((solid,), 24 * 24, 4, ((0.1,) * 3, (0.86,) * 3))
+        blocks = [np.repeat(np.repeat(a.reshape(24, 24, 3), 4, 0), 4, 1) for a in (points, normals)]
+        surface = upload_surface(engine, *blocks, np.ones((96, 96), bool))
+        camera = CameraModel(width=96, height=96, fx=90.0, fy=90.0, cx=48.0, cy=48.0)
+        for preset, rays, bands, reach_m in configurations():
+            if STRIDES[preset] == 4:
+                transfer = transfer_radiance(engine, camera, volume, surface, 4, direction_sets(rays, bands), reach_m)
+                shaded = engine.download(transfer.coefficients).astype(float) @ uniform(bands=bands)[:, 0]
+                np.testing.assert_allclose(shaded, 1.0, rtol=1e-6)
+
+
+def test_every_preset_that_exists_is_covered() -> None:
+    assert set(STRIDES) <= set(get_args(Preset))
+    assert set(STRIDES) == {"rm", "reg4", "reg8"}
+    assert Wishes().rays in RAYS
+
+
+@pytest.mark.parametrize("preset", STRIDES)
+def test_far_object_changes_no_pixel(device: Device, preset: str) -> None:
+    """The whole spine, with an object that neither is seen nor shadows anything: the camera's bytes come back."""
+    random = np.random.default_rng(1)
+    color = random.integers(60, 220, (CAMERA.height, CAMERA.width, 3), np.uint8)
+    wishes = Wishes(preset=preset, volume_m=BOUNDS, voxel_m=VOXEL_M, ray_length_m=2.0)  # type: ignore[arg-type]
+    pipeline = Pipeline(device, CAMERA, wishes)
+    pipeline.place_object(
+        "far", shape_of(trimesh.creation.icosphere(radius=0.2)), Placement(position_m=(0.0, 5.0, -60.0))
+    )
+    for frame in frames(BODIES["ball"], color):
+        result = pipeline.process(frame)
+    pipeline.close()
+    assert "shadow_real" in result.plan.run  # it was not spared by the plan
+    np.testing.assert_array_equal(result.color, color)
+
+
+def test_white_scene_tells_the_even_sky(device: Device) -> None:
+    """The furnace backwards: a picture that is the same everywhere is explained by an even sky."""
+    code = 188  # linear 0.5029: white times the assumed albedo
+    pipeline = Pipeline(device, CAMERA, Wishes(volume_m=BOUNDS, voxel_m=VOXEL_M))
+    result: FrameResult | Any = None
+    for frame in frames(BODIES["ball"], np.full((CAMERA.height, CAMERA.width, 3), code, np.uint8)):
+        result = pipeline.process(replace(frame))
+    pipeline.close()
+    sh = np.array(result.light.sh)
+    np.testing.assert_allclose(sh[0], uniform()[0] * 0.5029 / 0.5, rtol=0.01)
+    assert np.abs(sh[1:]).max() < 0.02 * sh[0].max()

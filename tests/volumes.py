@@ -54,9 +54,7 @@ def upload_depth(engine: Engine, depth_m: NDArray[Any]) -> cl_array.Array:
     return engine.workspace.upload("test_depth", depth_m.astype(np.float32))
 
 
-def fuse(
-    engine: Engine, volume: Volume, camera: CameraModel, world_from_camera: Floats, depth_m: NDArray[Any]
-) -> None:
+def fuse(engine: Engine, volume: Volume, camera: CameraModel, world_from_camera: Floats, depth_m: NDArray[Any]) -> None:
     """Allocate and integrate one depth picture."""
     pose = volume.volume_from_world() @ world_from_camera
     device_depth = upload_depth(engine, depth_m)

@@ -33,8 +33,9 @@ class Workspace:
     def constant(self, name: str, values: NDArray[Any]) -> cl_array.Array:
         """The array called `name`, copied from `values` the first time only; `values` must not change."""
         found = self._arrays.get(name)
-        same = found is not None and found.shape == values.shape and found.dtype == values.dtype
-        return found if same else self.upload(name, values)
+        if found is not None and found.shape == values.shape and found.dtype == values.dtype:
+            return found
+        return self.upload(name, values)
 
     @property
     def bytes_held(self) -> int:

@@ -220,7 +220,13 @@ def test_no_back_faces(engine: Engine) -> None:
 def test_from_behind_a_wall_the_far_wall_is_seen(engine: Engine) -> None:
     far, near = plane((0, 0, 1.4), (0.1, 0, -1)), plane((0, 0, -0.4), (0, 0, 1))
     volume = fused(engine, [far], [look_at((0, 0, 0), (0, 0, 1))])
-    fuse(engine, volume, CAMERA, look_at((0, 0, 0.6), (0, 0, -1)), look([near], CAMERA, look_at((0, 0, 0.6), (0, 0, -1))).depth_m)
+    fuse(
+        engine,
+        volume,
+        CAMERA,
+        look_at((0, 0, 0.6), (0, 0, -1)),
+        look([near], CAMERA, look_at((0, 0, 0.6), (0, 0, -1))).depth_m,
+    )
     new = look_at((0, 0, -1.0), (0, 0, 1))
     hit, depth, _ = cast(engine, volume, CAMERA, new)
     truth = look([far], CAMERA, new)

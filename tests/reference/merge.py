@@ -24,7 +24,9 @@ def agreement_m(depth_m: Floats, voxel_m: float) -> Floats:
 def unproject(camera: CameraModel, depth_m: Floats) -> Floats:
     """[h, w, 3] measured points in camera space."""
     v, u = np.mgrid[: camera.height, : camera.width]
-    return depth_m[..., None] * np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    return depth_m[..., None] * np.stack(
+        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1
+    )
 
 
 def neighbour(camera: CameraModel, points: Floats, dx: int, dy: int) -> Floats:

@@ -1,0 +1,282 @@
+"""Depth and poses that no camera should deliver, through the whole pipeline: nothing crashes, nothing is not a number.
+
+What is wrong is said: in the frame's notes, or as a ValueError of one line that leaves the session as it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel, RgbdFrame
+from protocol.messages import Light, Wishes
+from server.opencl.device import Device
+from server.pipeline import FrameResult, Pipeline
+from server.scene.placement import Placement
+from tests.analytic import look, look_at, room, sphere
+from tests.meshes import soup_of
+
+CAMERA = CameraModel(width=96, height=72, fx=80.0, fy=80.0, cx=48.0, cy=36.0)
+BOUNDS = (-1.2, -1.0, -0.5, 1.2, 1.0, 2.1)
+WISHES = Wishes(volume_m=BOUNDS, voxel_m=0.04)
+SCENE = [room((-1.1, -0.9, -0.4), (1.1, 0.8, 2.0)), sphere((0.2, 0.4, 1.2), 0.35)]
+SIZE = (CAMERA.height, CAMERA.width)
+PYRAMID = 0.25 * np.array(
+    [
+        [[0, 1, 0], [1, 0, 1], [-1, 0, 1]],
+        [[0, 1, 0], [1, 0, -1], [1, 0, 1]],
+        [[0, 1, 0], [-1, 0, -1], [1, 0, -1]],
+        [[0, 1, 0], [-1, 0, 1], [-1, 0, -1]],
+    ]
+)
+
+Matrix = NDArray[np.float64]
+Open = Callable[..., Pipeline]
+
+
+@pytest.fixture
+def open_pipeline(device: Device) -> Iterator[Open]:
+    """Makes pipelines with one object that stands in the room, and closes them."""
+    made: list[Pipeline] = []
+
+    def start(wishes: Wishes = WISHES, offset: Any = (0.0, 0.0, 0.0), camera: CameraModel = CAMERA) -> Pipeline:
+        made.append(Pipeline(device, camera, wishes))
+        x, y, z = (float(value) for value in np.array([-0.2, 0.7, 1.1]) + offset)
+        made[-1].place_object("pyramid", soup_of(PYRAMID), Placement(position_m=(x, y, z)))
+        return made[-1]
+
+    yield start
+    for pipeline in made:
+        pipeline.close()
+
+
+def good_depth(view: Matrix) -> NDArray[np.uint16]:
+    return np.rint(1000 * look(SCENE, CAMERA, view).depth_m).astype(np.uint16)
+
+
+def frame_of(depth: NDArray[np.uint16], view: Matrix | None = None, index: int = 0) -> RgbdFrame:
+    """A frame whose picture is shaded by a lamp to the upper left, where the scene is."""
+    view = np.eye(4) if view is None else view
+    try:
+        shade = look(SCENE, CAMERA, view).normals @ np.array([-0.5, -0.7, -0.5])
+    except ValueError:  # not a pose: the picture does not matter
+        shade = np.zeros(SIZE)
+    color = np.clip(90 + 110 * np.maximum(shade, 0), 0, 255).astype(np.uint8)
+    return RgbdFrame(index, index / 30, np.repeat(color[..., None], 3, axis=-1), depth, view)
+
+
+def numbers(value: Any) -> list[float]:
+    """All numbers in nested lists and mappings; None is an explicit unknown."""
+    if isinstance(value, dict):
+        return [n for item in value.values() for n in numbers(item)]
+    if isinstance(value, list | tuple):
+        return [n for item in value for n in numbers(item)]
+    return [float(value)] if isinstance(value, int | float) else []
+
+
+def assert_sound(result: FrameResult) -> Light:
+    """A picture of the camera's size, a finite light that can be sent, a rigid pose."""
+    assert result.color.shape == (*SIZE, 3)
+    assert result.color.dtype == np.uint8
+    light = result.light
+    assert np.isfinite(numbers(msgspec.to_builtins(light))).all()
+    assert msgspec.json.decode(msgspec.json.encode(light), type=Light) == light
+    assert np.isfinite(numbers(msgspec.to_builtins(result.timings))).all()
+    rotation = result.world_from_camera[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+    assert all("\n" not in note for note in result.notes)
+    return light
+
+
+def lit(pipeline: Pipeline, offset: Any = (0.0, 0.0, 0.0)) -> FrameResult:
+    """The result of some good frames."""
+    for index, x in enumerate((0.0, 0.1, 0.2)):
+        view = look_at((x, -0.2, 0.0), (0.1, 0.3, 1.2))
+        moved = view.copy()
+        moved[:3, 3] += offset
+        frame = frame_of(good_depth(view), view, index)
+        result = pipeline.process(RgbdFrame(index, frame.timestamp_s, frame.color, frame.depth, moved))
+    return result
+
+
+BAD_DEPTH: dict[str, NDArray[np.uint16]] = {
+    "empty": np.zeros(SIZE, np.uint16),
+    "covered lens": np.full(SIZE, 1, np.uint16),
+    "covered lens, 3 cm": np.full(SIZE, 30, np.uint16),
+    "saturated": np.full(SIZE, 65535, np.uint16),
+    "beyond 10 m": np.full(SIZE, 20_000, np.uint16),
+    "one pixel": np.pad(np.full((1, 1), 1200, np.uint16), ((35, 36), (48, 47))),
+    "one pixel in the corner": np.pad(np.full((1, 1), 1200, np.uint16), ((71, 0), (95, 0))),
+    "noise": np.random.default_rng(0).integers(0, 65536, SIZE).astype(np.uint16),
+    "alternating": np.indices(SIZE).sum(0).astype(np.uint16) % 2 * 1500,
+}
+
+
+@pytest.mark.parametrize("name", BAD_DEPTH)
+def test_bad_depth_from_the_start(open_pipeline: Open, name: str) -> None:
+    """A session may begin with it, and gets well as soon as the depth does."""
+    pipeline = open_pipeline()
+    for index in range(3):
+        result = pipeline.process(frame_of(BAD_DEPTH[name], index=index))
+        assert_sound(result)
+    if name in ("empty", "saturated", "beyond 10 m"):
+        assert any("depth" in note for note in result.notes)
+    if name in ("empty", "saturated", "beyond 10 m"):
+        assert any("the light is unknown" in note for note in result.notes)
+        assert not result.light.valid
+        assert not numbers(msgspec.to_builtins(result.light.sh))[0]
+    after = lit(pipeline)
+    assert_sound(after)
+    assert not any("unknown" in note for note in after.notes)
+    assert np.abs(after.light.dominant_direction).max() > 0
+
+
+@pytest.mark.parametrize("name", BAD_DEPTH)
+def test_bad_depth_in_between(open_pipeline: Open, name: str) -> None:
+    """A light that was found stays finite, and the reconstruction is not lost: it stands in for depth that is missing."""
+    view = look_at((0.2, -0.2, 0.0), (0.1, 0.3, 1.2))
+    results = []
+    for depth in (BAD_DEPTH[name], good_depth(view)):
+        pipeline = open_pipeline()
+        lit(pipeline)
+        for index in range(3, 6):
+            assert_sound(pipeline.process(frame_of(depth, view, index)))
+        results.append(lit(pipeline))
+        assert_sound(results[-1])
+    if name in ("empty", "saturated", "beyond 10 m", "one pixel"):
+        bad, good = (np.array(result.light.dominant_direction) for result in results)
+        assert np.degrees(np.arccos(np.clip(bad @ good, -1, 1))) < 10
+        assert (np.abs(results[0].color.astype(int) - results[1].color) > 8).mean() < 0.02
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e-4, 10.0, 1e6])
+def test_any_depth_scale(open_pipeline: Open, scale: float) -> None:
+    pipeline = open_pipeline(camera=replace(CAMERA, depth_scale_m=scale))
+    for index, depth in enumerate(BAD_DEPTH.values()):
+        assert_sound(pipeline.process(frame_of(depth, index=index)))
+
+
+@pytest.mark.parametrize(
+    "eye", [(1.08, 0.0, 1.0), (1.14, 0.0, 1.0), (0.2, 0.4, 1.2), (0.0, 0.0, 2.05), (3.0, 0.0, 1.0)]
+)
+def test_a_camera_inside_a_wall(open_pipeline: Open, eye: tuple[float, float, float]) -> None:
+    """In and behind surface that was fused before, with the depth of the scene, none, and of what it stands in."""
+    pipeline = open_pipeline()
+    lit(pipeline)
+    for index, target in enumerate(((0.0, 0.1, 1.0), (1.2, 0.1, 1.0), (1.08, 0.9, 1.0), (0.2, 0.4, 1.3))):
+        view = look_at(eye, np.array(target) + 1e-3)
+        for depth in (good_depth(view), np.zeros(SIZE, np.uint16), np.full(SIZE, 20, np.uint16)):
+            assert_sound(pipeline.process(frame_of(depth, view, index)))
+    assert_sound(lit(pipeline))
+
+
+@pytest.mark.parametrize("offset", [(1e4, 0.0, 0.0), (-7e3, 7e3, -5e3)])
+def test_a_scene_10_km_from_the_origin(open_pipeline: Open, offset: tuple[float, float, float]) -> None:
+    """Poses are relative to the volume in float64 before they become float32: the same light and picture."""
+    near = lit(open_pipeline())
+    bounds = tuple(float(value) for value in np.array(BOUNDS) + np.tile(offset, 2))
+    far = lit(open_pipeline(replace(WISHES, volume_m=bounds), offset), offset)
+    assert_sound(far)
+    np.testing.assert_allclose(far.light.sh, near.light.sh, atol=1e-3 * np.abs(near.light.sh).max())
+    assert (np.abs(far.color.astype(int) - near.color) > 1).mean() < 2e-3
+
+
+@pytest.mark.parametrize("distance_m", [30.0, 1e4, 1e9])
+def test_a_volume_far_from_the_camera(open_pipeline: Open, distance_m: float) -> None:
+    """A wrong volume: nothing is fused, what the sensor sees still is real geometry."""
+    view = look_at((0.0, 0.0, 0.0), (0.1, 0.3, 1.2))
+    pose = view.copy()
+    pose[:3, 3] += distance_m
+    frame = frame_of(good_depth(view), view)
+    result = open_pipeline().process(RgbdFrame(0, 0.0, frame.color, frame.depth, pose))
+    assert_sound(result)
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-5, 5e-3])
+def test_a_pose_that_is_nearly_a_rotation_is_repaired(open_pipeline: Open, size: float) -> None:
+    view = look_at((0.1, -0.2, 0.0), (0.1, 0.3, 1.2))
+    bent = view.copy()
+    bent[:3, :3] += size * np.random.default_rng(1).uniform(-0.4, 0.4, (3, 3))
+    result = open_pipeline().process(RgbdFrame(0, 0.0, frame_of(good_depth(view), view).color, good_depth(view), bent))
+    assert_sound(result)
+    assert np.linalg.det(result.world_from_camera[:3, :3]) == pytest.approx(1)
+    np.testing.assert_allclose(result.world_from_camera, view, atol=2 * size + 1e-12)
+    # The nearest rotation: no other is nearer to what came.
+    for axis in np.vstack([np.eye(3), -np.eye(3)]):
+        turn = np.eye(3) + 1e-4 * np.cross(np.eye(3), axis)
+        other = np.linalg.qr(turn)[0] * np.sign(np.diag(np.linalg.qr(turn)[1])) @ result.world_from_camera[:3, :3]
+        ours = np.linalg.norm(result.world_from_camera[:3, :3] - bent[:3, :3])
+        assert np.linalg.norm(other - bent[:3, :3]) > ours
+
+
+def pose_with(index: tuple[Any, ...], value: float) -> Matrix:
+    pose = np.eye(4)
+    pose[index] = value
+    return pose
+
+
+NO_POSES: dict[str, Matrix | None] = {
+    "mirrored": np.diag([-1.0, 1.0, 1.0, 1.0]),
+    "scaled": np.diag([2.0, 2.0, 2.0, 1.0]),
+    "sheared": pose_with((0, 1), 0.3),
+    "singular": pose_with((2, 2), 0.0),
+    "zeros": np.zeros((4, 4)),
+    "not a number": pose_with((0, 0), np.nan),
+    "infinite translation": pose_with((1, 3), np.inf),
+    "column-major": pose_with((3, 0), 1.5),
+    "3 x 4": np.eye(4)[:3],
+    "missing": None,
+}
+
+
+@pytest.mark.parametrize("name", NO_POSES)
+def test_what_is_no_pose_is_refused(open_pipeline: Open, name: str) -> None:
+    pipeline = open_pipeline()
+    before = lit(pipeline)
+    good = frame_of(good_depth(np.eye(4)))
+    with pytest.raises(ValueError, match=r"world_from_camera|pose") as caught:
+        pipeline.process(RgbdFrame(9, 0.3, good.color, good.depth, NO_POSES[name]))
+    assert "\n" not in str(caught.value)
+    again = open_pipeline()
+    lit(again)
+    for left, right in zip([lit(pipeline)], [lit(again)], strict=True):  # as if the frame had never come
+        np.testing.assert_array_equal(left.color, right.color)
+        assert left.light == right.light
+    assert before.color.shape == good.color.shape
+
+
+def test_pictures_of_another_size_are_refused(open_pipeline: Open) -> None:
+    pipeline = open_pipeline()
+    good = frame_of(good_depth(np.eye(4)))
+    for color, depth in ((good.color[:-1], good.depth), (good.color, good.depth[:, :-1]), (good.color.T, good.depth.T)):
+        with pytest.raises(ValueError, match=r"the camera has 96x72"):
+            pipeline.process(RgbdFrame(0, 0.0, color, depth, np.eye(4)))
+    assert_sound(lit(pipeline))
+
+
+@pytest.mark.parametrize("name", ["empty", "saturated", "one pixel"])
+def test_a_live_session_waits_for_depth_to_place_its_volume(open_pipeline: Open, name: str) -> None:
+    pipeline = open_pipeline(Wishes(voxel_m=0.04))
+    with pytest.raises(ValueError, match="has no depth to place a volume around"):
+        pipeline.process(frame_of(BAD_DEPTH[name]))
+    assert_sound(lit(pipeline))
+
+
+def test_a_black_and_a_white_picture(open_pipeline: Open) -> None:
+    """Good depth, no usable radiance: no light, and no light of what is clipped."""
+    depth = good_depth(np.eye(4))
+    for code in (0, 255):
+        pipeline = open_pipeline()
+        color = np.full((*SIZE, 3), code, np.uint8)
+        for index in range(3):
+            result = pipeline.process(RgbdFrame(index, index / 30, color, depth, np.eye(4)))
+        assert_sound(result)
+        assert not result.light.valid
+        assert any("the light is unknown" in note for note in result.notes)
+        assert (result.color == code).mean() > 0.99  # all but the object, which nothing lights

@@ -3,6 +3,7 @@
 //
 // Equation 7.1 adds the difference of two shadings R and R' to the picture scaled by the picture itself. For a Lambertian
 // surface the picture is albedo times R, so the factor that leaves the albedo alone is R' / R; it needs no tone mapper.
+#include "direction_sets.clh"
 #include "sh.clh"
 #include "virtual_objects.clh"
 #include "visibility.clh"
@@ -24,7 +25,7 @@ static inline float ball_cosine(const float4 ball, const float3 point, float3 *t
 
 // Real surface: the ratio R' / R of shading with virtual objects to shading without, at the samples of the transfer.
 // transfer [rows][cols][COEFFICIENTS], free_mask [rows][cols][MASK_WORDS]: see radiance_transfer.cl.
-// ball: center and radius of a ball around all objects. light [COEFFICIENTS] rgb; directions [4][count] (unit, sr), arriving [4][count]: radiance of the light from each of them.
+// ball: center and radius of a ball around all objects. light [COEFFICIENTS] rgb; directions [16][count] (unit, sr), arriving [16][count]: radiance of the light from each of them.
 // -> ratio [rows][cols] (rgb, w = 1), w = 0 where there is no surface.
 kernel void shadow_real(const int cols, const int rows, const int stride, const int width,
                         global const float4 *positions, global const float4 *normals, global const float *transfer,
@@ -48,7 +49,7 @@ kernel void shadow_real(const int cols, const int rows, const int stride, const 
     float3 towards;
     const float least_cosine = ball_cosine(ball, origin, &towards) - 1e-4f;
     float3 taken = (float3)(0.0f);
-    const int set = ((row & 1) * 2 + (col & 1)) * count;
+    const int set = direction_set(row, col) * count;
     for (int j = 0; j < count; j++) {
         const float4 direction = directions[set + j];
         if (dot(direction.xyz, towards) < least_cosine) continue;
@@ -80,7 +81,7 @@ kernel void shadow_virtual(const int cols, const int rows, const int stride, con
     float4 taken = (float4)(0.0f);
     if (position.w > 0.0f) {
         taken.w = 1.0f;
-        const int set = ((row & 1) * 2 + (col & 1)) * count;
+        const int set = direction_set(row, col) * count;
         for (int j = 0; j < count; j++) {
             const float4 direction = directions[set + j];
             const float cosine = dot(normal, direction.xyz);

@@ -41,34 +41,37 @@ static inline int same_surface(const float4 position, const float4 normal, const
     return dot(normal.xyz, other_normal.xyz) > 0.9f && fabs(dot(offset, normal.xyz)) < voxel_m + 0.1f * length(offset);
 }
 
-// Each of 2 x 2 neighbours was traced along another direction set: their mean has a quarter of the quadrature's error, which
-// least squares would take for signal (errors in variables). Mean over those of (col .. col + 1, row .. row + 1) on the
-// sample's surface; weight: their share.
-// transfer, observed [rows][cols] -> pooled_transfer [rows][cols][COEFFICIENTS], pooled [rows][cols] (rgb, w).
-kernel void pool_samples(const int cols, const int rows, const int stride, const int width,
-                         global const float4 *positions, global const float4 *normals, global const float *transfer,
-                         global const float4 *observed, const float voxel_m,
+// Each of 4 x 4 neighbours was traced along another direction set: their mean has a small part of one's quadrature error,
+// which least squares would take for signal (errors in variables). One item a pool, around every second sample: the mean
+// over those of 4 x 4 samples (from one before to two after) on that sample's surface; weight: their share.
+// transfer, observed [rows][cols] -> pooled_transfer [pool_rows][pool_cols][COEFFICIENTS], pooled [pool_rows][pool_cols] (rgb, w).
+kernel void pool_samples(const int pool_cols, const int pool_rows, const int cols, const int rows, const int stride,
+                         const int width, global const float4 *positions, global const float4 *normals,
+                         global const float *transfer, global const float4 *observed, const float voxel_m,
                          global float *pooled_transfer, global float4 *pooled) {
-    const int col = get_global_id(0);
-    const int row = get_global_id(1);
-    if (col >= cols || row >= rows) return;
+    const int pool_col = get_global_id(0);
+    const int pool_row = get_global_id(1);
+    if (pool_col >= pool_cols || pool_row >= pool_rows) return;
+    const int col = 2 * pool_col, row = 2 * pool_row;
     const int first = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
     float sum[COEFFICIENTS];
     for (int i = 0; i < COEFFICIENTS; i++) sum[i] = 0.0f;
     float4 seen = (float4)(0.0f);
     if (observed[row * cols + col].w > 0.0f) {
-        for (int k = 0; k < 4; k++) {
-            const int c = col + (k & 1), r = row + (k >> 1);
-            const int pixel = first + ((k & 1) + (k >> 1) * width) * stride;
-            if (c >= cols || r >= rows || observed[r * cols + c].w <= 0.0f) continue;
-            if (!same_surface(positions[first], normals[first], positions[pixel], normals[pixel], voxel_m)) continue;
-            for (int i = 0; i < COEFFICIENTS; i++) sum[i] += transfer[(r * cols + c) * COEFFICIENTS + i];
-            seen += observed[r * cols + c];
+        for (int r = max(row - 1, 0); r <= min(row + 2, rows - 1); r++) {
+            for (int c = max(col - 1, 0); c <= min(col + 2, cols - 1); c++) {
+                const int pixel = first + ((r - row) * width + c - col) * stride;
+                if (observed[r * cols + c].w <= 0.0f) continue;
+                if (!same_surface(positions[first], normals[first], positions[pixel], normals[pixel], voxel_m)) continue;
+                for (int i = 0; i < COEFFICIENTS; i++) sum[i] += transfer[(r * cols + c) * COEFFICIENTS + i];
+                seen += observed[r * cols + c];
+            }
         }
     }
     const float count = seen.w > 0.0f ? seen.w : 1.0f;
-    for (int i = 0; i < COEFFICIENTS; i++) pooled_transfer[(row * cols + col) * COEFFICIENTS + i] = sum[i] / count;
-    pooled[row * cols + col] = (float4)(seen.xyz / count, 0.25f * seen.w);
+    const int pool = pool_row * pool_cols + pool_col;
+    for (int i = 0; i < COEFFICIENTS; i++) pooled_transfer[pool * COEFFICIENTS + i] = sum[i] / count;
+    pooled[pool] = (float4)(seen.xyz / count, seen.w / 16.0f);
 }
 
 // One work-group of 64 items a tile of 8 x 8 samples. With row vectors s = (transfer, r, g, b) of a tile's samples, its

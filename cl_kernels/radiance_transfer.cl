@@ -1,5 +1,6 @@
 // Diffuse shadowed radiance transfer by ray tracing the volume (thesis 5.1.2, eq. 5.2), projected to spherical harmonics.
 // Provides transfer_radiance.
+#include "direction_sets.clh"
 #include "sh.clh"
 #include "visibility.clh"
 
@@ -40,8 +41,8 @@ static float4 smooth_normal(const int width, const int height, global const floa
 // sampled and taken away, so an open surface shades without quadrature error.
 //
 // One item a sample; samples lie every `stride` pixels from stride / 2. positions, normals [h][w]: the geometry buffer.
-// directions [4][count]: unit directions and their solid angle (w, sr), basis [4][count][COEFFICIENTS]: Y there; the set
-// changes over 2 x 2 samples. radius: of the window that a sample's normal is the mean of, pixels.
+// directions [16][count]: unit directions and their solid angle (w, sr), basis [16][count][COEFFICIENTS]: Y there; see
+// direction_sets.clh. radius: of the window that a sample's normal is the mean of, pixels.
 // -> transfer [rows][cols][COEFFICIENTS], openness [rows][cols]: free share of the cosine-weighted
 // sky (-1 where there is no surface), flatness [rows][cols]: share of the window on the sample's own surface, free_mask [rows][cols][MASK_WORDS]: bit j = direction j lies above the surface and is free.
 kernel void transfer_radiance(const int cols, const int rows, const int stride, const int width, const int height, const int radius,
@@ -74,7 +75,7 @@ kernel void transfer_radiance(const int cols, const int rows, const int stride, 
         sh_basis(normal.xyz, t);
         for (int l = 0; l < BANDS; l++)
             for (int i = l * l; i < (l + 1) * (l + 1); i++) t[i] *= lambert_band(l);
-        const int set = ((row & 1) * 2 + (col & 1)) * count;
+        const int set = direction_set(row, col) * count;
         for (int j = 0; j < count; j++) {
             const float4 direction = directions[set + j];
             const float cosine = dot(normal.xyz, direction.xyz);

@@ -45,7 +45,7 @@ def fill(engine: Engine, volume: Volume, tsdf: Floats, weight: Floats) -> None:
     volume._allocated = np.arange(volume._slots.size, dtype=np.int32)
     volume._upload_table()
     pairs = np.stack([in_bricks(tsdf), in_bricks(weight)], axis=-1).astype(np.float32)
-    volume.voxels.set(np.ascontiguousarray(pairs).view(cl_types.float2)[..., 0])
+    volume.voxels.set(np.ascontiguousarray(pairs).view(cl_types.float2)[..., 0], engine.queue)
     volume.summarize()
 
 

@@ -105,11 +105,14 @@ def sum_tiles(
         LEAST_FLATNESS,
         observed,
     )
-    pooled_transfer = space.array("pooled_transfer", (rows, cols, n), np.float32)
-    pooled = space.array("pooled", (rows, cols), cl_types.float4)
+    pool_rows, pool_cols = -(-rows // 2), -(-cols // 2)
+    pooled_transfer = space.array("pooled_transfer", (pool_rows, pool_cols, n), np.float32)
+    pooled = space.array("pooled", (pool_rows, pool_cols), cl_types.float4)
     engine.launch(
         engine.kernel("light_estimation.cl", "pool_samples", **defines),
-        (cols, rows),
+        (pool_cols, pool_rows),
+        pool_cols,
+        pool_rows,
         cols,
         rows,
         transfer.stride,
@@ -122,14 +125,14 @@ def sum_tiles(
         pooled_transfer,
         pooled,
     )
-    tile_cols, tile_rows = -(-cols // _TILE), -(-rows // _TILE)
+    tile_cols, tile_rows = -(-pool_cols // _TILE), -(-pool_rows // _TILE)
     entries = (n + 3) * (n + 4) // 2
     partial = space.array("tile_sums", (tile_cols * tile_rows, entries + 2), np.float32)
     engine.launch(
         engine.kernel("light_estimation.cl", "accumulate_tiles", **defines),
         (tile_cols * tile_rows * _TILE * _TILE,),
-        cols,
-        rows,
+        pool_cols,
+        pool_rows,
         tile_cols,
         pooled_transfer,
         pooled,

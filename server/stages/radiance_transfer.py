@@ -19,9 +19,9 @@ from server.opencl.engine import Engine
 from server.stages.raycast import Surface
 from server.stages.volume import Volume
 
-SETS = 4
-"""Turned copies of the direction set, interleaved over 2 x 2 samples, so that neighbours fill each other's gaps."""
-_SEED = 20150101
+SETS = 16
+"""Direction sets, interleaved over 4 x 4 samples, so that neighbours fill each other's gaps."""
+_SEED = 1
 _WINDOW = 1 / 160  # half the window that a sample's normal is the mean of, in picture widths
 
 
@@ -42,10 +42,14 @@ class Directions:
 
 @cache
 def direction_sets(count: int, bands: int) -> Directions:
-    """SETS turned copies of `count` spherical Fibonacci directions of equal solid angle."""
-    generator = np.random.default_rng(_SEED)
-    base = spherical_fibonacci(count)
-    turned = np.stack([base @ np.linalg.qr(generator.normal(size=(3, 3)))[0] for _ in range(SETS)])
+    """SETS sets of `count` directions of equal solid angle: one spherical Fibonacci lattice, dealt to the sets in turn.
+
+    Each set alone covers the sphere, and all together are the even, fine lattice; of the ways tried (turned copies,
+    shifted copies, blocks) it left the least error in the mean over the sets. Turned off the axes, along which rooms lie.
+    """
+    turn = np.linalg.qr(np.random.default_rng(_SEED).normal(size=(3, 3)))[0]
+    lattice = spherical_fibonacci(SETS * count) @ turn
+    turned = np.stack([lattice[k::SETS] for k in range(SETS)])
     weighted = np.concatenate([turned, np.full((SETS, count, 1), 4 * np.pi / count)], -1)
     return Directions(weighted.astype(np.float32), sh_basis(turned, bands).astype(np.float32))
 

@@ -125,8 +125,8 @@ def test_bad_depth_from_the_start(open_pipeline: Open, name: str) -> None:
     for index in range(3):
         result = pipeline.process(frame_of(BAD_DEPTH[name], index=index))
         assert_sound(result)
-    if name in ("empty", "saturated", "beyond 10 m"):
-        assert any("depth" in note for note in result.notes)
+    if name == "empty":
+        assert "the depth picture is empty: is the sensor covered?" in result.notes
     if name in ("empty", "saturated", "beyond 10 m"):
         assert any("the light is unknown" in note for note in result.notes)
         assert not result.light.valid
@@ -139,7 +139,7 @@ def test_bad_depth_from_the_start(open_pipeline: Open, name: str) -> None:
 
 @pytest.mark.parametrize("name", BAD_DEPTH)
 def test_bad_depth_in_between(open_pipeline: Open, name: str) -> None:
-    """A light that was found stays finite, and the reconstruction is not lost: it stands in for depth that is missing."""
+    """A light that was found stays finite; the reconstruction is not lost, and stands in for depth that is missing."""
     view = look_at((0.2, -0.2, 0.0), (0.1, 0.3, 1.2))
     results = []
     for depth in (BAD_DEPTH[name], good_depth(view)):
@@ -153,6 +153,14 @@ def test_bad_depth_in_between(open_pipeline: Open, name: str) -> None:
         bad, good = (np.array(result.light.dominant_direction) for result in results)
         assert np.degrees(np.arccos(np.clip(bad @ good, -1, 1))) < 10
         assert (np.abs(results[0].color.astype(int) - results[1].color) > 8).mean() < 0.02
+
+
+@pytest.mark.parametrize("name", ["empty", "saturated", "beyond 10 m"])
+def test_depth_without_a_usable_value_is_named(open_pipeline: Open, name: str) -> None:
+    """Also once a light has been found, when nothing else says that something is wrong."""
+    pipeline = open_pipeline()
+    lit(pipeline)
+    assert any("depth" in note for note in pipeline.process(frame_of(BAD_DEPTH[name])).notes)
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1e-4, 10.0, 1e6])

@@ -41,12 +41,12 @@ class Twin:
         self.tsdf, self.weight = twin(camera, pose, depth, *sizes, self.tsdf, self.weight)
 
 
-def compare(engine: Engine, expected: Twin, steepest: float = 1.0) -> None:
+def compare(engine: Engine, expected: Twin) -> None:
     """Weights are counts, and exact; a distance rounds with the depth it is taken from, and is told in truncations."""
     volume = expected.volume
     tsdf, weight, allocated = dense_voxels(engine, volume)
     assert (expected.weight[allocated] > 0).sum() > 1000
-    atol = relative_tolerance(engine.device) * 4.0 / volume.truncation_m * steepest
+    atol = relative_tolerance(engine.device) * 4.0 / volume.truncation_m
     same = (weight == expected.weight) & (np.abs(tsdf - expected.tsdf) < atol)
     assert (~same)[allocated].mean() < FLIPS
 

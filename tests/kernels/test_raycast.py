@@ -1,4 +1,4 @@
-"""The predicted surface against its float64 twin, and against scenes whose depth and normals are known in closed form."""
+"""The predicted surface against its float64 twin, and against scenes whose depth is known in closed form."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ def test_a_ball_seen_all_around_keeps_its_size(engine: Engine) -> None:
 @pytest.mark.parametrize("flipped", [False, True])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_looking_exactly_along_an_axis(engine: Engine, axis: int, flipped: bool) -> None:
-    """Rays with zeros in their direction, from a camera on voxel and brick boundaries, inside and outside the volume."""
+    """Rays with zeros in their direction, from a camera on bricks' boundaries, inside and outside the volume."""
     camera = replace(CAMERA, width=96, height=72, cx=48.0, cy=36.0)
     view = np.eye(4)
     view[:3, :3] = np.roll(np.eye(3), axis, axis=0)

@@ -146,7 +146,7 @@ def test_volume_covers_its_bounds(engine: Engine) -> None:
     ],
 )
 def test_impossible_volumes_are_refused(engine: Engine, bounds: tuple[float, ...], voxel_m: float) -> None:
-    with pytest.raises(VolumeSizeError, match="a volume of .* m at .* mm a voxel"):
+    with pytest.raises(VolumeSizeError, match=r"a volume of .* m at .* mm a voxel"):
         Volume(engine, bounds, voxel_m)  # type: ignore[arg-type]
 
 

@@ -1,6 +1,6 @@
 """E1 (thesis 5.3.1): the reconstructed scene shaded with a known light goes through the pipeline as its camera picture.
 
-The shading comes from ten times as many directions at every pixel as the estimate uses at every fourth, so what is
+The shading comes from five times as many directions at every pixel as the estimate uses at every fourth, so what is
 tested is the sampling, the 8-bit picture and the estimator; the geometry is the same on both sides, as the thesis has it.
 """
 
@@ -29,51 +29,66 @@ from server.stages.radiance_transfer import direction_sets, transfer_radiance
 from server.stages.raycast import raycast
 from server.stages.volume import Volume
 
-FRAME = 12
-REFERENCE_RAYS = 810
+FRAMES = range(4, 28, 4)
+REFERENCE_RAYS = 405
 BOUND_DEG = 3.0
 
 
-class Scene:
-    """One view of the synthetic table, reconstructed, with its transfer at every pixel."""
+class Shot:
+    """One frame of the synthetic table and the transfer of what is reconstructed when it has been fused."""
 
-    def __init__(self, device: Device) -> None:
-        source = open_source("synthetic:table?frames=30&size=320x240")
-        self.frame: RgbdFrame = source[FRAME]
-        self.camera: CameraModel = source.camera
-        bounds = default_volume(source, range(FRAME, FRAME + 1))
-        self.wishes = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), preset="reg4")
-        engine = Engine(device)
-        volume = Volume(engine, bounds, default_voxel(bounds))
-        assert self.frame.world_from_camera is not None
-        pose = volume.volume_from_world() @ self.frame.world_from_camera
-        depth_m = measure(engine, self.camera, self.frame).depth_m
-        volume.allocate(self.camera, pose, depth_m)
-        integrate(engine, volume, self.camera, pose, depth_m)
-        surface = raycast(engine, self.camera, pose, volume)
-        rays = direction_sets(REFERENCE_RAYS, 4)
-        transfer = transfer_radiance(engine, self.camera, volume, surface, 1, rays, 1000.0)
-        self.transfer: NDArray[np.float64] = engine.download(transfer.coefficients).astype(np.float64)
-        self.covered: NDArray[np.bool_] = engine.download(transfer.openness) >= 0
-        engine.close()
+    def __init__(self, frame: RgbdFrame, transfer: NDArray[np.float64], covered: NDArray[np.bool_]) -> None:
+        self.frame, self.transfer, self.covered = frame, transfer, covered
 
-    def shaded(self, light: NDArray[np.float64]) -> RgbdFrame:
+    def brightest(self, light: NDArray[np.float64]) -> float:
+        return float((self.transfer @ light)[self.covered].max())
+
+    def under(self, light: NDArray[np.float64]) -> RgbdFrame:
         """The frame with a picture of the scene under `light` [16, 3], as 8-bit sRGB; grey where there is no surface."""
         radiance = np.where(self.covered[..., None], ASSUMED_ALBEDO * (self.transfer @ light), 0.5)
         return replace(self.frame, color=srgb_codes(radiance))
 
 
+class Path:
+    """A camera path over the synthetic table, reconstructed as the pipeline does it."""
+
+    def __init__(self, device: Device) -> None:
+        source = open_source("synthetic:table?frames=30")
+        self.camera: CameraModel = source.camera
+        bounds = default_volume(source, range(30))
+        self.wishes = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), preset="reg4")
+        engine = Engine(device)
+        volume = Volume(engine, bounds, default_voxel(bounds))
+        self.shots = [self._shot(engine, volume, source[index]) for index in FRAMES]
+        engine.close()
+
+    def _shot(self, engine: Engine, volume: Volume, frame: RgbdFrame) -> Shot:
+        assert frame.world_from_camera is not None
+        pose = volume.volume_from_world() @ frame.world_from_camera
+        depth_m = measure(engine, self.camera, frame).depth_m
+        volume.allocate(self.camera, pose, depth_m)
+        integrate(engine, volume, self.camera, pose, depth_m)
+        surface = raycast(engine, self.camera, pose, volume)
+        rays = direction_sets(REFERENCE_RAYS, 4)
+        transfer = transfer_radiance(engine, self.camera, volume, surface, 1, rays, 1000.0)
+        covered = engine.download(transfer.openness) >= 0
+        return Shot(frame, engine.download(transfer.coefficients).astype(np.float64), covered)
+
+
 @pytest.fixture(scope="module")
-def scene(device: Device) -> Scene:
-    return Scene(device)
+def path(device: Device) -> Path:
+    return Path(device)
 
 
 @pytest.mark.parametrize("number", range(8))
-def test_ring_of_eight_is_recovered_at_reg4(device: Device, scene: Scene, number: int) -> None:
+def test_ring_of_eight_is_recovered_at_reg4(device: Device, path: Path, number: int) -> None:
     light = ring_light(number).sh
-    light = light * (0.8 / (ASSUMED_ALBEDO * (scene.transfer @ light)[scene.covered].max()))  # nothing clips
-    pipeline = Pipeline(device, scene.camera, scene.wishes)
-    estimated = np.array(pipeline.process(scene.shaded(light)).light.sh)
+    light = light * (0.8 / (ASSUMED_ALBEDO * max(shot.brightest(light) for shot in path.shots)))  # nothing clips
+    pipeline = Pipeline(device, path.camera, path.wishes)
+    for shot in path.shots:
+        estimated = np.array(pipeline.process(shot.under(light)).light.sh)
     pipeline.close()
     cosine = np.clip(dominant_direction(estimated) @ dominant_direction(light), -1, 1)
-    assert np.degrees(np.arccos(cosine)) <= BOUND_DEG
+    error_deg = float(np.degrees(np.arccos(cosine)))
+    print(f"light {number}: {error_deg:.2f} degrees")  # noqa: T201
+    assert error_deg <= BOUND_DEG

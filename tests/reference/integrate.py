@@ -1,4 +1,4 @@
-"""Float64 twin of cl_kernels/integrate.cl: TSDF fusion (Newcombe et al. 2011, eq. 6-13; thesis 4.2.1), on a dense grid."""
+"""Float64 twin of cl_kernels/integrate.cl, dense: TSDF fusion (Newcombe et al. 2011, eq. 6-13; thesis 4.2.1)."""
 
 from __future__ import annotations
 

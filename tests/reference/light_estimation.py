@@ -40,27 +40,29 @@ def gather_samples(
 def pool_samples(
     positions: Floats, normals: Floats, transfer: Floats, observed: Floats, voxel_m: float
 ) -> tuple[Floats, Floats]:
-    """Means of transfer [rows, cols, n] and observed [rows, cols, 4] over 2 x 2 samples on one surface.
+    """Means of transfer [rows, cols, n] and observed [rows, cols, 4] over 4 x 4 samples on one surface, around every
+    second sample: [ceil(rows / 2), ceil(cols / 2), ...].
 
     positions, normals [rows, cols, 3] at the samples. The weight of a mean is the share of samples in it.
     """
-    rows, cols = observed.shape[:2]
-    pooled_transfer, pooled = np.zeros_like(transfer), np.zeros_like(observed)
-    for row in range(rows):
-        for col in range(cols):
+    rows, cols, n = transfer.shape
+    pooled_transfer = np.zeros((-(-rows // 2), -(-cols // 2), n))
+    pooled = np.zeros((*pooled_transfer.shape[:2], 4))
+    for row in range(0, rows, 2):
+        for col in range(0, cols, 2):
             if observed[row, col, 3] <= 0:
                 continue
             members = []
-            for r in range(row, min(row + 2, rows)):
-                for c in range(col, min(col + 2, cols)):
+            for r in range(max(row - 1, 0), min(row + 3, rows)):
+                for c in range(max(col - 1, 0), min(col + 3, cols)):
                     offset = positions[r, c] - positions[row, col]
                     near = abs(offset @ normals[row, col]) < voxel_m + 0.1 * np.linalg.norm(offset)
                     if observed[r, c, 3] > 0 and near and normals[r, c] @ normals[row, col] > 0.9:
                         members.append((r, c))
             if members:
                 index = tuple(np.array(members).T)
-                pooled_transfer[row, col] = transfer[index].mean(0)
-                pooled[row, col] = [*observed[index][:, :3].mean(0), len(members) / 4]
+                pooled_transfer[row // 2, col // 2] = transfer[index].mean(0)
+                pooled[row // 2, col // 2] = [*observed[index][:, :3].mean(0), len(members) / 16]
     return pooled_transfer, pooled
 
 

@@ -32,7 +32,7 @@ def unproject(camera: CameraModel, depth_m: Floats) -> Floats:
 def neighbour(camera: CameraModel, points: Floats, dx: int, dy: int) -> Floats:
     """[h, w, 3] the point `dx`, `dy` pixels on where it is on the same surface, else the pixel's own.
 
-    The same surface: depths less apart than 2 % and 5 mm, or than REACH_PX pixels of a surface that is seen at a slope of 3.
+    The same surface: depths less apart than 2 % and 5 mm, or than REACH_PX pixels of a surface seen at a slope of 3.
     """
     height, width = points.shape[:2]
     v, u = np.mgrid[:height, :width]
@@ -45,7 +45,7 @@ def neighbour(camera: CameraModel, points: Floats, dx: int, dy: int) -> Floats:
 
 
 def measured_normals(camera: CameraModel, depth_m: Floats) -> Floats:
-    """[h, w, 3] unit normals in camera space towards the camera, by differences two pixels to either side; 0 if none."""
+    """[h, w, 3] unit normals in camera space, to the camera, by differences two pixels to either side; 0 if none."""
     points = unproject(camera, depth_m)
     along_x = neighbour(camera, points, REACH_PX, 0) - neighbour(camera, points, -REACH_PX, 0)
     along_y = neighbour(camera, points, 0, REACH_PX) - neighbour(camera, points, 0, -REACH_PX)

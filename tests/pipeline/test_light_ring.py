@@ -1,0 +1,43 @@
+"""A ring of eight known lights around a synthetic scene: the whole spine recovers each of them (thesis 5.3.1)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from client.laptop.synthetic.lights import RING_SIZE
+from client.laptop.synthetic.source import SyntheticSource, open_synthetic
+from client.laptop.volume import default_volume, default_voxel
+from protocol.messages import Light, Wishes
+from server.opencl.device import Device
+from server.pipeline import Pipeline
+from tests.lights import degrees_between
+
+FRAMES = range(0, 90, 18)
+"""Half of the path: 70 degrees around the table."""
+GREATEST_ERROR_DEG = 3.0
+
+
+def source_of(light: int) -> SyntheticSource:
+    return open_synthetic(f"synthetic:table?light={light}&frames=90&size=320x240")
+
+
+def estimates(device: Device, source: SyntheticSource) -> list[Light]:
+    """The light after each of FRAMES, with the volume that `run` would choose."""
+    volume_m = default_volume(source, range(len(source)))
+    wishes = Wishes(preset="reg4", volume_m=volume_m, voxel_m=default_voxel(volume_m), up=source.up)
+    pipeline = Pipeline(device, source.camera, wishes)
+    found = [pipeline.process(source[index]).light for index in FRAMES]
+    pipeline.close()
+    return found
+
+
+@pytest.mark.parametrize("light", range(RING_SIZE))
+def test_dominant_direction(device: Device, light: int) -> None:
+    source = source_of(light)
+    errors = []
+    for index, found in zip(FRAMES, estimates(device, source), strict=True):
+        errors.append(degrees_between(found.dominant_direction, source.truth(index).light_direction))
+        assert np.isfinite(found.sh).all()
+        assert found.dominant_intensity > 0
+    assert errors[-1] < GREATEST_ERROR_DEG, np.round(errors, 1)

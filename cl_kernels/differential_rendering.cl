@@ -25,7 +25,7 @@ static inline float ball_cosine(const float4 ball, const float3 point, float3 *t
 
 // Real surface: the ratio R' / R of shading with virtual objects to shading without, at the samples of the transfer.
 // transfer [rows][cols][COEFFICIENTS], free_mask [rows][cols][MASK_WORDS]: see radiance_transfer.cl.
-// ball: center and radius of a ball around all objects. light [COEFFICIENTS] rgb; directions [16][count] (unit, sr), arriving [16][count]: radiance of the light from each of them.
+// ball: center and radius of a ball around all objects. light [COEFFICIENTS] rgb; directions [64][count] (unit, sr), arriving [64][count]: radiance of the light from each of them.
 // -> ratio [rows][cols] (rgb, w = 1), w = 0 where there is no surface.
 kernel void shadow_real(const int cols, const int rows, const int stride, const int width,
                         global const float4 *positions, global const float4 *normals, global const float *transfer,

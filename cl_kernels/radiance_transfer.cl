@@ -41,7 +41,7 @@ static float4 smooth_normal(const int width, const int height, global const floa
 // sampled and taken away, so an open surface shades without quadrature error.
 //
 // One item a sample; samples lie every `stride` pixels from stride / 2. positions, normals [h][w]: the geometry buffer.
-// directions [16][count]: unit directions and their solid angle (w, sr), basis [16][count][COEFFICIENTS]: Y there; see
+// directions [64][count]: unit directions and their solid angle (w, sr), basis [64][count][COEFFICIENTS]: Y there; see
 // direction_sets.clh. radius: of the window that a sample's normal is the mean of, pixels.
 // -> transfer [rows][cols][COEFFICIENTS], openness [rows][cols]: free share of the cosine-weighted
 // sky (-1 where there is no surface), flatness [rows][cols]: share of the window on the sample's own surface, free_mask [rows][cols][MASK_WORDS]: bit j = direction j lies above the surface and is free.

@@ -25,7 +25,7 @@ from server.stages.composite import shown_picture
 from server.stages.differential_rendering import upload_light
 from server.stages.integrate import integrate
 from server.stages.light_estimation import LightEstimate, LightEstimator, sum_tiles
-from server.stages.measure import measure
+from server.stages.measure import GREATEST_DEPTH_M, measure
 from server.stages.merge import merge_depth
 from server.stages.radiance_transfer import direction_sets, transfer_radiance
 from server.stages.raycast import raycast
@@ -185,8 +185,9 @@ class Pipeline:
 
     def _notes(self, frame: RgbdFrame, volume: Volume, estimate: LightEstimate) -> tuple[str, ...]:
         notes = []
-        if not frame.depth.any():
-            notes.append("the depth picture is empty: is the sensor covered?")
+        depth_m = frame.depth * self._camera.depth_scale_m
+        if not ((frame.depth > 0) & (frame.depth != 65535) & (depth_m <= GREATEST_DEPTH_M)).any():
+            notes.append("the depth picture has no usable value: is the sensor covered?")
         if volume.is_full:
             notes.append("the volume's memory is full, new surface is not fused: give a larger --voxel")
         if estimate.std is None:

@@ -245,4 +245,4 @@ def _progress(console: Console) -> Progress:
         TextColumn("{task.fields[note]}"),
         TimeElapsedColumn(),
     )
-    return Progress(*columns, console=console)
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)

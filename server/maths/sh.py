@@ -51,11 +51,15 @@ def lambert_transfer(normals: NDArray[np.float64], bands: int) -> NDArray[np.flo
     return transfer
 
 
-def spherical_fibonacci(count: int) -> NDArray[np.float64]:
-    """`count` unit directions [count, 3] of nearly equal solid angle 4 pi / count."""
+GOLDEN_TURN = (3 - sqrt(5)) / 2
+"""Share of a full turn by which successive points of a spherical Fibonacci lattice advance."""
+
+
+def spherical_fibonacci(count: int, advance: float = GOLDEN_TURN) -> NDArray[np.float64]:
+    """`count` unit directions [count, 3] of nearly equal solid angle 4 pi / count; `advance` in full turns."""
     index = np.arange(count) + 0.5
     z = 1 - 2 * index / count
-    azimuth = index * (pi * (3 - sqrt(5)))
+    azimuth = index * (2 * pi * advance)
     radius = np.sqrt(1 - z * z)
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], -1)
 

@@ -30,8 +30,13 @@ LEAST_OPENNESS = 0.05
 """Samples that see less of the sky say more about indirect light than about the sky (thesis 5.2)."""
 LEAST_FLATNESS = 0.95
 """Samples nearer to an edge have a normal and a colour that may belong to two surfaces."""
-FORGETTING = 0.6
-"""What remains of earlier frames' evidence a frame later: a new light has 78 % of the weight after 3 frames."""
+FORGETTING = 0.9
+"""What remains of earlier frames' evidence a frame later while the light is steady: a memory of ten frames (5.4)."""
+CHANGED_FORGETTING = 0.3
+"""The same where the frame contradicts the light so far: a new light has 97 % of the weight after 3 frames."""
+CHANGE = 3.0
+"""The light has changed if the frame's misfit under it is this many times what the frame's own best fit leaves."""
+_LEAST_MISFIT = 1e-4  # of the frame's energy: below it a ratio of misfits says nothing
 THESIS_FORGETTING = 0.9
 COLOR_DEVIATION = 0.2
 """Prior size of a channel's deviation from its multiple of the luminance, relative to the luminance's."""
@@ -161,7 +166,6 @@ class LightEstimator:
         """`as_thesis`: white light by plain least squares, a memory as long as a moving average of 10 (5.4)."""
         self._bands = bands
         self._as_thesis = as_thesis
-        self._forgetting = THESIS_FORGETTING if as_thesis else FORGETTING
         self._precision = prior_precision(bands)
         self._evidence: NormalEquations | None = None
         self._weight = 0.0
@@ -171,9 +175,10 @@ class LightEstimator:
         """Fold one frame's sums in and solve. A frame that saw nothing leaves the estimate as it was."""
         frame = tiles.total()
         if frame.count >= _LEAST_SAMPLES:
-            kept = self._evidence.scaled(self._forgetting) if self._evidence else frame.scaled(0.0)
+            forgetting = self._forgetting_for(frame)
+            kept = self._evidence.scaled(forgetting) if self._evidence else frame.scaled(0.0)
             self._evidence = kept + frame
-            self._weight = self._forgetting * self._weight + 1.0
+            self._weight = forgetting * self._weight + 1.0
             for _ in range(_DEPENDENCE_STEPS):
                 luminance = self._solve_luminance(self._evidence)
                 ridge = self._dependence * luminance.ratio * np.diag(self._precision)
@@ -192,6 +197,18 @@ class LightEstimator:
         else:
             mean, std = self._solve_color(self._evidence, luminance)
         return LightEstimate(mean / ASSUMED_ALBEDO, std / ASSUMED_ALBEDO, luminance.condition, valid=bool(fixed))
+
+    def _forgetting_for(self, frame: NormalEquations) -> float:
+        """How much of the evidence so far to keep beside `frame`."""
+        if self._as_thesis:
+            return THESIS_FORGETTING
+        if self._evidence is None:
+            return 0.0
+        luminance = frame.channels(0, 1)
+        misfit = float(luminance.less(self._solve_luminance(self._evidence).mean).energy[0])
+        own = solve_with_evidence(luminance.scaled(1 / self._dependence), self._precision).mean
+        least = float(luminance.less(own).energy[0]) + _LEAST_MISFIT * float(luminance.energy[0])
+        return CHANGED_FORGETTING if misfit > CHANGE * least else FORGETTING
 
     def _thinned(self, evidence: NormalEquations) -> NormalEquations:
         """Evidence of one average frame, thinned to its number of independent samples."""

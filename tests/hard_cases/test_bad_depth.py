@@ -125,8 +125,8 @@ def test_bad_depth_from_the_start(open_pipeline: Open, name: str) -> None:
     for index in range(3):
         result = pipeline.process(frame_of(BAD_DEPTH[name], index=index))
         assert_sound(result)
-    if name == "empty":
-        assert "the depth picture is empty: is the sensor covered?" in result.notes
+    if name in ("empty", "saturated", "beyond 10 m"):
+        assert "the depth picture has no usable value: is the sensor covered?" in result.notes
     if name in ("empty", "saturated", "beyond 10 m"):
         assert any("the light is unknown" in note for note in result.notes)
         assert not result.light.valid

@@ -146,14 +146,14 @@ def test_sums_are_the_twins(device: Device, engine: Engine, height: int, width: 
     transfer, pooled = twin.pool_samples(
         frame.positions[sampled], frame.normals[sampled], frame.transfer, observed, VOXEL_M
     )
-    assert len(np.unique(pooled[..., 3])) == 5
+    assert len(np.unique(pooled[..., 3])) > 5
     np.testing.assert_allclose(
-        download4(engine, space.array("pooled", (rows, cols), cl_types.float4)), pooled, rtol=tolerance
+        download4(engine, space.array("pooled", pooled.shape[:2], cl_types.float4)), pooled, rtol=tolerance
     )
-    device_transfer = engine.download(space.array("pooled_transfer", (rows, cols, n), np.float32))
+    device_transfer = engine.download(space.array("pooled_transfer", transfer.shape, np.float32))
     np.testing.assert_allclose(device_transfer, transfer, atol=tolerance)
 
-    pooled = download4(engine, space.array("pooled", (rows, cols), cl_types.float4)).astype(np.float64)
+    pooled = download4(engine, space.array("pooled", pooled.shape[:2], cl_types.float4)).astype(np.float64)
     sums = twin.accumulate_tiles(device_transfer.astype(np.float64), pooled)
     sizes = twin.accumulate_tiles(np.abs(device_transfer).astype(np.float64), pooled)  # of what is added up
     partial = engine.download(space.array("tile_sums", sums.shape, np.float32))

@@ -14,7 +14,7 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.stages.radiance_transfer import SETS, direction_sets, transfer_radiance
 from server.stages.volume import Volume
-from tests.lights import unit
+from tests.lights import random_directions, unit
 from tests.reference import radiance_transfer as twin
 from tests.reference.sh import open_transfer
 from tests.reference.visibility import trace_volume
@@ -108,7 +108,7 @@ def trace(
 def rays_of(traced: Traced, count: int, bands: int = 4) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Origins and directions [rows, cols, count, 3] of every ray, and whether it lies above the surface."""
     rows, cols = np.indices(traced.openness.shape)
-    directions = direction_sets(count, bands).directions.astype(np.float64)[(rows % 2) * 2 + cols % 2, :, :3]
+    directions = direction_sets(count, bands).directions.astype(np.float64)[twin.direction_set(rows, cols), :, :3]
     origins = np.broadcast_to(traced.origins[:, :, None], directions.shape)
     normals = traced.normals[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE, None, :3]
     return origins, directions, (directions * normals).sum(-1) > 1e-6
@@ -311,13 +311,26 @@ def test_empty_volume_is_open(engine: Engine) -> None:
     np.testing.assert_array_equal(traced.openness, 1.0)
 
 
-def test_neighbouring_samples_use_different_directions() -> None:
-    sets = direction_sets(81, 4).directions[..., :3].astype(float)
+@pytest.mark.parametrize("count", [32, 81, 324])
+def test_direction_sets(count: int) -> None:
+    """Each set is as even as a lattice of its own size, and those of 4 x 4 neighbours together as one of 16 times that."""
+    sets = direction_sets(count, 4).directions
+    assert len(sets) == SETS
+    np.testing.assert_allclose(sets[..., 3].sum(-1), 4 * np.pi, rtol=1e-6)
+    directions = sets[..., :3].astype(float)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, atol=1e-6)
+
+    def unevenness(points: Floats) -> float:
+        """Greatest angle from anywhere to the nearest point, in units of that of points on a square grid."""
+        farthest = np.arccos(np.clip((random_directions(4000, 14) @ points.T).max(1), -1, 1)).max()
+        return float(farthest / np.sqrt(2 * np.pi / len(points)))
+
+    assert max(unevenness(one) for one in directions) < 1.5
+    blocks = directions.reshape(-1, 16 * count, 3)
+    assert max(unevenness(block) for block in blocks) < 1.6
     for a in range(SETS):
         for b in range(a):
-            assert (sets[a] @ sets[b].T).max() < 1 - 1e-6
-    np.testing.assert_allclose(np.linalg.norm(sets, axis=-1), 1, atol=1e-6)
-    assert direction_sets(81, 4).directions[..., 3].sum(-1) == pytest.approx([4 * np.pi] * SETS, rel=1e-6)
+            assert np.abs(directions[a] - directions[b]).max() > 0.1
 
 
 def test_same_bits_twice(engine: Engine) -> None:

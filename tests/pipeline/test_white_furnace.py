@@ -129,7 +129,7 @@ def test_far_object_changes_no_pixel(device: Device, preset: str) -> None:
     pipeline.place_object(
         "far", shape_of(trimesh.creation.icosphere(radius=0.2)), Placement(position_m=(0.0, 5.0, -60.0))
     )
-    for frame in frames(BODIES["ball"], color):
+    for frame in frames(BODIES["wall"], color):
         result = pipeline.process(frame)
     pipeline.close()
     assert "shadow_real" in result.plan.run  # it was not spared by the plan

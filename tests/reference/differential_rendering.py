@@ -7,6 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from tests.reference.radiance_transfer import direction_set
+
 Floats = NDArray[np.float64]
 IsFree = Callable[[Floats, Floats], NDArray[np.bool_]]
 LEAST_SHADING = 0.02
@@ -43,7 +45,7 @@ def shadow_real(
             position, normal = (a[stride // 2 + row * stride, stride // 2 + col * stride] for a in (positions, normals))
             if position[3] <= 0 or normal[3] <= 0:
                 continue
-            turned = (row % 2) * 2 + col % 2
+            turned = direction_set(row, col)
             rays = directions[turned]
             origins = np.tile(position[:3] + offset_m * normal[:3], (len(rays), 1))
             taken = free[row, col] & ~passes_objects(origins, rays[:, :3])
@@ -73,7 +75,7 @@ def shadow_virtual(
             position, normal = (a[stride // 2 + row * stride, stride // 2 + col * stride] for a in (positions, normals))
             if position[3] <= 0:
                 continue
-            turned = (row % 2) * 2 + col % 2
+            turned = direction_set(row, col)
             rays = directions[turned]
             off_object, off_volume = (np.tile(position[:3] + d * normal[:3], (len(rays), 1)) for d in (cell_m, voxel_m))
             free = passes_objects(off_object, rays[:, :3]) & passes_volume(off_volume, rays[:, :3])

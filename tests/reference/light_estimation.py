@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 STATIC = 1
 TILE = 8
+POOL_BEFORE, POOL_AFTER = 1, 2
+"""A pool reaches from so many samples before its own to so many after."""
 
 
 def gather_samples(
@@ -40,7 +42,7 @@ def gather_samples(
 def pool_samples(
     positions: Floats, normals: Floats, transfer: Floats, observed: Floats, voxel_m: float
 ) -> tuple[Floats, Floats]:
-    """Means of transfer [rows, cols, n] and observed [rows, cols, 4] over 4 x 4 samples on one surface, around every
+    """Means of transfer [rows, cols, n] and observed [rows, cols, 4] over the pool of samples on one surface around every
     second sample: [ceil(rows / 2), ceil(cols / 2), ...].
 
     positions, normals [rows, cols, 3] at the samples. The weight of a mean is the share of samples in it.
@@ -53,8 +55,8 @@ def pool_samples(
             if observed[row, col, 3] <= 0:
                 continue
             members = []
-            for r in range(max(row - 1, 0), min(row + 3, rows)):
-                for c in range(max(col - 1, 0), min(col + 3, cols)):
+            for r in range(max(row - POOL_BEFORE, 0), min(row + POOL_AFTER + 1, rows)):
+                for c in range(max(col - POOL_BEFORE, 0), min(col + POOL_AFTER + 1, cols)):
                     offset = positions[r, c] - positions[row, col]
                     near = abs(offset @ normals[row, col]) < voxel_m + 0.1 * np.linalg.norm(offset)
                     if observed[r, c, 3] > 0 and near and normals[r, c] @ normals[row, col] > 0.9:
@@ -62,7 +64,10 @@ def pool_samples(
             if members:
                 index = tuple(np.array(members).T)
                 pooled_transfer[row // 2, col // 2] = transfer[index].mean(0)
-                pooled[row // 2, col // 2] = [*observed[index][:, :3].mean(0), len(members) / 16]
+                pooled[row // 2, col // 2] = [
+                    *observed[index][:, :3].mean(0),
+                    len(members) / (POOL_BEFORE + POOL_AFTER + 1) ** 2,
+                ]
     return pooled_transfer, pooled
 
 

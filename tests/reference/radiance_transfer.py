@@ -13,6 +13,11 @@ Floats = NDArray[np.float64]
 IsFree = Callable[[Floats, Floats], NDArray[np.bool_]]
 
 
+def direction_set(row: NDArray[np.int64] | int, col: NDArray[np.int64] | int) -> NDArray[np.int64] | int:
+    """Which of the 64 direction sets a sample traces: 4 x 4 blocks of 16 sets, 2 x 2 of which are of different lattices."""
+    return ((row // 4 % 2) * 2 + col // 4 % 2) * 16 + (row % 4) * 4 + col % 4
+
+
 def smooth_normal(
     positions: Floats, normals: Floats, x: int, y: int, radius: int, voxel_m: float
 ) -> tuple[Floats, float]:
@@ -58,7 +63,7 @@ def transfer_radiance(
             if positions[y, x, 3] <= 0 or normals[y, x, 3] <= 0:
                 continue
             normal, flatness[row, col] = smooth_normal(positions, normals, x, y, radius, voxel_m)
-            turned = (row % 2) * 2 + col % 2
+            turned = direction_set(row, col)
             arriving = directions[turned]
             cosine = arriving[:, :3] @ normal
             share = np.maximum(cosine, 0) * arriving[:, 3] / np.pi

@@ -55,7 +55,7 @@ kernel void shadow_real(const int cols, const int rows, const int stride, const 
         if (dot(direction.xyz, towards) < least_cosine) continue;
         if (!((free_mask[sample * MASK_WORDS + (j >> 5)] >> (j & 31)) & 1)) continue;
         if (trace_objects(objects, grid_from_volume, dims, distances, origin, direction.xyz, reach_m) > 0.0f) continue;
-        taken += dot(normal.xyz, direction.xyz) * direction.w * M_1_PI_F * arriving[set + j].xyz;
+        taken += fmax(dot(normal.xyz, direction.xyz), 0.0f) * direction.w * M_1_PI_F * arriving[set + j].xyz;
     }
     const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
     ratio[sample] = (float4)(fmax(without - taken, floor) / fmax(without, floor), 1.0f);

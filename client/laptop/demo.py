@@ -17,7 +17,9 @@ from client.progress import say
 from protocol.messages import Wishes
 from server.serve import open_service, start_in_background
 
-SOURCE = "synthetic:table?frames=30&light=7"
+SOURCE = "synthetic:table?light=7&frames="
+FRAMES, FRAMES_TO_WATCH = 30, 300
+"""The same path, walked in one second of pictures to keep, or in ten for somebody who watches."""
 VASE_STANDS_AT_M = (0.1, 0.0, 0.12)
 
 
@@ -35,14 +37,15 @@ def run_demo(out: Path, device_name: str | None, keep: bool, port: int = 0) -> N
 
     Raises ServeError, ClientError or UserError, each with one line.
     """
-    with _prepared() as demo, start_in_background(open_service(device_name), port=port) as server:
+    with _prepared(FRAMES) as demo, start_in_background(open_service(device_name), port=port) as server:
         say(f"watch it at {server.url}")
         done = _stream(demo, server.url, out)
         say(f"{done.answered} frames in {done.seconds:.1f} s, pictures in {out / 'frames'}")
         if keep:
             say(f"still streaming to {server.url}; end with Ctrl-C")
-        while keep:
-            _stream(demo, server.url, None)
+            with _prepared(FRAMES_TO_WATCH) as endless:
+                while True:
+                    _stream(endless, server.url, None)
 
 
 def _stream(demo: Demo, url: str, out: Path | None) -> StreamSummary:
@@ -50,9 +53,9 @@ def _stream(demo: Demo, url: str, out: Path | None) -> StreamSummary:
 
 
 @contextmanager
-def _prepared() -> Iterator[Demo]:
+def _prepared(frames: int) -> Iterator[Demo]:
     """The scene, its volume, and the vase as a file."""
-    source = open_source(SOURCE)
+    source = open_source(f"{SOURCE}{frames}")
     volume = default_volume(source, range(len(source)))
     wishes = Wishes(volume_m=volume, voxel_m=default_voxel(volume), up=source.up)
     with tempfile.TemporaryDirectory(prefix="probeless-") as folder:

@@ -53,7 +53,7 @@ def _supported(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Those of the constraints `held` that push, and their forces, from forces >= 0 that may not be the best."""
     while len(held):
-        wanted = np.linalg.lstsq(reach[:, held], -start, rcond=None)[0]
+        wanted = np.asarray(np.linalg.lstsq(reach[:, held], -start, rcond=None)[0], np.float64)
         pulls = wanted <= 0
         if not pulls.any():
             return held, wanted

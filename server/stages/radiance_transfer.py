@@ -48,8 +48,8 @@ def direction_sets(count: int, bands: int) -> Directions:
     in turn.
 
     A lattice advances by a sixteenth of a golden turn and of whole turns, so that every sixteenth point advances by a
-    golden turn: each set is a spherical Fibonacci lattice, and 16 together are an even, fine one. What error a lattice has left is the same
-    wherever it is used, so blocks of samples take turns with four of them.
+    golden turn: each set is a spherical Fibonacci lattice, and 16 together are an even, fine one. What error a lattice
+    has left is the same wherever it is used, so blocks of samples take turns with four of them.
     """
     generator = np.random.default_rng(_SEED)
     lattice = spherical_fibonacci(_DEALT * count, (GOLDEN_TURN + _WHOLE_TURNS) / _DEALT)

@@ -115,11 +115,14 @@ def shade_floor(
     rays: int = 81,
     reach_m: float = FAR_M,
     points: Floats | None = None,
+    roughness: float = 0.0,
 ) -> Shaded:
-    """The ratio on a floor with a box above it."""
+    """The ratio on a floor with a box above it; `roughness`: noise of each pixel's normal."""
     points = floor_points() if points is None else points
     side = round(len(points) ** 0.5)
     positions, normals = buffer(points, UP, (side, side), STRIDE)
+    noise = roughness * np.random.default_rng(3).normal(size=normals[..., :3].shape)
+    normals = np.concatenate([lights.unit(normals[..., :3] + noise), normals[..., 3:]], -1)
     camera, directions = camera_of(positions), direction_sets(rays, round(len(light) ** 0.5))
     surface = upload_surface(engine, positions[..., :3], normals[..., :3], positions[..., 3] > 0)
     volume = fill_volume(engine, scene, VOXEL_M)
@@ -232,6 +235,13 @@ def test_ratio_is_bounded_whatever_the_light(engine: Engine, light: Floats) -> N
     assert (ratio >= 0).all()
     if (light >= 0).all():
         assert (ratio[..., :3] <= 1).all()
+
+
+def test_rough_normals_do_not_brighten(engine: Engine) -> None:
+    """Free directions are those above the smoothed normal; some lie below a rough pixel's own."""
+    low = box((0.1, 0.11, 0.1), (0.86, 0.12, 0.86))
+    ratio = shade_floor(engine, low, lights.lobe((1.0, 0.3, 0.0)), roughness=0.15).ratio
+    assert (ratio[..., :3] <= 1).all()
 
 
 def test_no_surface_has_no_ratio(engine: Engine) -> None:

@@ -42,8 +42,8 @@ def gather_samples(
 def pool_samples(
     positions: Floats, normals: Floats, transfer: Floats, observed: Floats, voxel_m: float
 ) -> tuple[Floats, Floats]:
-    """Means of transfer [rows, cols, n] and observed [rows, cols, 4] over the pool of samples on one surface around every
-    second sample: [ceil(rows / 2), ceil(cols / 2), ...].
+    """Means of transfer [rows, cols, n] and observed [rows, cols, 4] over the pool of samples on one surface around
+    every second sample: [ceil(rows / 2), ceil(cols / 2), ...].
 
     positions, normals [rows, cols, 3] at the samples. The weight of a mean is the share of samples in it.
     """

@@ -14,7 +14,7 @@ IsFree = Callable[[Floats, Floats], NDArray[np.bool_]]
 
 
 def direction_set(row: NDArray[np.int64] | int, col: NDArray[np.int64] | int) -> NDArray[np.int64] | int:
-    """Which of the 64 direction sets a sample traces: 4 x 4 blocks of 16 sets, 2 x 2 of which are of different lattices."""
+    """Which of the 64 direction sets a sample traces: 16 in a block of 4 x 4 samples, others in the next block."""
     return ((row // 4 % 2) * 2 + col // 4 % 2) * 16 + (row % 4) * 4 + col % 4
 
 

@@ -99,7 +99,7 @@ class Pipeline:
                 "objects": placed,
                 "volume": volume,
                 "rays": self._rays,
-                "shown": shown_picture(camera, frame.color),
+                "shown": shown_picture(engine, camera, frame.color, measurement.radiance),
                 "measurement": measurement,
                 "surface": surface,
                 "transfer": transfer,

@@ -30,8 +30,16 @@ def _shown_codes() -> NDArray[np.uint8]:
     return srgb_codes(linear_values("linear16").astype(np.float64))
 
 
-def shown_picture(camera: CameraModel, color: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """[h, w, 3] the camera picture as sRGB codes: unchanged if it is sRGB, sRGB(value / 65535) if linear."""
+def shown_picture(
+    engine: Engine, camera: CameraModel, color: NDArray[np.uint8] | NDArray[np.uint16], radiance: cl_array.Array
+) -> NDArray[np.uint8]:
+    """[h, w, 3] the camera picture as sRGB codes: unchanged if it is sRGB, sRGB(value / 65535) if linear.
+
+    A distorted camera's picture is shown rectified, because virtual things are drawn as a pinhole camera sees them.
+    """
+    if camera.is_distorted:
+        rectified = engine.download(radiance)
+        return srgb_codes(np.stack([rectified[channel] for channel in "xyz"], axis=-1).astype(np.float64))
     if camera.color_encoding == "linear16":
         return _shown_codes()[color]
     return color.astype(np.uint8, copy=False)

@@ -41,7 +41,7 @@ THESIS_FORGETTING = 0.9
 COLOR_DEVIATION = 0.2
 """Prior size of a channel's deviation from its multiple of the luminance, relative to the luminance's."""
 _TILE = 8
-_LEAST_SAMPLES = 32
+_LEAST_POOLS = 8
 _DEPENDENCE_STEPS = 2  # the light and its samples' dependence are found in turn
 _QUANTILE_95 = 2.4477  # radius that holds 95 % of a two-dimensional normal distribution
 _VALID_RAD = np.deg2rad(15.0)
@@ -174,7 +174,7 @@ class LightEstimator:
     def update(self, tiles: TileSums) -> LightEstimate:
         """Fold one frame's sums in and solve. A frame that saw nothing leaves the estimate as it was."""
         frame = tiles.total()
-        if frame.count >= _LEAST_SAMPLES:
+        if frame.count >= _LEAST_POOLS:
             forgetting = self._forgetting_for(frame)
             kept = self._evidence.scaled(forgetting) if self._evidence else frame.scaled(0.0)
             self._evidence = kept + frame

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -172,15 +173,24 @@ def test_nothing_virtual_is_the_camera_picture(engine: Engine) -> None:
         np.testing.assert_array_equal(compose(engine, shown, radiance, WALL, nowhere, NONE_TAKEN, ratio), shown)
 
 
-def test_shown_picture_of_srgb_is_itself() -> None:
-    codes, _ = camera_picture()
-    np.testing.assert_array_equal(shown_picture(CAMERA, codes), codes)
+def test_shown_picture_of_srgb_is_itself(engine: Engine) -> None:
+    codes, radiance = camera_picture()
+    shown = shown_picture(engine, CAMERA, codes, engine.workspace.upload("radiance", float4(radiance[..., :3])))
+    np.testing.assert_array_equal(shown, codes)
 
 
-def test_shown_picture_of_linear16_is_encoded() -> None:
+def test_shown_picture_of_a_distorted_camera_is_the_rectified_radiance(engine: Engine) -> None:
+    codes, radiance = camera_picture()
+    camera = msgspec.structs.replace(CAMERA, distortion=(0.1, 0.0, 0.0, 0.0, 0.0))
+    half = engine.workspace.upload("radiance", float4(0.5 * radiance[..., :3]))
+    expected = twin.srgb_codes((0.5 * radiance[..., :3]).astype(np.float32).astype(np.float64))
+    np.testing.assert_array_equal(shown_picture(engine, camera, codes, half), expected)
+
+
+def test_shown_picture_of_linear16_is_encoded(engine: Engine) -> None:
     camera = CameraModel(width=256, height=256, fx=1, fy=1, cx=0, cy=0, color_encoding="linear16")
     levels = np.repeat(np.arange(65536, dtype=np.uint16).reshape(256, 256, 1), 3, 2)
-    np.testing.assert_array_equal(shown_picture(camera, levels), twin.srgb_codes(levels / 65535))
+    np.testing.assert_array_equal(shown_picture(engine, camera, levels, None), twin.srgb_codes(levels / 65535))
 
 
 def test_codes_invert_the_linearisation() -> None:

@@ -1,8 +1,8 @@
 """E1 (thesis 5.3.1): the reconstructed scene shaded with a known light goes through the pipeline as its camera picture.
 
 The shading comes from ten times as many directions as the estimate uses, so what is tested is the sampling of
-visibility, the 8-bit picture and the estimator; the geometry is the same on both sides, as the thesis has it. One shading
-stands for each 4 x 4 pixels, which is what REG4 looks at.
+visibility, the 8-bit picture and the estimator; the geometry is the same on both sides, as the thesis has it. One
+shading stands for each 4 x 4 pixels, which is what REG4 looks at.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ FRAMES = range(1, 30, 3)
 STRIDE = 4
 REFERENCE_RAYS = 810
 BOUNDS_DEG = {81: 5.0, 243: 3.0}
-"""By the number of rays. What is left at 81 is their quadrature: least squares takes error in the transfer for signal."""
+"""By the number of rays. What is left at 81 is their quadrature: least squares takes its error for signal."""
 
 
 class Shot:
@@ -48,7 +48,7 @@ class Shot:
         return float((self.transfer @ light)[self.covered].max())
 
     def under(self, light: NDArray[np.float64]) -> RgbdFrame:
-        """The frame with a picture of the scene under `light` [16, 3], as 8-bit sRGB; grey where there is no surface."""
+        """The frame with a picture under `light` [16, 3], as 8-bit sRGB; grey where there is no surface."""
         radiance = np.where(self.covered[..., None], ASSUMED_ALBEDO * (self.transfer @ light), 0.5)
         return replace(self.frame, color=np.kron(srgb_codes(radiance), np.ones((STRIDE, STRIDE, 1), np.uint8)))
 

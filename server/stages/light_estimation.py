@@ -12,6 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pyopencl as cl
+import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
@@ -90,15 +92,25 @@ def sum_tiles(
     voxel_m: float,
 ) -> TileSums:
     """Normal equations of the frame's samples: static surface, open enough, neither clipped nor black."""
-    space = engine.workspace
-    rows, cols, n = transfer.rows, transfer.cols, transfer.bands**2
-    defines = {"COEFFICIENTS": n}
-    observed = space.array("observed", (rows, cols), cl_types.float4)
+    observed = _gather(engine, camera, measurement, surface, transfer)
+    pooled_transfer, pooled = _pool(engine, camera, surface, transfer, observed, voxel_m)
+    return unpack_tiles(_accumulate(engine, pooled_transfer, pooled), transfer.bands**2)
+
+
+def _kernel(engine: Engine, name: str, coefficients: int) -> cl.Kernel:
+    return engine.kernel("light_estimation.cl", name, COEFFICIENTS=coefficients)
+
+
+def _gather(
+    engine: Engine, camera: CameraModel, measurement: Measurement, surface: Surface, transfer: Transfer
+) -> cl_array.Array:
+    """[rows, cols] float4: what the camera saw at each sample, and whether it may be used."""
+    observed = engine.workspace.array("observed", (transfer.rows, transfer.cols), cl_types.float4)
     engine.launch(
-        engine.kernel("light_estimation.cl", "gather_samples", **defines),
-        (cols, rows),
-        cols,
-        rows,
+        _kernel(engine, "gather_samples", transfer.bands**2),
+        (transfer.cols, transfer.rows),
+        transfer.cols,
+        transfer.rows,
         transfer.stride,
         camera.width,
         camera.height,
@@ -110,16 +122,28 @@ def sum_tiles(
         LEAST_FLATNESS,
         observed,
     )
-    pool_rows, pool_cols = -(-rows // 2), -(-cols // 2)
-    pooled_transfer = space.array("pooled_transfer", (pool_rows, pool_cols, n), np.float32)
-    pooled = space.array("pooled", (pool_rows, pool_cols), cl_types.float4)
+    return observed
+
+
+def _pool(
+    engine: Engine,
+    camera: CameraModel,
+    surface: Surface,
+    transfer: Transfer,
+    observed: cl_array.Array,
+    voxel_m: float,
+) -> tuple[cl_array.Array, cl_array.Array]:
+    """Means over neighbours on one surface: transfer [rows, cols, n] and observation [rows, cols] float4."""
+    rows, cols, n = -(-transfer.rows // 2), -(-transfer.cols // 2), transfer.bands**2
+    pooled_transfer = engine.workspace.array("pooled_transfer", (rows, cols, n), np.float32)
+    pooled = engine.workspace.array("pooled", (rows, cols), cl_types.float4)
     engine.launch(
-        engine.kernel("light_estimation.cl", "pool_samples", **defines),
-        (pool_cols, pool_rows),
-        pool_cols,
-        pool_rows,
+        _kernel(engine, "pool_samples", n),
+        (cols, rows),
         cols,
         rows,
+        transfer.cols,
+        transfer.rows,
         transfer.stride,
         camera.width,
         surface.positions,
@@ -130,21 +154,27 @@ def sum_tiles(
         pooled_transfer,
         pooled,
     )
-    tile_cols, tile_rows = -(-pool_cols // _TILE), -(-pool_rows // _TILE)
+    return pooled_transfer, pooled
+
+
+def _accumulate(engine: Engine, transfer: cl_array.Array, observed: cl_array.Array) -> NDArray[np.float64]:
+    """[tiles, entries + 2] packed sums of transfer [rows, cols, n] and observed [rows, cols], see accumulate_tiles."""
+    rows, cols, n = transfer.shape
+    tile_cols, tile_rows = -(-cols // _TILE), -(-rows // _TILE)
     entries = (n + 3) * (n + 4) // 2
-    partial = space.array("tile_sums", (tile_cols * tile_rows, entries + 2), np.float32)
+    partial = engine.workspace.array("tile_sums", (tile_cols * tile_rows, entries + 2), np.float32)
     engine.launch(
-        engine.kernel("light_estimation.cl", "accumulate_tiles", **defines),
+        _kernel(engine, "accumulate_tiles", n),
         (tile_cols * tile_rows * _TILE * _TILE,),
-        pool_cols,
-        pool_rows,
+        cols,
+        rows,
         tile_cols,
-        pooled_transfer,
-        pooled,
+        transfer,
+        observed,
         partial,
         local=(_TILE * _TILE,),
     )
-    return unpack_tiles(engine.download(partial).astype(np.float64), n)
+    return engine.download(partial).astype(np.float64)
 
 
 def unpack_tiles(partial: NDArray[np.float64], n: int) -> TileSums:

@@ -26,15 +26,15 @@ static float3 open_shading(const float3 normal, global const float4 *light) {
     return sum;
 }
 
-// ratio [rows][cols] (w = 1 valid) -> touched [rows + 1][cols + 1]: whether the 4 x 4 samples around a cell hold one that is
+// ratio [rows][cols] (w = 1 valid) -> touched [rows + 1][cols + 1]: whether the 6 x 6 samples around a cell hold one that is
 // valid and not 1. Most of a picture is not touched, and need not be upsampled.
 kernel void mark_touched(const int cols, const int rows, global const float4 *ratio, global uchar *touched) {
     const int cell_col = (int)get_global_id(0) - 1;
     const int cell_row = (int)get_global_id(1) - 1;
     if (cell_col >= cols || cell_row >= rows) return;
     int any = 0;
-    for (int row = max(cell_row - 1, 0); row <= min(cell_row + 2, rows - 1); row++) {
-        for (int col = max(cell_col - 1, 0); col <= min(cell_col + 2, cols - 1); col++) {
+    for (int row = max(cell_row - 2, 0); row <= min(cell_row + 3, rows - 1); row++) {
+        for (int col = max(cell_col - 2, 0); col <= min(cell_col + 3, cols - 1); col++) {
             const float4 v = ratio[row * cols + col];
             any |= v.w > 0.0f && (v.x != 1.0f || v.y != 1.0f || v.z != 1.0f);
         }

@@ -38,35 +38,36 @@ def srgb_codes(linear: Floats) -> NDArray[np.uint8]:
 
 
 def mark_touched(ratio: Floats) -> NDArray[np.bool_]:
-    """[rows + 1, cols + 1] whether the 4 x 4 samples around a cell, which begins at sample (row - 1, col - 1), hold one
+    """[rows + 1, cols + 1] whether the 6 x 6 samples around a cell, which begins at sample (row - 1, col - 1), hold one
     that is valid and not 1. ratio [rows, cols, 4].
     """
     rows, cols = ratio.shape[:2]
     changed = (ratio[..., 3] > 0) & (ratio[..., :3] != 1).any(-1)
     return np.array(
         [
-            [changed[max(r - 2, 0) : r + 2, max(c - 2, 0) : c + 2].any() for c in range(cols + 1)]
+            [changed[max(r - 3, 0) : r + 3, max(c - 3, 0) : c + 3].any() for c in range(cols + 1)]
             for r in range(rows + 1)
         ]
     )
 
 
 def upsample(samples: Samples, surface: Buffer, x: int, y: int, tolerance_m: float) -> Floats:
-    """[4] joint-bilateral mean of the 4 x 4 samples around a pixel: a tent of two samples' half-width, times closeness
+    """[4] joint-bilateral mean of the samples around a pixel: a box four samples wide, times closeness
     to the pixel's tangent plane, times agreement of the normals; w = 0 where none fits.
     """
     rows, cols = samples.values.shape[:2]
     u, v = ((c - samples.stride // 2) / samples.stride for c in (x, y))
     position, normal = surface.positions[y, x, :3], surface.normals[y, x, :3]
     total = np.zeros(4)
-    for row in range(int(np.floor(v)) - 1, int(np.floor(v)) + 3):
-        for col in range(int(np.floor(u)) - 1, int(np.floor(u)) + 3):
+    for row in range(int(np.floor(v)) - 2, int(np.floor(v)) + 4):
+        for col in range(int(np.floor(u)) - 2, int(np.floor(u)) + 4):
             if not (0 <= row < rows and 0 <= col < cols) or samples.values[row, col, 3] <= 0:
                 continue
             py, px = samples.stride // 2 + row * samples.stride, samples.stride // 2 + col * samples.stride
             off_plane = normal @ (surface.positions[py, px, :3] - position) / tolerance_m
             facing = max(float(normal @ surface.normals[py, px, :3]), 0.0)
-            weight = (2 - abs(col - u)) * (2 - abs(row - v)) * facing**4 / (1 + off_plane**4)
+            box = min(max(2.5 - abs(col - u), 0), 1) * min(max(2.5 - abs(row - v), 0), 1)
+            weight = box * facing**4 / (1 + off_plane**4)
             total += weight * np.array([*samples.values[row, col, :3], 1])
     return np.array([*(total[:3] / total[3]), 1]) if total[3] > 1e-4 else np.zeros(4)
 

@@ -34,20 +34,23 @@ static inline float depth_sigma(const float z) {
     return 0.0012f + 0.0019f * (z - 0.4f) * (z - 0.4f);
 }
 
-// positions, normals [h][w]: the volume's surface (in), the merged geometry buffer (out); depth_m [h][w] measured, 0 = none.
-// -> labels [h][w]: none, static (from the volume), dynamic (from the sensor: the volume says otherwise or nothing).
+// model_positions, model_normals [h][w]: the volume's surface; depth_m [h][w] measured, 0 = none.
+// -> positions, normals [h][w]: the merged geometry buffer; labels [h][w]: none, static (from the volume), dynamic (from the sensor: the volume says otherwise or nothing).
 kernel void merge_depth(const int width, const int height, global const float *depth_m, const float4 intrinsics,
                         const float16 volume_from_camera, const float16 camera_from_volume, const float voxel_m,
+                        global const float4 *model_positions, global const float4 *model_normals,
                         global float4 *positions, global float4 *normals, global uchar *labels) {
     const int x = get_global_id(0);
     const int y = get_global_id(1);
     if (x >= width || y >= height) return;
     const int pixel = y * width + x;
     const float measured = depth_m[pixel];
-    const float4 surface = positions[pixel];
+    const float4 surface = model_positions[pixel];
     const float predicted = transform_point(camera_from_volume, surface.xyz).z;
     const float agree = 1.5f * voxel_m + 4.0f * depth_sigma(measured);  // lambda_D
     if (surface.w > 0.0f && (measured <= 0.0f || fabs(measured - predicted) < agree)) {
+        positions[pixel] = surface;
+        normals[pixel] = model_normals[pixel];
         labels[pixel] = LABEL_STATIC;
     } else if (measured > 0.0f) {
         const float3 point = measured * unproject(intrinsics, x, y);
@@ -56,6 +59,8 @@ kernel void merge_depth(const int width, const int height, global const float *d
         normals[pixel] = (float4)(transform_vector(volume_from_camera, normal.xyz), normal.w);
         labels[pixel] = LABEL_DYNAMIC;
     } else {
+        positions[pixel] = (float4)(0.0f);
+        normals[pixel] = (float4)(0.0f);
         labels[pixel] = LABEL_NONE;
     }
 }

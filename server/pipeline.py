@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Light, Plan, Timings, Tracking, Wishes
 from server.effects import EFFECTS, View, gather_facts
+from server.geometry import Geometry, GeometryFrame
 from server.light_message import light_message
-from server.maths.rigid import repaired_pose
 from server.maths.sh import webxr_from_world
 from server.opencl.device import Device
 from server.opencl.engine import Engine
@@ -20,15 +20,11 @@ from server.plan import execute, make_plan
 from server.scene.mesh import Mesh
 from server.scene.objects import SceneObjects
 from server.scene.placement import Placement
-from server.settings import Settings, bounds_seen, default_voxel_m, read_wishes, stride_of
+from server.settings import Settings, read_wishes, stride_of
 from server.stages.composite import shown_picture
 from server.stages.differential_rendering import upload_light
-from server.stages.integrate import integrate
 from server.stages.light_estimation import LightEstimate, LightEstimator, sum_tiles
-from server.stages.measure import GREATEST_DEPTH_M, measure
-from server.stages.merge import merge_depth
 from server.stages.radiance_transfer import direction_sets, transfer_radiance
-from server.stages.raycast import raycast
 from server.stages.volume import Volume
 
 
@@ -55,9 +51,9 @@ class Pipeline:
         self._camera = camera
         self._wishes = wishes
         self._engine = Engine(device)
+        self._geometry = Geometry(self._engine, camera, wishes)
         self._rays = direction_sets(self._settings.rays, self._settings.bands)
         self._estimator = LightEstimator(self._settings.bands, as_thesis=self._settings.as_thesis)
-        self._volume: Volume | None = None
         self._objects: SceneObjects | None = None
         self._waiting: list[tuple[str, Mesh, Placement]] = []
         self._webxr_from_world = np.eye(3)
@@ -70,20 +66,12 @@ class Pipeline:
         Raises ValueError with one line for a frame that is refused; the session's state is then as it was.
         """
         started = time.perf_counter()
-        world_from_camera = self._checked_pose(frame)
-        volume, objects = self._scene(frame, world_from_camera)
         engine, camera, settings, stage = self._engine, self._camera, self._settings, self._engine.profile.stage
-        volume_from_camera = volume.volume_from_world() @ world_from_camera
+        engine.profile.forget()
+        geometry = self._geometry.update(frame)  # ch. 4
+        volume, objects = self._scene(geometry)
+        measurement, surface = geometry.measurement, geometry.surface
 
-        with stage("input"):  # 5.1.1
-            measurement = measure(engine, camera, frame)
-        with stage("reconstruct"):  # 4.2.1
-            volume.allocate(camera, volume_from_camera, measurement.depth_m)
-            integrate(engine, volume, camera, volume_from_camera, measurement.depth_m)
-        with stage("surface"):  # 4.2.1
-            surface = raycast(engine, camera, volume_from_camera, volume)
-        with stage("dynamic_geometry"):  # 4.2.2, eq. 4.3
-            merge_depth(engine, camera, volume_from_camera, measurement.depth_m, surface, volume.voxel_m)
         with stage("radiance_transfer"):  # 5.1.2, eq. 5.2
             transfer = transfer_radiance(engine, camera, volume, surface, settings.stride, self._rays, settings.reach_m)
         with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
@@ -91,7 +79,7 @@ class Pipeline:
             with engine.profile.host():
                 estimate = self._estimator.update(tiles)
         with stage("rendering"):  # 7.1-7.2, the effects this frame calls for
-            view = View(engine, camera, volume_from_camera, settings.reach_m)
+            view = View(engine, camera, geometry.volume_from_camera, settings.reach_m)
             placed = objects.placed(volume.volume_from_world())
             order, plan = make_plan(EFFECTS, "picture", _GIVEN, gather_facts(view, placed, estimate.sh))
             given = {
@@ -112,11 +100,11 @@ class Pipeline:
         return FrameResult(
             color=picture,
             light=light_message(frame.index, frame.timestamp_s, estimate, self._webxr_from_world),
-            world_from_camera=world_from_camera,
-            tracking="given",
+            world_from_camera=geometry.world_from_camera,
+            tracking=geometry.tracking,
             timings=Timings(**rows, total=(time.perf_counter() - started) * 1e3),
             plan=plan,
-            notes=self._notes(frame, volume, estimate),
+            notes=(*geometry.notes, *_notes(estimate)),
         )
 
     def place_object(self, object_id: str, mesh: Mesh, placement: Placement) -> tuple[str, ...]:
@@ -152,30 +140,20 @@ class Pipeline:
             self._objects.clear()
         self._engine.close()
 
-    def _checked_pose(self, frame: RgbdFrame) -> NDArray[np.float64]:
-        size = (self._camera.height, self._camera.width)
-        if frame.color.shape != (*size, 3) or frame.depth.shape != size:
-            raise ValueError(
-                f"colour is {frame.color.shape[1]}x{frame.color.shape[0]}, depth {frame.depth.shape[1]}x"
-                f"{frame.depth.shape[0]}; the camera has {size[1]}x{size[0]}"
-            )
-        if frame.world_from_camera is None:
-            raise ValueError("the frame has no pose, and tracking is not available: use a source with poses")
-        return repaired_pose(frame.world_from_camera)
-
-    def _scene(self, frame: RgbdFrame, world_from_camera: NDArray[np.float64]) -> tuple[Volume, SceneObjects]:
-        """The volume and the objects; both are made when the first frame says where the scene is and what is up."""
-        if self._volume is None or self._objects is None:
-            bounds = self._wishes.volume_m or bounds_seen(self._camera, frame, world_from_camera)
-            self._volume = Volume(self._engine, bounds, self._wishes.voxel_m or default_voxel_m(bounds))
-            up = np.array(self._wishes.up or -world_from_camera[:3, 1], np.float64)
+    def _scene(self, geometry: GeometryFrame) -> tuple[Volume, SceneObjects]:
+        """The volume and the objects; the first frame says what is up."""
+        volume = self._geometry.volume
+        assert volume is not None
+        if self._objects is None:
+            camera_up, forward = -geometry.world_from_camera[:3, 1], geometry.world_from_camera[:3, 2]
+            up = np.array(self._wishes.up or camera_up, np.float64)
             up /= np.linalg.norm(up)
-            self._webxr_from_world = webxr_from_world(up, world_from_camera[:3, 2])
+            self._webxr_from_world = webxr_from_world(up, forward)
             self._objects = SceneObjects(self._engine, up)
             for object_id, mesh, placement in self._waiting:
                 self._objects.place(object_id, mesh, placement)
             self._waiting.clear()
-        return self._volume, self._objects
+        return volume, self._objects
 
     def _waiting_index(self, object_id: str) -> int:
         names = [name for name, _, _ in self._waiting]
@@ -183,16 +161,9 @@ class Pipeline:
             raise KeyError(object_id)
         return names.index(object_id)
 
-    def _notes(self, frame: RgbdFrame, volume: Volume, estimate: LightEstimate) -> tuple[str, ...]:
-        notes = []
-        depth_m = frame.depth * self._camera.depth_scale_m
-        if not ((frame.depth > 0) & (frame.depth != 65535) & (depth_m <= GREATEST_DEPTH_M)).any():
-            notes.append("the depth picture has no usable value: is the sensor covered?")
-        if volume.is_full:
-            notes.append("the volume's memory is full, new surface is not fused: give a larger --voxel")
-        if estimate.std is None:
-            notes.append("no usable surface has been seen yet, the light is unknown")
-        return tuple(notes)
+
+def _notes(estimate: LightEstimate) -> tuple[str, ...]:
+    return ("no usable surface has been seen yet, the light is unknown",) if estimate.std is None else ()
 
 
 _GIVEN = frozenset({"view", "objects", "volume", "rays", "shown", "measurement", "surface", "transfer", "light"})

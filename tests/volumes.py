@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
 from server.stages.integrate import integrate
+from server.stages.measure import Measurement
 from server.stages.raycast import raycast
 from server.stages.volume import BRICK, BRICK_VOXELS, Volume
 
@@ -54,12 +55,20 @@ def upload_depth(engine: Engine, depth_m: NDArray[Any]) -> cl_array.Array:
     return engine.workspace.upload("test_depth", depth_m.astype(np.float32))
 
 
+def upload_measurement(engine: Engine, depth_m: NDArray[Any], radiance: NDArray[Any] | None = None) -> Measurement:
+    """A rectified picture on the device: depth [h, w] metres and linear RGB [h, w, 3], mid grey without one."""
+    color = np.full((*depth_m.shape, 3), 0.5) if radiance is None else radiance
+    usable = np.concatenate([color, np.ones((*depth_m.shape, 1))], axis=-1).astype(np.float32)
+    device_radiance = engine.workspace.upload("test_radiance", usable.view(cl_types.float4)[..., 0])
+    return Measurement(device_radiance, upload_depth(engine, depth_m))
+
+
 def fuse(engine: Engine, volume: Volume, camera: CameraModel, world_from_camera: Floats, depth_m: NDArray[Any]) -> None:
     """Allocate and integrate one depth picture."""
     pose = volume.volume_from_world() @ world_from_camera
-    device_depth = upload_depth(engine, depth_m)
-    volume.allocate(camera, pose, device_depth)
-    integrate(engine, volume, camera, pose, device_depth)
+    measurement = upload_measurement(engine, depth_m)
+    volume.allocate(camera, pose, measurement.depth_m)
+    integrate(engine, volume, camera, pose, measurement)
 
 
 def cast(

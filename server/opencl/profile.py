@@ -40,6 +40,11 @@ class Profile:
         finally:
             self._host_ms[self.row] += (time.perf_counter() - start) * 1e3
 
+    def forget(self) -> None:
+        """Leave out what a frame that failed has left."""
+        self._events.clear()
+        self._host_ms.clear()
+
     def collect(self) -> tuple[dict[str, float], dict[str, float]]:
         """Milliseconds per row and per kernel since the last call. Every event must have finished."""
         rows: dict[str, float] = defaultdict(float, self._host_ms)
@@ -48,6 +53,5 @@ class Profile:
             spent_ms = (event.profile.end - event.profile.start) * 1e-6
             rows[row] += spent_ms
             kernels[kernel] += spent_ms
-        self._events.clear()
-        self._host_ms.clear()
+        self.forget()
         return dict(rows), dict(kernels)

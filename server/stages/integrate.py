@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import pyopencl.array as cl_array
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine, float16, int4
-from server.stages.measure import intrinsics
+from server.stages.measure import Measurement, intrinsics
 from server.stages.volume import BRICK, Volume
 
 GREATEST_WEIGHT = 64.0
@@ -21,9 +20,9 @@ def integrate(
     volume: Volume,
     camera: CameraModel,
     volume_from_camera: NDArray[np.float64],
-    depth_m: cl_array.Array,
+    measurement: Measurement,
 ) -> None:
-    """Fold depth_m [h, w] (metres, 0 = none) into the bricks that are allocated."""
+    """Fold a rectified picture into the bricks that are allocated."""
     if not volume.allocated_bricks:
         return
     engine.launch(
@@ -35,7 +34,7 @@ def integrate(
         int4(*volume.bricks, 0),
         volume.allocated_device,
         volume.slots_device,
-        depth_m,
+        measurement.depth_m,
         intrinsics(camera),
         float16(inverse_rigid(volume_from_camera)),
         volume.voxel_m,

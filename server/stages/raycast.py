@@ -46,4 +46,4 @@ def raycast(engine: Engine, camera: CameraModel, volume_from_camera: NDArray[np.
         positions,
         normals,
     )
-    return Surface(positions, normals, engine.workspace.array("labels", size, np.uint8))
+    return Surface(positions, normals, engine.workspace.array("model_labels", size, np.uint8))

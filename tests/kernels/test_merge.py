@@ -18,7 +18,7 @@ from server.stages.raycast import LABEL_DYNAMIC, LABEL_NONE, LABEL_STATIC, Surfa
 from tests.analytic import look, look_at, pixel_rays, plane, quantised, room, sphere
 from tests.reference import merge as twin
 from tests.tolerance import relative_tolerance
-from tests.volumes import upload_depth, vectors
+from tests.volumes import upload_measurement, vectors
 
 CAMERA = CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.313, cy=36.127)
 VOXEL_M = 0.02
@@ -59,9 +59,9 @@ def merge(
     def upload(name: str, values: Floats) -> Any:
         return engine.workspace.upload(name, values.astype(np.float32).view(cl_types.float4)[..., 0])
 
-    labels = engine.workspace.upload("labels", np.full(depth_m.shape, 77, np.uint8))
+    labels = engine.workspace.upload("model_labels", np.full(depth_m.shape, 77, np.uint8))
     surface = Surface(upload("positions", positions), upload("normals", normals), labels)
-    result = merge_depth(engine, camera, pose, upload_depth(engine, depth_m), surface, VOXEL_M)
+    result = merge_depth(engine, camera, pose, upload_measurement(engine, depth_m), surface, VOXEL_M)
     buffers = (vectors(engine.download(a)) for a in (result.positions, result.normals))
     merged = Merged(*buffers, engine.download(result.labels))
     assert np.isfinite(merged.positions).all()

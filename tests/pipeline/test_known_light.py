@@ -69,9 +69,9 @@ class Path:
     def _shot(self, engine: Engine, volume: Volume, frame: RgbdFrame) -> Shot:
         assert frame.world_from_camera is not None
         pose = volume.volume_from_world() @ frame.world_from_camera
-        depth_m = measure(engine, self.camera, frame).depth_m
-        volume.allocate(self.camera, pose, depth_m)
-        integrate(engine, volume, self.camera, pose, depth_m)
+        measured = measure(engine, self.camera, frame)
+        volume.allocate(self.camera, pose, measured.depth_m)
+        integrate(engine, volume, self.camera, pose, measured)
         surface = raycast(engine, self.camera, pose, volume)
         rays = direction_sets(REFERENCE_RAYS, 4)
         transfer = transfer_radiance(engine, self.camera, volume, surface, STRIDE, rays, 1000.0)

@@ -64,9 +64,9 @@ def reconstruct(engine: Engine, body: Shape) -> tuple[Volume, Surface]:
         pose = volume.volume_from_world() @ frame.world_from_camera
         measured = measure(engine, CAMERA, frame)
         volume.allocate(CAMERA, pose, measured.depth_m)
-        integrate(engine, volume, CAMERA, pose, measured.depth_m)
-        surface = raycast(engine, CAMERA, pose, volume)
-        merge_depth(engine, CAMERA, pose, measured.depth_m, surface, volume.voxel_m)
+        integrate(engine, volume, CAMERA, pose, measured)
+        model = raycast(engine, CAMERA, pose, volume)
+        surface = merge_depth(engine, CAMERA, pose, measured, model, volume.voxel_m)
     return volume, surface
 
 

@@ -2,8 +2,11 @@
 
 PoCL asks LLVM for the host processor's name and hands it to clang. LLVM answers "generic" for an x86 processor it does
 not know (an AMD Zen 5 with the LLVM 14 of PoCL 3.0), clang refuses that name, and no kernel compiles; no option of PoCL
-overrides it. The name is a C string that the device structure points to: it is replaced in place by the x86-64 feature
-level (psABI: v2 or v3; v4 measured no faster) that this processor has.
+overrides it. The name is a C string that the device structure points to: it is replaced in place.
+
+Which name matters: PoCL's own library of built-in functions comes compiled for `skylake-avx512` or `haswell`, and LLVM
+inlines a function only into code for a processor that has all of its features. Under the plain x86-64 levels each `fmin`,
+`dot` or `vload8` stays a call, and kernels take up to 1.5 times as long. The levels remain for older processors.
 """
 
 from __future__ import annotations
@@ -18,39 +21,40 @@ if TYPE_CHECKING:
 
 _UNKNOWN = b"generic\0"
 _DEVICE_STRUCT_BYTES = 4096
-_LEVELS = (
-    (b"x86-64-v3", {"avx2", "bmi1", "bmi2", "fma", "f16c", "movbe"}),
-    (b"x86-64-v2", {"sse4_1", "sse4_2", "ssse3", "popcnt"}),
+_V2 = frozenset({"sse4_1", "sse4_2", "ssse3", "popcnt"})
+_V3 = _V2 | {"avx2", "bmi1", "bmi2", "fma", "f16c", "movbe"}
+_HASWELL = _V3 | {"fsgsbase", "invpcid", "pclmulqdq", "rdrand", "xsaveopt"}
+_SKYLAKE = _HASWELL | {"adx", "aes", "clflushopt", "clwb", "rdseed", "xsavec", "xsaves"}
+_NAMES = (
+    (b"skylake-avx512", _SKYLAKE | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
+    (b"haswell", _HASWELL),
+    (b"x86-64-v3", _V3),
+    (b"x86-64-v2", _V2),
 )
 
 
-def feature_level(cpuinfo: str) -> bytes:
-    """The highest x86-64 feature level whose flags /proc/cpuinfo lists."""
+def processor_name(cpuinfo: str) -> bytes:
+    """The best processor that LLVM 14 knows whose features /proc/cpuinfo lists."""
     flags: set[str] = set()
     for line in cpuinfo.splitlines():
         if line.startswith("flags"):
             flags = set(line.partition(":")[2].split())
             break
-    level = b"x86-64"
-    for name, needed in reversed(_LEVELS):
-        if not needed <= flags:
-            break
-        level = name
-    return level
+    return next((name for name, needed in _NAMES if needed <= flags), b"x86-64")
 
 
 def name_unknown_cpu(device: cl.Device) -> str | None:
     """If `device` is PoCL's CPU under the name "generic", give it one clang knows; return the name, else None."""
     if "pthread" not in device.name or platform.machine() != "x86_64" or not Path("/proc/self/mem").exists():
         return None
-    level = feature_level(Path("/proc/cpuinfo").read_text())
+    name = processor_name(Path("/proc/cpuinfo").read_text())
     structure = ctypes.string_at(device.int_ptr, _DEVICE_STRUCT_BYTES)
     with Path("/proc/self/mem").open("rb", buffering=0) as memory:
         for offset in range(0, _DEVICE_STRUCT_BYTES, 8):
             address = int.from_bytes(structure[offset : offset + 8], "little")
             if _reads(memory, address, len(_UNKNOWN)) == _UNKNOWN:
-                ctypes.memmove(address, level + b"\0", len(level) + 1)  # malloc gives 24 bytes or more
-                return level.decode()
+                ctypes.memmove(address, name + b"\0", len(name) + 1)  # malloc gives 24 bytes or more
+                return name.decode()
     return None
 
 

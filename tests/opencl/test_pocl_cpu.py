@@ -1,4 +1,4 @@
-"""The x86-64 feature level that PoCL is told for a processor it does not know."""
+"""The processor's name that PoCL is told for a processor it does not know."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from pathlib import Path
 import pytest
 
 from server.opencl.device import list_devices
-from server.opencl.pocl_cpu import feature_level
+from server.opencl.pocl_cpu import processor_name
 
 BASE = "fpu vme de pse tsc msr pae mce cx8 apic sse sse2 ht syscall nx lm"
 V2 = f"{BASE} pni ssse3 cx16 sse4_1 sse4_2 popcnt lahf_lm"
 V3 = f"{V2} avx avx2 bmi1 bmi2 fma f16c movbe abm"
+HASWELL = f"{V3} fsgsbase invpcid pclmulqdq rdrand xsaveopt"
 V4 = f"{V3} avx512f avx512bw avx512cd avx512dq avx512vl"
+SKYLAKE = f"{HASWELL} {V4} adx aes clflushopt clwb rdseed xsavec xsaves"
 
 
 def cpuinfo(flags: str, cores: int = 2) -> str:
@@ -21,37 +23,40 @@ def cpuinfo(flags: str, cores: int = 2) -> str:
 
 
 @pytest.mark.parametrize(
-    ("flags", "level"),
+    ("flags", "name"),
     [
         (BASE, b"x86-64"),
         (V2, b"x86-64-v2"),
         (V3, b"x86-64-v3"),
         (V4, b"x86-64-v3"),
+        (HASWELL, b"haswell"),
+        (SKYLAKE, b"skylake-avx512"),
+        (SKYLAKE.replace(" avx512vl", ""), b"haswell"),
         (" ".join(reversed(V3.split())), b"x86-64-v3"),
         (V3.replace(" movbe", ""), b"x86-64-v2"),
         (V3.replace(" fma ", " "), b"x86-64-v2"),
         (V3.replace(" fma ", " fma4 "), b"x86-64-v2"),  # names are whole words
-        (V3.replace(" popcnt", ""), b"x86-64"),  # a level needs those below it
+        (V3.replace(" popcnt", ""), b"x86-64"),
         ("", b"x86-64"),
     ],
 )
-def test_level_is_the_highest_whose_flags_are_all_there(flags: str, level: bytes) -> None:
-    assert feature_level(cpuinfo(flags)) == level
+def test_the_best_whose_flags_are_all_there(flags: str, name: bytes) -> None:
+    assert processor_name(cpuinfo(flags)) == name
 
 
 @pytest.mark.parametrize("text", ["", "processor : 0\nFeatures : fp asimd\n", "garbage", "flags"])
-def test_other_files_give_the_base_level(text: str) -> None:
-    assert feature_level(text) == b"x86-64"
+def test_other_files_give_the_base_name(text: str) -> None:
+    assert processor_name(text) == b"x86-64"
 
 
 def test_the_first_core_decides() -> None:
-    assert feature_level(cpuinfo(V2) + cpuinfo(V4)) == b"x86-64-v2"
+    assert processor_name(cpuinfo(V2) + cpuinfo(V4)) == b"x86-64-v2"
 
 
-def test_level_fits_in_the_place_of_the_name_it_replaces() -> None:
+def test_name_fits_in_the_place_of_the_name_it_replaces() -> None:
     """The name is written over the C string "generic": malloc gives at least 24 bytes."""
-    for flags in (BASE, V2, V3, V4):
-        assert len(feature_level(cpuinfo(flags))) + 1 <= 24
+    for flags in (BASE, V2, V3, HASWELL, SKYLAKE):
+        assert len(processor_name(cpuinfo(flags))) + 1 <= 24
 
 
 def test_pocl_compiles_here() -> None:

@@ -5,8 +5,8 @@ not know (an AMD Zen 5 with the LLVM 14 of PoCL 3.0), clang refuses that name, a
 overrides it. The name is a C string that the device structure points to: it is replaced in place.
 
 Which name matters: PoCL's own library of built-in functions comes compiled for `skylake-avx512` or `haswell`, and LLVM
-inlines a function only into code for a processor that has all of its features. Under the plain x86-64 levels each `fmin`,
-`dot` or `vload8` stays a call, and kernels take up to 1.5 times as long. The levels remain for older processors.
+inlines a function only into code for a processor that has all of its features. Under the plain x86-64 levels each
+`fmin`, `dot` or `vload8` stays a call, and kernels take up to 1.5 times as long.
 """
 
 from __future__ import annotations
@@ -23,12 +23,9 @@ _UNKNOWN = b"generic\0"
 _DEVICE_STRUCT_BYTES = 4096
 _V2 = frozenset({"sse4_1", "sse4_2", "ssse3", "popcnt"})
 _V3 = _V2 | {"avx2", "bmi1", "bmi2", "fma", "f16c", "movbe"}
-_HASWELL = _V3 | {"fsgsbase", "invpcid", "pclmulqdq", "rdrand", "xsaveopt"}
-_SKYLAKE = _HASWELL | {"adx", "aes", "clflushopt", "clwb", "rdseed", "xsavec", "xsaves"}
-_NAMES = (
-    (b"skylake-avx512", _SKYLAKE | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
-    (b"haswell", _HASWELL),
-    (b"x86-64-v3", _V3),
+_NAMES = (  # with the features that compilers use unasked; what else the name stands for, programs must ask for
+    (b"skylake-avx512", _V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
+    (b"haswell", _V3),
     (b"x86-64-v2", _V2),
 )
 

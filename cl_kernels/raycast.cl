@@ -1,100 +1,134 @@
 // Surface prediction (KinectFusion; thesis 4.2.1): the zero crossing of the TSDF along each pixel's ray, and its normal.
-// Provides raycast.
+// Provides bound_rays, raycast.
 #include "camera.clh"
-#include "volume.clh"
+#include "field.clh"
+#include "rays.clh"
 
-// Gradient of the tsdf from the 4x4x4 voxels around a point in voxels; (0, 0, 0) where there is none.
-// Where all of them were seen: central differences one voxel wide, trilinear between voxels. Else of the inner cell alone.
-static float3 surface_gradient(const Volume volume, const float3 point) {
-    float3 f;
-    const int3 low = trilinear_cell(point, &f) - 1;
-    int starts[8];
-    brick_starts(volume, low, low + 3, starts);
-    const float tx[4] = {0.0f, 1.0f - f.x, f.x, 0.0f}, dx[4] = {f.x - 1.0f, -f.x, 1.0f - f.x, f.x};
-    const float ty[4] = {0.0f, 1.0f - f.y, f.y, 0.0f}, dy[4] = {f.y - 1.0f, -f.y, 1.0f - f.y, f.y};
-    const float tz[4] = {0.0f, 1.0f - f.z, f.z, 0.0f}, dz[4] = {f.z - 1.0f, -f.z, 1.0f - f.z, f.z};
-    const float c[4] = {0.0f, -1.0f, 1.0f, 0.0f};
-    float3 wide = (float3)(0.0f);
-    float3 cell = (float3)(0.0f);
-    float least_weight = 1.0f;
-#pragma unroll
-    for (int k = 0; k < 4; k++) {
-#pragma unroll
-        for (int j = 0; j < 4; j++) {
-#pragma unroll
-            for (int i = 0; i < 4; i++) {
-                const int outer = (i == 0 || i == 3) + (j == 0 || j == 3) + (k == 0 || k == 3);
-                if (outer > 1) continue;
-                const float2 v = load_from(volume, starts, low, low.x + i, low.y + j, low.z + k);
-                wide += v.x * (float3)(dx[i] * ty[j] * tz[k], tx[i] * dy[j] * tz[k], tx[i] * ty[j] * dz[k]);
-                cell += v.x * (float3)(c[i] * ty[j] * tz[k], tx[i] * c[j] * tz[k], tx[i] * ty[j] * c[k]);
-                least_weight = v.y < least_weight ? v.y : least_weight;
-            }
+#define TILE 8
+#define SURFACE_REACH 3.0f
+
+// Between which depths each tile of TILE x TILE pixels can see a solid voxel: what lies outside a ray need not look at.
+// One item a brick of allocated [count]; nearest, farthest [tile row][tile column]: bits of float metres, which order as
+// they do; start as +infinity and 0.
+kernel void bound_rays(const int count, const int width, const int height, const int4 bricks, global const int *allocated,
+                       global const ulong *solid, const float voxel_m, const float4 intrinsics,
+                       const float16 camera_from_volume, global int *nearest, global int *farthest) {
+    const int item = get_global_id(0);
+    if (item >= count) return;
+    const int index = allocated[item];
+    if (solid[index] == 0) return;
+    // The surface may lie this far in front of a solid voxel's centre.
+    const float margin = SURFACE_REACH * voxel_m;
+    const float3 low = convert_float3((int3)(index % bricks.x, (index / bricks.x) % bricks.y, index / (bricks.x * bricks.y))) *
+                       (BRICK * voxel_m) - margin;
+    const float side = BRICK * voxel_m + 2.0f * margin;
+    float2 least = (float2)(1e9f), most = (float2)(-1e9f);
+    float near = 1e9f, far = 0.0f;
+    for (int corner = 0; corner < 8; corner++) {
+        const float3 p = low + side * (float3)(corner & 1, (corner >> 1) & 1, corner >> 2);
+        const float3 in_camera = transform_point(camera_from_volume, p);
+        near = fmin(near, in_camera.z);
+        far = fmax(far, in_camera.z);
+        const float2 pixel = project(intrinsics, (float3)(in_camera.xy, fmax(in_camera.z, 1e-3f)));
+        least = fmin(least, pixel);
+        most = fmax(most, pixel);
+    }
+    if (far <= 0.0f) return;
+    const int around = near < 1e-2f;  // reaches behind the camera: its corners' pixels say nothing
+    const int2 size = (int2)(width, height);
+    const int2 first = around ? (int2)(0) : convert_int2(clamp(least, 0.0f, 1e5f)) / TILE;
+    const int2 last = around ? (size - 1) / TILE : min(convert_int2(clamp(most + 1.0f, -1.0f, 1e5f)), size - 1) / TILE;
+    if (!around && (most.x < -1.0f || most.y < -1.0f)) return;
+    const int columns = (width + TILE - 1) / TILE;
+    const int near_bits = as_int(fmax(near, 0.0f)), far_bits = as_int(far);
+    for (int y = first.y; y <= last.y; y++) {
+        for (int x = first.x; x <= last.x; x++) {
+            atomic_min(nearest + y * columns + x, near_bits);
+            atomic_max(farthest + y * columns + x, far_bits);
         }
     }
-    return least_weight > 0.0f ? wide : cell;
 }
 
-// From a point within about a voxel of the surface: one Newton and one secant step along the ray in the trilinear field.
-// 0 where the field was not seen or does not fall through zero there.
-static float refine_crossing(const Volume volume, const VoxelRay ray, const float start) {
+// From where rays enter a solid voxel: one Newton and one secant step along them in the trilinear field, to where it falls
+// through zero; 0 where it was not seen there or does not.
+static inline floatn refine_crossing(const Volume volume, const Rays rays, const floatn start) {
     const float truncation = volume.truncation_m / volume.voxel_m;
-    int seen_a, seen_b;
-    const float a = sample_tsdf(volume, ray.origin + start * ray.direction, &seen_a);
-    const float step = (a > 0.0f ? fmax(a * truncation, 0.25f) : fmin(a * truncation, -0.25f));
-    const float b = sample_tsdf(volume, ray.origin + (start + step) * ray.direction, &seen_b);
-    const float slope = (b - a) / step;  // per voxel, negative where the ray enters
-    if (!seen_a || !seen_b || slope > -0.05f / truncation) return 0.0f;
-    const float onward = -b / slope;
-    return fabs(onward) < 1.5f ? start + step + onward : 0.0f;
+    intn seen_a, seen_b;
+    const floatn a = sample_tsdf(volume, point_at(rays, start), &seen_a) * truncation;
+    const floatn step = MASK(a > 0.0f) ? fmax(a, 0.25f) : fmin(a, -0.25f);
+    const floatn b = sample_tsdf(volume, point_at(rays, start + step), &seen_b) * truncation;
+    const floatn slope = (b - a) / step;  // negative where the ray enters
+    const intn falls = seen_a & seen_b & MASK(slope <= -0.05f);
+    const floatn onward = -b / (falls ? slope : 1.0f);
+    return (falls & MASK(fabs(onward) < 1.5f)) ? start + step + onward : 0.0f;
 }
 
-// Distance in voxels along the ray at which it enters the surface from the front, 0 if it does not.
-static float find_surface(const Volume volume, const VoxelRay ray, const float begin, const float end) {
-    float t = begin;
-    while (t < end) {
-        const Crossing cell = next_solid_cell(volume, ray, t, end);
-        if (cell.octet == 0) return 0.0f;
-        const float solid = first_solid(ray, cell);
-        if (solid >= 0.0f) {
-            const float crossing = refine_crossing(volume, ray, solid - 0.4f);
-            if (crossing > begin) return crossing;
-        }
-        t = cell.leave + 0.01f;
+// Where rays first cross a surface that faces them, as distance in voxels, 0 if nowhere; beside a silhouette a ray may graze
+// a solid voxel or cross the field where it slopes away, and goes on to what lies behind. -> facing: unit normals.
+static floatn find_surface(const Volume volume, const Rays rays, const floatn begin, const floatn end, Vectors *facing) {
+    floatn found = 0.0f, t = begin;
+    intn looking = MASK(begin < end);
+    while (ANY(looking)) {
+        t = find_solid_voxels(volume, rays, looking ? t : end, end);
+        looking &= MASK(t < end);
+        if (!ANY(looking)) break;
+        const floatn crossing = refine_crossing(volume, rays, t);
+        const Vectors g = surface_gradient(volume, point_at(rays, MASK(crossing > begin) ? crossing : t));
+        const floatn steepness = sqrt(g.x * g.x + g.y * g.y + g.z * g.z);
+        const floatn towards = g.x * rays.direction.x + g.y * rays.direction.y + g.z * rays.direction.z;
+        const intn faces = looking & MASK(crossing > begin) & MASK(steepness > 1e-6f) & MASK(towards < 0.0f);
+        const floatn scale = 1.0f / (faces ? steepness : 1.0f);
+        facing->x = faces ? g.x * scale : facing->x;
+        facing->y = faces ? g.y * scale : facing->y;
+        facing->z = faces ? g.z * scale : facing->z;
+        found = faces ? crossing : found;
+        looking &= ~faces;
+        t += 0.7f;  // the next solid voxel on the way
     }
-    return 0.0f;
+    return found;
 }
 
-// The first surface along the ray that faces it, as distance in voxels, 0 if there is none; beside a silhouette the ray may
-// cross the field where it slopes away, and goes on to what lies behind. -> normal: unit, towards free space.
-static float find_facing_surface(const Volume volume, const VoxelRay ray, const float begin, const float end, float3 *normal) {
-    for (float t = find_surface(volume, ray, begin, end); t > 0.0f; t = find_surface(volume, ray, t + 0.5f, end)) {
-        const float3 gradient = surface_gradient(volume, ray.origin + t * ray.direction);
-        const float steepness = length(gradient);
-        if (steepness > 1e-6f && dot(gradient, ray.direction) < 0.0f) {
-            *normal = gradient / steepness;
-            return t;
-        }
-    }
-    return 0.0f;
-}
-
-// Volume and view -> positions [h][w] (volume space metres, w = 1 surface, 0 none), normals [h][w] (unit, towards free space, w likewise).
+// Volume and view -> positions [h][w] (volume space metres, w = 1 surface, 0 none), normals [h][w] (unit, towards free
+// space, w likewise). One item LANES pixels of a row.
 kernel void raycast(const int width, const int height, const int4 bricks, global const int *slots, global const uchar *gaps,
-                    global const ulong *solid, global const uchar *octets, global const float2 *voxels, const float voxel_m, const float truncation_m, const float4 intrinsics,
-                    const float16 volume_from_camera, const float greatest_depth_m,
+                    global const ulong *solid, global const uchar *octets, global const float2 *voxels, const float voxel_m,
+                    const float truncation_m, const float4 intrinsics, const float16 volume_from_camera,
+                    const float greatest_depth_m, global const int *nearest, global const int *farthest,
                     global float4 *positions, global float4 *normals) {
-    const int x = get_global_id(0);
+    const int x = get_global_id(0) * LANES;
     const int y = get_global_id(1);
     if (x >= width || y >= height) return;
     const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
-    const float3 ray_m = transform_vector(volume_from_camera, unproject(intrinsics, x, y));
-    const float along = length(ray_m);
-    const VoxelRay ray = make_voxel_ray(volume, volume_from_camera.s37b, ray_m / along);
-    const float2 span = clip_to_volume(volume, ray);
-    float3 facing = (float3)(0.0f);
-    const float t = find_facing_surface(volume, ray, span.x, fmin(span.y, greatest_depth_m * along / voxel_m), &facing);
-    const float hit = t > 0.0f ? 1.0f : 0.0f;
-    positions[y * width + x] = (float4)(hit * voxel_m * (ray.origin + t * ray.direction), hit);
-    normals[y * width + x] = (float4)(facing, hit);
+    const float16 m = volume_from_camera;
+    const floatn u = (x + LANE_NUMBERS - intrinsics.s2) / intrinsics.s0;
+    const float v = (y - intrinsics.s3) / intrinsics.s1;
+    const floatn length = sqrt(u * u + (v * v + 1.0f));
+    const floatn shorten = 1.0f / length;
+    const Vectors direction = {(m.s0 * u + (m.s1 * v + m.s2)) * shorten, (m.s4 * u + (m.s5 * v + m.s6)) * shorten,
+                               (m.s8 * u + (m.s9 * v + m.sa)) * shorten};
+    const Rays rays = make_rays(m.s37b / voxel_m, direction);
+    floatn begin, end;
+    clip_rays(volume, rays, &begin, &end);
+    const int tile = y / TILE * ((width + TILE - 1) / TILE) + x / TILE;
+    const floatn per_depth = length / voxel_m;
+    begin = fmax(begin, as_float(nearest[tile]) * per_depth);
+    end = fmin(end, fmin(greatest_depth_m, as_float(farthest[tile])) * per_depth);
+
+    Vectors facing = {0.0f, 0.0f, 0.0f};
+    const floatn t = find_surface(volume, rays, begin, end, &facing);
+    const Vectors point = point_at(rays, t);
+    float hits[LANES], px[LANES], py[LANES], pz[LANES], nx[LANES], ny[LANES], nz[LANES];
+    STORE_LANES(t, hits);
+    STORE_LANES(point.x, px);
+    STORE_LANES(point.y, py);
+    STORE_LANES(point.z, pz);
+    STORE_LANES(facing.x, nx);
+    STORE_LANES(facing.y, ny);
+    STORE_LANES(facing.z, nz);
+    const int lanes = min(LANES, width - x);
+    for (int lane = 0; lane < lanes; lane++) {
+        const float hit = hits[lane] > 0.0f ? 1.0f : 0.0f;
+        positions[y * width + x + lane] = (float4)(hit * voxel_m * (float3)(px[lane], py[lane], pz[lane]), hit);
+        normals[y * width + x + lane] = (float4)(nx[lane], ny[lane], nz[lane], hit);
+    }
 }

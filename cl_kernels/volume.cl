@@ -1,7 +1,9 @@
 // The brick volume's table: which bricks the measured surface needs, where they are solid, and how far apart those are.
-// Provides mark_bricks, find_solid, start_gaps, gap_along_axis.
+// Provides mark_bricks, find_solid, gaps_along_x, gap_along_axis.
 #include "camera.clh"
 #include "volume.clh"
+
+#define TILE 4
 
 // Beyond this a point is outside any volume, and its brick may not fit an int.
 #define FAR_BRICKS 1e6f
@@ -11,94 +13,185 @@ static inline int floor_of(const float x) {
     return truncated - (x < truncated);
 }
 
-// depth_m [h][w], 0 = none -> wanted [z][y][x] = 1 for every brick within `reach_m` of the measured surface along its ray.
+// What of the measured surface lies around one ray of the camera: a piece of a frustum.
+typedef struct {
+    float3 origin;  // of the camera, in bricks
+    float3 onward;  // along the ray, bricks a metre of depth
+    float3 beside;  // half the frustum's width along the volume's axes, bricks a metre of depth
+    float near;     // depths it reaches over, metres
+    float far;
+} Frustum;
+
+// wanted [z][y][x] = 1 for every brick that the frustum touches: slice by slice of at most half a brick, the box around each.
+static void mark_frustum(const int4 bricks, const Frustum piece, global uchar *wanted) {
+    const float span = piece.far - piece.near;
+    const int steps = min((int)(2.0f * span * length(piece.onward)), 1000) + 1;
+    const float3 step = span / steps * piece.onward;
+    const float3 pad = 0.5f * fabs(step) + piece.far * piece.beside;
+    const float3 first = piece.origin + piece.near * piece.onward + 0.5f * step;
+    for (int i = 0; i < steps; i++) {
+        const float3 p = first + (float)i * step;
+        if (!(fabs(p.x) + fabs(p.y) + fabs(p.z) < FAR_BRICKS)) continue;
+        const int low_x = max(floor_of(p.x - pad.x), 0), high_x = min(floor_of(p.x + pad.x), bricks.x - 1);
+        const int low_y = max(floor_of(p.y - pad.y), 0), high_y = min(floor_of(p.y + pad.y), bricks.y - 1);
+        const int low_z = max(floor_of(p.z - pad.z), 0), high_z = min(floor_of(p.z + pad.z), bricks.z - 1);
+        for (int bz = low_z; bz <= high_z; bz++)
+            for (int by = low_y; by <= high_y; by++)
+                for (int bx = low_x; bx <= high_x; bx++) wanted[(bz * bricks.y + by) * bricks.x + bx] = 1;  // all write 1
+    }
+}
+
+// depth_m [h][w], 0 = none -> wanted [z][y][x] = 1 for every brick that holds a voxel within `reach_m`, along its ray, of
+// the surface that its pixel measured, and a few more. One item a tile of TILE x TILE pixels; its depths are taken together as
+// far as they lie within half a brick.
 kernel void mark_bricks(const int width, const int height, const int4 bricks, global const float *depth_m,
                         const float4 intrinsics, const float16 volume_from_camera, const float voxel_m, const float reach_m,
                         global uchar *wanted) {
-    const int x = get_global_id(0);
-    const int y = get_global_id(1);
+    const int x = get_global_id(0) * TILE;
+    const int y = get_global_id(1) * TILE;
     if (x >= width || y >= height) return;
-    const float depth = depth_m[y * width + x];
-    if (depth <= 0.0f) return;
-    // Of 2 x 2 pixels at one depth, the first marks for all: its margin reaches over them.
-    const int is_first = ((x | y) & 1) == 0;
-    if (!is_first && fabs(depth_m[(y & ~1) * width + (x & ~1)] - depth) < voxel_m) return;
-    const float brick_m = BRICK * voxel_m;
-    const float3 ray = unproject(intrinsics, x, y);
-    const float reach_z = reach_m / length(ray);
-    const float3 onward = transform_vector(volume_from_camera, ray) / brick_m;
-    const float3 first = volume_from_camera.s37b / brick_m + (depth - reach_z) * onward;
-    const int steps = (int)(4.0f * reach_m / brick_m) + 1;  // at most half a brick apart
-    const float3 step = 2.0f * reach_z / steps * onward;
-    // Around each step: half of the way to the next one, and the voxels beside the ray that are these pixels'.
-    const float pixel = depth / (fmin(intrinsics.s0, intrinsics.s1) * voxel_m);
-    const float pad = clamp(2.0f + 2.0f * pixel, 3.0f, 6.0f) / BRICK;
-    for (int i = 0; i <= steps; i++) {
-        const float3 p = first + (float)i * step;
-        if (fabs(p.x) + fabs(p.y) + fabs(p.z) > FAR_BRICKS) continue;
-        const int3 low = (int3)(max(floor_of(p.x - pad), 0), max(floor_of(p.y - pad), 0), max(floor_of(p.z - pad), 0));
-        const int3 high = (int3)(min(floor_of(p.x + pad), bricks.x - 1), min(floor_of(p.y + pad), bricks.y - 1),
-                                 min(floor_of(p.z + pad), bricks.z - 1));
-        for (int bz = low.z; bz <= high.z; bz++)
-            for (int by = low.y; by <= high.y; by++)
-                for (int bx = low.x; bx <= high.x; bx++) wanted[(bz * bricks.y + by) * bricks.x + bx] = 1;  // all write 1
-    }
-}
-
-// allocated [count] brick indices -> solid [z][y][x]: bit (z 4 + y) 4 + x where a cell of 2x2x2 voxels holds a solid voxel;
-// octets [slot][64]: which of the cell's voxels are. One work-group of 64 items a brick, one item a cell.
-kernel void find_solid(const int count, global const int *allocated, global const int *slots, global const float2 *voxels,
-                       global ulong *solid, global uchar *octets) {
-    local uint halves[64];
-    const int group = get_group_id(0);
-    const int cell = get_local_id(0);
-    const int index = group < count ? allocated[group] : allocated[0];
-    const int first = ((cell >> 4) * 2 * BRICK + ((cell >> 2) & 3) * 2) * BRICK + (cell & 3) * 2;
-    global const float2 *corner = voxels + slots[index] * BRICK_VOXELS + first;
-    uint octet = 0;
-    for (int i = 0; i < 8; i++) {
-        const float2 voxel = corner[((i >> 2) * BRICK + ((i >> 1) & 1)) * BRICK + (i & 1)];
-        octet |= (voxel.y > 0.0f && voxel.x < 0.0f) << i;
-    }
-    halves[cell] = (octet != 0) << (cell & 31);
-    if (group < count) octets[slots[index] * 64 + cell] = (uchar)octet;
-    barrier(CLK_LOCAL_MEM_FENCE);
-    if (cell == 0 && group < count) {
-        uint low = 0, high = 0;
-        for (int i = 0; i < 32; i++) {
-            low |= halves[i];
-            high |= halves[32 + i];
+    float depth[TILE * TILE];
+    float4 nearest = (float4)(MAXFLOAT);
+    for (int row = 0; row < TILE; row++) {
+        if (x + TILE <= width && y + row < height) {
+            vstore4(vload4(0, depth_m + (y + row) * width + x), row, depth);
+        } else {
+            for (int i = 0; i < TILE; i++)
+                depth[row * TILE + i] = x + i < width && y + row < height ? depth_m[(y + row) * width + x + i] : 0.0f;
         }
-        solid[index] = ((ulong)high << 32) | low;
+        const float4 four = vload4(row, depth);
+        nearest = fmin(nearest, select((float4)(MAXFLOAT), four, four > 0.0f));
+    }
+    float near = fmin(fmin(nearest.x, nearest.y), fmin(nearest.z, nearest.w));
+    if (near == MAXFLOAT) return;
+
+    const float brick_m = BRICK * voxel_m;
+    const float3 ray = unproject(intrinsics, x + 0.5f * (TILE - 1), y + 0.5f * (TILE - 1));
+    // Half a pixel beyond the tile are its pixels' own voxels, and up to one and a half those it lends its depth to.
+    const float2 beside = (0.5f * TILE + 1.0f) / intrinsics.lo;
+    const float least_slant = length(fmax(fabs(ray) - (float3)(beside, 0.0f), 0.0f));
+    const float reach_z = reach_m / least_slant;
+    Frustum piece;
+    piece.origin = volume_from_camera.s37b / brick_m;
+    piece.onward = transform_vector(volume_from_camera, ray) / brick_m;
+    piece.beside = (fabs(volume_from_camera.s048) * beside.x + fabs(volume_from_camera.s159) * beside.y) / brick_m;
+    while (near < MAXFLOAT) {  // a tile on an edge holds several surfaces
+        const float edge = fmax(near + 0.5f * brick_m, 1.001f * near);  // more than near, whatever the voxels
+        float4 far = (float4)(near), next = (float4)(MAXFLOAT);
+        for (int row = 0; row < TILE; row++) {
+            const float4 four = vload4(row, depth);
+            far = select(far, fmax(far, four), four < edge);
+            next = select(next, fmin(next, four), four >= edge);
+        }
+        piece.near = near - reach_z;
+        piece.far = fmax(fmax(far.x, far.y), fmax(far.z, far.w)) + reach_z;
+        mark_frustum(bricks, piece, wanted);
+        near = fmin(fmin(next.x, next.y), fmin(next.z, next.w));
     }
 }
 
-// solid [z][y][x] -> gap [z][y][x]: 0 where a brick holds a solid voxel, else `limit`.
-kernel void start_gaps(const int count, global const ulong *solid, const int limit, global uchar *gap) {
-    const int index = get_global_id(0);
-    if (index >= count) return;
-    gap[index] = solid[index] != 0 ? 0 : (uchar)limit;
+// Bit 2 k + 0 or 1 of element 2 n + 0 or 1 of `octets`: whether that voxel of a row of 8 is solid (seen, tsdf < 0), k the row's
+// place in its cells.
+static inline int8 solid_bits(global const float2 *row, const int k) {
+    const float16 voxels = vload16(0, (global const float *)row);
+    const int8 bits = (int8)(1, 2, 1, 2, 1, 2, 1, 2) << (int8)(2 * k);
+    return (voxels.odd > 0.0f && voxels.even < 0.0f) & bits;
 }
 
-// One axis of the one-sided Chebyshev distance: the least, over bricks `offset` ahead, of max(offset, their distance so far).
-// inner [variants][z][y][x] -> gap [2 variants][z][y][x]: first looking towards lower indices, then towards higher ones.
+// listed [count] brick indices -> solid [z][y][x]: bit (z 4 + y) 4 + x where a cell of 2x2x2 voxels holds a solid voxel;
+// octets [slot][64]: which of the cell's voxels are. 16 items a brick, 4 bricks a work-group; an item is a row of 4 cells.
+kernel void find_solid(const int count, global const int *listed, global const int *slots, global const float2 *voxels,
+                       global ulong *solid, global uchar *octets) {
+    local uint cells[64];
+    const int item = get_local_id(0);
+    const int place = get_global_id(0) >> 4;
+    const int row = item & 15;
+    const int index = listed[min(place, count - 1)];
+    const int first = (row >> 2) * 2 * BRICK * BRICK + (row & 3) * 2 * BRICK;
+    global const float2 *corner = voxels + slots[index] * BRICK_VOXELS + first;
+    const int8 bits = solid_bits(corner, 0) | solid_bits(corner + BRICK, 1) | solid_bits(corner + BRICK * BRICK, 2) |
+                      solid_bits(corner + BRICK * BRICK + BRICK, 3);
+    const int4 found = bits.even | bits.odd;
+    const int4 set = (found != 0) & (int4)(1, 2, 4, 8);
+    cells[item] = set.x | set.y | set.z | set.w;
+    if (place < count) vstore4(convert_uchar4(found), slots[index] * 16 + row, octets);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (row == 0 && place < count) {
+        ulong mask = 0;
+        for (int i = 0; i < 16; i++) mask |= (ulong)cells[item + i] << (4 * i);
+        solid[index] = mask;
+    }
+}
+
+// Which of the bricks have changed between solid and not: corners of the box around them, in bricks; low > high = none.
+#define CHANGED_LOW 0
+#define CHANGED_HIGH 3
+
+// solid [z][y][x], occupied [z][y][x] (1 where a brick holds a solid voxel, from the last time) -> occupied, changed [6], and
+// gap [2][z][y][x]: bricks to the nearest occupied one of the row, at most `limit`, towards lower x and towards higher. One item a row.
+kernel void gaps_along_x(const int4 bricks, global const ulong *solid, const int limit, global uchar *occupied,
+                         global int *changed, global uchar *gap) {
+    const int y = get_global_id(0);
+    const int z = get_global_id(1);
+    if (y >= bricks.y || z >= bricks.z) return;
+    const int first = (z * bricks.y + y) * bricks.x;
+    int low = bricks.x, high = -1, back = limit, ahead = limit;
+    for (int x = 0; x < bricks.x; x++) {
+        const uchar now = solid[first + x] != 0;
+        if (now != occupied[first + x]) {
+            low = min(low, x);
+            high = x;
+            occupied[first + x] = now;
+        }
+    }
+    if (high < 0) return;
+    for (int x = 0; x < bricks.x; x++) {
+        back = occupied[first + x] ? 0 : min(back + 1, limit);
+        gap[first + x] = (uchar)back;
+    }
+    global uchar *onward = gap + bricks.x * bricks.y * bricks.z;
+    for (int x = bricks.x - 1; x >= 0; x--) {
+        ahead = occupied[first + x] ? 0 : min(ahead + 1, limit);
+        onward[first + x] = (uchar)ahead;
+    }
+    atomic_min(changed + CHANGED_LOW, low);
+    atomic_min(changed + CHANGED_LOW + 1, y);
+    atomic_min(changed + CHANGED_LOW + 2, z);
+    atomic_max(changed + CHANGED_HIGH, high);
+    atomic_max(changed + CHANGED_HIGH + 1, y);
+    atomic_max(changed + CHANGED_HIGH + 2, z);
+}
+
+// One more axis (1 = y, 2 = z) of the one-sided Chebyshev distance: the least, over bricks `offset` ahead, of max(offset, their
+// distance so far). inner [variants][z][y][x] and 16 bytes more -> gap [2 variants][z][y][x]: towards lower indices, then towards
+// higher ones; only where `changed` may have had an effect. One item 16 bricks of a row.
 kernel void gap_along_axis(const int4 bricks, const int variants, global const uchar *inner, const int axis, const int limit,
-                           global uchar *gap) {
+                           global const int *changed, global uchar *gap) {
+    const int x = max(min(16 * (int)get_global_id(0), bricks.x - 16), 0);
+    const int y = get_global_id(1);
+    const int z = get_global_id(2) % bricks.z;
     const int variant = get_global_id(2) / bricks.z;
-    const int3 b = (int3)(get_global_id(0), get_global_id(1), get_global_id(2) % bricks.z);
-    if (!inside_bricks(bricks, b) || variant >= 2 * variants) return;
+    if (16 * get_global_id(0) >= bricks.x || y >= bricks.y || variant >= 2 * variants) return;
+    if (x + 15 < changed[CHANGED_LOW] - limit || x > changed[CHANGED_HIGH] + limit) return;
+    if (y < changed[CHANGED_LOW + 1] - limit || y > changed[CHANGED_HIGH + 1] + limit) return;
+    if (z < changed[CHANGED_LOW + 2] - limit || z > changed[CHANGED_HIGH + 2] + limit) return;
     const int volume = bricks.x * bricks.y * bricks.z;
-    const int ahead = variant >= variants ? 1 : -1;
-    const int position = axis == 0 ? b.x : axis == 1 ? b.y : b.z;
-    const int size = axis == 0 ? bricks.x : axis == 1 ? bricks.y : bricks.z;
-    const int stride = ahead * (axis == 0 ? 1 : axis == 1 ? bricks.x : bricks.x * bricks.y);
-    const int room = ahead > 0 ? size - 1 - position : position;
-    global const uchar *from = inner + (variant % variants) * volume + brick_index(bricks, b);
-    int nearest = limit;
-    for (int offset = 0; offset <= room && offset < nearest; offset++) {
-        const int there = from[offset * stride];
-        const int distance = there > offset ? there : offset;
-        nearest = distance < nearest ? distance : nearest;
+    const int position = axis == 1 ? y : z;
+    const int size = axis == 1 ? bricks.y : bricks.z;
+    const int is_ahead = variant >= variants;
+    const int stride = (is_ahead ? 1 : -1) * (axis == 1 ? bricks.x : bricks.x * bricks.y);
+    const int room = min(is_ahead ? size - 1 - position : position, limit - 1);
+    const int place = (z * bricks.y + y) * bricks.x + x;
+    global const uchar *from = inner + (variant % variants) * volume + place;
+    uchar16 nearest = (uchar16)(limit);
+    for (int offset = 0; offset <= room; offset++)
+        nearest = min(nearest, max(vload16(0, from + offset * stride), (uchar16)(offset)));
+    global uchar *to = gap + variant * volume + place;
+    if (bricks.x >= 16) {
+        vstore16(nearest, 0, to);
+        return;
     }
-    gap[variant * volume + brick_index(bricks, b)] = (uchar)nearest;
+    uchar values[16];
+    vstore16(nearest, 0, values);
+    for (int i = 0; i < bricks.x; i++) to[i] = values[i];
 }

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
+from server.stages.brick_pool import BRICK_VOXELS
+from server.stages.brick_table import AWAY_SLOT, BRICK
 from server.stages.integrate import integrate
 from server.stages.measure import Measurement
 from server.stages.raycast import raycast
-from server.stages.volume import BRICK, BRICK_VOXELS, Volume
+from server.stages.volume import Volume
 
 Floats = NDArray[np.float64]
 
@@ -28,9 +30,9 @@ def dense_voxels(engine: Engine, volume: Volume) -> tuple[NDArray[np.float32], N
     """tsdf, weight and whether allocated, each [z, y, x] over the whole volume; never seen voxels are (1, 0)."""
     slots = engine.download(volume.slots_device)
     pool = vectors(engine.download(volume.voxels)).reshape(-1, BRICK, BRICK, BRICK, 2)
-    bricks = np.where((slots >= 0)[..., None, None, None, None], pool[np.maximum(slots, 0)], 0)
+    bricks = pool[np.maximum(slots, AWAY_SLOT)]  # of which no voxel was ever seen
     dense = bricks.transpose(0, 3, 1, 4, 2, 5, 6).reshape(*(np.array(slots.shape) * BRICK), 2)
-    allocated = np.kron(slots >= 0, np.ones((BRICK,) * 3, bool)).astype(bool)
+    allocated = np.kron(slots > AWAY_SLOT, np.ones((BRICK,) * 3, bool)).astype(bool)
     return np.where(dense[..., 1] > 0, dense[..., 0], 1), dense[..., 1], allocated
 
 
@@ -42,11 +44,12 @@ def in_bricks(dense: NDArray[Any]) -> NDArray[Any]:
 
 def fill(engine: Engine, volume: Volume, tsdf: Floats, weight: Floats) -> None:
     """Put tsdf and weight [z, y, x] into the volume, every brick allocated, and summarize it."""
-    volume._slots.ravel()[:] = np.arange(volume._slots.size)
-    volume._allocated = np.arange(volume._slots.size, dtype=np.int32)
-    volume._upload_table()
+    volume.allocate_everywhere()
+    slots = engine.download(volume.slots_device).ravel()
+    pool = engine.download(volume.voxels)
     pairs = np.stack([in_bricks(tsdf), in_bricks(weight)], axis=-1).astype(np.float32)
-    volume.voxels.set(np.ascontiguousarray(pairs).view(cl_types.float2)[..., 0], engine.queue)
+    pool[slots] = np.ascontiguousarray(pairs).view(cl_types.float2)[..., 0]
+    volume.voxels.set(pool, engine.queue)
     volume.summarize()
 
 
@@ -63,10 +66,17 @@ def upload_measurement(engine: Engine, depth_m: NDArray[Any], radiance: NDArray[
     return Measurement(device_radiance, upload_depth(engine, depth_m))
 
 
-def fuse(engine: Engine, volume: Volume, camera: CameraModel, world_from_camera: Floats, depth_m: NDArray[Any]) -> None:
-    """Allocate and integrate one depth picture."""
+def fuse(
+    engine: Engine,
+    volume: Volume,
+    camera: CameraModel,
+    world_from_camera: Floats,
+    depth_m: NDArray[Any],
+    radiance: NDArray[Any] | None = None,
+) -> None:
+    """Allocate and integrate one picture: depth [h, w] metres and linear RGB [h, w, 3], mid grey without one."""
     pose = volume.volume_from_world() @ world_from_camera
-    measurement = upload_measurement(engine, depth_m)
+    measurement = upload_measurement(engine, depth_m, radiance)
     volume.allocate(camera, pose, measurement.depth_m)
     integrate(engine, volume, camera, pose, measurement)
 

@@ -29,6 +29,11 @@ class Engine:
         self.profile = Profile()
         self._kernels: dict[tuple[object, ...], cl.Kernel] = {}
 
+    @property
+    def lanes(self) -> int:
+        """Neighbours that a work-item of a vectorised kernel does at once (include/lanes.clh)."""
+        return 1 if self.device.is_gpu else 8
+
     def kernel(self, file: str, name: str, **defines: Define) -> cl.Kernel:
         """Kernel `name` of `cl_kernels/<file>`; retrieved once, because a kernel object carries its arguments."""
         key = (file, name, define_options(defines))  # as text: 1, 1.0 and True are equal in Python

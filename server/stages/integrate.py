@@ -25,9 +25,10 @@ def integrate(
     """Fold a rectified picture into the bricks that are allocated."""
     if not volume.allocated_bricks:
         return
+    items = 64 if engine.lanes == 1 else 1  # a processor's core has a brick to itself
     engine.launch(
-        engine.kernel("integrate.cl", "integrate"),
-        (BRICK * volume.allocated_bricks, BRICK),
+        engine.kernel("integrate.cl", "integrate", LANES=engine.lanes),
+        (items * volume.allocated_bricks,),
         volume.allocated_bricks,
         camera.width,
         camera.height,
@@ -35,12 +36,18 @@ def integrate(
         volume.allocated_device,
         volume.slots_device,
         measurement.depth_m,
+        measurement.radiance,
         intrinsics(camera),
         float16(inverse_rigid(volume_from_camera)),
         volume.voxel_m,
         volume.truncation_m,
         GREATEST_WEIGHT,
+        volume.frames,
         volume.voxels,
-        local=(BRICK, BRICK),
+        volume.colors,
+        volume.solid,
+        volume.octets,
+        local=(items,),
     )
-    volume.summarize()
+    volume.count_frame()
+    volume.summarize(all=False)

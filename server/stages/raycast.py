@@ -10,11 +10,12 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.opencl.engine import Engine, float16
+from server.maths.rigid import inverse_rigid
+from server.opencl.engine import Engine, float16, int4
 from server.stages.measure import GREATEST_DEPTH_M, intrinsics
 from server.stages.volume import Volume
 
-LABEL_NONE, LABEL_STATIC, LABEL_DYNAMIC = 0, 1, 2
+LABEL_NONE, LABEL_STATIC, LABEL_DYNAMIC, LABEL_FILLED = 0, 1, 2, 3
 
 
 @dataclass(frozen=True)
@@ -29,20 +30,53 @@ class Surface:
     """uint8: LABEL_NONE, LABEL_STATIC (from the volume), LABEL_DYNAMIC (from the sensor)."""
 
 
+_TILE = 8  # as in raycast.cl
+_FARTHEST = int(np.float32(np.inf).view(np.int32))
+
+
+def _ray_bounds(
+    engine: Engine, camera: CameraModel, volume_from_camera: NDArray[np.float64], volume: Volume
+) -> tuple[cl_array.Array, cl_array.Array]:
+    """Nearest and farthest depth [tile row, tile column] with a solid voxel, as bits of float metres."""
+    tiles = (-(-camera.height // _TILE), -(-camera.width // _TILE))
+    nearest = engine.workspace.array("rays_nearest", tiles, np.int32)
+    farthest = engine.workspace.array("rays_farthest", tiles, np.int32)
+    nearest.fill(np.int32(_FARTHEST))
+    farthest.fill(np.int32(0))
+    if volume.allocated_bricks:
+        engine.launch(
+            engine.kernel("raycast.cl", "bound_rays", LANES=engine.lanes),
+            (volume.allocated_bricks,),
+            volume.allocated_bricks,
+            camera.width,
+            camera.height,
+            int4(*volume.bricks, 0),
+            volume.allocated_device,
+            volume.solid,
+            volume.voxel_m,
+            intrinsics(camera),
+            float16(inverse_rigid(volume_from_camera)),
+            nearest,
+            farthest,
+        )
+    return nearest, farthest
+
+
 def raycast(engine: Engine, camera: CameraModel, volume_from_camera: NDArray[np.float64], volume: Volume) -> Surface:
     """Surface of the volume alone; labels are not filled."""
-    size = (camera.height, camera.width)
+    size, lanes = (camera.height, camera.width), engine.lanes
     positions = engine.workspace.array("positions", size, cl_types.float4)
     normals = engine.workspace.array("normals", size, cl_types.float4)
     engine.launch(
-        engine.kernel("raycast.cl", "raycast"),
-        (camera.width, camera.height),
+        engine.kernel("raycast.cl", "raycast", LANES=lanes),
+        (-(-camera.width // lanes), camera.height),
         camera.width,
         camera.height,
         *volume.arguments(),
         intrinsics(camera),
         float16(volume_from_camera),
         GREATEST_DEPTH_M,
+        *_ray_bounds(engine, camera, volume_from_camera, volume),
         positions,
         normals,
     )

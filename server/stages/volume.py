@@ -1,28 +1,34 @@
 """The brick volume: a TSDF whose memory follows the surface. Kernels: volume.cl, layout: include/volume.clh.
 
-Space is a regular grid of bricks of 8x8x8 voxels; a brick gets a slot of the pool when a measured
-surface comes near it.
+Space is a regular grid of bricks of 8x8x8 voxels; a brick gets a slot of the pool when a measured surface comes
+near it. Past the budget, bricks that no camera looks at go to the host, the longest unwanted first, and come back
+bit for bit when one looks at them again. While away they still stop rays, as cells of 2x2x2 voxels.
 """
 
 from __future__ import annotations
 
-from itertools import pairwise
+from collections.abc import Iterator
 
 import numpy as np
 import pyopencl.array as cl_array
-import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.maths.rigid import translation
 from server.opencl.engine import Engine, KernelArgument, float16, int4
+from server.opencl.transfer import fill_bytes
+from server.stages.brick_pool import BRICK_VOXELS
+from server.stages.brick_residency import Residency
+from server.stages.brick_table import BRICK, Indices
+from server.stages.bricks import Bricks, unpack_bricks
 from server.stages.measure import intrinsics
+from server.stages.ray_tables import RayTables
 
-BRICK = 8
-BRICK_VOXELS = BRICK**3
+__all__ = ["BRICK", "BRICK_VOXELS", "TRUNCATION_VOXELS", "Bricks", "Volume", "VolumeSizeError"]
+
 TRUNCATION_VOXELS = 4.0
-_GREATEST_GAP = 15
 _GREATEST_BRICKS = 1 << 22
+_TILE = 4
 
 
 class VolumeSizeError(ValueError):
@@ -30,7 +36,10 @@ class VolumeSizeError(ValueError):
 
 
 class Volume:
-    """TSDF of one session. World axes; volume space has its origin at the volume's lower corner."""
+    """TSDF of one session. World axes; volume space has its origin at the volume's lower corner.
+
+    `budget_bytes` is device memory of the pool, `host_budget_bytes` (default four times that) of released bricks.
+    """
 
     def __init__(
         self,
@@ -38,38 +47,78 @@ class Volume:
         bounds_m: tuple[float, float, float, float, float, float],
         voxel_m: float,
         budget_bytes: int = 512 << 20,
+        host_budget_bytes: int | None = None,
     ) -> None:
         self.origin_world = np.array(bounds_m[:3], np.float64)
         self.voxel_m = float(voxel_m)
-        extent = np.array(bounds_m[3:]) - self.origin_world
-        counts = np.ceil(extent / (BRICK * self.voxel_m) - 1e-6)  # floats: their product does not overflow
-        if (extent <= 0).any() or counts.prod() > _GREATEST_BRICKS:
-            raise VolumeSizeError(
-                f"a volume of {extent[0]:.2f} x {extent[1]:.2f} x {extent[2]:.2f} m at {1e3 * self.voxel_m:.1f} mm "
-                f"a voxel has {counts.prod():.0f} bricks, at most {_GREATEST_BRICKS}: give a larger --voxel"
-            )
-        counts = counts.astype(np.int64)
-        self.bricks = (int(counts[0]), int(counts[1]), int(counts[2]))
+        self.bricks = _brick_counts(np.array(bounds_m[3:]) - self.origin_world, self.voxel_m)
         self.truncation_m = TRUNCATION_VOXELS * self.voxel_m
-        self.capacity = int(min(counts.prod(), budget_bytes // (8 * BRICK_VOXELS)))
+        self.frames = 0
         self.is_full = False
         self._engine = engine
-        self._slots = np.full(counts[::-1], -1, np.int32)
-        self._allocated = np.empty(0, np.int32)
-        space = engine.workspace
-        self.voxels: cl_array.Array = space.array("voxels", (self.capacity, BRICK_VOXELS), cl_types.float2)
-        self.voxels.fill(np.zeros((), cl_types.float2))
-        self._solid = space.array("brick_solid", self._slots.shape, np.uint64)
-        self._solid.fill(np.uint64(0))
-        self._octets = space.array("solid_octets", (self.capacity, 64), np.uint8)
-        self._gaps = space.array("brick_gaps", (8 * self._slots.size,), np.uint8)
-        self._upload_table()
-        self.summarize()
+        self._tables = RayTables(engine, self.bricks)
+        host_bytes = 4 * budget_bytes if host_budget_bytes is None else host_budget_bytes
+        self._residency = Residency(engine, self._tables, self.voxel_m, budget_bytes, host_bytes)
+        self._tables.update()
+
+    @property
+    def voxels(self) -> cl_array.Array:
+        """[slots, 512] float2 (tsdf, weight); another array after the pool has grown."""
+        return self._residency.pool.voxels
+
+    @property
+    def colors(self) -> cl_array.Array:
+        """[slots, 512] uint32 packed colour, see bricks.py; 0 = none. Another array after the pool has grown."""
+        return self._residency.pool.colors
+
+    @property
+    def octets(self) -> cl_array.Array:
+        """[slots, 64] uint8, see volume.clh. Another array after the pool has grown."""
+        return self._residency.pool.octets
+
+    @property
+    def solid(self) -> cl_array.Array:
+        """[z, y, x] uint64, see volume.clh."""
+        return self._tables.solid
+
+    @property
+    def slots_device(self) -> cl_array.Array:
+        """[z, y, x] int32 slot of each brick, AWAY_SLOT, or NO_SLOT."""
+        return self._residency.slots_device
+
+    @property
+    def allocated_device(self) -> cl_array.Array:
+        """[allocated_bricks and more] int32: the bricks that have a slot of their own, in the order of the slots."""
+        return self._residency.resident_device
 
     @property
     def allocated_bricks(self) -> int:
-        """Bricks that hold voxels."""
-        return len(self._allocated)
+        """Bricks that have a slot of their own."""
+        return self._residency.resident_count
+
+    @property
+    def released_bricks(self) -> int:
+        """Bricks that the host keeps."""
+        return len(self._residency.store)
+
+    @property
+    def capacity(self) -> int:
+        """Bricks that the pool has slots for now; it grows up to the budget."""
+        return self._residency.pool.capacity
+
+    @property
+    def device_bytes(self) -> int:
+        """Device memory of the voxels and of all tables."""
+        return self._residency.device_bytes + self._tables.bytes_held
+
+    @property
+    def host_bytes(self) -> int:
+        """Host memory of the released bricks."""
+        return self._residency.store.bytes_held
+
+    def count_frame(self) -> None:
+        """Say that one more picture was integrated."""
+        self.frames += 1
 
     def volume_from_world(self) -> NDArray[np.float64]:
         """4x4 that moves world coordinates to the volume's origin."""
@@ -80,21 +129,56 @@ class Volume:
         return (
             int4(*self.bricks, 0),
             self.slots_device,
-            self._gaps,
-            self._solid,
-            self._octets,
+            self._tables.gaps,
+            self._tables.solid,
+            self.octets,
             self.voxels,
             self.voxel_m,
             self.truncation_m,
         )
 
     def allocate(self, camera: CameraModel, volume_from_camera: NDArray[np.float64], depth_m: cl_array.Array) -> None:
-        """Give a slot to every brick near the measured surface; past the budget the nearest table order wins."""
-        wanted = self._engine.workspace.array("wanted_bricks", self._slots.shape, np.uint8)
-        wanted.fill(np.uint8(0))
+        """Give a slot to every brick near the measured surface, and bring back what the camera sees.
+
+        Where the budget has no room for all of them, the ones nearest the camera win, and `is_full` says so.
+        """
+        wanted = self._mark(camera, volume_from_camera, depth_m)
+        self._residency.begin_frame(wanted)
+        self.is_full = not self._residency.provide(camera, volume_from_camera, wanted)
+
+    def bring_back(self, camera: CameraModel, volume_from_camera: NDArray[np.float64]) -> None:
+        """Bring back released bricks that a camera sees, before casting rays from where nothing is measured."""
+        self._residency.provide(camera, volume_from_camera, np.empty(0, np.int32))
+
+    def allocate_everywhere(self) -> None:
+        """Give a slot to every brick there is; a dense volume. Raises VolumeSizeError past the budget."""
+        count, limit = int(np.prod(self.bricks)), self._residency.limit
+        if count > limit:
+            raise VolumeSizeError(f"a dense volume of {count} bricks is more than the budget's {limit}")
+        self._residency.provide_all()
+
+    def summarize(self, all: bool = True) -> None:
+        """After integration: how far rays may jump. `all`: look for solid voxels first; else integration did so."""
+        if all:
+            pool = self._residency.pool
+            self._tables.find_solid(self.allocated_device, self.allocated_bricks, self.slots_device, pool)
+        self._tables.update()
+
+    def download_batches(self) -> Iterator[Bricks]:
+        """All bricks that hold voxels, released ones too, some at a time."""
+        for places, voxels, colors in self._residency.everything():
+            yield unpack_bricks(places, voxels, colors)
+
+    def download_bricks(self) -> Bricks:
+        """All bricks that hold voxels, released ones too."""
+        return Bricks.joined(list(self.download_batches()))
+
+    def _mark(self, camera: CameraModel, volume_from_camera: NDArray[np.float64], depth_m: cl_array.Array) -> Indices:
+        wanted = self._engine.workspace.array("wanted_bricks", (self.solid.size,), np.uint8)
+        fill_bytes(self._engine.queue, wanted, 0)
         self._engine.launch(
             self._engine.kernel("volume.cl", "mark_bricks"),
-            (camera.width, camera.height),
+            (-(-camera.width // _TILE), -(-camera.height // _TILE)),
             camera.width,
             camera.height,
             int4(*self.bricks, 0),
@@ -105,48 +189,16 @@ class Volume:
             self.truncation_m + self.voxel_m,
             wanted,
         )
-        new = np.flatnonzero((self._engine.download(wanted) != 0).ravel() & (self._slots.ravel() < 0)).astype(np.int32)
-        room = self.capacity - len(self._allocated)
-        self.is_full = len(new) > room
-        new = new[:room]
-        if new.size:
-            self._slots.ravel()[new] = np.arange(len(self._allocated), len(self._allocated) + len(new))
-            self._allocated = np.concatenate([self._allocated, new])
-            self._upload_table()
+        return np.flatnonzero(self._engine.download(wanted).view(np.bool_)).astype(np.int32)
 
-    def summarize(self) -> None:
-        """After integration: find the solid cells and how far rays may jump between them."""
-        space, bricks = self._engine.workspace, int4(*self.bricks, 0)
-        if self.allocated_bricks:
-            self._engine.launch(
-                self._engine.kernel("volume.cl", "find_solid"),
-                (64 * self.allocated_bricks,),
-                self.allocated_bricks,
-                self.allocated_device,
-                self.slots_device,
-                self.voxels,
-                self._solid,
-                self._octets,
-            )
-        count = self._slots.size
-        gaps = [space.array(f"gaps_{i}", (variants * count,), np.uint8) for i, variants in enumerate((1, 2, 4))]
-        self._engine.launch(
-            self._engine.kernel("volume.cl", "start_gaps"), (count,), count, self._solid, _GREATEST_GAP, gaps[0]
+
+def _brick_counts(extent_m: NDArray[np.float64], voxel_m: float) -> tuple[int, int, int]:
+    """Bricks along x, y, z. Raises VolumeSizeError."""
+    counts = np.ceil(extent_m / (BRICK * voxel_m) - 1e-6)  # floats: their product does not overflow
+    if (extent_m <= 0).any() or counts.prod() > _GREATEST_BRICKS:
+        raise VolumeSizeError(
+            f"a volume of {extent_m[0]:.2f} x {extent_m[1]:.2f} x {extent_m[2]:.2f} m at {1e3 * voxel_m:.1f} mm "
+            f"a voxel has {counts.prod():.0f} bricks, at most {_GREATEST_BRICKS}: give a larger --voxel"
         )
-        for axis, (inner, outer) in enumerate(pairwise([*gaps, self._gaps])):
-            self._engine.launch(
-                self._engine.kernel("volume.cl", "gap_along_axis"),
-                (self.bricks[0], self.bricks[1], self.bricks[2] * (2 << axis)),
-                bricks,
-                1 << axis,
-                inner,
-                axis,
-                _GREATEST_GAP,
-                outer,
-            )
-
-    def _upload_table(self) -> None:
-        """Bring slots and the list of allocated bricks to the device."""
-        space = self._engine.workspace
-        self.slots_device = space.upload("brick_slots", self._slots)
-        self.allocated_device = space.upload("allocated_bricks", self._allocated) if self._allocated.size else None
+    x, y, z = counts.astype(np.int64).tolist()
+    return x, y, z

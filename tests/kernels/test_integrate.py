@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
-from server.stages.integrate import GREATEST_WEIGHT
+from server.stages.integrate import GREATEST_WEIGHT, integrate
 from server.stages.volume import Volume
 from tests.analytic import look, look_at, plane, room, sphere
 from tests.reference.integrate import integrate as twin
-from tests.reference.integrate import project, voxel_centers
+from tests.reference.integrate import integrate_color, project, voxel_centers
 from tests.tolerance import relative_tolerance
-from tests.volumes import dense_voxels, fuse
+from tests.volumes import dense_voxels, fuse, upload_measurement
 
 CAMERA = CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.313, cy=36.127)
 BOUNDS = (-1.0, -1.0, 0.0, 1.0, 1.0, 2.4)
@@ -82,6 +82,75 @@ def test_matches_twin(engine: Engine, name: str) -> None:
         now.fuse(camera, view, depth)
         expected.tsdf[new], expected.weight[new] = now.tsdf[new], now.weight[new]
     compare(engine, expected)
+
+
+def dense_colors(volume: Volume) -> tuple[Floats, Floats]:
+    """Linear RGB [z, y, x, 3] and colour weight [z, y, x], 0 where no brick is."""
+    x, y, z = (8 * count for count in volume.bricks)
+    colors, count = np.zeros((z, y, x, 3)), np.zeros((z, y, x))
+    bricks = volume.download_bricks()
+    for (bx, by, bz), color, weight in zip(bricks.indices * 8, bricks.colors, bricks.color_weight, strict=True):
+        colors[bz : bz + 8, by : by + 8, bx : bx + 8] = color
+        count[bz : bz + 8, by : by + 8, bx : bx + 8] = weight
+    return colors, count
+
+
+def test_color_matches_twin(engine: Engine) -> None:
+    """Within the steps that colour is kept in: sqrt(c) in 1/511 (blue 1/255), rounded at each of the frames."""
+    volume = Volume(engine, BOUNDS, VOXEL_M)
+    color, count = (
+        np.zeros((*(8 * c for c in reversed(volume.bricks)), 3)),
+        np.zeros([8 * c for c in volume.bricks][::-1]),
+    )
+    rng = np.random.default_rng(7)
+    for view in (np.eye(4), look_at((0.4, -0.3, -0.2), (-0.2, 0.2, 1.4)), np.eye(4)):
+        depth = look(SCENE, CAMERA, view).depth_m.astype(np.float32).astype(np.float64)
+        radiance = rng.random((CAMERA.height, CAMERA.width, 3)).astype(np.float32).astype(np.float64)
+        fuse(engine, volume, CAMERA, view, depth, radiance)
+        pose = volume.volume_from_world() @ view
+        color, count = integrate_color(CAMERA, pose, depth, radiance, VOXEL_M, volume.truncation_m, color, count)
+    found, weight = dense_colors(volume)
+    seen = weight > 0
+    assert (weight == count)[seen].mean() > 1 - FLIPS
+    assert set(np.unique(weight)) == {0, 1, 2, 3}
+    same = seen & (weight == count)
+    error = np.abs(np.sqrt(found) - np.sqrt(color))[same] / np.array([1 / 511, 1 / 511, 1 / 255])
+    # A step of the root each frame; a dark mean after a bright look loses a step of the brighter root.
+    assert np.quantile(error, 0.999) < 3
+    assert error.mean() < 1
+    assert np.abs((np.sqrt(found) - np.sqrt(color))[same].mean(0)).max() < 2e-4  # rounding is unbiased
+
+
+@pytest.mark.parametrize(("before", "after"), [(0.25, 0.252), (0.25, 0.248), (0.01, 0.0104)])
+def test_a_change_below_one_step_is_not_lost(engine: Engine, before: float, after: float) -> None:
+    """A mean of 63 looks moves by 1/63 of a change, here less than half a step of how colour is kept."""
+    volume = Volume(engine, (-0.16, -0.16, 1.0, 0.16, 0.16, 1.32), 0.02)
+    depth = np.full((CAMERA.height, CAMERA.width), 1.16)
+
+    def look_often(value: float, times: int) -> NDArray[Any]:
+        for _ in range(times):
+            fuse(engine, volume, CAMERA, np.eye(4), depth, np.full((*depth.shape, 3), value))
+        colors, weight = dense_colors(volume)
+        return np.asarray(colors[weight == 63])
+
+    assert abs(np.sqrt(after) - np.sqrt(before)) / 63 < 0.5 / 511
+    start = look_often(before, 100)
+    assert np.abs(start.mean(0) - before).max() < 0.05 * abs(after - before) + 1e-4
+    moved = look_often(after, 250)
+    assert np.abs(moved.mean(0) - after).max() < 0.15 * abs(after - before)
+
+
+def test_no_color_from_outside_the_camera_s_picture(engine: Engine) -> None:
+    """A rectified picture of a distorted lens has borders that no pixel filled."""
+    volume = Volume(engine, (-0.16, -0.16, 1.0, 0.16, 0.16, 1.32), 0.02)
+    measurement = upload_measurement(engine, np.full((CAMERA.height, CAMERA.width), 1.16))
+    radiance = measurement.radiance.get()
+    radiance["w"] = -1
+    measurement.radiance.set(radiance)
+    volume.allocate(CAMERA, volume.volume_from_world(), measurement.depth_m)
+    integrate(engine, volume, CAMERA, volume.volume_from_world(), measurement)
+    assert not dense_colors(volume)[1].any()
+    assert dense_voxels(engine, volume)[1].any()
 
 
 def test_leaves_alone_what_it_does_not_see(engine: Engine) -> None:

@@ -74,3 +74,26 @@ def integrate(
     sample = np.minimum(distance / truncation_m, 1)
     mean = (weight * tsdf + sample) / (weight + 1)
     return np.where(updated, mean, tsdf), np.where(updated, np.minimum(weight + 1, greatest_weight), weight)
+
+
+def integrate_color(
+    camera: CameraModel,
+    volume_from_camera: Floats,
+    depth_m: Floats,
+    radiance: Floats,
+    voxel_m: float,
+    truncation_m: float,
+    color: Floats,
+    count: Floats,
+) -> tuple[Floats, Floats]:
+    """Linear RGB [z, y, x, 3] and its weight [z, y, x] after one more picture: a running mean, the weight at most 63.
+
+    A voxel within 1.5 voxels of the measured surface takes the colour of its nearest pixel. radiance: [h, w, 3].
+    """
+    points = (voxel_centers(count.shape, voxel_m) - volume_from_camera[:3, 3]) @ volume_from_camera[:3, :3]
+    near = np.abs(signed_distance(camera, points, depth_m, truncation_m)) < 1.5 * voxel_m  # NaN is not near
+    pixels = np.where(near[..., None], project(camera, points), 0)
+    u, v = np.floor(pixels + 0.5).astype(int).transpose(-1, 0, 1, 2)
+    next_count = np.minimum(count + 1, 63)
+    mean = color + (np.minimum(radiance[v, u], 1) - color) / next_count[..., None]
+    return np.where(near[..., None], mean, color), np.where(near, next_count, count)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,6 +49,13 @@ def find_solid(tsdf: Floats, weight: Floats) -> tuple[NDArray[np.uint64], NDArra
 def start_gaps(solid: NDArray[np.uint64], limit: int) -> NDArray[np.uint8]:
     """0 where a brick holds a solid voxel, else `limit`."""
     return np.where(solid != 0, 0, limit).astype(np.uint8)
+
+
+def changed_box(before: NDArray[Any], now: Bools) -> NDArray[np.int64]:
+    """[2, 3] corners (x, y, z) of the box around the bricks [z, y, x] that differ; (2^30, -2^30) where none does."""
+    places = np.argwhere(before != now)[:, ::-1]
+    none = np.full((2, 3), [[1 << 30], [-(1 << 30)]])
+    return np.stack([places.min(0), places.max(0)]) if len(places) else none
 
 
 def gap_along_axis(inner: NDArray[np.uint8], axis: int, limit: int) -> NDArray[np.uint8]:

@@ -1,0 +1,29 @@
+"""Copies and fills of raw memory, queued: what pyopencl's arrays would launch kernels of their own for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cl_array
+from numpy.typing import NDArray
+
+
+def fill_bytes(queue: cl.CommandQueue, array: cl_array.Array, value: int) -> None:
+    """Set every byte of `array` to `value`, 0 to 255."""
+    if array.nbytes:
+        cl.enqueue_fill_buffer(queue, _memory(array), np.array([value], np.uint8), 0, array.nbytes)
+
+
+def copy_beginning(queue: cl.CommandQueue, array: cl_array.Array, values: cl_array.Array | NDArray[Any]) -> None:
+    """Copy `values`, of the array's type, over its beginning; host memory is read before this returns."""
+    if isinstance(values, cl_array.Array):
+        cl.enqueue_copy(queue, _memory(array), _memory(values), byte_count=values.nbytes)
+    elif values.nbytes:
+        cl.enqueue_copy(queue, _memory(array), np.ascontiguousarray(values), is_blocking=True)
+
+
+def _memory(array: cl_array.Array) -> cl.Buffer:
+    assert isinstance(array.data, cl.Buffer)
+    return array.data

@@ -1,0 +1,127 @@
+"""Device memory of the bricks' voxels: it grows with the surface. Kernels: brick_pool.cl."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from server.opencl.engine import Engine
+from server.opencl.transfer import copy_beginning, fill_bytes
+
+BRICK_VOXELS = 512
+BRICK_CELLS = 64
+BRICK_BYTES = 12 * BRICK_VOXELS + BRICK_CELLS
+"""Of one brick in the pool: tsdf and weight, colour, octets."""
+_BATCH = 1024
+"""Bricks that are copied between device and host at once."""
+NOTHING_SEEN = 2.0
+
+
+class BrickPool:
+    """Slots 1 to `capacity`, and slot 0 for all bricks that are away."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        self.capacity = 0
+        self._allocate(0)
+        fill_bytes(engine.queue, self.voxels, 0)
+        fill_bytes(engine.queue, self.colors, 0)
+        fill_bytes(engine.queue, self.octets, 255)  # rays stop at what is away, but nothing is interpolated
+
+    @property
+    def bytes_held(self) -> int:
+        """Device memory of all slots."""
+        return int(self.voxels.nbytes + self.colors.nbytes + self.octets.nbytes)
+
+    def grow(self, capacity: int) -> None:
+        """Have `capacity` slots; contents stay. For a moment old and new lie side by side."""
+        old = (self.voxels, self.colors, self.octets)
+        self._allocate(capacity)
+        for before, after in zip(old, (self.voxels, self.colors, self.octets), strict=True):
+            copy_beginning(self._engine.queue, after, before)
+        self._engine.queue.finish()
+        for before in old:
+            if isinstance(before.data, cl.Buffer):
+                before.data.release()
+
+    def clear(self, slots: NDArray[np.int32]) -> None:
+        """Make voxels unseen and colourless."""
+        self._over_rows("claim_bricks", len(slots), self._list("claimed", slots), self.voxels, self.colors)
+
+    def least_tsdf(self, slots: NDArray[np.int32]) -> NDArray[np.float32]:
+        """[n] the least tsdf that was seen in each brick, NOTHING_SEEN where there is none."""
+        if not slots.size:
+            return np.empty(0, np.float32)
+        least = self._engine.workspace.array("least_tsdf", (_rounded(len(slots)),), np.float32)
+        kernel = self._engine.kernel("brick_pool.cl", "weigh_bricks")
+        arguments = (self._list("weighed", slots), self.voxels, NOTHING_SEEN, least)
+        self._engine.launch(kernel, (len(slots),), len(slots), *arguments)
+        result: NDArray[np.float32] = self._engine.download(least)[: len(slots)]
+        return result
+
+    def download(self, slots: NDArray[np.int32]) -> Iterator[tuple[slice, NDArray[Any], NDArray[np.uint32]]]:
+        """In batches: which of `slots`, their voxels [k, 512] float2, their colours [k, 512]."""
+        for batch in _batches(len(slots)):
+            voxels, colors, rows = self._staging(batch)
+            chosen = self._list("copied", slots[batch])
+            self._over_rows("copy_bricks", len(slots[batch]), chosen, self.voxels, self.colors, rows, voxels, colors)
+            count = len(slots[batch])
+            yield batch, self._engine.download(voxels)[:count], self._engine.download(colors)[:count]
+
+    def upload(self, slots: NDArray[np.int32], voxels: NDArray[Any], colors: NDArray[np.uint32]) -> None:
+        """Fill slots with voxels [n, 512] float2 and colours [n, 512]."""
+        for batch in _batches(len(slots)):
+            staged_voxels, staged_colors, rows = self._staging(batch)
+            copy_beginning(self._engine.queue, staged_voxels, voxels[batch])
+            copy_beginning(self._engine.queue, staged_colors, colors[batch])
+            chosen = self._list("copied", slots[batch])
+            self._over_rows(
+                "copy_bricks", len(slots[batch]), rows, staged_voxels, staged_colors, chosen, self.voxels, self.colors
+            )
+
+    def _allocate(self, capacity: int) -> None:
+        space, rows = self._engine.workspace, capacity + 1
+        self.capacity = capacity
+        self.voxels: cl_array.Array = space.array("voxels", (rows, BRICK_VOXELS), cl_types.float2)
+        self.colors: cl_array.Array = space.array("voxel_colors", (rows, BRICK_VOXELS), np.uint32)
+        self.octets: cl_array.Array = space.array("solid_octets", (rows, BRICK_CELLS), np.uint8)
+
+    def _staging(self, batch: slice) -> tuple[cl_array.Array, cl_array.Array, cl_array.Array]:
+        """Voxels and colours of one batch between device and host, and the rows of it that are used."""
+        space = self._engine.workspace
+        rows = min(_BATCH, _rounded(batch.stop - batch.start))
+        return (
+            space.array("staged_voxels", (rows, BRICK_VOXELS), cl_types.float2),
+            space.array("staged_colors", (rows, BRICK_VOXELS), np.uint32),
+            space.constant("staged_rows", np.arange(_BATCH, dtype=np.int32)),
+        )
+
+    def _over_rows(self, kernel: str, count: int, *arguments: cl_array.Array) -> None:
+        if count:
+            size = (BRICK_CELLS * count,)
+            self._engine.launch(self._engine.kernel("brick_pool.cl", kernel), size, count, *arguments)
+
+    def _list(self, name: str, values: NDArray[np.int32]) -> cl_array.Array:
+        return upload_list(self._engine, f"pool_{name}", values)
+
+
+def upload_list(engine: Engine, name: str, values: NDArray[np.int32]) -> cl_array.Array:
+    """[n or more] int32 on the device, the first n of them `values`: a list whose length changes keeps its memory."""
+    array = engine.workspace.array(name, (_rounded(len(values)),), np.int32)
+    copy_beginning(engine.queue, array, values)
+    return array
+
+
+def _rounded(count: int) -> int:
+    return 1 << max(10, (count - 1).bit_length())
+
+
+def _batches(count: int) -> Iterator[slice]:
+    for start in range(0, count, _BATCH):
+        yield slice(start, min(start + _BATCH, count))

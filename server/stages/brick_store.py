@@ -1,0 +1,61 @@
+"""Bricks that were released to the host, until the camera looks at them again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_BATCH = 1024
+
+
+class BrickStore:
+    """Voxels of released bricks, bit for bit, by place in the table."""
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._bricks: dict[int, tuple[NDArray[Any], NDArray[np.uint32]]] = {}
+        self._indices: NDArray[np.int32] | None = None
+
+    def __len__(self) -> int:
+        return len(self._bricks)
+
+    @property
+    def room(self) -> int:
+        """How many bricks more fit into the host's budget."""
+        return self._capacity - len(self._bricks)
+
+    @property
+    def bytes_held(self) -> int:
+        """Host memory of the voxels."""
+        return sum(voxels.nbytes + colors.nbytes for voxels, colors in self._bricks.values())
+
+    def indices(self) -> NDArray[np.int32]:
+        """[n] places of all bricks held."""
+        if self._indices is None:
+            self._indices = np.fromiter(self._bricks, np.int32, len(self._bricks))
+        return self._indices
+
+    def put(self, indices: NDArray[np.int32], voxels: NDArray[Any], colors: NDArray[np.uint32]) -> None:
+        """Keep copies of [n, 512] voxels (float2) and colours."""
+        for index, voxel, color in zip(indices.tolist(), voxels, colors, strict=True):
+            self._bricks[index] = (voxel.copy(), color.copy())
+        self._indices = None
+
+    def batches(self) -> Iterator[tuple[NDArray[np.int32], NDArray[Any], NDArray[np.uint32]]]:
+        """All bricks, some at a time: places, voxels [k, 512] float2, colours [k, 512]."""
+        indices = self.indices()
+        for start in range(0, len(indices), _BATCH):
+            chosen = indices[start : start + _BATCH]
+            yield chosen, *_stacked([self._bricks[index] for index in chosen.tolist()])
+
+    def take(self, indices: NDArray[np.int32]) -> tuple[NDArray[Any], NDArray[np.uint32]]:
+        """[n, 512] voxels and colours of bricks that are held; they are held no longer."""
+        self._indices = None
+        return _stacked([self._bricks.pop(index) for index in indices.tolist()])
+
+
+def _stacked(bricks: list[tuple[NDArray[Any], NDArray[np.uint32]]]) -> tuple[NDArray[Any], NDArray[np.uint32]]:
+    return np.stack([voxels for voxels, _ in bricks]), np.stack([colors for _, colors in bricks])

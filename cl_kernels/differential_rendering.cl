@@ -82,14 +82,27 @@ kernel void shadow_virtual(const int cols, const int rows, const int stride, con
     if (position.w > 0.0f) {
         taken.w = 1.0f;
         const int set = direction_set(row, col) * count;
+        int chosen[LANES];  // directions that no object blocks, until there are enough to trace
+        int waiting = 0;
         for (int j = 0; j < count; j++) {
             const float4 direction = directions[set + j];
             const float cosine = dot(normal, direction.xyz);
-            if (cosine <= 0.0f) continue;
-            const int is_free =
-                trace_objects(objects, grid_from_volume, dims, distances, position.xyz + offset_m * normal, direction.xyz, reach_m) > 0.0f &&
-                trace_volume(volume, position.xyz + voxel_m * normal, direction.xyz, reach_m);
-            if (!is_free) taken.xyz += cosine * direction.w * M_1_PI_F * arriving[set + j].xyz;
+            if (cosine > 0.0f) {
+                if (trace_objects(objects, grid_from_volume, dims, distances, position.xyz + offset_m * normal, direction.xyz, reach_m) > 0.0f)
+                    chosen[waiting++] = set + j;
+                else
+                    taken.xyz += cosine * direction.w * M_1_PI_F * arriving[set + j].xyz;
+            }
+            if (waiting < LANES && (j < count - 1 || waiting == 0)) continue;
+            for (int lane = waiting; lane < LANES; lane++) chosen[lane] = chosen[0];
+            const Rays rays = volume_rays(volume, position.xyz + voxel_m * normal, directions, chosen);
+            const int open = bits_of(trace_volume(volume, rays, reach_m));
+            for (int lane = 0; lane < waiting; lane++) {
+                const float4 blocked = directions[chosen[lane]];
+                if (!((open >> lane) & 1))
+                    taken.xyz += dot(normal, blocked.xyz) * blocked.w * M_1_PI_F * arriving[chosen[lane]].xyz;
+            }
+            waiting = 0;
         }
     }
     occluded[row * cols + col] = taken;

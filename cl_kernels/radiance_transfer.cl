@@ -76,19 +76,27 @@ kernel void transfer_radiance(const int cols, const int rows, const int stride, 
         for (int l = 0; l < BANDS; l++)
             for (int i = l * l; i < (l + 1) * (l + 1); i++) t[i] *= lambert_band(l);
         const int set = direction_set(row, col) * count;
+        int chosen[LANES];  // directions above the horizon, until there are enough to trace
+        int waiting = 0;
         for (int j = 0; j < count; j++) {
-            const float4 direction = directions[set + j];
-            const float cosine = dot(normal.xyz, direction.xyz);
-            if (cosine <= 0.0f) continue;
-            const float share = cosine * direction.w * M_1_PI_F;
-            sky += share;
-            if (trace_volume(volume, origin, direction.xyz, reach_m)) {
-                mask[j >> 5] |= 1u << (j & 31);
-            } else {
-                blocked_sky += share;
-                global const float *y = basis + (set + j) * COEFFICIENTS;
-                for (int i = 0; i < COEFFICIENTS; i++) t[i] -= share * y[i];
+            if (dot(normal.xyz, directions[set + j].xyz) > 0.0f) chosen[waiting++] = set + j;
+            if (waiting < LANES && (j < count - 1 || waiting == 0)) continue;
+            for (int lane = waiting; lane < LANES; lane++) chosen[lane] = chosen[0];
+            const int open = bits_of(trace_volume(volume, volume_rays(volume, origin, directions, chosen), reach_m));
+            for (int lane = 0; lane < waiting; lane++) {
+                const float4 direction = directions[chosen[lane]];
+                const float share = dot(normal.xyz, direction.xyz) * direction.w * M_1_PI_F;
+                sky += share;
+                if ((open >> lane) & 1) {
+                    const int bit = chosen[lane] - set;
+                    mask[bit >> 5] |= 1u << (bit & 31);
+                } else {
+                    blocked_sky += share;
+                    global const float *y = basis + chosen[lane] * COEFFICIENTS;
+                    for (int i = 0; i < COEFFICIENTS; i++) t[i] -= share * y[i];
+                }
             }
+            waiting = 0;
         }
     }
     for (int i = 0; i < COEFFICIENTS; i++) transfer[sample * COEFFICIENTS + i] = t[i];

@@ -77,7 +77,7 @@ def shadow_real(
     """Ratio R' / R of real surface shaded with and without the objects, at the transfer's samples (eq. 7.1)."""
     shape = (transfer.rows, transfer.cols)
     ratio = SampleGrid(transfer.stride, engine.workspace.array("shadow_ratio", shape, cl_types.float4))
-    defines = {"BANDS": transfer.bands, "MASK_WORDS": transfer.free_mask.shape[2]}
+    defines = {"BANDS": transfer.bands, "MASK_WORDS": transfer.free_mask.shape[2], "LANES": engine.lanes}
     engine.launch(
         engine.kernel("differential_rendering.cl", "shadow_real", **defines),
         (transfer.cols, transfer.rows),
@@ -124,7 +124,7 @@ def shadow_virtual(
     """Radiance that real and virtual occluders take from the virtual surface, at every VIRTUAL_STRIDE-th pixel."""
     shape = (camera.height // VIRTUAL_STRIDE, camera.width // VIRTUAL_STRIDE)
     occluded = SampleGrid(VIRTUAL_STRIDE, engine.workspace.array("virtual_occluded", shape, cl_types.float4))
-    defines = {"BANDS": bands, "MASK_WORDS": -(-rays.count // 32)}
+    defines = {"BANDS": bands, "MASK_WORDS": -(-rays.count // 32), "LANES": engine.lanes}
     engine.launch(
         engine.kernel("differential_rendering.cl", "shadow_virtual", **defines),
         (occluded.cols, occluded.rows),

@@ -97,7 +97,7 @@ def transfer_radiance(
         space.array("free_mask", (rows, cols, words), np.uint32),
     )
     engine.launch(
-        engine.kernel("radiance_transfer.cl", "transfer_radiance", BANDS=bands, MASK_WORDS=words),
+        engine.kernel("radiance_transfer.cl", "transfer_radiance", BANDS=bands, MASK_WORDS=words, LANES=engine.lanes),
         (cols, rows),
         cols,
         rows,

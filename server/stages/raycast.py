@@ -17,6 +17,9 @@ from server.stages.volume import Volume
 
 LABEL_NONE, LABEL_STATIC, LABEL_DYNAMIC, LABEL_FILLED = 0, 1, 2, 3
 
+_TILE = 8  # as in raycast.cl
+_FARTHEST = int(np.float32(np.inf).view(np.int32))
+
 
 @dataclass(frozen=True)
 class Surface:
@@ -27,11 +30,31 @@ class Surface:
     normals: cl_array.Array
     """float4: unit, world axes, towards the camera, w likewise."""
     labels: cl_array.Array
-    """uint8: LABEL_NONE, LABEL_STATIC (from the volume), LABEL_DYNAMIC (from the sensor)."""
+    """uint8: LABEL_NONE, LABEL_STATIC (from the volume), LABEL_DYNAMIC (from the sensor), LABEL_FILLED (from its
+    neighbours)."""
 
 
-_TILE = 8  # as in raycast.cl
-_FARTHEST = int(np.float32(np.inf).view(np.int32))
+def raycast(
+    engine: Engine, camera: CameraModel, volume_from_camera: NDArray[np.float64], volume: Volume, buffers: str = "model"
+) -> Surface:
+    """Surface of the volume alone; labels are not filled. `buffers` names the arrays, which the next call reuses."""
+    size, lanes = (camera.height, camera.width), engine.lanes
+    positions = engine.workspace.array(f"{buffers}_positions", size, cl_types.float4)
+    normals = engine.workspace.array(f"{buffers}_normals", size, cl_types.float4)
+    engine.launch(
+        engine.kernel("raycast.cl", "raycast", LANES=lanes),
+        (-(-camera.width // lanes), camera.height),
+        camera.width,
+        camera.height,
+        *volume.arguments(),
+        intrinsics(camera),
+        float16(volume_from_camera),
+        GREATEST_DEPTH_M,
+        *_ray_bounds(engine, camera, volume_from_camera, volume),
+        positions,
+        normals,
+    )
+    return Surface(positions, normals, engine.workspace.array(f"{buffers}_labels", size, np.uint8))
 
 
 def _ray_bounds(
@@ -60,24 +83,3 @@ def _ray_bounds(
             farthest,
         )
     return nearest, farthest
-
-
-def raycast(engine: Engine, camera: CameraModel, volume_from_camera: NDArray[np.float64], volume: Volume) -> Surface:
-    """Surface of the volume alone; labels are not filled."""
-    size, lanes = (camera.height, camera.width), engine.lanes
-    positions = engine.workspace.array("positions", size, cl_types.float4)
-    normals = engine.workspace.array("normals", size, cl_types.float4)
-    engine.launch(
-        engine.kernel("raycast.cl", "raycast", LANES=lanes),
-        (-(-camera.width // lanes), camera.height),
-        camera.width,
-        camera.height,
-        *volume.arguments(),
-        intrinsics(camera),
-        float16(volume_from_camera),
-        GREATEST_DEPTH_M,
-        *_ray_bounds(engine, camera, volume_from_camera, volume),
-        positions,
-        normals,
-    )
-    return Surface(positions, normals, engine.workspace.array("model_labels", size, np.uint8))

@@ -2,20 +2,49 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.limits import MAX_IMAGE_SIDE_PX
+from protocol.limits import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE_PX
 
 ColorEncoding = Literal["srgb8", "linear16"]
 
 
+Distortion = tuple[float, float, float, float, float]
+NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+Matrix4 = Annotated[tuple[float, ...], msgspec.Meta(min_length=16, max_length=16)]
+
+GREATEST_BASELINE_M = 2.0
+"""Between the lenses of one camera; more is taken for a translation in millimetres."""
+_NEAR_ROTATION = 1e-3
+
+
+class DepthCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The depth picture's own lens, where it is another than the colour picture's; conventions as in `CameraModel`."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: Distortion = NO_DISTORTION
+    color_from_depth: Matrix4 = IDENTITY
+    """Row-major rigid 4x4, metres: point_in_color_camera = color_from_depth * point_in_depth_camera."""
+
+    def __post_init__(self) -> None:
+        _check_lens("camera.depth", self)
+        _check_rigid("camera.depth.color_from_depth", self.color_from_depth)
+
+
 class CameraModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Pinhole camera with polynomial distortion; colour and depth share it (depth is registered to colour).
+    """Pinhole camera with polynomial distortion, of the colour picture, and of the depth picture unless `depth` is set.
 
     A pixel centre lies at integer coordinates: `u = fx * x / z + cx`. Distortion is OpenCV's
     `(k1, k2, p1, p2, k3)` on normalised coordinates, all zero for a rectified camera.
@@ -29,24 +58,58 @@ class CameraModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     cy: float
     depth_scale_m: float = 0.001
     """Metres per unit of the uint16 depth."""
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: Distortion = NO_DISTORTION
     color_encoding: ColorEncoding = "srgb8"
+    depth: DepthCamera | None = None
+    """None: depth is registered to colour, pixel by pixel."""
 
     def __post_init__(self) -> None:
-        for name in ("width", "height"):
-            if not 8 <= getattr(self, name) <= MAX_IMAGE_SIDE_PX:
-                raise ValueError(f"camera.{name} is {getattr(self, name)}, must be 8 to {MAX_IMAGE_SIDE_PX}")
-        for name in ("fx", "fy", "depth_scale_m"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"camera.{name} is {value}, must be positive and finite")
-        if not np.isfinite((self.cx, self.cy, *self.distortion)).all():
-            raise ValueError("camera.cx, camera.cy and camera.distortion must be finite")
+        _check_lens("camera", self)
+        if not (math.isfinite(self.depth_scale_m) and self.depth_scale_m > 0):
+            raise ValueError(f"camera.depth_scale_m is {self.depth_scale_m}, must be positive and finite")
 
     @property
     def is_distorted(self) -> bool:
-        """True if any distortion coefficient is not zero."""
+        """True if any distortion coefficient of the colour lens is not zero."""
         return any(self.distortion)
+
+    @property
+    def depth_lens(self) -> CameraModel | DepthCamera:
+        """The lens that the depth picture was taken through: its size, intrinsics and distortion."""
+        return self.depth or self
+
+    @property
+    def color_from_depth(self) -> NDArray[np.float64]:
+        """[4, 4] rigid, metres: from the axes of the depth picture's lens to those of the colour picture's."""
+        return np.array(self.depth.color_from_depth if self.depth else IDENTITY, np.float64).reshape(4, 4)
+
+
+def _check_lens(owner: str, lens: CameraModel | DepthCamera) -> None:
+    for name in ("width", "height"):
+        if not 8 <= getattr(lens, name) <= MAX_IMAGE_SIDE_PX:
+            raise ValueError(f"{owner}.{name} is {getattr(lens, name)}, must be 8 to {MAX_IMAGE_SIDE_PX}")
+    if lens.width * lens.height > MAX_IMAGE_PIXELS:
+        raise ValueError(f"{owner} has {lens.width}x{lens.height} pixels, more than {MAX_IMAGE_PIXELS} in all")
+    for name in ("fx", "fy"):
+        value = getattr(lens, name)
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{owner}.{name} is {value}, must be positive and finite")
+    if not np.isfinite((lens.cx, lens.cy, *lens.distortion)).all():
+        raise ValueError(f"{owner}.cx, {owner}.cy and {owner}.distortion must be finite")
+
+
+def _check_rigid(owner: str, row_major: tuple[float, ...]) -> None:
+    if len(row_major) != 16 or not np.isfinite(row_major).all():
+        raise ValueError(f"{owner} must be 16 finite numbers")
+    matrix = np.array(row_major, np.float64).reshape(4, 4)
+    rotation, offset = matrix[:3, :3], matrix[:3, 3]
+    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise ValueError(f"{owner}'s last row is not 0 0 0 1: is it row-major?")
+    is_near = np.abs(rotation).max() < 2 and np.abs(rotation @ rotation.T - np.eye(3)).max() < _NEAR_ROTATION
+    if not is_near or np.linalg.det(rotation) < 0:
+        raise ValueError(f"{owner}'s upper left 3x3 is not a rotation")
+    if np.abs(offset).max() > GREATEST_BASELINE_M:
+        raise ValueError(f"{owner} moves by {np.abs(offset).max():g} m: is it in millimetres?")
 
 
 @dataclass(frozen=True)
@@ -57,8 +120,8 @@ class RgbdFrame:
     """0-based position in the source; output files are numbered by it."""
     timestamp_s: float
     color: NDArray[np.uint8] | NDArray[np.uint16]
-    """[height, width, 3] RGB: uint8 sRGB (`srgb8`) or uint16 linear radiance (`linear16`)."""
+    """[height, width, 3] RGB of the camera's size: uint8 sRGB (`srgb8`) or uint16 linear radiance (`linear16`)."""
     depth: NDArray[np.uint16]
-    """[height, width] in units of `CameraModel.depth_scale_m`, 0 = no measurement."""
+    """[height, width] of `CameraModel.depth_lens`, in units of `CameraModel.depth_scale_m`, 0 = no measurement."""
     world_from_camera: NDArray[np.float64] | None
     """[4, 4] rigid, metres, OpenCV camera axes (x right, y down, z forward); None where the source has no pose."""

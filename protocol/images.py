@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from protocol.codec import ProtocolError
 from protocol.depth_codec import deflate, filter_depth, inflate, unfilter_depth, zstd_compress, zstd_decompress
-from protocol.frames import CameraModel, ColorEncoding
+from protocol.frames import CameraModel, ColorEncoding, DepthCamera
 from protocol.messages import ColorImage, DepthImage, Payload
 from protocol.picture_headers import jpeg_size, png_size
 
@@ -52,7 +52,7 @@ def decode_color(image: ColorImage, camera: CameraModel, encoding: ColorEncoding
     if image.encoding != expected:
         raise ProtocolError(f"color.encoding is {image.encoding}, this session's is {expected}")
     _require_codec(image.codec, image.encoding)
-    _require_camera_size("color", image, camera)
+    _require_size("color", image, camera)
     if image.codec == "raw":
         return _raw("color", image, _COLOR_DTYPE[image.encoding], 3).reshape(image.height, image.width, 3)
     return _decompress_color(image)
@@ -71,11 +71,11 @@ def encode_depth(depth: NDArray[np.uint16], codec: DepthCodec = DEFAULT_DEPTH_CO
 
 
 def decode_depth(image: DepthImage, camera: CameraModel) -> NDArray[np.uint16]:
-    """Payload -> [h, w] uint16 in units of `camera.depth_scale_m`, 0 = no measurement, of the camera's size.
+    """Payload -> [h, w] uint16 in units of `camera.depth_scale_m`, 0 = no measurement, of `camera.depth_lens`'s size.
 
     Raises ProtocolError, before anything is allocated, for a picture that is not what it declares.
     """
-    _require_camera_size("depth", image, camera)
+    _require_size("depth", image, camera.depth_lens)
     if image.codec == "raw":
         return _raw("depth", image, "<u2", 1).reshape(image.height, image.width)
     decompress = inflate if image.codec == "zdelta" else zstd_decompress
@@ -87,10 +87,10 @@ def _require_codec(codec: ColorCodec, encoding: ColorEncoding) -> None:
         raise ProtocolError(f"color.codec {codec} carries srgb8 only; send {encoding} as raw")
 
 
-def _require_camera_size(field: str, image: Payload, camera: CameraModel) -> None:
-    if (image.width, image.height) != (camera.width, camera.height):
+def _require_size(field: str, image: Payload, lens: CameraModel | DepthCamera) -> None:
+    if (image.width, image.height) != (lens.width, lens.height):
         declared = f"{field} is {image.width}x{image.height}"
-        raise ProtocolError(f"{declared}, the session's camera is {camera.width}x{camera.height}")
+        raise ProtocolError(f"{declared}, the session's camera is {lens.width}x{lens.height}")
 
 
 def _raw(field: str, image: Payload, dtype: str, channels: int) -> NDArray[Any]:

@@ -17,9 +17,11 @@ from protocol.limits import (
     MAX_IMAGE_PIXELS,
     MAX_IMAGE_SIDE_PX,
     MAX_MESH_BYTES,
+    MAX_MESH_PART_BYTES,
     MAX_MESSAGE_BYTES,
     MAX_NAME_CHARS,
     MAX_REASON_CHARS,
+    MAX_SCENE_MESH_BYTES,
     MAX_SH_BANDS,
 )
 
@@ -36,6 +38,7 @@ RgbOrNull = tuple[float | None, float | None, float | None]
 Preset = Literal["rm", "reg4", "reg8", "art1", "art4", "art8", "gr15", "gr15fast", "auto"]
 Poses = Literal["given", "track", "refine"]
 Tracking = Literal["given", "tracked", "lost"]
+MeshFormat = Literal["ply", "glb"]
 
 
 def _require_finite(owner: str, **fields: object) -> None:
@@ -85,6 +88,10 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     albedo: Literal["constant", "estimated"] = "constant"
     indirect: Literal["none", "observed"] = "none"
     as_thesis: bool = False
+    denoise: Literal["none", "bilateral", "tv_l1"] = "none"
+    """Of the lightness that the light is estimated from; the composite keeps the camera's picture."""
+    denoise_iterations: Annotated[int, Meta(ge=1, le=1000)] = 20
+    """Of TV-L1."""
     poses: Poses = "given"
     volume_m: tuple[float, float, float, float, float, float] | None = None
     """x0, y0, z0, x1, y1, z1 in world metres; None: what the first frame sees."""
@@ -182,6 +189,12 @@ class Quality(Message, frozen=True, kw_only=True, tag="quality"):
     preset: Preset
 
 
+class RequestMesh(Message, frozen=True, kw_only=True, tag="request_mesh"):
+    """Ask for the surface fused so far, as files; answered by the parts of each and then acknowledged."""
+
+    request: Index
+
+
 class Bye(Message, frozen=True, kw_only=True, tag="bye"):
     """Either side says it is leaving, and why."""
 
@@ -271,6 +284,21 @@ class Dropped(Message, frozen=True, kw_only=True, tag="dropped"):
     reason: Reason
 
 
+class MeshPart(Message, frozen=True, kw_only=True, tag="mesh_part"):
+    """A piece of a file of the scene's mesh; the pieces of a file come in order, one file after the other.
+
+    PLY: world axes, metres. GLB: a node turns the world into glTF's axes, +y up. Vertex colours are sRGB.
+    """
+
+    request: Index
+    format: MeshFormat
+    size_bytes: Annotated[int, Meta(ge=1, le=MAX_SCENE_MESH_BYTES)]
+    """Of the whole file."""
+    offset: Index
+    """Of this piece's first byte in the file."""
+    data: Annotated[bytes, Meta(min_length=1, max_length=MAX_MESH_PART_BYTES)]
+
+
 class Acknowledged(Message, frozen=True, kw_only=True, tag="acknowledged"):
     """A control message was applied, or refused with its error."""
 
@@ -286,5 +314,5 @@ class Error(Message, frozen=True, kw_only=True, tag="error"):
     fatal: bool
 
 
-ClientMessage = Hello | Watch | Frame | PlaceObject | MoveObject | RemoveObject | Quality | Bye
-ServerMessage = Welcome | Composite | Light | Dropped | Acknowledged | Error | Bye
+ClientMessage = Hello | Watch | Frame | PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh | Bye
+ServerMessage = Welcome | Composite | Light | Dropped | MeshPart | Acknowledged | Error | Bye

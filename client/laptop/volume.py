@@ -45,6 +45,18 @@ def default_volume(source: Source, frames: range) -> Volume:
     return x0, y0, z0, x1, y1, z1
 
 
+def with_room_to_move(volume: Volume) -> Volume:
+    """`volume` grown by half its longest side all around: what a camera may come to see whose way is not known.
+
+    Costs little: memory is taken where there is surface.
+    """
+    more = round(max(volume[axis + 3] - volume[axis] for axis in range(3)) / 2, 3)
+    x0, y0, z0, x1, y1, z1 = volume
+    grown = (x0 - more, y0 - more, z0 - more, x1 + more, y1 + more, z1 + more)
+    x0, y0, z0, x1, y1, z1 = (round(value, 3) for value in grown)
+    return x0, y0, z0, x1, y1, z1
+
+
 def default_voxel(volume: Volume) -> float:
     """Voxel side in metres: the longest side over 256, up to the next half millimetre, 4 mm at least."""
     longest_m = max(volume[axis + 3] - volume[axis] for axis in range(3))
@@ -62,8 +74,10 @@ def _points_in_world(frame: RgbdFrame, camera: CameraModel) -> NDArray[np.float6
     depth = frame.depth[::PIXEL_STEP, ::PIXEL_STEP] * camera.depth_scale_m
     v, u = np.nonzero((depth > 0) & (depth <= TRUSTED_DEPTH_M))
     z = depth[v, u]
-    x = (u * PIXEL_STEP - camera.cx) / camera.fx * z
-    y = (v * PIXEL_STEP - camera.cy) / camera.fy * z
+    lens = camera.depth_lens
+    x = (u * PIXEL_STEP - lens.cx) / lens.fx * z
+    y = (v * PIXEL_STEP - lens.cy) / lens.fy * z
     points = np.stack([x, y, z], axis=1)
     pose = np.eye(4) if frame.world_from_camera is None else frame.world_from_camera
-    return points @ pose[:3, :3].T + pose[:3, 3]
+    world_from_depth = pose @ camera.color_from_depth
+    return points @ world_from_depth[:3, :3].T + world_from_depth[:3, 3]

@@ -22,7 +22,6 @@ from server.maths.bayes import NormalEquations, Posterior, solve_plain, solve_wi
 from server.maths.nonnegative import nonnegative_mean, nonnegative_sum
 from server.maths.sh import LUMINANCE, band_of
 from server.opencl.engine import Engine
-from server.stages.measure import Measurement
 from server.stages.radiance_transfer import Transfer
 from server.stages.raycast import Surface
 
@@ -86,13 +85,16 @@ class TileSums:
 def sum_tiles(
     engine: Engine,
     camera: CameraModel,
-    measurement: Measurement,
+    radiance: cl_array.Array,
     surface: Surface,
     transfer: Transfer,
     voxel_m: float,
 ) -> TileSums:
-    """Normal equations of the frame's samples: static surface, open enough, neither clipped nor black."""
-    observed = _gather(engine, camera, measurement, surface, transfer)
+    """Normal equations of the frame's samples: static surface, open enough, neither clipped nor black.
+
+    radiance: [h, w] float4 as in Measurement.
+    """
+    observed = _gather(engine, camera, radiance, surface, transfer)
     pooled_transfer, pooled = _pool(engine, camera, surface, transfer, observed, voxel_m)
     return unpack_tiles(_accumulate(engine, pooled_transfer, pooled), transfer.bands**2)
 
@@ -102,7 +104,7 @@ def _kernel(engine: Engine, name: str, coefficients: int) -> cl.Kernel:
 
 
 def _gather(
-    engine: Engine, camera: CameraModel, measurement: Measurement, surface: Surface, transfer: Transfer
+    engine: Engine, camera: CameraModel, radiance: cl_array.Array, surface: Surface, transfer: Transfer
 ) -> cl_array.Array:
     """[rows, cols] float4: what the camera saw at each sample, and whether it may be used."""
     observed = engine.workspace.array("observed", (transfer.rows, transfer.cols), cl_types.float4)
@@ -114,7 +116,7 @@ def _gather(
         transfer.stride,
         camera.width,
         camera.height,
-        measurement.radiance,
+        radiance,
         surface.labels,
         transfer.openness,
         transfer.flatness,

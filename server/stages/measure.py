@@ -1,4 +1,7 @@
-"""Measure the input (thesis 5.1.1): undistort colour and depth, remove the gamma. Kernel: measure.cl."""
+"""Measure the input (thesis 5.1.1): undistort colour and depth, remove the gamma, bring depth to the colour picture.
+
+Kernels: measure.cl, and register.cl where depth has a lens of its own.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,9 @@ import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
-from protocol.frames import CameraModel, ColorEncoding, RgbdFrame
+from protocol.frames import CameraModel, ColorEncoding, DepthCamera, RgbdFrame
 from server.opencl.engine import Engine, float4
+from server.stages.register import register_depth
 
 GREATEST_DEPTH_M = 10.0
 """Beyond it no depth camera for rooms measures anything; larger values are taken as no measurement."""
@@ -36,33 +40,57 @@ def linear_values(encoding: ColorEncoding) -> NDArray[np.float32]:
     return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
-def intrinsics(camera: CameraModel) -> np.generic:
+def intrinsics(lens: CameraModel | DepthCamera) -> np.generic:
     """(fx, fy, cx, cy) as a kernel argument."""
-    return float4(camera.fx, camera.fy, camera.cx, camera.cy)
+    return float4(lens.fx, lens.fy, lens.cx, lens.cy)
 
 
 def measure(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> Measurement:
-    """Upload `frame` and rectify it. The frame's arrays must have the camera's size."""
-    size = (camera.height, camera.width)
+    """Upload `frame` and rectify it. Its pictures must have the sizes of the camera's lenses."""
+    radiance = _measure_color(engine, camera, frame)
+    units = engine.workspace.upload("depth_units", frame.depth)
+    if camera.depth is None:
+        depth_m = _measure_depth(engine, camera, units)
+    else:
+        depth_m = register_depth(engine, camera, units, GREATEST_DEPTH_M)
+    return Measurement(radiance, depth_m)
+
+
+def _measure_color(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> cl_array.Array:
     space = engine.workspace
-    radiance = space.array("radiance", size, cl_types.float4)
-    depth_m = space.array("depth_m", size, np.float32)
-    kernel = engine.kernel(
-        "measure.cl", "measure", LINEAR16=camera.color_encoding == "linear16", DISTORTED=camera.is_distorted
-    )
+    radiance = space.array("radiance", (camera.height, camera.width), cl_types.float4)
+    is_linear = camera.color_encoding == "linear16"
     engine.launch(
-        kernel,
+        engine.kernel("measure.cl", "measure_color", LINEAR16=is_linear, DISTORTED=camera.is_distorted),
         (camera.width, camera.height),
         camera.width,
         camera.height,
         space.upload("color_codes", frame.color),
-        space.upload("depth_units", frame.depth),
         space.constant("linear_values", linear_values(camera.color_encoding)),
         intrinsics(camera),
-        cl_types.make_float8(*camera.distortion, 0, 0, 0),  # type: ignore[attr-defined]
+        _distortion(camera),
+        radiance,
+    )
+    return radiance
+
+
+def _measure_depth(engine: Engine, camera: CameraModel, units: cl_array.Array) -> cl_array.Array:
+    depth_m = engine.workspace.array("depth_m", (camera.height, camera.width), np.float32)
+    engine.launch(
+        engine.kernel("measure.cl", "measure_depth", DISTORTED=camera.is_distorted),
+        (camera.width, camera.height),
+        camera.width,
+        camera.height,
+        units,
+        intrinsics(camera),
+        _distortion(camera),
         camera.depth_scale_m,
         GREATEST_DEPTH_M,
-        radiance,
         depth_m,
     )
-    return Measurement(radiance, depth_m)
+    return depth_m
+
+
+def _distortion(camera: CameraModel) -> np.generic:
+    vector: np.generic = cl_types.make_float8(*camera.distortion, 0, 0, 0)  # type: ignore[attr-defined]
+    return vector

@@ -240,6 +240,42 @@ def test_meta_with_a_wrong_entry(key: str, value: object, words: str, tmp_path: 
     assert words in error_of(folder)
 
 
+def with_camera(folder: Path, **more: object) -> Path:
+    """The folder, with more said of its camera."""
+    meta = json.loads((folder / "meta.json").read_text())
+    meta["camera"] |= more
+    (folder / "meta.json").write_text(json.dumps(meta))
+    return folder
+
+
+def test_meta_with_a_depth_lens(tmp_path: Path) -> None:
+    matrix = [1, 0, 0, 0.05, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+    lens = {"width": 16, "height": 12, "fx": 15.0, "fy": 15.5, "cx": 7.5, "cy": 5.5, "color_from_depth": matrix}
+    folder = with_camera(folders.ground_truth(tmp_path / "g"), distortion=[0.1, 0, 0, 0, 0], depth=lens)
+    for i in range(3):
+        folders.write_picture(tmp_path / "shared_depth" / f"{i:06d}.png", np.full((12, 16), 500 + i, np.uint16))
+    source = open_source(str(folder))
+    assert source.camera.distortion == (0.1, 0, 0, 0, 0)
+    assert source.camera.depth is not None
+    assert source.camera.color_from_depth[0, 3] == 0.05
+    assert source[1].depth.shape == (12, 16)
+    assert source[1].color.shape == (folders.HEIGHT, folders.WIDTH, 3)
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({"distortion": [0.1, 0, 0, 0]}, "of length 5, got 4"),
+        ({"depth": {"width": 16}}, "missing required field"),
+        ({"depth": {"width": 16, "height": 12, "fx": 15, "fy": 15, "cx": 7, "cy": 5, "scale": 2}}, "unknown field"),
+        ({"depth": {"width": 16, "height": 12, "fx": -15, "fy": 15, "cx": 7, "cy": 5}}, "camera.depth.fx"),
+        ({"depth": {"width": 16, "height": 13, "fx": 15, "fy": 15, "cx": 7, "cy": 5}}, "the depth lens is 16x13"),
+    ],
+)
+def test_meta_with_a_wrong_lens(more: dict[str, object], words: str, tmp_path: Path) -> None:
+    assert words in error_of(with_camera(folders.ground_truth(tmp_path / "g"), **more))
+
+
 def test_meta_that_is_no_json(tmp_path: Path) -> None:
     folder = folders.ground_truth(tmp_path / "g")
     (folder / "meta.json").write_text('{"camera": ')

@@ -112,7 +112,6 @@ UNBUILT = [
     {"indirect": "observed"},
     {"light": "light.json"},
     {"panorama": "sky.hdr"},
-    {"mesh": True},
     {"budget_ms": 40.0},
     {"max_light_error": 3.0},
 ]

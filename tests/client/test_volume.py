@@ -9,7 +9,7 @@ import pytest
 
 from client.laptop.errors import SourceError
 from client.laptop.volume import MARGIN_M, default_volume, default_voxel
-from protocol.frames import CameraModel, RgbdFrame
+from protocol.frames import CameraModel, DepthCamera, RgbdFrame
 
 CAMERA = CameraModel(width=64, height=48, fx=50, fy=50, cx=31.5, cy=23.5)
 
@@ -57,6 +57,14 @@ def test_camera_that_looks_along_x() -> None:
     assert (turned[0], turned[3]) == (straight[2], straight[5])
     assert (turned[1], turned[4]) == (straight[1], straight[4])
     assert (turned[2], turned[5]) == pytest.approx((-straight[3], -straight[0]), abs=1e-9)
+
+
+def test_depth_of_another_lens_lies_where_that_lens_sees_it() -> None:
+    aside = (1.0, 0.0, 0.0, 0.5, 0.0, 1.0, 0.0, -0.25, 0.0, 0.0, 1.0, 0.125, 0.0, 0.0, 0.0, 1.0)
+    lens = DepthCamera(width=64, height=48, fx=50, fy=50, cx=31.5, cy=23.5, color_from_depth=aside)
+    color = CameraModel(width=640, height=480, fx=700, fy=700, cx=300, cy=200, depth=lens)
+    moved = np.array(default_volume(Wall(), range(1))) + np.tile((0.5, -0.25, 0.125), 2)
+    assert default_volume(Wall(camera=color), range(1)) == pytest.approx(moved, abs=1e-3)
 
 
 def test_frames_are_spread_and_counted() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
 import pytest
 from numpy.typing import NDArray
@@ -23,7 +24,6 @@ from server.stages.light_estimation import (
     sum_tiles,
     unpack_tiles,
 )
-from server.stages.measure import Measurement
 from server.stages.radiance_transfer import Transfer
 from server.stages.raycast import LABEL_DYNAMIC, LABEL_NONE, LABEL_STATIC, Surface
 from tests import lights
@@ -56,16 +56,13 @@ class Frame:
     openness: Floats
     flatness: Floats
 
-    def upload(self, engine: Engine) -> tuple[CameraModel, Measurement, Surface, Transfer]:
+    def upload(self, engine: Engine) -> tuple[CameraModel, cl_array.Array, Surface, Transfer]:
         height, width = self.labels.shape
         rows, cols, n = self.transfer.shape
         space = engine.workspace
         return (
             CameraModel(width=width, height=height, fx=100.0, fy=100.0, cx=0.0, cy=0.0),
-            Measurement(
-                space.upload("radiance", float4(self.radiance[..., :3], self.radiance[..., 3])),
-                space.upload("depth_m", np.ones((height, width), np.float32)),
-            ),
+            space.upload("radiance", float4(self.radiance[..., :3], self.radiance[..., 3])),
             Surface(
                 space.upload("positions", float4(self.positions)),
                 space.upload("normals", float4(self.normals)),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from protocol.frames import CameraModel
+from protocol.frames import CameraModel, DepthCamera
 from protocol.messages import (
     Acknowledged,
     Bye,
@@ -18,11 +18,13 @@ from protocol.messages import (
     Hello,
     LeftOut,
     Light,
+    MeshPart,
     MoveObject,
     PlaceObject,
     Plan,
     Quality,
     RemoveObject,
+    RequestMesh,
     ServerMessage,
     Timings,
     Watch,
@@ -32,6 +34,25 @@ from protocol.messages import (
 
 IDENTITY = tuple(float(row == column) for row in range(4) for column in range(4))
 CAMERA = CameraModel(width=64, height=48, fx=50.0, fy=50.5, cx=31.5, cy=23.5)
+TWO_LENSES = CameraModel(
+    width=64,
+    height=48,
+    fx=50.0,
+    fy=50.5,
+    cx=31.5,
+    cy=23.5,
+    distortion=(0.1, -0.05, 0.001, 0.002, 0.01),
+    depth=DepthCamera(
+        width=32,
+        height=24,
+        fx=26.0,
+        fy=26.5,
+        cx=15.25,
+        cy=11.75,
+        distortion=(-0.2, 0.1, 0.0, 0.0, 0.0),
+        color_from_depth=(1.0, 0.0, 0.0, 0.075, 0.0, 0.8, -0.6, 0.0, 0.0, 0.6, 0.8, -0.001, 0.0, 0.0, 0.0, 1.0),
+    ),
+)
 COLOR = ColorImage(width=2, height=1, codec="raw", data=bytes(range(6)))
 DEPTH = DepthImage(width=2, height=1, codec="raw", data=b"\xe8\x03\x00\x00")
 
@@ -41,6 +62,7 @@ CLIENT: dict[str, ClientMessage] = {
         camera=CAMERA,
         wishes=Wishes(preset="art4", volume_m=(-1.0, -1.0, 0.0, 1.0, 1.0, 2.0), up=(0.0, -1.0, 0.0), ray_length_m=0.1),
     ),
+    "hello_two_lenses": Hello(client="rig", camera=TWO_LENSES),
     "watch": Watch(),
     "watch_named": Watch(session="küche"),
     "frame": Frame(frame=7, timestamp_s=0.25, world_from_camera=IDENTITY, color=COLOR, depth=DEPTH),
@@ -49,6 +71,7 @@ CLIENT: dict[str, ClientMessage] = {
     "move_object": MoveObject(request=2, object="sofa", position_m=(0.0, 0.0, 1.0), scale=2.0, yaw_deg=-90.0),
     "remove_object": RemoveObject(request=3, object="sofa"),
     "quality": Quality(request=4, preset="gr15fast"),
+    "request_mesh": RequestMesh(request=5),
     "client_bye": Bye(reason="the sequence is over"),
 }
 
@@ -82,6 +105,7 @@ SERVER: dict[str, ServerMessage] = {
         valid=True,
     ),
     "dropped": Dropped(frame=6, reason="replaced by a newer frame"),
+    "mesh_part": MeshPart(request=5, format="ply", size_bytes=9, offset=4, data=b"\nend\n"),
     "acknowledged": Acknowledged(request=1, notes=("no normals: computed",)),
     "acknowledged_error": Acknowledged(request=2, error="there is no object 'chair'"),
     "error": Error(reason="not a valid message", fatal=True),

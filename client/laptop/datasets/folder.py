@@ -50,12 +50,13 @@ class FolderSource:
         return RgbdFrame(range(len(self))[index], files.timestamp_s, color, depth, pose)
 
     def _require_match(self, files: FrameFiles, color: NDArray, depth: NDArray) -> None:
-        if color.shape[:2] != depth.shape:
+        camera, lens = self.camera, self.camera.depth_lens
+        if camera.depth is None and color.shape[:2] != depth.shape:
             raise SourceError(f"{files.color}: colour is {_size(color)} but {files.depth.name} is {_size(depth)}")
-        if depth.shape != (self.camera.height, self.camera.width):
-            raise SourceError(
-                f"{files.color}: {_size(color)}, but the camera is {self.camera.width}x{self.camera.height}"
-            )
+        if color.shape[:2] != (camera.height, camera.width):
+            raise SourceError(f"{files.color}: {_size(color)}, but the camera is {camera.width}x{camera.height}")
+        if depth.shape != (lens.height, lens.width):
+            raise SourceError(f"{files.depth}: {_size(depth)}, but the depth lens is {lens.width}x{lens.height}")
         if color.dtype != COLOR_DTYPE[self.camera.color_encoding]:
             raise SourceError(f"{files.color}: {color.dtype} does not fit {self.camera.color_encoding}")
 

@@ -1,5 +1,7 @@
 """The ground-truth layout: meta.json with relative paths to depth, colour and poses.
 
+Its camera may say `distortion` and, where the depth picture has a lens of its own, `depth`, as `CameraModel` does.
+
 Its virtual objects and its light are truth for evaluation, never input; `meta` keeps them for those who compare.
 """
 
@@ -9,11 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from client.laptop.datasets import intrinsics
 from client.laptop.datasets.folder import COLOR_SUFFIXES, FolderSource, FrameFiles, numbered, require_file
 from client.laptop.errors import SourceError
 from client.laptop.poses import read_tum
-from protocol.frames import CameraModel
+from protocol.frames import NO_DISTORTION, CameraModel, DepthCamera, Distortion
 
 LOOKED_FOR = "meta.json (ground-truth layout)"
 DEFAULT_FPS = 30.0
@@ -79,7 +83,13 @@ def _camera(path: Path, meta: dict[str, Any]) -> CameraModel:
     if meta["color_encoding"] not in ("srgb8", "linear16"):
         raise SourceError(f"{path}: color_encoding is {meta['color_encoding']!r}, must be srgb8 or linear16")
     values = [camera[name] for name in names]
-    return intrinsics.make(path, *values, depth_scale_m=meta["depth_scale_m"], color_encoding=meta["color_encoding"])
+    more = {"depth_scale_m": meta["depth_scale_m"], "color_encoding": meta["color_encoding"]}
+    try:
+        distortion = msgspec.convert(camera.get("distortion", NO_DISTORTION), Distortion)
+        depth = msgspec.convert(camera.get("depth"), DepthCamera | None)
+    except (msgspec.ValidationError, ValueError) as error:
+        raise SourceError(f"{path}: {error}") from error
+    return intrinsics.make(path, *values, **more, distortion=distortion, depth=depth)
 
 
 def _up(path: Path, meta: dict[str, Any]) -> tuple[float, float, float] | None:

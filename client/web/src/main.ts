@@ -50,6 +50,7 @@ function receive(message: ServerMessage): void {
       addNote(`the server says: ${message.reason}`, null);
       break;
     case "acknowledged":
+    case "mesh_part":
       return;
     default:
       message satisfies never;

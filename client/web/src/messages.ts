@@ -16,6 +16,7 @@ const SERVER_TAGS: ReadonlySet<unknown> = new Set<ServerMessage["type"]>([
   "composite",
   "light",
   "dropped",
+  "mesh_part",
   "acknowledged",
   "error",
   "bye",

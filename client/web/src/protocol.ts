@@ -7,12 +7,27 @@ export const MAX_MESSAGE_BYTES = 16777216;
 export const MAX_IMAGE_SIDE_PX = 4096;
 export const MAX_IMAGE_PIXELS = 2304000;
 export const MAX_MESH_BYTES = 12582912;
+export const MAX_MESH_PART_BYTES = 4194304;
+export const MAX_SCENE_MESH_BYTES = 268435456;
 export const MAX_NAME_CHARS = 64;
 export const MAX_REASON_CHARS = 400;
 export const MAX_SH_BANDS = 6;
 
+/** The depth picture's own lens, where it is another than the colour picture's; conventions as in `CameraModel`. */
+export interface DepthCamera {
+  width: number;
+  height: number;
+  fx: number;
+  fy: number;
+  cx: number;
+  cy: number;
+  distortion?: [number, number, number, number, number];
+  /** Row-major rigid 4x4, metres: point_in_color_camera = color_from_depth * point_in_depth_camera. */
+  color_from_depth?: Array<number>;
+}
+
 /**
- * Pinhole camera with polynomial distortion; colour and depth share it (depth is registered to colour).
+ * Pinhole camera with polynomial distortion, of the colour picture, and of the depth picture unless `depth` is set.
  *
  * A pixel centre lies at integer coordinates: `u = fx * x / z + cx`. Distortion is OpenCV's
  * `(k1, k2, p1, p2, k3)` on normalised coordinates, all zero for a rectified camera.
@@ -28,6 +43,8 @@ export interface CameraModel {
   depth_scale_m?: number;
   distortion?: [number, number, number, number, number];
   color_encoding?: "linear16" | "srgb8";
+  /** null: depth is registered to colour, pixel by pixel. */
+  depth?: DepthCamera | null;
 }
 
 /** What a capturing client asks of its session; the command line's options of the same names. */
@@ -40,6 +57,10 @@ export interface Wishes {
   albedo?: "constant" | "estimated";
   indirect?: "none" | "observed";
   as_thesis?: boolean;
+  /** Of the lightness that the light is estimated from; the composite keeps the camera's picture. */
+  denoise?: "bilateral" | "none" | "tv_l1";
+  /** Of TV-L1. */
+  denoise_iterations?: number;
   poses?: "given" | "refine" | "track";
   /** x0, y0, z0, x1, y1, z1 in world metres; null: what the first frame sees. */
   volume_m?: [number, number, number, number, number, number] | null;
@@ -133,6 +154,12 @@ export interface Quality {
   preset: "art1" | "art4" | "art8" | "auto" | "gr15" | "gr15fast" | "reg4" | "reg8" | "rm";
 }
 
+/** Ask for the surface fused so far, as files; answered by the parts of each and then acknowledged. */
+export interface RequestMesh {
+  type: "request_mesh";
+  request: number;
+}
+
 /** Either side says it is leaving, and why. */
 export interface Bye {
   type: "bye";
@@ -216,6 +243,22 @@ export interface Dropped {
   reason: string;
 }
 
+/**
+ * A piece of a file of the scene's mesh; the pieces of a file come in order, one file after the other.
+ *
+ * PLY: world axes, metres. GLB: a node turns the world into glTF's axes, +y up. Vertex colours are sRGB.
+ */
+export interface MeshPart {
+  type: "mesh_part";
+  request: number;
+  format: "glb" | "ply";
+  /** Of the whole file. */
+  size_bytes: number;
+  /** Of this piece's first byte in the file. */
+  offset: number;
+  data: Uint8Array;
+}
+
 /** A control message was applied, or refused with its error. */
 export interface Acknowledged {
   type: "acknowledged";
@@ -239,6 +282,7 @@ export type ClientMessage =
   | MoveObject
   | RemoveObject
   | Quality
+  | RequestMesh
   | Bye;
 
 export type ServerMessage =
@@ -246,6 +290,7 @@ export type ServerMessage =
   | Composite
   | Light
   | Dropped
+  | MeshPart
   | Acknowledged
   | Error
   | Bye;

@@ -1,0 +1,131 @@
+"""Depth of another lens brought to the colour picture (thesis 5.1.1). Kernel: register.cl.
+
+Each depth pixel's own ray is looked up, not the depth picture resampled, so that no measurement moves or is lost.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel, DepthCamera
+from protocol.limits import MAX_IMAGE_SIDE_PX
+from server.opencl.engine import Engine, float4, float16
+
+_NEWTON_STEPS = 20
+_CLOSE = 1e-9
+_SPREAD = 4.0
+"""A triangle between neighbouring depth pixels may be this many times larger than one seen from the front."""
+
+
+def register_depth(
+    engine: Engine, camera: CameraModel, units: cl_array.Array, greatest_depth_m: float
+) -> cl_array.Array:
+    """[h, w] float32 of the colour picture: metres along its axis of the nearest surface measured there, 0 = none.
+
+    units: [h, w] uint16 of `camera.depth`, which must be set; 0 and 65535: none. Surfaces are filled between their
+    measurements, not across the edges of depth. The result is valid until the next call.
+    """
+    lens = camera.depth
+    assert lens is not None
+    projected = _project(engine, camera, lens, units, greatest_depth_m)
+    size, space = (camera.height, camera.width), engine.workspace
+    surface, points = space.array("register_surface", size, np.uint32), space.array("register_points", size, np.uint32)
+    count, focal_px = camera.width * camera.height, math.sqrt(lens.fx * lens.fy)
+    engine.launch(engine.kernel("register.cl", "clear_depth"), (count,), count, surface, points)
+    engine.launch(
+        engine.kernel("register.cl", "splat_surface"),
+        (lens.width - 1, lens.height - 1),
+        lens.width,
+        lens.height,
+        projected,
+        focal_px,
+        camera.width,
+        camera.height,
+        _greatest_px(camera, lens),
+        surface,
+    )
+    splat_points, resolve = (engine.kernel("register.cl", name) for name in ("splat_points", "resolve_depth"))
+    engine.launch(splat_points, (projected.size,), projected.size, projected, camera.width, camera.height, points)
+    depth_m = space.array("depth_m", size, np.float32)
+    engine.launch(resolve, (count,), count, surface, points, focal_px, greatest_depth_m, depth_m)
+    return depth_m
+
+
+def _project(
+    engine: Engine, camera: CameraModel, lens: DepthCamera, units: cl_array.Array, greatest_depth_m: float
+) -> cl_array.Array:
+    """[h, w] float4 of the depth lens: pixel in the colour picture, 1 / z there, z here; 0 = none."""
+    space, shape = engine.workspace, (lens.height, lens.width)
+    projected = space.array("projected_depth", shape, cl_types.float4)
+    engine.launch(
+        engine.kernel("register.cl", "project_depth"),
+        (lens.width, lens.height),
+        lens.width,
+        lens.height,
+        units,
+        space.constant(f"rays of {lens}", rays_of(lens)),
+        camera.depth_scale_m,
+        greatest_depth_m,
+        float16(camera.color_from_depth),
+        float4(camera.fx, camera.fy, camera.cx, camera.cy),
+        projected,
+    )
+    return projected
+
+
+def _greatest_px(camera: CameraModel, lens: DepthCamera) -> int:
+    return math.ceil(min(_SPREAD * max(camera.fx / lens.fx, camera.fy / lens.fy), MAX_IMAGE_SIDE_PX)) + 2
+
+
+@lru_cache(maxsize=8)
+def rays_of(lens: DepthCamera) -> NDArray[np.float32]:
+    """[h, w, 4] (x, y, 1, 0): the ray at z = 1 that every pixel of the distorted picture sees, z = 0 where it has none.
+
+    Newton's method on Brown's polynomial, from the distorted place. Where the polynomial folds back there is no ray.
+    """
+    v, u = np.mgrid[: lens.height, : lens.width].astype(np.float64)
+    wanted = np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy], axis=-1)
+    found = wanted.copy()
+    with np.errstate(all="ignore"):  # beyond the fold it may run away; what did not arrive is dropped
+        for _ in range(_NEWTON_STEPS):
+            off, jacobian = _distorted(lens, found)
+            found -= _solve_2x2(jacobian, off - wanted)
+        off, jacobian = _distorted(lens, found)
+        arrived = (np.abs(off - wanted).max(-1) < _CLOSE) & (_determinant(jacobian) > 0) & (jacobian[..., 0, 0] > 0)
+    rays = np.zeros((*arrived.shape, 4), np.float32)
+    rays[arrived, :2] = found[arrived]
+    rays[arrived, 2] = 1.0
+    return rays
+
+
+def _distorted(lens: DepthCamera, point: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Brown's polynomial at points [..., 2], and its Jacobian [..., 2, 2]."""
+    k1, k2, p1, p2, k3 = lens.distortion
+    x, y = point[..., 0], point[..., 1]
+    r2 = x * x + y * y
+    radial, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
+    off_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    off_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    mixed = x * y * slope + 2 * p1 * x + 2 * p2 * y
+    rows = (
+        (radial + x * x * slope + 2 * p1 * y + 6 * p2 * x, mixed),
+        (mixed, radial + y * y * slope + 6 * p1 * y + 2 * p2 * x),
+    )
+    return np.stack([off_x, off_y], axis=-1), np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _determinant(m: NDArray[np.float64]) -> NDArray[np.float64]:
+    result: NDArray[np.float64] = m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0]
+    return result
+
+
+def _solve_2x2(m: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    x = m[..., 1, 1] * b[..., 0] - m[..., 0, 1] * b[..., 1]
+    y = m[..., 0, 0] * b[..., 1] - m[..., 1, 0] * b[..., 0]
+    return np.stack([x, y], axis=-1) / _determinant(m)[..., None]

@@ -5,7 +5,6 @@
 #include "rays.clh"
 
 #define TILE 8
-#define SURFACE_REACH 3.0f
 
 // Between which depths each tile of TILE x TILE pixels can see a solid voxel: what lies outside a ray need not look at.
 // One item a brick of allocated [count]; nearest, farthest [tile row][tile column]: bits of float metres, which order as
@@ -17,11 +16,8 @@ kernel void bound_rays(const int count, const int width, const int height, const
     if (item >= count) return;
     const int index = allocated[item];
     if (solid[index] == 0) return;
-    // The surface may lie this far in front of a solid voxel's centre.
-    const float margin = SURFACE_REACH * voxel_m;
-    const float3 low = convert_float3((int3)(index % bricks.x, (index / bricks.x) % bricks.y, index / (bricks.x * bricks.y))) *
-                       (BRICK * voxel_m) - margin;
-    const float side = BRICK * voxel_m + 2.0f * margin;
+    const float side = BRICK * voxel_m;
+    const float3 low = convert_float3((int3)(index % bricks.x, (index / bricks.x) % bricks.y, index / (bricks.x * bricks.y))) * side;
     float2 least = (float2)(1e9f), most = (float2)(-1e9f);
     float near = 1e9f, far = 0.0f;
     for (int corner = 0; corner < 8; corner++) {
@@ -49,40 +45,42 @@ kernel void bound_rays(const int count, const int width, const int height, const
     }
 }
 
-// From where rays enter a solid voxel: one Newton and one secant step along them in the trilinear field, to where it falls
-// through zero; 0 where it was not seen there or does not.
-static inline floatn refine_crossing(const Volume volume, const Rays rays, const floatn start) {
-    const float truncation = volume.truncation_m / volume.voxel_m;
-    intn seen_a, seen_b;
-    const floatn a = sample_tsdf(volume, point_at(rays, start), &seen_a) * truncation;
-    const floatn step = MASK(a > 0.0f) ? fmax(a, 0.25f) : fmin(a, -0.25f);
-    const floatn b = sample_tsdf(volume, point_at(rays, start + step), &seen_b) * truncation;
-    const floatn slope = (b - a) / step;  // negative where the ray enters
-    const intn falls = seen_a & seen_b & MASK(slope <= -0.05f);
-    const floatn onward = -b / (falls ? slope : 1.0f);
-    return (falls & MASK(fabs(onward) < 1.5f)) ? start + step + onward : 0.0f;
+// Steps in voxels along rays to where the field falls through zero (Newton); 0 in `falls` where it does not, or is unseen.
+static inline floatn newton_step(const Rays rays, const Field field, const float truncation_voxels, intn *falls) {
+    const floatn slope = field.slope.x * rays.direction.x + field.slope.y * rays.direction.y + field.slope.z * rays.direction.z;
+    *falls = field.seen & MASK(slope * truncation_voxels <= -0.05f);
+    return -field.tsdf / (*falls ? slope : 1.0f);
 }
 
 // Where rays first cross a surface that faces them, as distance in voxels, 0 if nowhere; beside a silhouette a ray may graze
-// a solid voxel or cross the field where it slopes away, and goes on to what lies behind. -> facing: unit normals.
+// a solid voxel or cross the field where it slopes away, and goes on to what lies behind. From where a ray enters a solid
+// voxel it is two Newton steps to the crossing. -> facing: unit normals.
 static floatn find_surface(const Volume volume, const Rays rays, const floatn begin, const floatn end, Vectors *facing) {
+    const float truncation_voxels = volume.truncation_m / volume.voxel_m;
     floatn found = 0.0f, t = begin;
     intn looking = MASK(begin < end);
     while (ANY(looking)) {
         t = find_solid_voxels(volume, rays, looking ? t : end, end);
         looking &= MASK(t < end);
-        if (!ANY(looking)) break;
-        const floatn crossing = refine_crossing(volume, rays, t);
-        const Vectors g = surface_gradient(volume, point_at(rays, MASK(crossing > begin) ? crossing : t));
-        const floatn steepness = sqrt(g.x * g.x + g.y * g.y + g.z * g.z);
-        const floatn towards = g.x * rays.direction.x + g.y * rays.direction.y + g.z * rays.direction.z;
-        const intn faces = looking & MASK(crossing > begin) & MASK(steepness > 1e-6f) & MASK(towards < 0.0f);
-        const floatn scale = 1.0f / (faces ? steepness : 1.0f);
-        facing->x = faces ? g.x * scale : facing->x;
-        facing->y = faces ? g.y * scale : facing->y;
-        facing->z = faces ? g.z * scale : facing->z;
-        found = faces ? crossing : found;
-        looking &= ~faces;
+        intn falls, still;
+        const floatn first = newton_step(rays, sample_field(volume, point_at(rays, looking ? t : 1.0f)), truncation_voxels, &falls);
+        falls &= looking;
+        if (ANY(falls)) {
+            const floatn near = falls ? t + clamp(first, -1.0f, 1.0f) : t;
+            Vectors g;
+            const Field there = sample_surface(volume, point_at(rays, falls ? near : 1.0f), &g);
+            const floatn second = newton_step(rays, there, truncation_voxels, &still);
+            const floatn steepness = sqrt(g.x * g.x + g.y * g.y + g.z * g.z);
+            const floatn towards = g.x * rays.direction.x + g.y * rays.direction.y + g.z * rays.direction.z;
+            const intn faces = falls & still & MASK(fabs(second) < 1.0f) & MASK(near + second > 0.0f) & MASK(steepness > 1e-6f) &
+                               MASK(towards < 0.0f);
+            const floatn scale = 1.0f / (faces ? steepness : 1.0f);
+            facing->x = faces ? g.x * scale : facing->x;
+            facing->y = faces ? g.y * scale : facing->y;
+            facing->z = faces ? g.z * scale : facing->z;
+            found = faces ? near + second : found;
+            looking &= ~faces;
+        }
         t += 0.7f;  // the next solid voxel on the way
     }
     return found;

@@ -11,7 +11,7 @@ help:
 	@echo "make install the program alone, as .venv/bin/probeless"
 
 install: .venv/installed
-install-bench: .venv/installed-test
+install-bench: .venv/installed-bench
 
 demo: .venv/installed
 	$(BIN)/probeless demo
@@ -24,7 +24,7 @@ lint: .venv/installed-test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-bench: .venv/installed-test
+bench: .venv/installed-bench
 	$(BIN)/probeless bench service
 
 web: .venv/installed-test
@@ -33,9 +33,13 @@ web: .venv/installed-test
 
 # The locks hold every package with its hash, for every platform and Python that pyproject.toml allows.
 lock: .venv/installed-test
-	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build pyproject.toml -o requirements.lock
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh \
+		pyproject.toml -o requirements.lock
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra test \
 		--constraint requirements.lock pyproject.toml -o requirements-test.lock
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra test --extra mesh \
+		--extra model --extra bench --constraint requirements-test.lock --constraint requirements.lock \
+		pyproject.toml -o requirements-bench.lock
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
@@ -49,6 +53,10 @@ lock: .venv/installed-test
 
 .venv/installed-test: requirements-test.lock .venv/installed
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-test.lock
+	@touch $@
+
+.venv/installed-bench: requirements-bench.lock .venv/installed-test
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-bench.lock
 	@touch $@
 
 clean:

@@ -12,7 +12,7 @@ import typer
 
 from client import options as o
 from client.laptop.errors import OptionError
-from client.progress import Stopwatch, note, say, track
+from client.progress import Stopwatch, note, progress_bar, say, track
 
 USAGE_STATUS, FAILURE_STATUS, INTERRUPTED_STATUS = 2, 1, 130
 OWN_PACKAGES = {"client", "server", "protocol"}
@@ -80,6 +80,8 @@ def run(
     albedo: o.Albedo = None,
     indirect: o.Indirect = None,
     as_thesis: o.AsThesis = False,
+    denoise: o.Denoise = "none",
+    denoise_iterations: o.DenoiseIterations = 20,
     object: o.Object = None,
     up: o.Up = None,
     light: o.LightFile = None,
@@ -92,13 +94,20 @@ def run(
     """The pipeline in one process, no network."""
     capture = o.prepare(o.CaptureOptions.of(locals()))
     from client.laptop.output import OutputWriter
-    from client.laptop.run import run as run_pipeline
+    from client.laptop.run import Run
 
+    if mesh:
+        from server.meshing.surface import find_library
+
+        find_library()  # before the frames, not after them
     watch = Stopwatch()
-    with OutputWriter(out) as writer:
-        for output in track(run_pipeline(capture, device, note), len(capture.frames)):
+    with OutputWriter(out) as writer, Run(capture, device, note) as pipeline:
+        for output in track(pipeline.outputs(), len(capture.frames)):
             writer.write(output)
             watch.frames += 1
+        if mesh:
+            with progress_bar("mesh") as progress:
+                writer.write_mesh(pipeline.mesh(progress))
     say(f"{watch.summary()}, written to {out}")
 
 
@@ -120,6 +129,8 @@ def stream(
     albedo: o.Albedo = None,
     indirect: o.Indirect = None,
     as_thesis: o.AsThesis = False,
+    denoise: o.Denoise = "none",
+    denoise_iterations: o.DenoiseIterations = 20,
     object: o.Object = None,
     up: o.Up = None,
     light: o.LightFile = None,
@@ -132,10 +143,13 @@ def stream(
     """The laptop client: sends a source to a server and shows what comes back."""
     if device is not None:
         raise OptionError("--device: the server has the device; name it there with probeless serve --device")
+    if mesh and out is None:
+        raise OptionError("--mesh writes files: say where with --out")
     capture = o.prepare(o.CaptureOptions.of(locals()), lossless=lossless)
     from client.laptop.stream import stream as send
 
-    done = send(capture.source, server, capture.objects, capture.wishes, out, lossless, record, frames=capture.frames)
+    options = {"frames": capture.frames, "mesh": mesh}
+    done = send(capture.source, server, capture.objects, capture.wishes, out, lossless, record, **options)
     written = f", written to {out}" if out is not None else ""
     speed = done.answered / done.seconds if done.seconds > 0 else 0.0
     say(
@@ -173,6 +187,24 @@ def demo(
     from client.laptop.demo import run_demo
 
     run_demo(out, device, keep, port)
+
+
+@app.command()
+def model(
+    source: o.SourceArgument,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="what is written: .ply (world axes) or .glb (+y up)")],
+    frames: o.Frames = None,
+    voxel: o.Voxel = None,
+) -> None:
+    """A static scene's posed frames as one triangle mesh, made offline from a point cloud."""
+    from client.laptop.static_model import check_output, model_of_source, open_posed, write_model
+
+    check_output(out)
+    opened, chosen, cell_m = open_posed(source, frames, voxel)
+    done = model_of_source(opened, chosen, cell_m, track)
+    write_model(done.mesh, out)
+    counts = f"{len(chosen)} frames, {done.points} points, {len(done.mesh.triangles)} triangles"
+    say(f"{counts}, {done.turned} normals turned to the camera, written to {out}")
 
 
 @app.command()

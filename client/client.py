@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import deque
-from collections.abc import AsyncIterator, Callable
-from dataclasses import dataclass
+from collections.abc import AsyncIterator, Callable, Mapping
+from dataclasses import dataclass, field
 from itertools import count
 from urllib.parse import urlsplit
 
@@ -29,10 +29,13 @@ from protocol.messages import (
     Frame,
     Hello,
     Light,
+    MeshFormat,
+    MeshPart,
     MoveObject,
     PlaceObject,
     Quality,
     RemoveObject,
+    RequestMesh,
     ServerMessage,
     Vector3,
     Watch,
@@ -57,6 +60,26 @@ class Answer:
     composite: Composite
 
 
+@dataclass
+class _MeshInbox:
+    """The files of a mesh as their parts arrive."""
+
+    request: int
+    progress: Callable[[int, int], None]
+    files: dict[MeshFormat, bytearray] = field(default_factory=dict)
+    sizes: dict[MeshFormat, int] = field(default_factory=dict)
+
+    def add(self, part: MeshPart) -> None:
+        """Append a part. Raises ProtocolError for one that does not follow on."""
+        data = self.files.setdefault(part.format, bytearray())
+        size = self.sizes.setdefault(part.format, part.size_bytes)
+        follows = part.request == self.request and part.size_bytes == size and part.offset == len(data)
+        if not follows or len(data) + len(part.data) > size:
+            raise ProtocolError(f"mesh_part at byte {part.offset} of {part.format} does not follow on")
+        data += part.data
+        self.progress(len(data), part.size_bytes)
+
+
 Tap = Callable[[ClientMessage | ServerMessage], None]
 
 
@@ -77,6 +100,7 @@ class StreamClient:
         self._unanswered: set[int] = set()
         self._unread: deque[Answer | Dropped | Error] = deque()
         self._acknowledged: dict[int, Acknowledged] = {}
+        self._mesh: _MeshInbox | None = None
         self._welcome: Welcome | None = None
         self._light: Light | None = None
         self._reason_given: str | None = None
@@ -171,6 +195,23 @@ class StreamClient:
         """Change the preset of the running session."""
         return await self._ask(Quality(request=next(self._requests), preset=preset))
 
+    async def request_mesh(
+        self, progress: Callable[[int, int], None] = lambda _done, _total: None
+    ) -> Mapping[MeshFormat, bytes]:
+        """The files of the surface that the server has fused so far; `progress` is told bytes of each file.
+
+        Raises ClientError where the server has none, or one that is too large.
+        """
+        request = next(self._requests)
+        self._mesh = inbox = _MeshInbox(request, progress)
+        done = await self._ask(RequestMesh(request=request))
+        self._mesh = None
+        if done.error is not None:
+            raise ClientError(done.error)
+        if not inbox.files or any(len(data) != inbox.sizes[format_] for format_, data in inbox.files.items()):
+            raise ClientError(f"the server at {self._url} sent an incomplete mesh")
+        return {format_: bytes(data) for format_, data in inbox.files.items()}
+
     async def answers(self) -> AsyncIterator[Answer | Dropped | Error]:
         """What comes back, in the order it came, until `close` or the server's end. Raises ClientError.
 
@@ -210,7 +251,7 @@ class StreamClient:
         if self._tap is not None:
             self._tap(message)
 
-    async def _ask(self, message: PlaceObject | MoveObject | RemoveObject | Quality) -> Acknowledged:
+    async def _ask(self, message: PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh) -> Acknowledged:
         await self._send(message)
         await self._wait_until(lambda: message.request in self._acknowledged)
         return self._acknowledged.pop(message.request)
@@ -266,6 +307,8 @@ class StreamClient:
             case Dropped():
                 await self._deliver(message)
                 self._unanswered.discard(message.frame)
+            case MeshPart() if self._mesh is not None:
+                self._mesh.add(message)
             case Acknowledged():
                 self._acknowledged[message.request] = message
             case Error(fatal=False):

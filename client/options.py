@@ -11,13 +11,14 @@ import typer
 from client.laptop.errors import OptionError
 from client.laptop.objects import ObjectFile, parse_object
 from client.laptop.source import Source, open_source
-from client.laptop.volume import Volume, default_volume, default_voxel
+from client.laptop.volume import Volume, default_volume, default_voxel, with_room_to_move
 from protocol.limits import MAX_SH_BANDS
 from protocol.messages import Wishes
 
 BUILT_PRESETS = ("rm", "reg4", "reg8")
 PRESETS = (*BUILT_PRESETS, "art1", "art4", "art8", "gr15", "gr15fast", "auto")
 THESIS_RAY_LENGTH_M = 0.1
+DENOISE = ("none", "bilateral", "tv_l1")
 
 SourceArgument = Annotated[
     str, typer.Argument(metavar="SOURCE", help="data-set folder, synthetic:NAME, recording or oak")
@@ -39,6 +40,10 @@ Bands = Annotated[int, typer.Option(min=2, max=MAX_SH_BANDS, help="spherical-har
 Albedo = Annotated[str | None, typer.Option(metavar="constant|estimated", help="default: constant")]
 Indirect = Annotated[str | None, typer.Option(metavar="none|observed", help="default: none")]
 AsThesis = Annotated[bool, typer.Option("--as-thesis", help="--ray-length 0.1 --albedo constant --indirect none")]
+Denoise = Annotated[
+    str, typer.Option(metavar="|".join(DENOISE), help="of the lightness that the light is estimated from")
+]
+DenoiseIterations = Annotated[int, typer.Option(min=1, max=1000, help="of TV-L1")]
 Object = Annotated[
     list[str] | None, typer.Option(metavar="FILE[@x,y,z[,scale[,yaw]]]", help="virtual object; may be repeated")
 ]
@@ -67,11 +72,12 @@ class CaptureOptions:
     albedo: str | None = None
     indirect: str | None = None
     as_thesis: bool = False
+    denoise: str = "none"
+    denoise_iterations: int = 20
     object: list[str] | None = None
     up: str | None = None
     light: str | None = None
     panorama: str | None = None
-    mesh: bool = False
     budget_ms: float | None = None
     max_light_error: float | None = None
 
@@ -98,29 +104,36 @@ def prepare(options: CaptureOptions, lossless: bool = False) -> Capture:
     up, volume = parse_up(options.up), parse_volume(options.volume)
     wishes = _wishes_of_options(options)
     source = open_source(options.source)
-    if not source.has_poses:
-        raise OptionError(f"{source.name} has no poses and tracking is not built yet; use a source with poses")
+    poses = choose_poses(options.poses, source)
     frames = parse_frames(options.frames, len(source))
-    volume = volume or default_volume(source, frames)
-    voxel = options.voxel or default_voxel(volume)
-    settled = {"volume_m": volume, "voxel_m": voxel, "up": up or source.up, "poses": "given", "lossless": lossless}
+    seen = volume or default_volume(source, frames)
+    voxel = options.voxel or default_voxel(seen)
+    volume = volume or (seen if source.has_poses else with_room_to_move(seen))
+    settled = {"volume_m": volume, "voxel_m": voxel, "up": up or source.up, "poses": poses, "lossless": lossless}
     return Capture(source, frames, Wishes(**wishes, **settled), objects)
+
+
+def choose_poses(asked: str | None, source: Source) -> str:
+    """What was asked for, else given where the source has poses, else track. Raises OptionError."""
+    poses = asked or ("given" if source.has_poses else "track")
+    if poses != "track" and not source.has_poses:
+        raise OptionError(f"--poses {poses}: {source.name} has no poses; leave it out or use --poses track")
+    return poses
 
 
 def refuse_unbuilt(options: CaptureOptions) -> None:
     """Raise OptionError for an option whose system does not exist yet, naming what does."""
     _choice("--preset", options.preset, PRESETS)
+    _choice("--denoise", options.denoise, DENOISE)
     _choice("--poses", options.poses, ("given", "track", "refine"))
     _choice("--albedo", options.albedo, ("constant", "estimated"))
     _choice("--indirect", options.indirect, ("none", "observed"))
     unbuilt = {
         f"--preset {options.preset}": (options.preset not in BUILT_PRESETS, f"use {', '.join(BUILT_PRESETS)}"),
-        f"--poses {options.poses}": (options.poses in ("track", "refine"), "use --poses given"),
         "--albedo estimated": (options.albedo == "estimated", "use --albedo constant"),
         "--indirect observed": (options.indirect == "observed", "use --indirect none"),
         "--light": (options.light is not None, "leave it out and the light is estimated"),
         "--panorama": (options.panorama is not None, "leave it out and the light is estimated"),
-        "--mesh": (options.mesh, "leave it out"),
         "--budget-ms": (options.budget_ms is not None, "choose a --preset and --rays instead"),
         "--max-light-error": (options.max_light_error is not None, "choose a --preset and --rays instead"),
     }
@@ -190,6 +203,8 @@ def _wishes_of_options(options: CaptureOptions) -> dict[str, Any]:
         "ray_length_m": ray_length_m,
         "bands": options.bands,
         "as_thesis": options.as_thesis,
+        "denoise": options.denoise,
+        "denoise_iterations": options.denoise_iterations,
     }
 
 

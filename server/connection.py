@@ -18,6 +18,8 @@ MAX_CLOSE_REASON_BYTES = 123
 SEND_PATIENCE_S = 30.0
 CLOSE_PATIENCE_S = 5.0
 
+CONTROL_TYPES = ("place_object", "move_object", "remove_object", "quality", "request_mesh")
+
 
 class Refusal(Exception):
     """The server ends this client's connection: a close code and one line for the client."""
@@ -130,6 +132,6 @@ def _judge(data: bytes, reason: str) -> Refusal | BadMessage:
         return Refusal(INVALID, reason)
     if envelope.type == "frame" and envelope.frame is not None:
         return BadMessage(Dropped(frame=envelope.frame, reason=reason))
-    if envelope.type in ("place_object", "move_object", "remove_object", "quality") and envelope.request is not None:
+    if envelope.type in CONTROL_TYPES and envelope.request is not None:
         return BadMessage(Acknowledged(request=envelope.request, error=reason))
     return Refusal(INVALID, reason)

@@ -14,9 +14,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from protocol.messages import Frame, MoveObject, PlaceObject, Quality, RemoveObject
+from protocol.messages import Frame, MoveObject, PlaceObject, Quality, RemoveObject, RequestMesh
 
-Control = PlaceObject | MoveObject | RemoveObject | Quality
+Control = PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh
 
 MAX_WAITING_LETTERS = 64
 MAX_WAITING_BYTES = 48 << 20

@@ -24,9 +24,12 @@ from protocol.messages import (
     PlaceObject,
     Quality,
     RemoveObject,
+    RequestMesh,
 )
 from server.connection import POLICY, Refusal
-from server.mailbox import Control, Letter, Mailbox
+from server.mailbox import Letter, Mailbox
+from server.mesh_message import mesh_parts
+from server.meshing.files import mesh_files
 from server.metrics import Metrics
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
@@ -35,6 +38,8 @@ if TYPE_CHECKING:
     from server.pipeline import FrameResult, Pipeline
 
 JPEG_QUALITY = 90
+
+SceneControl = PlaceObject | MoveObject | RemoveObject | Quality
 
 
 class Outlet(Protocol):
@@ -91,6 +96,8 @@ class Worker:
         if isinstance(letter.message, Frame):
             self._workshop.metrics.queue_age_ms.observe(letter.age_ms)
             self._answer_frame(pipeline, letter.message)
+        elif isinstance(letter.message, RequestMesh):
+            self._send_mesh(pipeline, letter.message.request)
         else:
             self._outlet.send(encode(apply_control(pipeline, letter.message, self._workshop.load_mesh)))
 
@@ -106,6 +113,15 @@ class Worker:
         self._workshop.metrics.observe_stages(result.timings)
         self._workshop.metrics.processed.inc()
         return self._deliver(frame, result)
+
+    def _send_mesh(self, pipeline: Pipeline, request: int) -> None:
+        try:
+            parts = mesh_parts(request, mesh_files(pipeline.scene_mesh()))
+        except ValueError as error:  # MeshingError is one
+            return self._outlet.send(encode(Acknowledged(request=request, error=one_line(str(error)))))
+        for part in parts:
+            self._outlet.send(encode(part))
+        return self._outlet.send(encode(Acknowledged(request=request)))
 
     def _decode(self, frame: Frame) -> RgbdFrame:
         start_s = time.perf_counter()
@@ -159,7 +175,7 @@ def _row_major(matrix: NDArray[np.float64]) -> tuple[float, ...]:
     return tuple(matrix.ravel().tolist())
 
 
-def apply_control(pipeline: Pipeline, message: Control, load_mesh: Callable[[bytes, str], Mesh]) -> Acknowledged:
+def apply_control(pipeline: Pipeline, message: SceneControl, load_mesh: Callable[[bytes, str], Mesh]) -> Acknowledged:
     """Do what a control message asks; what cannot be done is said in the acknowledgement."""
     try:
         notes = _apply(pipeline, message, load_mesh)
@@ -168,7 +184,7 @@ def apply_control(pipeline: Pipeline, message: Control, load_mesh: Callable[[byt
     return Acknowledged(request=message.request, notes=tuple(one_line(note) for note in notes))
 
 
-def _apply(pipeline: Pipeline, message: Control, load_mesh: Callable[[bytes, str], Mesh]) -> tuple[str, ...]:
+def _apply(pipeline: Pipeline, message: SceneControl, load_mesh: Callable[[bytes, str], Mesh]) -> tuple[str, ...]:
     match message:
         case PlaceObject():
             return pipeline.place_object(message.object, load_mesh(message.data, message.format), _placement(message))

@@ -1,4 +1,4 @@
-"""What `run` and `stream` write into their folder: pictures, lights, trajectory, timings.
+"""What `run` and `stream` write into their folder: pictures, lights, trajectory, timings, the scene's mesh.
 
 Equal inputs give equal bytes: PNG parameters are fixed, JSON has fixed separators and Python's shortest floats.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -19,10 +20,11 @@ from numpy.typing import NDArray
 
 from client.laptop.errors import OutputError
 from client.laptop.poses import quaternion
-from protocol.messages import Light, Plan, Timings
+from protocol.messages import Light, MeshFormat, Plan, Timings
 
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 3, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT)
 _LINE_FILES = ("light.jsonl", "trajectory.txt", "timings.jsonl")
+_MESH_FILES = ("mesh.ply", "mesh.glb")
 _OWN_PICTURE = re.compile(r"\d{6,}\.png")
 
 
@@ -66,6 +68,14 @@ class OutputWriter:
             self._line("light.jsonl", _json(light_row(output.light), output.frame))
             self._line("trajectory.txt", trajectory_row(output.timestamp_s, output.world_from_camera))
             self._line("timings.jsonl", _json(timings_row(output), output.frame))
+        except OSError as error:
+            raise _unwritable(self.folder, error) from error
+
+    def write_mesh(self, files: Mapping[MeshFormat, bytes]) -> None:
+        """Write mesh.ply and mesh.glb. Raises OutputError."""
+        try:
+            for format_, data in files.items():
+                (self.folder / f"mesh.{format_}").write_bytes(data)
         except OSError as error:
             raise _unwritable(self.folder, error) from error
 
@@ -143,9 +153,11 @@ def _json(row: dict[str, Any], frame: int) -> str:
 
 
 def _remove_earlier_run(folder: Path) -> None:
-    """Pictures of an earlier, perhaps longer run would pass for this one's."""
+    """Pictures of an earlier, perhaps longer run would pass for this one's, and so would its mesh."""
     if not (folder / "light.jsonl").is_file():
         return
+    for name in _MESH_FILES:
+        (folder / name).unlink(missing_ok=True)
     for picture in (folder / "frames").iterdir():
         if _OWN_PICTURE.fullmatch(picture.name):
             picture.unlink()

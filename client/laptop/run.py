@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from types import TracebackType
 from typing import Protocol
 
 from client.laptop.errors import RunError
@@ -10,7 +11,8 @@ from client.laptop.objects import ObjectFile, pack_mesh
 from client.laptop.output import FrameOutput
 from client.options import Capture
 from protocol.frames import CameraModel, RgbdFrame
-from protocol.messages import Wishes
+from protocol.messages import MeshFormat, Wishes
+from server.meshing.files import mesh_files
 from server.opencl.device import open_device
 from server.pipeline import FrameResult, Pipeline
 from server.scene.mesh import load_mesh
@@ -23,17 +25,37 @@ class Processor(Protocol):
     def process(self, frame: RgbdFrame) -> FrameResult: ...
 
 
-def run(capture: Capture, device_name: str | None, note: Callable[[str], None]) -> Iterator[FrameOutput]:
-    """One output per frame, in order; `note` gets what the pipeline says about objects.
+class Run:
+    """A capture's pipeline, open; a context manager."""
 
-    Raises UserError, DeviceError or MeshError, each with one clear line.
-    """
-    pipeline = _open_pipeline(device_name, capture.source.camera, capture.wishes)
-    try:
-        place_objects(pipeline, capture.objects, note)
-        yield from process_frames(pipeline, (capture.source[i] for i in capture.frames))
-    finally:
-        pipeline.close()
+    def __init__(self, capture: Capture, device_name: str | None, note: Callable[[str], None]) -> None:
+        """`note` gets what the pipeline says about objects.
+
+        Raises UserError, DeviceError or MeshError, each with one clear line.
+        """
+        self._capture = capture
+        self._pipeline = _open_pipeline(device_name, capture.source.camera, capture.wishes)
+        try:
+            place_objects(self._pipeline, capture.objects, note)
+        except BaseException:
+            self._pipeline.close()
+            raise
+
+    def outputs(self) -> Iterator[FrameOutput]:
+        """One output per frame, in order. Raises UserError."""
+        yield from process_frames(self._pipeline, (self._capture.source[i] for i in self._capture.frames))
+
+    def mesh(self, progress: Callable[[int, int], None]) -> dict[MeshFormat, bytes]:
+        """The files of the surface fused so far; `progress` is told parts done and in all. Raises MeshingError."""
+        return mesh_files(self._pipeline.scene_mesh(progress))
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._pipeline.close()
 
 
 def process_frames(pipeline: Processor, frames: Iterable[RgbdFrame]) -> Iterator[FrameOutput]:

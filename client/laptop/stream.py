@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from client.laptop.output import FrameOutput, OutputWriter
 from client.laptop.source import Source
 from protocol.frames import CameraModel
 from protocol.images import decode_color
-from protocol.messages import ClientMessage, Dropped, Error, ServerMessage, Welcome, Wishes
+from protocol.messages import ClientMessage, Dropped, Error, MeshFormat, ServerMessage, Welcome, Wishes
 from protocol.recording import write_message
 
 
@@ -53,17 +53,19 @@ def stream(
     realtime: bool = True,
     *,
     frames: range | None = None,
+    mesh: bool = False,
     console: Console | None = None,
 ) -> StreamSummary:
     """Send `frames` of the source (default: all) to the server and write its answers into `out`, where one is given.
 
     `realtime` keeps the source's frame rate and skips frames while the server is busy; without it every frame is sent
     as soon as there is room. `lossless` sends raw colour and waits for each answer, so that every frame is answered
-    with the very pixels of the server's picture. `record` gets every message sent and received.
+    with the very pixels of the server's picture. `mesh` asks for the scene's mesh after the last answer and writes it
+    into `out`. `record` gets every message sent and received.
     Raises ClientError, UserError, each with one clear line. Progress goes to `console` (default: standard error).
     """
     wishes = msgspec.structs.replace(wishes or Wishes(), lossless=lossless)
-    job = _Job(source, frames or range(len(source)), server_url, objects, wishes, realtime and not lossless)
+    job = _Job(source, frames or range(len(source)), server_url, objects, wishes, realtime and not lossless, mesh)
     console = console or Console(stderr=True)
     with _recorder(record) as tap, contextlib.ExitStack() as stack:
         writer = stack.enter_context(OutputWriter(out)) if out is not None else None
@@ -81,6 +83,7 @@ class _Job:
     objects: Sequence[ObjectFile]
     wishes: Wishes
     realtime: bool
+    mesh: bool
 
 
 class _Stream:
@@ -143,6 +146,8 @@ class _Stream:
             await client.wait_until_answered()
             raise
         await client.wait_until_answered()
+        if self._job.mesh:
+            await self._fetch_mesh(client)
 
     async def _send_frames(self, client: StreamClient) -> None:
         start_s = time.perf_counter()
@@ -157,6 +162,16 @@ class _Stream:
             self._summary.sent += 1
             if self._job.wishes.lossless:
                 await client.wait_until_answered()
+
+    async def _fetch_mesh(self, client: StreamClient) -> None:
+        bar = self._progress.add_task("mesh", total=None, note="the server makes it")
+
+        def show(done: int, total: int) -> None:
+            self._progress.update(bar, completed=done, total=total, note="bytes of each file")
+
+        files: Mapping[MeshFormat, bytes] = await client.request_mesh(show)
+        if self._writer is not None:
+            await asyncio.to_thread(self._writer.write_mesh, files)
 
     async def _receive(self, client: StreamClient) -> None:
         async for answer in client.answers():

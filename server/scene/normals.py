@@ -36,7 +36,7 @@ def creased_normals(vertices: NDArray[Any], triangles: Ints) -> tuple[Ints, Ints
     """
     faces = unit(face_crosses(vertices, triangles))
     group = _joined(3 * len(triangles), _smooth_links(numbered(vertices)[triangles], faces))
-    corner_normals = np.repeat(faces, 3, axis=0) * _corner_angles(vertices, triangles).reshape(-1, 1)
+    corner_normals = np.repeat(faces, 3, axis=0) * corner_angles(vertices, triangles).reshape(-1, 1)
     sums = np.zeros((3 * len(triangles), 3))
     np.add.at(sums, group, corner_normals)
     key = group * (len(vertices) + 1) + triangles.reshape(-1)
@@ -87,7 +87,7 @@ def _joined(count: int, links: Ints) -> Ints:
             label = label[label]
 
 
-def _corner_angles(vertices: NDArray[Any], triangles: Ints) -> Floats:
+def corner_angles(vertices: NDArray[Any], triangles: Ints) -> Floats:
     """[t, 3] the angle of each triangle at each of its corners, radians."""
     corners = vertices[triangles].astype(np.float64)
     onward = np.roll(corners, -1, axis=1) - corners

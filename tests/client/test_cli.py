@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from client.bench import SUITES, find_suite
 from client.cli import run_command
@@ -57,6 +58,7 @@ def assert_one_line(done: subprocess.CompletedProcess[str], status: int, words: 
         (["run", TABLE, "--out", "{tmp}", "--preset", "art4"], "not built yet"),
         (["stream", TABLE], "--server"),
         (["stream", TABLE, "--server", "localhost:1", "--device", "x"], "probeless serve --device"),
+        (["stream", TABLE, "--server", "http://127.0.0.1:9", "--mesh"], "say where with --out"),
         (["serve", "--token", "x"], "not built yet"),
         (["serve", "--tls", "x"], "not built yet"),
         (["serve", "--port", "70000"], "--port"),
@@ -95,6 +97,17 @@ def test_truncated_picture_in_the_middle_of_a_run(tmp_path: Path) -> None:
     assert [json.loads(line)["frame"] for line in lines] == [0, 1]
 
 
+def test_mesh_is_written_and_an_empty_one_told(tmp_path: Path) -> None:
+    volume = ["--volume", "-0.7,-0.1,-0.5,0.7,0.4,0.5", "--voxel", "0.02", "--mesh", "--out"]
+    done = probeless("run", TABLE, "--frames", "0:2", *volume, tmp_path)
+    assert done.returncode == 0, done.stderr
+    meshes = [trimesh.load(tmp_path / f"mesh.{kind}", force="mesh", process=False) for kind in ("ply", "glb")]
+    np.testing.assert_allclose(meshes[0].extents, [1.2, 0.25, 0.8], atol=0.1)  # the table and its things
+    np.testing.assert_allclose(meshes[1].extents[1], meshes[0].extents[1], atol=1e-6)  # turned about up only
+    volume[1] = "5,5,5,6,6,6"
+    assert_one_line(probeless("run", TABLE, "--frames", "0:2", *volume, tmp_path), 1, "there is no surface to mesh")
+
+
 def test_debug_shows_the_traceback_wherever_it_stands() -> None:
     for words in (["--debug", "run", "/nowhere", "--out", "x"], ["run", "/nowhere", "--out", "x", "--debug"]):
         done = probeless(*words)
@@ -111,7 +124,7 @@ def test_stream_without_a_server() -> None:
 
 def test_help_names_every_command_and_option() -> None:
     general = probeless("--help", COLUMNS="200").stdout
-    for command in ("run", "stream", "serve", "demo", "devices", "bench"):
+    for command in ("run", "stream", "model", "serve", "demo", "devices", "bench"):
         assert command in general
     shared = (
         "--frames --poses --volume --voxel --preset --rays --ray-length --bands --albedo --indirect --as-thesis "

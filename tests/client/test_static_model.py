@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 import trimesh
@@ -29,7 +30,7 @@ from client.laptop.errors import RunError, SourceError
 from client.laptop.point_cloud import CloudFusion, PointCloud, depth_noise_m, pixel_rays, usable_pixels
 from client.laptop.source import open_source
 from client.laptop.static_model import StaticModel, model_of_fusion
-from protocol.frames import CameraModel, RgbdFrame
+from protocol.frames import IDENTITY, CameraModel, DepthCamera, RgbdFrame
 from tests.analytic import Shape, look, look_at, plane, room, sphere
 from tests.data import data_folder
 
@@ -124,6 +125,29 @@ def test_viewing_directions_are_the_cameras_mean() -> None:
     expected = np.array([1.0, 0, 0]) - cloud.points[only_right]
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     assert angle_deg(cloud.towards_camera[only_right], expected).max() < 1
+
+
+def test_depth_of_a_lens_of_its_own_gets_the_colour_of_the_same_place() -> None:
+    """The depth lens stands 6 cm to the right of the colour lens and looks at a wall that is red for x > 0."""
+    depth_lens = DepthCamera(
+        width=120, height=90, fx=90.0, fy=90.0, cx=59.5, cy=44.5, color_from_depth=(1, 0, 0, 0.06, *IDENTITY[4:])
+    )
+    camera = msgspec.structs.replace(CAMERA, depth=depth_lens)
+    pose = look_at((0.3, 0, 0), (0.3, 0, 2))
+    color = np.zeros((120, 160, 3), np.uint8)
+    x = 0.3 + (np.arange(160) - CAMERA.cx) / CAMERA.fx * 2
+    color[:, x > 0, 0] = 255
+    frame = RgbdFrame(0, 0.0, color, np.full((90, 120), 20_000, np.uint16), pose)
+    cloud = fused([frame], camera).cloud()
+    # The depth lens sees x from -0.97 to 1.69, the colour lens less: what has no colour is left out.
+    low, high = (0.3 + side * 80 / 130 * 2 for side in (-1, 1))
+    assert low < cloud.points[:, 0].min() < low + 0.05
+    assert high - 0.05 < cloud.points[:, 0].max() < high
+    clear = np.abs(cloud.points[:, 0]) > 0.03
+    np.testing.assert_allclose(cloud.colors[clear, 0], cloud.points[clear, 0] > 0, atol=1e-6)
+    expected = pose[:3, 3] + [0.06, 0, 0] - cloud.points
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    assert angle_deg(cloud.towards_camera, expected).max() < 0.1
 
 
 def test_edges_of_depth_are_left_out() -> None:

@@ -12,6 +12,8 @@ import numpy as np
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import encode_color, encode_depth
 from protocol.messages import Frame, LeftOut, Light, Plan, Timings, Wishes
+from server.meshing.scene_mesh import SceneMesh
+from server.meshing.surface import MeshingError
 
 PATIENCE_S = 20.0
 CAMERA = CameraModel(width=48, height=32, fx=40.0, fy=41.0, cx=23.5, cy=15.5)
@@ -45,6 +47,8 @@ class Lab:
     released: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
     log: list = field(default_factory=list)
     """Everything asked of the pipelines, in order."""
+    mesh: SceneMesh | None = None
+    """What the pipelines say they have fused; None: nothing."""
     closed: threading.Event = field(default_factory=threading.Event)
     threads: set = field(default_factory=set)
 
@@ -89,6 +93,12 @@ class FakePipeline:
 
     def set_preset(self, preset: str) -> None:
         self.lab.log.append(("preset", preset))
+
+    def scene_mesh(self) -> SceneMesh:
+        self.lab.log.append(("mesh",))
+        if self.lab.mesh is None:
+            raise MeshingError("there is no surface to mesh: no frame has been fused yet")
+        return self.lab.mesh
 
     def process(self, frame: RgbdFrame) -> FakeResult:
         self.lab.log.append(("frame", frame.index))
@@ -151,6 +161,19 @@ def frame_message(index: int, first_depth_mm: int = 1000) -> Frame:
         world_from_camera=tuple(POSE.ravel().tolist()),
         color=encode_color(frame.color, "raw"),
         depth=encode_depth(frame.depth),
+    )
+
+
+def terrain(side: int) -> SceneMesh:
+    """A mesh of `side` x `side` vertices, different in every byte that is sent."""
+    random = np.random.default_rng(side)
+    corner = np.arange(side * (side - 1)).reshape(side - 1, side)[:, :-1].ravel()
+    return SceneMesh(
+        vertices=random.normal(size=(side * side, 3)).astype(np.float32),
+        triangles=np.stack([corner, corner + 1, corner + side], axis=1).astype(np.int32),
+        normals=np.tile(np.float32([0, 0, 1]), (side * side, 1)),
+        colors=random.integers(0, 256, (side * side, 3), np.uint8),
+        gltf_from_world=np.diag([1.0, -1.0, -1.0]),
     )
 
 

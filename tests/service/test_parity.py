@@ -13,6 +13,7 @@ from client.laptop.output import FrameOutput, OutputWriter
 from client.laptop.stream import stream
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
+from server.meshing.files import mesh_files
 from server.opencl.device import Device
 from server.pipeline import Pipeline
 from server.scene.mesh import load_mesh
@@ -61,6 +62,7 @@ def run_in_process(device: Device, scene: Scene, folder: Path) -> None:
         for frame in (scene.source[i] for i in range(FRAMES)):
             result = vars(pipeline.process(frame))
             writer.write(FrameOutput(frame=frame.index, timestamp_s=frame.timestamp_s, **result))
+        writer.write_mesh(mesh_files(pipeline.scene_mesh()))
     pipeline.close()
 
 
@@ -80,8 +82,9 @@ def test_lossless_stream_gives_the_bits_of_an_in_process_run(device: Device, sce
     run_in_process(device, scene, tmp_path / "run")
     with start_in_background(Service(device)) as server:
         quiet = Console(file=io.StringIO())
-        stream(scene.source, server.url, [scene.item], WISHES, tmp_path / "stream", lossless=True, console=quiet)
+        options = {"lossless": True, "mesh": True, "console": quiet}
+        stream(scene.source, server.url, [scene.item], WISHES, tmp_path / "stream", **options)
     run, streamed = comparable(tmp_path / "run"), comparable(tmp_path / "stream")
     assert len([name for name in run if name.endswith(".png")]) == FRAMES
-    assert run.keys() == streamed.keys()
+    assert run.keys() == streamed.keys() >= {"mesh.ply", "mesh.glb"}
     assert [name for name in run if run[name] != streamed[name]] == []

@@ -1,5 +1,5 @@
-// The pool of bricks: emptying, copying and weighing them. Slot 0 is everybody's who is away, see server/stages/brick_pool.py.
-// Provides claim_bricks, place_bricks, copy_bricks, weigh_bricks.
+// The pool of bricks: emptying, placing and copying them. Slot 0 is everybody's who is away, see server/stages/brick_pool.py.
+// Provides claim_bricks, place_bricks, copy_bricks.
 #include "volume.clh"
 
 // slots [count] -> those bricks' voxels never seen, without colour. One item a row of 8 voxels.
@@ -30,19 +30,4 @@ kernel void copy_bricks(const int count, global const int *from, global const fl
     const int source = from[brick] * BRICK * BRICK + row, target = to[brick] * BRICK * BRICK + row;
     vstore16(vload16(source, (global const float *)voxels_from), target, (global float *)voxels_to);
     vstore8(vload8(source, colors_from), target, colors_to);
-}
-
-// slots [count] -> least [count]: the least tsdf that a brick's voxels were seen with, `nothing` where none was seen.
-kernel void weigh_bricks(const int count, global const int *slots, global const float2 *voxels, const float nothing,
-                         global float *least) {
-    const int item = get_global_id(0);
-    if (item >= count) return;
-    float8 lowest = (float8)(nothing);
-    for (int row = 0; row < BRICK * BRICK; row++) {
-        const float16 pairs = vload16(slots[item] * BRICK * BRICK + row, (global const float *)voxels);
-        lowest = select(lowest, fmin(lowest, pairs.even), pairs.odd > 0.0f);
-    }
-    const float4 half_way = fmin(lowest.lo, lowest.hi);
-    const float2 quarter = fmin(half_way.lo, half_way.hi);
-    least[item] = fmin(quarter.x, quarter.y);
 }

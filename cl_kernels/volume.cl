@@ -1,5 +1,5 @@
 // The brick volume's table: which bricks the measured surface needs, where they are solid, and how far apart those are.
-// Provides mark_bricks, find_solid, gaps_along_x, gap_along_axis.
+// Provides mark_bricks, find_solid, find_near_solid, gaps_along_x, gap_along_axis.
 #include "camera.clh"
 #include "volume.clh"
 
@@ -121,6 +121,31 @@ kernel void find_solid(const int count, global const int *listed, global const i
         for (int i = 0; i < 16; i++) mask |= (ulong)cells[item + i] << (4 * i);
         solid[index] = mask;
     }
+}
+
+// Cells of the brick `offset` (-1, 0, 1) bricks away along an axis that lie within two of this one; `low` and `high` are
+// the halves of a brick along it.
+static inline ulong facing_half(const int offset, const ulong low, const ulong high) {
+    return offset > 0 ? low : offset < 0 ? high : (low | high);
+}
+
+// listed [count] brick indices -> near [count]: 1 where the brick holds a solid voxel, or a brick beside it does within two
+// cells, 4 voxels. Elsewhere, no voxel of the brick is interpolated where a ray looks for a surface.
+kernel void find_near_solid(const int count, global const int *listed, const int4 bricks, global const ulong *solid,
+                            global uchar *near) {
+    const int item = get_global_id(0);
+    if (item >= count) return;
+    const int index = listed[item];
+    const int3 here = (int3)(index % bricks.x, (index / bricks.x) % bricks.y, index / (bricks.x * bricks.y));
+    ulong any = 0;
+    for (int i = 0; i < 27; i++) {
+        const int3 offset = (int3)(i % 3, (i / 3) % 3, i / 9) - 1;
+        if (!inside_bricks(bricks, here + offset)) continue;
+        any |= solid[brick_index(bricks, here + offset)] & facing_half(offset.x, 0x3333333333333333UL, 0xCCCCCCCCCCCCCCCCUL) &
+               facing_half(offset.y, 0x00FF00FF00FF00FFUL, 0xFF00FF00FF00FF00UL) &
+               facing_half(offset.z, 0x00000000FFFFFFFFUL, 0xFFFFFFFF00000000UL);
+    }
+    near[item] = any != 0;
 }
 
 // Which of the bricks have changed between solid and not: corners of the box around them, in bricks; low > high = none.

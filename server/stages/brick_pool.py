@@ -20,7 +20,6 @@ BRICK_BYTES = 12 * BRICK_VOXELS + BRICK_CELLS
 """Of one brick in the pool: tsdf and weight, colour, octets."""
 _BATCH = 1024
 """Bricks that are copied between device and host at once."""
-NOTHING_SEEN = 2.0
 
 
 class BrickPool:
@@ -29,7 +28,10 @@ class BrickPool:
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self.capacity = 0
-        self._allocate(0)
+        space = engine.workspace
+        self.voxels: cl_array.Array = space.array("voxels", (1, BRICK_VOXELS), cl_types.float2)
+        self.colors: cl_array.Array = space.array("voxel_colors", (1, BRICK_VOXELS), np.uint32)
+        self.octets: cl_array.Array = space.array("solid_octets", (1, BRICK_CELLS), np.uint8)
         fill_bytes(engine.queue, self.voxels, 0)
         fill_bytes(engine.queue, self.colors, 0)
         fill_bytes(engine.queue, self.octets, 255)  # rays stop at what is away, but nothing is interpolated
@@ -40,30 +42,15 @@ class BrickPool:
         return int(self.voxels.nbytes + self.colors.nbytes + self.octets.nbytes)
 
     def grow(self, capacity: int) -> None:
-        """Have `capacity` slots; contents stay. For a moment old and new lie side by side."""
-        old = (self.voxels, self.colors, self.octets)
-        self._allocate(capacity)
-        for before, after in zip(old, (self.voxels, self.colors, self.octets), strict=True):
-            copy_beginning(self._engine.queue, after, before)
-        self._engine.queue.finish()
-        for before in old:
-            if isinstance(before.data, cl.Buffer):
-                before.data.release()
+        """Have `capacity` slots; contents stay. One array at a time lies there twice for a moment."""
+        self.capacity = capacity
+        self.voxels = self._grown("voxels", self.voxels)
+        self.colors = self._grown("voxel_colors", self.colors)
+        self.octets = self._grown("solid_octets", self.octets)
 
     def clear(self, slots: NDArray[np.int32]) -> None:
         """Make voxels unseen and colourless."""
         self._over_rows("claim_bricks", len(slots), self._list("claimed", slots), self.voxels, self.colors)
-
-    def least_tsdf(self, slots: NDArray[np.int32]) -> NDArray[np.float32]:
-        """[n] the least tsdf that was seen in each brick, NOTHING_SEEN where there is none."""
-        if not slots.size:
-            return np.empty(0, np.float32)
-        least = self._engine.workspace.array("least_tsdf", (_rounded(len(slots)),), np.float32)
-        kernel = self._engine.kernel("brick_pool.cl", "weigh_bricks")
-        arguments = (self._list("weighed", slots), self.voxels, NOTHING_SEEN, least)
-        self._engine.launch(kernel, (len(slots),), len(slots), *arguments)
-        result: NDArray[np.float32] = self._engine.download(least)[: len(slots)]
-        return result
 
     def download(self, slots: NDArray[np.int32]) -> Iterator[tuple[slice, NDArray[Any], NDArray[np.uint32]]]:
         """In batches: which of `slots`, their voxels [k, 512] float2, their colours [k, 512]."""
@@ -85,17 +72,18 @@ class BrickPool:
                 "copy_bricks", len(slots[batch]), rows, staged_voxels, staged_colors, chosen, self.voxels, self.colors
             )
 
-    def _allocate(self, capacity: int) -> None:
-        space, rows = self._engine.workspace, capacity + 1
-        self.capacity = capacity
-        self.voxels: cl_array.Array = space.array("voxels", (rows, BRICK_VOXELS), cl_types.float2)
-        self.colors: cl_array.Array = space.array("voxel_colors", (rows, BRICK_VOXELS), np.uint32)
-        self.octets: cl_array.Array = space.array("solid_octets", (rows, BRICK_CELLS), np.uint8)
+    def _grown(self, name: str, old: cl_array.Array) -> cl_array.Array:
+        new = self._engine.workspace.array(name, (self.capacity + 1, *old.shape[1:]), old.dtype)
+        copy_beginning(self._engine.queue, new, old)
+        self._engine.queue.finish()
+        if isinstance(old.data, cl.Buffer):
+            old.data.release()
+        return new
 
     def _staging(self, batch: slice) -> tuple[cl_array.Array, cl_array.Array, cl_array.Array]:
         """Voxels and colours of one batch between device and host, and the rows of it that are used."""
         space = self._engine.workspace
-        rows = min(_BATCH, _rounded(batch.stop - batch.start))
+        rows = min(_BATCH, rounded(batch.stop - batch.start))
         return (
             space.array("staged_voxels", (rows, BRICK_VOXELS), cl_types.float2),
             space.array("staged_colors", (rows, BRICK_VOXELS), np.uint32),
@@ -113,12 +101,13 @@ class BrickPool:
 
 def upload_list(engine: Engine, name: str, values: NDArray[np.int32]) -> cl_array.Array:
     """[n or more] int32 on the device, the first n of them `values`: a list whose length changes keeps its memory."""
-    array = engine.workspace.array(name, (_rounded(len(values)),), np.int32)
+    array = engine.workspace.array(name, (rounded(len(values)),), np.int32)
     copy_beginning(engine.queue, array, values)
     return array
 
 
-def _rounded(count: int) -> int:
+def rounded(count: int) -> int:
+    """Length of a buffer for a list of about `count`: only now and then another."""
     return 1 << max(10, (count - 1).bit_length())
 
 

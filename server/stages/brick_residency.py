@@ -10,20 +10,18 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
-from server.stages.brick_pool import BRICK_BYTES, BRICK_VOXELS, NOTHING_SEEN, BrickPool, upload_list
+from server.stages.brick_pool import BRICK_BYTES, BRICK_VOXELS, BrickPool, upload_list
 from server.stages.brick_store import BrickStore
 from server.stages.brick_table import AWAY_SLOT, NO_SLOT, BrickTable, Indices, in_view
 from server.stages.ray_tables import RayTables
 
 _VOXEL_BYTES = 12
 _FIRST_CAPACITY = 4096
-_GROWTH = 1.5
+_GROWTH = 1.25
 _IDLE_FRAMES = 32
-"""A brick that was not wanted for so long and holds nothing near a surface is given back."""
+"""A brick that was not wanted for so long, and has no surface in it or near it, is given back."""
 _SETTLING_FRAMES = 8
 """How often bricks are looked through for those."""
-_SURFACE_TSDF = 0.5
-"""A brick with no less than this is two voxels or more from any surface: no interpolation reads so far."""
 _SPARE_SHARE = 1 / 16
 """Part of the budget that is released beyond what is asked, so that not every frame has to."""
 
@@ -117,30 +115,31 @@ class Residency:
             self._table.grow(capacity)
 
     def _claim(self, bricks: Indices) -> None:
-        self.pool.clear(self._table.take(bricks, self._frame))
+        self.pool.clear(self._table.take(bricks))
         self._place(bricks)
 
     def _restore(self, bricks: Indices) -> None:
         if not bricks.size:
             return
-        self.pool.upload(self._table.take(bricks, self._frame), *self.store.take(bricks))
+        self.pool.upload(self._table.take(bricks), *self.store.take(bricks))
         self._place(bricks)
         listed = upload_list(self._engine, "restored_bricks", bricks)
         self._tables.find_solid(listed, len(bricks), self.slots_device, self.pool)
 
     def _release(self, bricks: Indices) -> None:
-        is_seen = self.pool.least_tsdf(self._table.slots_of(bricks)) < NOTHING_SEEN
-        kept, unseen = bricks[is_seen], bricks[~is_seen]
-        for batch, voxels, colors in self.pool.download(self._table.slots_of(kept)):
-            self.store.put(kept[batch], voxels, colors)
-        self._table.leave(kept, AWAY_SLOT)
-        self._table.leave(unseen, NO_SLOT)
+        for batch, voxels, colors in self.pool.download(self._table.slots_of(bricks)):
+            self.store.put(bricks[batch], voxels, colors)
+        self._table.leave(bricks, AWAY_SLOT)
         self._place(bricks)
 
     def _give_back_idle(self) -> None:
-        """Bricks that noise asked for, or whose surface was carved away."""
-        idle = self._table.settle(self._frame - _IDLE_FRAMES)
-        empty = idle[self.pool.least_tsdf(self._table.slots_of(idle)) > _SURFACE_TSDF]
+        """Bricks that noise asked for, or whose surface was carved away, with any budget the same ones."""
+        before = self._frame - _IDLE_FRAMES
+        idle = np.concatenate(
+            [self._table.settle(self._table.resident(), before), self._table.settle(self.store.indices(), before)]
+        )
+        empty = idle[~self._tables.near_solid(idle)]
+        self.store.forget(empty[self._table.slots_of(empty) == AWAY_SLOT])
         self._table.leave(empty, NO_SLOT)
         self._place(empty)
 

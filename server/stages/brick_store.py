@@ -51,6 +51,12 @@ class BrickStore:
             chosen = indices[start : start + _BATCH]
             yield chosen, *_stacked([self._bricks[index] for index in chosen.tolist()])
 
+    def forget(self, indices: NDArray[np.int32]) -> None:
+        """Give the memory of bricks back."""
+        for index in indices.tolist():
+            del self._bricks[index]
+        self._indices = None
+
     def take(self, indices: NDArray[np.int32]) -> tuple[NDArray[Any], NDArray[np.uint32]]:
         """[n, 512] voxels and colours of bricks that are held; they are held no longer."""
         self._indices = None

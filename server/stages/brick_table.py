@@ -23,59 +23,50 @@ class BrickTable:
     def __init__(self, bricks: tuple[int, int, int]) -> None:
         self.slots = np.full(bricks[::-1], NO_SLOT, np.int32)
         """[z, y, x]"""
-        self._brick_of_slot = np.full(1, NO_SLOT, np.int32)
-        self._last_wanted = np.zeros(1, np.int32)
-        self._is_settled = np.zeros(1, np.bool_)
-
-    @property
-    def capacity(self) -> int:
-        """Slots there are."""
-        return len(self._brick_of_slot) - 1
+        self._brick_of_slot = np.empty(0, np.int32)
+        self._last_wanted = np.zeros(self.slots.size, np.int32)
+        self._is_settled = np.zeros(self.slots.size, np.bool_)
 
     def grow(self, capacity: int) -> None:
         """Have `capacity` slots, at least as many as before."""
-        added = capacity - self.capacity
-        self._brick_of_slot = np.concatenate([self._brick_of_slot, np.full(added, NO_SLOT, np.int32)])
-        self._last_wanted = np.concatenate([self._last_wanted, np.zeros(added, np.int32)])
-        self._is_settled = np.concatenate([self._is_settled, np.zeros(added, np.bool_)])
+        added = np.full(capacity - len(self._brick_of_slot), NO_SLOT, np.int32)
+        self._brick_of_slot = np.concatenate([self._brick_of_slot, added])
 
     def resident(self) -> Indices:
         """All bricks with a slot of their own, in the order of their slots."""
-        return self._brick_of_slot[1:][self._brick_of_slot[1:] >= 0]
+        return self._brick_of_slot[self._brick_of_slot >= 0]
 
     def slots_of(self, indices: Indices) -> Indices:
         """[n] slots."""
         return self.slots.ravel()[indices]
 
-    def take(self, indices: Indices, frame: int) -> Indices:
+    def take(self, indices: Indices) -> Indices:
         """Give each brick the lowest free slot; returns the slots."""
-        slots = np.flatnonzero(self._brick_of_slot[1:] < 0)[: len(indices)].astype(np.int32) + 1
-        self.slots.ravel()[indices] = slots
-        self._brick_of_slot[slots] = indices
-        self._last_wanted[slots] = frame
-        self._is_settled[slots] = False
-        return slots
+        free = np.flatnonzero(self._brick_of_slot < 0)[: len(indices)].astype(np.int32)
+        self._brick_of_slot[free] = indices
+        self.slots.ravel()[indices] = free + 1
+        return free + 1
 
     def leave(self, indices: Indices, slot: int) -> None:
-        """Take the slots of bricks away; they go to AWAY_SLOT or NO_SLOT."""
-        self._brick_of_slot[self.slots_of(indices)] = NO_SLOT
+        """Take the slots of bricks away, as far as they have any; they go to AWAY_SLOT or NO_SLOT."""
+        slots = self.slots_of(indices)
+        self._brick_of_slot[slots[slots > AWAY_SLOT] - 1] = NO_SLOT
         self.slots.ravel()[indices] = slot
 
     def touch(self, indices: Indices, frame: int) -> None:
-        """Say that these bricks were wanted now, as far as they have slots."""
-        slots = self.slots_of(indices)
-        self._last_wanted[slots[slots > AWAY_SLOT]] = frame
-        self._is_settled[slots] = False
-
-    def settle(self, before: int) -> Indices:
-        """Resident bricks that were wanted last before a frame; each is returned once, until it is wanted again."""
-        idle = (self._brick_of_slot >= 0) & ~self._is_settled & (self._last_wanted < before)
-        self._is_settled |= idle
-        return self._brick_of_slot[idle]
+        """Say that these bricks are wanted now."""
+        self._last_wanted[indices] = frame
+        self._is_settled[indices] = False
 
     def last_wanted(self, indices: Indices) -> NDArray[np.int32]:
-        """[n] frames in which resident bricks were wanted last."""
-        return self._last_wanted[self.slots_of(indices)]
+        """[n] frames in which bricks were wanted last."""
+        return self._last_wanted[indices]
+
+    def settle(self, indices: Indices, before: int) -> Indices:
+        """Those of the bricks that were wanted last before a frame; each only once, until it is wanted again."""
+        idle = indices[(self._last_wanted[indices] < before) & ~self._is_settled[indices]]
+        self._is_settled[idle] = True
+        return idle
 
     def coordinates(self, indices: Indices) -> Indices:
         """[n, 3] x, y, z."""

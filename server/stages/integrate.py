@@ -9,7 +9,7 @@ from protocol.frames import CameraModel
 from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine, float16, int4
 from server.stages.measure import Measurement, intrinsics
-from server.stages.volume import BRICK, Volume
+from server.stages.volume import Volume
 
 GREATEST_WEIGHT = 64.0
 """Where the running mean's weight saturates: it then forgets with a time constant of as many frames."""

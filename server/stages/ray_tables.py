@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pyopencl.array as cl_array
+from numpy.typing import NDArray
 
 from server.opencl.engine import Engine, int4
 from server.opencl.transfer import copy_beginning, fill_bytes
-from server.stages.brick_pool import BrickPool
+from server.stages.brick_pool import BrickPool, rounded, upload_list
 
 GREATEST_GAP = 15
 _CELL_ROWS = 16
@@ -46,6 +47,15 @@ class RayTables:
             self.solid,
             pool.octets,
         )
+
+    def near_solid(self, indices: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """[n] whether there is a solid voxel in a brick, or within some 4 voxels of it, as far as is known."""
+        near = self._engine.workspace.array("bricks_near_solid", (rounded(len(indices)),), np.uint8)
+        listed = upload_list(self._engine, "idle_bricks", indices)
+        kernel = self._engine.kernel("volume.cl", "find_near_solid")
+        self._engine.launch(kernel, (len(indices),), len(indices), listed, int4(*self.bricks, 0), self.solid, near)
+        found: NDArray[np.bool_] = self._engine.download(near)[: len(indices)].view(np.bool_)
+        return found
 
     def update(self) -> None:
         """Renew the gaps around bricks that have become solid, or are no longer."""

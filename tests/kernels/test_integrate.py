@@ -231,3 +231,44 @@ def test_a_moved_wall_is_forgotten(engine: Engine) -> None:
     for _ in range(int(3 * GREATEST_WEIGHT)):
         fuse(engine, volume, CAMERA, np.eye(4), np.full(shape, 1.18))
     assert crossing() == pytest.approx(1.18 - 0.04 * np.exp(-3), abs=2e-3)
+
+
+def mean_in_16_bits(value: int, weight: int, told: float) -> int:
+    """A running mean that is kept as a short, cast as KinectFusion implementations do: the next value, in 1 / 32766."""
+    return int((value * weight + told * 32766) / (weight + 1))
+
+
+def test_ten_thousand_frames_do_not_stall_the_mean(engine: Engine) -> None:
+    """Then the wall goes 0.12 mm back, 1/500 of the truncation: that is followed, where 16 bits stay for ever.
+
+    A share of 1/65 of that is 1/32 500 of the truncation: about a quantum of theirs, and the cast drops what is less.
+    """
+    volume = Volume(engine, (-0.08, -0.08, 1.0, 0.08, 0.08, 1.24), 0.015)
+    pose, shape, place = volume.volume_from_world(), (CAMERA.height, CAMERA.width), (7, 5, 5)
+
+    def told(depth_m: float, frames: int) -> tuple[float, float]:
+        measurement = upload_measurement(engine, np.full(shape, depth_m))
+        volume.allocate(CAMERA, pose, measurement.depth_m)
+        for frame in range(frames):
+            integrate(engine, volume, CAMERA, pose, measurement)
+            if frame % 100 == 0:
+                engine.queue.finish()
+                engine.profile.forget()
+        tsdf, weight, _ = dense_voxels(engine, volume)
+        return float(tsdf[place]), float(weight[place])
+
+    step = 1 / 500
+    first, _ = told(1.12, 1)
+    assert 0.05 < first < 0.5
+    still, weight = told(1.12, 9_999)
+    assert weight == GREATEST_WEIGHT
+    assert still == pytest.approx(first, abs=2**-23)
+    moved, _ = told(1.12 + step * volume.truncation_m, 400)
+    center = voxel_centers((16, 10, 10), volume.voxel_m)[place] + volume.origin_world
+    wanted = first + step * float(np.linalg.norm(center) / center[2])
+    assert moved == pytest.approx(wanted, abs=0.01 * step)
+
+    short = int(first * 32766)
+    for _ in range(400):
+        short = mean_in_16_bits(short, int(GREATEST_WEIGHT), wanted)
+    assert abs(short / 32766 - wanted) > 0.9 * step

@@ -78,6 +78,22 @@ def test_one_valid_pixel_has_its_bricks(engine: Engine, pixel: tuple[int, int]) 
     assert_enough_bricks(engine, volume_of(engine, 0.015), np.eye(4), depth)
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_scattered_pixels_have_their_bricks(engine: Engine, seed: int) -> None:
+    """Each alone, from a camera whose pixels are narrower than voxels: nothing but its own slices marks for it."""
+    fine = CameraModel(width=291, height=213, fx=240.0, fy=234.0, cx=142.0, cy=108.0)
+    rng = np.random.default_rng(seed)
+    depth = np.zeros((fine.height, fine.width))
+    alone = rng.random(depth[3::16, 5::16].shape) < 0.2
+    depth[3::16, 5::16] = np.where(alone, rng.uniform(0.7, 1.7, alone.shape), 0)
+    volume = volume_of(engine, 0.015)
+    pose = volume.volume_from_world() @ VIEWS["turned"]
+    volume.allocate(fine, pose, upload_depth(engine, depth))
+    needed = twin.mark_bricks(fine, pose, depth, volume.bricks, volume.voxel_m, volume.truncation_m + volume.voxel_m)
+    assert needed.any()
+    assert not (needed & (engine.download(volume.slots_device) < 0)).any()
+
+
 def test_unmeasured_pixels_need_no_bricks(engine: Engine) -> None:
     volume = volume_of(engine)
     pose = volume.volume_from_world()
@@ -251,6 +267,23 @@ def test_solid_cells_match_brute_force(engine: Engine, share: float) -> None:
     found = engine.download(device_octets)
     np.testing.assert_array_equal(found[slots[chosen]], octets.reshape(count, 64)[chosen])
     assert (found[len(chosen) :] == 77).all()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.3])
+def test_bricks_near_solid_match_their_twin(engine: Engine, share: float) -> None:
+    rng, shape = np.random.default_rng(2), (5, 7, 6)
+    cell = np.uint64(1) << rng.integers(0, 64, shape, np.uint64)
+    solid = np.where(rng.random(shape) < share, cell, np.uint64(0))
+    listed = rng.permutation(solid.size)[:150].astype(np.int32)
+    near = engine.workspace.upload("near", np.full(len(listed) + 1, 77, np.uint8))
+    arguments = (
+        engine.workspace.upload("listed", listed),
+        int4(*shape[::-1], 0),
+        engine.workspace.upload("solid", solid),
+    )
+    kernel = engine.kernel("volume.cl", "find_near_solid")
+    engine.launch(kernel, (len(listed),), len(listed), *arguments, near)
+    np.testing.assert_array_equal(engine.download(near), [*twin.near_solid(solid).ravel()[listed], 77])
 
 
 def test_summary_follows_the_voxels(engine: Engine) -> None:

@@ -46,6 +46,15 @@ def find_solid(tsdf: Floats, weight: Floats) -> tuple[NDArray[np.uint64], NDArra
     return masks.astype(np.uint64), octets
 
 
+def near_solid(solid: NDArray[np.uint64]) -> Bools:
+    """[z, y, x] whether there is a solid cell in a brick, or within two cells of it."""
+    z, y, x = solid.shape
+    cells = (solid[..., None] >> np.arange(64, dtype=np.uint64)) & np.uint64(1)
+    dense = cells.astype(bool).reshape(z, y, x, 4, 4, 4).transpose(0, 3, 1, 4, 2, 5).reshape(4 * z, 4 * y, 4 * x)
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(dense, 2), (8, 8, 8))
+    return windows[::4, ::4, ::4].any((3, 4, 5))
+
+
 def start_gaps(solid: NDArray[np.uint64], limit: int) -> NDArray[np.uint8]:
     """0 where a brick holds a solid voxel, else `limit`."""
     return np.where(solid != 0, 0, limit).astype(np.uint8)

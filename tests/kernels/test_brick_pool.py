@@ -1,0 +1,91 @@
+"""The pool of bricks: its kernels move bits, so they are exact."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+import pytest
+from numpy.typing import NDArray
+
+from server.opencl.engine import Engine
+from server.stages.brick_pool import BRICK_VOXELS, BrickPool
+from server.stages.brick_table import AWAY_SLOT, NO_SLOT
+from tests.reference import brick_pool as twin
+from tests.volumes import vectors
+
+SLOTS = 70
+
+
+def random_pool(rng: np.random.Generator, rows: int = SLOTS) -> tuple[NDArray[Any], NDArray[Any]]:
+    """tsdf and weight [rows, 512, 2] and colours [rows, 512]."""
+    voxels = rng.uniform(-1, 1, (rows, BRICK_VOXELS, 2)).astype(np.float32)
+    return voxels, rng.integers(0, 2**32, (rows, BRICK_VOXELS), np.uint32)
+
+
+def as_pairs(voxels: NDArray[Any]) -> NDArray[Any]:
+    return np.ascontiguousarray(voxels).view(cl_types.float2)[..., 0]
+
+
+def launch(engine: Engine, name: str, items: int, count: int, *arguments: cl_array.Array) -> None:
+    engine.launch(engine.kernel("brick_pool.cl", name), (items * count,), count, *arguments)
+
+
+@pytest.mark.parametrize("count", [1, 3, 64])
+def test_kernels_match_their_twins(engine: Engine, count: int) -> None:
+    rng, upload = np.random.default_rng(count), engine.workspace.upload
+    voxels, colors = random_pool(rng)
+    slots = rng.permutation(SLOTS)[:count].astype(np.int32)
+    device = {"voxels": upload("v", as_pairs(voxels)), "colors": upload("c", colors), "slots": upload("s", slots)}
+
+    other_voxels, other_colors = random_pool(rng)
+    places = rng.permutation(SLOTS)[:count].astype(np.int32)
+    target = upload("tv", as_pairs(other_voxels)), upload("tc", other_colors)
+    source = device["slots"], device["voxels"], device["colors"]
+    launch(engine, "copy_bricks", 64, count, *source, upload("places", places), *target)
+    np.testing.assert_array_equal(
+        vectors(engine.download(target[0])), twin.copy_bricks(voxels, slots, other_voxels, places)
+    )
+    np.testing.assert_array_equal(engine.download(target[1]), twin.copy_bricks(colors, slots, other_colors, places))
+
+    launch(engine, "claim_bricks", 64, count, *source)
+    voxels, colors = twin.claim_bricks(slots, voxels, colors)
+    np.testing.assert_array_equal(vectors(engine.download(device["voxels"])), voxels)
+    np.testing.assert_array_equal(engine.download(device["colors"]), colors)
+
+
+def test_placing_matches_its_twin(engine: Engine) -> None:
+    rng, upload = np.random.default_rng(1), engine.workspace.upload
+    table, solid = rng.integers(-1, 50, 300).astype(np.int32), rng.integers(0, 2**63, 300, np.uint64)
+    bricks = rng.permutation(300)[:130].astype(np.int32)
+    slots = rng.integers(NO_SLOT, AWAY_SLOT + 3, 130).astype(np.int32)
+    device = upload("table", table), upload("solid", solid)
+    launch(engine, "place_bricks", 1, 130, upload("bricks", bricks), upload("slots", slots), *device)
+    expected = twin.place_bricks(bricks, slots, table, solid)
+    for found, wanted in zip(device, expected, strict=True):
+        np.testing.assert_array_equal(engine.download(found), wanted)
+
+
+def test_bricks_survive_growth_and_the_way_to_the_host_and_back(engine: Engine) -> None:
+    rng = np.random.default_rng(2)
+    pool = BrickPool(engine)
+    pool.grow(40)
+    voxels, colors = random_pool(rng, 40)
+    first = np.arange(1, 41, dtype=np.int32)
+    pool.upload(first, as_pairs(voxels), colors)
+    pool.grow(3000)
+    assert pool.capacity == 3000
+    slots = rng.permutation(np.arange(41, 3001, dtype=np.int32))[:1500]  # more than are copied at once
+    more_voxels, more_colors = random_pool(rng, 1500)
+    pool.upload(slots, as_pairs(more_voxels), more_colors)
+    everything = np.concatenate([slots, first])
+    found = list(pool.download(everything))
+    assert len(found) > 1
+    assert np.array_equal(np.concatenate([everything[batch] for batch, _, _ in found]), everything)
+    found_voxels = np.concatenate([batch for _, batch, _ in found]).view(np.float32).reshape(-1, BRICK_VOXELS, 2)
+    np.testing.assert_array_equal(found_voxels, np.concatenate([more_voxels, voxels]))
+    np.testing.assert_array_equal(np.concatenate([batch for _, _, batch in found]), [*more_colors, *colors])
+    assert not vectors(engine.download(pool.voxels)[AWAY_SLOT]).any()
+    assert (engine.download(pool.octets)[AWAY_SLOT] == 255).all()

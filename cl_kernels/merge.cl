@@ -1,66 +1,216 @@
-// Hybrid geometry buffer (thesis 4.2.2, eq. 4.3): the volume where it agrees with the sensor, the sensor where it does not.
-// Provides merge_depth.
+// The hybrid depth picture (thesis 4.2.2): merging and hole filling D' (eq. 4.1-4.3), noise filter D'' (eq. 4.4) and
+// smoothing filter D''' (eq. 4.5). One work-item does eight pixels along x; a depth of 0 is unknown.
+// Provides lay_out, compare_depth, merge_depth, align_depth, smooth_depth.
+#include "agreement.clh"
 #include "camera.clh"
+#include "median.clh"
+#include "planes.clh"
+#include "volume.clh"
 
-#define LABEL_NONE 0
-#define LABEL_STATIC 1
-#define LABEL_DYNAMIC 2
+#define HOLE_STEP 4      // k = 17: Omega_k of eq. 4.3 is 17 x 17 pixels, subsampled to 5 x 5
+#define LEAST_SUPPORT 4  // as many samples as a straight line through the window meets: less is no evidence
+#define OUTSIDE -1000.0f // an intensity like no other
 
-// Depth and ray of a neighbour as a point in camera space; w = 0 where it has no depth or lies across an edge.
-static inline float4 neighbour(const int width, const int height, global const float *depth_m, const float4 intrinsics,
-                               const int x, const int y, const float depth) {
-    if (x < 0 || y < 0 || x >= width || y >= height) return (float4)(0.0f);
-    const float z = depth_m[y * width + x];
-    const float edge = fmax(0.02f, 6.0f / intrinsics.s0) * depth + 0.005f;  // two pixels of a surface seen at up to 70 degrees
-    return z > 0.0f && fabs(z - depth) < edge ? (float4)(z * unproject(intrinsics, x, y), 1.0f) : (float4)(0.0f);
+// Eq. 4.1 for eight pixels: -1 where the neighbour is about as bright, else 0.
+static inline int8 is_similar(const float8 shade, const float8 here, const float lambda_intensity) {
+    return fabs(shade - here) < lambda_intensity;
 }
 
-// Normal of the measured depth by differences to the neighbours that lie on the same surface, towards the camera; w = 0 if none.
-static float4 measured_normal(const int width, const int height, global const float *depth_m, const float4 intrinsics,
-                              const int x, const int y, const float3 here) {
-    const float4 left = neighbour(width, height, depth_m, intrinsics, x - 2, y, here.z);
-    const float4 right = neighbour(width, height, depth_m, intrinsics, x + 2, y, here.z);
-    const float4 up = neighbour(width, height, depth_m, intrinsics, x, y - 2, here.z);
-    const float4 down = neighbour(width, height, depth_m, intrinsics, x, y + 2, here.z);
-    const float3 along_x = (right.w > 0.0f ? right.xyz : here) - (left.w > 0.0f ? left.xyz : here);
-    const float3 along_y = (down.w > 0.0f ? down.xyz : here) - (up.w > 0.0f ? up.xyz : here);
-    const float3 n = cross(along_y, along_x);
-    const float size = length(n);
-    return size > 1e-12f ? (float4)(n / size, 1.0f) : (float4)(0.0f);
+// In how many frames the voxel around a point of the volume was seen.
+static float weight_at(const int4 bricks, global const int *slots, global const float2 *voxels, const float3 point) {
+    const int3 voxel = convert_int3(point);
+    const int3 brick = voxel >> 3;
+    if (point.x < 0.0f || point.y < 0.0f || point.z < 0.0f || !inside_bricks(bricks, brick)) return 0.0f;
+    const int slot = slots[brick_index(bricks, brick)];
+    const int3 within = voxel & 7;
+    return slot < 0 ? 0.0f : voxels[slot * BRICK_VOXELS + (within.z * BRICK + within.y) * BRICK + within.x].y;
 }
 
-// Sensor noise of structured light and stereo along z (Nguyen et al. 2012, eq. 3), metres.
-static inline float depth_sigma(const float z) {
-    return 0.0012f + 0.0019f * (z - 0.4f) * (z - 0.4f);
+// Over the bordered planes. depth_m, radiance, positions (of the volume's surface, w = 0 none) [h][w] -> measured: D_C;
+// predicted: D_X; shade: intensity, the square root of the luminance. Borders are 0, like those that sensed, merged and
+// aligned get, which later kernels write inside only.
+kernel void lay_out(const int width, const int height, const int pitch, global const float *depth_m,
+                    global const float4 *radiance, global const float4 *positions, const float16 camera_from_volume,
+                    global float *measured, global float *predicted, global float *shade, global float *sensed,
+                    global float *merged, global float *aligned) {
+    const int x = (int)get_global_id(0) - BORDER;
+    const int y = (int)get_global_id(1) - BORDER;
+    if (x >= pitch - BORDER || y >= height + BORDER) return;
+    const int at = plane_index(pitch, x, y);
+    if (x < 0 || y < 0 || x >= width || y >= height) {
+        measured[at] = predicted[at] = sensed[at] = merged[at] = aligned[at] = 0.0f;
+        shade[at] = OUTSIDE;
+        return;
+    }
+    const int pixel = y * width + x;
+    const float4 surface = positions[pixel];
+    const float3 color = radiance[pixel].xyz;
+    measured[at] = depth_m[pixel];
+    predicted[at] = surface.w > 0.0f ? fmax(transform_point(camera_from_volume, surface.xyz).z, 0.0f) : 0.0f;
+    shade[at] = sqrt(fmax(0.2126f * color.x + 0.7152f * color.y + 0.0722f * color.z, 0.0f));
 }
 
-// model_positions, model_normals [h][w]: the volume's surface; depth_m [h][w] measured, 0 = none.
-// -> positions, normals [h][w]: the merged geometry buffer; labels [h][w]: none, static (from the volume), dynamic (from the sensor: the volume says otherwise or nothing).
-kernel void merge_depth(const int width, const int height, global const float *depth_m, const float4 intrinsics,
-                        const float16 volume_from_camera, const float16 camera_from_volume, const float voxel_m,
-                        global const float4 *model_positions, global const float4 *model_normals,
-                        global float4 *positions, global float4 *normals, global uchar *labels) {
-    const int x = get_global_id(0);
+// -1 where eight pixels mix two surfaces, as sensors do on rims: at most two of the eight neighbours are on a pixel's own
+// surface, and there are both nearer and farther ones.
+static int8 is_mixed(global const float *measured, const int pitch, const int at, const float8 here) {
+    const float8 near = SAME_SURFACE_M(here);
+    int8 own = 0, nearer = 0, farther = 0;
+#pragma unroll
+    for (int i = 0; i < 9; i++) {
+        const float8 there = vload8(0, measured + at + (i / 3 - 1) * pitch + i % 3 - 1);
+        const int8 known = there > 0.0f;
+        own -= known & (fabs(there - here) < near);
+        nearer |= known & (there <= here - near);
+        farther |= known & (there >= here + near);
+    }
+    return (own <= 3) & nearer & farther;
+}
+
+// -1 where the sensor agrees with the volume: at the pixel to within lambda_D, and on the average of all pixels around that
+// do so by much less, as noise does not last there. Else what moves slowly would be static, with the normals of a while ago.
+static int8 agrees_with_volume(global const float *measured, global const float *predicted, const int pitch, const int at,
+                               const float8 sensor, const float8 volume, const float voxel_m) {
+    const int8 here = (volume > 0.0f) & (fabs(sensor - volume) < AGREEMENT_M(sensor, voxel_m));
+    if (!any(here)) return here;
+    float8 sum = 0.0f, count = 0.0f;
+#pragma unroll
+    for (int i = 0; i < 25; i++) {
+        const int there = at + (i / 5 - 2) * pitch + i % 5 - 2;
+        const float8 z = vload8(0, measured + there), expected = vload8(0, predicted + there);
+        const float8 apart = z - expected;
+        const int8 close = (z > 0.0f) & (expected > 0.0f) & (fabs(apart) < AGREEMENT_M(z, voxel_m));
+        sum += as_float8(close & as_int8(apart));
+        count += as_float8(close & as_int8((float8)(1.0f)));
+    }
+    return here & (fabs(sum) < MEAN_AGREEMENT_M(sensor, voxel_m) * count);
+}
+
+// Turns those of `count` predicted depths negative that lie in a hole and whose surface too few frames have seen.
+static void mark_new_surface(global const float4 *positions, const int4 bricks, global const int *slots,
+                             global const float2 *voxels, const float voxel_m, const float least_weight, const int8 hole,
+                             const int count, global float *predicted) {
+    int holes[8];
+    vstore8(hole, 0, holes);
+    for (int i = 0; i < count; i++) {
+        if (!holes[i] || predicted[i] <= 0.0f) continue;
+        if (weight_at(bricks, slots, voxels, positions[i].xyz / voxel_m) < least_weight) predicted[i] = -predicted[i];
+    }
+}
+
+// measured, predicted, positions and the volume -> sensed: D_C, negative where it agrees with the volume, 0 also where
+// two surfaces are mixed; predicted: negative where sensed is 0 and too few frames have seen the volume's surface.
+kernel void compare_depth(const int width, const int height, const int pitch, global const float *measured,
+                          global const float4 *positions, const int4 bricks, global const int *slots,
+                          global const float2 *voxels, const float voxel_m, const float least_weight,
+                          global float *predicted, global float *sensed) {
+    const int x = 8 * get_global_id(0);
     const int y = get_global_id(1);
     if (x >= width || y >= height) return;
-    const int pixel = y * width + x;
-    const float measured = depth_m[pixel];
-    const float4 surface = model_positions[pixel];
-    const float predicted = transform_point(camera_from_volume, surface.xyz).z;
-    const float agree = 1.5f * voxel_m + 4.0f * depth_sigma(measured);  // lambda_D
-    if (surface.w > 0.0f && (measured <= 0.0f || fabs(measured - predicted) < agree)) {
-        positions[pixel] = surface;
-        normals[pixel] = model_normals[pixel];
-        labels[pixel] = LABEL_STATIC;
-    } else if (measured > 0.0f) {
-        const float3 point = measured * unproject(intrinsics, x, y);
-        const float4 normal = measured_normal(width, height, depth_m, intrinsics, x, y, point);
-        positions[pixel] = (float4)(transform_point(volume_from_camera, point), 1.0f);
-        normals[pixel] = (float4)(transform_vector(volume_from_camera, normal.xyz), normal.w);
-        labels[pixel] = LABEL_DYNAMIC;
-    } else {
-        positions[pixel] = (float4)(0.0f);
-        normals[pixel] = (float4)(0.0f);
-        labels[pixel] = LABEL_NONE;
+    const int at = plane_index(pitch, x, y);
+    const float8 sensor = vload8(0, measured + at), volume = vload8(0, predicted + at);
+    const int8 hole = (sensor <= 0.0f) | is_mixed(measured, pitch, at, sensor);
+    const int8 agrees = agrees_with_volume(measured, predicted, pitch, at, sensor, volume, voxel_m);
+    vstore8(select(select(sensor, -sensor, agrees), (float8)(0.0f), hole), 0, sensed + at);
+    if (any(hole & (volume > 0.0f)))
+        mark_new_surface(positions + y * width + x, bricks, slots, voxels, voxel_m, least_weight, hole, min(8, width - x), predicted + at);
+}
+
+// How many samples around eight pixels, `step` apart, say that the volume's surface there is still where it was, less those
+// through which the sensor sees farther. Only samples of that same surface have a say; one hidden by something nearer has none.
+static int8 word_of_surface(global const float *sensed, global const float *predicted, const int pitch, const int at,
+                            const int step, const float8 surface, const float8 near) {
+    int8 agreeing = 0;
+#pragma unroll
+    for (int i = 0; i < 25; i++) {
+        const int there = at + (i / 5 - 2) * step * pitch + (i % 5 - 2) * step;
+        const int8 key = as_int8(vload8(0, sensed + there));
+        const float8 expected = vload8(0, predicted + there);
+        const int8 same = (fabs(expected - surface) < near) & (key != 0);
+        agreeing += (same & (as_float8(key) > expected)) - (same & (key < 0));  // masks are -1
     }
+    return agreeing;
+}
+
+// What fills eight holes (third and fourth case of eq. 4.3). The median of the supporting neighbours where they are enough,
+// and most of them say that the scene has changed, or the volume has no word. It has none where it has not seen its surface
+// for long, or where the sensor contradicts most of that same surface around the pixel. Else the volume.
+static int8 fill_holes(global const float *sensed, global const float *predicted, global const float *shade, const int pitch,
+                       const int at, const float voxel_m, const float lambda_intensity) {
+    const float8 here = vload8(0, shade + at), surface = vload8(0, predicted + at);
+    const float8 near = AGREEMENT_M(surface, voxel_m);
+    int8 values[25], pad = FIRST_PAD, count = 0, votes = 0;
+#pragma unroll
+    for (int i = 0; i < 25; i++) {
+        const int there = at + (i / 5 - 2) * HOLE_STEP * pitch + (i % 5 - 2) * HOLE_STEP;
+        const int8 key = as_int8(vload8(0, sensed + there));
+        const int8 support = is_similar(vload8(0, shade + there), here, lambda_intensity) & (key != 0);
+        values[i] = pad_unless(support, key & INT_MAX, &pad);
+        count -= support;
+        votes -= support & (key < 0);
+    }
+    const int8 word = word_of_surface(sensed, predicted, pitch, at, HOLE_STEP, surface, near) +
+                      word_of_surface(sensed, predicted, pitch, at, HOLE_STEP / 2, surface, near);
+    const int8 known = (surface > 0.0f) & (word >= 0);
+    const int8 filled = (count >= LEAST_SUPPORT) & ((2 * votes < count) | ~known);
+    return select(known & as_int8(surface), middle_of(values, 25), filled);
+}
+
+// D' (eq. 4.3): sensed, predicted, shade -> merged.
+kernel void merge_depth(const int width, const int height, const int pitch, global const float *sensed,
+                        global const float *predicted, global const float *shade, const float voxel_m,
+                        const float lambda_intensity, global float *merged) {
+    const int x = 8 * get_global_id(0);
+    const int y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    const int at = plane_index(pitch, x, y);
+    const int8 key = as_int8(vload8(0, sensed + at));
+    int8 result = select(key, as_int8(vload8(0, predicted + at)), key < 0);
+    if (any(key == 0)) {
+        const int8 filled = fill_holes(sensed, predicted, shade, pitch, at, voxel_m, lambda_intensity);
+        result = select(result, filled, key == 0);
+    }
+    vstore8(as_float8(result), 0, merged + at);
+}
+
+// D'' (eq. 4.4), a joint bilateral median over 5 x 5 pixels: merged, shade -> aligned. Unknown stays unknown.
+kernel void align_depth(const int width, const int height, const int pitch, global const float *merged,
+                        global const float *shade, const float lambda_intensity, global float *aligned) {
+    const int x = 8 * get_global_id(0);
+    const int y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    const int at = plane_index(pitch, x, y);
+    const float8 here = vload8(0, shade + at);
+    int8 values[25], pad = FIRST_PAD;
+#pragma unroll
+    for (int i = 0; i < 25; i++) {
+        const int there = at + (i / 5 - 2) * pitch + i % 5 - 2;
+        const int8 key = as_int8(vload8(0, merged + there));
+        const int8 member = is_similar(vload8(0, shade + there), here, lambda_intensity) & (key != 0);
+        values[i] = pad_unless(member, key, &pad);
+    }
+    const int8 known = as_int8(vload8(0, merged + at)) != 0;
+    vstore8(as_float8(known & middle_of(values, 25)), 0, aligned + at);
+}
+
+// D''' (eq. 4.5), a median over 3 x 3 pixels: aligned -> smoothed. Unknown stays unknown. Where at least two neighbours are
+// on the pixel's own surface the median is theirs alone: of all it would round corners and take away what is a pixel wide.
+kernel void smooth_depth(const int width, const int height, const int pitch, global const float *aligned,
+                         global float *smoothed) {
+    const int x = 8 * get_global_id(0);
+    const int y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    const int at = plane_index(pitch, x, y);
+    const float8 here = vload8(0, aligned + at);
+    const float8 near = SAME_SURFACE_M(here);
+    int8 values[9], own[9], pad = FIRST_PAD, count = 0;
+#pragma unroll
+    for (int i = 0; i < 9; i++) {
+        const float8 there = vload8(0, aligned + at + (i / 3 - 1) * pitch + i % 3 - 1);
+        values[i] = as_int8(there);
+        own[i] = (there > 0.0f) & (fabs(there - here) < near);
+        count -= own[i];
+    }
+#pragma unroll
+    for (int i = 0; i < 9; i++) values[i] = pad_unless((values[i] != 0) & (own[i] | (count < 3)), values[i], &pad);
+    vstore8(as_float8((here > 0.0f) & middle_of(values, 9)), 0, smoothed + at);
 }

@@ -66,7 +66,7 @@ def reconstruct(engine: Engine, body: Shape) -> tuple[Volume, Surface]:
         volume.allocate(CAMERA, pose, measured.depth_m)
         integrate(engine, volume, CAMERA, pose, measured)
         model = raycast(engine, CAMERA, pose, volume)
-        surface = merge_depth(engine, CAMERA, pose, measured, model, volume.voxel_m)
+        surface = merge_depth(engine, CAMERA, pose, measured, model, volume)
     return volume, surface
 
 

@@ -1,0 +1,109 @@
+// The geometry buffer of the hybrid depth picture (thesis 4.2.2): positions, normals, and whose word each pixel is.
+// Provides label_surface, fit_normals.
+#include "agreement.clh"
+#include "camera.clh"
+#include "planes.clh"
+
+#define LABEL_NONE 0
+#define LABEL_STATIC 1
+#define LABEL_DYNAMIC 2
+#define LABEL_FILLED 3
+
+// depth, sensed, predicted: planes (see merge.cl; sensed is negative where sensor and volume agree); model_positions,
+// model_normals [h][w]: the volume's surface -> positions, normals, labels [h][w]: the volume's own surface where the
+// filtered depth agrees with it, else a point of that depth, labelled by whether the sensor agrees; its normal is left 0.
+kernel void label_surface(const int width, const int height, const int pitch, global const float *depth,
+                          global const float *sensed, global const float *predicted, const float4 intrinsics,
+                          const float16 volume_from_camera, const float voxel_m, global const float4 *model_positions,
+                          global const float4 *model_normals, global float4 *positions, global float4 *normals,
+                          global uchar *labels) {
+    const int x = get_global_id(0);
+    const int y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    const int pixel = y * width + x;
+    const int at = plane_index(pitch, x, y);
+    const float z = depth[at], volume = fabs(predicted[at]), sensor = fabs(sensed[at]);
+    const float near = AGREEMENT_M(z, voxel_m);
+    const int has_shifted = sensed[at] > 0.0f && fabs(sensor - volume) < near;  // by little, and all around
+    if (z > 0.0f && volume > 0.0f && fabs(z - volume) < near && !has_shifted) {
+        positions[pixel] = model_positions[pixel];
+        normals[pixel] = model_normals[pixel];
+        labels[pixel] = LABEL_STATIC;
+    } else if (z > 0.0f) {
+        positions[pixel] = (float4)(transform_point(volume_from_camera, z * unproject(intrinsics, x, y)), 1.0f);
+        normals[pixel] = (float4)(0.0f);
+        labels[pixel] = sensor > 0.0f && fabs(z - sensor) < near ? LABEL_DYNAMIC : LABEL_FILLED;
+    } else {
+        positions[pixel] = (float4)(0.0f);
+        normals[pixel] = (float4)(0.0f);
+        labels[pixel] = LABEL_NONE;
+    }
+}
+
+// Slopes of eight planes: how much the inverse depth changes a pixel, as a share of its own, along x and y.
+typedef struct {
+    float8 x;
+    float8 y;
+    int8 valid;  // -1 where at least three pixels lie on the same surface
+} Slopes;
+
+// A plane's inverse depth is linear in the pixel: least squares over 5 x 5 pixels, STEP apart, of the same surface. A ridge
+// of half a pixel keeps a surface one pixel wide flat across; of a whole window it takes 1 %.
+#define STEP 2
+#define RIDGE 0.5f
+static Slopes fit_slopes(global const float *depth, const int pitch, const int at, const float focal_px) {
+    const float8 here = vload8(0, depth + at);
+    const int8 known = here > 0.0f;
+    // Two pixels of a surface apart: 2 % and 5 mm, or the step of one seen at a slope of 3 across half the window.
+    const float8 near = fmax(0.02f, 6.0f * STEP / focal_px) * here + 0.005f;
+    float8 n = 0.0f, sx = 0.0f, sy = 0.0f, sxx = 0.0f, sxy = 0.0f, syy = 0.0f, sr = 0.0f, sxr = 0.0f, syr = 0.0f;
+#pragma unroll
+    for (int i = 0; i < 25; i++) {
+        const float dx = i % 5 - 2, dy = i / 5 - 2;
+        const float8 there = vload8(0, depth + at + (i / 5 - 2) * STEP * pitch + (i % 5 - 2) * STEP);
+        const int8 used = known & (there > 0.0f) & (fabs(there - here) < near);
+        const float8 one = as_float8(used & as_int8((float8)(1.0f)));
+        const float8 r = as_float8(used & as_int8(here / there - 1.0f));
+        n += one;
+        sx += dx * one;
+        sy += dy * one;
+        sxx += dx * dx * one;
+        sxy += dx * dy * one;
+        syy += dy * dy * one;
+        sr += r;
+        sxr += dx * r;
+        syr += dy * r;
+    }
+    const float8 mean = 1.0f / select(n, (float8)(1.0f), n < 1.0f);
+    const float8 xx = sxx - sx * sx * mean + RIDGE, xy = sxy - sx * sy * mean, yy = syy - sy * sy * mean + RIDGE;
+    const float8 xr = sxr - sx * sr * mean, yr = syr - sy * sr * mean;
+    const float8 scale = 1.0f / (STEP * (xx * yy - xy * xy));
+    const Slopes result = {scale * (xr * yy - yr * xy), scale * (yr * xx - xr * xy), n > 2.5f};
+    return result;
+}
+
+// depth: plane; labels [h][w] -> normals [h][w], unit, towards the camera, of dynamic and filled pixels; w = 0 if unknown.
+kernel void fit_normals(const int width, const int height, const int pitch, global const float *depth,
+                        global const uchar *labels, const float4 intrinsics, const float16 volume_from_camera,
+                        global float4 *normals) {
+    const int x = 8 * get_global_id(0);
+    const int y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    const int pixel = y * width + x;
+    const int count = min(8, width - x);
+    int needed = 0;
+    for (int i = 0; i < count; i++) needed |= labels[pixel + i] >= LABEL_DYNAMIC;
+    if (!needed) return;
+    const Slopes slopes = fit_slopes(depth, pitch, plane_index(pitch, x, y), intrinsics.s0);
+    float a[8], b[8];
+    int valid[8];
+    vstore8(slopes.x, 0, a);
+    vstore8(slopes.y, 0, b);
+    vstore8(slopes.valid, 0, valid);
+    for (int i = 0; i < count; i++) {
+        if (labels[pixel + i] < LABEL_DYNAMIC || !valid[i]) continue;
+        const float across = a[i] * (x + i - intrinsics.s2) + b[i] * (y - intrinsics.s3);
+        const float3 facing = normalize((float3)(-a[i] * intrinsics.s0, -b[i] * intrinsics.s1, across - 1.0f));
+        normals[pixel + i] = (float4)(transform_vector(volume_from_camera, facing), 1.0f);
+    }
+}

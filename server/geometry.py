@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Tracking, Wishes
-from server.maths.rigid import repaired_pose
 from server.opencl.engine import Engine
 from server.settings import bounds_seen, default_voxel_m
 from server.stages.integrate import integrate
@@ -17,6 +16,7 @@ from server.stages.measure import GREATEST_DEPTH_M, Measurement, measure
 from server.stages.merge import merge_depth
 from server.stages.raycast import Surface, raycast
 from server.stages.volume import Volume
+from server.tracking import CameraTracking
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,7 @@ class GeometryFrame:
     world_from_camera: NDArray[np.float64]
     volume_from_camera: NDArray[np.float64]
     tracking: Tracking
+    """Where it is lost, the pose and the surfaces are the last good frame's."""
     notes: tuple[str, ...]
     """What was wrong with this frame, one line each."""
 
@@ -42,38 +43,46 @@ class Geometry:
         self._engine = engine
         self._camera = camera
         self._wishes = wishes
+        self._tracking = CameraTracking(engine, camera, wishes.poses)
+        self._last: GeometryFrame | None = None
         self.volume: Volume | None = None
 
     def update(self, frame: RgbdFrame) -> GeometryFrame:
         """Measure, locate, fuse, predict, merge. Raises ValueError, one line, for a frame that is refused."""
         engine, camera, stage = self._engine, self._camera, self._engine.profile.stage
-        world_from_camera = self._checked_pose(frame)
-        volume = self._scene(frame, world_from_camera)
-        volume_from_camera = volume.volume_from_world() @ world_from_camera
+        self._check_size(frame)
+        volume = self._scene(frame, self._tracking.first_guess(frame))
 
         with stage("input"):  # 5.1.1
             measurement = measure(engine, camera, frame)
         with stage("reconstruct"):  # 4.2.1
-            volume.allocate(camera, volume_from_camera, measurement.depth_m)
-            integrate(engine, volume, camera, volume_from_camera, measurement)
+            located = self._tracking.locate(frame, measurement, volume)
+            notes = (*located.notes, *self._notes(frame, volume))
+            if self._last is not None and not located.fuse:
+                return replace(self._last, measurement=measurement, tracking=located.tracking, notes=notes)
+            volume_from_camera = volume.volume_from_world() @ located.world_from_camera
+            if located.fuse:
+                volume.allocate(camera, volume_from_camera, measurement.depth_m)
+                integrate(engine, volume, camera, volume_from_camera, measurement)
         with stage("surface"):  # 4.2.1
             model = raycast(engine, camera, volume_from_camera, volume)
+            if located.fuse:
+                self._tracking.remember(frame, located, model, volume_from_camera)
         with stage("dynamic_geometry"):  # 4.2.2
-            surface = merge_depth(engine, camera, volume_from_camera, measurement, model, volume.voxel_m)
-        return GeometryFrame(
-            measurement, model, surface, world_from_camera, volume_from_camera, "given", self._notes(frame, volume)
+            surface = merge_depth(engine, camera, volume_from_camera, measurement, model, volume)
+        result = GeometryFrame(
+            measurement, model, surface, located.world_from_camera, volume_from_camera, located.tracking, notes
         )
+        self._last = result if located.fuse else None
+        return result
 
-    def _checked_pose(self, frame: RgbdFrame) -> NDArray[np.float64]:
-        size = (self._camera.height, self._camera.width)
-        if frame.color.shape != (*size, 3) or frame.depth.shape != size:
+    def _check_size(self, frame: RgbdFrame) -> None:
+        color, depth = self._camera, self._camera.depth_lens
+        if frame.color.shape != (color.height, color.width, 3) or frame.depth.shape != (depth.height, depth.width):
             raise ValueError(
                 f"colour is {frame.color.shape[1]}x{frame.color.shape[0]}, depth {frame.depth.shape[1]}x"
-                f"{frame.depth.shape[0]}; the camera has {size[1]}x{size[0]}"
+                f"{frame.depth.shape[0]}; the camera has {color.width}x{color.height} and {depth.width}x{depth.height}"
             )
-        if frame.world_from_camera is None:
-            raise ValueError("the frame has no pose, and tracking is not available: use a source with poses")
-        return repaired_pose(frame.world_from_camera)
 
     def _scene(self, frame: RgbdFrame, world_from_camera: NDArray[np.float64]) -> Volume:
         """The volume; made when the first frame says where the scene is."""

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
-from protocol.messages import Light, Plan, Timings, Tracking, Wishes
+from protocol.messages import LeftOut, Light, Plan, Timings, Tracking, Wishes
 from server.effects import EFFECTS, View, gather_facts
 from server.geometry import Geometry, GeometryFrame
 from server.light_message import light_message
 from server.maths.sh import webxr_from_world
+from server.meshing.scene_mesh import SceneMesh, scene_mesh
+from server.meshing.surface import MeshingError
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.plan import execute, make_plan
@@ -22,6 +25,7 @@ from server.scene.objects import SceneObjects
 from server.scene.placement import Placement
 from server.settings import Settings, read_wishes, stride_of
 from server.stages.composite import shown_picture
+from server.stages.denoise import denoise_radiance
 from server.stages.differential_rendering import upload_light
 from server.stages.light_estimation import LightEstimate, LightEstimator, sum_tiles
 from server.stages.radiance_transfer import direction_sets, transfer_radiance
@@ -70,12 +74,15 @@ class Pipeline:
         engine.profile.forget()
         geometry = self._geometry.update(frame)  # ch. 4
         volume, objects = self._scene(geometry)
+        if geometry.tracking == "lost":
+            return self._lost(frame, geometry, started)
         measurement, surface = geometry.measurement, geometry.surface
 
         with stage("radiance_transfer"):  # 5.1.2, eq. 5.2
             transfer = transfer_radiance(engine, camera, volume, surface, settings.stride, self._rays, settings.reach_m)
         with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
-            tiles = sum_tiles(engine, camera, measurement, surface, transfer, volume.voxel_m)
+            smooth = denoise_radiance(engine, measurement, settings.denoise, settings.denoise_iterations)
+            tiles = sum_tiles(engine, camera, smooth, surface, transfer, volume.voxel_m)
             with engine.profile.host():
                 estimate = self._estimator.update(tiles)
         with stage("rendering"):  # 7.1-7.2, the effects this frame calls for
@@ -107,6 +114,24 @@ class Pipeline:
             notes=(*geometry.notes, *_notes(estimate)),
         )
 
+    def _lost(self, frame: RgbdFrame, geometry: GeometryFrame, started: float) -> FrameResult:
+        """The camera's own picture and the last light: where it is not known, nothing can be drawn or learnt."""
+        with self._engine.profile.stage("rendering"):
+            picture = shown_picture(self._engine, self._camera, frame.color, geometry.measurement.radiance)
+        left_out = tuple(LeftOut(effect=e.name, reason="the camera is lost", error_bound=255.0) for e in EFFECTS)
+        estimate = self._estimator.estimate()
+        self._engine.queue.finish()
+        rows, self.kernel_ms = self._engine.profile.collect()
+        return FrameResult(
+            color=picture,
+            light=light_message(frame.index, frame.timestamp_s, estimate, self._webxr_from_world),
+            world_from_camera=geometry.world_from_camera,
+            tracking="lost",
+            timings=Timings(**rows, total=(time.perf_counter() - started) * 1e3),
+            plan=Plan(run=(), left_out=left_out),
+            notes=(*geometry.notes, *_notes(estimate)),
+        )
+
     def place_object(self, object_id: str, mesh: Mesh, placement: Placement) -> tuple[str, ...]:
         """Put a mesh into the scene, in the place of one with the same id; returns notes about it."""
         if self._objects is None:
@@ -133,6 +158,14 @@ class Pipeline:
     def set_preset(self, preset: str) -> None:
         """Change the sampling preset from the next frame on. Raises ValueError for one that does not exist."""
         self._settings = replace(self._settings, stride=stride_of(preset))
+
+    def scene_mesh(self, progress: Callable[[int, int], None] = lambda _done, _total: None) -> SceneMesh:
+        """The surface fused so far as triangles. Raises MeshingError, one line, where there is none."""
+        volume = self._geometry.volume
+        if volume is None:
+            raise MeshingError("there is no surface to mesh: no frame has been fused yet")
+        bricks = volume.download_bricks()
+        return scene_mesh(bricks, volume.voxel_m, volume.origin_world, self._webxr_from_world, progress)
 
     def close(self) -> None:
         """Give the device's memory back."""

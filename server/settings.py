@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
+from server.stages.denoise import DenoiseMethod
 
 STRIDES = {"rm": 1, "reg4": 4, "reg8": 8}
 """Presets that exist: every how many pixels transfer is sampled (thesis 6.1.3)."""
@@ -35,6 +36,8 @@ class Settings:
     bands: int
     reach_m: float
     as_thesis: bool
+    denoise: DenoiseMethod
+    denoise_iterations: int
 
 
 def read_wishes(wishes: Wishes) -> Settings:
@@ -43,8 +46,6 @@ def read_wishes(wishes: Wishes) -> Settings:
         raise ValueError("albedo 'estimated' is not available: use 'constant'")
     if wishes.indirect != "none":
         raise ValueError("indirect 'observed' is not available: use 'none'")
-    if wishes.poses != "given":
-        raise ValueError(f"poses {wishes.poses!r} is not available: use 'given' with a source that has poses")
     reach_m = WHOLE_ROOM_M if wishes.ray_length_m is None else wishes.ray_length_m
     return Settings(
         stride=stride_of(wishes.preset),
@@ -52,6 +53,8 @@ def read_wishes(wishes: Wishes) -> Settings:
         bands=wishes.bands,
         reach_m=THESIS_REACH_M if wishes.as_thesis else reach_m,
         as_thesis=wishes.as_thesis,
+        denoise=wishes.denoise,
+        denoise_iterations=wishes.denoise_iterations,
     )
 
 
@@ -72,8 +75,9 @@ def bounds_seen(camera: CameraModel, frame: RgbdFrame, world_from_camera: NDArra
     if len(u) < 16:
         raise ValueError("the first frame has no depth to place a volume around: point the camera at the scene")
     z = depth[v, u]
-    points = np.stack([(4 * u - camera.cx) / camera.fx * z, (4 * v - camera.cy) / camera.fy * z, z], axis=1)
-    points = points @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+    lens, world_from_depth = camera.depth_lens, world_from_camera @ camera.color_from_depth
+    points = np.stack([(4 * u - lens.cx) / lens.fx * z, (4 * v - lens.cy) / lens.fy * z, z], axis=1)
+    points = points @ world_from_depth[:3, :3].T + world_from_depth[:3, 3]
     low, high = np.percentile(points, (1, 99), axis=0)
     center, half = (low + high) / 2, np.maximum((high - low) / 2 + _MARGIN_M, _LEAST_SIDE_M / 2)
     x0, y0, z0, x1, y1, z1 = (float(value) for value in (*(center - half), *(center + half)))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from client.laptop.errors import OptionError, SourceError
-from client.laptop.volume import default_volume, default_voxel
+from client.laptop.volume import default_volume, default_voxel, with_room_to_move
 from client.options import CaptureOptions, parse_frames, parse_ray_length, prepare
 from tests.client import folders
 
@@ -106,8 +106,6 @@ REFUSED = [
 ]
 UNBUILT = [
     *({"preset": name} for name in ("art1", "art4", "art8", "gr15", "gr15fast", "auto")),
-    {"poses": "track"},
-    {"poses": "refine"},
     {"albedo": "estimated"},
     {"indirect": "observed"},
     {"light": "light.json"},
@@ -131,11 +129,18 @@ def test_what_is_not_built_yet_names_the_alternative(said: dict, source: str) ->
     assert "\n" not in str(caught.value)
 
 
-def test_source_without_poses(tmp_path: Path) -> None:
+def test_source_without_poses_is_tracked(tmp_path: Path, source: str) -> None:
+    """In a volume that leaves its camera room to move; poses that are not there cannot be asked for."""
     folder = folders.redwood(tmp_path / "r")
     (folder / "trajectory.log").unlink()
-    with pytest.raises(OptionError, match="no poses"):
-        prepare(CaptureOptions(str(folder)))
+    capture = prepare(CaptureOptions(str(folder)))
+    assert capture.wishes.poses == "track"
+    assert capture.wishes.volume_m == with_room_to_move(default_volume(capture.source, capture.frames))
+    assert prepare(CaptureOptions(str(folder), volume="0,0,0,1,2,3")).wishes.volume_m == (0, 0, 0, 1, 2, 3)
+    for poses in ("given", "refine"):
+        with pytest.raises(OptionError, match="--poses track"):
+            prepare(CaptureOptions(str(folder), poses=poses))
+        assert prepare(CaptureOptions(source, poses=poses)).wishes.poses == poses
 
 
 def test_bad_options_are_told_before_the_source_is_opened() -> None:

@@ -32,12 +32,17 @@ Floats = NDArray[np.float64]
 
 TOLERANCE_VOXELS = 0.25
 """A motion that the scene fixes less well than this is not taken from it."""
-_LEAST_SHARE, _LEAST_OVERLAP, _GREATEST_DEVIATION_M = 0.45, 0.05, 0.015
+_LEAST_SHARE, _LEAST_OVERLAP, _GREATEST_DEVIATION_M = 0.4, 0.05, 0.015
 """Measured on four sets: registrations that are right have shares of 0.76 and more, wrong ones up to 0.32."""
 _GREATEST_STEP_M, _GREATEST_TURN_RAD = 0.25, np.radians(20.0)
 """Between two frames, beside what was predicted."""
 _GREATEST_CORRECTION_M, _GREATEST_CORRECTION_RAD = 0.1, np.radians(10.0)
 """Of a client's motion between two frames."""
+_KEPT_M, _KEPT_RAD, _KEPT_FIT = 0.05, np.radians(3.0), 0.95
+"""A view of the volume is kept while the camera stays this near and fits it about as well as at first. With a new one
+every frame the least bias of a registration would add up, and a camera that stands still would drift."""
+_SETTLING_FRAMES = 32
+"""The same view is renewed after 1, 2, 4, ... frames up to this: until then fusion makes it better."""
 _NEAREST_DEPTH_M = 0.1
 """A lens that is covered measures less."""
 _LEAST_START = 0.05
@@ -61,6 +66,24 @@ class Located:
         return self.tracking != "lost"
 
 
+@dataclass
+class _Place:
+    """Where a camera has stayed for some frames."""
+
+    volume_from_camera: Floats
+    frames: int = 0
+    fit: float = 0.0
+    """Best share of the picture that agreed with the volume."""
+
+    def holds(self, volume_from_camera: Floats, fit: float) -> bool:
+        """Whether the camera is still there, and the scene as it was."""
+        return (
+            distance_between(self.volume_from_camera, volume_from_camera) < _KEPT_M
+            and angle_between(self.volume_from_camera, volume_from_camera) < _KEPT_RAD
+            and fit > _KEPT_FIT * self.fit
+        )
+
+
 class CameraTracking:
     """One camera's pose from frame to frame. `locate` a frame, fuse it, `remember` what the volume then shows.
 
@@ -76,6 +99,8 @@ class CameraTracking:
         self._pose: Floats | None = None
         self._given: Floats | None = None
         self._is_lost = False
+        self._fit = 0.0
+        self._place: _Place | None = None
         self._pyramid: Pyramid = ()
         self._keyframes = Keyframes()
 
@@ -104,11 +129,21 @@ class CameraTracking:
         """What the volume shows from where the frame was located: the next one is compared with it."""
         if self._mode == "given":
             return
-        self._view = view_model(self._engine, self._camera, volume_from_camera, model)
+        if self._needs_view(volume_from_camera):
+            self._view = view_model(self._engine, self._camera, volume_from_camera, model)
         self._pose, self._given = located.world_from_camera, frame.world_from_camera
         self._is_lost = False
         if self._mode == "track" and self._keyframes.is_new(volume_from_camera):
             self._keyframes.add(thumbnail(frame, self._engine.download(self._pyramid[0])), volume_from_camera)
+
+    def _needs_view(self, volume_from_camera: Floats) -> bool:
+        """Whether the next frame is to be compared with what the volume shows now, instead of some frames ago."""
+        place = self._place
+        if place is None or self._is_lost or not place.holds(volume_from_camera, self._fit):
+            place = self._place = _Place(volume_from_camera)
+        place.frames += 1
+        place.fit = max(place.fit, self._fit)
+        return place.frames <= _SETTLING_FRAMES and place.frames.bit_count() == 1
 
     def _start(self, guess: Floats, volume: Volume) -> Located:
         """The first frame makes the world, if there is enough in it to find the next one's place by."""
@@ -151,6 +186,7 @@ class CameraTracking:
 
     def _tracked(self, found: Registration | None, volume: Volume, instead: str) -> Located:
         assert found is not None
+        self._fit = found.share
         pose = inverse_rigid(volume.volume_from_world()) @ found.volume_from_camera
         notes = (f"the scene does not fix {motions_in_words(found.free)}: {instead}",) if len(found.free) else ()
         return Located(pose, "tracked", notes)
@@ -183,7 +219,7 @@ def motions_in_words(free: Floats) -> str:
 
 def _axis_in_words(axis: Floats) -> str:
     unit = axis / np.linalg.norm(axis)
-    unit = np.where(np.abs(unit) < 0.005, 0.0, unit) * np.sign(unit[np.abs(unit).argmax()])
+    unit = np.where(np.abs(unit) < 0.005, 0.0, unit * np.sign(unit[np.abs(unit).argmax()]))
     return f"({unit[0]:.2f}, {unit[1]:.2f}, {unit[2]:.2f})"
 
 

@@ -133,7 +133,7 @@ def test_a_plain_wall_does_not_end_being_lost(geometry: Geometry) -> None:
 def test_a_hand_over_a_third_of_the_picture_is_no_loss(geometry: Geometry) -> None:
     walk(geometry, range(10))
     view = view_at(10)
-    hand = sphere(view[:3, 3] + 0.45 * view[:3, 2] + 0.1 * view[:3, 0], 0.16)
+    hand = sphere(view[:3, 3] + 0.45 * view[:3, 2] + 0.1 * view[:3, 0], 0.145)
     frame = frame_at(view, 10, scene=[*ROOM, hand])
     assert (frame.depth != frame_at(view, 10).depth).mean() > 0.3
     result = geometry.update(frame)

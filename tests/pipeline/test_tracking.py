@@ -39,7 +39,7 @@ def test_track_follows_without_poses(open_geometry: Open) -> None:
         found.append(result.world_from_camera)
     np.testing.assert_array_equal(found[0], truth[0])
     assert sum(distance_between(a, b) for a, b in pairwise(truth)) > 0.8
-    assert ate_rmse_m(found, truth) < 0.1 * VOXEL_M
+    assert ate_rmse_m(found, truth) < 0.15 * VOXEL_M
     assert max(angle_between(a, b) for a, b in zip(found, truth, strict=True)) < np.radians(0.15)
 
 
@@ -56,18 +56,18 @@ def test_sensor_noise_does_not_lead_away(open_geometry: Open) -> None:
         truth.append(view_at(index))
         frame = frame_at(truth[-1], index, noise_m=0.006, given=truth[0])
         found.append(geometry.update(frame).world_from_camera)
-    assert ate_rmse_m(found, truth) < 0.2 * VOXEL_M
+    assert ate_rmse_m(found, truth) < 0.3 * VOXEL_M
 
 
-@pytest.mark.parametrize("noise_m", [0.0, 0.003])
-def test_a_camera_that_stands_still_does_not_drift(open_geometry: Open, noise_m: float) -> None:
+@pytest.mark.parametrize(("noise_m", "bound_m"), [(0.0, 2e-6), (0.003, 1e-3)])
+def test_a_camera_that_stands_still_does_not_drift(open_geometry: Open, noise_m: float, bound_m: float) -> None:
+    """Once the volume has settled."""
     geometry = open_geometry("track")
     view = view_at(5)
     frames = [frame_at(view, index, noise_m=noise_m, given=view) for index in range(20)]
     found = [geometry.update(frames[index % 20]).world_from_camera for index in range(300)]
-    later = np.array([distance_between(pose, found[50]) for pose in found[50:]])
-    assert later.max() < (1e-4 if noise_m == 0 else 3e-4)
-    assert distance_between(np.eye(4), np.eye(4) + sum(found[250:]) / 50 - sum(found[50:100]) / 50) < 1e-4
+    assert max(distance_between(pose, found[40]) for pose in found[40:]) < bound_m
+    assert distance_between(np.mean(found[-50:], axis=0), np.mean(found[40:90], axis=0)) < 5e-5
 
 
 def test_given_poses_are_taken_as_they_are(open_geometry: Open) -> None:
@@ -87,7 +87,7 @@ def test_refine_corrects_a_client_that_drifts(open_geometry: Open) -> None:
         found.append(geometry.update(frame_at(truth[-1], index, given=given[-1])).world_from_camera)
         drift = drift @ motion_of_twist(np.array([0.001, -0.0005, 0.0008, 0.002, 0.0005, -0.001]))
     assert ate_rmse_m(given, truth) > 0.04
-    assert ate_rmse_m(found, truth) < 0.1 * VOXEL_M
+    assert ate_rmse_m(found, truth) < 0.15 * VOXEL_M
 
 
 def test_refine_follows_motion_that_tracking_alone_cannot(open_geometry: Open) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from server.opencl.engine import Engine, int4
+from server.opencl.engine import Engine
 from server.opencl.profile import Profile
 
 
@@ -66,16 +66,16 @@ def test_host_time_counts_under_its_row() -> None:
 
 
 def test_launched_kernels_are_counted(engine: Engine) -> None:
-    solid = engine.workspace.upload("solid", np.zeros((4, 4, 4), np.uint64))
-    gaps = [engine.workspace.array(f"gaps_{i}", (2**i * 64,), np.uint8) for i in range(2)]
+    depth = engine.workspace.upload("depth", np.ones((16, 16), np.float32))
+    halved = engine.workspace.array("halved", (8, 8), np.float32)
+    inverse = engine.workspace.array("inverse", (16, 16), np.float32)
     with engine.profile.stage("reconstruct"):
         for _ in range(3):
-            engine.launch(engine.kernel("volume.cl", "start_gaps"), (64,), 64, solid, 15, gaps[0])
+            engine.launch(engine.kernel("track.cl", "halve_depth", ROWS=16), (8, 8), 8, 8, 16, depth, 0.05, halved)
     with engine.profile.stage("surface"):
-        kernel = engine.kernel("volume.cl", "gap_along_axis")
-        engine.launch(kernel, (4, 4, 8), int4(4, 4, 4, 0), 1, gaps[0], 0, 15, gaps[1])
+        engine.launch(engine.kernel("denoise.cl", "invert"), (256,), 256, depth, inverse)
     engine.queue.finish()
     rows, kernels = engine.profile.collect()
     assert set(rows) == {"reconstruct", "surface"}
-    assert rows["reconstruct"] == pytest.approx(kernels["start_gaps"]) != 0
-    assert rows["surface"] == pytest.approx(kernels["gap_along_axis"]) != 0
+    assert rows["reconstruct"] == pytest.approx(kernels["halve_depth"]) != 0
+    assert rows["surface"] == pytest.approx(kernels["invert"]) != 0

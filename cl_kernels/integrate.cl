@@ -76,11 +76,7 @@ kernel void integrate(const int count, const int width, const int height, const 
     const int3 brick = (int3)(index % bricks.x, (index / bricks.x) % bricks.y, index / (bricks.x * bricks.y));
     const float3 center = transform_point(camera_from_volume, (convert_float3(brick) + 0.5f) * (BRICK * voxel_m));
     const float radius = 0.8661f * BRICK * voxel_m;  // half the brick's diagonal
-    const float reach = center.z + radius;
-    const float side_x = fmax(intrinsics.s2, width - intrinsics.s2) + 0.5f;  // farthest pixel from the axis
-    const float side_y = fmax(intrinsics.s3, height - intrinsics.s3) + 0.5f;
-    const int touched = group < count && reach > 0.0f && (fabs(center.x) - radius) * intrinsics.s0 <= reach * side_x &&
-                        (fabs(center.y) - radius) * intrinsics.s1 <= reach * side_y;
+    const int touched = group < count && may_be_seen(intrinsics, width, height, center, radius);
     const Picture picture = {width, height, depth_m, radiance, intrinsics};
     const int pool = slots[index] * BRICK_VOXELS;
     const float3 corner = transform_point(camera_from_volume, (convert_float3(brick * BRICK) + 0.5f) * voxel_m);
@@ -122,7 +118,8 @@ kernel void integrate(const int count, const int width, const int height, const 
             if (ANY(colored)) {
                 global int *packed = (global int *)colors + pool + first;
                 const intn old = LOAD_LANES(packed);
-                const intn mean = mean_color(picture, old, pixel, pool + first + CONVERT_INTN(LANE_NUMBERS), frame);
+                const int voxel = index * BRICK_VOXELS + first;  // not its slot, which depends on the budget
+                const intn mean = mean_color(picture, old, pixel, voxel + CONVERT_INTN(LANE_NUMBERS), frame);
                 STORE_LANES(colored ? mean : old, packed);
             }
         }

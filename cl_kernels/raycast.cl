@@ -18,6 +18,8 @@ kernel void bound_rays(const int count, const int width, const int height, const
     if (solid[index] == 0) return;
     const float side = BRICK * voxel_m;
     const float3 low = convert_float3((int3)(index % bricks.x, (index / bricks.x) % bricks.y, index / (bricks.x * bricks.y))) * side;
+    const float3 center = transform_point(camera_from_volume, low + 0.5f * side);
+    if (!may_be_seen(intrinsics, width, height, center, 0.8661f * side)) return;  // half a brick's diagonal
     float2 least = (float2)(1e9f), most = (float2)(-1e9f);
     float near = 1e9f, far = 0.0f;
     for (int corner = 0; corner < 8; corner++) {
@@ -29,7 +31,6 @@ kernel void bound_rays(const int count, const int width, const int height, const
         least = fmin(least, pixel);
         most = fmax(most, pixel);
     }
-    if (far <= 0.0f) return;
     const int around = near < 1e-2f;  // reaches behind the camera: its corners' pixels say nothing
     const int2 size = (int2)(width, height);
     const int2 first = around ? (int2)(0) : convert_int2(clamp(least, 0.0f, 1e5f)) / TILE;

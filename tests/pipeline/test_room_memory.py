@@ -42,16 +42,14 @@ def fuse_walk(engine: Engine, volume: Volume, views: Sequence[Floats]) -> None:
         fuse(engine, volume, CAMERA, view, LIVING_ROOM.depth_m(CAMERA, view))
 
 
-def contents(volume: Volume) -> dict[tuple[int, ...], tuple[Any, ...]]:
-    """tsdf and weight of every brick by its place."""
+def contents(volume: Volume) -> dict[tuple[int, ...], list[Any]]:
+    """tsdf, weight and colour of every brick by its place."""
     bricks = volume.download_bricks()
-    return {
-        tuple(place): (tsdf, weight)
-        for place, tsdf, weight in zip(bricks.indices.tolist(), bricks.tsdf, bricks.weight, strict=True)
-    }
+    arrays = (bricks.tsdf, bricks.weight, bricks.colors, bricks.color_weight)
+    return {tuple(place): parts for place, *parts in zip(bricks.indices.tolist(), *arrays, strict=True)}
 
 
-def assert_same(one: dict[tuple[int, ...], tuple[Any, ...]], other: dict[tuple[int, ...], tuple[Any, ...]]) -> None:
+def assert_same(one: dict[tuple[int, ...], list[Any]], other: dict[tuple[int, ...], list[Any]]) -> None:
     assert one.keys() == other.keys()
     for place, arrays in one.items():
         for a, b in zip(arrays, other[place], strict=True):

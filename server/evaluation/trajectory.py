@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Poses, Tracking, Wishes
+from server.evaluation.rooms import seen_depth
 from server.geometry import Geometry
 from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine
 from server.settings import Bounds
+from server.stages.measure import measure
 
 Floats = NDArray[np.float64]
 
@@ -37,6 +39,16 @@ def position_errors_m(estimated: list[Floats], truth: list[Floats]) -> Floats:
     return np.array([np.linalg.norm((align @ a - b)[:3, 3]) for a, b in zip(estimated, truth, strict=True)])
 
 
+def aligned_ate_rmse_m(estimated: list[Floats], truth: list[Floats]) -> float:
+    """The same with all positions aligned as well as one rigid motion can (Horn 1987; Sturm et al. 2012, eq. 3)."""
+    position_errors_m(estimated, truth)  # checks the counts
+    a, b = (np.array(poses)[:, :3, 3] for poses in (estimated, truth))
+    u, _, vt = np.linalg.svd((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
+    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    apart = (a - a.mean(axis=0)) @ rotation.T - (b - b.mean(axis=0))
+    return float(np.sqrt((apart**2).sum(axis=1).mean()))
+
+
 class Frames(Protocol):
     """A source of posed frames, as `client.laptop.source.Source` is one."""
 
@@ -56,6 +68,36 @@ class Track:
     notes: list[tuple[str, ...]]
     track_ms: list[float]
     """Device time of the tracker's own kernels: pyramid, view of the model, all iterations; no filter."""
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """How well depth pictures agree with the volume that all of them were fused into. Needs no truth."""
+
+    median_m: float
+    """Of the absolute difference in depth."""
+    within_2cm: float
+    """Share of the pixels that have both depths."""
+
+
+def consistency(
+    engine: Engine, source: Frames, poses: list[Floats], voxel_m: float, volume_m: Bounds, step: int = 5
+) -> Consistency:
+    """Fuse the first frames of `source` at `poses` (world_from_camera), then look at every `step`-th again."""
+    geometry = Geometry(engine, source.camera, Wishes(voxel_m=voxel_m, volume_m=volume_m))
+    for index, pose in enumerate(poses):
+        geometry.update(replace(source[index], world_from_camera=pose))
+        engine.queue.finish()
+        engine.profile.forget()
+    assert geometry.volume is not None
+    apart = []
+    for index in range(0, len(poses), step):
+        measured_m = engine.download(measure(engine, source.camera, source[index]).depth_m)
+        seen_m = seen_depth(engine, geometry.volume, source.camera, poses[index])
+        both = (measured_m > 0) & (seen_m > 0)
+        apart.append(np.abs(measured_m - seen_m)[both])
+    off = np.concatenate(apart)
+    return Consistency(float(np.median(off)), float((off < 0.02).mean()))
 
 
 def track_source(

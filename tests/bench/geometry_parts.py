@@ -14,22 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.laptop.source import Source, open_source
-from client.laptop.volume import default_volume, default_voxel
 from client.progress import note
 from server.evaluation.hand import HandBefore
 from server.evaluation.interleaving import interleaving_spread
 from server.evaluation.memory import room_memory
 from server.evaluation.noise import NormalView, normal_improvement, plane_normals
 from server.evaluation.surface import fused_views, surface_accuracy
-from server.evaluation.trajectory import ate_rmse_m, track_source
 from server.opencl.device import Device, open_device
-from server.opencl.engine import Engine
 from tests.bench.contest import WARM_UP, contest_part, play
 from tests.bench.filters import filters_part
 from tests.bench.finished import ROOT, Part, UnmeasurableError
 from tests.bench.geometry_pictures import draw_hand, draw_surface
 from tests.bench.hand import hand_part, hand_volume
 from tests.bench.peers.contestant import Scene
+from tests.bench.trajectories import trajectory_rows
 
 OUT = Path("out/bench/geometry")
 ATE_GOALS_MM = {
@@ -117,21 +115,8 @@ def trajectory_part(run: Run) -> Part:
     for name, goal_mm in ATE_GOALS_MM.items():
         source = data_source(name)
         count = min(len(source), run.of(60, len(source)))
-        frames = range(count)
-        volume_m = CUBE_M if name in {CLEAN, NOISY} else default_volume(source, range(len(source)))
-        voxel_m = VOXEL_M if name in {CLEAN, NOISY} else default_voxel(volume_m)
-        run.say(f"trajectory: {name}, {count} frames, {1e3 * voxel_m:.1f} mm voxels")
-        engine = Engine(run.device)
-        try:
-            track = track_source(engine, source, frames, voxel_m, volume_m, "track")
-        finally:
-            engine.close()
-        poses = [source[i].world_from_camera for i in frames]
-        tracked = sum(status == "tracked" for status in track.statuses)
-        part.sizes[f"frames of {name} tracked"] = count
-        part.add(f"{name}: ATE, first pose aligned", 1e3 * ate_rmse_m(track.poses, poses), "mm", f"<= {goal_mm:g}")
-        part.add(f"{name}: frames tracked", 100 * tracked / count, "%", ">= 100")
-        part.add(f"{name}: tracking, median of its kernels' time", float(np.median(track.track_ms[1:])), "ms")
+        cube = (CUBE_M, VOXEL_M) if name in {CLEAN, NOISY} else None
+        trajectory_rows(part, run.device, source, name, count, goal_mm, run.say, cube)
     return part
 
 

@@ -25,6 +25,7 @@ lint: .venv/installed-test
 	$(BIN)/mypy
 
 bench: .venv/installed-bench
+	$(BIN)/probeless bench geometry
 	$(BIN)/probeless bench service
 
 web: .venv/installed-test

@@ -26,7 +26,9 @@ from tests.bench.filters import filters_part
 from tests.bench.finished import ROOT, Part, UnmeasurableError
 from tests.bench.geometry_pictures import draw_hand, draw_surface
 from tests.bench.hand import hand_part, hand_volume
+from tests.bench.hybrid_normals import add_moving_rows, add_still_rows
 from tests.bench.peers.contestant import Scene
+from tests.bench.thin import CHAIR_SOURCE, add_rod_rows, draw_thin
 from tests.bench.trajectories import trajectory_rows
 
 OUT = Path("out/bench/geometry")
@@ -121,7 +123,7 @@ def trajectory_part(run: Run) -> Part:
 
 
 def noise_part(run: Run) -> Part:
-    """What the depth filters do to normals: noisy sequence, truth from the clean one."""
+    """What depth filters and the geometry buffer do to normals, and the buffer to thin things, against exact truth."""
     clean, noisy = data_source(CLEAN), data_source(NOISY)
     chosen = range(0, 100, run.of(20, 5))
     scale = clean.camera.depth_scale_m
@@ -133,6 +135,10 @@ def noise_part(run: Run) -> Part:
         part.add(f"normals of noisy depth, {name}: mean error", error.mean_deg, "deg")
     for name, error in (("bilateral", found.bilateral), ("TV-L1", found.tv_l1)):
         part.add(f"normals of noisy depth: better by {name}", found.raw.median_deg - error.median_deg, "deg", ">= 0")
+    run.say("normals of the geometry buffer, still")
+    add_still_rows(part, run.device, clean, noisy, CUBE_M, VOXEL_M, run.of(40, 100))
+    add_moving_rows(part, run.device, run.of(4, 1), run.say)
+    add_rod_rows(part, run.device, run.of(5, 20), run.say)
     return part
 
 
@@ -142,11 +148,12 @@ def hand(run: Run) -> Part:
 
 
 def pictures(run: Run) -> Part:
-    """The surface and the hand, to look at."""
+    """The surface, the hand and thin things, to look at."""
     draw_surface(OUT / "surface.png", run.device, data_source(CLEAN), data_source(NOISY), CUBE_M, VOXEL_M)
     kitchen = data_source(KITCHEN)
     source = HandBefore(kitchen, data_folder(HAND), first=20, worn=True)
     draw_hand(OUT / "hand.png", run.device, source, *hand_volume(kitchen, source))
+    draw_thin(OUT / "thin.png", run.device, data_source(CHAIR_SOURCE))
     return Part()
 
 

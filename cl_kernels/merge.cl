@@ -85,34 +85,40 @@ static int8 agrees_with_volume(global const float *measured, global const float 
     return here & (fabs(sum) < MEAN_AGREEMENT_M(sensor, voxel_m) * count);
 }
 
-// Turns those of `count` predicted depths negative that lie in a hole and whose surface too few frames have seen.
-static void mark_new_surface(global const float4 *positions, const int4 bricks, global const int *slots,
-                             global const float2 *voxels, const float voxel_m, const float least_weight, const int8 hole,
-                             const int count, global float *predicted) {
-    int holes[8];
-    vstore8(hole, 0, holes);
-    for (int i = 0; i < count; i++) {
-        if (!holes[i] || predicted[i] <= 0.0f) continue;
-        if (weight_at(bricks, slots, voxels, positions[i].xyz / voxel_m) < least_weight) predicted[i] = -predicted[i];
-    }
+// In how many frames the volume's surface at eight pixels was seen, of those `asked` for; the others get 0.
+static float8 ages_of_surface(global const float4 *positions, const int4 bricks, global const int *slots,
+                              global const float2 *voxels, const float voxel_m, const int8 asked, const int count) {
+    int wanted[8];
+    float ages[8];
+    vstore8(asked, 0, wanted);
+    for (int i = 0; i < 8; i++)
+        ages[i] = i < count && wanted[i] ? weight_at(bricks, slots, voxels, positions[i].xyz / voxel_m) : 0.0f;
+    return vload8(0, ages);
 }
 
 // measured, predicted, positions and the volume -> sensed: D_C, negative where it agrees with the volume, 0 also where
-// two surfaces are mixed; predicted: negative where sensed is 0 and too few frames have seen the volume's surface.
+// two surfaces are mixed; trusted: predicted, negative where sensed is 0 and under `least_filling` frames have seen the
+// volume's surface. With a surface that under `least_still` frames have seen nothing agrees: it may be what moves, fused just now.
 kernel void compare_depth(const int width, const int height, const int pitch, global const float *measured,
-                          global const float4 *positions, const int4 bricks, global const int *slots,
-                          global const float2 *voxels, const float voxel_m, const float least_weight,
-                          global float *predicted, global float *sensed) {
+                          global const float *predicted, global const float4 *positions, const int4 bricks, global const int *slots,
+                          global const float2 *voxels, const float voxel_m, const float least_still,
+                          const float least_filling, global float *trusted, global float *sensed) {
     const int x = 8 * get_global_id(0);
     const int y = get_global_id(1);
     if (x >= width || y >= height) return;
     const int at = plane_index(pitch, x, y);
     const float8 sensor = vload8(0, measured + at), volume = vload8(0, predicted + at);
     const int8 hole = (sensor <= 0.0f) | is_mixed(measured, pitch, at, sensor);
-    const int8 agrees = agrees_with_volume(measured, predicted, pitch, at, sensor, volume, voxel_m);
+    int8 agrees = agrees_with_volume(measured, predicted, pitch, at, sensor, volume, voxel_m);
+    const int8 asked = (volume > 0.0f) & (hole | agrees);
+    float8 marked = volume;
+    if (any(asked)) {
+        const float8 age = ages_of_surface(positions + y * width + x, bricks, slots, voxels, voxel_m, asked, min(8, width - x));
+        agrees &= age >= least_still;
+        marked = select(volume, -volume, asked & hole & (age < least_filling));
+    }
+    vstore8(marked, 0, trusted + at);
     vstore8(select(select(sensor, -sensor, agrees), (float8)(0.0f), hole), 0, sensed + at);
-    if (any(hole & (volume > 0.0f)))
-        mark_new_surface(positions + y * width + x, bricks, slots, voxels, voxel_m, least_weight, hole, min(8, width - x), predicted + at);
 }
 
 // How many samples around eight pixels, `step` apart, say that the volume's surface there is still where it was, less those
@@ -155,7 +161,7 @@ static int8 fill_holes(global const float *sensed, global const float *predicted
     return select(known & as_int8(surface), middle_of(values, 25), filled);
 }
 
-// D' (eq. 4.3): sensed, predicted, shade -> merged.
+// D' (eq. 4.3): sensed, predicted (`trusted` of compare_depth), shade -> merged.
 kernel void merge_depth(const int width, const int height, const int pitch, global const float *sensed,
                         global const float *predicted, global const float *shade, const float voxel_m,
                         const float lambda_intensity, global float *merged) {

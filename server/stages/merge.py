@@ -37,6 +37,10 @@ TRUSTED_WEIGHT = 15.0
 are fewer than twice as many. A sparse volume keeps no memory of free space, so that what moves through it becomes
 surface at once; where the sensor is blind, as beside a hand, nothing else would tell it from the room."""
 
+STILL_WEIGHT = 5.0
+"""Frames, likewise, that must have seen a surface before it is called static: what moves agrees with a volume that it
+was fused into just now."""
+
 _BORDER = 8
 _PLANES = ("measured", "predicted", "shade", "sensed", "merged", "aligned")
 
@@ -60,6 +64,7 @@ def merge_depth(
     planes = {name: space.array(f"plane_{name}", bordered[::-1], np.float32) for name in _PLANES}
     measured, predicted, shade, sensed, merged, aligned = planes.values()
     smoothed = merged  # D''' does not read D'
+    trusted = aligned  # until D'' is written
 
     def launch(file: str, name: str, items: tuple[int, int], *arguments: cl_array.Array | np.generic | float) -> None:
         engine.launch(engine.kernel(file, name), items, *size, bordered[0], *arguments)
@@ -79,17 +84,19 @@ def merge_depth(
         "compare_depth",
         groups,
         measured,
+        predicted,
         model.positions,
         int4(*volume.bricks, 0),
         volume.slots_device,
         volume.voxels,
         volume.voxel_m,
+        min(STILL_WEIGHT, volume.frames / 2),
         min(TRUSTED_WEIGHT, volume.frames / 2),
-        predicted,
+        trusted,
         sensed,
     )
     launch(
-        "merge.cl", "merge_depth", groups, sensed, predicted, shade, volume.voxel_m, LAMBDA_INTENSITY, merged
+        "merge.cl", "merge_depth", groups, sensed, trusted, shade, volume.voxel_m, LAMBDA_INTENSITY, merged
     )  # eq. 4.3
     launch("merge.cl", "align_depth", groups, merged, shade, LAMBDA_INTENSITY, aligned)  # eq. 4.4
     launch("merge.cl", "smooth_depth", groups, aligned, smoothed)  # eq. 4.5

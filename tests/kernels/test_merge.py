@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
-from server.stages.merge import TRUSTED_WEIGHT, merge_depth
+from server.stages.merge import STILL_WEIGHT, TRUSTED_WEIGHT, merge_depth
 from server.stages.raycast import LABEL_DYNAMIC, LABEL_FILLED, LABEL_NONE, LABEL_STATIC, Surface
 from server.stages.volume import Volume
 from tests.analytic import look, look_at, pixel_rays, plane, quantised, room, sphere
@@ -116,14 +116,24 @@ def test_matches_twin(engine: Engine, size: tuple[int, int]) -> None:
     depth = sensor_sees.astype(np.float32).astype(np.float64)
     color = np.where(ball[..., None], [0.5, 0.3, 0.2], [0.2, 0.25, 0.3]) + rng.normal(size=(*ball.shape, 3)) * 0.02
     color = color.astype(np.float32).astype(np.float64)
-    weight = rng.choice([0.0, 5.0, 64.0], (48, 48, 64), p=[0.2, 0.2, 0.6])
+    weight = rng.choice([0.0, 4.0, 5.0, 64.0], (48, 48, 64), p=[0.1, 0.1, 0.2, 0.6])
     weight = np.ones((88, 48, 64)) * np.resize(weight, (88, 48, 64))
     positions, normals = surface_from(volume_sees, camera)
     positions = positions.astype(np.float32).astype(np.float64)
     voxel = (positions[..., :3] / VOXEL_M).astype(int)
-    trusted = weight[voxel[..., 2], voxel[..., 1], voxel[..., 0]] >= TRUSTED_WEIGHT
+    age = weight[voxel[..., 2], voxel[..., 1], voxel[..., 0]]
     merged = merge(engine, depth, positions, normals, camera=camera, radiance=color, weight=weight)
-    expected = twin.merge_depth(camera, in_volume(), depth, color, VOXEL_M, positions, normals, trusted)
+    expected = twin.merge_depth(
+        camera,
+        in_volume(),
+        depth,
+        color,
+        VOXEL_M,
+        positions,
+        normals,
+        trusted=age >= TRUSTED_WEIGHT,
+        still=age >= STILL_WEIGHT,
+    )
     same = merged.labels == expected[2]
     assert (~same).mean() <= FLIPS
     assert set(np.unique(expected[2])) == {LABEL_NONE, LABEL_STATIC, LABEL_DYNAMIC, LABEL_FILLED} or min(size) == 8

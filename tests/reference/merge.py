@@ -161,14 +161,16 @@ def merge_depth(
     positions: Floats,
     normals: Floats,
     trusted: Bools,
+    still: Bools,
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
     """positions, normals [h, w, 4] (w = 1 where valid) and labels [h, w] of the merged buffer.
 
-    positions, normals: the volume's surface; depth_m: measured; radiance [h, w, 3] linear; trusted: see merge.
+    positions, normals: the volume's surface; depth_m: measured; radiance [h, w, 3] linear; trusted: see merge; still:
+    [h, w] whether the volume has seen its surface long enough to call it static.
     """
     rotation, origin = volume_from_camera[:3, :3], volume_from_camera[:3, 3]
     volume_m = np.where(positions[..., 3] > 0, (positions[..., :3] - origin) @ rotation[:, 2], 0)
-    shade, agrees = intensity(radiance), agreement(depth_m, volume_m, voxel_m)
+    shade, agrees = intensity(radiance), agreement(depth_m, volume_m, voxel_m) & still
     depth_m = unmixed(depth_m)
     filtered = smooth(align(merge(depth_m, volume_m, agrees, trusted, shade, voxel_m), shade))
     labels = label(filtered, depth_m, volume_m, agrees, voxel_m)

@@ -34,7 +34,7 @@ from server.stages.volume import Volume
 FRAMES = range(1, 30, 3)
 STRIDE = 4
 REFERENCE_RAYS = 810
-BOUNDS_DEG = {81: 5.0, 243: 3.0}
+BOUNDS_DEG = {81: 6.0, 243: 3.0}
 """By the number of rays. What is left at 81 is their quadrature: least squares takes its error for signal."""
 
 

@@ -98,6 +98,12 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     voxel_m: Annotated[float, Meta(gt=0, le=1)] | None = None
     up: Vector3 | None = None
     """World direction; None: the first camera's -y."""
+    light: tuple[Rgb, ...] | None = None
+    """Radiance SH to render with instead of an estimate: 1, 4, 9 ... coefficients; None: estimate one."""
+    light_axes: Literal["world", "webxr"] = "world"
+    """Of `light`; `webxr`: up as +y and the first camera's view near -z."""
+    lamps: Literal["auto", "on", "off"] = "auto"
+    """Whether lights inside the room are looked for; `auto`: where distant light does not explain what is seen."""
     lossless: bool = False
     """Answers carry PNG pictures, and every frame is answered in order instead of latest-wins."""
 
@@ -109,6 +115,10 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             raise ValueError("wishes.volume_m must be x0,y0,z0,x1,y1,z1 with each x0 < x1")
         if self.up is not None and math.hypot(*self.up) < 1e-6:
             raise ValueError("wishes.up must not be zero")
+        if self.light is not None:
+            _require_finite("wishes", light=tuple(value for row in self.light for value in row))
+            if len(self.light) not in [bands * bands for bands in range(1, MAX_SH_BANDS + 1)]:
+                raise ValueError(f"wishes.light must have 1, 4, 9 ... {MAX_SH_BANDS**2} coefficients")
 
 
 class Message(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="type"):
@@ -242,6 +252,32 @@ class Timings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     total: float = 0.0
 
 
+class DirectedLight(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One of the lights that the room's light is made of, besides an even sky."""
+
+    direction: Vector3
+    """World, unit, towards the light."""
+    irradiance: Rgb
+    """Radiance of a white surface that faces it, lit by it alone."""
+    spread_deg: float
+    """Standard deviation along either axis; 0 for light from one direction."""
+
+
+class Lamp(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A light inside the room that shines evenly all around."""
+
+    position_m: Vector3
+    """World."""
+    position_std_m: Vector3
+    """One standard deviation along the world's axes."""
+    intensity: Rgb
+    """Radiant intensity: radiance of the light's units times m^2; d metres away it adds intensity / (pi d^2) to a white
+    surface that faces it."""
+    intensity_std: Rgb
+    share: float
+    """Of the light (luminance) that the surfaces seen receive."""
+
+
 class Light(Message, frozen=True, kw_only=True, tag="light"):
     """The room's light as one frame left it; the fields of a line of `light.jsonl`."""
 
@@ -258,6 +294,10 @@ class Light(Message, frozen=True, kw_only=True, tag="light"):
     dominant_direction: Vector3
     """World, unit, towards the light, from l = 1 of Rec. 709 luminance; (0, 0, 0) where there is none."""
     dominant_intensity: float
+    dominant_lights: tuple[DirectedLight, ...] = ()
+    """Each of the lights, strongest first, where there is more than an even sky."""
+    lamps: tuple[Lamp, ...] = ()
+    """Lights inside the room, strongest first; their light is not part of `sh`."""
     condition: float | None
     """Condition number of the unregularised normal equations; null when infinite."""
     valid: bool

@@ -7,7 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.messages import Light
+from protocol.messages import DirectedLight, Lamp, Light
+from server.maths.dominant import dominant_lights
+from server.maths.emitters import Emitter
 from server.maths.sh import dominant_direction, dominant_intensity, webxr_floats
 from server.stages.light_estimation import LightEstimate
 
@@ -15,9 +17,13 @@ _WIRE_COEFFICIENTS = 16
 
 
 def light_message(
-    frame: int, timestamp_s: float, estimate: LightEstimate, webxr_from_world: NDArray[np.float64]
+    frame: int,
+    timestamp_s: float,
+    estimate: LightEstimate,
+    webxr_from_world: NDArray[np.float64],
+    lamps: tuple[Emitter, ...] = (),
 ) -> Light:
-    """Message of `estimate`; bands not estimated are zeros with unknown deviation."""
+    """Message of `estimate` and lamps in the world; bands not estimated are zeros with unknown deviation."""
     sh, std = estimate.sh, estimate.std
     direction = dominant_direction(sh)
     return Light(
@@ -31,8 +37,27 @@ def light_message(
         sh_webxr=webxr_floats(sh, webxr_from_world),
         dominant_direction=_rgb(direction),
         dominant_intensity=dominant_intensity(sh),
+        dominant_lights=tuple(
+            DirectedLight(
+                direction=_rgb(light.direction),
+                irradiance=_rgb(light.irradiance),
+                spread_deg=math.degrees(light.spread_rad),
+            )
+            for light in dominant_lights(sh)
+        ),
+        lamps=tuple(_lamp(lamp) for lamp in lamps),
         condition=estimate.condition if math.isfinite(estimate.condition) else None,
         valid=estimate.valid,
+    )
+
+
+def _lamp(lamp: Emitter) -> Lamp:
+    return Lamp(
+        position_m=_rgb(lamp.position),
+        position_std_m=_rgb(np.sqrt(np.diag(lamp.position_covariance))),
+        intensity=_rgb(lamp.intensity),
+        intensity_std=_rgb(lamp.intensity_std),
+        share=lamp.share,
     )
 
 

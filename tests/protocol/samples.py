@@ -12,10 +12,12 @@ from protocol.messages import (
     ColorImage,
     Composite,
     DepthImage,
+    DirectedLight,
     Dropped,
     Error,
     Frame,
     Hello,
+    Lamp,
     LeftOut,
     Light,
     MeshPart,
@@ -60,7 +62,15 @@ CLIENT: dict[str, ClientMessage] = {
     "hello": Hello(
         client="laptop",
         camera=CAMERA,
-        wishes=Wishes(preset="art4", volume_m=(-1.0, -1.0, 0.0, 1.0, 1.0, 2.0), up=(0.0, -1.0, 0.0), ray_length_m=0.1),
+        wishes=Wishes(
+            preset="art4",
+            volume_m=(-1.0, -1.0, 0.0, 1.0, 1.0, 2.0),
+            up=(0.0, -1.0, 0.0),
+            ray_length_m=0.1,
+            light=((1.0, 0.5, 0.25),),
+            light_axes="webxr",
+            lamps="on",
+        ),
     ),
     "hello_two_lenses": Hello(client="rig", camera=TWO_LENSES),
     "watch": Watch(),
@@ -101,6 +111,16 @@ SERVER: dict[str, ServerMessage] = {
         sh_webxr=tuple(k / 16 for k in range(27)),
         dominant_direction=(0.0, 0.6, -0.8),
         dominant_intensity=1.25,
+        dominant_lights=(DirectedLight(direction=(0.0, 0.6, -0.8), irradiance=(1.5, 1.25, 1.0), spread_deg=12.5),),
+        lamps=(
+            Lamp(
+                position_m=(0.5, 1.25, -0.75),
+                position_std_m=(0.01, 0.02, 0.04),
+                intensity=(2.5, 2.0, 1.25),
+                intensity_std=(0.25, 0.125, 0.0625),
+                share=0.75,
+            ),
+        ),
         condition=None,
         valid=True,
     ),
@@ -143,6 +163,14 @@ def random_light(random: np.random.Generator) -> Light:
         sh_webxr=tuple(random.normal(0, 3, 27).tolist()),
         dominant_direction=rgb(),
         dominant_intensity=float(random.exponential()),
+        dominant_lights=tuple(
+            DirectedLight(direction=rgb(), irradiance=rgb(), spread_deg=float(random.exponential()))
+            for _ in range(random.integers(0, 4))
+        ),
+        lamps=tuple(
+            Lamp(position_m=rgb(), position_std_m=rgb(), intensity=rgb(), intensity_std=rgb(), share=random.random())
+            for _ in range(random.integers(0, 3))
+        ),
         condition=None if random.random() < 0.5 else float(random.exponential(1e6)),
         valid=bool(random.random() < 0.5),
     )

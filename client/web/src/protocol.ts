@@ -67,6 +67,12 @@ export interface Wishes {
   voxel_m?: number | null;
   /** World direction; null: the first camera's -y. */
   up?: [number, number, number] | null;
+  /** Radiance SH to render with instead of an estimate: 1, 4, 9 ... coefficients; null: estimate one. */
+  light?: Array<[number, number, number]> | null;
+  /** Of `light`; `webxr`: up as +y and the first camera's view near -z. */
+  light_axes?: "webxr" | "world";
+  /** Whether lights inside the room are looked for; `auto`: where distant light does not explain what is seen. */
+  lamps?: "auto" | "off" | "on";
   /** Answers carry PNG pictures, and every frame is answered in order instead of latest-wins. */
   lossless?: boolean;
 }
@@ -215,6 +221,32 @@ export interface Composite {
   notes: Array<string>;
 }
 
+/** One of the lights that the room's light is made of, besides an even sky. */
+export interface DirectedLight {
+  /** World, unit, towards the light. */
+  direction: [number, number, number];
+  /** Radiance of a white surface that faces it, lit by it alone. */
+  irradiance: [number, number, number];
+  /** Standard deviation along either axis; 0 for light from one direction. */
+  spread_deg: number;
+}
+
+/** A light inside the room that shines evenly all around. */
+export interface Lamp {
+  /** World. */
+  position_m: [number, number, number];
+  /** One standard deviation along the world's axes. */
+  position_std_m: [number, number, number];
+  /**
+   * Radiant intensity: radiance of the light's units times m^2; d metres away it adds intensity / (pi d^2) to a white
+   * surface that faces it.
+   */
+  intensity: [number, number, number];
+  intensity_std: [number, number, number];
+  /** Of the light (luminance) that the surfaces seen receive. */
+  share: number;
+}
+
 /** The room's light as one frame left it; the fields of a line of `light.jsonl`. */
 export interface Light {
   type: "light";
@@ -231,6 +263,10 @@ export interface Light {
   /** World, unit, towards the light, from l = 1 of Rec. 709 luminance; (0, 0, 0) where there is none. */
   dominant_direction: [number, number, number];
   dominant_intensity: number;
+  /** Each of the lights, strongest first, where there is more than an even sky. */
+  dominant_lights: Array<DirectedLight>;
+  /** Lights inside the room, strongest first; their light is not part of `sh`. */
+  lamps: Array<Lamp>;
   /** Condition number of the unregularised normal equations; null when infinite. */
   condition: number | null;
   valid: boolean;

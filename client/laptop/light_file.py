@@ -1,0 +1,63 @@
+"""Lights from files: `light.json` (ground truth), `light.jsonl` (what this program writes) and panoramas."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from client.laptop.errors import OptionError
+from protocol.limits import MAX_SH_BANDS
+from protocol.messages import Rgb
+from server.stages.panorama import PanoramaError, panorama_sh, read_panorama
+
+_COUNTS = tuple(bands * bands for bands in range(1, MAX_SH_BANDS + 1))
+
+Coefficients = tuple[Rgb, ...]
+
+
+def read_light(path: Path) -> Coefficients:
+    """SH of a light file, world axes: of `{"sh": [[r, g, b], ...]}`, or of the last line of a `light.jsonl`.
+
+    `sh_all` is taken before `sh`. Raises OptionError, one line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise OptionError(f"--light {path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+    return _coefficients(path, _document(path, text))
+
+
+def read_panorama_light(path: Path, bands: int) -> Coefficients:
+    """SH of a lat-long panorama, in WebXR's axes. Raises OptionError, one line."""
+    try:
+        light = panorama_sh(read_panorama(path), bands)
+    except PanoramaError as error:
+        raise OptionError(f"--panorama {error}") from error
+    return tuple((float(r), float(g), float(b)) for r, g, b in light)
+
+
+def _document(path: Path, text: str) -> Any:
+    """The whole file, or its last line where every line is a document."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    for candidate in (text, lines[-1] if lines else ""):
+        try:
+            return json.loads(candidate)
+        except ValueError:
+            continue
+    raise OptionError(f"--light {path}: not JSON")
+
+
+def _coefficients(path: Path, document: Any) -> Coefficients:
+    rows = document.get("sh_all") or document.get("sh") if isinstance(document, dict) else None
+    try:
+        values = np.array(rows, np.float64)
+    except (TypeError, ValueError):
+        values = np.zeros(0)
+    if values.ndim != 2 or values.shape[1] != 3 or len(values) not in _COUNTS or not np.isfinite(values).all():
+        raise OptionError(
+            f'--light {path}: expected {{"sh": ...}} with {", ".join(map(str, _COUNTS))} finite [r, g, b]'
+        )
+    return tuple((float(r), float(g), float(b)) for r, g, b in values)

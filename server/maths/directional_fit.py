@@ -1,0 +1,134 @@
+"""An even sky and a few lights, each of a direction, a strength and a spread, fitted to coefficients of radiance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.maths.sh import band_of, sh_basis, spherical_fibonacci
+from server.maths.sh_polynomials import sh_with_slope
+
+_WIDEST_RAD = 0.9
+_SPREADS_RAD = (0.0, 0.45, 0.9)
+_DIRECTIONS = 256
+_LEAST_LENGTH = 1e-9
+_MOST_STEPS = 40
+_CONVERGED = 1e-10  # of the target's energy
+_LEAST_STEP_GAIN = 1e-4
+
+Floats = NDArray[np.float64]
+
+
+def directional_sh(direction: Floats, spread_rad: float, bands: int) -> Floats:
+    """Coefficients [bands^2] of a light that lets a white surface facing it shade to 1 (whole series, spread 0)."""
+    band = band_of(bands * bands)
+    return np.asarray(pi * np.exp(-band * (band + 1) * spread_rad**2 / 2) * sh_basis(direction, bands))
+
+
+@dataclass(frozen=True)
+class DirectionalFit:
+    """Least squares of `target` [rows] = `root` [rows, bands^2] x.
+
+    Parameters [1 + 4 lights]: the sky, then of each light its vector s d [3] and its spread's square / 2.
+    """
+
+    root: Floats
+    target: Floats
+    bands: int
+    sharp: bool
+    """No spread."""
+
+    def sky(self) -> Floats:
+        """Parameters of the best even sky alone."""
+        column = self.root[:, 0]
+        return np.array([max(0.0, float(column @ self.target) / max(float(column @ column), 1e-300))])
+
+    def linearised(self, parameters: Floats) -> tuple[Floats, Floats]:
+        """[rows] model less target, and its derivatives [rows, parameters]."""
+        lights = parameters[1:].reshape(-1, 4)
+        vectors, flatness = lights[:, :3], lights[:, 3]
+        length = np.maximum(np.sqrt(np.sum(vectors**2, axis=1)), _LEAST_LENGTH)[:, None]
+        unit = vectors / length
+        values, slopes = sh_with_slope(unit, self.bands)
+        band = band_of(self.bands**2)
+        fading = pi * np.exp(-np.outer(flatness, band * (band + 1)))
+        # s Y(d) = s^(1-l) P(v): its gradient by v is that of P less what P grows along v by itself.
+        turning = fading[..., None] * (slopes + (1 - band)[:, None] * values[..., None] * unit[:, None])
+        spreading = -length * fading * values * (0 if self.sharp else band * (band + 1))
+        derivatives = np.concatenate([turning, spreading[..., None]], axis=2)  # [lights, bands^2, 4]
+        jacobian = self.root @ np.swapaxes(derivatives, 0, 1).reshape(len(band), -1)
+        model = parameters[0] * self.root[:, 0] + self.root @ np.sum(length * fading * values, axis=0)
+        return model - self.target, np.column_stack([self.root[:, 0], jacobian])
+
+    def misfit(self, parameters: Floats) -> float:
+        """Squared error."""
+        return float(np.sum(self.linearised(parameters)[0] ** 2))
+
+    def unit_lights(self, parameters: Floats) -> Floats:
+        """[rows, 1 + lights]: the sky and the lights of `parameters`, each of strength 1."""
+        columns = [self.root[:, 0]]
+        for light in parameters[1:].reshape(-1, 4):
+            direction = light[:3] / max(float(np.linalg.norm(light[:3])), _LEAST_LENGTH)
+            columns.append(self.root @ directional_sh(direction, np.sqrt(2 * light[3]), self.bands))
+        return np.stack(columns, axis=1)
+
+    def with_next(self, found: Floats) -> Floats:
+        """`found` and the light that lessens its misfit most: all candidates are tried at once."""
+        spreads = (0.0,) if self.sharp else _SPREADS_RAD
+        directions, atoms = _candidates(self.bands, spreads)
+        atoms = self.root @ atoms
+        held = np.linalg.qr(self.unit_lights(found))[0]  # what the found ones can take over does not count
+        atoms = atoms - held @ (held.T @ atoms)
+        products = -self.linearised(found)[0] @ atoms
+        norms = np.maximum(np.sum(atoms**2, axis=0), 1e-300)
+        best = int((np.maximum(products, 0.0) ** 2 / norms).argmax())
+        strength = max(float(products[best] / norms[best]), _LEAST_LENGTH)
+        flatness = spreads[best // _DIRECTIONS] ** 2 / 2
+        return np.array([*found, *(strength * directions[best % _DIRECTIONS]), flatness])
+
+    def refined(self, start: Floats) -> Floats:
+        """The nearest parameters of least error (Levenberg-Marquardt within the limits)."""
+        low, high = _limits(len(start))
+        here, damping = start, 1e-3
+        residual, jacobian = self.linearised(here)
+        cost = float(residual @ residual)
+        enough = _CONVERGED * float(self.target @ self.target)
+        for _ in range(_MOST_STEPS):
+            if cost <= enough or damping > 1e9:
+                break
+            normal, slope = jacobian.T @ jacobian, jacobian.T @ residual
+            free = ~((here <= low) & (slope > 0) | (here >= high) & (slope < 0))
+            damped = normal + np.diag(damping * np.diag(normal) + 1e-12 * normal.max())
+            tried = here.copy()
+            tried[free] -= np.linalg.solve(damped[np.ix_(free, free)], slope[free])
+            tried = np.clip(tried, low, high)
+            tried_residual, tried_jacobian = self.linearised(tried)
+            misfit = float(tried_residual @ tried_residual)
+            if misfit >= cost:
+                damping *= 8
+                continue
+            gain = cost - misfit
+            here, cost, residual, jacobian = tried, misfit, tried_residual, tried_jacobian
+            damping = max(damping / 8, 1e-12)
+            if gain <= _LEAST_STEP_GAIN * cost:
+                break
+        return here
+
+
+def _limits(count: int) -> tuple[Floats, Floats]:
+    """Least and most of each of `count` parameters: no negative sky, no spread beyond what four bands can tell."""
+    low, high = np.full(count, -np.inf), np.full(count, np.inf)
+    low[0], low[4::4], high[4::4] = 0.0, 0.0, _WIDEST_RAD**2 / 2
+    return low, high
+
+
+@cache
+def _candidates(bands: int, spreads: tuple[float, ...]) -> tuple[Floats, Floats]:
+    """Directions [d, 3], and lights along them [bands^2, spreads * d], spread by spread."""
+    directions = spherical_fibonacci(_DIRECTIONS)
+    columns = [directional_sh(direction, spread, bands) for spread in spreads for direction in directions]
+    return directions, np.stack(columns, axis=1)

@@ -1,0 +1,58 @@
+"""Spherical harmonics with their derivatives: each is a homogeneous polynomial of the degree of its band."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.maths.sh import band_of, sh_basis, spherical_fibonacci
+
+Floats = NDArray[np.float64]
+
+
+def sh_with_slope(points: Floats, bands: int) -> tuple[Floats, Floats]:
+    """The polynomials [k, bands^2] at `points` [k, 3] and their gradients [k, bands^2, 3].
+
+    On unit points the polynomials are `sh_basis`; elsewhere they are r^l times it.
+    """
+    polynomials = _polynomials(bands)
+    powers = np.ones((3, bands, len(points)))
+    for degree in range(1, bands):
+        powers[:, degree] = powers[:, degree - 1] * points.T
+    x, y, z = (powers[axis, polynomials.degrees[axis]] for axis in range(3))  # [monomials, k] each
+    # The derivative of p^0 is 0 p^-1: the factor 0 makes up for the wrong power.
+    dx, dy, dz = (
+        polynomials.degrees[axis][:, None] * powers[axis, np.maximum(polynomials.degrees[axis] - 1, 0)]
+        for axis in range(3)
+    )
+    monomials = np.stack([x * y * z, dx * y * z, x * dy * z, x * y * dz])
+    values = polynomials.factors @ monomials  # [4, bands^2, k]
+    return values[0].T, np.moveaxis(values[1:], 0, -1).swapaxes(0, 1)
+
+
+@dataclass(frozen=True)
+class _Polynomials:
+    """All of a number of bands."""
+
+    degrees: NDArray[np.int64]
+    """[3, monomials] powers of x, y, z."""
+    factors: Floats
+    """[bands^2, monomials]."""
+
+
+@cache
+def _polynomials(bands: int) -> _Polynomials:
+    """From `sh_basis`: on the sphere the monomials of one degree are independent."""
+    degrees = np.array([(a, b, l - a - b) for l in range(bands) for a in range(l + 1) for b in range(l + 1 - a)]).T
+    points = spherical_fibonacci(8 * bands * bands)
+    monomials = np.prod(points.T[:, None] ** degrees[..., None], axis=0)  # [monomials, points]
+    basis, band = sh_basis(points, bands), band_of(bands * bands)
+    factors = np.zeros((bands * bands, degrees.shape[1]))
+    for l in range(bands):
+        mine = degrees.sum(axis=0) == l
+        solved = np.linalg.lstsq(monomials[mine].T, basis[:, band == l], rcond=None)[0]
+        factors[np.ix_(band == l, mine)] = solved.T
+    return _Polynomials(degrees, factors)

@@ -1,4 +1,4 @@
-"""Float64 twin of trace_volume (include/visibility.clh): the ray's exact walk through solid voxels."""
+"""Float64 twins: a ray's exact walk through solid voxels (include/visibility.clh), and find_blockers (blockers.clh)."""
 
 from __future__ import annotations
 
@@ -28,3 +28,22 @@ def trace_volume(
         cell[rows, axis] += step[rows, axis]
         onward[rows, axis] += np.abs(1 / slope[rows, axis])
     return free
+
+
+def find_blockers(
+    solid: NDArray[np.bool_], origin: Floats, normal: Floats, reach: float, margin: float
+) -> list[tuple[Floats, Floats]]:
+    """Corners of the boxes, one a brick that comes within `reach`, around its voxels of `solid` [z, y, x] that rise
+    above the plane through `origin`, or to `margin` below it; voxels.
+    """
+    cells = np.argwhere(solid)[:, ::-1]
+    brick = cells // 8
+    beside = np.maximum(np.maximum(8 * brick - origin, origin - 8 * brick - 8), 0)
+    above = (cells + (normal > 0) - origin) @ normal > -margin
+    chosen = above & ((beside**2).sum(1) <= reach**2)
+    cells, brick = cells[chosen], brick[chosen]
+    boxes = []
+    for place in np.unique(brick, axis=0):
+        own = cells[(brick == place).all(1)]
+        boxes.append((own.min(0).astype(np.float64), own.max(0) + 1.0))
+    return boxes

@@ -26,6 +26,21 @@ static float3 open_shading(const float3 normal, global const float4 *light) {
     return sum;
 }
 
+// A pixel's value: from the refined ones around it where it has one, else from the samples of `grid`.
+static float4 value_at(const Grid grid, global const float4 *values, global const float4 *refined, const int has_refined,
+                       global const float4 *positions, global const float4 *normals, const int x, const int y,
+                       const int height, const float tolerance_m) {
+    if (has_refined && refined[y * grid.width + x].w > 0.0f) {
+        const Grid every = {grid.width, height, 1, grid.width};
+        return upsample(every, refined, positions, normals, x, y, tolerance_m);
+    }
+#ifdef BICUBIC
+    return upsample_bicubic(grid, values, x, y);
+#else
+    return upsample(grid, values, positions, normals, x, y, tolerance_m);
+#endif
+}
+
 // ratio [rows][cols] (w = 1 valid) -> touched [rows + 1][cols + 1]: whether the 6 x 6 samples around a cell hold one that is
 // valid and not 1. Most of a picture is not touched, and need not be upsampled.
 kernel void mark_touched(const int cols, const int rows, global const float4 *ratio, global uchar *touched) {
@@ -46,7 +61,8 @@ kernel void mark_touched(const int cols, const int rows, global const float4 *ra
 // virtual_positions, virtual_normals, virtual_colors [h][w] (w = 1 where covered): the virtual one, or none without HAS_OBJECTS.
 // occluded [object_rows][object_cols]: radiance that occluders take from virtual samples (w = 1 valid);
 // ratio [rows][cols]: shaded with over without virtual objects on real samples (w = 1 valid), touched: see mark_touched; or
-// none without HAS_SHADOWS. codes [65536]: sRGB code of linear radiance i / 65535.
+// none without HAS_SHADOWS. refined_occluded, refined_ratio [h][w]: the same at pixels that have w = 1, or none where has_... is 0.
+// BICUBIC: samples are mixed across edges. codes [65536]: sRGB code of linear radiance i / 65535.
 // -> picture [h][w][3] sRGB. A pixel that nothing virtual touches is the camera's, byte for byte.
 kernel void composite(const int width, const int height, global const uchar *shown, global const float4 *radiance,
                       global const float4 *positions, global const float4 *normals, const float16 camera_from_volume,
@@ -55,7 +71,9 @@ kernel void composite(const int width, const int height, global const uchar *sho
                       global const float4 *virtual_colors, global const float4 *light,
                       const int object_cols, const int object_rows, const int object_stride, global const float4 *occluded,
                       const int cols, const int rows, const int stride, global const float4 *ratio,
-                      global const uchar *touched, global const uchar *codes, global uchar *picture) {
+                      global const uchar *touched, const int has_refined_occluded, global const float4 *refined_occluded,
+                      const int has_refined_ratio, global const float4 *refined_ratio,
+                      global const uchar *codes, global uchar *picture) {
     const int x = get_global_id(0);
     const int y = get_global_id(1);
     if (x >= width || y >= height) return;
@@ -68,7 +86,7 @@ kernel void composite(const int width, const int height, global const uchar *sho
         if (real.w <= 0.0f || in_front > -tolerance_m) {
             const float3 normal = virtual_normals[pixel].xyz;
             const Grid grid = {object_cols, object_rows, object_stride, width};
-            const float4 taken = upsample(grid, occluded, virtual_positions, virtual_normals, x, y, tolerance_m);
+            const float4 taken = value_at(grid, occluded, refined_occluded, has_refined_occluded, virtual_positions, virtual_normals, x, y, height, tolerance_m);
             const float3 shading = fmax(open_shading(normal, light) - taken.xyz, (float3)(0.0f));
             write_color(picture, pixel, virtual_colors[pixel].xyz * shading, codes);
             return;
@@ -79,7 +97,7 @@ kernel void composite(const int width, const int height, global const uchar *sho
     const Grid grid = {cols, rows, stride, width};
     const int cell = (cell_of(y, stride) + 1) * (cols + 1) + cell_of(x, stride) + 1;
     if (touched[cell] && real.w > 0.0f && radiance[pixel].w >= 0.0f) {
-        const float4 factor = upsample(grid, ratio, positions, normals, x, y, tolerance_m);
+        const float4 factor = value_at(grid, ratio, refined_ratio, has_refined_ratio, positions, normals, x, y, height, tolerance_m);
         const float3 change = fabs(factor.xyz - 1.0f);
         if (factor.w > 0.0f && fmax(fmax(change.x, change.y), change.z) > UNTOUCHED) {
             write_color(picture, pixel, radiance[pixel].xyz * factor.xyz, codes);

@@ -16,6 +16,7 @@ from server.stages.differential_rendering import DeviceLight, SampleGrid
 from server.stages.measure import linear_values
 from server.stages.rasterize import VirtualSurface
 from server.stages.raycast import Surface
+from server.stages.sampling import Upsampling
 
 
 def srgb_codes(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
@@ -57,8 +58,13 @@ def composite(
     virtual: VirtualSurface | None = None,
     occluded: SampleGrid | None = None,
     ratio: SampleGrid | None = None,
+    refined_occluded: cl_array.Array | None = None,
+    refined_ratio: cl_array.Array | None = None,
+    upsampling: Upsampling = "bilateral",
 ) -> NDArray[np.uint8]:
     """Picture [h, w, 3] sRGB of the camera picture `shown` with what is virtual; unchanged where nothing virtual is.
+
+    `refined_occluded`, `refined_ratio` [h, w] float4: what stands for `occluded` and `ratio` where w = 1.
 
     `tolerance_m`: how far behind a real surface a virtual one still shows, for objects that stand on it.
     """
@@ -67,9 +73,8 @@ def composite(
     space = engine.workspace
     picture = space.array("picture", (camera.height, camera.width, 3), np.uint8)
     bands = round(light.coefficients.shape[0] ** 0.5)
-    kernel = engine.kernel(
-        "composite.cl", "composite", BANDS=bands, HAS_OBJECTS=virtual is not None, HAS_SHADOWS=ratio is not None
-    )
+    defines = {"HAS_OBJECTS": virtual is not None, "HAS_SHADOWS": ratio is not None, "BICUBIC": upsampling == "bicubic"}
+    kernel = engine.kernel("composite.cl", "composite", BANDS=bands, **defines)
     unused = space.array("unused", (1,), cl_types.float4)
     touched = mark_touched(engine, ratio, bands) if ratio else unused
     engine.launch(
@@ -88,6 +93,10 @@ def composite(
         *_grid(occluded, unused),
         *_grid(ratio, unused),
         touched,
+        refined_occluded is not None,
+        unused if refined_occluded is None else refined_occluded,
+        refined_ratio is not None,
+        unused if refined_ratio is None else refined_ratio,
         space.constant("srgb_codes", _shown_codes()),
         picture,
     )

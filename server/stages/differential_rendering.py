@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine, KernelArgument, float4
-from server.stages.radiance_transfer import Directions, Transfer
+from server.stages.radiance_transfer import Directions, Transfer, own_sets
 from server.stages.rasterize import Placed, VirtualSurface
 from server.stages.raycast import Surface
 from server.stages.volume import Volume
@@ -56,7 +56,7 @@ class SampleGrid:
 
 def upload_light(engine: Engine, sh: NDArray[np.float64], rays: Directions) -> DeviceLight:
     """Bring radiance coefficients [bands^2, 3] and what they send along `rays` to the device."""
-    arriving = rays.basis.astype(np.float64) @ sh
+    arriving = rays.basis @ sh.astype(np.float32)
     return DeviceLight(
         engine.workspace.upload("light", _float4(sh)), engine.workspace.upload("arriving", _float4(arriving))
     )
@@ -78,6 +78,7 @@ def shadow_real(
     shape = (transfer.rows, transfer.cols)
     ratio = SampleGrid(transfer.stride, engine.workspace.array("shadow_ratio", shape, cl_types.float4))
     defines = {"BANDS": transfer.bands, "MASK_WORDS": transfer.free_mask.shape[2], "LANES": engine.lanes}
+    defines["INTERLEAVE"] = transfer.interleave
     engine.launch(
         engine.kernel("differential_rendering.cl", "shadow_real", **defines),
         (transfer.cols, transfer.rows),
@@ -89,12 +90,13 @@ def shadow_real(
         surface.normals,
         transfer.coefficients,
         transfer.free_mask,
+        transfer.sets if transfer.sets is not None else own_sets(engine, transfer.rows, transfer.cols),
         light.coefficients,
         rays.count,
-        engine.workspace.constant("directions", rays.directions.view(cl_types.float4)),
+        rays.on_device(engine),
         light.arriving,
         reach_m,
-        *_objects(table),
+        *object_arguments(table),
         ball_around(objects),
         voxel_m,
         ratio.values,
@@ -136,22 +138,22 @@ def shadow_virtual(
         virtual.normal,
         *volume.arguments(),
         rays.count,
-        engine.workspace.constant("directions", rays.directions.view(cl_types.float4)),
+        rays.on_device(engine),
         light.arriving,
         reach_m,
-        *_objects(table),
+        *object_arguments(table),
         max(table.cell_m, default=0.0),
         occluded.values,
     )
     return occluded
 
 
-def _objects(table: ObjectTable) -> tuple[KernelArgument, ...]:
+def object_arguments(table: ObjectTable) -> tuple[KernelArgument, ...]:
     """What trace_objects of include/virtual_objects.clh takes, in its order."""
     return table.count, table.grid_from_volume, table.dims, table.distances
 
 
-def _float4(rgb: NDArray[np.float64]) -> NDArray[np.float32]:
+def _float4(rgb: NDArray[np.floating]) -> NDArray[np.float32]:
     """[..., 3] -> [...] float4 with w = 0."""
     padded = np.zeros((*rgb.shape[:-1], 4), np.float32)
     padded[..., :3] = rgb

@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import pyopencl.array as cl_array
 import pytest
 from numpy.typing import NDArray
 
@@ -17,6 +18,7 @@ from server.stages.measure import linear_values
 from server.stages.radiance_transfer import direction_sets
 from server.stages.rasterize import VirtualSurface
 from server.stages.raycast import Surface
+from server.stages.sampling import Upsampling
 from tests import lights
 from tests.meshes import pose
 from tests.reference import composite as twin
@@ -87,6 +89,9 @@ def compose(
     occluded: Samples | None = None,
     ratio: Samples | None = None,
     light: Floats = LIGHT,
+    refined_occluded: Samples | None = None,
+    refined_ratio: Samples | None = None,
+    upsampling: Upsampling = "bilateral",
 ) -> Codes:
     surface: Surface = upload_surface(
         engine, real.positions[..., :3], real.normals[..., :3], real.positions[..., 3] > 0
@@ -103,7 +108,15 @@ def compose(
         upload_virtual(engine, virtual) if virtual else None,
         upload_samples(engine, "occluded", occluded),
         upload_samples(engine, "ratio", ratio),
+        upload_every(engine, "refined_occluded", refined_occluded),
+        upload_every(engine, "refined_ratio", refined_ratio),
+        upsampling,
     )
+
+
+def upload_every(engine: Engine, name: str, samples: Samples | None) -> cl_array.Array | None:
+    grid = upload_samples(engine, name, samples)
+    return grid.values if grid else None
 
 
 def samples(stride: int, value: float | Floats, valid: Any = 1.0) -> Samples:
@@ -148,6 +161,32 @@ def test_picture_is_the_twins(engine: Engine, stride: int, bands: int) -> None:
     assert difference.max() <= 1
     assert (difference > 0).mean() < 5e-3
     np.testing.assert_array_equal(found[~changed], shown[~changed])
+
+
+@pytest.mark.parametrize("stride", [4, 8])
+@pytest.mark.parametrize("upsampling", ["bilateral", "bicubic"])
+def test_refined_and_bicubic_values_are_the_twins(engine: Engine, stride: int, upsampling: Upsampling) -> None:
+    """Refined values in a part of the picture, samples elsewhere, mixed across edges or not."""
+    random = np.random.default_rng(5)
+    shown, radiance = camera_picture()
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    virtual = buffer(*plane(0.8, 0.7), (u - 30) ** 2 + (v - 20) ** 2 < 200)
+    ratio = samples(stride, random.uniform(0.3, 0.9, (HEIGHT // stride, WIDTH // stride, 3)))
+    ratio.values[..., 3] = random.random(ratio.values.shape[:2]) < 0.9
+    occluded = samples(2, random.uniform(0, 0.2, (HEIGHT // 2, WIDTH // 2, 3)))
+    occluded.values[..., 3] = virtual.positions[1::2, 1::2, 3]
+    refined = [
+        samples(1, random.uniform(low, high, (HEIGHT, WIDTH, 3)), part)
+        for low, high, part in ((0, 0.2, (u < 32) & (virtual.positions[..., 3] > 0)), (0.3, 0.9, v < 24))
+    ]
+    found = compose(engine, shown, radiance, WALL, virtual, occluded, ratio, LIGHT, *refined, upsampling)
+    pose = np.linalg.inv(VOLUME_FROM_CAMERA)
+    arguments = (shown, radiance, WALL, pose, TOLERANCE_M, LIGHT, virtual, occluded, ratio)
+    expected = twin.composite(*arguments, *refined, upsampling == "bicubic")
+    difference = np.abs(found.astype(int) - expected)
+    assert difference.max() <= 1
+    assert (difference > 0).mean() < 5e-3
+    assert (expected != twin.composite(*arguments, bicubic=upsampling == "bicubic")).any()
 
 
 @pytest.mark.parametrize("shape", [(11, 15), (1, 1), (5, 40)])

@@ -148,21 +148,28 @@ def test_two_writers_are_refused() -> None:
                 "rasterize": "no virtual object",
                 "shade_virtual": "no virtual object",
                 "shadow_real": "no virtual object",
+                "refine_virtual": "no virtual object",
+                "refine_real": "no virtual object",
             },
         ),
         (
             SceneFacts(objects=2, objects_in_view=0, has_light=True),
             {"tabulate", "shadow_real", "composite"},  # what is out of view may still cast a shadow into it
-            {"rasterize": "in view", "shade_virtual": "in view"},
+            {"rasterize": "in view", "shade_virtual": "in view", "refine_virtual": "in view", "refine_real": "refine"},
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=False),
             {"rasterize", "composite"},
-            {"shade_virtual": "no light", "shadow_real": "no light"},
+            dict.fromkeys(("shade_virtual", "shadow_real", "refine_virtual", "refine_real"), "no light"),
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=True),
             {"rasterize", "tabulate", "shade_virtual", "shadow_real", "composite"},
+            {"refine_virtual": "does not refine", "refine_real": "does not refine"},
+        ),
+        (
+            SceneFacts(objects=1, objects_in_view=1, has_light=True, adaptive=True),
+            {"rasterize", "tabulate", "shade_virtual", "refine_virtual", "shadow_real", "refine_real", "composite"},
             {},
         ),
     ],
@@ -179,4 +186,4 @@ def test_effects_of_a_scene(facts: SceneFacts, run: set[str], reasons: dict[str,
     for item in plan.left_out:
         assert reasons[item.effect] in item.reason
         assert item.error_bound is not None
-        assert item.error_bound == (255.0 if "light" in item.reason else 0.0)
+        assert item.error_bound == (0.0 if "object" in item.reason else 255.0)

@@ -25,19 +25,22 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import FrameResult, Pipeline
 from server.scene.placement import Placement
-from server.settings import STRIDES, THESIS_REACH_M, WHOLE_ROOM_M
+from server.settings import THESIS_REACH_M, WHOLE_ROOM_M
 from server.stages.integrate import integrate
 from server.stages.light_estimation import LEAST_FLATNESS
 from server.stages.measure import measure
 from server.stages.merge import merge_depth
 from server.stages.radiance_transfer import direction_sets, transfer_radiance
 from server.stages.raycast import LABEL_STATIC, Surface, raycast
+from server.stages.sampling import PRESETS
 from server.stages.volume import Volume
 from tests.analytic import Shape, look, look_at, plane, sphere
 from tests.lights import random_directions, uniform
 from tests.meshes import shape_of
 from tests.solids import HalfSpace, ball, fill_volume, points_on, upload_surface
 
+STRIDES = {name: PRESETS[name].stride for name in ("rm", "reg4", "reg8")}
+"""Presets that differ in what one frame traces; the others add what earlier frames found."""
 CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
 BOUNDS = (-0.8, -0.8, 0.5, 0.8, 0.8, 2.1)
 VOXEL_M = 0.008
@@ -115,12 +118,12 @@ def test_exact_scene_shades_to_one(engine: Engine) -> None:
 
 
 def test_every_preset_that_exists_is_covered() -> None:
-    assert set(STRIDES) <= set(get_args(Preset))
-    assert set(STRIDES) == {"rm", "reg4", "reg8"}
+    assert set(PRESETS) <= set(get_args(Preset))
+    assert set(STRIDES.values()) == {preset.stride for preset in PRESETS.values()}
     assert Wishes().rays in RAYS
 
 
-@pytest.mark.parametrize("preset", STRIDES)
+@pytest.mark.parametrize("preset", PRESETS)
 def test_far_object_changes_no_pixel(device: Device, preset: str) -> None:
     """The whole spine, with an object that neither is seen nor shadows anything: the camera's bytes come back."""
     random = np.random.default_rng(1)

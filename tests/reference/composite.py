@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import BSpline
 
 from tests.reference.sh import open_transfer
 
@@ -72,6 +73,24 @@ def upsample(samples: Samples, surface: Buffer, x: int, y: int, tolerance_m: flo
     return np.array([*(total[:3] / total[3]), 1]) if total[3] > 1e-4 else np.zeros(4)
 
 
+_cubic = BSpline.basis_element(np.arange(-2, 3), extrapolate=False)
+
+
+def upsample_bicubic(samples: Samples, x: int, y: int) -> Floats:
+    """[4] cubic B-spline mean of the valid ones of the 4 x 4 samples around a pixel; w = 0 without any."""
+    u, v = ((c - samples.stride // 2) / samples.stride for c in (x, y))
+    across, down = (
+        np.nan_to_num(_cubic(np.arange(n) - at)) for n, at in zip(samples.values.shape[1::-1], (u, v), strict=True)
+    )
+    weights = np.outer(down, across) * (samples.values[..., 3] > 0)
+    total = float(weights.sum())
+    return (
+        np.array([*(np.einsum("rc,rck->k", weights, samples.values[..., :3]) / total), 1])
+        if total > 1e-4
+        else np.zeros(4)
+    )
+
+
 def composite(
     shown: NDArray[np.uint8],
     radiance: Floats,
@@ -82,24 +101,33 @@ def composite(
     virtual: Buffer | None = None,
     occluded: Samples | None = None,
     ratio: Samples | None = None,
+    refined_occluded: Samples | None = None,
+    refined_ratio: Samples | None = None,
+    bicubic: bool = False,
 ) -> NDArray[np.uint8]:
     """The picture [h, w, 3]: the nearer of virtual and real surface, real ones times `ratio`, untouched ones as shown.
 
     radiance [h, w, 4]; light [n, 3]. A virtual surface at most `tolerance_m` behind a real one is in front.
     """
+
+    def value_at(samples: Samples, refined: Samples | None, surface: Buffer, x: int, y: int) -> Floats:
+        if refined is not None and refined.values[y, x, 3] > 0:
+            return upsample(refined, surface, x, y, tolerance_m)
+        return upsample_bicubic(samples, x, y) if bicubic else upsample(samples, surface, x, y, tolerance_m)
+
     picture = shown.copy()
     for y, x in np.ndindex(shown.shape[:2]):
         here = real.positions[y, x]
         if virtual is not None and occluded is not None and virtual.positions[y, x, 3] > 0:
             ahead = camera_from_volume[2, :3] @ (here[:3] - virtual.positions[y, x, :3])
             if here[3] <= 0 or ahead > -tolerance_m:
-                taken = upsample(occluded, virtual, x, y, tolerance_m)[:3]
+                taken = value_at(occluded, refined_occluded, virtual, x, y)[:3]
                 bands = round(len(light) ** 0.5)
                 shading = np.maximum(open_transfer(virtual.normals[y, x, :3], bands) @ light - taken, 0)
                 picture[y, x] = srgb_codes(virtual.colors[y, x] * shading)
                 continue
         if ratio is not None and here[3] > 0 and radiance[y, x, 3] >= 0:
-            factor = upsample(ratio, real, x, y, tolerance_m)
+            factor = value_at(ratio, refined_ratio, real, x, y)
             if factor[3] > 0 and np.abs(factor[:3] - 1).max() > UNTOUCHED:
                 picture[y, x] = srgb_codes(radiance[y, x, :3] * factor[:3])
     return picture

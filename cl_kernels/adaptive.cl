@@ -1,0 +1,128 @@
+// Adaptive refinement (thesis 6.1.1, step 1): shading at every pixel where that of samples changes from one to the next.
+// Provides mark_edges, mark_varying, shade_samples, refine_virtual, refine_real.
+#include "direction_sets.clh"
+#include "sh.clh"
+#include "shadows.clh"
+#include "upsample.clh"
+
+// Normals of a smooth surface turn less from pixel to pixel, about 25 degrees.
+#define SMOOTH_COSINE 0.9f
+
+// Whether a virtual surface goes on from pixel `at` to its neighbour.
+static inline int goes_on(global const float4 *positions, global const float4 *normals, const int at, const int neighbour,
+                          const float tolerance_m) {
+    const float4 here = positions[at], there = positions[neighbour];
+    const float3 offset = there.xyz - here.xyz;
+    return there.w > 0.0f && dot(normals[at].xyz, normals[neighbour].xyz) > SMOOTH_COSINE &&
+           fabs(dot(offset, normals[at].xyz)) < tolerance_m + 0.3f * length(offset);
+}
+
+// positions, normals [h][w]: virtual surface -> edges [h][w]: 1 where it ends, bends or steps beside a pixel that it covers.
+kernel void mark_edges(const int width, const int height, global const float4 *positions, global const float4 *normals,
+                       const float tolerance_m, global uchar *edges) {
+    const int x = get_global_id(0);
+    const int y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    const int at = y * width + x;
+    int edge = 0;
+    if (positions[at].w > 0.0f) {
+        edge |= x > 0 && !goes_on(positions, normals, at, at - 1, tolerance_m);
+        edge |= x < width - 1 && !goes_on(positions, normals, at, at + 1, tolerance_m);
+        edge |= y > 0 && !goes_on(positions, normals, at, at - width, tolerance_m);
+        edge |= y < height - 1 && !goes_on(positions, normals, at, at + width, tolerance_m);
+    }
+    edges[at] = (uchar)edge;
+}
+
+// Mean of the valid ones of 4 x 4 samples from (row, col) on, whose directions are those of all sets of a lattice: single
+// samples differ by their directions alone. w = 0 without any.
+static float4 block_mean(const int cols, const int rows, global const float4 *ratio, const int row, const int col) {
+    float4 sum = (float4)(0.0f);
+    for (int r = max(row, 0); r <= min(row + 3, rows - 1); r++) {
+        for (int c = max(col, 0); c <= min(col + 3, cols - 1); c++) {
+            const float4 v = ratio[r * cols + c];
+            if (v.w > 0.0f) sum += (float4)(v.xyz, 1.0f);
+        }
+    }
+    return sum.w > 0.0f ? (float4)(sum.xyz / sum.w, 1.0f) : (float4)(0.0f);
+}
+
+static inline float greatest_change(const float4 a, const float4 b) {
+    const float3 change = fabs(a.xyz - b.xyz) * a.w * b.w;
+    return fmax(fmax(change.x, change.y), change.z);
+}
+
+// ratio [rows][cols] (w = 1 valid) -> varying [rows + 1][cols + 1]: whether the mean of the 4 x 4 samples to one side of a
+// cell, which begins at sample (row - 1, col - 1), is another than to the opposite side by more than `least_change`.
+kernel void mark_varying(const int cols, const int rows, global const float4 *ratio, const float least_change,
+                         global uchar *varying) {
+    const int cell_col = (int)get_global_id(0) - 1;
+    const int cell_row = (int)get_global_id(1) - 1;
+    if (cell_col >= cols || cell_row >= rows) return;
+    const float across = greatest_change(block_mean(cols, rows, ratio, cell_row - 1, cell_col - 3),
+                                         block_mean(cols, rows, ratio, cell_row - 1, cell_col + 1));
+    const float along = greatest_change(block_mean(cols, rows, ratio, cell_row - 3, cell_col - 1),
+                                        block_mean(cols, rows, ratio, cell_row + 1, cell_col - 1));
+    varying[(cell_row + 1) * (cols + 1) + cell_col + 1] = (uchar)(fmax(across, along) > least_change);
+}
+
+// Radiance of real samples, white: transfer [rows][cols][COEFFICIENTS], openness [rows][cols], light [COEFFICIENTS]
+// -> shaded [rows][cols] (rgb, w = 1 where there is surface).
+kernel void shade_samples(const int samples, global const float *transfer, global const float *openness,
+                          global const float4 *light, global float4 *shaded) {
+    const int sample = get_global_id(0);
+    if (sample >= samples) return;
+    float3 sum = (float3)(0.0f);
+    for (int i = 0; i < COEFFICIENTS; i++) sum += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
+    shaded[sample] = (float4)(sum, openness[sample] >= 0.0f ? 1.0f : 0.0f);
+}
+
+// What occluders take from the virtual surface at `pixels` [listed]; positions, normals [h][w]: the virtual geometry buffer.
+// -> occluded [h][w] (rgb, w = 1); other pixels are left as they are.
+kernel void refine_virtual(const int listed, global const int *pixels, const int width,
+                           global const float4 *positions, global const float4 *normals,
+                           const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid,
+                           global const uchar *octets, global const float2 *voxels, const float voxel_m,
+                           const float truncation_m, const int count, global const float4 *directions,
+                           global const float4 *arriving, const float reach_m,
+                           const int objects, global const float16 *grid_from_volume, global const int4 *dims,
+                           global const float *distances, const float offset_m, global float4 *occluded) {
+    const int item = get_global_id(0);
+    if (item >= listed) return;
+    const int pixel = pixels[item];
+    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
+    const Objects things = {objects, grid_from_volume, dims, distances, offset_m};
+    const Arriving light = {count, directions, arriving, reach_m};
+    const int set = direction_set(pixel / width, pixel % width);
+    occluded[pixel] = taken_from_virtual(volume, things, light, positions[pixel], normals[pixel].xyz, set);
+}
+
+// The ratio R' / R of shading with virtual objects to shading without, at `pixels` [listed] of the real surface. What the
+// objects take is sampled at the pixel; R changes little from sample to sample and is taken from them: shaded [rows][cols].
+// -> ratio [h][w] (rgb, w = 1), w = 0 where there is no surface; other pixels are left as they are.
+kernel void refine_real(const int listed, global const int *pixels, const int width,
+                        global const float4 *positions, global const float4 *normals,
+                        const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid,
+                        global const uchar *octets, global const float2 *voxels, const float voxel_m,
+                        const float truncation_m, const int count, global const float4 *directions,
+                        global const float4 *arriving, const float reach_m,
+                        const int objects, global const float16 *grid_from_volume, global const int4 *dims,
+                        global const float *distances, const float4 ball, global const float4 *light,
+                        const int cols, const int rows, const int stride, global const float4 *shaded, global float4 *ratio) {
+    const int item = get_global_id(0);
+    if (item >= listed) return;
+    const int pixel = pixels[item];
+    const int x = pixel % width, y = pixel / width;
+    float4 result = (float4)(0.0f);
+    if (positions[pixel].w > 0.0f && normals[pixel].w > 0.0f) {
+        const Grid grid = {cols, rows, stride, width};
+        const float4 without = upsample(grid, shaded, positions, normals, x, y, voxel_m);
+        const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
+        const Objects things = {objects, grid_from_volume, dims, distances, 0.0f};
+        const Arriving arrives = {count, directions, arriving, reach_m};
+        const float3 taken = taken_from_real(volume, things, arrives, ball, positions[pixel].xyz, normals[pixel].xyz, direction_set(y, x));
+        const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
+        result = (float4)(fmax(without.xyz - taken, floor) / fmax(without.xyz, floor), without.w);
+    }
+    ratio[pixel] = result;
+}

@@ -1,0 +1,181 @@
+"""Adaptive refinement (thesis 6.1.1, step 1) against float64 and against what samples at every pixel give."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.maths.rigid import inverse_rigid
+from server.opencl.engine import Engine
+from server.scene.virtual_object import VirtualObject
+from server.stages import adaptive, differential_rendering
+from server.stages.differential_rendering import SampleGrid, shadow_real, shadow_virtual, upload_light
+from server.stages.radiance_transfer import direction_sets, transfer_radiance
+from server.stages.rasterize import rasterize
+from server.stages.raycast import LABEL_STATIC, Surface, raycast
+from server.stages.voxelize import object_table
+from tests.analytic import look_at
+from tests.meshes import shape_of
+from tests.reference import adaptive as twin
+from tests.reference.composite import Buffer, Samples, upsample
+from tests.solids import SCENES, download4, fill_volume, float4
+
+VOXEL_M = 0.01
+CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
+VIEW = look_at((0.25, 0.5, 0.05), (0.4, 0.15, 0.4))
+STRIDE = 4
+ROOM_M = 1000.0
+SIZE = (CAMERA.height, CAMERA.width)
+Floats = NDArray[np.float64]
+
+
+class Stage:
+    """A ball above a floor, a virtual box beside it, and a light from one side."""
+
+    def __init__(self, engine: Engine, stride: int) -> None:
+        self.engine = engine
+        self.volume = fill_volume(engine, SCENES["ball above a floor"], VOXEL_M)
+        model = raycast(engine, CAMERA, VIEW, self.volume)
+        labels = np.full(SIZE, LABEL_STATIC, np.uint8)
+        self.surface = Surface(model.positions, model.normals, engine.workspace.upload("test_labels", labels))
+        self.rays = direction_sets(81, 4)
+        self.transfer = transfer_radiance(engine, CAMERA, self.volume, self.surface, stride, self.rays, ROOM_M)
+        sh = np.zeros((16, 3))
+        sh[:4] = [[3.0, 2.8, 2.6], [1.2, 1.2, 1.2], [0.5, 0.4, 0.3], [1.0, 0.9, 0.8]]
+        self.light = upload_light(engine, sh, self.rays)
+        placed = np.eye(4)
+        placed[:3, 3] = (0.3, 0.17, 0.35)
+        thing = VirtualObject.upload(engine, shape_of(trimesh.creation.box((0.06, 0.1, 0.06))))
+        self.objects = [(thing, placed)]
+        self.table = object_table(engine, self.objects)
+        self.virtual = rasterize(engine, CAMERA, inverse_rigid(VIEW), self.objects)
+
+    def ratio(self) -> SampleGrid:
+        return shadow_real(
+            self.engine,
+            CAMERA,
+            self.surface,
+            self.transfer,
+            self.light,
+            self.rays,
+            ROOM_M,
+            self.objects,
+            self.table,
+            VOXEL_M,
+        )
+
+    def refined(self, ratio: SampleGrid) -> Floats:
+        found = adaptive.refine_real(
+            self.engine,
+            CAMERA,
+            self.surface,
+            self.transfer,
+            self.volume,
+            self.light,
+            self.rays,
+            ROOM_M,
+            self.objects,
+            self.table,
+            ratio,
+        )
+        return download4(self.engine, found).astype(float)
+
+
+def test_real_surface_loses_what_samples_at_every_pixel_lose(engine: Engine) -> None:
+    """With a sample at every pixel R - R' is the same ray by ray; R itself is the mean over neighbours."""
+    stage = Stage(engine, 1)
+    coarse = stage.ratio()
+    ratio = download4(engine, coarse.values).astype(float)
+    refined = stage.refined(coarse)
+    listed = refined[..., 3] > 0
+    assert 100 < listed.sum() < 0.6 * listed.size
+    transfer = engine.download(stage.transfer.coefficients).astype(float)
+    light = download4(engine, stage.light.coefficients)[:, :3].astype(float)
+    shaded = np.concatenate([transfer @ light, engine.download(stage.transfer.openness)[..., None] >= 0], -1)
+    surface = buffer_of(engine, stage.surface)
+    for y, x in np.argwhere(listed)[::23]:
+        mean = upsample(Samples(1, shaded), surface, int(x), int(y), VOXEL_M)[:3]
+        expected = (1 - ratio[y, x, :3]) * shaded[y, x, :3]
+        np.testing.assert_allclose((1 - refined[y, x, :3]) * mean, expected, atol=2e-3)
+
+
+def test_refined_rims_are_nearer_to_every_pixel(engine: Engine) -> None:
+    """Where shading is refined, the picture's factor is nearer to that of samples at every pixel than without."""
+    every, coarse = Stage(engine, 1), None
+    dense = Samples(1, download4(engine, every.ratio().values).astype(float))
+    stage = Stage(engine, STRIDE)
+    coarse = stage.ratio()
+    samples = Samples(STRIDE, download4(engine, coarse.values).astype(float))
+    refined = Samples(1, stage.refined(coarse))
+    surface = buffer_of(engine, stage.surface)
+    errors = []
+    for y, x in np.argwhere(refined.values[..., 3] > 0)[::7]:
+        want = upsample(dense, surface, int(x), int(y), VOXEL_M)[:3]
+        errors.append(
+            [np.abs(upsample(s, surface, int(x), int(y), VOXEL_M)[:3] - want).mean() for s in (refined, samples)]
+        )
+    after, before = np.mean(errors, axis=0)
+    assert after < 0.5 * before
+
+
+def test_virtual_surface_near_edges_is_as_at_every_pixel(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = Stage(engine, STRIDE)
+    arguments = (engine, CAMERA, stage.virtual, stage.volume, 4, stage.light, stage.rays, ROOM_M, stage.table)
+    refined = download4(engine, adaptive.refine_virtual(*arguments))
+    monkeypatch.setattr(differential_rendering, "VIRTUAL_STRIDE", 1)
+    every = download4(engine, shadow_virtual(*arguments).values)
+    positions = download4(engine, stage.virtual.position).astype(float)
+    normals = download4(engine, stage.virtual.normal).astype(float)
+    covered = positions[..., 3] > 0
+    near = adaptive.grown(twin.edges(positions, normals, VOXEL_M), adaptive.MARGIN_PX)
+    assert 20 < (near & covered).sum() < covered.sum()
+    np.testing.assert_array_equal(refined[..., 3] > 0, near & covered)
+    np.testing.assert_array_equal(refined[near & covered], every[near & covered])
+    assert (every[near & covered][:, :3] > 0).any()
+
+
+@pytest.mark.parametrize("stride", [1, 4, 8])
+def test_varying_cells_are_the_twins(engine: Engine, stride: int) -> None:
+    random = np.random.default_rng(3)
+    rows, cols = 48 // stride, 64 // stride
+    step = (np.arange(cols) > cols // 2)[None, :, None]
+    values = np.where(step, 0.7, 1.0) + random.uniform(-0.03, 0.03, (rows, cols, 3))
+    valid = random.random((rows, cols)) < 0.8
+    values = np.where(valid[..., None], values, 0.0).astype(np.float32).astype(float)
+    grid = SampleGrid(stride, engine.workspace.upload("ratio", float4(values, valid)))
+    found = adaptive.varying_cells(engine, grid, 4)
+    expected, margin = twin.varying(np.concatenate([values, valid[..., None]], -1), adaptive.LEAST_CHANGE)
+    clear = np.abs(margin) > 1e-5
+    np.testing.assert_array_equal(found[clear], expected[clear])
+    assert 0 < found.sum() < found.size or stride == 8
+
+
+@pytest.mark.parametrize("stride", [1, 3, 4, 8])
+def test_pixels_of_cells(stride: int) -> None:
+    """Cell i begins at sample i - 1; pixel x is in the cell of the last sample at or before it."""
+    width, height = 37, 29
+    random = np.random.default_rng(1)
+    cells = random.random((height // stride + 1, width // stride + 1)) < 0.5
+    pixels = adaptive.pixels_of(cells, stride, width, height)
+    for y, x in np.ndindex(height, width):
+        row, col = (int(np.floor((a - stride // 2) / stride)) + 1 for a in (y, x))
+        assert pixels[y, x] == cells[min(row, cells.shape[0] - 1), min(col, cells.shape[1] - 1)]
+
+
+def test_grown() -> None:
+    mask = np.zeros((9, 9), bool)
+    mask[4, 4] = mask[0, 8] = True
+    expected = np.zeros_like(mask)
+    expected[2:7, 2:7] = expected[:3, 6:] = True
+    np.testing.assert_array_equal(adaptive.grown(mask, 2), expected)
+
+
+def buffer_of(engine: Engine, surface: Surface) -> Buffer:
+    return Buffer(
+        download4(engine, surface.positions).astype(float),
+        download4(engine, surface.normals).astype(float),
+        np.zeros((*SIZE, 3)),
+    )

@@ -1,0 +1,115 @@
+// Depth pictures of the volume from all around it, and what they say of visibility (thesis 6.2.1, 7.3.2).
+// Provides draw_views, look_into_views.
+#include "direction_sets.clh"
+#include "rays.clh"
+
+#ifndef MASK_WORDS
+#error MASK_WORDS must be defined: 32-bit words that hold one bit a direction
+#endif
+#ifndef SIDE
+#error SIDE must be defined: pixels of an auxiliary view's side
+#endif
+
+// Slope of the outermost pixel centres' lines of sight is SIDE / 2 - 1 / 2 of these.
+static inline float slope_of(const float pixel, const float per_pixel) {
+    return (pixel - 0.5f * (SIDE - 1)) * per_pixel;
+}
+
+// Where the lines of sight of auxiliary views first meet a solid voxel: what is behind it, as seen from there, gets no light from
+// there. One item LANES pixels of a row of views[get_global_id(2)]. axes [views][3]: right, down and forward, unit, volume space; a
+// view's eye is distance_m before center. per_pixel: slope of a pixel. -> depths [view][SIDE][SIDE]: metres along the axis, 0 = none.
+kernel void draw_views(const int count, global const int *views, const int4 bricks, global const int *slots, global const uchar *gaps,
+                       global const ulong *solid, global const uchar *octets, global const float2 *voxels, const float voxel_m,
+                       const float truncation_m, const float4 center, const float distance_m, const float per_pixel,
+                       global const float4 *axes, global float *depths) {
+    const int x = get_global_id(0) * LANES;
+    const int y = get_global_id(1);
+    if (x >= SIDE || y >= SIDE || (int)get_global_id(2) >= count) return;
+    const int view = views[get_global_id(2)];
+    const float4 right = axes[3 * view], down = axes[3 * view + 1], ahead = axes[3 * view + 2];
+    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
+    const floatn across = (CONVERT_FLOATN(x + CONVERT_INTN(LANE_NUMBERS)) - 0.5f * (SIDE - 1)) * per_pixel;
+    const float4 middle = ahead + slope_of(y, per_pixel) * down;
+    const floatn shorten = 1.0f / sqrt(across * across + dot(middle, middle));
+    const Vectors direction = {(middle.x + across * right.x) * shorten, (middle.y + across * right.y) * shorten,
+                               (middle.z + across * right.z) * shorten};
+    const Rays rays = make_rays((center.xyz - distance_m * ahead.xyz) / voxel_m, direction);
+    floatn begin, end;
+    clip_rays(volume, rays, &begin, &end);
+    const floatn t = find_solid_voxels(volume, rays, begin, end);
+    float found[LANES];
+    STORE_LANES((MASK(t < end) & MASK(begin < end)) ? t * shorten * voxel_m : 0.0f, found);
+    for (int lane = 0; lane < min(LANES, SIDE - x); lane++) depths[(view * SIDE + y) * SIDE + x + lane] = found[lane];
+}
+
+// LANES samples of the same direction set: every 8th sample along both axes has the same (direction_sets.clh), and what they look
+// into for one direction is one view.
+#define SET_STEP 8
+#define LANE_COLS (LANES == 8 ? 4 : 1)
+#define LANE_ROWS (LANES / LANE_COLS)
+
+// Whether auxiliary views from where the directions' light comes see the samples: nothing that one sees in a point's pixel is nearer
+// to it, within reach_m of the point and above the point's tangent plane by lift_m.
+//
+// One item LANES samples, `blocks` items a set. positions [h][w], sample_normals [rows][cols] (w = 0 without surface); axes,
+// depths, center, distance_m, per_pixel: see draw_views; view_of [sets][count]: the view for a direction.
+// -> lit [rows][cols][MASK_WORDS]: bit j = direction j lies above the surface and its light arrives.
+kernel void look_into_views(const int cols, const int rows, const int stride, const int width, const int block_cols,
+                            const int block_rows, global const float4 *positions, global const float4 *sample_normals,
+                            const int count, const int first_set, global const float4 *directions, global const int *view_of,
+                            global const float4 *axes, global const float *depths, const float4 center, const float distance_m,
+                            const float per_pixel, const float reach_m, const float lift_m, global uint *lit) {
+    const int item = get_global_id(0);
+    const int blocks = block_cols * block_rows;
+    if (item >= SET_STEP * SET_STEP * blocks) return;
+    const int place = item / blocks, block = item % blocks;
+    const int first_col = place % SET_STEP + block % block_cols * (SET_STEP * LANE_COLS);
+    const int first_row = place / SET_STEP + block / block_cols * (SET_STEP * LANE_ROWS);
+    float px[LANES], py[LANES], pz[LANES], nx[LANES], ny[LANES], nz[LANES];
+    int covered = 0;
+    for (int lane = 0; lane < LANES; lane++) {
+        const int col = first_col + lane % LANE_COLS * SET_STEP, row = first_row + lane / LANE_COLS * SET_STEP;
+        float4 position = (float4)(0.0f), normal = (float4)(0.0f);
+        if (col < cols && row < rows) {
+            position = positions[(stride / 2 + row * stride) * width + stride / 2 + col * stride] - center;
+            normal = sample_normals[row * cols + col];
+        }
+        covered |= normal.w > 0.0f;
+        px[lane] = position.x, py[lane] = position.y, pz[lane] = position.z;
+        nx[lane] = normal.x, ny[lane] = normal.y, nz[lane] = normal.z;
+    }
+    uint bits[LANES * MASK_WORDS];
+    for (int i = 0; i < LANES * MASK_WORDS; i++) bits[i] = 0;
+    if (covered) {
+        const Vectors p = {LOAD_LANES(px), LOAD_LANES(py), LOAD_LANES(pz)}, n = {LOAD_LANES(nx), LOAD_LANES(ny), LOAD_LANES(nz)};
+        const float shift_x = 0.5f * SIDE + (first_col & 1) * 0.5f - 0.25f, shift_y = 0.5f * SIDE + (first_row & 1) * 0.5f - 0.25f;
+        const int set = (first_set + direction_set(first_row, first_col)) * count;
+        for (int j = 0; j < count; j++) {
+            const float4 w = directions[set + j];
+            const intn above = MASK(n.x * w.x + n.y * w.y + n.z * w.z > 0.0f);
+            if (!ANY(above)) continue;
+            const int view = view_of[set + j];
+            const float4 right = axes[3 * view], down = axes[3 * view + 1], ahead = axes[3 * view + 2];
+            const floatn z = ahead.x * p.x + ahead.y * p.y + ahead.z * p.z + distance_m;
+            const floatn pixels = 1.0f / (z * per_pixel);
+            const floatn x = (right.x * p.x + right.y * p.y + right.z * p.z) * pixels + shift_x;
+            const floatn y = (down.x * p.x + down.y * p.y + down.z * p.z) * pixels + shift_y;
+            const intn col = clamp(CONVERT_INTN(x), 0, SIDE - 1), row = clamp(CONVERT_INTN(y), 0, SIDE - 1);
+            const floatn depth = GATHER_FLOATN(depths, ((view * SIDE + row) * SIDE + col) & above);
+            const floatn sx = (CONVERT_FLOATN(col) - 0.5f * (SIDE - 1)) * per_pixel, sy = (CONVERT_FLOATN(row) - 0.5f * (SIDE - 1)) * per_pixel;
+            const floatn tx = depth * (sx * right.x + sy * down.x + ahead.x) - (distance_m * ahead.x + p.x);
+            const floatn ty = depth * (sx * right.y + sy * down.y + ahead.y) - (distance_m * ahead.y + p.y);
+            const floatn tz = depth * (sx * right.z + sy * down.z + ahead.z) - (distance_m * ahead.z + p.z);
+            const intn hidden = MASK(depth > 0.0f) & MASK(depth < z) & MASK(tx * n.x + ty * n.y + tz * n.z > lift_m) &
+                                MASK(tx * tx + ty * ty + tz * tz < reach_m * reach_m);
+            const int arrives = bits_of(above & ~hidden);
+            for (int lane = 0; lane < LANES; lane++)
+                bits[lane * MASK_WORDS + (j >> 5)] |= (uint)((arrives >> lane) & 1) << (j & 31);
+        }
+    }
+    for (int lane = 0; lane < LANES; lane++) {
+        const int col = first_col + lane % LANE_COLS * SET_STEP, row = first_row + lane / LANE_COLS * SET_STEP;
+        if (col >= cols || row >= rows) continue;
+        for (int i = 0; i < MASK_WORDS; i++) lit[(row * cols + col) * MASK_WORDS + i] = bits[lane * MASK_WORDS + i];
+    }
+}

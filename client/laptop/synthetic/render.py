@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from client.laptop.synthetic.charts import Grid
 from client.laptop.synthetic.harmonics import unshadowed_transfer
+from client.laptop.synthetic.lamps import Lamp, lamplight
 from client.laptop.synthetic.lights import DistantLight
 from client.laptop.synthetic.shapes import Solid
 from client.laptop.synthetic.textures import PLAIN_ALBEDO, Texture
@@ -39,13 +40,15 @@ class Rendering:
     depth_m: Floats
     """[h, w] along the camera's z; 0 = no surface."""
     owner: NDArray[np.int16]
-    """[h, w] position in the list of solids, -1 = no surface."""
+    """[h, w] position in the list of solids, lamps' bulbs after them, -1 = no surface."""
     normals: Floats
     """[h, w, 3] world."""
     albedo: Floats
     """[h, w, 3] linear."""
     radiance: Floats
     """[h, w, 3] linear, in the units of the picture; the backdrop where there is no surface."""
+    lamplight: Floats
+    """[h, w, 3] the part of it that lamps send to surfaces."""
 
 
 def camera_rays(camera: CameraModel) -> Floats:
@@ -84,19 +87,33 @@ def cast(solids: list[Solid], camera: CameraModel, rays: Floats, pose: Floats) -
     return depth.ravel(), owner.ravel()
 
 
-def render(bodies: list[Lit], camera: CameraModel, rays: Floats, pose: Floats, light: DistantLight) -> Rendering:
+def render(
+    bodies: list[Lit],
+    camera: CameraModel,
+    rays: Floats,
+    pose: Floats,
+    light: DistantLight,
+    lamps: tuple[Lamp, ...] = (),
+) -> Rendering:
     """Everything about one view."""
-    depth, owner = cast([body.solid for body in bodies], camera, rays, pose)
+    solids: list[Solid] = [body.solid for body in bodies]
+    depth, owner = cast([*solids, *(lamp.bulb for lamp in lamps)], camera, rays, pose)
     directions = rays @ pose[:3, :3].T
     count = len(rays)
     normals, albedo, radiance = np.zeros((count, 3)), np.zeros((count, 3)), np.empty((count, 3))
+    near = np.zeros((count, 3))
     for number, body in enumerate(bodies):
         pixels = np.flatnonzero(owner == number)
         if pixels.size:
             points = pose[:3, 3] + depth[pixels, None] * directions[pixels]
             normals[pixels] = body.solid.normals(points)
             albedo[pixels] = PLAIN_ALBEDO if body.texture is None else body.texture(points)
-            radiance[pixels] = albedo[pixels] * irradiance(body, points, normals[pixels], light)
+            near[pixels] = albedo[pixels] * lamplight(lamps, solids, points, normals[pixels])
+            radiance[pixels] = albedo[pixels] * irradiance(body, points, normals[pixels], light) + near[pixels]
+    for number, lamp in enumerate(lamps, len(bodies)):
+        pixels = np.flatnonzero(owner == number)
+        normals[pixels] = lamp.bulb.normals(pose[:3, 3] + depth[pixels, None] * directions[pixels])
+        radiance[pixels] = lamp.radiance
     empty = np.flatnonzero(owner < 0)
     away = directions[empty] / np.linalg.norm(directions[empty], axis=1, keepdims=True)
     radiance[empty] = BACKDROP * light.radiance(away)
@@ -108,6 +125,7 @@ def render(bodies: list[Lit], camera: CameraModel, rays: Floats, pose: Floats, l
         normals.reshape(*shape, 3),
         albedo.reshape(*shape, 3),
         radiance.reshape(*shape, 3),
+        near.reshape(*shape, 3),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from client.laptop.synthetic import textures
 from client.laptop.synthetic.rounds import Cylinder, Sphere
 from client.laptop.synthetic.shapes import Solid, box, rotation_about, wedge
 from client.laptop.synthetic.shell import Opening, Shell
+
+DIM_SKY = 0.2
+"""Brightness of the sky where lamps are what lights the room."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,11 @@ def room() -> Scene:
         Body(Cylinder(np.array([1.2, 0.0, 0.35]), np.array([0, 1.0, 0]), 0.45, 0.17), paint(0.25, 0.5, 0.35)),
     )
     return Scene("room", bodies, 0.025, 6144, _walk_in_room, brightness=1.5)
+
+
+def lamp_room() -> Scene:
+    """The room under a dim sky: what lights it are its lamps, see lamps.py."""
+    return replace(room(), brightness=DIM_SKY)
 
 
 def _walk_around_table(time_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -13,6 +13,7 @@ from client.laptop.synthetic.bake import bake
 from client.laptop.synthetic.cache import cached
 from client.laptop.synthetic.charts import atlas
 from client.laptop.synthetic.harmonics import sphere_directions
+from client.laptop.synthetic.lamps import Lamp, room_lamps
 from client.laptop.synthetic.lights import RING_SIZE, DistantLight, ring_light
 from client.laptop.synthetic.noise import kinect_like
 from client.laptop.synthetic.render import Lit, Rendering, camera_rays, look_at, render
@@ -47,6 +48,10 @@ class Truth:
     """[h, w, 3] the picture before it is encoded as sRGB in 8 bits."""
     light_direction: NDArray[np.float64]
     """[3] unit, world: the dominant direction of the light."""
+    lamps: tuple[Lamp, ...]
+    """Lights inside the scene, besides `sh`."""
+    lamplight: NDArray[np.float64]
+    """[h, w, 3] the part of `radiance` that lamps send to surfaces."""
 
 
 class SyntheticSource:
@@ -66,6 +71,7 @@ class SyntheticSource:
             width=width, height=height, fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2
         )
         self.scene = SCENES[options.name]()
+        self.lamps = room_lamps(options.lamps, options.place)
         self._rays = camera_rays(self.camera)
         self._grids = atlas([solid.charts for solid in self.scene.solids], self.scene.step_m)
         self._texel_light = lru_cache(maxsize=1)(self._shadowed_light)
@@ -103,9 +109,11 @@ class SyntheticSource:
             normals=rendering.normals.astype(np.float32),
             albedo=rendering.albedo.astype(np.float32),
             visible=rendering.owner >= 0,
-            dynamic=rendering.owner >= len(self.scene.bodies),
+            dynamic=(rendering.owner >= len(self.scene.bodies)) & (self.options.name == "hand"),
             radiance=rendering.radiance,
             light_direction=light.direction,
+            lamps=self.lamps,
+            lamplight=rendering.lamplight,
         )
 
     def _bake(self) -> dict[str, NDArray]:
@@ -136,7 +144,7 @@ class SyntheticSource:
         ]
         if self.options.name == "hand":
             bodies = self._with_hand(bodies, index, light)
-        return render(bodies, self.camera, self._rays, self.pose(index), light)
+        return render(bodies, self.camera, self._rays, self.pose(index), light, self.lamps)
 
     def _with_hand(self, bodies: list[Lit], index: int, light: DistantLight) -> list[Lit]:
         """The static bodies under the hand's shadow, then the hand's parts."""

@@ -9,16 +9,21 @@ from urllib.parse import parse_qsl
 
 from client.laptop.errors import SourceError
 from client.laptop.synthetic import scenes
+from client.laptop.synthetic.halves import halves
+from client.laptop.synthetic.lamps import PLACES_M
 from client.laptop.synthetic.lights import RING_SIZE
 from protocol.limits import MAX_IMAGE_PIXELS
 
 LARGEST_FRAMES = 100_000
+LARGEST_LAMPS = 2
 
 SCENES: dict[str, Callable[[], scenes.Scene]] = {
     "room": scenes.room,
     "table": scenes.table,
     "hand": scenes.table,
     "light": scenes.table,
+    "lamp": scenes.lamp_room,
+    "halves": halves,
 }
 
 
@@ -32,6 +37,9 @@ class Options:
     light: int = 1
     texture: bool = False
     noise: bool = False
+    lamps: int = 0
+    place: int = 0
+    """Of the first lamp, see lamps.py."""
 
 
 def parse_spec(spec: str) -> Options:
@@ -39,7 +47,7 @@ def parse_spec(spec: str) -> Options:
     name, _, query = spec.removeprefix("synthetic:").partition("?")
     if name not in SCENES:
         raise SourceError(f"{spec}: there is no such scene; use synthetic:{', synthetic:'.join(SCENES)}")
-    options = Options(name, texture=name == "room")
+    options = Options(name, texture=name in ("room", "halves"), lamps=int(name == "lamp"))
     for key, value in parse_qsl(query, keep_blank_values=True):
         if key not in _KEYS:
             raise SourceError(f"{spec}: there is no key {key!r}; use {', '.join(_KEYS)}")
@@ -47,6 +55,8 @@ def parse_spec(spec: str) -> Options:
             options = replace(options, **{key: _KEYS[key](value)})
         except ValueError as error:
             raise SourceError(f"{spec}: {key}={value}: expected {error}") from None
+    if options.lamps and name != "lamp":
+        raise SourceError(f"{spec}: only synthetic:lamp has lamps")
     return options
 
 
@@ -81,4 +91,6 @@ _KEYS: dict[str, Callable[[str], Any]] = {
     "light": _count(0, RING_SIZE - 1),
     "texture": _flag,
     "noise": _flag,
+    "lamps": _count(0, LARGEST_LAMPS),
+    "place": _count(0, len(PLACES_M) - 1),
 }

@@ -52,7 +52,7 @@ def _tv_l1_rows(part: Part, engine: Engine, gray: Picture, iterations: int, tria
         nonlocal theirs
         theirs = _opencv(gray, iterations)
 
-    (our_ms, our_cpu), (their_ms, their_cpu) = _in_turn((run_ours, run_theirs), trials)
+    (our_ms, our_cpu), (their_ms, their_cpu) = in_turn((run_ours, run_theirs), trials)
     result = np.clip(engine.download(tv_l1(engine, picture, iterations, WEIGHT)), 0, 1)
     ours = np.rint(255 * result).astype(np.uint8)  # as theirs are
     name = f"TV-L1, {iterations} iterations"
@@ -76,7 +76,7 @@ def _bilateral_rows(part: Part, engine: Engine, depth_m: NDArray[np.float32], tr
     def run_theirs() -> None:
         cv2.bilateralFilter(depth_m, 7, 0.03, 2.0)
 
-    (our_ms, our_cpu), (their_ms, _) = _in_turn((run_ours, run_theirs), trials)
+    (our_ms, our_cpu), (their_ms, _) = in_turn((run_ours, run_theirs), trials)
     part.add("bilateral filter of depth: probeless, median", our_ms, "ms", f"<= {BILATERAL_GOAL_MS}")
     part.add("bilateral filter of depth: probeless, processor time, median", our_cpu, "ms")
     part.add("bilateral filter of depth: OpenCV bilateralFilter 7x7 (holes not left out), median", their_ms, "ms")
@@ -98,7 +98,7 @@ def energy(picture: Picture, noisy: Picture) -> float:
     return float(np.hypot(right, down).sum() + WEIGHT * np.abs(u - f).sum())
 
 
-def _in_turn(runs: tuple[Callable[[], None], ...], trials: int) -> list[tuple[float, float]]:
+def in_turn(runs: tuple[Callable[[], None], ...], trials: int) -> list[tuple[float, float]]:
     """Median wall and processor ms of each, run by turns after one round that does not count."""
     times: list[list[tuple[float, float]]] = [[] for _ in runs]
     for trial in range(trials + 1):

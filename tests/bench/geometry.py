@@ -15,7 +15,6 @@ from server.opencl.device import open_device
 from tests.bench.finished import Finished, Part
 from tests.bench.geometry_parts import (
     OUT,
-    Run,
     filters,
     hand,
     interleaving_part,
@@ -27,6 +26,7 @@ from tests.bench.geometry_parts import (
     trajectory_part,
 )
 from tests.bench.geometry_pictures import draw_times
+from tests.bench.run import Run
 
 PARTS: dict[str, Callable[[Run], Part]] = {
     "speed": speed_part,

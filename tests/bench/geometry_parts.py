@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -13,21 +11,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.source import Source, open_source
+from client.laptop.source import Source
 from client.progress import note
 from server.evaluation.hand import HandBefore
 from server.evaluation.interleaving import interleaving_spread
 from server.evaluation.memory import room_memory
 from server.evaluation.noise import NormalView, normal_improvement, plane_normals
 from server.evaluation.surface import fused_views, surface_accuracy
-from server.opencl.device import Device, open_device
+from server.opencl.device import open_device
 from tests.bench.contest import WARM_UP, contest_part, play
 from tests.bench.filters import filters_part
-from tests.bench.finished import ROOT, Part, UnmeasurableError
+from tests.bench.finished import Part
 from tests.bench.geometry_pictures import draw_hand, draw_surface
 from tests.bench.hand import hand_part, hand_volume
 from tests.bench.hybrid_normals import add_moving_rows, add_still_rows
 from tests.bench.peers.contestant import Scene
+from tests.bench.run import Run, data_folder, data_source
 from tests.bench.thin import CHAIR_SOURCE, add_rod_rows, draw_thin
 from tests.bench.trajectories import trajectory_rows
 
@@ -47,21 +46,6 @@ CLEAN, NOISY, ROOM, KITCHEN, HAND = (
     "rgbd_7scenes_redkitchen",
     "hand_depth_sr305",
 )
-
-Say = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Run:
-    """What every part is told."""
-
-    device: Device
-    quick: bool
-    say: Say
-
-    def of(self, quick: int, full: int) -> int:
-        """How many: the one of this size of run."""
-        return quick if self.quick else full
 
 
 def speed_part(run: Run) -> Part:
@@ -191,16 +175,3 @@ def interleaving_part(run: Run) -> Part:
 
 def _room_memory(frames: int) -> dict[str, float]:
     return room_memory(open_device(None), note, frames)
-
-
-def data_folder(name: str) -> Path:
-    """Folder of a public data set. Raises UnmeasurableError."""
-    base = Path(os.environ.get("PROBELESS_DATA", ROOT.parent / "shared" / "data"))
-    if not (base / name).exists():
-        raise UnmeasurableError(f"public data set {name} is not at {base} (set PROBELESS_DATA)")
-    return base / name
-
-
-def data_source(name: str) -> Source:
-    """A public data set as a source. Raises UnmeasurableError."""
-    return open_source(str(data_folder(name)))

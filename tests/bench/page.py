@@ -1,0 +1,36 @@
+"""Puts a suite's last figures into its page of docs/benchmarks, between two marks, and the JSON beside the page."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+START, END = "<!-- figures -->\n", "<!-- end of figures -->\n"
+
+
+def write_page(page: Path, result: Path) -> None:
+    """Write the figures of a suite's result.json into `page`, and a copy of it beside the page."""
+    before, _, rest = page.read_text().partition(START)
+    after = rest.partition(END)[2]
+    page.write_text(before + START + figures(json.loads(result.read_text())) + END + after)
+    shutil.copy(result, page.with_suffix(".json"))
+
+
+def figures(result: dict[str, Any]) -> str:
+    """Markdown: the machine, what was held and what not, all rows, what was not measured."""
+    sizes = ", ".join(f"{name}: {count}" for name, count in result["sizes"].items())
+    held = [row for row in result["rows"] if row["goal"]]
+    others = [row for row in result["rows"] if not row["goal"]]
+    lines = [f"Commit {result['commit']} on {result['device']}. {sizes}.", "", "Held against a goal:", ""]
+    lines += ["| row | value | unit | goal | holds |", "|---|---|---|---|---|"]
+    for row in held:
+        holds = "yes" if row["holds"] else "**no**"
+        lines.append(f"| {row['name']} | {row['value']:.4g} | {row['unit']} | {row['goal']} | {holds} |")
+    lines += ["", "Beside them:", "", "| row | value | unit |", "|---|---|---|"]
+    lines += [f"| {row['name']} | {row['value']:.4g} | {row['unit']} |" for row in others]
+    if result["unmeasured"]:
+        lines += ["", "Not measured:", ""]
+        lines += [f"- {item['name']}: {item['reason']}" for item in result["unmeasured"]]
+    return "\n".join([*lines, ""])

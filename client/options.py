@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from client.laptop.errors import OptionError
+from client.laptop.light_file import read_light, read_panorama_light
 from client.laptop.objects import ObjectFile, parse_object
 from client.laptop.source import Source, open_source
 from client.laptop.volume import Volume, default_volume, default_voxel, with_room_to_move
 from protocol.limits import MAX_SH_BANDS
 from protocol.messages import Wishes
 
-BUILT_PRESETS = ("rm", "reg4", "reg8")
-PRESETS = (*BUILT_PRESETS, "art1", "art4", "art8", "gr15", "gr15fast", "auto")
+BUILT_PRESETS = ("rm", "reg4", "reg8", "art1", "art4", "art8", "gr15", "gr15fast")
+PRESETS = (*BUILT_PRESETS, "auto")
 THESIS_RAY_LENGTH_M = 0.1
 DENOISE = ("none", "bilateral", "tv_l1")
 
@@ -37,8 +39,8 @@ RayLength = Annotated[
     str | None, typer.Option(metavar="M|room", help="how far occluders are looked for; default: room")
 ]
 Bands = Annotated[int, typer.Option(min=2, max=MAX_SH_BANDS, help="spherical-harmonics bands")]
-Albedo = Annotated[str | None, typer.Option(metavar="constant|estimated", help="default: constant")]
-Indirect = Annotated[str | None, typer.Option(metavar="none|observed", help="default: none")]
+Albedo = Annotated[str | None, typer.Option(metavar="constant|estimated", help="default: estimated")]
+Indirect = Annotated[str | None, typer.Option(metavar="none|observed", help="default: observed")]
 AsThesis = Annotated[bool, typer.Option("--as-thesis", help="--ray-length 0.1 --albedo constant --indirect none")]
 Denoise = Annotated[
     str, typer.Option(metavar="|".join(DENOISE), help="of the lightness that the light is estimated from")
@@ -50,6 +52,9 @@ Object = Annotated[
 Up = Annotated[str | None, typer.Option(metavar="x,y,z", help="default: what the source says, else the camera's -y")]
 LightFile = Annotated[str | None, typer.Option("--light", metavar="FILE", help="use this light, estimate none")]
 Panorama = Annotated[str | None, typer.Option(metavar="FILE", help="light from a panorama")]
+Lamps = Annotated[
+    str | None, typer.Option(metavar="on|off", help="look for lights inside the room; default: where called for")
+]
 Mesh = Annotated[bool, typer.Option("--mesh", help="write mesh.ply and mesh.glb")]
 BudgetMs = Annotated[float | None, typer.Option(metavar="N", help="choose the operating point for this time")]
 MaxLightError = Annotated[float | None, typer.Option(metavar="DEG", help="choose it for this light error")]
@@ -78,6 +83,7 @@ class CaptureOptions:
     up: str | None = None
     light: str | None = None
     panorama: str | None = None
+    lamps: str | None = None
     budget_ms: float | None = None
     max_light_error: float | None = None
 
@@ -128,12 +134,9 @@ def refuse_unbuilt(options: CaptureOptions) -> None:
     _choice("--poses", options.poses, ("given", "track", "refine"))
     _choice("--albedo", options.albedo, ("constant", "estimated"))
     _choice("--indirect", options.indirect, ("none", "observed"))
+    _choice("--lamps", options.lamps, ("on", "off"))
     unbuilt = {
         f"--preset {options.preset}": (options.preset not in BUILT_PRESETS, f"use {', '.join(BUILT_PRESETS)}"),
-        "--albedo estimated": (options.albedo == "estimated", "use --albedo constant"),
-        "--indirect observed": (options.indirect == "observed", "use --indirect none"),
-        "--light": (options.light is not None, "leave it out and the light is estimated"),
-        "--panorama": (options.panorama is not None, "leave it out and the light is estimated"),
         "--budget-ms": (options.budget_ms is not None, "choose a --preset and --rays instead"),
         "--max-light-error": (options.max_light_error is not None, "choose a --preset and --rays instead"),
     }
@@ -196,16 +199,34 @@ def _wishes_of_options(options: CaptureOptions) -> dict[str, Any]:
         raise OptionError(f"--voxel {options.voxel:g}: expected metres, more than 0 and at most 1")
     if options.as_thesis and options.ray_length is not None:
         raise OptionError("--as-thesis sets --ray-length 0.1; leave one of the two out")
+    for name, asked in (("--albedo", options.albedo), ("--indirect", options.indirect)):
+        if options.as_thesis and asked not in (None, "constant", "none"):
+            raise OptionError(f"--as-thesis sets {name}; leave one of the two out")
     ray_length_m = THESIS_RAY_LENGTH_M if options.as_thesis else parse_ray_length(options.ray_length)
     return {
         "preset": options.preset,
         "rays": options.rays,
         "ray_length_m": ray_length_m,
         "bands": options.bands,
+        "albedo": options.albedo or ("constant" if options.as_thesis else "estimated"),
+        "indirect": options.indirect or ("none" if options.as_thesis else "observed"),
         "as_thesis": options.as_thesis,
         "denoise": options.denoise,
         "denoise_iterations": options.denoise_iterations,
+        "lamps": options.lamps or "auto",
+        **_given_light(options),
     }
+
+
+def _given_light(options: CaptureOptions) -> dict[str, Any]:
+    """The wishes of `--light` and `--panorama`. Raises OptionError."""
+    if options.light is not None and options.panorama is not None:
+        raise OptionError("--light and --panorama each give the light; leave one of the two out")
+    if options.light is not None:
+        return {"light": read_light(Path(options.light))}
+    if options.panorama is not None:
+        return {"light": read_panorama_light(Path(options.panorama), options.bands), "light_axes": "webxr"}
+    return {}
 
 
 def _choice(name: str, value: str | None, allowed: tuple[str, ...]) -> None:

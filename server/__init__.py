@@ -1,0 +1,6 @@
+"""The server: fuses the room, finds its light, renders what is virtual."""
+
+import os
+
+# Its threads wait in busy loops, and take the cores from PoCL's. NumPy reads this once, when it is first imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import LeftOut, Light, Plan, Timings, Tracking, Wishes
 from server.effects import EFFECTS, View, gather_facts
 from server.geometry import Geometry, GeometryFrame
+from server.light import RoomLight
 from server.light_message import light_message
 from server.maths.sh import webxr_from_world
 from server.meshing.scene_mesh import SceneMesh, scene_mesh
@@ -23,13 +25,16 @@ from server.plan import execute, make_plan
 from server.scene.mesh import Mesh
 from server.scene.objects import SceneObjects
 from server.scene.placement import Placement
-from server.settings import Settings, read_wishes, stride_of
+from server.settings import Settings, read_wishes, sampling_of
 from server.stages.composite import shown_picture
 from server.stages.denoise import denoise_radiance
 from server.stages.differential_rendering import upload_light
-from server.stages.light_estimation import LightEstimate, LightEstimator, sum_tiles
-from server.stages.radiance_transfer import direction_sets, transfer_radiance
+from server.stages.lamp_finder import LampFinder
+from server.stages.light_estimation import LightEstimate
+from server.stages.near_light import remove_lamps
+from server.stages.sampling import Sampling, TransferSampler
 from server.stages.volume import Volume
+from server.static_light import static_estimate
 
 
 @dataclass(frozen=True)
@@ -56,8 +61,10 @@ class Pipeline:
         self._wishes = wishes
         self._engine = Engine(device)
         self._geometry = Geometry(self._engine, camera, wishes)
-        self._rays = direction_sets(self._settings.rays, self._settings.bands)
-        self._estimator = LightEstimator(self._settings.bands, as_thesis=self._settings.as_thesis)
+        self._sampler = self._make_sampler(self._settings.sampling)
+        self._room_light = RoomLight(self._engine, camera, self._settings)
+        self._lamps = LampFinder(self._engine, camera, self._settings.lamps)
+        self._given_light: LightEstimate | None = None
         self._objects: SceneObjects | None = None
         self._waiting: list[tuple[str, Mesh, Placement]] = []
         self._webxr_from_world = np.eye(3)
@@ -75,62 +82,74 @@ class Pipeline:
         geometry = self._geometry.update(frame)  # ch. 4
         volume, objects = self._scene(geometry)
         if geometry.tracking == "lost":
-            return self._lost(frame, geometry, started)
+            return self._lost(frame, geometry, volume, started)
         measurement, surface = geometry.measurement, geometry.surface
 
         with stage("radiance_transfer"):  # 5.1.2, eq. 5.2
-            transfer = transfer_radiance(engine, camera, volume, surface, settings.stride, self._rays, settings.reach_m)
+            transfer = self._sampler.transfer(
+                volume, surface, geometry.volume_from_camera, objects.up, settings.reach_m
+            )
         with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
-            smooth = denoise_radiance(engine, measurement, settings.denoise, settings.denoise_iterations)
-            tiles = sum_tiles(engine, camera, smooth, surface, transfer, volume.voxel_m)
-            with engine.profile.host():
-                estimate = self._estimator.update(tiles)
+            estimate = self._given_light  # S2
+            if estimate is None:
+                smooth = denoise_radiance(engine, measurement, settings.denoise, settings.denoise_iterations)
+                distant = remove_lamps(engine, smooth, surface, volume, self._lamps.lamps)  # B4
+                estimate = self._room_light.update(
+                    distant, measurement.depth_m, geometry, volume, transfer, self._sampler.rays
+                )
         with stage("rendering"):  # 7.1-7.2, the effects this frame calls for
-            view = View(engine, camera, geometry.volume_from_camera, settings.reach_m)
+            view = View(engine, camera, geometry.volume_from_camera, settings.reach_m, self._sampler.sampling)
             placed = objects.placed(volume.volume_from_world())
             order, plan = make_plan(EFFECTS, "picture", _GIVEN, gather_facts(view, placed, estimate.sh))
             given = {
                 "view": view,
                 "objects": placed,
                 "volume": volume,
-                "rays": self._rays,
+                "rays": self._sampler.rays,
                 "shown": shown_picture(engine, camera, frame.color, measurement.radiance),
                 "measurement": measurement,
                 "surface": surface,
                 "transfer": transfer,
-                "light": upload_light(engine, estimate.sh, self._rays),
+                "light": upload_light(engine, estimate.sh, self._sampler.rays),
             }
             picture: NDArray[np.uint8] = execute(order, given, "picture")
+        if self._given_light is None:  # B4, for the frames to come: it takes the place of this frame's transfer
+            with stage("light_estimation"):
+                self._lamps.work(measurement.radiance, surface, volume)
 
         engine.queue.finish()
         rows, self.kernel_ms = engine.profile.collect()
         return FrameResult(
             color=picture,
-            light=light_message(frame.index, frame.timestamp_s, estimate, self._webxr_from_world),
+            light=self._light_message(frame, estimate, volume),
             world_from_camera=geometry.world_from_camera,
             tracking=geometry.tracking,
             timings=Timings(**rows, total=(time.perf_counter() - started) * 1e3),
-            plan=plan,
+            plan=structs.replace(plan, left_out=(*plan.left_out, *self._lamps.left_out())),
             notes=(*geometry.notes, *_notes(estimate)),
         )
 
-    def _lost(self, frame: RgbdFrame, geometry: GeometryFrame, started: float) -> FrameResult:
+    def _lost(self, frame: RgbdFrame, geometry: GeometryFrame, volume: Volume, started: float) -> FrameResult:
         """The camera's own picture and the last light: where it is not known, nothing can be drawn or learnt."""
         with self._engine.profile.stage("rendering"):
             picture = shown_picture(self._engine, self._camera, frame.color, geometry.measurement.radiance)
         left_out = tuple(LeftOut(effect=e.name, reason="the camera is lost", error_bound=255.0) for e in EFFECTS)
-        estimate = self._estimator.estimate()
+        estimate = self._given_light or self._room_light.estimate()
         self._engine.queue.finish()
         rows, self.kernel_ms = self._engine.profile.collect()
         return FrameResult(
             color=picture,
-            light=light_message(frame.index, frame.timestamp_s, estimate, self._webxr_from_world),
+            light=self._light_message(frame, estimate, volume),
             world_from_camera=geometry.world_from_camera,
             tracking="lost",
             timings=Timings(**rows, total=(time.perf_counter() - started) * 1e3),
             plan=Plan(run=(), left_out=left_out),
             notes=(*geometry.notes, *_notes(estimate)),
         )
+
+    def _light_message(self, frame: RgbdFrame, estimate: LightEstimate, volume: Volume) -> Light:
+        lamps = self._lamps.lamps_at(volume.origin_world)
+        return light_message(frame.index, frame.timestamp_s, estimate, self._webxr_from_world, lamps)
 
     def place_object(self, object_id: str, mesh: Mesh, placement: Placement) -> tuple[str, ...]:
         """Put a mesh into the scene, in the place of one with the same id; returns notes about it."""
@@ -157,7 +176,9 @@ class Pipeline:
 
     def set_preset(self, preset: str) -> None:
         """Change the sampling preset from the next frame on. Raises ValueError for one that does not exist."""
-        self._settings = replace(self._settings, stride=stride_of(preset))
+        sampling = sampling_of(preset)
+        if sampling != self._sampler.sampling:
+            self._sampler = self._make_sampler(sampling)
 
     def scene_mesh(self, progress: Callable[[int, int], None] = lambda _done, _total: None) -> SceneMesh:
         """The surface fused so far as triangles. Raises MeshingError, one line, where there is none."""
@@ -173,6 +194,10 @@ class Pipeline:
             self._objects.clear()
         self._engine.close()
 
+    def _make_sampler(self, sampling: Sampling) -> TransferSampler:
+        """Transfer sampled from the start: nothing is remembered from another preset."""
+        return TransferSampler(self._engine, self._camera, sampling, self._settings.rays, self._settings.bands)
+
     def _scene(self, geometry: GeometryFrame) -> tuple[Volume, SceneObjects]:
         """The volume and the objects; the first frame says what is up."""
         volume = self._geometry.volume
@@ -182,6 +207,7 @@ class Pipeline:
             up = np.array(self._wishes.up or camera_up, np.float64)
             up /= np.linalg.norm(up)
             self._webxr_from_world = webxr_from_world(up, forward)
+            self._given_light = static_estimate(self._wishes, self._settings.bands, self._webxr_from_world)
             self._objects = SceneObjects(self._engine, up)
             for object_id, mesh, placement in self._waiting:
                 self._objects.place(object_id, mesh, placement)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +11,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from server.stages.denoise import DenoiseMethod
-
-STRIDES = {"rm": 1, "reg4": 4, "reg8": 8}
-"""Presets that exist: every how many pixels transfer is sampled (thesis 6.1.3)."""
+from server.stages.sampling import PRESETS, Sampling
 
 WHOLE_ROOM_M = 1000.0
 """Visibility rays this long leave any volume."""
@@ -31,38 +30,41 @@ Bounds = tuple[float, float, float, float, float, float]
 class Settings:
     """A session's operating point."""
 
-    stride: int
+    sampling: Sampling
+    lamps: Literal["auto", "on", "off"]
+    """Whether lights inside the room are looked for."""
     rays: int
     bands: int
     reach_m: float
     as_thesis: bool
+    albedo: Literal["constant", "estimated"]
+    indirect: Literal["none", "observed"]
     denoise: DenoiseMethod
     denoise_iterations: int
 
 
 def read_wishes(wishes: Wishes) -> Settings:
     """Settings for `wishes`. Raises ValueError, one line, for what this server cannot do."""
-    if wishes.albedo != "constant":
-        raise ValueError("albedo 'estimated' is not available: use 'constant'")
-    if wishes.indirect != "none":
-        raise ValueError("indirect 'observed' is not available: use 'none'")
     reach_m = WHOLE_ROOM_M if wishes.ray_length_m is None else wishes.ray_length_m
     return Settings(
-        stride=stride_of(wishes.preset),
+        sampling=sampling_of(wishes.preset),
+        lamps="off" if wishes.as_thesis else wishes.lamps,
         rays=wishes.rays,
         bands=wishes.bands,
         reach_m=THESIS_REACH_M if wishes.as_thesis else reach_m,
         as_thesis=wishes.as_thesis,
+        albedo="constant" if wishes.as_thesis else wishes.albedo,
+        indirect="none" if wishes.as_thesis else wishes.indirect,
         denoise=wishes.denoise,
         denoise_iterations=wishes.denoise_iterations,
     )
 
 
-def stride_of(preset: str) -> int:
-    """Sampling stride of a preset in pixels. Raises ValueError for one that does not exist."""
-    if preset not in STRIDES:
-        raise ValueError(f"preset {preset!r} is not available: use one of {', '.join(STRIDES)}")
-    return STRIDES[preset]
+def sampling_of(preset: str) -> Sampling:
+    """How a preset samples transfer. Raises ValueError for one that does not exist."""
+    if preset not in PRESETS:
+        raise ValueError(f"preset {preset!r} is not available: use one of {', '.join(PRESETS)}")
+    return PRESETS[preset]
 
 
 def bounds_seen(camera: CameraModel, frame: RgbdFrame, world_from_camera: NDArray[np.float64]) -> Bounds:

@@ -116,6 +116,8 @@ def light_row(light: Light) -> dict[str, Any]:
         "sh_webxr": light.sh_webxr,
         "dominant_direction": light.dominant_direction,
         "dominant_intensity": light.dominant_intensity,
+        "dominant_lights": msgspec.to_builtins(light.dominant_lights),
+        "lamps": msgspec.to_builtins(light.lamps),
         "condition": light.condition,
         "valid": light.valid,
     }

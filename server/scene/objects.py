@@ -26,12 +26,12 @@ class SceneObjects:
 
     def __init__(self, engine: Engine, up: NDArray[np.float64]) -> None:
         self._engine = engine
-        self._up = up
+        self.up = up
         self._entries: dict[str, _Entry] = {}
 
     def place(self, object_id: str, mesh: Mesh, placement: Placement) -> None:
         """Add a mesh, in the place of one with the same id."""
-        entry = _Entry(mesh, VirtualObject.upload(self._engine, mesh), world_from_model(mesh, placement, self._up))
+        entry = _Entry(mesh, VirtualObject.upload(self._engine, mesh), world_from_model(mesh, placement, self.up))
         if object_id in self._entries:
             self.remove(object_id)
         self._entries[object_id] = entry
@@ -39,7 +39,7 @@ class SceneObjects:
     def move(self, object_id: str, placement: Placement) -> None:
         """Give an object another place. Raises KeyError if there is none of that id."""
         entry = self._entries[object_id]
-        placed = world_from_model(entry.mesh, placement, self._up)
+        placed = world_from_model(entry.mesh, placement, self.up)
         self._entries[object_id] = _Entry(entry.mesh, entry.thing, placed)
 
     def remove(self, object_id: str) -> None:

@@ -94,7 +94,7 @@ def sum_tiles(
 
     radiance: [h, w] float4 as in Measurement.
     """
-    observed = _gather(engine, camera, radiance, surface, transfer)
+    observed = gather_samples(engine, camera, radiance, surface, transfer)
     pooled_transfer, pooled = _pool(engine, camera, surface, transfer, observed, voxel_m)
     return unpack_tiles(_accumulate(engine, pooled_transfer, pooled), transfer.bands**2)
 
@@ -103,10 +103,10 @@ def _kernel(engine: Engine, name: str, coefficients: int) -> cl.Kernel:
     return engine.kernel("light_estimation.cl", name, COEFFICIENTS=coefficients)
 
 
-def _gather(
+def gather_samples(
     engine: Engine, camera: CameraModel, radiance: cl_array.Array, surface: Surface, transfer: Transfer
 ) -> cl_array.Array:
-    """[rows, cols] float4: what the camera saw at each sample, and whether it may be used."""
+    """[rows, cols] float4: what the camera saw at each sample, w = 1 where usable; `radiance` as in Measurement."""
     observed = engine.workspace.array("observed", (transfer.rows, transfer.cols), cl_types.float4)
     engine.launch(
         _kernel(engine, "gather_samples", transfer.bands**2),

@@ -1,0 +1,72 @@
+// What surfaces send to a sample has been photographed: the colour that the volume holds where a hidden direction ends.
+// Provides gather_hits.
+#include "visibility.clh"
+
+#ifndef MASK_WORDS
+#error MASK_WORDS must be defined: 32-bit words that hold one bit a direction
+#endif
+
+// Colour of a voxel as bricks.py packs it: roots of the channels in 9, 9 and 8 bits, and how often it was looked at.
+static inline float4 unpack_color(const uint packed) {
+    const float3 root = (float3)((float)((packed >> 23) & 511), (float)((packed >> 14) & 511), (float)((packed >> 6) & 255)) /
+                        (float3)(511.0f, 511.0f, 255.0f);
+    return (float4)(root * root, (packed & 63) ? 1.0f : 0.0f);
+}
+
+// Radiance of the surface that a ray met at voxel `at`; w = 0 where no picture shows it.
+static inline float4 color_at(const Volume volume, global const uint *colors, const float3 at) {
+    const int3 top = volume.bricks.xyz * BRICK - 1;
+    const int3 voxel = clamp(convert_int3(at), (int3)(0), top);
+    const int slot = volume.slots[brick_index(volume.bricks, voxel >> 3)];
+    if (slot <= AWAY_SLOT) return (float4)(0.0f);
+    return unpack_color(colors[slot * BRICK_VOXELS + ((voxel.z & 7) * BRICK + (voxel.y & 7)) * BRICK + (voxel.x & 7)]);
+}
+
+// One item a sample. It follows every `every`-th of its hidden directions, beginning with another one than its neighbours do.
+// positions, normals [h][w]; free_mask [rows][cols][MASK_WORDS], sets [rows][cols][INTERLEAVE] (see Transfer); directions
+// [64][count] (unit, sr); colors: of the volume
+// -> hits [rows][cols]: sum over them of radiance times cosine, and of cosine (w), where the surface met has a colour; both
+// times `every`.
+kernel void gather_hits(const int cols, const int rows, const int stride, const int width, global const float4 *positions,
+                        global const float4 *normals, global const uint *free_mask, global const uchar *sets,
+                        const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid,
+                        global const uchar *octets, global const float2 *voxels, const float voxel_m, const float truncation_m,
+                        global const uint *colors, const int count, global const float4 *directions, const float reach_m,
+                        const int every, const float least_cosine, global float4 *hits) {
+    const int col = get_global_id(0);
+    const int row = get_global_id(1);
+    if (col >= cols || row >= rows) return;
+    const int sample = row * cols + col;
+    const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
+    const float4 position = positions[pixel], normal = normals[pixel];
+    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
+    float4 sum = (float4)(0.0f);
+    if (position.w > 0.0f && normal.w > 0.0f) {
+        const float3 origin_m = position.xyz + voxel_m * normal.xyz;
+        int chosen[LANES];
+        int waiting = 0, met = (col + 2 * row) % every;
+        for (int j = 0; j < count; j++) {
+            const int from = sets[sample * INTERLEAVE + j % INTERLEAVE] * count + j;
+            const int hidden = dot(normal.xyz, directions[from].xyz) >= least_cosine &&
+                               !((free_mask[sample * MASK_WORDS + (j >> 5)] >> (j & 31)) & 1);
+            if (hidden && met++ % every == 0) chosen[waiting++] = from;
+            if (waiting == 0 || (waiting < LANES && j < count - 1)) continue;
+            for (int lane = waiting; lane < LANES; lane++) chosen[lane] = chosen[0];
+            const Rays rays = volume_rays(volume, origin_m, directions, chosen);
+            floatn begin, end;
+            clip_rays(volume, rays, &begin, &end);
+            end = fmin(end, reach_m / voxel_m);
+            const floatn t = find_solid_voxels(volume, rays, begin, end);
+            float distance[LANES];
+            STORE_LANES(t < end ? t : -1.0f, distance);
+            for (int lane = 0; lane < waiting; lane++) {
+                if (distance[lane] < 0.0f) continue;
+                const float3 direction = directions[chosen[lane]].xyz;
+                const float4 color = color_at(volume, colors, origin_m / voxel_m + distance[lane] * direction);
+                sum += color.w * dot(normal.xyz, direction) * (float4)(color.xyz, 1.0f);
+            }
+            waiting = 0;
+        }
+    }
+    hits[sample] = (float)every * sum;
+}

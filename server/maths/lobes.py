@@ -1,0 +1,125 @@
+"""Light as non-negative combinations of smooth lobes: what keeps an estimate from a room finite, positive and as simple
+as the pictures allow.
+
+The sphere is cut into CELLS cells of one radiance each; a family of lobes of one width spans smooth functions of them.
+A room fixes light from wide lobes well and from narrow ones badly, so the widest family is taken that explains the
+pictures: a narrower one must leave clearly less.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.maths.nonnegative_qp import solve_nonnegative
+from server.maths.sh import sh_basis, spherical_fibonacci
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+CELLS = 256
+CELL_SR = 4 * np.pi / CELLS
+WIDTHS_DEG = (35.0, 25.0, 18.0, 12.0, 8.0)
+"""Standard deviations of the families' lobes, widest first."""
+LEAST_GAIN = 0.8
+"""A narrower family must leave less than this share of the residual's variance, once for every step in width."""
+RIDGE = 1e-3
+"""Of the mean diagonal: the least prior that keeps what no surface sees finite."""
+_LOBES_PER_WIDTH = 1.5  # centres for every square width of the sphere
+_FEWEST_LOBES = 24
+
+
+@cache
+def cell_directions() -> Floats:
+    """[CELLS, 3] unit, world axes."""
+    return spherical_fibonacci(CELLS)
+
+
+@cache
+def cells_to_sh(bands: int) -> Floats:
+    """[bands^2, CELLS]: coefficients of radiances of the cells."""
+    return np.ascontiguousarray(sh_basis(cell_directions(), bands).T * CELL_SR)
+
+
+@cache
+def lobe_family(width_deg: float) -> Floats:
+    """[CELLS, lobes]: radiances of the cells, each lobe with sum 1."""
+    width = np.deg2rad(width_deg)
+    count = int(np.clip(np.ceil(4 * np.pi / width**2 * _LOBES_PER_WIDTH), _FEWEST_LOBES, CELLS))
+    apart = np.arccos(np.clip(cell_directions() @ spherical_fibonacci(count).T, -1, 1))
+    lobes = np.exp(-0.5 * (apart / width) ** 2)
+    return np.asarray(lobes / lobes.sum(axis=0))
+
+
+@dataclass(frozen=True)
+class LobeFit:
+    """A non-negative light."""
+
+    width_deg: float
+    cells: Floats
+    """[CELLS] radiance."""
+    misfit: float
+    """Weighted sum of squares that is left."""
+    amounts: Floats
+    """[lobes] of its family."""
+
+
+@dataclass(frozen=True)
+class CellEquations:
+    """Sums over samples of one channel: y = M x with x the cells' radiances."""
+
+    matrix: Floats
+    """[CELLS, CELLS] sum w m m^T."""
+    vector: Floats
+    """[CELLS] sum w m y."""
+    energy: float
+    """Sum w y^2."""
+
+    def misfit(self, cells: Floats) -> float:
+        """What radiances [CELLS] leave of the energy."""
+        left = self.energy + cells @ (self.matrix @ cells - 2 * self.vector)
+        return max(float(left), 1e-12 * self.energy)
+
+
+def fit_lobes(equations: CellEquations) -> LobeFit:
+    """The simplest light that explains the sums: see the module."""
+    chosen = fit_width(equations, WIDTHS_DEG[0])
+    allowed = 1.0
+    for width in WIDTHS_DEG[1:]:
+        allowed *= LEAST_GAIN
+        narrower = fit_width(equations, width)
+        if narrower.misfit < allowed * chosen.misfit:
+            chosen, allowed = narrower, 1.0
+    return chosen
+
+
+def fit_width(equations: CellEquations, width_deg: float, near: Floats | None = None, pull: float = 0.0) -> LobeFit:
+    """The best light of one family; drawn to radiances `near` [CELLS] by `pull` times the ridge, if they are given."""
+    lobes = lobe_family(width_deg)
+    matrix = lobes.T @ equations.matrix @ lobes
+    count = len(matrix)
+    ridge = RIDGE * max(float(np.trace(matrix)) / count, 1e-300)
+    vector = lobes.T @ equations.vector
+    if near is not None:
+        weights = np.linalg.lstsq(lobes, near, rcond=None)[0]
+        vector = vector + ridge * pull * weights
+    regular = matrix + ridge * (1.0 + pull) * np.eye(count)
+    amounts, _ = solve_nonnegative(regular, vector)
+    cells = lobes @ amounts
+    return LobeFit(width_deg, cells, equations.misfit(cells), amounts)
+
+
+def spread_of(equations: CellEquations, fit: LobeFit, noise: float) -> Floats:
+    """[CELLS, lobes]: its outer square is the cells' covariance, where `noise` is the variance of an observation.
+
+    The prior lets any lobe be as bright as the light's are on average, so what no sample sees is as uncertain as that.
+    That light is not negative is left out: it would say less of what is dark.
+    """
+    lobes = lobe_family(fit.width_deg)
+    prior = noise / max(float((fit.amounts**2).mean()), 1e-300)
+    information = lobes.T @ equations.matrix @ lobes + prior * np.eye(lobes.shape[1])
+    root = np.linalg.inv(np.linalg.cholesky(information + 1e-12 * np.trace(information) * np.eye(len(information))))
+    return np.asarray(lobes @ root.T * np.sqrt(noise))

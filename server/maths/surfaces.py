@@ -1,0 +1,145 @@
+"""Surfaces and their albedos, told apart by what the light so far does not explain of the picture.
+
+What a pool of surface reflects, its radiance over its shading, has a colour and a lightness. Colours are clustered; the
+lightnesses of one colour are up to three materials, as of a chequered floor (a mixture of normal distributions of the
+logarithm, their number by BIC). Light and albedos are then found in turn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.maths.sh import LUMINANCE
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+COLOR_RADIUS = 0.5
+"""Colours of one surface lie so near each other, as logarithms of red and blue over green."""
+LEAST_SPREAD = 0.04
+"""Deviation of a material's lightness, relative, at least."""
+LEAST_GAP = 0.5
+"""Between lightnesses of materials of one colour (logarithm)."""
+MOST_MATERIALS = 3
+"""Of one colour."""
+_LEAST_SHARE = 0.005  # of all weight, for a colour of its own
+_ALIKE = 20.0  # pools that say what one says: neighbours err alike
+_BINS = 96
+_EM_STEPS = 20
+_DARKEST = 1e-4
+
+
+@dataclass(frozen=True)
+class Albedos:
+    """What each pool's surface reflects."""
+
+    lightness: Floats
+    """[n] of luminance, relative to the weighted mean."""
+    color: Floats
+    """[n, 3] of luminance 1."""
+    count: int
+    """Materials told apart."""
+
+
+def one_albedo(count: int) -> Albedos:
+    """All `count` pools are of one grey."""
+    return Albedos(np.ones(count), np.ones((count, 3)), 1)
+
+
+class Surfaces:
+    """The colours seen so far."""
+
+    def __init__(self) -> None:
+        self._colors = np.empty((0, 2))
+
+    def albedos(self, seen: Floats, shading: Floats, weights: Floats, *, materials: bool = True) -> Albedos:
+        """Albedos of pools of radiance `seen` [n, 3] whose shading, if white, were `shading` [n, 3]; weights [n] > 0.
+
+        `materials`: also by lightness; without it all of one colour are of one albedo.
+        """
+        reflected = np.maximum(seen, _DARKEST) / np.maximum(shading, _DARKEST)
+        member = self._cluster(np.log(reflected[:, [0, 2]] / reflected[:, 1:2]), weights)
+        log_lightness = np.log(np.maximum(seen @ LUMINANCE, _DARKEST) / np.maximum(shading @ LUMINANCE, _DARKEST))
+        lightness, color, count = np.zeros(len(seen)), np.ones((len(seen), 3)), 0
+        for number in range(len(self._colors)):
+            own = member == number
+            if not own.any():
+                continue
+            levels = lightness_levels(log_lightness[own], weights[own], MOST_MATERIALS if materials else 1)
+            lightness[own] = levels[np.abs(log_lightness[own, None] - levels).argmin(axis=1)]
+            mean = weights[own] @ reflected[own]
+            color[own] = mean / (mean @ LUMINANCE)
+            count += len(levels)
+        lightness = np.exp(lightness)
+        lightness /= np.average(lightness, weights=weights)
+        mean_color = weights @ color / weights.sum()
+        return Albedos(lightness, color / (mean_color / (mean_color @ LUMINANCE)), count)
+
+    def _cluster(self, colors: Floats, weights: Floats) -> Indices:
+        """[n] cluster of each of `colors` [n, 2]; renews the centres."""
+        centers = self._colors if len(self._colors) else np.average(colors, axis=0, weights=weights)[None]
+        for _ in range(3):
+            centers = _with_far_ones(colors, weights, centers)
+            member = _nearest(colors, centers)
+            sums = np.bincount(member, weights, len(centers))
+            moved = np.stack([np.bincount(member, weights * c, len(centers)) for c in colors.T], axis=1)
+            centers = np.where(sums[:, None] > 0, moved / np.maximum(sums, 1e-300)[:, None], centers)
+        self._colors = centers
+        return _nearest(colors, centers)
+
+
+def _nearest(colors: Floats, centers: Floats) -> Indices:
+    return np.asarray(((colors[:, None] - centers) ** 2).sum(axis=2).argmin(axis=1))
+
+
+def _with_far_ones(colors: Floats, weights: Floats, centers: Floats) -> Floats:
+    """`centers` and, where enough colours are far from all of them, the densest of those in turn."""
+    least = _LEAST_SHARE * weights.sum()
+    while True:
+        far = ((colors[:, None] - centers) ** 2).sum(axis=2).min(axis=1) > COLOR_RADIUS**2
+        if weights[far].sum() < least:
+            return centers
+        some = np.flatnonzero(far)[:: max(1, int(far.sum()) // 64)]
+        near = ((colors[some][:, None] - colors[far]) ** 2).sum(axis=2) < COLOR_RADIUS**2
+        mass = near @ weights[far]
+        if mass.max() < least:
+            return centers
+        centers = np.vstack([centers, colors[some[int(mass.argmax())]]])
+
+
+def lightness_levels(values: Floats, weights: Floats, most: int) -> Floats:
+    """[k <= most] means of the mixture that explains `values` [n] (logarithms) best for its size."""
+    low, high = float(values.min()), float(values.max())
+    if most == 1 or high - low < 2 * LEAST_SPREAD:
+        return np.array([np.average(values, weights=weights)])
+    counts, edges = np.histogram(values, _BINS, (low, high), weights=weights)
+    at = 0.5 * (edges[1:] + edges[:-1])
+    independent = max(len(values) / _ALIKE, 2.0)
+    best, best_score = np.array([np.average(values, weights=weights)]), -np.inf
+    for k in range(1, most + 1):
+        means, likelihood = _mixture(at, counts / counts.sum(), k)
+        if k > 1 and np.diff(np.sort(means)).min() < LEAST_GAP:
+            continue  # shading that is not understood yet does as much
+        score = independent * likelihood - k * np.log(independent)
+        if score > best_score:
+            best, best_score = means, score
+    return best
+
+
+def _mixture(at: Floats, mass: Floats, k: int) -> tuple[Floats, float]:
+    """Means [k] of `k` normal distributions of one spread, by EM, and the mean log likelihood."""
+    means = np.interp((np.arange(k) + 0.5) / k, np.cumsum(mass), at)
+    spread = max(float(np.sqrt(mass @ (at - mass @ at) ** 2)) / k, LEAST_SPREAD)
+    shares = np.full(k, 1 / k)
+    density = np.empty(len(at))
+    for _ in range(_EM_STEPS):
+        parts = shares * np.exp(-0.5 * ((at[:, None] - means) / spread) ** 2) / spread
+        density = parts.sum(axis=1) + 1e-300
+        parts = parts / density[:, None] * mass[:, None]
+        shares = parts.sum(axis=0) + 1e-12
+        means = (parts * at[:, None]).sum(axis=0) / shares
+        spread = max(float(np.sqrt((parts * (at[:, None] - means) ** 2).sum())), LEAST_SPREAD)
+    return means, float(mass @ np.log(density))

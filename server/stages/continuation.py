@@ -1,0 +1,244 @@
+"""Walls and tables go on beyond what was seen of them: how far, the shading shows.
+
+Where no camera looked, the volume is empty, and light would come through the rest of a wall. The planes of what was
+seen are continued into what was not, as far beyond each of their sides as explains the pictures best: the extents are
+changed one at a time, a few tries a frame, and kept where the light they leave fits clearly better.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.maths.lobes import CELL_SR, RIDGE, cell_directions
+from server.maths.nonnegative_qp import solve_nonnegative
+from server.maths.planes import SIDES, STEPS_M, PlanePatch, find_planes
+from server.maths.rigid import inverse_rigid
+
+Floats = NDArray[np.float64]
+PlaneArrays = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8]]
+"""Planes [n, 4, 4], their shapes [n, 4] and all maps, as hide_cells of cell_transfer.cl takes them."""
+NO_PLANES: PlaneArrays = (np.zeros((0, 4, 4), np.float32), np.zeros((0, 4), np.int32), np.zeros(1, np.uint8))
+
+SPOKES = 4
+"""Directions of a cell that are tried, as in cell_transfer.cl."""
+LEAST_M = 0.03
+"""A pool does not hide from itself."""
+LEAST_GAIN = 0.01
+"""A longer extent must leave so much less of the residual's energy; a shorter one may leave a fifth of that more."""
+FIRST_TRIES, TRIES, RETRY_FRAMES = 400, 40, 16
+"""Extents tried in each of the first frames, until all have been settled; then so many every so many frames."""
+SETTLED_PASSES = 2
+"""Times that every side is settled before the extents are believed."""
+BELIEVED = 0.9
+"""All extents together are believed if they leave less than this share of the residual's energy: what is left of noise
+alone some extents always explain a little better."""
+VIEWS = 8
+"""Earlier frames whose depth a new plane is compared with."""
+LEAST_FRAMES = 2
+"""Frames before extents are tried: one picture can be explained in too many ways."""
+MOST_ROWS = 700
+"""Pools that extents are judged by."""
+_BEHIND_M = 0.05  # a camera that measures so much farther looked through
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Pools by which extents are judged, for the albedos and the share of indirect light found so far."""
+
+    positions: Floats
+    """[n, 3]."""
+    transfer: Floats
+    """[n, CELLS] of white surface, nothing continued."""
+    lobes: Floats
+    """[CELLS, k]."""
+    target: Floats
+    """[n] radiance over albedo, less what seen surface sends."""
+    beyond: Floats
+    """[n] radiance that continued planes send."""
+    weights: Floats
+    """[n]."""
+
+
+class Continuation:
+    """The planes of one session's room."""
+
+    def __init__(self) -> None:
+        self.planes: list[PlanePatch] = []
+        self._looked: list[PlanePatch] = []
+        self._views: deque[tuple[Floats, Floats]] = deque(maxlen=VIEWS)
+        self._frames = 0
+        self._turn, self._passes = 0, 0
+        self._boxes: list[Floats] = []
+        self.explained = 1.0
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether extents are believed."""
+        return self._passes >= SETTLED_PASSES
+
+    def look(self, camera: CameraModel, volume_from_camera: Floats, depth_m: Floats) -> None:
+        """Note where a camera looked through the planes' continuations. depth_m: [h, w], 0 = none."""
+        self._views.append((inverse_rigid(volume_from_camera), depth_m))
+        for plane in self.planes:
+            is_new = not any(plane is known for known in self._looked)
+            for camera_from_volume, depth in list(self._views) if is_new else [self._views[-1]]:
+                plane.empty |= _looked_through(plane, camera, camera_from_volume, depth)
+        self._looked = list(self.planes)
+
+    def find(self, positions: Floats, normals: Floats) -> None:
+        """Look for planes among pools [n, 3] whenever as many frames more have come as there were."""
+        self._frames += 1
+        if self._frames & (self._frames - 1) == 0 or self._frames % 32 == 0:
+            known = len(self.planes)
+            self.planes = find_planes(positions, normals, self.planes)
+            if len(self.planes) != known:
+                self._turn, self._passes = 0, 0
+
+    def try_extents(self, judged: Judged) -> bool:
+        """Try some other extents; whether what is taken for true has changed.
+
+        The extents explain the pictures together, so none is believed before all have been settled twice.
+        """
+        if not self.planes or self._frames < LEAST_FRAMES or (self.is_settled and self._frames % RETRY_FRAMES):
+            return False
+        sides = SIDES * len(self.planes)
+        tries = FIRST_TRIES if self._passes < SETTLED_PASSES else TRIES
+        trial = _Trial(self.planes, judged)
+        while tries > 0:
+            tries -= trial.settle(*divmod(self._turn, SIDES))
+            self._turn = (self._turn + 1) % sides
+            self._passes += self._turn == 0
+            if self._turn == 0 and self._passes >= SETTLED_PASSES:
+                break
+        if self._turn != 0 or self._passes < SETTLED_PASSES:
+            return False
+        self.explained = trial.misfit / trial.misfit_of_none()
+        believed = self.planes if self.explained < BELIEVED else []
+        before, self._boxes = self._boxes, [plane.box for plane in believed]
+        return len(before) != len(self._boxes) or not np.array_equal(before, self._boxes)
+
+    def arrays(self) -> PlaneArrays:
+        """What is continued, for the device."""
+        if not self._boxes:
+            return NO_PLANES
+        rows = [
+            [
+                [*plane.normal, plane.offset_m],
+                [*plane.across, plane.corner[0]],
+                [*plane.along, plane.corner[1]],
+                box,
+            ]
+            for plane, box in zip(self.planes, self._boxes, strict=False)
+        ]
+        believed = self.planes[: len(self._boxes)]
+        sizes = [plane.empty.size for plane in believed]
+        starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+        shapes = [
+            [plane.empty.shape[1], plane.empty.shape[0], start, 0]
+            for plane, start in zip(believed, starts, strict=True)
+        ]
+        maps = np.concatenate([~plane.empty.ravel() for plane in believed])
+        return np.array(rows, np.float32), np.array(shapes, np.int32), maps.astype(np.uint8)
+
+
+def _looked_through(
+    plane: PlanePatch, camera: CameraModel, camera_from_volume: Floats, depth_m: Floats
+) -> NDArray[np.bool_]:
+    """[rows, cols] cells of a plane's map behind which the camera measured something."""
+    at = plane.cell_centers() @ camera_from_volume[:3, :3].T + camera_from_volume[:3, 3]
+    z = at[..., 2]
+    safe = np.maximum(z, 1e-3)
+    u = np.rint(at[..., 0] / safe * camera.fx + camera.cx)
+    v = np.rint(at[..., 1] / safe * camera.fy + camera.cy)
+    inside = (z > 0.1) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+    measured = np.zeros(z.shape)
+    measured[inside] = depth_m[v[inside].astype(np.int64), u[inside].astype(np.int64)]
+    return np.asarray(inside & (measured > z + _BEHIND_M))
+
+
+def spokes() -> Floats:
+    """[CELLS, SPOKES, 3] unit directions, four about the middle of each cell."""
+    middle = cell_directions()
+    side = np.cross(middle, np.eye(3)[np.abs(middle).argmin(axis=1)])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    other = np.cross(middle, side)
+    reach = 0.6 * np.sqrt(CELL_SR / np.pi)
+    around = np.stack([middle + reach * (a * side + b * other) for a, b in ((1, 0), (0, 1), (-1, 0), (0, -1))], axis=1)
+    return np.asarray(around / np.linalg.norm(around, axis=2, keepdims=True))
+
+
+class _Trial:
+    """Extents and how well the light they leave explains some pools."""
+
+    def __init__(self, planes: list[PlanePatch], judged: Judged) -> None:
+        self._planes = planes
+        self._judged = judged
+        self._open = judged.transfer.sum(axis=1)
+        steps = np.array(STEPS_M)
+        directions = spokes().reshape(-1, 3)
+        self._needed = [
+            [
+                np.searchsorted(steps, side).astype(np.uint8)
+                for side in plane.beyond(judged.positions, directions, LEAST_M)
+            ]
+            for plane in planes
+        ]
+        self._hidden = [self._hidden_by(k, plane.steps) for k, plane in enumerate(planes)]
+        self.misfit = self._misfit_of(np.logical_or.reduce(self._hidden))
+
+    def misfit_of_none(self) -> float:
+        """The same where no plane goes on."""
+        return self._misfit_of(np.zeros_like(self._hidden[0]))
+
+    def settle(self, plane: int, side: int) -> int:
+        """Give one side of a plane the best of the extents near its own; how many were tried."""
+        patch, tried = self._planes[plane], 0
+        others = np.zeros_like(self._hidden[plane])
+        for k, hidden in enumerate(self._hidden):
+            if k != plane:
+                others |= hidden
+        for step in self._candidates(int(patch.steps[side])):
+            steps = patch.steps.copy()
+            steps[side] = step
+            hidden = self._hidden_by(plane, steps)
+            if not ((hidden ^ self._hidden[plane]) & ~others).any():
+                continue
+            tried += 1
+            misfit = self._misfit_of(others | hidden)
+            allowed = 1 - LEAST_GAIN if step > patch.steps[side] else 1 + 0.2 * LEAST_GAIN
+            if misfit < allowed * self.misfit:
+                patch.steps, self._hidden[plane], self.misfit = steps, hidden, misfit
+        return max(tried, 1)
+
+    def _candidates(self, now: int) -> Iterator[int]:
+        """Other extents: all where nothing is known, else the next ones."""
+        everything = range(len(STEPS_M)) if now == 0 else (now - 2, now - 1, now + 1, now + 2)
+        return (step for step in everything if step != now and 0 <= step < len(STEPS_M))
+
+    def _hidden_by(self, plane: int, steps: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """[n, CELLS * SPOKES]."""
+        hidden = self._needed[plane][0] <= steps[0]
+        for side in range(1, SIDES):
+            hidden &= self._needed[plane][side] <= steps[side]
+        return np.asarray(hidden)
+
+    def _misfit_of(self, hidden: NDArray[np.bool_]) -> float:
+        """What the best light of the judged lobes leaves where directions [n, CELLS * SPOKES] are hidden."""
+        judged, codes = self._judged, hidden.view(np.uint8)
+        met = codes[:, 0::4] + codes[:, 1::4] + codes[:, 2::4] + codes[:, 3::4]
+        open_cells = judged.transfer * (1.0 - met / SPOKES)
+        target = judged.target - judged.beyond * (self._open - open_cells.sum(axis=1))
+        columns = open_cells @ judged.lobes
+        weighted = judged.weights[:, None] * columns
+        matrix, vector = weighted.T @ columns, weighted.T @ target
+        ridge = RIDGE * max(float(np.trace(matrix)) / len(matrix), 1e-300)
+        amounts, _ = solve_nonnegative(matrix + ridge * np.eye(len(matrix)), vector)
+        energy = max(float(judged.weights @ target**2), 1e-300)
+        left = energy + amounts @ (matrix @ amounts - 2 * vector)
+        return max(float(left), 1e-12 * energy)

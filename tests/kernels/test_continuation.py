@@ -1,0 +1,167 @@
+"""Planes continued beyond the pictures: the kernel against its twin, and extents found from shading alone."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from client.laptop.source import open_source
+from client.laptop.volume import default_volume, default_voxel
+from protocol.frames import CameraModel
+from protocol.messages import Wishes
+from server.evaluation.environment import direction_error_deg
+from server.maths.lobes import CELLS, cell_directions, lobe_family
+from server.maths.planes import STEPS_M, find_planes
+from server.opencl.device import Device
+from server.opencl.engine import Engine
+from server.pipeline import Pipeline
+from server.stages.cell_transfer import PoolGrid, PoolWindow
+from server.stages.continuation import LEAST_M, NO_PLANES, Continuation, Judged, spokes
+from server.stages.lobe_estimator import LightModel, LobeEstimator
+from tests.analytic import Floats
+from tests.data import data_folder
+from tests.maths.test_planes import FLOOR, WALL, corner
+
+CAMERA = CameraModel(width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
+
+
+def settled(continuation: Continuation, judged: Judged) -> None:
+    """Let extents be tried until they are believed, or not."""
+    for _ in range(10):
+        continuation.try_extents(judged)
+
+
+def looking(points: Floats, normals: Floats) -> Continuation:
+    continuation = Continuation()
+    for _ in range(2):
+        continuation.find(points, normals)
+        continuation.look(CAMERA, np.eye(4), np.zeros((48, 64)))
+    return continuation
+
+
+def test_hidden_cells_match_twin(engine: Engine) -> None:
+    rng = np.random.default_rng(1)
+    continuation = Continuation()
+    planes = continuation.planes = find_planes(*corner(), [])
+    for plane in planes:
+        plane.steps[:] = rng.integers(0, 8, 4)
+        plane.empty |= rng.random(plane.empty.shape) < 0.2
+    continuation._boxes = [plane.box for plane in planes]
+    grid = PoolGrid(2, 3, 7)
+    window = PoolWindow(engine, grid, 2)
+    positions = rng.random((2, grid.count, 3)) * [1, 0.9, 0.9] + [0, 0, 1]
+    raw = rng.random((2, grid.count, CELLS)).astype(np.float32)
+    places = np.zeros((2, grid.count, 8), np.float32)
+    places[..., :3], places[..., 3] = positions, 1
+    window.raw.set(raw)
+    window._places.set(places)
+    window.hide([1], continuation.arrays())
+    directions = spokes().reshape(-1, 3)
+    hidden = np.zeros((grid.count, CELLS * 4), np.bool_)
+    for plane in planes:
+        needed = plane.beyond(positions[1], directions, LEAST_M)
+        reach = np.array(STEPS_M)[plane.steps]
+        hidden |= np.logical_and.reduce([side <= most for side, most in zip(needed, reach, strict=True)])
+    expected = raw[1] * (1 - hidden.reshape(grid.count, CELLS, 4).mean(axis=2))
+    got = engine.download(window.values)[1]
+    assert 0.05 < hidden.mean() < 0.95
+    differs = ~np.isclose(got, expected, atol=1e-5)
+    assert differs.mean() < 0.002  # float32 decides otherwise at the edges of map cells
+    window.hide([0], NO_PLANES)
+    np.testing.assert_array_equal(engine.download(window.values)[0], raw[0])
+
+
+def test_spokes_stay_in_their_cells() -> None:
+    directions = spokes()
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=2), 1)
+    own = np.einsum("ksx,kx->ks", directions, cell_directions())
+    assert (own > np.cos(np.deg2rad(7))).all()
+    np.testing.assert_allclose(directions.mean(axis=1) / np.linalg.norm(directions.mean(axis=1), axis=1)[:, None],
+                               cell_directions(), atol=1e-6)  # fmt: skip
+
+
+def shaded_corner(extent_m: float, noise: float = 0.02) -> tuple[Floats, Floats, Judged]:
+    """A floor before a wall that goes on `extent_m` beyond both of its seen sides, under a light from behind the wall's
+    unseen part: what the floor shows tells how far the wall goes."""
+    rng = np.random.default_rng(2)
+    points, normals = corner(250)
+    transfer = np.maximum(normals @ cell_directions().T, 0)
+    transfer /= transfer.sum(axis=1, keepdims=True)
+    continuation = Continuation()
+    continuation.planes = find_planes(points, normals, [])
+    wall = next(plane for plane in continuation.planes if plane.normal @ WALL > 0.9)
+    needed = np.stack(wall.beyond(points, spokes().reshape(-1, 3), LEAST_M)).max(axis=0)
+    shown = transfer * (1 - (needed <= extent_m).reshape(len(points), CELLS, 4).mean(axis=2))
+    towards = np.stack([[1.0, -0.3, 0.5], [-1.0, -0.5, 0.4], [0, -1, 0.2]])
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    light = 0.3 + (8 * np.exp(-0.5 * (np.arccos(np.clip(cell_directions() @ towards.T, -1, 1)) / 0.5) ** 2)).sum(axis=1)
+    target = shown @ light * (1 + noise * rng.normal(size=len(points)))
+    weights = 1 / np.maximum(target, 0.05 * target.mean()) ** 2
+    return points, normals, Judged(points, transfer, lobe_family(25.0), target, np.zeros(len(points)), weights)
+
+
+def test_a_wall_goes_on_as_far_as_the_shading_says() -> None:
+    points, normals, judged = shaded_corner(1.0)
+    continuation = looking(points, normals)
+    settled(continuation, judged)
+    wall = next(plane for plane in continuation.planes if plane.normal @ WALL > 0.9)
+    assert continuation.explained < 0.5
+    across = np.array(STEPS_M)[wall.steps]
+    assert np.sort(across)[-2:].min() >= 0.6
+    assert continuation.arrays()[0].shape[0] == len(continuation.planes)
+
+
+def test_nothing_is_believed_that_explains_little() -> None:
+    """Open surroundings: extents that noise alone suggests are not taken."""
+    points, normals, judged = shaded_corner(-1.0)
+    continuation = looking(points, normals)
+    settled(continuation, judged)
+    assert continuation.arrays()[0].shape[0] == 0
+
+
+def test_the_first_frame_is_left_alone() -> None:
+    points, normals, judged = shaded_corner(1.0)
+    continuation = Continuation()
+    continuation.find(points, normals)
+    assert not continuation.try_extents(judged)
+    assert not continuation.is_settled
+
+
+def test_a_camera_that_looks_through_empties_the_plane() -> None:
+    continuation = Continuation()
+    points, normals = corner()
+    continuation.find(points, normals)
+    depth = np.full((48, 64), 3.0)  # beyond the wall at 2 m
+    continuation.look(CAMERA, np.eye(4), depth)
+    wall = next(plane for plane in continuation.planes if plane.normal @ WALL > 0.9)
+    floor = next(plane for plane in continuation.planes if plane.normal @ FLOOR > 0.9)
+    at = wall.cell_centers()
+    seen = (np.abs(at[..., 0] / at[..., 2]) < 0.6) & (np.abs(at[..., 1] / at[..., 2]) < 0.44)
+    assert wall.empty[seen].all()
+    assert not wall.empty[~seen & ((np.abs(at[..., 0]) > 1.4) | (np.abs(at[..., 1]) > 1.1))].any()
+    assert floor.empty.any()
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("name", "bound_deg"), [("key_white_direct", 8.0), ("key_tex_direct", 15.0)])
+def test_the_light_of_a_room_seen_in_part(device: Device, name: str, bound_deg: float) -> None:
+    """mitsuba_room: what no picture shows of its walls lets light through unless it is continued."""
+    source = open_source(str(data_folder("mitsuba_room") / name))
+    true = np.array(json.loads((data_folder("mitsuba_room") / name / "light.json").read_text())["sh"])
+    bounds = default_volume(source, range(len(source)))
+    albedo = "estimated" if "tex" in name else "constant"
+    wishes = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), albedo=albedo, indirect="none", up=source.up)
+    errors_deg = {}
+    for continued in (True, False):
+        pipeline = Pipeline(device, source.camera, wishes)
+        model = LightModel(albedos=albedo == "estimated")
+        light = LobeEstimator(pipeline._engine, 4, model, Continuation() if continued else None)
+        pipeline._room_light._harmonics, pipeline._room_light._lobes = None, light
+        for index in range(len(source)):
+            sh = np.array(pipeline.process(source[index]).light.sh)
+        errors_deg[continued] = direction_error_deg(sh, true)
+        pipeline.close()
+    assert errors_deg[True] < bound_deg
+    assert errors_deg[True] < 0.5 * errors_deg[False]

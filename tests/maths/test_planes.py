@@ -1,0 +1,95 @@
+"""Planes in oriented points: found, kept, and where rays meet what was not seen of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from server.maths.planes import CELL_M, STEPS_M, PlanePatch, find_planes
+from tests.analytic import Floats
+
+WALL, FLOOR = np.array([0.0, 0.0, -1.0]), np.array([0.0, -1.0, 0.0])
+
+
+def corner(count: int = 400, noise_m: float = 0.002, shift: float = 0.0) -> tuple[Floats, Floats]:
+    """Points of a wall z = 2 with x and y in [0, 1], and of a floor y = 1 with z in [1, 2], and their normals."""
+    rng = np.random.default_rng(3)
+    wall = np.column_stack([rng.random((count, 2)) + np.array([shift, 0]), np.full(count, 2.0)])
+    floor = np.column_stack([rng.random(count) + shift, np.full(count, 1.0), 1 + rng.random(count)])
+    points = np.concatenate([wall, floor]) + noise_m * rng.normal(size=(2 * count, 3))
+    return points, np.repeat([WALL, FLOOR], count, axis=0)
+
+
+def plane_with(planes: list[PlanePatch], normal: Floats) -> PlanePatch:
+    found = [plane for plane in planes if plane.normal @ normal > 0.99]
+    assert len(found) == 1
+    return found[0]
+
+
+def test_wall_and_floor_are_found() -> None:
+    planes = find_planes(*corner(), [])
+    assert len(planes) == 2
+    assert plane_with(planes, WALL).offset_m == pytest.approx(-2.0, abs=0.002)
+    assert plane_with(planes, FLOOR).offset_m == pytest.approx(-1.0, abs=0.002)
+
+
+def test_axes_are_orthonormal_and_follow_the_plane_it_stands_on() -> None:
+    for plane in find_planes(*corner(), []):
+        axes = np.stack([plane.across, plane.along, plane.normal])
+        np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-9)
+        assert np.abs(axes).max(axis=1) == pytest.approx(np.ones(3), abs=0.02)
+
+
+def test_scattered_points_are_no_plane() -> None:
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(500, 3))
+    assert find_planes(rng.random((500, 3)), normals / np.linalg.norm(normals, axis=1, keepdims=True), []) == []
+
+
+def test_a_plane_found_again_keeps_what_is_known_of_it_and_grows() -> None:
+    planes = find_planes(*corner(), [])
+    wall = plane_with(planes, WALL)
+    wall.steps[:] = 3
+    wall.empty[0, 0] = True
+    before = wall.seen.copy()
+    again = plane_with(find_planes(*corner(shift=0.5), planes), WALL)
+    assert again is wall
+    assert again.empty[0, 0]
+    assert (again.steps == 3).all()
+    grown = np.ptp(again.seen, axis=0) - np.ptp(before, axis=0)
+    assert sorted(grown) == pytest.approx([0, 0.5], abs=0.03)
+
+
+def test_how_far_beyond_each_side_a_ray_meets_the_plane() -> None:
+    wall = plane_with(find_planes(*corner(noise_m=0.0), []), WALL)
+    targets = np.array([[1.4, 0.5, 2.0], [-0.3, 0.5, 2.0], [0.5, -0.7, 2.0], [0.5, 0.5, 2.0], [1.25, -0.35, 2.0]])
+    origin = np.array([[0.5, 0.5, 0.5]])
+    directions = targets - origin
+    beyond = np.stack(wall.beyond(origin, directions / np.linalg.norm(directions, axis=1, keepdims=True), 0.03))[:, 0]
+    assert sorted(beyond[:, 0])[-1] == pytest.approx(0.4, abs=0.02)
+    assert (np.sort(beyond, axis=0)[:-1, :3] == 0).all()
+    assert beyond[:, 1].max() == pytest.approx(0.3, abs=0.02)
+    assert beyond[:, 2].max() == pytest.approx(0.7, abs=0.02)
+    assert (beyond[:, 3] == 0).all()
+    assert np.sort(beyond[:, 4])[-2:] == pytest.approx([0.25, 0.35], abs=0.02)
+
+
+def test_rays_that_miss_or_go_where_a_camera_looked_through() -> None:
+    wall = plane_with(find_planes(*corner(), []), WALL)
+    origin = np.array([[0.5, 0.5, 0.5]])
+    ahead, back, beside = np.array([[0.0, 0, 1]]), np.array([[0.0, 0, -1]]), np.array([[1.0, 0, 0]])
+    assert np.isfinite(wall.beyond(origin, ahead, 0.03)[0]).all()
+    assert np.isinf(wall.beyond(origin, back, 0.03)[0]).all()
+    assert np.isinf(wall.beyond(origin, beside, 0.03)[0]).all()
+    assert np.isinf(wall.beyond(np.array([[0.5, 0.5, 1.98]]), ahead, 0.03)[0]).all()  # it does not hide from itself
+    centers = wall.cell_centers()
+    looked = np.linalg.norm(centers[..., :2] - 0.5, axis=-1) < 2 * CELL_M
+    wall.empty |= looked
+    assert np.isinf(wall.beyond(origin, ahead, 0.03)[0]).all()
+
+
+def test_the_box_is_what_was_seen_and_what_it_is_taken_to_go_on() -> None:
+    wall = plane_with(find_planes(*corner(), []), WALL)
+    wall.steps[:] = [0, 2, 0, 4]
+    (low_x, low_y), (high_x, high_y) = wall.seen
+    np.testing.assert_allclose(wall.box, [low_x, high_x + STEPS_M[2], low_y, high_y + STEPS_M[4]])

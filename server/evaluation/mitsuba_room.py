@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.messages import Wishes
-from server.settings import read_wishes
 
 Floats = NDArray[np.float64]
 
@@ -75,15 +74,6 @@ def read_linear(path: Path) -> Floats:
 
 
 def model_for(item: RoomSet, wishes: Wishes) -> Wishes:
-    """`wishes` with what a set calls for, as far as this server has it: albedo estimated where it is textured, else as
-    wished; observed indirect light where there is any, else none. Raises ValueError for a preset it has not."""
-    albedo = "estimated" if item.surface == "tex" else wishes.albedo
+    """`wishes` with what a set calls for: albedos estimated, observed indirect light where there is any, else none."""
     indirect = "observed" if item.transport == "gi" else "none"
-    for wanted in ((albedo, indirect), (albedo, "none"), ("constant", indirect), ("constant", "none")):
-        tried = msgspec.structs.replace(wishes, albedo=wanted[0], indirect=wanted[1])
-        try:
-            read_wishes(tried)
-        except ValueError:
-            continue
-        return tried
-    raise ValueError(f"preset {wishes.preset!r} is not available")
+    return msgspec.structs.replace(wishes, albedo="estimated", indirect=indirect)

@@ -55,13 +55,18 @@ class Surfaces:
     def __init__(self) -> None:
         self._colors = np.empty((0, 2))
 
-    def albedos(self, seen: Floats, shading: Floats, weights: Floats, *, materials: bool = True) -> Albedos:
+    def albedos(
+        self, seen: Floats, shading: Floats, weights: Floats, *, materials: bool = True, one_color: bool = False
+    ) -> Albedos:
         """Albedos of pools of radiance `seen` [n, 3] whose shading, if white, were `shading` [n, 3]; weights [n] > 0.
 
-        `materials`: also by lightness; without it all of one colour are of one albedo.
+        `materials`: also by lightness; without it all of one colour are of one albedo. `one_color`: all are of one.
         """
         reflected = np.maximum(seen, _DARKEST) / np.maximum(shading, _DARKEST)
-        member = self._cluster(np.log(reflected[:, [0, 2]] / reflected[:, 1:2]), weights)
+        colors = np.log(reflected[:, [0, 2]] / reflected[:, 1:2])
+        if one_color:
+            self._colors = np.average(colors, axis=0, weights=weights)[None]
+        member = np.zeros(len(seen), np.int64) if one_color else self._cluster(colors, weights)
         log_lightness = np.log(np.maximum(seen @ LUMINANCE, _DARKEST) / np.maximum(shading @ LUMINANCE, _DARKEST))
         lightness, color, count = np.zeros(len(seen)), np.ones((len(seen), 3)), 0
         for number in range(len(self._colors)):

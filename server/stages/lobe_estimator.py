@@ -68,6 +68,9 @@ ROUNDS, FIRST_ROUNDS, COLOR_ROUNDS = 4, 16, 4
 """Of light and albedos in turn: in a frame, in the first and after a change, and how many of those by colour alone."""
 JUDGED_WIDTH_DEG = 25.0
 """Of the lobes that extents are judged with: a light of wide lobes alone would have planes make its edges."""
+ONE_COLOR = 0.12
+"""Root mean square scatter of reflected colours, as logarithms of ratios, that counts as one colour."""
+_DARK = 1e-4
 _PATCH = 8  # pools along the side of a patch, within which their errors are alike
 _SCORE_MEMORY = 0.8  # so a lasting excess of a tenth adds up to a half
 _LEAST_MISFIT = 1e-4  # of the frame's energy: below it a ratio of misfits says nothing
@@ -153,6 +156,7 @@ class LobeEstimator:
         self._next = 0
         self._surfaces = Surfaces()
         self._solution: _Solution | None = None
+        self._one_color = True
         self._scores = np.zeros(len(MEMORIES))
         self._predictions: list[Floats] = []
         self._last: tuple[_Rows, Albedos, Floats] | None = None
@@ -302,22 +306,40 @@ class LobeEstimator:
             rounds = min(rounds, 2)
         solution, first = self._solution, rounds == FIRST_ROUNDS
         albedos, weights = one_albedo(len(rows.seen)), self._weights(rows, None, None)
+        self._one_color = not self._model.albedos or self._is_of_one_color(rows)
+        pull = COLOR_PULL if self._one_color else None
         for number in range(rounds):
             if solution is not None:
                 albedos = self._albedos(rows, solution, materials=not first or number > COLOR_ROUNDS)
                 weights = self._weights(rows, solution, albedos)
             columns, target, scaled = self._system(rows, albedos, weights)
             amounts = self._solve_amounts(columns, target, scaled)
-            solution = self._with_colors(rows, albedos, weights, amounts[:-1], float(amounts[-1]))
+            solution = self._with_colors(rows, albedos, weights, amounts[:-1], float(amounts[-1]), pull)
         self._solution = solution
         return albedos, weights
+
+    def _is_of_one_color(self, rows: _Rows) -> bool:
+        """Whether coloured light on surfaces of one colour explains all colours.
+
+        If it does, there is no telling it from surfaces of many colours, and colourless rooms under coloured lights are
+        the simpler world.
+        """
+        albedos, weights = one_albedo(len(rows.seen)), self._weights(rows, None, None)
+        amounts = self._solve_amounts(*self._system(rows, albedos, weights))
+        mean_albedo = float(amounts[-1])
+        colors = self._with_colors(rows, albedos, weights, amounts[:-1], mean_albedo, pull=0.0).colors
+        shading = rows.columns @ colors + mean_albedo * rows.sent
+        reflected = np.log(np.maximum(rows.seen, _DARK) / np.maximum(shading, _DARK))
+        ratios = reflected[:, [0, 2]] - reflected[:, 1:2]
+        apart = np.linalg.norm(ratios - np.median(ratios, axis=0), axis=1)
+        return bool(np.sqrt(np.mean(np.minimum(apart, 3 * np.median(apart)) ** 2)) < ONE_COLOR)
 
     def _albedos(self, rows: _Rows, solution: _Solution, *, materials: bool) -> Albedos:
         if not self._model.albedos:
             return one_albedo(len(rows.seen))
         materials = materials and (self.continuation is None or self.continuation.is_settled)
         shading = rows.columns @ solution.colors + solution.mean_albedo * rows.sent
-        return self._surfaces.albedos(rows.seen, shading, rows.weights, materials=materials)
+        return self._surfaces.albedos(rows.seen, shading, rows.weights, materials=materials, one_color=self._one_color)
 
     def _weights(self, rows: _Rows, solution: _Solution | None, albedos: Albedos | None) -> Floats:
         """[n] of residuals in radiance."""
@@ -355,15 +377,31 @@ class LobeEstimator:
         return amounts
 
     def _with_colors(
-        self, rows: _Rows, albedos: Albedos, weights: Floats, amounts: Floats, mean_albedo: float
+        self,
+        rows: _Rows,
+        albedos: Albedos,
+        weights: Floats,
+        amounts: Floats,
+        mean_albedo: float,
+        pull: float | None,
     ) -> _Solution:
-        """The solution with every channel a multiple of the luminance: so it is while surfaces' colours are looked for,
-        or coloured surfaces would pass for coloured light."""
-        shading = rows.columns @ amounts
+        """The solution with its colours, each channel drawn to a multiple of the luminance by `pull` times the ridge.
+
+        None: each is one, as while surfaces' colours are looked for: or coloured surfaces would pass for coloured light.
+        """
         scaled = weights * albedos.lightness**2
+        weighted = scaled[:, None] * rows.columns
         target = rows.seen / (albedos.lightness[:, None] * albedos.color) - mean_albedo * rows.sent
-        tint = np.maximum((scaled * shading) @ target / max(float(scaled @ shading**2), 1e-300), 0.0)
-        return _Solution(amounts, amounts[:, None] * tint, mean_albedo)
+        vectors = weighted.T @ target
+        if pull is None:
+            along = max(float(scaled @ (rows.columns @ amounts) ** 2), 1e-300)
+            return _Solution(amounts, amounts[:, None] * np.maximum(amounts @ vectors / along, 0.0), mean_albedo)
+        matrix = weighted.T @ rows.columns
+        tint = np.maximum(amounts @ vectors / max(float(amounts @ matrix @ amounts), 1e-300), 0.0)
+        ridge = RIDGE * max(float(np.trace(matrix)) / len(matrix), 1e-300)
+        regular, near = matrix + ridge * (1.0 + pull) * np.eye(len(matrix)), ridge * pull * amounts
+        colors = [solve_nonnegative(regular, vectors[:, c] + tint[c] * near)[0] for c in range(3)]
+        return _Solution(amounts, np.stack(colors, axis=1), mean_albedo)
 
     def _predict(self, albedos: Albedos, weights: Floats, rows: _Rows) -> list[Floats]:
         """For each memory, the light that all frames so far make under it."""

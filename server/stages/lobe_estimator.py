@@ -387,7 +387,7 @@ class LobeEstimator:
     ) -> _Solution:
         """The solution with its colours, each channel drawn to a multiple of the luminance by `pull` times the ridge.
 
-        None: each is one, as while surfaces' colours are looked for: or coloured surfaces would pass for coloured light.
+        None: each is one, as while surfaces of many colours are looked for, which else would pass for coloured light.
         """
         scaled = weights * albedos.lightness**2
         weighted = scaled[:, None] * rows.columns

@@ -7,7 +7,6 @@ import pytest
 
 from client.laptop.source import open_source
 from protocol.messages import Wishes
-from server.evaluation import mitsuba_room
 from server.evaluation.mitsuba_room import RoomSet, model_for, room_sets
 from server.evaluation.object_shading import ObjectShading
 from server.maths.sh import dominant_direction, rotate_sh
@@ -48,33 +47,11 @@ def test_composites_differ_from_pictures_at_the_objects(sets: dict[str, RoomSet]
     assert differs.mean() < 0.5
 
 
-@pytest.mark.parametrize(("built", "expected"), [
-    ({"estimated", "observed"}, ("estimated", "observed")),
-    ({"estimated"}, ("estimated", "none")),
-    ({"observed"}, ("constant", "observed")),
-    (set(), ("constant", "none")),
-])  # fmt: skip
-def test_a_set_gets_what_the_server_has(
-    sets: dict[str, RoomSet], monkeypatch: pytest.MonkeyPatch, built: set[str], expected: tuple[str, str]
-) -> None:
-    def read(wishes: Wishes) -> None:
-        if not {wishes.albedo, wishes.indirect} - {"constant", "none"} <= built:
-            raise ValueError("not available")
-
-    monkeypatch.setattr(mitsuba_room, "read_wishes", read)
-    found = model_for(sets["key_tex_gi"], Wishes(rays=7))
-    assert (found.albedo, found.indirect, found.rays) == (*expected, 7)
-    plain = model_for(sets["key_white_direct"], Wishes(albedo="constant", indirect="observed"))
-    assert (plain.albedo, plain.indirect) == ("constant", "none")
-
-
-def test_a_preset_that_does_not_exist_is_refused(sets: dict[str, RoomSet], monkeypatch: pytest.MonkeyPatch) -> None:
-    def read(_wishes: Wishes) -> None:
-        raise ValueError("no such preset")
-
-    monkeypatch.setattr(mitsuba_room, "read_wishes", read)
-    with pytest.raises(ValueError, match="'reg4' is not available"):
-        model_for(sets["key_tex_gi"], Wishes())
+def test_a_set_is_run_with_what_it_calls_for(sets: dict[str, RoomSet]) -> None:
+    found = model_for(sets["key_tex_gi"], Wishes(rays=7, albedo="constant", indirect="none"))
+    assert (found.albedo, found.indirect, found.rays) == ("estimated", "observed", 7)
+    plain = model_for(sets["key_white_direct"], Wishes(indirect="observed"))
+    assert (plain.albedo, plain.indirect) == ("estimated", "none")
 
 
 def test_the_true_light_shades_the_objects_as_the_path_tracer(sets: dict[str, RoomSet], shading: ObjectShading) -> None:

@@ -84,15 +84,16 @@ kernel void refine_virtual(const int listed, global const int *pixels, const int
                            const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid,
                            global const uchar *octets, global const float2 *voxels, const float voxel_m,
                            const float truncation_m, const int count, global const float4 *directions,
-                           global const float4 *arriving, const float reach_m,
-                           const int objects, global const float16 *grid_from_volume, global const int4 *dims,
+                           global const float4 *arriving, const float reach_m, const int plane_count,
+                           global const float4 *planes, global const int4 *shapes, global const uchar *maps, const float cell_m,
+                           const float least_m, const int objects, global const float16 *grid_from_volume, global const int4 *dims,
                            global const float *distances, const float offset_m, global float4 *occluded) {
     const int item = get_global_id(0);
     if (item >= listed) return;
     const int pixel = pixels[item];
     const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
     const Objects things = {objects, grid_from_volume, dims, distances, offset_m};
-    const Arriving light = {count, directions, arriving, reach_m};
+    const Arriving light = {count, directions, arriving, reach_m, {plane_count, planes, shapes, maps, cell_m, least_m}};
     const int set = direction_set(pixel / width, pixel % width);
     occluded[pixel] = taken_from_virtual(volume, things, light, positions[pixel], normals[pixel].xyz, set);
 }
@@ -105,8 +106,9 @@ kernel void refine_real(const int listed, global const int *pixels, const int wi
                         const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid,
                         global const uchar *octets, global const float2 *voxels, const float voxel_m,
                         const float truncation_m, const int count, global const float4 *directions,
-                        global const float4 *arriving, const float reach_m,
-                        const int objects, global const float16 *grid_from_volume, global const int4 *dims,
+                        global const float4 *arriving, const float reach_m, const int plane_count,
+                        global const float4 *planes, global const int4 *shapes, global const uchar *maps, const float cell_m,
+                        const float least_m, const int objects, global const float16 *grid_from_volume, global const int4 *dims,
                         global const float *distances, const float4 ball, global const float4 *light,
                         const int cols, const int rows, const int stride, global const float4 *shaded, global float4 *ratio) {
     const int item = get_global_id(0);
@@ -119,7 +121,7 @@ kernel void refine_real(const int listed, global const int *pixels, const int wi
         const float4 without = upsample(grid, shaded, positions, normals, x, y, voxel_m);
         const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
         const Objects things = {objects, grid_from_volume, dims, distances, 0.0f};
-        const Arriving arrives = {count, directions, arriving, reach_m};
+        const Arriving arrives = {count, directions, arriving, reach_m, {plane_count, planes, shapes, maps, cell_m, least_m}};
         const float3 taken = taken_from_real(volume, things, arrives, ball, positions[pixel].xyz, normals[pixel].xyz, direction_set(y, x));
         const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
         result = (float4)(fmax(without.xyz - taken, floor) / fmax(without.xyz, floor), without.w);

@@ -3,6 +3,8 @@
 #ifndef CELLS
 #error CELLS must be defined: a multiple of 8
 #endif
+#include "continued.clh"
+
 #define COLUMNS (CELLS + 8)
 #define BLOCKS (COLUMNS / 8)
 #define SPOKES 4  // directions of a cell that are tried
@@ -108,31 +110,7 @@ kernel void pool_cells(const int pool_cols, const int pool_rows, const int cols,
     place[slot * pool_rows * pool_cols + pool] = (float8)(positions[middle].xyz, 1.0f, normal, free_sky);
 }
 
-// A plane that goes on beyond what was seen of it: see continuation.py.
-typedef struct {
-    float4 normal;   // w: its distance from the origin
-    float4 across;   // unit, in the plane; w: coordinate of the map's first edge
-    float4 along;    // likewise
-    float4 box;      // across from, to, along from, to: coordinates relative to the map's edges between which it is taken to be
-    int4 map;        // cells across, along, and where its map begins
-} Plane;
-
-// Whether a ray meets the plane where it is taken to go on.
-static inline int meets(const Plane plane, global const uchar *maps, const float3 origin, const float3 direction, const float cell_m,
-                        const float least_m) {
-    const float sinking = dot(plane.normal.xyz, direction);
-    if (fabs(sinking) < 1e-5f) return 0;
-    const float t = (plane.normal.w - dot(plane.normal.xyz, origin)) / sinking;
-    if (t < least_m) return 0;
-    const float3 point = origin + t * direction;
-    const float x = dot(plane.across.xyz, point) - plane.across.w, y = dot(plane.along.xyz, point) - plane.along.w;
-    if (!(x >= plane.box.x && x <= plane.box.y && y >= plane.box.z && y <= plane.box.w)) return 0;
-    const int col = clamp((int)(x / cell_m), 0, plane.map.x - 1), row = clamp((int)(y / cell_m), 0, plane.map.y - 1);
-    return maps[plane.map.z + row * plane.map.x + col];
-}
-
-// One item a pool. places [count]; planes [plane_count][4], shapes [plane_count]: see Plane; maps: 1 where a plane may be;
-// directions [CELLS][SPOKES]: each cell's, unit
+// One item a pool. places [count]; planes ... cell_m: see continued.clh; directions [CELLS][SPOKES]: each cell's, unit
 // -> pools [count][CELLS] = raw [count][CELLS] times the share of a cell's directions that meet no plane.
 kernel void hide_cells(const int count, const int first, global const float8 *places, const int plane_count,
                        global const float4 *planes, global const int4 *shapes, global const uchar *maps, const float cell_m,
@@ -140,16 +118,12 @@ kernel void hide_cells(const int count, const int first, global const float8 *pl
     const int pool = get_global_id(0);
     if (pool >= count) return;
     const float8 place = places[first + pool];
+    const Continued continued = {plane_count, planes, shapes, maps, cell_m, least_m};
     for (int k = 0; k < CELLS; k++) {
         const int index = (first + pool) * CELLS + k;
         int hidden = 0;
         for (int spoke = 0; spoke < SPOKES && raw[index] > 0.0f; spoke++) {
-            int met = 0;
-            for (int i = 0; i < plane_count && !met; i++) {
-                const Plane plane = {planes[4 * i], planes[4 * i + 1], planes[4 * i + 2], planes[4 * i + 3], shapes[i]};
-                met = meets(plane, maps, place.s012, directions[SPOKES * k + spoke].xyz, cell_m, least_m);
-            }
-            hidden += met;
+            hidden += is_hidden(continued, place.s012, directions[SPOKES * k + spoke].xyz);
         }
         pools[index] = raw[index] * (SPOKES - hidden) / SPOKES;
     }

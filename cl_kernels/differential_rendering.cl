@@ -59,8 +59,9 @@ kernel void shadow_virtual(const int cols, const int rows, const int stride, con
                            const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid,
                            global const uchar *octets, global const float2 *voxels, const float voxel_m,
                            const float truncation_m, const int count, global const float4 *directions,
-                           global const float4 *arriving, const float reach_m,
-                           const int objects, global const float16 *grid_from_volume, global const int4 *dims,
+                           global const float4 *arriving, const float reach_m, const int plane_count,
+                           global const float4 *planes, global const int4 *shapes, global const uchar *maps, const float cell_m,
+                           const float least_m, const int objects, global const float16 *grid_from_volume, global const int4 *dims,
                            global const float *distances, const float offset_m, global float4 *occluded) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
@@ -68,6 +69,6 @@ kernel void shadow_virtual(const int cols, const int rows, const int stride, con
     const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
     const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
     const Objects things = {objects, grid_from_volume, dims, distances, offset_m};
-    const Arriving light = {count, directions, arriving, reach_m};
+    const Arriving light = {count, directions, arriving, reach_m, {plane_count, planes, shapes, maps, cell_m, least_m}};
     occluded[row * cols + col] = taken_from_virtual(volume, things, light, positions[pixel], normals[pixel].xyz, direction_set(row, col));
 }

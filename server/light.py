@@ -12,7 +12,7 @@ from protocol.frames import CameraModel
 from server.geometry import GeometryFrame
 from server.opencl.engine import Engine
 from server.settings import Settings
-from server.stages.continuation import Continuation
+from server.stages.continuation import NO_PLANES, Continuation, PlaneArrays
 from server.stages.indirect import gather_hits, no_hits
 from server.stages.light_estimation import LightEstimate, LightEstimator, gather_samples, sum_tiles
 from server.stages.lobe_estimator import LightModel, LobeEstimator
@@ -35,6 +35,12 @@ class RoomLight:
     def estimate(self) -> LightEstimate:
         """The light as it stands."""
         return self._harmonics.estimate() if self._harmonics else self._lobes.estimate()
+
+    @property
+    def planes(self) -> PlaneArrays:
+        """Surfaces taken to go on beyond what was seen of them: they hide light from virtual things too."""
+        continuation = self._lobes.continuation
+        return continuation.arrays() if continuation and not self._harmonics else NO_PLANES
 
     def update(
         self,

@@ -110,10 +110,10 @@ class Pipeline:
                 "measurement": measurement,
                 "surface": surface,
                 "transfer": transfer,
-                "light": upload_light(engine, estimate.sh, self._sampler.rays),
+                "light": upload_light(engine, estimate.sh, self._sampler.rays, self._room_light.planes),
             }
             picture: NDArray[np.uint8] = execute(order, given, "picture")
-        if self._given_light is None:  # B4, for the frames to come: it takes the place of this frame's transfer
+        if self._given_light is None:  # B4, for the frames to come
             with stage("light_estimation"):
                 self._lamps.work(measurement.radiance, surface, volume)
 

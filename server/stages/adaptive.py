@@ -170,7 +170,7 @@ def _empty(engine: Engine, camera: CameraModel, name: str) -> cl_array.Array:
 
 
 def _light(engine: Engine, light: DeviceLight, rays: Directions, reach_m: float) -> tuple[KernelArgument, ...]:
-    return rays.count, rays.on_device(engine), light.arriving, reach_m
+    return rays.count, rays.on_device(engine), light.arriving, reach_m, *light.continued
 
 
 def _defines(engine: Engine, bands: int) -> dict[str, int]:

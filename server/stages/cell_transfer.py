@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.maths.lobes import CELL_SR, CELLS, CellEquations, cell_directions
-from server.maths.planes import CELL_M
 from server.opencl.engine import Engine, float4
-from server.stages.continuation import LEAST_M, PlaneArrays, spokes
+from server.stages.continuation import PlaneArrays, plane_arguments, spokes
 from server.stages.radiance_transfer import Directions, Transfer, own_sets
 from server.stages.raycast import Surface
 
@@ -161,14 +160,9 @@ class PoolWindow:
 
     def hide(self, slots: Iterable[int], planes: PlaneArrays) -> None:
         """Make `values` of `slots` anew: `raw` less what `planes` hide."""
-        rows, shapes, maps = planes
-        engine, space, count = self._engine, self._engine.workspace, len(shapes)
-        directions = np.pad(spokes(), ((0, 0), (0, 0), (0, 1))).astype(np.float32)
-        uploaded = [
-            space.upload("planes", (rows if count else np.zeros((1, 4, 4), np.float32)).view(cl_types.float4)),
-            space.upload("plane_shapes", (shapes if count else np.zeros((1, 4), np.int32)).view(cl_types.int4)),
-            space.upload("plane_maps", maps),
-        ]
+        engine = self._engine
+        directions = np.pad(spokes(), ((0, 0), (0, 0), (0, 1))).astype(np.float32).view(cl_types.float4)
+        arguments = plane_arguments(engine, "pool_planes", planes)
         for slot in slots:
             engine.launch(
                 self._kernel("hide_cells"),
@@ -176,11 +170,8 @@ class PoolWindow:
                 self.grid.count,
                 slot * self.grid.count,
                 self._places,
-                count,
-                *uploaded,
-                CELL_M,
-                LEAST_M,
-                space.constant("cell_spokes", directions.view(cl_types.float4)),
+                *arguments,
+                engine.workspace.constant("cell_spokes", directions),
                 self.raw,
                 self.values,
             )

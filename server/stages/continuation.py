@@ -12,13 +12,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.maths.lobes import CELL_SR, RIDGE, cell_directions
 from server.maths.nonnegative_qp import solve_nonnegative
-from server.maths.planes import SIDES, STEPS_M, PlanePatch, find_planes
+from server.maths.planes import CELL_M, SIDES, STEPS_M, PlanePatch, find_planes
 from server.maths.rigid import inverse_rigid
+from server.opencl.engine import Engine, KernelArgument
 
 Floats = NDArray[np.float64]
 PlaneArrays = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8]]
@@ -145,6 +147,21 @@ class Continuation:
         ]
         maps = np.concatenate([~plane.empty.ravel() for plane in believed])
         return np.array(rows, np.float32), np.array(shapes, np.int32), maps.astype(np.uint8)
+
+
+def plane_arguments(engine: Engine, name: str, planes: PlaneArrays) -> tuple[KernelArgument, ...]:
+    """`planes` on the device, under `name`, in the order of Continued of include/continued.clh."""
+    rows, shapes, maps = planes
+    count = len(shapes)
+    space = engine.workspace
+    return (
+        count,
+        space.upload(name, (rows if count else np.zeros((1, 4, 4), np.float32)).view(cl_types.float4)),
+        space.upload(f"{name}_shapes", (shapes if count else np.zeros((1, 4), np.int32)).view(cl_types.int4)),
+        space.upload(f"{name}_maps", maps),
+        CELL_M,
+        LEAST_M,
+    )
 
 
 def _looked_through(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine, KernelArgument, float4
+from server.stages.continuation import NO_PLANES, PlaneArrays, plane_arguments
 from server.stages.radiance_transfer import Directions, Transfer, own_sets
 from server.stages.rasterize import Placed, VirtualSurface
 from server.stages.raycast import Surface
@@ -34,6 +35,8 @@ class DeviceLight:
     """[bands^2] float4: RGB radiance coefficients."""
     arriving: cl_array.Array
     """[SETS, count] float4: RGB radiance from each direction that visibility is tested along."""
+    continued: tuple[KernelArgument, ...]
+    """Planes that hide it where the volume is empty, as Continued of include/continued.clh takes them."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +57,15 @@ class SampleGrid:
         return int(self.values.shape[1])
 
 
-def upload_light(engine: Engine, sh: NDArray[np.float64], rays: Directions) -> DeviceLight:
-    """Bring radiance coefficients [bands^2, 3] and what they send along `rays` to the device."""
+def upload_light(
+    engine: Engine, sh: NDArray[np.float64], rays: Directions, planes: PlaneArrays = NO_PLANES
+) -> DeviceLight:
+    """Bring radiance coefficients [bands^2, 3], what they send along `rays`, and what hides it, to the device."""
     arriving = rays.basis @ sh.astype(np.float32)
     return DeviceLight(
-        engine.workspace.upload("light", _float4(sh)), engine.workspace.upload("arriving", _float4(arriving))
+        engine.workspace.upload("light", _float4(sh)),
+        engine.workspace.upload("arriving", _float4(arriving)),
+        plane_arguments(engine, "light_planes", planes),
     )
 
 
@@ -141,6 +148,7 @@ def shadow_virtual(
         rays.on_device(engine),
         light.arriving,
         reach_m,
+        *light.continued,
         *object_arguments(table),
         max(table.cell_m, default=0.0),
         occluded.values,

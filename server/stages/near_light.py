@@ -44,7 +44,8 @@ class Emitters:
     def shares(self, emitters: NDArray[np.float64]) -> NDArray[np.float32]:
         """[emitters, samples] g = V max(n.w, 0) / (pi d^2) of emitters [n, 3] in volume space, 1 / m^2."""
         engine = self._engine
-        found = engine.workspace.array("near_shares", (len(emitters), self._count), np.float32)
+        size = len(emitters) * self._count
+        found = engine.workspace.array("near_shares", (-(-size // _SHARES_STEP) * _SHARES_STEP,), np.float32)
         engine.launch(
             self.compiled(engine),
             (-(-self._count // engine.lanes), len(emitters)),
@@ -57,13 +58,17 @@ class Emitters:
             *self._volume.arguments(),
             found,
         )
-        shares: NDArray[np.float32] = engine.download(found)
+        shares: NDArray[np.float32] = engine.download(found)[:size].reshape(len(emitters), self._count)
         return shares
 
 
+_VECTORS_STEP, _SHARES_STEP = 2048, 1 << 20
+"""Arrays grow in such steps, so that searches of about one size take no new memory."""
+
+
 def _upload(engine: Engine, name: str, vectors: NDArray[np.float64]) -> cl_array.Array:
-    padded = np.zeros((len(vectors), 4), np.float32)
-    padded[:, :3] = vectors
+    padded = np.zeros((-(-len(vectors) // _VECTORS_STEP) * _VECTORS_STEP, 4), np.float32)
+    padded[: len(vectors), :3] = vectors
     return engine.workspace.upload(name, padded.view(cl_types.float4)[:, 0])
 
 

@@ -126,7 +126,7 @@ def transfer_radiance(
     """
     cols, rows = camera.width // stride, camera.height // stride
     space = engine.workspace
-    sets = space.array("sets", (rows, cols, rays.interleave), np.uint8)
+    sets = space.array(f"sets_{rows}x{cols}", (rows, cols, rays.interleave), np.uint8)
     result = room_for_transfer(engine, rows, cols, stride, rays, sets)
     words = result.free_mask.shape[2]
     defines = {"BANDS": result.bands, "MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": rays.interleave}
@@ -164,17 +164,17 @@ def transfer_radiance(
 def room_for_transfer(
     engine: Engine, rows: int, cols: int, stride: int, rays: Directions, sets: cl_array.Array
 ) -> Transfer:
-    """The arrays of a transfer, their contents undefined; `sets` as given."""
-    space, coefficients = engine.workspace, rays.basis.shape[2]
+    """The arrays of a transfer, their contents undefined, kept by their number of samples; `sets` as given."""
+    space, coefficients, size = engine.workspace, rays.basis.shape[2], f"{rows}x{cols}"
     return Transfer(
         stride,
         rows,
         cols,
         round(coefficients**0.5),
-        space.array("transfer", (rows, cols, coefficients), np.float32),
-        space.array("openness", (rows, cols), np.float32),
-        space.array("flatness", (rows, cols), np.float32),
-        space.array("free_mask", (rows, cols, -(-rays.count // 32)), np.uint32),
+        space.array(f"transfer_{size}", (rows, cols, coefficients), np.float32),
+        space.array(f"openness_{size}", (rows, cols), np.float32),
+        space.array(f"flatness_{size}", (rows, cols), np.float32),
+        space.array(f"free_mask_{size}", (rows, cols, -(-rays.count // 32)), np.uint32),
         sets,
     )
 
@@ -191,7 +191,7 @@ def first_set(turn: int) -> int:
 
 def own_sets(engine: Engine, rows: int, cols: int, turn: int = 0) -> cl_array.Array:
     """[rows, cols, 1] uint8: the set of each sample where nothing is taken from other frames (direction_sets.clh)."""
-    return engine.workspace.constant(f"own_sets_{turn % TURNS}", _sets_of(rows, cols, turn % TURNS))
+    return engine.workspace.constant(f"own_sets_{turn % TURNS}_{rows}x{cols}", _sets_of(rows, cols, turn % TURNS))
 
 
 @cache

@@ -16,9 +16,11 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from protocol.frames import CameraModel
+from server.maths.planes import PlanePatch
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.scene.virtual_object import VirtualObject
+from server.stages.continuation import NO_PLANES, Continuation, PlaneArrays
 from server.stages.differential_rendering import SampleGrid, shadow_real, shadow_virtual, upload_light
 from server.stages.radiance_transfer import Directions, direction_sets, transfer_radiance
 from server.stages.rasterize import Placed, VirtualSurface
@@ -266,7 +268,7 @@ TABLE_TOP = box((0.2, 0.2, 0.2), (0.76, 0.22, 0.76))
 
 
 def shade_top(
-    engine: Engine, scene: Scene, solids: list[Box], light: Floats, rays: int = 81
+    engine: Engine, scene: Scene, solids: list[Box], light: Floats, rays: int = 81, planes: PlaneArrays = NO_PLANES
 ) -> tuple[Floats, Floats, Floats, float]:
     """Occluded radiance [rows, cols, 4] on top of the first solid, its geometry buffer, and its cells' side."""
     x, z = np.meshgrid(np.linspace(0.25, 0.71, 20), np.linspace(0.25, 0.71, 20))
@@ -287,7 +289,7 @@ def shade_top(
     directions = direction_sets(rays, 4)
     table = object_table(engine, [placed(engine, solid) for solid in solids])
     volume: Volume = fill_volume(engine, scene, VOXEL_M)
-    device_light = upload_light(engine, light, directions)
+    device_light = upload_light(engine, light, directions, planes)
     found: SampleGrid = shadow_virtual(
         engine, camera_of(positions), surface, volume, 4, device_light, directions, FAR_M, table
     )
@@ -347,3 +349,28 @@ def test_arriving_light_is_the_lights_radiance(engine: Engine) -> None:
     np.testing.assert_allclose(download4(engine, light.arriving)[..., :3], exact, atol=2e-6)
     np.testing.assert_allclose(download4(engine, light.coefficients)[..., :3], LIGHT, rtol=1e-6, atol=1e-12)
     assert light.coefficients.dtype == cl_types.float4
+
+
+def test_a_continued_plane_hides_the_sky_as_a_wall_would(engine: Engine) -> None:
+    """Under an even sky of 1, a wall of which the volume knows nothing takes the share of the sky that it covers."""
+    wall = PlanePatch(
+        normal=np.array([1.0, 0, 0]),
+        offset_m=0.0,
+        across=np.array([0.0, 0, 1]),
+        along=np.array([0.0, 1, 0]),
+        corner=np.zeros(2),
+        empty=np.zeros((40, 40), np.bool_),
+        seen=np.array([[0.0, 0], [0.8, 0.8]]),
+    )
+    continuation = Continuation()
+    continuation.planes, continuation._boxes = [wall], [wall.box]
+    shadowless = shade_top(engine, FLOOR, [TABLE_TOP], lights.uniform(), rays=1024)[0]
+    occluded, positions, _, _ = shade_top(engine, FLOOR, [TABLE_TOP], lights.uniform(), 1024, continuation.arrays())
+    like_wall = box((-0.02, 0.0, 0.0), (0.0, 0.8, 0.8))
+    taken = 0.0
+    for row, col in [(10, 10), (10, 4), (3, 3)]:
+        near = (occluded - shadowless)[row : row + 2, col : col + 2, 0].mean()
+        point = positions[2 * row : 2 * row + 4 : 2, 2 * col : 2 * col + 4 : 2, :3].reshape(-1, 3).mean(0)
+        assert near == pytest.approx(sky_behind(like_wall, point), abs=0.01)
+        taken = max(taken, near)
+    assert taken > 0.05

@@ -80,6 +80,11 @@ class Continuation:
         self.explained = 1.0
 
     @property
+    def is_searching(self) -> bool:
+        """Whether extents are about to be found for the first time: materials could then pass for their shadows."""
+        return self._frames > 0 and not self.is_settled
+
+    @property
     def is_settled(self) -> bool:
         """Whether extents are believed."""
         return self._passes >= SETTLED_PASSES

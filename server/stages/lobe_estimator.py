@@ -56,10 +56,14 @@ COLOR_PULL = 25.0
 """How much more a channel is drawn to its multiple of the luminance than to darkness: deviations of a fifth."""
 ALBEDO_SPREAD = 0.15
 """Deviation of a room's mean albedo from ASSUMED_ALBEDO, as far as indirect light does not tell."""
+ALBEDO_RANGE = (0.15, 0.9)
+"""A room's mean albedo."""
 UNSEEN_SPREAD = 0.5
 """Relative deviation of what surface sends that no picture shows."""
 NOISE = 0.1
 """Relative deviation of a pool's radiance from its model, at least in order of magnitude."""
+ALIKE = 200.0
+"""Pools that say of the mean albedo what one says: neighbours err alike."""
 BRIGHTER_COUNTS = 0.6
 """Weight of a pool goes with its expected radiance to minus this power: 0 for even, 2 for relative noise."""
 LEAST_WEIGHT = 8.0
@@ -337,7 +341,7 @@ class LobeEstimator:
     def _albedos(self, rows: _Rows, solution: _Solution, *, materials: bool) -> Albedos:
         if not self._model.albedos:
             return one_albedo(len(rows.seen))
-        materials = materials and (self.continuation is None or self.continuation.is_settled)
+        materials = materials and (self.continuation is None or not self.continuation.is_searching)
         shading = rows.columns @ solution.colors + solution.mean_albedo * rows.sent
         return self._surfaces.albedos(rows.seen, shading, rows.weights, materials=materials, one_color=self._one_color)
 
@@ -369,11 +373,12 @@ class LobeEstimator:
         matrix, vector = weighted.T @ columns, weighted.T @ target
         lobes = len(matrix) - 1
         pull = np.full(lobes + 1, RIDGE * max(float(np.trace(matrix[:lobes, :lobes])) / lobes, 1e-300))
-        noise = max(float(weights @ target**2) * NOISE**2, 1e-300)  # of all pools, if they were one
+        independent = max(len(target) / ALIKE, 1.0)
+        noise = max(float(weights @ target**2) * NOISE**2 / independent, 1e-300)
         pull[-1] = noise / ALBEDO_SPREAD**2
         vector[-1] += pull[-1] * ASSUMED_ALBEDO
         amounts, _ = solve_nonnegative(matrix + np.diag(pull), vector)
-        amounts[-1] = min(amounts[-1], 1.0)
+        amounts[-1] = np.clip(amounts[-1], *ALBEDO_RANGE)
         return amounts
 
     def _with_colors(

@@ -139,8 +139,9 @@ def _add_shading(
         part.leave_out(f"{row}: objects' radiance", bench.no_shading)
         return
     shading = bench.shading
-    observed = [EXPOSURE * item.picture(i) for i in range(len(found))] if wishes.indirect == "observed" else None
+    pictures = [EXPOSURE * item.picture(i) for i in range(len(shading.frames))]
     reach_m = THESIS_REACH_M if wishes.as_thesis else np.inf
+    observed = pictures if wishes.indirect == "observed" else None
     exact = [shading.error(item, i, light_in(result), reach_m, observed) for i, result in enumerate(found)]
     part.add(f"{row}: objects' radiance, exact geometry, median error", 100 * median(exact), "%", goal)
     shown = [_shown_error(item, shading, i, result) for i, result in enumerate(found)]

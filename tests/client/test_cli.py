@@ -55,7 +55,7 @@ def assert_one_line(done: subprocess.CompletedProcess[str], status: int, words: 
         (["run", TABLE, "--out", "{tmp}", "--bands", "9"], "--bands"),
         (["run", TABLE, "--out", "{tmp}", "--wrong"], "--wrong"),
         (["run", TABLE, "--out", "{tmp}", "--frames", "0:9"], "0:4"),
-        (["run", TABLE, "--out", "{tmp}", "--preset", "art4"], "not built yet"),
+        (["run", TABLE, "--out", "{tmp}", "--preset", "auto"], "not built yet"),
         (["stream", TABLE], "--server"),
         (["stream", TABLE, "--server", "localhost:1", "--device", "x"], "probeless serve --device"),
         (["stream", TABLE, "--server", "http://127.0.0.1:9", "--mesh"], "say where with --out"),
@@ -128,7 +128,7 @@ def test_help_names_every_command_and_option() -> None:
         assert command in general
     shared = (
         "--frames --poses --volume --voxel --preset --rays --ray-length --bands --albedo --indirect --as-thesis "
-        "--object --up --light --panorama --mesh --budget-ms --max-light-error --out"
+        "--object --up --light --panorama --lamps --mesh --budget-ms --max-light-error --out"
     )
     for command in ("run", "stream"):
         text = probeless(command, "--help", COLUMNS="200").stdout

@@ -26,7 +26,8 @@ def test_defaults_fit_the_source(source: str) -> None:
     assert wishes.voxel_m == default_voxel(wishes.volume_m)
     assert wishes.up == (0.0, -1.0, 0.0)  # what the source says
     assert (wishes.preset, wishes.rays, wishes.bands, wishes.ray_length_m) == ("reg4", 81, 4, None)
-    assert (wishes.albedo, wishes.indirect, wishes.poses) == ("constant", "none", "given")
+    assert (wishes.albedo, wishes.indirect, wishes.poses) == ("estimated", "observed", "given")
+    assert wishes.lamps == "auto"
     assert not wishes.as_thesis
     assert not wishes.lossless
 
@@ -44,6 +45,7 @@ def test_everything_said(source: str) -> None:
         bands=3,
         albedo="constant",
         indirect="none",
+        lamps="on",
         up="0,0,1",
         object=[f"{source}/meta.json@1,2,3", f"{source}/meta.json"],
     )
@@ -53,7 +55,9 @@ def test_everything_said(source: str) -> None:
     assert [item.position_m for item in capture.objects] == [(1.0, 2.0, 3.0), None]
     assert wishes.volume_m == (0.0, 0.0, 0.0, 1.0, 2.0, 3.0)
     assert (wishes.voxel_m, wishes.preset, wishes.rays, wishes.ray_length_m, wishes.bands) == (0.02, "rm", 169, 0.5, 3)
+    assert (wishes.albedo, wishes.indirect) == ("constant", "none")
     assert wishes.up == (0.0, 0.0, 1.0)
+    assert wishes.lamps == "on"
     assert wishes.lossless
 
 
@@ -65,8 +69,15 @@ def test_run_and_stream_choose_the_same_volume(source: str) -> None:
 def test_as_thesis(source: str) -> None:
     wishes = prepare(CaptureOptions(source, as_thesis=True)).wishes
     assert (wishes.ray_length_m, wishes.albedo, wishes.indirect, wishes.as_thesis) == (0.1, "constant", "none", True)
-    with pytest.raises(OptionError, match="leave one of the two out"):
-        prepare(CaptureOptions(source, as_thesis=True, ray_length="1"))
+    same = prepare(CaptureOptions(source, as_thesis=True, albedo="constant", indirect="none")).wishes
+    assert same == wishes
+
+
+@pytest.mark.parametrize("said", [{"ray_length": "1"}, {"albedo": "estimated"}, {"indirect": "observed"}], ids=str)
+def test_as_thesis_is_not_said_with_what_it_is_not(said: dict, source: str) -> None:
+    with pytest.raises(OptionError, match="leave one of the two out") as caught:
+        prepare(CaptureOptions(source, as_thesis=True, **said))
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -103,13 +114,10 @@ REFUSED = [
     ({"albedo": "white"}, "--albedo"),
     ({"indirect": "all"}, "--indirect"),
     ({"poses": "guess"}, "--poses"),
+    ({"lamps": "bright"}, "--lamps"),
 ]
 UNBUILT = [
-    *({"preset": name} for name in ("art1", "art4", "art8", "gr15", "gr15fast", "auto")),
-    {"albedo": "estimated"},
-    {"indirect": "observed"},
-    {"light": "light.json"},
-    {"panorama": "sky.hdr"},
+    {"preset": "auto"},
     {"budget_ms": 40.0},
     {"max_light_error": 3.0},
 ]
@@ -127,6 +135,13 @@ def test_what_is_not_built_yet_names_the_alternative(said: dict, source: str) ->
     with pytest.raises(OptionError, match=r"is not built yet; \w+") as caught:
         prepare(CaptureOptions(source, **said))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("albedo", ["constant", "estimated"])
+@pytest.mark.parametrize("indirect", ["none", "observed"])
+def test_what_is_modelled_is_said_apart(albedo: str, indirect: str, source: str) -> None:
+    wishes = prepare(CaptureOptions(source, albedo=albedo, indirect=indirect)).wishes
+    assert (wishes.albedo, wishes.indirect) == (albedo, indirect)
 
 
 def test_source_without_poses_is_tracked(tmp_path: Path, source: str) -> None:

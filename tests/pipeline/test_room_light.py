@@ -1,0 +1,118 @@
+"""The spine with surfaces of unknown albedo and observed indirect light: a table painted in black and white stripes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from client.laptop.source import open_source
+from client.laptop.synthetic.source import SyntheticSource
+from client.laptop.volume import default_volume, default_voxel
+from protocol.frames import RgbdFrame
+from protocol.messages import Light, Wishes
+from server.maths.sh import dominant_direction
+from server.opencl.device import Device
+from server.pipeline import Pipeline
+from server.stages.composite import srgb_codes
+from tests.analytic import Floats
+from tests.lights import degrees_between
+
+BLACK = 0.12
+"""Of what the rest sends back."""
+FRAMES = range(0, 30, 5)
+
+
+def points_of(source: SyntheticSource, index: int) -> Floats:
+    """[h, w, 3] world metres that each pixel shows."""
+    camera, depth, pose = source.camera, source.truth(index).depth_m.astype(np.float64), source.pose(index)
+    v, u = np.mgrid[: camera.height, : camera.width]
+    points = np.stack([(u - camera.cx) / camera.fx * depth, (v - camera.cy) / camera.fy * depth, depth], axis=-1)
+    return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
+
+
+def striped(source: SyntheticSource, index: int) -> RgbdFrame:
+    """A frame with everything painted, across the table, in stripes 20 cm wide."""
+    black: NDArray[np.bool_] = np.floor(points_of(source, index)[..., 0] / 0.2 + 0.3).astype(int) % 2 == 0
+    radiance = source.truth(index).radiance * np.where(black, BLACK, 1.0)[..., None]
+    return replace(source[index], color=srgb_codes(radiance))
+
+
+@pytest.fixture(scope="module")
+def table() -> SyntheticSource:
+    source = open_source("synthetic:table?frames=30&size=160x120&light=1")
+    assert isinstance(source, SyntheticSource)
+    return source
+
+
+@pytest.fixture(scope="module")
+def frames(table: SyntheticSource) -> list[RgbdFrame]:
+    return [striped(table, index) for index in FRAMES]
+
+
+def wishes_for(source: SyntheticSource, **more: object) -> Wishes:
+    bounds = default_volume(source, range(30))
+    wishes = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), preset="reg4", up=source.up)
+    return msgspec.structs.replace(wishes, **more)
+
+
+def lights(device: Device, source: SyntheticSource, frames: list[RgbdFrame], **more: object) -> list[Light]:
+    pipeline = Pipeline(device, source.camera, wishes_for(source, **more))
+    found = [pipeline.process(frame).light for frame in frames]
+    pipeline.close()
+    return found
+
+
+def error_deg(source: SyntheticSource, light: Light) -> float:
+    return degrees_between(dominant_direction(np.array(light.sh)), source.truth(0).light_direction)
+
+
+def test_stripes_do_not_turn_the_light(device: Device, table: SyntheticSource, frames: list[RgbdFrame]) -> None:
+    """One albedo for all is 51 degrees off after six frames, albedos of their own 2 to 4."""
+    constant = lights(device, table, frames, albedo="constant", indirect="none")
+    estimated = lights(device, table, frames, albedo="estimated", indirect="observed")
+    direct = lights(device, table, frames, albedo="estimated", indirect="none")
+    for light in (*estimated, *direct):
+        assert np.isfinite(light.sh).all()
+        assert np.isfinite([x for row in light.sh_std or () for x in row if x is not None]).all()
+    assert error_deg(table, constant[-1]) > 25.0
+    assert error_deg(table, estimated[-1]) < 12.0
+    assert error_deg(table, direct[-1]) < 12.0
+    assert any((np.array(a.sh) != np.array(b.sh)).any() for a, b in zip(estimated, direct, strict=True))
+
+
+def test_the_thesis_knows_neither(device: Device, table: SyntheticSource, frames: list[RgbdFrame]) -> None:
+    """--as-thesis stays what it is, whatever else is wished."""
+    plain, wished = (
+        lights(device, table, frames[:2], as_thesis=True, albedo=albedo, indirect=indirect)
+        for albedo, indirect in (("constant", "none"), ("estimated", "observed"))
+    )
+    for a, b in zip(plain, wished, strict=True):
+        np.testing.assert_array_equal(np.array(a.sh), np.array(b.sh))
+        np.testing.assert_array_equal(np.array(a.sh)[:, 0], np.array(a.sh)[:, 2])  # white
+
+
+@pytest.mark.parametrize("other", ["rm", "reg8", "art4", "gr15fast"])
+def test_presets_can_be_changed_on_the_way(
+    device: Device, table: SyntheticSource, frames: list[RgbdFrame], other: str
+) -> None:
+    """Pools lie elsewhere then, and the window begins anew; coming back too."""
+    pipeline = Pipeline(device, table.camera, wishes_for(table, albedo="estimated", indirect="observed"))
+    for number, frame in enumerate(frames):
+        pipeline.set_preset(other if number in (2, 3) else "reg4")
+        light = pipeline.process(frame).light
+        assert np.isfinite(light.sh).all()
+        assert light.sh[0][1] > 0
+    pipeline.close()
+
+
+def test_a_black_picture_leaves_the_light(device: Device, table: SyntheticSource, frames: list[RgbdFrame]) -> None:
+    pipeline = Pipeline(device, table.camera, wishes_for(table, albedo="estimated", indirect="observed"))
+    for frame in frames[:2]:
+        known = pipeline.process(frame).light
+    nothing = replace(frames[2], color=np.zeros_like(frames[2].color))
+    np.testing.assert_array_equal(np.array(pipeline.process(nothing).light.sh), np.array(known.sh))
+    pipeline.close()

@@ -1,7 +1,7 @@
 """`mitsuba_room`: each preset's light against the path tracer's, and the virtual objects under it against its pictures.
 
-Every set is run with what it calls for, as far as this server has it (the row says which): estimated albedo where the
-room is textured, observed indirect light where there is any, neither elsewhere.
+Every set is run with what it calls for (the row says which): estimated albedos, and observed indirect light where there
+is any.
 """
 
 from __future__ import annotations

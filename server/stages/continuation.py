@@ -33,8 +33,10 @@ LEAST_M = 0.03
 """A pool does not hide from itself."""
 LEAST_GAIN = 0.01
 """A longer extent must leave so much less of the residual's energy; a shorter one may leave a fifth of that more."""
-FIRST_TRIES, TRIES, RETRY_FRAMES = 400, 40, 16
-"""Extents tried in each of the first frames, until all have been settled; then so many every so many frames."""
+FIRST_TRIES = 400
+"""Extents tried in each of the first frames, until all have been settled."""
+TRIES, RESUME_FRAMES, RETRY_FRAMES = 40, 4, 16
+"""Extents tried at a time from then on, and how often: while new planes are not settled, and while all are."""
 SETTLED_PASSES = 2
 """Times that every side is settled before the extents are believed."""
 BELIEVED = 0.9
@@ -75,14 +77,14 @@ class Continuation:
         self._looked: list[PlanePatch] = []
         self._views: deque[tuple[Floats, Floats]] = deque(maxlen=VIEWS)
         self._frames = 0
-        self._turn, self._passes = 0, 0
+        self._turn, self._passes, self._was_settled = 0, 0, False
         self._boxes: list[Floats] = []
         self.explained = 1.0
 
     @property
     def is_searching(self) -> bool:
         """Whether extents are about to be found for the first time: materials could then pass for their shadows."""
-        return self._frames > 0 and not self.is_settled
+        return self._frames > 0 and not self._was_settled
 
     @property
     def is_settled(self) -> bool:
@@ -112,10 +114,11 @@ class Continuation:
 
         The extents explain the pictures together, so none is believed before all have been settled twice.
         """
-        if not self.planes or self._frames < LEAST_FRAMES or (self.is_settled and self._frames % RETRY_FRAMES):
+        wait = RETRY_FRAMES if self.is_settled else RESUME_FRAMES if self._was_settled else 1
+        if not self.planes or self._frames < LEAST_FRAMES or self._frames % wait:
             return False
         sides = SIDES * len(self.planes)
-        tries = FIRST_TRIES if self._passes < SETTLED_PASSES else TRIES
+        tries = TRIES if self._was_settled else FIRST_TRIES
         trial = _Trial(self.planes, judged)
         while tries > 0:
             tries -= trial.settle(*divmod(self._turn, SIDES))
@@ -125,6 +128,7 @@ class Continuation:
                 break
         if self._turn != 0 or self._passes < SETTLED_PASSES:
             return False
+        self._was_settled = True
         self.explained = trial.misfit / trial.misfit_of_none()
         believed = self.planes if self.explained < BELIEVED else []
         before, self._boxes = self._boxes, [plane.box for plane in believed]

@@ -8,7 +8,7 @@ neutral. How fast earlier frames are forgotten is what would have predicted the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -48,6 +48,8 @@ MEMORIES = (0.95, 0.8, 0.5, 0.1)
 """What may remain of a frame's weight a frame later."""
 WORTH_FORGETTING = 1.5
 """Frames are forgotten sooner only where the longest memory's misfits are so many times the least, over some frames."""
+AVERAGE = 0.15
+"""Share that a new estimate has in the mean while the light is steady."""
 CHANGE = 3.0
 """The light has changed if the frame's misfit under it is this many times what the frame's own best fit leaves."""
 CHANGED_WEIGHT = 0.03
@@ -161,6 +163,8 @@ class LobeEstimator:
         self._surfaces = Surfaces()
         self._solution: _Solution | None = None
         self._one_color = True
+        self._memory = 0
+        self._steady, self._is_fresh = 0, True
         self._scores = np.zeros(len(MEMORIES))
         self._predictions: list[Floats] = []
         self._last: tuple[_Rows, Albedos, Floats] | None = None
@@ -198,6 +202,7 @@ class LobeEstimator:
             return self._estimate
         self._next = (slot + 1) % SLOTS
         window.hide([slot], self.continuation.arrays() if self.continuation else NO_PLANES)
+        was_searching = self.continuation is not None and self.continuation.is_searching
         estimate = self.fold(slot, pools)
         if self.continuation:
             self._look_around(self.continuation, camera, volume_from_camera, self._engine.download(depth_m))
@@ -206,15 +211,25 @@ class LobeEstimator:
                 for held, frame in self._frames.items():
                     frame.columns = window.shading(held, _lobes_and_all())
                 estimate = self._refresh(slot, ROUNDS)
-        return estimate
+            self._is_fresh |= was_searching and not self.continuation.is_searching
+        self._estimate = self._averaged(estimate)
+        return self._estimate
+
+    def _averaged(self, estimate: LightEstimate) -> LightEstimate:
+        """P3 (thesis 5.4): the mean of the last estimates, as long as the light is steady and understood alike."""
+        self._steady = 1 if self._is_fresh or not self._model.memory else self._steady + 1
+        rate = max(1.0 / self._steady, AVERAGE)
+        self._is_fresh = False
+        return replace(estimate, sh=self._estimate.sh + rate * (estimate.sh - self._estimate.sh))
 
     def fold(self, slot: int, pools: Pools) -> LightEstimate:
-        """The estimate with `pools`, whose transfer lies in `slot` of the window."""
+        """The light with `pools`, whose transfer lies in `slot` of the window, not averaged."""
         assert self._window is not None
         columns = self._window.shading(slot, _lobes_and_all())
         newest = _Frame(pools, columns)
         with self._engine.profile.host():
             rounds = self._forget(newest)
+        self._is_fresh |= rounds == FIRST_ROUNDS or self._memory > 0
         self._frames[slot] = newest
         return self._refresh(slot, rounds)
 
@@ -257,8 +272,7 @@ class LobeEstimator:
             self._predictions = self._predict(albedos, weights, rows)
         self.materials = albedos.count
         self._last = (rows, albedos, weights)
-        self._estimate = self._solve(rows, albedos, weights, slot)
-        return self._estimate
+        return self._solve(rows, albedos, weights, slot)
 
     def _window_for(self, grid: PoolGrid) -> PoolWindow:
         """The window, empty where pictures are cut otherwise than before."""
@@ -281,8 +295,8 @@ class LobeEstimator:
             self._scores = _SCORE_MEMORY * self._scores + np.log(misfits + _LEAST_MISFIT * energy)
         known = np.append(self._solution.amounts, self._solution.mean_albedo)
         changed = _misfit(columns, target, scaled, known) > CHANGE * own
-        longest = int(np.flatnonzero(self._scores <= self._scores.min() + np.log(WORTH_FORGETTING))[0])
-        memory = MEMORIES[longest]
+        self._memory = int(np.flatnonzero(self._scores <= self._scores.min() + np.log(WORTH_FORGETTING))[0])
+        memory = MEMORIES[self._memory]
         for frame in self._frames.values():
             frame.keep *= (CHANGED_WEIGHT if changed else memory) if self._model.memory else 0.0
         if changed:

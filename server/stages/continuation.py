@@ -35,6 +35,8 @@ LEAST_GAIN = 0.01
 """A longer extent must leave so much less of the residual's energy; a shorter one may leave a fifth of that more."""
 FIRST_TRIES = 400
 """Extents tried in each of the first frames, until all have been settled."""
+EARLY_TRIES, EARLY_FRAMES = 80, 10
+"""Extents tried a frame while every view is new."""
 TRIES, RESUME_FRAMES, RETRY_FRAMES = 40, 4, 16
 """Extents tried at a time from then on, and how often: while new planes are not settled, and while all are."""
 SETTLED_PASSES = 2
@@ -114,11 +116,12 @@ class Continuation:
 
         The extents explain the pictures together, so none is believed before all have been settled twice.
         """
-        wait = RETRY_FRAMES if self.is_settled else RESUME_FRAMES if self._was_settled else 1
+        is_early = self._frames <= EARLY_FRAMES or not self._was_settled
+        wait = 1 if is_early else RETRY_FRAMES if self.is_settled else RESUME_FRAMES
         if not self.planes or self._frames < LEAST_FRAMES or self._frames % wait:
             return False
         sides = SIDES * len(self.planes)
-        tries = TRIES if self._was_settled else FIRST_TRIES
+        tries = FIRST_TRIES if not self._was_settled else EARLY_TRIES if is_early else TRIES
         trial = _Trial(self.planes, judged)
         while tries > 0:
             tries -= trial.settle(*divmod(self._turn, SIDES))

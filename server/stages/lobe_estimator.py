@@ -48,6 +48,8 @@ MEMORIES = (0.95, 0.8, 0.5, 0.1)
 """What may remain of a frame's weight a frame later."""
 WORTH_FORGETTING = 1.5
 """Frames are forgotten sooner only where the longest memory's misfits are so many times the least, over some frames."""
+UNDERSTOOD = 0.8
+"""Earlier estimates do not count once the room's extents leave less than this share of what they left."""
 AVERAGE = 0.15
 """Share that a new estimate has in the mean while the light is steady."""
 CHANGE = 3.0
@@ -206,7 +208,9 @@ class LobeEstimator:
         estimate = self.fold(slot, pools)
         if self.continuation:
             self._look_around(self.continuation, camera, volume_from_camera, self._engine.download(depth_m))
+            before = self.continuation.explained
             if self.continuation.try_extents(self._judged()):
+                self._is_fresh |= self.continuation.explained < UNDERSTOOD * before
                 window.hide(self._frames, self.continuation.arrays())
                 for held, frame in self._frames.items():
                     frame.columns = window.shading(held, _lobes_and_all())

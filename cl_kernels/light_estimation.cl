@@ -74,12 +74,18 @@ kernel void pool_samples(const int pool_cols, const int pool_rows, const int col
     pooled[pool] = (float4)(seen.xyz / count, seen.w / 16.0f);
 }
 
+static inline float sum_of(const float16 v) {
+    const float8 a = v.lo + v.hi;
+    const float4 b = a.lo + a.hi;
+    return (b.x + b.z) + (b.y + b.w);
+}
+
 // One work-group of 64 items a tile of 8 x 8 samples. With row vectors s = (transfer, r, g, b) of a tile's samples, its
 // partial sum is the upper triangle of sum w s^T s, row by row, then sum w and the number of samples with w > 0.
 // transfer [rows][cols][COEFFICIENTS], observed [rows][cols] (rgb, w) -> partial [tiles][COLUMNS (COLUMNS + 1) / 2 + 2].
 kernel void accumulate_tiles(const int cols, const int rows, const int tile_cols, global const float *transfer,
                              global const float4 *observed, global float *partial) {
-    local float samples[TILE_SAMPLES][COLUMNS + 1];
+    local float samples[COLUMNS + 1][TILE_SAMPLES];  // the last: weights
     const int item = get_local_id(0);
     const int tile = get_group_id(0);
     const int col = (tile % tile_cols) * TILE + item % TILE;
@@ -87,30 +93,28 @@ kernel void accumulate_tiles(const int cols, const int rows, const int tile_cols
     const int inside = col < cols && row < rows;
     const int sample = inside ? row * cols + col : 0;
     const float4 seen = inside ? observed[sample] : (float4)(0.0f);
-    for (int i = 0; i < COEFFICIENTS; i++) samples[item][i] = seen.w > 0.0f ? transfer[sample * COEFFICIENTS + i] : 0.0f;
-    samples[item][COEFFICIENTS] = seen.x;
-    samples[item][COEFFICIENTS + 1] = seen.y;
-    samples[item][COEFFICIENTS + 2] = seen.z;
-    samples[item][COLUMNS] = seen.w;
+    for (int i = 0; i < COEFFICIENTS; i++) samples[i][item] = seen.w > 0.0f ? transfer[sample * COEFFICIENTS + i] : 0.0f;
+    samples[COEFFICIENTS][item] = seen.x;
+    samples[COEFFICIENTS + 1][item] = seen.y;
+    samples[COEFFICIENTS + 2][item] = seen.z;
+    samples[COLUMNS][item] = seen.w;
     barrier(CLK_LOCAL_MEM_FENCE);
 
     const int entries = COLUMNS * (COLUMNS + 1) / 2;
     global float *out = partial + tile * (entries + 2);
-    int entry = 0;
-    for (int a = 0; a < COLUMNS; a++) {
-        for (int b = a; b < COLUMNS; b++, entry++) {
-            if (entry % TILE_SAMPLES != item) continue;
-            float sum = 0.0f;
-            for (int k = 0; k < TILE_SAMPLES; k++) sum += samples[k][COLUMNS] * samples[k][a] * samples[k][b];
-            out[entry] = sum;
-        }
+    for (int entry = item; entry < entries; entry += TILE_SAMPLES) {
+        int a = 0, b = entry;
+        while (b >= COLUMNS - a) b -= COLUMNS - a++;
+        float16 sum = (float16)(0.0f);
+        for (int k = 0; k < TILE_SAMPLES / 16; k++) sum += vload16(k, samples[COLUMNS]) * vload16(k, samples[a]) * vload16(k, samples[a + b]);
+        out[entry] = sum_of(sum);
     }
     if (item == 0) {
         float weight = 0.0f;
         float used = 0.0f;
         for (int k = 0; k < TILE_SAMPLES; k++) {
-            weight += samples[k][COLUMNS];
-            used += samples[k][COLUMNS] > 0.0f ? 1.0f : 0.0f;
+            weight += samples[COLUMNS][k];
+            used += samples[COLUMNS][k] > 0.0f ? 1.0f : 0.0f;
         }
         out[entries] = weight;
         out[entries + 1] = used;

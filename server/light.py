@@ -15,7 +15,8 @@ from server.settings import Settings
 from server.stages.continuation import NO_PLANES, Continuation, PlaneArrays
 from server.stages.indirect import gather_hits, no_hits
 from server.stages.light_estimation import LightEstimate, LightEstimator, gather_samples, sum_tiles
-from server.stages.lobe_estimator import LightModel, LobeEstimator
+from server.stages.light_model import LightModel
+from server.stages.lobe_estimator import LobeEstimator
 from server.stages.radiance_transfer import Directions, Transfer
 from server.stages.volume import Volume
 

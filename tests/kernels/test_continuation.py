@@ -19,7 +19,8 @@ from server.opencl.engine import Engine
 from server.pipeline import Pipeline
 from server.stages.cell_transfer import PoolGrid, PoolWindow
 from server.stages.continuation import LEAST_M, NO_PLANES, Continuation, Judged, spokes
-from server.stages.lobe_estimator import LightModel, LobeEstimator
+from server.stages.light_model import LightModel
+from server.stages.lobe_estimator import LobeEstimator
 from tests.analytic import Floats
 from tests.data import data_folder
 from tests.maths.test_planes import FLOOR, WALL, corner

@@ -12,7 +12,8 @@ from server.maths.sh import LUMINANCE, spherical_fibonacci
 from server.opencl.engine import Engine
 from server.stages.cell_transfer import PoolGrid, Pools
 from server.stages.light_estimation import ASSUMED_ALBEDO, LightEstimate
-from server.stages.lobe_estimator import SLOTS, LightModel, LobeEstimator
+from server.stages.light_model import LightModel
+from server.stages.lobe_estimator import SLOTS, LobeEstimator
 from server.stages.radiance_transfer import direction_sets
 from tests.analytic import Floats
 from tests.kernels.test_cell_transfer import Samples

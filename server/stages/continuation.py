@@ -35,8 +35,6 @@ LEAST_GAIN = 0.01
 """A longer extent must leave so much less of the residual's energy; a shorter one may leave a fifth of that more."""
 FIRST_TRIES = 400
 """Extents tried in each of the first frames, until all have been settled."""
-EARLY_TRIES, EARLY_FRAMES = 80, 10
-"""Extents tried a frame while every view is new."""
 TRIES, RESUME_FRAMES, RETRY_FRAMES = 40, 4, 16
 """Extents tried at a time from then on, and how often: while new planes are not settled, and while all are."""
 SETTLED_PASSES = 2
@@ -116,12 +114,11 @@ class Continuation:
 
         The extents explain the pictures together, so none is believed before all have been settled twice.
         """
-        is_early = self._frames <= EARLY_FRAMES or not self._was_settled
-        wait = 1 if is_early else RETRY_FRAMES if self.is_settled else RESUME_FRAMES
+        wait = 1 if not self._was_settled else RETRY_FRAMES if self.is_settled else RESUME_FRAMES
         if not self.planes or self._frames < LEAST_FRAMES or self._frames % wait:
             return False
         sides = SIDES * len(self.planes)
-        tries = FIRST_TRIES if not self._was_settled else EARLY_TRIES if is_early else TRIES
+        tries = TRIES if self._was_settled else FIRST_TRIES
         trial = _Trial(self.planes, judged)
         while tries > 0:
             tries -= trial.settle(*divmod(self._turn, SIDES))

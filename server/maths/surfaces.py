@@ -19,6 +19,8 @@ Indices = NDArray[np.int64]
 
 COLOR_RADIUS = 0.5
 """Colours of one surface lie so near each other, as logarithms of red and blue over green."""
+SURFACE_COLORS, LIGHT_COLORS = 0.5, 0.15
+"""Deviations of surfaces' and of lights' colours from grey, as logarithms of ratios."""
 LEAST_SPREAD = 0.04
 """Deviation of a material's lightness, relative, at least."""
 LEAST_GAP = 0.5
@@ -80,8 +82,10 @@ class Surfaces:
             count += len(levels)
         lightness = np.exp(lightness)
         lightness /= np.average(lightness, weights=weights)
-        mean_color = weights @ color / weights.sum()
-        return Albedos(lightness, color / (mean_color / (mean_color @ LUMINANCE)), count)
+        if one_color:
+            return Albedos(lightness, np.ones_like(color), count)
+        colored = color * light_of_surfaces(color, weights @ shading, member)
+        return Albedos(lightness, colored / (colored @ LUMINANCE)[:, None], count)
 
     def _cluster(self, colors: Floats, weights: Floats) -> Indices:
         """[n] cluster of each of `colors` [n, 2]; renews the centres."""
@@ -94,6 +98,19 @@ class Surfaces:
             centers = np.where(sums[:, None] > 0, moved / np.maximum(sums, 1e-300)[:, None], centers)
         self._colors = centers
         return _nearest(colors, centers)
+
+
+def light_of_surfaces(color: Floats, tint: Floats, member: Indices) -> Floats:
+    """[3] by what surfaces' colours [n, 3] found under light of colour `tint` [3] have to be multiplied.
+
+    Rooms' lights are nearly white and their surfaces are of any colour, on average grey: each surface, `member` [n],
+    however large, says as much of the light's colour as its own may differ from grey.
+    """
+    _, first = np.unique(member, return_index=True)
+    shown = np.log(color[first] * tint / (color[first, 1:2] * tint[1]))
+    count = len(first)
+    share = count / (count + (SURFACE_COLORS / LIGHT_COLORS) ** 2)
+    return np.asarray(tint / tint[1] / np.exp(share * shown.mean(axis=0)))
 
 
 def _nearest(colors: Floats, centers: Floats) -> Indices:

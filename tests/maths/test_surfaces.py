@@ -12,6 +12,7 @@ from server.maths.surfaces import (
     LEAST_SPREAD,
     MOST_MATERIALS,
     Surfaces,
+    light_of_surfaces,
     lightness_levels,
     one_albedo,
 )
@@ -101,13 +102,27 @@ def test_colours_and_lightnesses_are_found() -> None:
         np.testing.assert_allclose(both / both[1], 1.0, rtol=0.05)  # relative to that of grey
 
 
-def test_the_mean_surface_is_grey() -> None:
-    """Nobody can tell the surfaces' mean colour from the light's."""
+def test_a_red_room_is_not_lit_red() -> None:
+    """One red surface, however large, says little of the light; colours of many are grey in the mean."""
+    one = light_of_surfaces(np.tile(RED, (50, 1)), np.ones(3), np.zeros(50, np.int64))
+    assert np.abs(np.log(one / one[1])).max() < 0.1 * np.abs(np.log(RED / RED[1])).max()
+    mostly_red = np.r_[np.zeros(900, np.int64), np.ones(100, np.int64)]
+    two = light_of_surfaces(np.stack([RED, GREY])[mostly_red], np.ones(3), mostly_red)
+    swapped = light_of_surfaces(np.stack([GREY, RED])[mostly_red], np.ones(3), mostly_red)
+    np.testing.assert_allclose(two / two[1], swapped / swapped[1])
+
+
+def test_surfaces_of_many_colours_show_that_of_the_light() -> None:
+    rng = np.random.default_rng(7)
+    light = np.array([1.3, 1.0, 0.7])
+    albedos = np.exp(rng.normal(0.0, 0.3, (300, 3)))
+    found = light_of_surfaces(albedos * light, np.ones(3), np.arange(300))  # what multiplies them takes the light away
+    np.testing.assert_allclose(found * light / (found * light)[1], 1.0, atol=0.1)
+
+
+def test_a_room_of_one_colour_is_grey() -> None:
     seen, shading, _ = scene([RED], [1.0])
-    np.testing.assert_allclose(Surfaces().albedos(seen, shading, np.ones(len(seen))).color, 1.0, atol=1e-9)
-    seen, shading, _ = scene([RED, BLUE], [0.7, 0.3])
-    mean = Surfaces().albedos(seen, shading, np.ones(len(seen))).color.mean(axis=0)
-    np.testing.assert_allclose(mean, mean[0], rtol=1e-6)
+    assert (Surfaces().albedos(seen, shading, np.ones(len(seen)), one_color=True).color == 1.0).all()
 
 
 def test_by_colour_alone() -> None:

@@ -181,6 +181,35 @@ def test_noise_of_a_flat_wall() -> None:
     assert (kinect_like(wall, np.full((200, 200), 0.05), 525.0, 3) == 0).all()
 
 
+@pytest.mark.parametrize("way", ["walk", "steps"])
+def test_another_exposure_is_another_picture_of_the_same(way: str) -> None:
+    """Truth is told in the picture's units; what frames say of it goes as the pictures do."""
+    usual, source = small("table"), small("table", f"&exposure={way}")
+    relative = [source.exposure(i) for i in range(60)]
+    assert relative[0] == 1
+    assert min(relative) < 0.6
+    assert max(relative) > 1.7
+    for index in (0, 20, 50):
+        frame, truth, exposure = source[index], source.truth(index), source.exposure(index)
+        assert frame.exposure == pytest.approx(source[0].exposure * exposure)
+        np.testing.assert_array_equal(frame.color, to_srgb8(truth.radiance))
+        np.testing.assert_allclose(truth.radiance, exposure * usual.truth(index).radiance)
+        np.testing.assert_allclose(truth.sh, exposure * usual.truth(index).sh)
+        np.testing.assert_array_equal(frame.depth, usual[index].depth)
+
+
+def test_lamps_are_told_in_the_picture_s_units() -> None:
+    usual, source = small("lamp").truth(15), small("lamp", "&exposure=steps").truth(15)
+    np.testing.assert_allclose(source.lamps[0].intensity, 0.5 * usual.lamps[0].intensity)
+    np.testing.assert_allclose(source.lamplight, 0.5 * usual.lamplight)
+
+
+def test_frames_say_that_their_exposure_is_constant_or_nothing() -> None:
+    assert {small("table")[i].exposure for i in (0, 7)} == {1.0}
+    assert small("table", "&exposure_given=0")[7].exposure is None
+    assert small("table", "&exposure=walk&exposure_given=0")[7].exposure is None
+
+
 def test_srgb_of_known_values() -> None:
     np.testing.assert_array_equal(
         to_srgb8(np.array([0, 0.0031308, 0.2158605, 0.5, 1.0, 2.0, -1.0])), [0, 10, 128, 188, 255, 255, 0]
@@ -197,6 +226,8 @@ def test_srgb_of_known_values() -> None:
         ("synthetic:table?frames=ten", "1 to"),
         ("synthetic:table?light=8", "0 to 7"),
         ("synthetic:table?texture=yes", "0 to 1"),
+        ("synthetic:table?exposure=auto", "constant, walk, steps"),
+        ("synthetic:table?exposure_given=yes", "0 to 1"),
         ("synthetic:table?size=640", "WIDTHxHEIGHT"),
         ("synthetic:table?size=8x8", "WIDTHxHEIGHT"),
         ("synthetic:table?size=1920x1920", "pixels"),

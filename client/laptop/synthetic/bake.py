@@ -11,6 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from client.laptop.synthetic.carved import CLEARANCE_M, Carved
 from client.laptop.synthetic.charts import Grid
 from client.laptop.synthetic.harmonics import COEFFICIENTS, basis
 from client.laptop.synthetic.shapes import Solid
@@ -32,11 +33,16 @@ def bake(solids: list[Solid], atlas: list[list[Grid]], directions: Floats) -> Fl
 
     `directions` [n, 3] float32, unit, evenly spread over the sphere.
     """
-    table = np.zeros((atlas[-1][-1].offset + atlas[-1][-1].size, COEFFICIENTS), np.float32)
+    table = np.zeros((table_size(atlas), COEFFICIENTS), np.float32)
     for own, grids in enumerate(atlas):
-        for grid in grids:
-            table[grid.offset : grid.offset + grid.size] = _bake_grid(solids, own, grid, directions)
+        for part, grid in enumerate(grids):
+            table[grid.offset : grid.offset + grid.size] = _bake_grid(solids, own, part, grid, directions)
     return table
+
+
+def table_size(atlas: list[list[Grid]]) -> int:
+    """Samples in all grids."""
+    return atlas[-1][-1].offset + atlas[-1][-1].size
 
 
 def blocked_directions(
@@ -54,7 +60,7 @@ def blocked_directions(
     for solid in solids:
         if solid is skip:
             continue
-        asked = np.flatnonzero(still_open & _directions_near(solid, middle, directions, reach))
+        asked = np.flatnonzero(still_open & directions_near(solid, middle, directions, reach))
         if asked.size:
             blocked[:, asked] |= solid.blocks(points, directions[asked])
         if solid.bounds is None:
@@ -62,8 +68,8 @@ def blocked_directions(
     return blocked
 
 
-def _directions_near(solid: Solid, middle: Floats, directions: Floats, reach: float) -> NDArray[np.bool_]:
-    """[directions] which of them may meet the solid."""
+def directions_near(solid: Solid, middle: Floats, directions: Floats, reach: float) -> NDArray[np.bool_]:
+    """[directions] which of them may meet the solid from within `reach` of `middle`."""
     everything = np.ones(len(directions), bool)
     if solid.bounds is None:
         return everything
@@ -76,17 +82,28 @@ def _directions_near(solid: Solid, middle: Floats, directions: Floats, reach: fl
     return directions @ (offset / distance).astype(np.float32) > cone - 1e-4
 
 
-def _bake_grid(solids: list[Solid], own: int, grid: Grid, directions: Floats) -> Floats:
+def seen_samples(solid: Solid, part: int, grid: Grid) -> tuple[NDArray, NDArray, Solid | None]:
+    """Where shadow rays from a chart's grid start, the surface's normals there, and which solid they cannot meet."""
     positions, normals = grid.samples()
-    buried = _buried(solids, own, positions, normals)
+    if isinstance(solid, Carved):
+        normals = -normals if solid.inwards(part) else normals
+        return positions + CLEARANCE_M * normals, normals, None
+    # A convex solid does not shadow itself.
+    return positions, normals, None if isinstance(solid, Shell) else solid
+
+
+def _bake_grid(solids: list[Solid], own: int, part: int, grid: Grid, directions: Floats) -> Floats:
+    positions, normals, skip = seen_samples(solids[own], part, grid)
+    buried = buried_samples(solids, own, part, grid)
     values = np.zeros((grid.rows, grid.columns, COEFFICIENTS), np.float32)
     weights = basis(directions) * np.float32(4 / len(directions))  # 4 pi / n of solid angle each, over pi
     if grid.is_flat:
         cosines = directions @ normals[0, 0].astype(np.float32)
         directions, weights = directions[cosines > 0], (cosines[:, None] * weights)[cosines > 0]
+        solids = [solid for solid in solids if _rises_above(solid, positions[0, 0], normals[0, 0])]
     pieces = [piece for piece in tiles(grid, len(directions)) if not buried[piece].all()]
     for batch in (pieces[i : i + BATCH] for i in range(0, len(pieces), BATCH)):
-        lost = _lost(solids, own, grid, [positions[p] for p in batch], [normals[p] for p in batch], directions)
+        lost = _lost(solids, skip, grid, [positions[p] for p in batch], [normals[p] for p in batch], directions)
         sums = np.split(lost @ weights, np.cumsum([buried[p].size for p in batch])[:-1])
         for piece, of_piece in zip(batch, sums, strict=True):
             values[piece] = of_piece.reshape(*buried[piece].shape, COEFFICIENTS)
@@ -94,12 +111,20 @@ def _bake_grid(solids: list[Solid], own: int, grid: Grid, directions: Floats) ->
     return values.reshape(-1, COEFFICIENTS)
 
 
+def _rises_above(solid: Solid, point: NDArray, normal: NDArray) -> bool:
+    """Some of it may be above the horizon of a flat face."""
+    return solid.bounds is None or bool((solid.bounds[0] - point) @ normal > -solid.bounds[1])
+
+
 def _lost(
-    solids: list[Solid], own: int, grid: Grid, positions: list[NDArray], normals: list[NDArray], directions: Floats
+    solids: list[Solid],
+    skip: Solid | None,
+    grid: Grid,
+    positions: list[NDArray],
+    normals: list[NDArray],
+    directions: Floats,
 ) -> Floats:
     """[samples, directions] 1 where a direction is blocked, times the cosine on surfaces that are not flat."""
-    # A convex solid does not shadow itself.
-    skip = solids[own] if solids[own].bounds is not None else None
     lost = []
     for places, ups in zip(positions, normals, strict=True):
         points = places.reshape(-1, 3).astype(np.float32)
@@ -119,8 +144,10 @@ def tiles(grid: Grid, directions: int) -> list[tuple[slice, slice]]:
     return [(slice(r, r + side), slice(c, c + side)) for r, c in starts]
 
 
-def _buried(solids: list[Solid], own: int, positions: NDArray, normals: NDArray) -> NDArray[np.bool_]:
+def buried_samples(solids: list[Solid], own: int, part: int, grid: Grid) -> NDArray[np.bool_]:
     """[rows, columns] samples inside another solid or in an opening, which nobody sees."""
+    _, normals, _ = seen_samples(solids[own], part, grid)
+    positions, _ = grid.samples()
     lifted = (positions + LIFT_M * normals).reshape(-1, 3)
     inside = np.zeros(len(lifted), bool)
     for number, solid in enumerate(solids):
@@ -128,6 +155,8 @@ def _buried(solids: list[Solid], own: int, positions: NDArray, normals: NDArray)
             inside |= solid.contains(lifted)
         elif isinstance(solid, Shell):
             inside |= solid.absent(positions.reshape(-1, 3))
+        elif isinstance(solid, Carved):
+            inside |= solid.absent(positions.reshape(-1, 3), part)
     return inside.reshape(positions.shape[:2])
 
 

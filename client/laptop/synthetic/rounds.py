@@ -88,19 +88,26 @@ class Cylinder:
         part = self.part(points)[:, None]
         return np.where(part == 0, radial, np.where(part == 1, -self.axis, self.axis))
 
-    def blocks(self, points: Points, directions: Points) -> NDArray[np.bool_]:
+    def span(self, points: Points, directions: Points) -> tuple[Points, Points]:
+        """[points, directions] where rays enter and leave, behind the point too; near >= far for a miss."""
         axis = self.axis.astype(points.dtype)
         start = points - self.base.astype(points.dtype)
         near, far = _tube(start, directions, axis, self.radius)
         height, along = (start @ axis)[:, None], no_zero(directions @ axis)
         low, high = -height / along, (self.length - height) / along
-        near = np.maximum(near, np.minimum(low, high))
-        far = np.minimum(far, np.maximum(low, high))
+        return np.maximum(near, np.minimum(low, high)), np.minimum(far, np.maximum(low, high))
+
+    def blocks(self, points: Points, directions: Points) -> NDArray[np.bool_]:
+        near, far = self.span(points, directions)
         return far > np.maximum(near, 0) + NEAREST
 
     def contains(self, points: Points) -> NDArray[np.bool_]:
+        return self.outside_m(points) < -1e-9
+
+    def outside_m(self, points: Points) -> NDArray[np.float64]:
+        """[n] how far points are out of the side or of an end, whichever is more; negative inside."""
         height = (points - self.base) @ self.axis
-        return (self._off_axis(points) < self.radius - 1e-9) & (height > 1e-9) & (height < self.length - 1e-9)
+        return np.max([self._off_axis(points) - self.radius, -height, height - self.length], axis=0)
 
     def _off_axis(self, points: Points) -> Points:
         offset = points - self.base

@@ -1,8 +1,9 @@
 """Solids with closed-form ray intersections: what each must offer, and the polyhedra; round ones are in rounds.py.
 
-All are convex, so that none shadows itself. `intersect` takes rays of one origin (a camera), in float64; directions
-need not be unit, distances are in multiples of them. `blocks` answers many rays of many points at once, and computes
-in the precision of what it is given. Charts lay a grid over each smooth part of a surface, for what is baked.
+All but those of carved.py are convex, so that none shadows itself. `intersect` takes rays of one origin (a camera),
+in float64; directions need not be unit, distances are in multiples of them. `blocks` answers many rays of many points
+at once, and computes in the precision of what it is given. Charts lay a grid over each smooth part of a surface, for
+what is baked.
 """
 
 from __future__ import annotations
@@ -94,6 +95,18 @@ class Polyhedron:
         hit = np.zeros((len(points), len(directions)), bool)
         hit[:, may_hit] = _slab_hit(gaps, slopes[may_hit])
         return hit
+
+    def span(self, points: Points, directions: Points) -> tuple[Points, Points]:
+        """[points, directions] where rays enter and leave, behind the point too; near >= far for a miss."""
+        normals, offsets = self.plane_normals.astype(points.dtype), self.plane_offsets.astype(points.dtype)
+        near = np.full((len(points), len(directions)), -np.inf, points.dtype)
+        far = np.full_like(near, np.inf)
+        for gap, slope in zip((offsets - points @ normals.T).T, (directions @ normals.T).T, strict=True):
+            closing = no_zero(slope)
+            t = gap[:, None] / closing
+            np.maximum(near, t, out=near, where=closing < 0)
+            np.minimum(far, t, out=far, where=closing > 0)
+        return near, far
 
     def contains(self, points: Points) -> NDArray[np.bool_]:
         return (points @ self.plane_normals.T < self.plane_offsets - 1e-9).all(axis=1)

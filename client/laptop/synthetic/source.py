@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 from client.laptop.synthetic import hand
 from client.laptop.synthetic.bake import bake
 from client.laptop.synthetic.cache import cached
+from client.laptop.synthetic.camera_exposure import UNIT, WAYS
 from client.laptop.synthetic.charts import atlas
+from client.laptop.synthetic.guests import GUESTS, bake_guests, guest_grids
 from client.laptop.synthetic.harmonics import sphere_directions
 from client.laptop.synthetic.lamps import Lamp, room_lamps
 from client.laptop.synthetic.lights import RING_SIZE, DistantLight, ring_light
 from client.laptop.synthetic.noise import kinect_like
 from client.laptop.synthetic.render import Lit, Rendering, camera_rays, look_at, render
-from client.laptop.synthetic.spec import SCENES, Options, parse_spec
+from client.laptop.synthetic.spec import Options, parse_spec, scene_of
 from protocol.frames import CameraModel, RgbdFrame
 
 FPS = 30.0
@@ -44,12 +46,14 @@ class Truth:
     """[h, w] there is a surface."""
     dynamic: NDArray[np.bool_]
     """[h, w] the surface moves."""
+    guest: NDArray[np.bool_]
+    """[h, w] the surface is one that `with=` has put there."""
     radiance: NDArray[np.float64]
     """[h, w, 3] the picture before it is encoded as sRGB in 8 bits."""
     light_direction: NDArray[np.float64]
     """[3] unit, world: the dominant direction of the light."""
     lamps: tuple[Lamp, ...]
-    """Lights inside the scene, besides `sh`."""
+    """Lights inside the scene, besides `sh`, in the same units."""
     lamplight: NDArray[np.float64]
     """[h, w, 3] the part of `radiance` that lamps send to surfaces."""
 
@@ -70,7 +74,8 @@ class SyntheticSource:
         self.camera = CameraModel(
             width=width, height=height, fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2
         )
-        self.scene = SCENES[options.name]()
+        self.scene = scene_of(options)
+        self.guests = GUESTS[options.guest]
         self.lamps = room_lamps(options.lamps, options.place)
         self._rays = camera_rays(self.camera)
         self._grids = atlas([solid.charts for solid in self.scene.solids], self.scene.step_m)
@@ -88,7 +93,14 @@ class SyntheticSource:
         if self.options.noise:
             depth_m = kinect_like(depth_m, self._slant(rendering, pose), self.camera.fx, index)
         depth = (depth_m / self.camera.depth_scale_m).round().clip(0, 65535).astype(np.uint16)
-        return RgbdFrame(index, index / FPS, to_srgb8(rendering.radiance), depth, pose)
+        exposure = self.exposure(index)
+        picture = to_srgb8(exposure * rendering.radiance)
+        said = (UNIT if self.options.exposure != "constant" else 1.0) * exposure
+        return RgbdFrame(index, index / FPS, picture, depth, pose, said if self.options.exposure_given else None)
+
+    def exposure(self, index: int) -> float:
+        """Of one frame's picture, relative to the first one's."""
+        return WAYS[self.options.exposure](index)
 
     def pose(self, index: int) -> NDArray[np.float64]:
         """world_from_camera [4, 4], exact."""
@@ -102,18 +114,19 @@ class SyntheticSource:
 
     def truth(self, index: int) -> Truth:
         """What is exactly known of frame `index`."""
-        rendering, light = self._rendering(index), self.light(index)
+        rendering, light, exposure = self._rendering(index), self.light(index), self.exposure(index)
         return Truth(
-            sh=light.sh,
+            sh=exposure * light.sh,
             depth_m=rendering.depth_m.astype(np.float32),
             normals=rendering.normals.astype(np.float32),
             albedo=rendering.albedo.astype(np.float32),
             visible=rendering.owner >= 0,
             dynamic=(rendering.owner >= len(self.scene.bodies)) & (self.options.name == "hand"),
-            radiance=rendering.radiance,
+            guest=(rendering.owner >= len(self.scene.bodies)) & bool(self.guests),
+            radiance=exposure * rendering.radiance,
             light_direction=light.direction,
-            lamps=self.lamps,
-            lamplight=rendering.lamplight,
+            lamps=tuple(replace(lamp, intensity=exposure * lamp.intensity) for lamp in self.lamps),
+            lamplight=exposure * rendering.lamplight,
         )
 
     def _bake(self) -> dict[str, NDArray]:
@@ -124,6 +137,15 @@ class SyntheticSource:
     def _transfer(self) -> NDArray[np.float32]:
         """[total, 16] occluded transfer on the grids."""
         return cached(self.scene.name, self._bake)["occluded"]
+
+    @cached_property
+    def _guest_transfer(self) -> dict[str, NDArray]:
+        """Occluded transfer that the guests cause, and on them, see bake_guests."""
+        directions = sphere_directions(self.scene.directions).astype(np.float32)
+        return cached(
+            f"{self.scene.name}_{self.options.guest}",
+            lambda: bake_guests(self.guests, self.scene.solids, self._grids, directions),
+        )
 
     @cached_property
     def _static(self) -> hand.StaticVisibility:
@@ -144,6 +166,8 @@ class SyntheticSource:
         ]
         if self.options.name == "hand":
             bodies = self._with_hand(bodies, index, light)
+        if self.guests:
+            bodies = self._with_guests(bodies, light)
         return render(bodies, self.camera, self._rays, self.pose(index), light, self.lamps)
 
     def _with_hand(self, bodies: list[Lit], index: int, light: DistantLight) -> list[Lit]:
@@ -161,6 +185,17 @@ class SyntheticSource:
         texture = hand.SKIN if self.options.texture else None
         skin = [Lit(part, texture, own, ((own, taken),)) for part, own in zip(parts, grids, strict=True)]
         return [*shadowed, *skin]
+
+    def _with_guests(self, bodies: list[Lit], light: DistantLight) -> list[Lit]:
+        """The static bodies under the guests' shadows, then the guests."""
+        sh = light.sh.astype(np.float32)
+        around, taken = self._guest_transfer["around"] @ sh, self._guest_transfer["on"] @ sh
+        shadowed = [
+            replace(body, occluded=(*body.occluded, (grids, around)))
+            for body, grids in zip(bodies, self._grids, strict=True)
+        ]
+        lit = zip(self.guests, guest_grids(self.guests), strict=True)
+        return [*shadowed, *(Lit(guest.solid, guest.texture, own, ((own, taken),)) for guest, own in lit)]
 
     def _slant(self, rendering: Rendering, pose: NDArray[np.float64]) -> NDArray[np.float64]:
         """[h, w] cosine between the surface and the ray."""

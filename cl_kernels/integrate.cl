@@ -2,6 +2,7 @@
 // Provides integrate.
 #include "camera.clh"
 #include "lanes.clh"
+#include "marks.clh"
 #include "volume.clh"
 
 #define COLOR_REACH 1.5f  // voxels from the surface: those that its colour is ever interpolated from
@@ -11,7 +12,7 @@ typedef struct {
     int width;
     int height;
     global const float *depth_m;  // [h][w], 0 = none
-    global const float *radiance; // [h][w] rgb linear, w < 0 outside the camera's picture
+    global const float *radiance; // [h][w] rgb linear, w: see marks.clh
     float4 intrinsics;
 } Picture;
 
@@ -31,17 +32,20 @@ static inline floatn depth_between(const Picture picture, const floatn u, const 
 }
 
 // Running mean of one channel that is kept as sqrt(c) * most in whole steps: rounded up as often as the fraction says, so
-// that changes below a step are not lost. `dice`: uniform in [0, 1).
-static inline intn mean_channel(const intn code, const float most, const floatn color, const floatn rate, const floatn dice) {
+// that changes below a step are not lost. Where the colour is a bound it only raises. `dice`: uniform in [0, 1).
+static inline intn mean_channel(const intn code, const float most, const floatn color, const intn is_bound, const floatn rate,
+                                const floatn dice) {
     const floatn root = CONVERT_FLOATN(code) * (1.0f / most);
-    const floatn mean = root * root + rate * (color - root * root);
+    const floatn more = color - root * root;
+    const floatn mean = root * root + rate * (is_bound ? fmax(more, 0.0f) : more);
     const floatn next = sqrt(fmax(mean, 0.0f)) * most;
     return CONVERT_INTN(fmin(next + dice, most));
 }
 
 // Colours of a row of voxels after one more look, see bricks.py for the packing.
 static inline intn mean_color(const Picture picture, const intn old, const intn pixel, const intn voxel, const int frame) {
-    const floatn outside = GATHER_FLOATN(picture.radiance, 4 * pixel + 3);
+    const floatn mark = GATHER_FLOATN(picture.radiance, 4 * pixel + 3);
+    const intn is_bound = MASK(mark == AT_LEAST);
     const intn count = old & 63;
     const intn next_count = min(count + 1, 63);
     const floatn rate = 1.0f / CONVERT_FLOATN(next_count);
@@ -50,14 +54,14 @@ static inline intn mean_color(const Picture picture, const intn old, const intn 
     h = (h ^ (h >> 12)) * 0x297A2D39u;
     h ^= h >> 15;
     const float unit = 1.0f / 1024.0f;
-    const intn red = mean_channel((old >> 23) & 511, 511.0f, fmin(GATHER_FLOATN(picture.radiance, 4 * pixel), 1.0f), rate,
+    const intn red = mean_channel((old >> 23) & 511, 511.0f, fmin(GATHER_FLOATN(picture.radiance, 4 * pixel), 1.0f), is_bound, rate,
                                   CONVERT_FLOATN(AS_INTN(h & 1023u)) * unit);
-    const intn green = mean_channel((old >> 14) & 511, 511.0f, fmin(GATHER_FLOATN(picture.radiance, 4 * pixel + 1), 1.0f), rate,
+    const intn green = mean_channel((old >> 14) & 511, 511.0f, fmin(GATHER_FLOATN(picture.radiance, 4 * pixel + 1), 1.0f), is_bound, rate,
                                     CONVERT_FLOATN(AS_INTN((h >> 10) & 1023u)) * unit);
-    const intn blue = mean_channel((old >> 6) & 255, 255.0f, fmin(GATHER_FLOATN(picture.radiance, 4 * pixel + 2), 1.0f), rate,
+    const intn blue = mean_channel((old >> 6) & 255, 255.0f, fmin(GATHER_FLOATN(picture.radiance, 4 * pixel + 2), 1.0f), is_bound, rate,
                                    CONVERT_FLOATN(AS_INTN((h >> 20) & 1023u)) * unit);
     const intn next = (red << 23) | (green << 14) | (blue << 6) | next_count;
-    return MASK(outside >= 0.0f) ? next : old;
+    return MASK(mark > -1.0f) ? next : old;
 }
 
 // One work-group a brick; its items share the rows of LANES voxels along x.

@@ -341,6 +341,7 @@ def frame_message(frame: RgbdFrame, camera: CameraModel, lossless: bool) -> Fram
         world_from_camera=None if pose is None else tuple(pose.ravel().tolist()),
         color=encode_color(frame.color, codec, camera.color_encoding),
         depth=encode_depth(frame.depth),
+        exposure=frame.exposure,
     )
 
 

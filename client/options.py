@@ -5,22 +5,25 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 
+from client.laptop.datasets.ground_truth import GroundTruthSource
 from client.laptop.errors import OptionError
 from client.laptop.light_file import read_light, read_panorama_light
 from client.laptop.objects import ObjectFile, parse_object
 from client.laptop.source import Source, open_source
 from client.laptop.volume import Volume, default_volume, default_voxel, with_room_to_move
 from protocol.limits import MAX_SH_BANDS
+from protocol.messages import Robustness as RobustnessName
 from protocol.messages import Wishes
 
 BUILT_PRESETS = ("rm", "reg4", "reg8", "art1", "art4", "art8", "gr15", "gr15fast")
 PRESETS = (*BUILT_PRESETS, "auto")
 THESIS_RAY_LENGTH_M = 0.1
 DENOISE = ("none", "bilateral", "tv_l1")
+ROBUSTNESS = get_args(RobustnessName)
 
 SourceArgument = Annotated[
     str, typer.Argument(metavar="SOURCE", help="data-set folder, synthetic:NAME, recording or oak")
@@ -55,6 +58,13 @@ Panorama = Annotated[str | None, typer.Option(metavar="FILE", help="light from a
 Lamps = Annotated[
     str | None, typer.Option(metavar="on|off", help="look for lights inside the room; default: where called for")
 ]
+Exposure = Annotated[
+    str | None, typer.Option(metavar="auto|constant", help="default: auto, as frames say it, else estimated")
+]
+Robustness = Annotated[
+    str | None,
+    typer.Option(metavar="LIST|none", help=f"of {', '.join(ROBUSTNESS)}; default: openness,memory,outliers"),
+]
 Mesh = Annotated[bool, typer.Option("--mesh", help="write mesh.ply and mesh.glb")]
 BudgetMs = Annotated[float | None, typer.Option(metavar="N", help="choose the operating point for this time")]
 MaxLightError = Annotated[float | None, typer.Option(metavar="DEG", help="choose it for this light error")]
@@ -84,6 +94,8 @@ class CaptureOptions:
     light: str | None = None
     panorama: str | None = None
     lamps: str | None = None
+    exposure: str | None = None
+    robustness: str | None = None
     budget_ms: float | None = None
     max_light_error: float | None = None
 
@@ -110,6 +122,8 @@ def prepare(options: CaptureOptions, lossless: bool = False) -> Capture:
     up, volume = parse_up(options.up), parse_volume(options.volume)
     wishes = _wishes_of_options(options)
     source = open_source(options.source)
+    if options.light is not None and isinstance(source, GroundTruthSource):
+        wishes["light"] = read_light(Path(options.light), source.radiance_of_white)
     poses = choose_poses(options.poses, source)
     frames = parse_frames(options.frames, len(source))
     seen = volume or default_volume(source, frames)
@@ -135,6 +149,7 @@ def refuse_unbuilt(options: CaptureOptions) -> None:
     _choice("--albedo", options.albedo, ("constant", "estimated"))
     _choice("--indirect", options.indirect, ("none", "observed"))
     _choice("--lamps", options.lamps, ("on", "off"))
+    _choice("--exposure", options.exposure, ("auto", "constant"))
     unbuilt = {
         f"--preset {options.preset}": (options.preset not in BUILT_PRESETS, f"use {', '.join(BUILT_PRESETS)}"),
         "--budget-ms": (options.budget_ms is not None, "choose a --preset and --rays instead"),
@@ -194,9 +209,23 @@ def parse_ray_length(text: str | None) -> float | None:
     return length_m
 
 
+def _robustness(text: str | None) -> dict[str, Any]:
+    """The measures that a list names. Raises OptionError for one that does not exist."""
+    if text is None:
+        return {}
+    names = () if text == "none" else tuple(name.strip() for name in text.split(","))
+    for name in names:
+        _choice("--robustness", name, (*ROBUSTNESS, "none"))
+    if "none" in names or {"normals", "normals_printed"} <= set(names):
+        raise OptionError(f"--robustness {text}: these exclude one another; leave one out")
+    return {"robustness": names}
+
+
 def _wishes_of_options(options: CaptureOptions) -> dict[str, Any]:
     if options.voxel is not None and not 0 < options.voxel <= 1:
         raise OptionError(f"--voxel {options.voxel:g}: expected metres, more than 0 and at most 1")
+    if options.as_thesis and "normals" in (options.robustness or ""):
+        raise OptionError("--as-thesis is plain least squares, without weights by normals; leave one of them out")
     if options.as_thesis and options.ray_length is not None:
         raise OptionError("--as-thesis sets --ray-length 0.1; leave one of the two out")
     for name, asked in (("--albedo", options.albedo), ("--indirect", options.indirect)):
@@ -214,6 +243,8 @@ def _wishes_of_options(options: CaptureOptions) -> dict[str, Any]:
         "denoise": options.denoise,
         "denoise_iterations": options.denoise_iterations,
         "lamps": options.lamps or "auto",
+        "exposure": options.exposure or "auto",
+        **_robustness(options.robustness),
         **_given_light(options),
     }
 

@@ -125,3 +125,5 @@ class RgbdFrame:
     """[height, width] of `CameraModel.depth_lens`, in units of `CameraModel.depth_scale_m`, 0 = no measurement."""
     world_from_camera: NDArray[np.float64] | None
     """[4, 4] rigid, metres, OpenCV camera axes (x right, y down, z forward); None where the source has no pose."""
+    exposure: float | None = None
+    """Exposure time times gain of the colour picture, any unit that stays the same; None where it is not known."""

@@ -36,6 +36,7 @@ Rgb = tuple[float, float, float]
 RgbOrNull = tuple[float | None, float | None, float | None]
 
 Preset = Literal["rm", "reg4", "reg8", "art1", "art4", "art8", "gr15", "gr15fast", "auto"]
+Robustness = Literal["openness", "normals", "normals_printed", "memory", "outliers"]
 Poses = Literal["given", "track", "refine"]
 Tracking = Literal["given", "tracked", "lost"]
 MeshFormat = Literal["ply", "glb"]
@@ -104,6 +105,11 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Of `light`; `webxr`: up as +y and the first camera's view near -z."""
     lamps: Literal["auto", "on", "off"] = "auto"
     """Whether lights inside the room are looked for; `auto`: where distant light does not explain what is seen."""
+    exposure: Literal["auto", "constant"] = "auto"
+    """`auto`: of each frame as it says, estimated where it does not say; `constant`: the same for all frames."""
+    robustness: tuple[Robustness, ...] = ("openness", "memory", "outliers")
+    """Measures that light estimation takes (thesis 5.2, 5.4): samples that see little sky are left out; weights by how
+    common a normal is (`normals_printed`: as eq. 5.7 has them); earlier frames count; what fits badly counts less."""
     lossless: bool = False
     """Answers carry PNG pictures, and every frame is answered in order instead of latest-wins."""
 
@@ -143,7 +149,7 @@ class Watch(Message, frozen=True, kw_only=True, tag="watch"):
     """None: the session that is streaming, now or next."""
 
 
-class Frame(Message, frozen=True, kw_only=True, tag="frame"):
+class Frame(Message, frozen=True, kw_only=True, omit_defaults=True, tag="frame"):
     """One RGB-D frame; answered by exactly one of composite (with its light before it), dropped or error."""
 
     frame: Index
@@ -151,6 +157,11 @@ class Frame(Message, frozen=True, kw_only=True, tag="frame"):
     world_from_camera: Matrix4 | None
     color: ColorImage
     depth: DepthImage
+    exposure: float | None = None
+    """Exposure time times gain of the colour picture, in any unit that stays the same for the session; None: unknown.
+
+    What cannot be one (not finite, not above 0) is told in the composite's notes and taken as None.
+    """
 
     def __post_init__(self) -> None:
         _require_finite("frame", timestamp_s=self.timestamp_s, world_from_camera=self.world_from_camera)
@@ -298,6 +309,9 @@ class Light(Message, frozen=True, kw_only=True, tag="light"):
     """Each of the lights, strongest first, where there is more than an even sky."""
     lamps: tuple[Lamp, ...] = ()
     """Lights inside the room, strongest first; their light is not part of `sh`."""
+    exposure: float = 1.0
+    """Of this frame relative to the session's first. All radiance here is in units of this frame's picture: over
+    `exposure` it is in those of the first one's, which a room under steady light keeps."""
     condition: float | None
     """Condition number of the unregularised normal equations; null when infinite."""
     valid: bool

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pyopencl.array as cl_array
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Tracking, Wishes
 from server.opencl.engine import Engine
 from server.settings import bounds_seen, default_voxel_m
+from server.stages.exposure import ExposureTracking, scene_radiance
 from server.stages.integrate import integrate
 from server.stages.measure import GREATEST_DEPTH_M, Measurement, measure
 from server.stages.merge import merge_depth
@@ -24,6 +27,10 @@ class GeometryFrame:
     """What one frame gave; arrays are the session's and hold until its next frame."""
 
     measurement: Measurement
+    exposure: float
+    """Of the picture relative to the session's first."""
+    scene_radiance: cl_array.Array
+    """`measurement.radiance` in the units of the first picture: that over `exposure`."""
     model: Surface
     """The volume alone, as the camera sees it."""
     surface: Surface
@@ -44,8 +51,16 @@ class Geometry:
         self._camera = camera
         self._wishes = wishes
         self._tracking = CameraTracking(engine, camera, wishes.poses)
+        self._exposure = ExposureTracking(engine, camera, "constant" if wishes.as_thesis else wishes.exposure)
         self._last: GeometryFrame | None = None
+        self._exposure_logarithms = 0.0  # sum over fused frames
         self.volume: Volume | None = None
+
+    @property
+    def usual_exposure(self) -> float:
+        """Geometric mean over the frames that were fused: under it the volume's colours look as in most pictures."""
+        frames = self.volume.frames if self.volume else 0
+        return math.exp(self._exposure_logarithms / frames) if frames else 1.0
 
     def update(self, frame: RgbdFrame) -> GeometryFrame:
         """Measure, locate, fuse, predict, merge. Raises ValueError, one line, for a frame that is refused."""
@@ -57,13 +72,18 @@ class Geometry:
             measurement = measure(engine, camera, frame)
         with stage("reconstruct"):  # 4.2.1
             located = self._tracking.locate(frame, measurement, volume)
-            notes = (*located.notes, *self._notes(frame, volume))
-            if self._last is not None and not located.fuse:
-                return replace(self._last, measurement=measurement, tracking=located.tracking, notes=notes)
             volume_from_camera = volume.volume_from_world() @ located.world_from_camera
+            place = volume_from_camera if located.fuse else None
+            exposure, doubts = self._exposure.update(frame, measurement, volume, place)  # B3
+            scene = scene_radiance(engine, measurement.radiance, exposure)
+            notes = (*located.notes, *doubts, *self._notes(frame, volume))
+            if self._last is not None and not located.fuse:
+                lost = replace(self._last, measurement=measurement, exposure=exposure, scene_radiance=scene)
+                return replace(lost, tracking=located.tracking, notes=notes)
             if located.fuse:
                 volume.allocate(camera, volume_from_camera, measurement.depth_m)
-                integrate(engine, volume, camera, volume_from_camera, measurement)
+                integrate(engine, volume, camera, volume_from_camera, Measurement(scene, measurement.depth_m))
+                self._exposure_logarithms += math.log(exposure)
         with stage("surface"):  # 4.2.1
             model = raycast(engine, camera, volume_from_camera, volume)
             if located.fuse:
@@ -71,7 +91,15 @@ class Geometry:
         with stage("dynamic_geometry"):  # 4.2.2
             surface = merge_depth(engine, camera, volume_from_camera, measurement, model, volume)
         result = GeometryFrame(
-            measurement, model, surface, located.world_from_camera, volume_from_camera, located.tracking, notes
+            measurement=measurement,
+            exposure=exposure,
+            scene_radiance=scene,
+            model=model,
+            surface=surface,
+            world_from_camera=located.world_from_camera,
+            volume_from_camera=volume_from_camera,
+            tracking=located.tracking,
+            notes=notes,
         )
         self._last = result if located.fuse else None
         return result

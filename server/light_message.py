@@ -22,9 +22,13 @@ def light_message(
     estimate: LightEstimate,
     webxr_from_world: NDArray[np.float64],
     lamps: tuple[Emitter, ...] = (),
+    exposure: float = 1.0,
 ) -> Light:
-    """Message of `estimate` and lamps in the world; bands not estimated are zeros with unknown deviation."""
-    sh, std = estimate.sh, estimate.std
+    """Message of `estimate` and lamps in the world; bands not estimated are zeros with unknown deviation.
+
+    exposure: of the frame, by which the light, told in units of the first picture, becomes one of the frame's own.
+    """
+    sh, std = exposure * estimate.sh, None if estimate.std is None else exposure * estimate.std
     direction = dominant_direction(sh)
     return Light(
         frame=frame,
@@ -45,18 +49,19 @@ def light_message(
             )
             for light in dominant_lights(sh)
         ),
-        lamps=tuple(_lamp(lamp) for lamp in lamps),
+        lamps=tuple(_lamp(lamp, exposure) for lamp in lamps),
+        exposure=exposure,
         condition=estimate.condition if math.isfinite(estimate.condition) else None,
         valid=estimate.valid,
     )
 
 
-def _lamp(lamp: Emitter) -> Lamp:
+def _lamp(lamp: Emitter, exposure: float) -> Lamp:
     return Lamp(
         position_m=_rgb(lamp.position),
         position_std_m=_rgb(np.sqrt(np.diag(lamp.position_covariance))),
-        intensity=_rgb(lamp.intensity),
-        intensity_std=_rgb(lamp.intensity_std),
+        intensity=_rgb(exposure * lamp.intensity),
+        intensity_std=_rgb(exposure * lamp.intensity_std),
         share=lamp.share,
     )
 

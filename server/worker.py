@@ -133,6 +133,7 @@ class Worker:
             color=decode_color(frame.color, camera),
             depth=decode_depth(frame.depth, camera),
             world_from_camera=None if pose is None else np.array(pose, np.float64).reshape(4, 4),
+            exposure=frame.exposure,
         )
         self._workshop.metrics.decode_ms.observe((time.perf_counter() - start_s) * 1e3)
         return rgbd

@@ -36,6 +36,17 @@ def dense_voxels(engine: Engine, volume: Volume) -> tuple[NDArray[np.float32], N
     return np.where(dense[..., 1] > 0, dense[..., 0], 1), dense[..., 1], allocated
 
 
+def dense_colors(volume: Volume) -> tuple[Floats, Floats]:
+    """Linear RGB [z, y, x, 3] and colour weight [z, y, x], 0 where no brick is."""
+    x, y, z = (8 * count for count in volume.bricks)
+    colors, count = np.zeros((z, y, x, 3)), np.zeros((z, y, x))
+    bricks = volume.download_bricks()
+    for (bx, by, bz), color, weight in zip(bricks.indices * 8, bricks.colors, bricks.color_weight, strict=True):
+        colors[bz : bz + 8, by : by + 8, bx : bx + 8] = color
+        count[bz : bz + 8, by : by + 8, bx : bx + 8] = weight
+    return colors, count
+
+
 def in_bricks(dense: NDArray[Any]) -> NDArray[Any]:
     """[bricks, 512] of an array [z, y, x], bricks in table order."""
     z, y, x = (size // BRICK for size in dense.shape)

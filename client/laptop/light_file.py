@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +19,18 @@ _COUNTS = tuple(bands * bands for bands in range(1, MAX_SH_BANDS + 1))
 Coefficients = tuple[Rgb, ...]
 
 
-def read_light(path: Path) -> Coefficients:
+def read_light(path: Path, radiance_of_white: float = 1.0) -> Coefficients:
     """SH of a light file, world axes: of `{"sh": [[r, g, b], ...]}`, or of the last line of a `light.jsonl`.
 
-    `sh_all` is taken before `sh`. Raises OptionError, one line.
+    `sh_all` is taken before `sh`. A line that says its frame's `exposure` is brought to the units of the first
+    picture of its session. Others are radiance, of which `radiance_of_white` is the picture's 1. Raises OptionError,
+    one line.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise OptionError(f"--light {path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
-    return _coefficients(path, _document(path, text))
+    return _coefficients(path, _document(path, text), radiance_of_white)
 
 
 def read_panorama_light(path: Path, bands: int) -> Coefficients:
@@ -50,7 +53,7 @@ def _document(path: Path, text: str) -> Any:
     raise OptionError(f"--light {path}: not JSON")
 
 
-def _coefficients(path: Path, document: Any) -> Coefficients:
+def _coefficients(path: Path, document: Any, radiance_of_white: float) -> Coefficients:
     rows = document.get("sh_all") or document.get("sh") if isinstance(document, dict) else None
     try:
         values = np.array(rows, np.float64)
@@ -60,4 +63,12 @@ def _coefficients(path: Path, document: Any) -> Coefficients:
         raise OptionError(
             f'--light {path}: expected {{"sh": ...}} with {", ".join(map(str, _COUNTS))} finite [r, g, b]'
         )
-    return tuple((float(r), float(g), float(b)) for r, g, b in values)
+    unit = _exposure(path, document) if document.keys() & {"frame", "exposure"} else radiance_of_white
+    return tuple((float(r), float(g), float(b)) for r, g, b in values / unit)
+
+
+def _exposure(path: Path, document: dict[str, Any]) -> float:
+    exposure = document.get("exposure", 1.0)
+    if type(exposure) not in (int, float) or not 0 < exposure < math.inf:
+        raise OptionError(f"--light {path}: exposure is {exposure!r}, expected a positive number")
+    return float(exposure)

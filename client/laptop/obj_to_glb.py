@@ -1,11 +1,12 @@
 """An OBJ with its material libraries and textures as one GLB: the same vertices, axes and units.
 
-`Kd` is taken as sRGB, as textures are; glTF's factors are linear.
+`Kd` is taken as sRGB, as textures are; glTF's factors are linear. Roughness is `Pr`, or what shines as `Ns` does;
+metalness is `Pm`. Of the maps, `map_Kd` is read, with its options -s, -o and -clamp.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -38,12 +39,38 @@ class _Model:
 
 
 @dataclass(frozen=True)
+class ColorMap:
+    """A `map_Kd`."""
+
+    file: Path
+    scale: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+    clamp: bool = False
+
+
+@dataclass(frozen=True)
 class Material:
     """What is kept of an MTL material."""
 
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """sRGB, 0 to 1."""
-    texture: Path | None = None
+    texture: ColorMap | None = None
+    specular: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    exponent: float | None = None
+    """Of Phong's highlight."""
+    given_roughness: float | None = None
+    metalness: float = 0.0
+
+    @property
+    def roughness(self) -> float:
+        """Perceptual, 0 to 1. A highlight of exponent n is that of microfacets with alpha^2 = 2 / (n + 2) (Karis 2013).
+
+        Without one, or where it is black: 1.
+        """
+        if self.given_roughness is not None:
+            return self.given_roughness
+        shines = self.exponent is not None and any(self.specular)
+        return (2 / (max(self.exponent or 0.0, 0.0) + 2)) ** 0.25 if shines else 1.0
 
 
 def libraries(path: Path, text: str) -> list[Path]:
@@ -68,11 +95,11 @@ def convert(path: Path, text: str, mtl_files: list[Path]) -> bytes:
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": []}],
     }
-    body = bytearray()
+    body, images = bytearray(), dict[Path, int]()
     for name, group in model.groups.items():
         if group.triangles:
             primitive = _primitive(document, body, model, group)
-            primitive["material"] = _add_material(document, body, materials.get(name, Material()))
+            primitive["material"] = _add_material(document, body, materials.get(name, Material()), images)
             document["meshes"][0]["primitives"].append(primitive)
     return glb.to_bytes(document, body)
 
@@ -161,41 +188,89 @@ def _read_materials(path: Path) -> dict[str, Material]:
             case ["newmtl", *words]:
                 name = " ".join(words)
                 materials[name] = Material()
-            case ["Kd", r, g, b, *_] if name in materials:
-                materials[name] = Material(_color(path, number, (r, g, b)), materials[name].texture)
             case ["map_Kd", *words] if name in materials and words:
-                materials[name] = Material(materials[name].color, _texture(path, words))
+                materials[name] = replace(materials[name], texture=_color_map(path, words))
+            case [key, *words] if name in materials and key in _FIELDS:
+                field, count = _FIELDS[key]
+                values = _numbers(path, number, key, words, count)
+                if key != "Ns":
+                    values = [min(max(value, 0.0), 1.0) for value in values]
+                change = {field: tuple(values) if count > 1 else values[0]}
+                materials[name] = replace(materials[name], **change)  # type: ignore[arg-type]
     return materials
 
 
-def _color(path: Path, number: int, words: tuple[str, str, str]) -> tuple[float, float, float]:
+_FIELDS = {
+    "Kd": ("color", 3),
+    "Ks": ("specular", 3),
+    "Ns": ("exponent", 1),
+    "Pr": ("given_roughness", 1),
+    "Pm": ("metalness", 1),
+}
+"""By the MTL's name: the field of Material, and how many numbers it has."""
+
+
+def _numbers(path: Path, number: int, key: str, words: list[str], count: int) -> list[float]:
     try:
-        r, g, b = (min(max(float(word), 0.0), 1.0) for word in words)
+        values = [float(word) for word in words[:count]]
     except ValueError:
-        raise ObjectError(f"{path}, line {number}: Kd needs three numbers") from None
-    return r, g, b
+        values = []
+    if len(values) < count or not np.isfinite(values).all():
+        counted = {1: "one number", 2: "two numbers", 3: "three numbers"}[count]
+        raise ObjectError(f"{path}, line {number}: {key} needs {counted}")
+    return values
 
 
-def _texture(path: Path, words: list[str]) -> Path:
+def _color_map(path: Path, words: list[str]) -> ColorMap:
     """The file after map_Kd's options; file names may have spaces, so the longest tail that exists wins."""
     for start in range(len(words)):
         file = path.parent / " ".join(words[start:]).replace("\\", "/")
         if file.is_file():
-            return file
+            scale, offset = (_option(words[:start], name, default) for name, default in (("-s", 1.0), ("-o", 0.0)))
+            return ColorMap(file, scale, offset, clamp="-clamp on" in " ".join(words[:start]).lower())
     raise ObjectError(f"{path.parent / words[-1]}: the texture that {path.name} names is missing")
 
 
-def _add_material(document: dict[str, Any], body: bytearray, material: Material) -> int:
+def _option(words: list[str], name: str, default: float) -> tuple[float, float]:
+    """The first two numbers after an option that has up to three."""
+    values = [default, default]
+    if name in words:
+        for k, word in enumerate(words[words.index(name) + 1 :][:2]):
+            try:
+                values[k] = float(word)
+            except ValueError:
+                break
+    return values[0], values[1]
+
+
+def _add_material(document: dict[str, Any], body: bytearray, material: Material, images: dict[Path, int]) -> int:
     srgb = np.array(material.color)
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     surface: dict[str, Any] = {
         "baseColorFactor": [*linear.tolist(), 1.0],
-        "metallicFactor": 0.0,
-        "roughnessFactor": 1.0,
+        "metallicFactor": material.metalness,
+        "roughnessFactor": material.roughness,
     }
     if material.texture is not None:
-        image = glb.add_image(document, body, material.texture.read_bytes(), material.texture)
-        document.setdefault("textures", []).append({"source": image})
-        surface["baseColorTexture"] = {"index": len(document["textures"]) - 1}
+        surface["baseColorTexture"] = _add_texture(document, body, material.texture, images)
     document.setdefault("materials", []).append({"pbrMetallicRoughness": surface, "doubleSided": True})
     return len(document["materials"]) - 1
+
+
+def _add_texture(
+    document: dict[str, Any], body: bytearray, texture: ColorMap, images: dict[Path, int]
+) -> dict[str, Any]:
+    """A reference to the texture. OBJ's v counts from the bottom: v' = s v + o is 1 - v' = s (1 - v) + 1 - s - o."""
+    if texture.file not in images:
+        images[texture.file] = glb.add_image(document, body, texture.file.read_bytes(), texture.file)
+    entry = {"source": images[texture.file]}
+    if texture.clamp:
+        document.setdefault("samplers", []).append({"wrapS": 33071, "wrapT": 33071})
+        entry["sampler"] = len(document["samplers"]) - 1
+    document.setdefault("textures", []).append(entry)
+    reference: dict[str, Any] = {"index": len(document["textures"]) - 1}
+    if texture.scale != (1.0, 1.0) or texture.offset != (0.0, 0.0):
+        offset = [texture.offset[0], 1 - texture.scale[1] - texture.offset[1]]
+        reference["extensions"] = {"KHR_texture_transform": {"scale": [*texture.scale], "offset": offset}}
+        document["extensionsUsed"] = ["KHR_texture_transform"]
+    return reference

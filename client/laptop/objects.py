@@ -52,7 +52,10 @@ def pack_mesh(path: Path) -> tuple[str, bytes]:
     data = read_bytes(path)
     format_, data = _PACKERS[suffix](path, data)
     if len(data) > MAX_MESH_BYTES:
-        raise ObjectError(f"{path}: {len(data)} bytes is more than the {MAX_MESH_BYTES} a mesh may have; simplify it")
+        raise ObjectError(
+            f"{path}: {len(data)} bytes is more than the {MAX_MESH_BYTES} a mesh may have with its "
+            "textures; simplify it, or make those smaller"
+        )
     return format_, data
 
 

@@ -118,6 +118,7 @@ def light_row(light: Light) -> dict[str, Any]:
         "dominant_intensity": light.dominant_intensity,
         "dominant_lights": msgspec.to_builtins(light.dominant_lights),
         "lamps": msgspec.to_builtins(light.lamps),
+        "exposure": light.exposure,
         "condition": light.condition,
         "valid": light.valid,
     }

@@ -51,7 +51,7 @@ class RecordedSource:
             raise SourceError(f"{where}: {error}") from error
         pose = message.world_from_camera
         matrix = None if pose is None else np.array(pose, np.float64).reshape(4, 4)
-        return RgbdFrame(index, message.timestamp_s, color, depth, matrix)
+        return RgbdFrame(index, message.timestamp_s, color, depth, matrix, message.exposure)
 
 
 def open_recording(path: Path) -> RecordedSource:

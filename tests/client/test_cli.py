@@ -128,7 +128,7 @@ def test_help_names_every_command_and_option() -> None:
         assert command in general
     shared = (
         "--frames --poses --volume --voxel --preset --rays --ray-length --bands --albedo --indirect --as-thesis "
-        "--object --up --light --panorama --lamps --mesh --budget-ms --max-light-error --out"
+        "--object --up --light --panorama --lamps --exposure --mesh --budget-ms --max-light-error --out"
     )
     for command in ("run", "stream"):
         text = probeless(command, "--help", COLUMNS="200").stdout

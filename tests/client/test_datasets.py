@@ -229,6 +229,11 @@ def test_quaternion_of_length_zero(tmp_path: Path) -> None:
         ("frames", 7, "picture 000003"),
         ("frames", 0, "positive"),
         ("up", [0, 0, 0], "up must be"),
+        ("exposures", [1.0, 2.0], "exposures must be 3 numbers"),
+        ("exposures", [1.0, "2", 3.0], "exposures must be"),
+        ("exposures", [1.0, True, 3.0], "exposures must be"),
+        ("exposures", 1.0, "exposures must be"),
+        ("exposures", [1, 10**400, 1], "no float holds"),
         ("depth_scale_m", -1, "depth_scale_m"),
         ("poses", "none.txt", "none.txt"),
     ],
@@ -238,6 +243,18 @@ def test_meta_with_a_wrong_entry(key: str, value: object, words: str, tmp_path: 
     meta = json.loads((folder / "meta.json").read_text())
     (folder / "meta.json").write_text(json.dumps(meta | {key: value}))
     assert words in error_of(folder)
+
+
+def test_exposures_of_a_set(tmp_path: Path) -> None:
+    """As its meta.json lists them; without a list linear pictures are of one exposure, others of an unknown one."""
+    for name, encoding, without in (("g", "srgb8", None), ("l", "linear16", 1.0)):
+        folder = folders.ground_truth(tmp_path / name / "set", encoding=encoding)
+        source = open_source(str(folder))
+        assert [source[i].exposure for i in range(3)] == [without] * 3
+        meta = json.loads((folder / "meta.json").read_text())
+        (folder / "meta.json").write_text(json.dumps(meta | {"exposures": [2, None, 0.5]}))
+        source = open_source(str(folder))
+        assert [source[i].exposure for i in range(3)] == [2.0, None, 0.5]
 
 
 def with_camera(folder: Path, **more: object) -> Path:

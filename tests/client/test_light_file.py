@@ -43,6 +43,21 @@ def test_last_line_of_a_run(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_light(path), more)
 
 
+def test_a_line_of_another_exposure_is_brought_to_the_first_picture_s_units(tmp_path: Path) -> None:
+    path = tmp_path / "light.jsonl"
+    path.write_text(json.dumps({"sh": rows(2 * LIGHT), "exposure": 2.0}))
+    np.testing.assert_array_equal(read_light(path), LIGHT)
+
+
+def test_radiance_is_brought_to_the_picture_s_units(tmp_path: Path) -> None:
+    """A light.json is radiance; a light.jsonl is in units of the picture already."""
+    path = tmp_path / "light.json"
+    path.write_text(json.dumps({"sh": rows(LIGHT)}))
+    np.testing.assert_allclose(read_light(path, 2.0), LIGHT / 2)
+    path.write_text(json.dumps({"frame": 3, "sh": rows(LIGHT)}))
+    np.testing.assert_array_equal(read_light(path, 2.0), LIGHT)
+
+
 @pytest.mark.parametrize(
     "content",
     [
@@ -57,6 +72,9 @@ def test_last_line_of_a_run(tmp_path: Path) -> None:
         b'{"sh": [[1, 2]]}',
         b'{"sh": [[1, 2, "x"]]}',
         b'{"sh": [[1, 2, NaN]]}',
+        b'{"sh": [[1, 2, 3]], "exposure": 0}',
+        b'{"sh": [[1, 2, 3]], "exposure": NaN}',
+        b'{"sh": [[1, 2, 3]], "exposure": "long"}',
     ],
 )
 def test_files_that_are_no_lights(content: bytes | None, tmp_path: Path) -> None:

@@ -118,6 +118,51 @@ def test_obj_materials(obj: Path) -> None:
     assert (pixels == (10, 20, 30)).all()
 
 
+@pytest.mark.parametrize(
+    ("lines", "roughness", "metalness"),
+    [
+        ("", 1.0, 0.0),
+        ("Ns 250", 1.0, 0.0),  # no Ks: nothing shines
+        ("Ns 250\nKs 0 0 0", 1.0, 0.0),
+        ("Ks 0.5 0.5 0.5\nNs 0", 1.0, 0.0),
+        ("Ks 0.5 0.5 0.5\nNs 30", 0.5, 0.0),
+        ("Ks 0.5 0.5 0.5\nNs 30\nPr 0.25\nPm 0.75", 0.25, 0.75),
+        ("Pr 7\nPm -1", 1.0, 0.0),
+    ],
+)
+def test_obj_roughness_and_metalness(lines: str, roughness: float, metalness: float, obj: Path) -> None:
+    (obj.parent / "model.mtl").write_text(MTL.replace("Kd 1 0.5 0", f"Kd 1 0.5 0\n{lines}"))
+    red, picture = (m["pbrMetallicRoughness"] for m in document_of(pack_mesh(obj)[1])[0]["materials"])
+    assert (red["roughnessFactor"], red["metallicFactor"]) == pytest.approx((roughness, metalness))
+    assert (picture["roughnessFactor"], picture["metallicFactor"]) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize("line", ["Ns many", "Pr nan", "Pm", "Ks 1 1"])
+def test_material_that_is_broken(line: str, obj: Path) -> None:
+    (obj.parent / "model.mtl").write_text(MTL.replace("Kd 1 0.5 0", f"Kd 1 0.5 0\n{line}"))
+    with pytest.raises(ObjectError, match=r"model\.mtl, line 3: .* needs (one|three) number"):
+        pack_mesh(obj)
+
+
+def test_obj_texture_options(obj: Path) -> None:
+    """Where the picture is read: at OBJ's own coordinates, scaled and moved, counted from the bottom."""
+    (obj.parent / "model.mtl").write_text(
+        "newmtl red paint\nmap_Kd -clamp on -s 2 3 1 -o 0.25 0.5 my texture.bmp\n"
+        "newmtl picture\nmap_Kd my texture.bmp\n"
+    )
+    document, _ = document_of(pack_mesh(obj)[1])
+    assert len(document["images"]) == 1  # one file, twice
+    first, second = (m["pbrMetallicRoughness"]["baseColorTexture"] for m in document["materials"])
+    assert "extensions" not in second
+    assert "sampler" not in document["textures"][second["index"]]
+    sampler = document["samplers"][document["textures"][first["index"]]["sampler"]]
+    assert sampler == {"wrapS": 33071, "wrapT": 33071}
+    change = first["extensions"]["KHR_texture_transform"]
+    u, v = 0.3, 0.9
+    moved = np.array([u, 1 - v]) * change["scale"] + change["offset"]
+    np.testing.assert_allclose([moved[0], 1 - moved[1]], [2 * u + 0.25, 3 * v + 0.5])
+
+
 def test_obj_texture_coordinates_are_turned_over(obj: Path) -> None:
     document, body = document_of(pack_mesh(obj)[1])
     with_texture, without = document["meshes"][0]["primitives"]

@@ -27,7 +27,8 @@ def test_defaults_fit_the_source(source: str) -> None:
     assert wishes.up == (0.0, -1.0, 0.0)  # what the source says
     assert (wishes.preset, wishes.rays, wishes.bands, wishes.ray_length_m) == ("reg4", 81, 4, None)
     assert (wishes.albedo, wishes.indirect, wishes.poses) == ("estimated", "observed", "given")
-    assert wishes.lamps == "auto"
+    assert (wishes.lamps, wishes.exposure) == ("auto", "auto")
+    assert wishes.robustness == ("openness", "memory", "outliers")
     assert not wishes.as_thesis
     assert not wishes.lossless
 
@@ -46,6 +47,8 @@ def test_everything_said(source: str) -> None:
         albedo="constant",
         indirect="none",
         lamps="on",
+        robustness="normals, memory",
+        exposure="constant",
         up="0,0,1",
         object=[f"{source}/meta.json@1,2,3", f"{source}/meta.json"],
     )
@@ -57,7 +60,8 @@ def test_everything_said(source: str) -> None:
     assert (wishes.voxel_m, wishes.preset, wishes.rays, wishes.ray_length_m, wishes.bands) == (0.02, "rm", 169, 0.5, 3)
     assert (wishes.albedo, wishes.indirect) == ("constant", "none")
     assert wishes.up == (0.0, 0.0, 1.0)
-    assert wishes.lamps == "on"
+    assert (wishes.lamps, wishes.exposure) == ("on", "constant")
+    assert wishes.robustness == ("normals", "memory")
     assert wishes.lossless
 
 
@@ -115,6 +119,11 @@ REFUSED = [
     ({"indirect": "all"}, "--indirect"),
     ({"poses": "guess"}, "--poses"),
     ({"lamps": "bright"}, "--lamps"),
+    ({"robustness": "normal"}, "--robustness"),
+    ({"robustness": "none,memory"}, "--robustness"),
+    ({"robustness": "normals,normals_printed"}, "--robustness"),
+    ({"as_thesis": True, "robustness": "normals"}, "--as-thesis"),
+    ({"exposure": "given"}, "--exposure"),
 ]
 UNBUILT = [
     {"preset": "auto"},

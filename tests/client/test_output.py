@@ -17,7 +17,7 @@ from protocol.messages import LeftOut, Light, Plan, Timings
 
 LIGHT_FIELDS = [
     *"frame timestamp_s sh sh_std sh_webxr dominant_direction dominant_intensity dominant_lights".split(),  # noqa: SIM905
-    *"lamps condition valid".split(),  # noqa: SIM905
+    *"lamps exposure condition valid".split(),  # noqa: SIM905
 ]
 ROWS = (
     "input reconstruct surface dynamic_geometry radiance_transfer light_estimation rendering total".split()  # noqa: SIM905

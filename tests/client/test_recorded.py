@@ -47,6 +47,19 @@ def test_frames_come_back_exactly(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frame.world_from_camera, folders.pose_of(number))
 
 
+def test_exposures_come_back(tmp_path: Path) -> None:
+    """One that cannot be is for the pipeline to tell of."""
+    path = record(tmp_path / "a.rec")
+    with path.open("ab") as file:
+        for number, exposure in enumerate((0.02, 0.04, float("nan"))):
+            color, depth = encode_color(folders.color_of(0), "raw"), encode_depth(folders.depth_of(0))
+            more = {"world_from_camera": None, "color": color, "depth": depth, "exposure": exposure}
+            write_message(file, Frame(frame=200 + number, timestamp_s=6 + number / 20, **more))
+    source = open_source(str(path))
+    assert [source[i].exposure for i in range(5)] == [None, None, None, 0.02, 0.04]
+    assert np.isnan(source[5].exposure)
+
+
 def test_without_poses(tmp_path: Path) -> None:
     source = open_source(str(record(tmp_path / "a.rec", posed=False)))
     assert not source.has_poses

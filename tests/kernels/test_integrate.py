@@ -16,7 +16,7 @@ from tests.analytic import look, look_at, plane, room, sphere
 from tests.reference.integrate import integrate as twin
 from tests.reference.integrate import integrate_color, project, voxel_centers
 from tests.tolerance import relative_tolerance
-from tests.volumes import dense_voxels, fuse, upload_measurement
+from tests.volumes import dense_colors, dense_voxels, fuse, upload_measurement
 
 CAMERA = CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.313, cy=36.127)
 BOUNDS = (-1.0, -1.0, 0.0, 1.0, 1.0, 2.4)
@@ -24,6 +24,9 @@ VOXEL_M = 0.04
 SCENE = [room((-0.9, -0.9, -0.3), (0.95, 0.9, 2.2)), sphere((0.1, 0.2, 1.2), 0.4)]
 FLIPS = 1e-3
 """Share of voxels whose pixel float32 rounds to its neighbour, or that lie at the end of the truncation."""
+
+AT_LEAST = -0.5
+"""Mark of a clipped pixel of another exposure than the first, see marks.clh."""
 
 Floats = NDArray[np.float64]
 
@@ -84,17 +87,6 @@ def test_matches_twin(engine: Engine, name: str) -> None:
     compare(engine, expected)
 
 
-def dense_colors(volume: Volume) -> tuple[Floats, Floats]:
-    """Linear RGB [z, y, x, 3] and colour weight [z, y, x], 0 where no brick is."""
-    x, y, z = (8 * count for count in volume.bricks)
-    colors, count = np.zeros((z, y, x, 3)), np.zeros((z, y, x))
-    bricks = volume.download_bricks()
-    for (bx, by, bz), color, weight in zip(bricks.indices * 8, bricks.colors, bricks.color_weight, strict=True):
-        colors[bz : bz + 8, by : by + 8, bx : bx + 8] = color
-        count[bz : bz + 8, by : by + 8, bx : bx + 8] = weight
-    return colors, count
-
-
 def test_color_matches_twin(engine: Engine) -> None:
     """Within the steps that colour is kept in: sqrt(c) in 1/511 (blue 1/255), rounded at each of the frames."""
     volume = Volume(engine, BOUNDS, VOXEL_M)
@@ -151,6 +143,30 @@ def test_no_color_from_outside_the_camera_s_picture(engine: Engine) -> None:
     integrate(engine, volume, CAMERA, volume.volume_from_world(), measurement)
     assert not dense_colors(volume)[1].any()
     assert dense_voxels(engine, volume)[1].any()
+
+
+def test_a_bound_only_raises_a_color(engine: Engine) -> None:
+    """A pixel that is clipped says that the surface is at least so bright."""
+    volume = Volume(engine, (-0.16, -0.16, 1.0, 0.16, 0.16, 1.32), 0.02)
+    depth = np.full((CAMERA.height, CAMERA.width), 1.16)
+
+    def look(value: float, mark: float) -> NDArray[np.float64]:
+        measurement = upload_measurement(engine, depth, np.full((*depth.shape, 3), value))
+        radiance = measurement.radiance.get()
+        radiance["w"] = mark
+        measurement.radiance.set(radiance)
+        volume.allocate(CAMERA, volume.volume_from_world(), measurement.depth_m)
+        integrate(engine, volume, CAMERA, volume.volume_from_world(), measurement)
+        colors, weight = dense_colors(volume)
+        return np.asarray(np.sqrt(colors[weight > 0]))
+
+    step = 1 / 255
+    assert np.abs(look(0.36, AT_LEAST) - 0.6).max() < 1.5 * step  # nothing else is known
+    assert np.abs(look(0.36, 1.0) - 0.6).max() < 2.5 * step
+    assert np.abs(look(0.04, AT_LEAST) - 0.6).max() < 3.5 * step
+    assert np.abs(look(0.04, 1.0).mean() - np.sqrt(0.36 + (0.04 - 0.36) / 4)) < step
+    raised = look(0.81, AT_LEAST).mean()
+    assert np.abs(raised - np.sqrt(0.28 + (0.81 - 0.28) / 5)) < step
 
 
 def test_leaves_alone_what_it_does_not_see(engine: Engine) -> None:

@@ -20,6 +20,8 @@ from tests.protocol.samples import CLIENT, COLOR, SERVER
 
 FOLDER = Path(__file__).resolve().parents[1] / "golden"
 EXPECTED = FOLDER / "messages.json"
+EARLIER = FOLDER / "earlier"
+"""Bytes that clients and servers out there write: they are read for as long as PROTOCOL_VERSION stays."""
 
 
 def depth_ramp() -> NDArray[np.uint16]:

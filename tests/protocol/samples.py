@@ -76,6 +76,9 @@ CLIENT: dict[str, ClientMessage] = {
     "watch": Watch(),
     "watch_named": Watch(session="küche"),
     "frame": Frame(frame=7, timestamp_s=0.25, world_from_camera=IDENTITY, color=COLOR, depth=DEPTH),
+    "frame_with_exposure": Frame(
+        frame=9, timestamp_s=0.75, world_from_camera=IDENTITY, color=COLOR, depth=DEPTH, exposure=0.0078125
+    ),
     "frame_without_pose": Frame(frame=8, timestamp_s=0.5, world_from_camera=None, color=COLOR, depth=DEPTH),
     "place_object": PlaceObject(request=1, object="sofa", format="glb", data=b"glTF\x02", position_m=(0.5, 0.25, 1.5)),
     "move_object": MoveObject(request=2, object="sofa", position_m=(0.0, 0.0, 1.0), scale=2.0, yaw_deg=-90.0),
@@ -124,6 +127,18 @@ SERVER: dict[str, ServerMessage] = {
         condition=None,
         valid=True,
     ),
+    "light_of_an_exposure": Light(
+        frame=9,
+        timestamp_s=0.75,
+        sh=tuple((k / 4, -k / 8, 0.125) for k in range(16)),
+        sh_std=((None, None, None),) * 16,
+        sh_webxr=tuple(k / 16 for k in range(27)),
+        dominant_direction=(0.0, 0.6, -0.8),
+        dominant_intensity=1.25,
+        exposure=1.5,
+        condition=12.5,
+        valid=False,
+    ),
     "dropped": Dropped(frame=6, reason="replaced by a newer frame"),
     "mesh_part": MeshPart(request=5, format="ply", size_bytes=9, offset=4, data=b"\nend\n"),
     "acknowledged": Acknowledged(request=1, notes=("no normals: computed",)),
@@ -143,6 +158,7 @@ def random_frame(random: np.random.Generator) -> Frame:
         world_from_camera=None if random.random() < 0.3 else tuple(pose.tolist()),
         color=ColorImage(width=width, height=height, codec="jpeg", data=random.bytes(random.integers(0, 5000))),
         depth=DepthImage(width=width, height=height, codec="zdelta", data=random.bytes(random.integers(0, 5000))),
+        exposure=None if random.random() < 0.5 else float(random.exponential()),
     )
 
 
@@ -171,6 +187,7 @@ def random_light(random: np.random.Generator) -> Light:
             Lamp(position_m=rgb(), position_std_m=rgb(), intensity=rgb(), intensity_std=rgb(), share=random.random())
             for _ in range(random.integers(0, 3))
         ),
+        exposure=float(random.exponential()),
         condition=None if random.random() < 0.5 else float(random.exponential(1e6)),
         valid=bool(random.random() < 0.5),
     )

@@ -7,8 +7,8 @@ import pytest
 
 from protocol.codec import decode_client, decode_server, encode
 from protocol.depth_codec import filter_depth, inflate, unfilter_depth
-from tests.protocol.golden import EXPECTED, FOLDER, depth_ramp, messages, render_expected
-from tests.protocol.samples import SERVER
+from tests.protocol.golden import EARLIER, EXPECTED, FOLDER, depth_ramp, messages, render_expected
+from tests.protocol.samples import CLIENT, SERVER
 
 
 @pytest.mark.parametrize("name", [name for name in messages() if name != "frame_zdelta"])
@@ -29,6 +29,21 @@ def test_the_expected_fields_for_other_languages_are_current() -> None:
     recorded = EXPECTED.read_text(encoding="utf-8")
     without_deflate = [line for line in recorded.splitlines() if "base64" not in line]
     assert without_deflate == [line for line in render_expected().splitlines() if "base64" not in line]
+
+
+@pytest.mark.parametrize("name", [path.stem for path in sorted(EARLIER.glob("*.msgpack"))])
+def test_bytes_of_earlier_clients_and_servers_are_read(name: str) -> None:
+    """From before exposure was said: fields that are missing have their defaults."""
+    data = (EARLIER / f"{name}.msgpack").read_bytes()
+    assert (decode_server if name in SERVER else decode_client)(data) == messages()[name]
+
+
+def test_there_are_earlier_bytes() -> None:
+    assert {path.stem for path in EARLIER.glob("*.msgpack")} == {"hello", "hello_two_lenses", "light", "frame"}
+
+
+def test_a_frame_of_unknown_exposure_is_written_as_it_always_was() -> None:
+    assert encode(CLIENT["frame"]) == (EARLIER / "frame.msgpack").read_bytes()
 
 
 def test_no_stray_vectors() -> None:

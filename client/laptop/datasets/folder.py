@@ -26,6 +26,8 @@ class FrameFiles:
     timestamp_s: float
     pose: NDArray[np.float64] | Path | None
     """world_from_camera [4, 4], or the file with its 16 numbers."""
+    exposure: float | None = None
+    """As in RgbdFrame."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,8 @@ class FolderSource:
         color, depth = read_color(files.color), read_depth(files.depth)
         self._require_match(files, color, depth)
         pose = poses.read_matrix(files.pose) if isinstance(files.pose, Path) else files.pose
-        return RgbdFrame(range(len(self))[index], files.timestamp_s, color, depth, pose)
+        number = range(len(self))[index]
+        return RgbdFrame(number, files.timestamp_s, color, depth, pose, files.exposure)
 
     def _require_match(self, files: FrameFiles, color: NDArray, depth: NDArray) -> None:
         camera, lens = self.camera, self.camera.depth_lens

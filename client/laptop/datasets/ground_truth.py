@@ -1,12 +1,15 @@
 """The ground-truth layout: meta.json with relative paths to depth, colour and poses.
 
 Its camera may say `distortion` and, where the depth picture has a lens of its own, `depth`, as `CameraModel` does.
+`exposures` may list what each frame's exposure time times gain was, null where that is not known; a `linear16` set
+without it is taken as of one exposure.
 
 Its virtual objects and its light are truth for evaluation, never input; `meta` keeps them for those who compare.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +34,14 @@ class GroundTruthSource(FolderSource):
 
     folder: Path = field(default_factory=Path)
     meta: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def radiance_of_white(self) -> float:
+        """What the picture's 1 stands for, in the units of its light.json. Raises SourceError."""
+        unit = self.meta.get("radiance_at_65535", 1.0)
+        if type(unit) not in (int, float) or not 0 < unit < math.inf:
+            raise SourceError(f"{self.folder / 'meta.json'}: radiance_at_65535 is {unit!r}, must be a positive number")
+        return float(unit)
 
 
 def recognises(folder: Path) -> bool:
@@ -65,7 +76,24 @@ def _frames(folder: Path, meta: dict[str, Any], path: Path) -> tuple[FrameFiles,
     if poses is not None and len(poses) < count:
         raise SourceError(f"{folder / meta['poses']}: has {len(poses)} poses for {count} frames")
     times = [i / DEFAULT_FPS for i in range(count)] if poses is None else [pose[0] for pose in poses]
-    return tuple(FrameFiles(colors[i], depths[i], times[i], poses[i][1] if poses else None) for i in range(count))
+    exposures = _exposures(path, meta, count)
+    return tuple(
+        FrameFiles(colors[i], depths[i], times[i], poses[i][1] if poses else None, exposures[i]) for i in range(count)
+    )
+
+
+def _exposures(path: Path, meta: dict[str, Any], count: int) -> list[float | None]:
+    """Of each frame. Values that cannot be one are for the pipeline to tell of. Raises SourceError."""
+    said = meta.get("exposures")
+    if said is None:
+        return [1.0 if meta["color_encoding"] == "linear16" else None] * count
+    is_list = isinstance(said, list) and all(x is None or type(x) in (int, float) for x in said)
+    if not is_list or len(said) != count:
+        raise SourceError(f"{path}: exposures must be {count} numbers, one a frame, null where it is not known")
+    try:
+        return [None if x is None else float(x) for x in said]
+    except OverflowError as error:
+        raise SourceError(f"{path}: exposures has a number that no float holds") from error
 
 
 def _subfolder(folder: Path, meta: dict[str, Any], key: str) -> Path:

@@ -73,6 +73,13 @@ export interface Wishes {
   light_axes?: "webxr" | "world";
   /** Whether lights inside the room are looked for; `auto`: where distant light does not explain what is seen. */
   lamps?: "auto" | "off" | "on";
+  /** `auto`: of each frame as it says, estimated where it does not say; `constant`: the same for all frames. */
+  exposure?: "auto" | "constant";
+  /**
+   * Measures that light estimation takes (thesis 5.2, 5.4): samples that see little sky are left out; weights by how
+   * common a normal is (`normals_printed`: as eq. 5.7 has them); earlier frames count; what fits badly counts less.
+   */
+  robustness?: Array<"memory" | "normals" | "normals_printed" | "openness" | "outliers">;
   /** Answers carry PNG pictures, and every frame is answered in order instead of latest-wins. */
   lossless?: boolean;
 }
@@ -121,6 +128,12 @@ export interface Frame {
   world_from_camera: Array<number> | null;
   color: ColorImage;
   depth: DepthImage;
+  /**
+   * Exposure time times gain of the colour picture, in any unit that stays the same for the session; null: unknown.
+   *
+   * What cannot be one (not finite, not above 0) is told in the composite's notes and taken as null.
+   */
+  exposure?: number | null;
 }
 
 /** Put a virtual object into the session; acknowledged. */
@@ -267,6 +280,11 @@ export interface Light {
   dominant_lights: Array<DirectedLight>;
   /** Lights inside the room, strongest first; their light is not part of `sh`. */
   lamps: Array<Lamp>;
+  /**
+   * Of this frame relative to the session's first. All radiance here is in units of this frame's picture: over
+   * `exposure` it is in those of the first one's, which a room under steady light keeps.
+   */
+  exposure: number;
   /** Condition number of the unregularised normal equations; null when infinite. */
   condition: number | null;
   valid: boolean;

@@ -1,7 +1,6 @@
 // Adaptive refinement (thesis 6.1.1, step 1): shading at every pixel where that of samples changes from one to the next.
-// Provides mark_edges, mark_varying, shade_samples, refine_virtual, refine_real.
+// Provides mark_edges, mark_varying, refine_virtual, refine_real.
 #include "direction_sets.clh"
-#include "sh.clh"
 #include "shadows.clh"
 #include "upsample.clh"
 
@@ -66,50 +65,27 @@ kernel void mark_varying(const int cols, const int rows, global const float4 *ra
     varying[(cell_row + 1) * (cols + 1) + cell_col + 1] = (uchar)(fmax(across, along) > least_change);
 }
 
-// Radiance of real samples, white: transfer [rows][cols][COEFFICIENTS], openness [rows][cols], light [COEFFICIENTS]
-// -> shaded [rows][cols] (rgb, w = 1 where there is surface).
-kernel void shade_samples(const int samples, global const float *transfer, global const float *openness,
-                          global const float4 *light, global float4 *shaded) {
-    const int sample = get_global_id(0);
-    if (sample >= samples) return;
-    float3 sum = (float3)(0.0f);
-    for (int i = 0; i < COEFFICIENTS; i++) sum += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
-    shaded[sample] = (float4)(sum, openness[sample] >= 0.0f ? 1.0f : 0.0f);
-}
-
 // What occluders take from the virtual surface at `pixels` [listed]; positions, normals [h][w]: the virtual geometry buffer.
 // -> occluded [h][w] (rgb, w = 1); other pixels are left as they are.
 kernel void refine_virtual(const int listed, global const int *pixels, const int width,
-                           global const float4 *positions, global const float4 *normals,
-                           const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid,
-                           global const uchar *octets, global const float2 *voxels, const float voxel_m,
-                           const float truncation_m, const int count, global const float4 *directions,
-                           global const float4 *arriving, const float reach_m, const int plane_count,
-                           global const float4 *planes, global const int4 *shapes, global const uchar *maps, const float cell_m,
-                           const float least_m, const int objects, global const float16 *grid_from_volume, global const int4 *dims,
-                           global const float *distances, const float offset_m, global float4 *occluded) {
+                           global const float4 *positions, global const float4 *normals, VOLUME_PARAMETERS, LIGHT_PARAMETERS,
+                           OBJECT_PARAMETERS, const float offset_m, global float4 *occluded) {
     const int item = get_global_id(0);
     if (item >= listed) return;
     const int pixel = pixels[item];
-    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
-    const Objects things = {objects, grid_from_volume, dims, distances, offset_m};
-    const Arriving light = {count, directions, arriving, reach_m, {plane_count, planes, shapes, maps, cell_m, least_m}};
+    const Volume volume = VOLUME_OF_PARAMETERS;
+    const Objects things = OBJECTS_OF_PARAMETERS(offset_m);
+    const Arriving arrives = LIGHT_OF_PARAMETERS;
     const int set = direction_set(pixel / width, pixel % width);
-    occluded[pixel] = taken_from_virtual(volume, things, light, positions[pixel], normals[pixel].xyz, set);
+    occluded[pixel] = taken_from_virtual(volume, things, arrives, positions[pixel], normals[pixel].xyz, set);
 }
 
 // The ratio R' / R of shading with virtual objects to shading without, at `pixels` [listed] of the real surface. What the
 // objects take is sampled at the pixel; R changes little from sample to sample and is taken from them: shaded [rows][cols].
 // -> ratio [h][w] (rgb, w = 1), w = 0 where there is no surface; other pixels are left as they are.
 kernel void refine_real(const int listed, global const int *pixels, const int width,
-                        global const float4 *positions, global const float4 *normals,
-                        const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid,
-                        global const uchar *octets, global const float2 *voxels, const float voxel_m,
-                        const float truncation_m, const int count, global const float4 *directions,
-                        global const float4 *arriving, const float reach_m, const int plane_count,
-                        global const float4 *planes, global const int4 *shapes, global const uchar *maps, const float cell_m,
-                        const float least_m, const int objects, global const float16 *grid_from_volume, global const int4 *dims,
-                        global const float *distances, const float4 ball, global const float4 *light,
+                        global const float4 *positions, global const float4 *normals, VOLUME_PARAMETERS, LIGHT_PARAMETERS,
+                        OBJECT_PARAMETERS, const float4 ball, global const float4 *light,
                         const int cols, const int rows, const int stride, global const float4 *shaded, global float4 *ratio) {
     const int item = get_global_id(0);
     if (item >= listed) return;
@@ -119,10 +95,11 @@ kernel void refine_real(const int listed, global const int *pixels, const int wi
     if (positions[pixel].w > 0.0f && normals[pixel].w > 0.0f) {
         const Grid grid = {cols, rows, stride, width};
         const float4 without = upsample(grid, shaded, positions, normals, x, y, voxel_m);
-        const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
-        const Objects things = {objects, grid_from_volume, dims, distances, 0.0f};
-        const Arriving arrives = {count, directions, arriving, reach_m, {plane_count, planes, shapes, maps, cell_m, least_m}};
-        const float3 taken = taken_from_real(volume, things, arrives, ball, positions[pixel].xyz, normals[pixel].xyz, direction_set(y, x));
+        const Volume volume = VOLUME_OF_PARAMETERS;
+        const Objects things = OBJECTS_OF_PARAMETERS(0.0f);
+        const Arriving arrives = LIGHT_OF_PARAMETERS;
+        const float3 taken = taken_from_real(volume, things, arrives, ball, positions[pixel].xyz, normals[pixel].xyz,
+                                             direction_set(y, x), 0, 1, 0);
         const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
         result = (float4)(fmax(without.xyz - taken, floor) / fmax(without.xyz, floor), without.w);
     }

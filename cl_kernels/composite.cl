@@ -6,7 +6,7 @@
 #ifndef BANDS
 #error BANDS must be defined: the number of spherical-harmonics bands
 #endif
-#include "sh.clh"
+#include "open_shading.clh"
 
 // codes [65536]: sRGB code of linear radiance i / 65535.
 static inline void write_color(global uchar *picture, const int pixel, const float3 linear, global const uchar *codes) {
@@ -14,16 +14,6 @@ static inline void write_color(global uchar *picture, const int pixel, const flo
     picture[3 * pixel] = codes[(int)level.x];
     picture[3 * pixel + 1] = codes[(int)level.y];
     picture[3 * pixel + 2] = codes[(int)level.z];
-}
-
-// Radiance of an unoccluded white Lambertian surface under the light.
-static float3 open_shading(const float3 normal, global const float4 *light) {
-    float y[COEFFICIENTS];
-    sh_basis(normal, y);
-    float3 sum = (float3)(0.0f);
-    for (int l = 0; l < BANDS; l++)
-        for (int i = l * l; i < (l + 1) * (l + 1); i++) sum += lambert_band(l) * y[i] * light[i].xyz;
-    return sum;
 }
 
 // A pixel's value: from the refined ones around it where it has one, else from the samples of `grid`.

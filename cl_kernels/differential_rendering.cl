@@ -1,10 +1,11 @@
 // Differential rendering (thesis 7.1): how virtual objects change the light that reaches real and virtual surfaces.
-// Provides shadow_real, shadow_virtual.
+// Provides shadow_real, bounce_real, shadow_virtual, light_points, count_open.
 //
 // Equation 7.1 adds the difference of two shadings R and R' to the picture scaled by the picture itself. For a Lambertian
 // surface the picture is albedo times R, so the factor that leaves the albedo alone is R' / R; it needs no tone mapper.
+// Where surfaces send light too (7.3.3), R and R' hold one bounce of it: seen surface sends what the camera saw of it.
 #include "direction_sets.clh"
-#include "sh.clh"
+#include "open_shading.clh"
 #include "shadows.clh"
 
 #ifndef MASK_WORDS
@@ -14,61 +15,145 @@
 #define INTERLEAVE 1
 #endif
 
+// What reaches a sample of real surface, over pi, without virtual objects: free directions bring the light, or what planes that
+// go on beyond the pictures send; hidden ones what their surfaces send. hit: of indirect.cl.
+static float3 shading_without(const Arriving light, const float3 position, const float3 normal, const float3 from_free,
+                              const float openness, const float4 hit, global const uchar *sets, global const uint *free) {
+    float3 sum = from_free;
+    for (int j = 0; j < light.count && light.continued.count > 0; j++) {
+        if (!((free[j >> 5] >> (j & 31)) & 1)) continue;
+        const int index = sets[j % INTERLEAVE] * light.count + j;
+        sum += share_of(light, index, normal) * (arriving_from(light, index, position) - light.arriving[index].xyz);
+    }
+    const float hidden = clamp(1.0f - openness, 0.0f, 1.0f);
+    const float known = fmin(hit.w / fmax(0.25f * light.count * hidden, 1e-6f), 1.0f);  // directions' cosines add up to count / 4
+    const float3 sent = known * light.unseen.w * hit.xyz / fmax(hit.w, 1e-6f) + (1.0f - known) * light.unseen.xyz;
+    return sum + hidden * sent;
+}
+
 // Real surface: the ratio R' / R of shading with virtual objects to shading without, at the samples of the transfer.
-// transfer [rows][cols][COEFFICIENTS], free_mask [rows][cols][MASK_WORDS], sets [rows][cols][INTERLEAVE]: see radiance_transfer.cl.
-// ball: center and radius of a ball around all objects. light [COEFFICIENTS] rgb; directions [64][count] (unit, sr), arriving [64][count]: radiance of the light from each of them.
-// -> ratio [rows][cols] (rgb, w = 1), w = 0 where there is no surface.
+// transfer [rows][cols][COEFFICIENTS], openness [rows][cols], free_mask [rows][cols][MASK_WORDS], sets [rows][cols][INTERLEAVE]:
+// see radiance_transfer.cl; hits [rows][cols]: see indirect.cl. ball: center and radius of a ball around all objects.
+// light [COEFFICIENTS] rgb; directions, arriving ... glow: see shadows.clh.
+// -> ratio [rows][cols] (rgb, w = 1), shaded [rows][cols] (rgb of R, w = 1); w = 0 where there is no surface.
 kernel void shadow_real(const int cols, const int rows, const int stride, const int width,
                         global const float4 *positions, global const float4 *normals, global const float *transfer,
-                        global const uint *free_mask, global const uchar *sets, global const float4 *light, const int count,
-                        global const float4 *directions, global const float4 *arriving, const float reach_m,
-                        const int objects, global const float16 *grid_from_volume, global const int4 *dims,
-                        global const float *distances, const float4 ball, const float offset_m, global float4 *ratio) {
+                        global const float *openness, global const uint *free_mask, global const uchar *sets,
+                        global const float4 *hits, global const float4 *light, VOLUME_PARAMETERS, LIGHT_PARAMETERS,
+                        OBJECT_PARAMETERS, const float4 ball, global float4 *ratio, global float4 *shaded) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= cols || row >= rows) return;
     const int sample = row * cols + col;
     const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
-    const float4 normal = normals[pixel];
-    if (positions[pixel].w <= 0.0f || normal.w <= 0.0f) {
-        ratio[sample] = (float4)(0.0f);
+    const float4 normal = normals[pixel], position = positions[pixel];
+    if (position.w <= 0.0f || normal.w <= 0.0f) {
+        ratio[sample] = shaded[sample] = (float4)(0.0f);
         return;
     }
-    const float3 origin = positions[pixel].xyz + offset_m * normal.xyz;
+    const Volume volume = VOLUME_OF_PARAMETERS;
+    const Objects things = OBJECTS_OF_PARAMETERS(0.0f);
+    const Arriving arrives = LIGHT_OF_PARAMETERS;
+    global const uint *free = free_mask + sample * MASK_WORDS;
+    global const uchar *own = sets + sample * INTERLEAVE;
     float3 without = (float3)(0.0f);
     for (int i = 0; i < COEFFICIENTS; i++) without += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
-    float3 towards;
-    const float least_cosine = ball_cosine(ball, origin, &towards) - 1e-4f;
-    float3 taken = (float3)(0.0f);
-    for (int j = 0; j < count; j++) {
-        const int index = sets[sample * INTERLEAVE + j % INTERLEAVE] * count + j;
-        const float4 direction = directions[index];
-        if (dot(direction.xyz, towards) < least_cosine) continue;
-        if (!((free_mask[sample * MASK_WORDS + (j >> 5)] >> (j & 31)) & 1)) continue;
-        if (trace_objects(objects, grid_from_volume, dims, distances, origin, direction.xyz, reach_m) > 0.0f) continue;
-        taken += fmax(dot(normal.xyz, direction.xyz), 0.0f) * direction.w * M_1_PI_F * arriving[index].xyz;
-    }
+    const float3 taken = taken_from_real(volume, things, arrives, ball, position.xyz, normal.xyz, 0, own, INTERLEAVE, free);
+    if (any(taken != 0.0f))
+        without = shading_without(arrives, position.xyz, normal.xyz, without, openness[sample], hits[sample], own, free);
     const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
     ratio[sample] = (float4)(fmax(without - taken, floor) / fmax(without, floor), 1.0f);
+    shaded[sample] = (float4)(without, 1.0f);
+}
+
+// What a sample of real surface gains from other real surface whose own shading virtual objects changed (eq. 7.6: R'_ID - R_ID),
+// added to the ratio. It follows every `every`-th of its hidden directions, beginning with another one than its neighbours do.
+// ratio, shaded [rows][cols]: of shadow_real; changed: that ratio. -> bounced [rows][cols] (rgb, w = 1), w = 0 as in ratio.
+kernel void bounce_real(const int cols, const int rows, const int stride, const int width,
+                        global const float4 *positions, global const float4 *normals, global const float *openness,
+                        global const uint *free_mask, global const uchar *sets, global const float4 *light,
+                        VOLUME_PARAMETERS, LIGHT_PARAMETERS, const int every, global const float4 *shaded, global float4 *bounced) {
+    const int col = get_global_id(0);
+    const int row = get_global_id(1);
+    if (col >= cols || row >= rows) return;
+    const int sample = row * cols + col;
+    const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
+    const float4 normal = normals[pixel], before = changed_ratio[sample];
+    if (before.w <= 0.0f) {
+        bounced[sample] = before;
+        return;
+    }
+    const Volume volume = VOLUME_OF_PARAMETERS;
+    const Arriving arrives = LIGHT_OF_PARAMETERS;
+    const float3 origin = positions[pixel].xyz + voxel_m * normal.xyz;
+    float4 sum = (float4)(0.0f);
+    int chosen[LANES];
+    float met[LANES];
+    int waiting = 0, hidden = (col + 2 * row) % every;
+    for (int j = 0; j < count; j++) {
+        const int from = sets[sample * INTERLEAVE + j % INTERLEAVE] * count + j;
+        const int is_hidden_one = dot(normal.xyz, directions[from].xyz) > 0.0f && !((free_mask[sample * MASK_WORDS + (j >> 5)] >> (j & 31)) & 1);
+        if (is_hidden_one && hidden++ % every == 0) chosen[waiting++] = from;
+        if (waiting == 0 || (waiting < LANES && j < count - 1)) continue;
+        for (int lane = waiting; lane < LANES; lane++) chosen[lane] = chosen[0];
+        meet_surface(volume, arrives, origin, chosen, met);
+        for (int lane = 0; lane < waiting; lane++) {
+            if (met[lane] < 0.0f) continue;
+            const float3 direction = directions[chosen[lane]].xyz;
+            const float3 change = sent_from(volume, arrives, origin, direction, met[lane], 1) - sent_from(volume, arrives, origin, direction, met[lane], 0);
+            sum += dot(normal.xyz, direction) * (float4)(change, 1.0f);
+        }
+        waiting = 0;
+    }
+    const float3 gained = clamp(1.0f - openness[sample], 0.0f, 1.0f) * sum.xyz / fmax(sum.w, 1e-6f);
+    const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
+    const float3 without = fmax(shaded[sample].xyz, floor);
+    bounced[sample] = (float4)(fmax(before.xyz * without + gained, floor) / without, 1.0f);
 }
 
 // Virtual surface: the radiance that real and virtual occluders take from it, at every `stride`-th pixel it covers.
 // positions, normals [h][w] (w = 1 where covered): the virtual geometry buffer. -> occluded [rows][cols] (rgb, w = 1 valid).
 kernel void shadow_virtual(const int cols, const int rows, const int stride, const int width,
-                           global const float4 *positions, global const float4 *normals,
-                           const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid,
-                           global const uchar *octets, global const float2 *voxels, const float voxel_m,
-                           const float truncation_m, const int count, global const float4 *directions,
-                           global const float4 *arriving, const float reach_m, const int plane_count,
-                           global const float4 *planes, global const int4 *shapes, global const uchar *maps, const float cell_m,
-                           const float least_m, const int objects, global const float16 *grid_from_volume, global const int4 *dims,
-                           global const float *distances, const float offset_m, global float4 *occluded) {
+                           global const float4 *positions, global const float4 *normals, VOLUME_PARAMETERS, LIGHT_PARAMETERS,
+                           OBJECT_PARAMETERS, const float offset_m, global float4 *occluded) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= cols || row >= rows) return;
     const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
-    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
-    const Objects things = {objects, grid_from_volume, dims, distances, offset_m};
-    const Arriving light = {count, directions, arriving, reach_m, {plane_count, planes, shapes, maps, cell_m, least_m}};
-    occluded[row * cols + col] = taken_from_virtual(volume, things, light, positions[pixel], normals[pixel].xyz, direction_set(row, col));
+    const Volume volume = VOLUME_OF_PARAMETERS;
+    const Objects things = OBJECTS_OF_PARAMETERS(offset_m);
+    const Arriving arrives = LIGHT_OF_PARAMETERS;
+    occluded[row * cols + col] = taken_from_virtual(volume, things, arrives, positions[pixel], normals[pixel].xyz, direction_set(row, col));
+}
+
+// Points on virtual objects: what they send. points, normals (volume space), albedos [points_count] -> radiances [points_count] (rgb).
+// offsets_m [points_count]: how far off the surface rays begin.
+kernel void light_points(const int points_count, global const float4 *points, global const float4 *normals,
+                         global const float4 *albedos, global const float *offsets_m, global const float4 *light,
+                         VOLUME_PARAMETERS, LIGHT_PARAMETERS, OBJECT_PARAMETERS, global float4 *radiances) {
+    const int index = get_global_id(0);
+    if (index >= points_count) return;
+    const Volume volume = VOLUME_OF_PARAMETERS;
+    const Objects things = OBJECTS_OF_PARAMETERS(offsets_m[index]);
+    const Arriving arrives = LIGHT_OF_PARAMETERS;
+    const float3 normal = normals[index].xyz;
+    const float4 taken = taken_from_virtual(volume, things, arrives, points[index], normal, direction_set(index >> 3, index & 7));
+    radiances[index] = (float4)(albedos[index].xyz * fmax(open_shading(normal, light) - taken.xyz, 0.0f), 1.0f);
+}
+
+// How many of `directions` [count] above the surface leave the object whose grid has `dims` unhindered, from one cell off
+// each of its points. points, normals [points_count] in cells and along the axes of the grid.
+kernel void count_open(const int points_count, global const float4 *points, global const float4 *normals, const int count,
+                       global const float4 *directions, const int4 dims, global const float *distances, global int *open) {
+    const int index = get_global_id(0);
+    if (index >= points_count) return;
+    const float16 same = (float16)(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1);
+    const float3 normal = normals[index].xyz, origin = points[index].xyz + normal;
+    const float reach = (float)(dims.x + dims.y + dims.z);
+    int sum = 0;
+    for (int j = 0; j < count; j++) {
+        const float3 direction = directions[j].xyz;
+        if (dot(normal, direction) > 0.0f) sum += trace_object(same, dims, distances, origin, direction, reach) > 0.0f;
+    }
+    open[index] = sum;
 }

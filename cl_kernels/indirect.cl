@@ -1,26 +1,11 @@
 // What surfaces send to a sample has been photographed: the colour that the volume holds where a hidden direction ends.
 // Provides gather_hits.
+#include "surface_color.clh"
 #include "visibility.clh"
 
 #ifndef MASK_WORDS
 #error MASK_WORDS must be defined: 32-bit words that hold one bit a direction
 #endif
-
-// Colour of a voxel as bricks.py packs it: roots of the channels in 9, 9 and 8 bits, and how often it was looked at.
-static inline float4 unpack_color(const uint packed) {
-    const float3 root = (float3)((float)((packed >> 23) & 511), (float)((packed >> 14) & 511), (float)((packed >> 6) & 255)) /
-                        (float3)(511.0f, 511.0f, 255.0f);
-    return (float4)(root * root, (packed & 63) ? 1.0f : 0.0f);
-}
-
-// Radiance of the surface that a ray met at voxel `at`; w = 0 where no picture shows it.
-static inline float4 color_at(const Volume volume, global const uint *colors, const float3 at) {
-    const int3 top = volume.bricks.xyz * BRICK - 1;
-    const int3 voxel = clamp(convert_int3(at), (int3)(0), top);
-    const int slot = volume.slots[brick_index(volume.bricks, voxel >> 3)];
-    if (slot <= AWAY_SLOT) return (float4)(0.0f);
-    return unpack_color(colors[slot * BRICK_VOXELS + ((voxel.z & 7) * BRICK + (voxel.y & 7)) * BRICK + (voxel.x & 7)]);
-}
 
 // One item a sample. It follows every `every`-th of its hidden directions, beginning with another one than its neighbours do.
 // positions, normals [h][w]; free_mask [rows][cols][MASK_WORDS], sets [rows][cols][INTERLEAVE] (see Transfer); directions

@@ -16,10 +16,12 @@ from server.plan import Effect, Omission
 from server.stages import adaptive
 from server.stages import composite as composite_stage
 from server.stages import differential_rendering as differential
-from server.stages.differential_rendering import DeviceLight, SampleGrid
+from server.stages.differential_rendering import Changed, DeviceLight, RealShadow, SampleGrid
+from server.stages.indirect import Indirect
 from server.stages.measure import Measurement
+from server.stages.object_glow import Glow
 from server.stages.radiance_transfer import Directions, Transfer
-from server.stages.rasterize import Placed, VirtualSurface, pixel_box
+from server.stages.rasterize import Placed, VirtualSurface, boxes_in_view
 from server.stages.rasterize import rasterize as rasterize_stage
 from server.stages.raycast import Surface
 from server.stages.sampling import PRESETS, Sampling
@@ -47,17 +49,22 @@ class SceneFacts:
     objects_in_view: int
     has_light: bool
     adaptive: bool = False
+    indirect: bool = False
+    """Whether surfaces send light."""
 
 
-def gather_facts(view: View, objects: Sequence[Placed], light: NDArray[np.float64]) -> SceneFacts:
+def gather_facts(
+    view: View, objects: Sequence[Placed], light: NDArray[np.float64], indirect: Indirect | None
+) -> SceneFacts:
     """Facts of a frame. light: SH radiance [bands^2, 3]."""
     camera_from_volume = inverse_rigid(view.volume_from_camera)
-    boxes = [pixel_box(view.camera, camera_from_volume @ placed, *thing.bounds) for thing, placed in objects]
+    boxes = boxes_in_view(view.camera, camera_from_volume, objects)
     return SceneFacts(
         len(objects),
         sum(box is not None for box in boxes),
         has_light=bool(light.any()),
         adaptive=view.sampling.adaptive,
+        indirect=indirect is not None,
     )
 
 
@@ -71,14 +78,11 @@ def tabulate(view: View, objects: Sequence[Placed]) -> ObjectTable:
     return object_table(view.engine, objects)
 
 
-def shade_virtual(
-    view: View, virtual: VirtualSurface, volume: Volume, rays: Directions, light: DeviceLight, table: ObjectTable
-) -> SampleGrid:
-    """Shadows of real and virtual things on virtual ones."""
-    bands = round(light.coefficients.shape[0] ** 0.5)
-    return differential.shadow_virtual(
-        view.engine, view.camera, virtual, volume, bands, light, rays, view.reach_m, table
-    )
+def light_objects(
+    view: View, objects: Sequence[Placed], volume: Volume, rays: Directions, light: DeviceLight, table: ObjectTable
+) -> Glow:
+    """What virtual objects send to real surface and to one another."""
+    return differential.light_points(view.engine, objects, volume, light, rays, view.reach_m, table)
 
 
 def shadow_real(
@@ -90,35 +94,118 @@ def shadow_real(
     light: DeviceLight,
     objects: Sequence[Placed],
     table: ObjectTable,
+    indirect: Indirect | None,
+    glow: Glow | None = None,
+) -> RealShadow:
+    """What virtual things take from real ones, less what they send them, and what those then send one another."""
+    shadow = differential.shadow_real(
+        view.engine,
+        view.camera,
+        surface,
+        transfer,
+        volume,
+        light,
+        rays,
+        view.reach_m,
+        objects,
+        table,
+        indirect,
+        glow,
+    )
+    if indirect is None:
+        return shadow
+    return differential.bounce_real(
+        view.engine,
+        view.camera,
+        surface,
+        transfer,
+        volume,
+        light,
+        rays,
+        view.reach_m,
+        inverse_rigid(view.volume_from_camera),
+        shadow,
+    )
+
+
+def _changed(view: View, surface: Surface, ratio: RealShadow | None) -> Changed | None:
+    """How the picture shows what real surface sends to change."""
+    if ratio is None:
+        return None
+    return Changed(view.camera, inverse_rigid(view.volume_from_camera), surface.positions, ratio)
+
+
+def shade_virtual(
+    view: View,
+    virtual: VirtualSurface,
+    volume: Volume,
+    rays: Directions,
+    light: DeviceLight,
+    table: ObjectTable,
+    surface: Surface,
+    glow: Glow | None = None,
+    ratio: RealShadow | None = None,
 ) -> SampleGrid:
-    """Shadows of virtual things on real ones."""
-    return differential.shadow_real(
-        view.engine, view.camera, surface, transfer, light, rays, view.reach_m, objects, table, volume.voxel_m
+    """What real and virtual things take from virtual ones, less what they send them."""
+    bands = round(light.coefficients.shape[0] ** 0.5)
+    return differential.shadow_virtual(
+        view.engine,
+        view.camera,
+        virtual,
+        volume,
+        bands,
+        light,
+        rays,
+        view.reach_m,
+        table,
+        glow,
+        _changed(view, surface, ratio),
     )
 
 
 def refine_virtual(
-    view: View, virtual: VirtualSurface, volume: Volume, rays: Directions, light: DeviceLight, table: ObjectTable
+    view: View,
+    virtual: VirtualSurface,
+    volume: Volume,
+    rays: Directions,
+    light: DeviceLight,
+    table: ObjectTable,
+    surface: Surface,
+    glow: Glow | None = None,
+    ratio: RealShadow | None = None,
 ) -> cl_array.Array:
     """Shadows on virtual things at every pixel near their edges."""
     bands = round(light.coefficients.shape[0] ** 0.5)
-    return adaptive.refine_virtual(view.engine, view.camera, virtual, volume, bands, light, rays, view.reach_m, table)
+    return adaptive.refine_virtual(
+        view.engine,
+        view.camera,
+        virtual,
+        volume,
+        bands,
+        light,
+        rays,
+        view.reach_m,
+        table,
+        glow,
+        _changed(view, surface, ratio),
+    )
 
 
 def refine_real(
     view: View,
     surface: Surface,
-    transfer: Transfer,
     volume: Volume,
     rays: Directions,
     light: DeviceLight,
     objects: Sequence[Placed],
     table: ObjectTable,
-    ratio: SampleGrid,
+    ratio: RealShadow,
+    glow: Glow | None = None,
 ) -> cl_array.Array:
     """Shadows on real things at every pixel of their rims."""
+    bands = round(light.coefficients.shape[0] ** 0.5)
     return adaptive.refine_real(
-        view.engine, view.camera, surface, transfer, volume, light, rays, view.reach_m, objects, table, ratio
+        view.engine, view.camera, surface, bands, volume, light, rays, view.reach_m, objects, table, ratio, glow
     )
 
 
@@ -176,6 +263,10 @@ def _no_light(facts: SceneFacts) -> Omission | None:
     return None if facts.has_light else Omission("no light has been found yet", 255.0)
 
 
+def _nothing_sent(facts: SceneFacts) -> Omission | None:
+    return None if facts.indirect else Omission("indirect light is left out", 255.0)
+
+
 def _not_refined(facts: SceneFacts) -> Omission | None:
     return None if facts.adaptive else Omission("the preset does not refine", 255.0)
 
@@ -183,6 +274,7 @@ def _not_refined(facts: SceneFacts) -> Omission | None:
 EFFECTS: tuple[Effect[SceneFacts], ...] = (
     Effect(rasterize, writes="virtual", omitted=_nothing_in_view),
     Effect(tabulate, writes="table", omitted=_nothing_casts),
+    Effect(light_objects, writes="glow", omitted=lambda f: _nothing_casts(f) or _nothing_sent(f)),
     Effect(shade_virtual, writes="occluded", omitted=_nothing_to_shade),
     Effect(shadow_real, writes="ratio", omitted=_nothing_casts),
     Effect(refine_virtual, writes="refined_occluded", omitted=lambda f: _nothing_to_shade(f) or _not_refined(f)),

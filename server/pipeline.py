@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import pyopencl.array as cl_array
 from msgspec import structs
 from numpy.typing import NDArray
 
@@ -23,15 +24,18 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.plan import execute, make_plan
 from server.scene.mesh import Mesh
-from server.scene.objects import SceneObjects
-from server.scene.placement import Placement
+from server.scene.objects import SceneObjects, check_room
+from server.scene.placement import Placement, check_size
 from server.settings import Settings, read_wishes, sampling_of
 from server.stages.composite import shown_picture
 from server.stages.denoise import denoise_radiance
 from server.stages.differential_rendering import upload_light
+from server.stages.exposure import scene_radiance
+from server.stages.indirect import Indirect, observe_indirect
 from server.stages.lamp_finder import LampFinder
 from server.stages.light_estimation import LightEstimate
 from server.stages.near_light import remove_lamps
+from server.stages.radiance_transfer import Transfer
 from server.stages.sampling import Sampling, TransferSampler
 from server.stages.volume import Volume
 from server.static_light import static_estimate
@@ -64,7 +68,6 @@ class Pipeline:
         self._sampler = self._make_sampler(self._settings.sampling)
         self._room_light = RoomLight(self._engine, camera, self._settings)
         self._lamps = LampFinder(self._engine, camera, self._settings.lamps)
-        self._given_light: LightEstimate | None = None
         self._objects: SceneObjects | None = None
         self._waiting: list[tuple[str, Mesh, Placement]] = []
         self._webxr_from_world = np.eye(3)
@@ -89,18 +92,17 @@ class Pipeline:
             transfer = self._sampler.transfer(
                 volume, surface, geometry.volume_from_camera, objects.up, settings.reach_m
             )
+            indirect = self._observe_indirect(geometry, volume, transfer)  # 7.3.3
         with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
-            estimate = self._given_light  # S2
-            if estimate is None:
-                smooth = denoise_radiance(engine, measurement, settings.denoise, settings.denoise_iterations)
-                distant = remove_lamps(engine, smooth, surface, volume, self._lamps.lamps)  # B4
-                estimate = self._room_light.update(
-                    distant, measurement.depth_m, geometry, volume, transfer, self._sampler.rays
-                )
+            smooth = self._smooth(geometry)
+            distant = remove_lamps(engine, smooth, surface, volume, self._lamps.lamps)  # B4
+            estimate = self._room_light.update(
+                distant, measurement.depth_m, geometry, volume, transfer, self._sampler.rays, indirect
+            )
         with stage("rendering"):  # 7.1-7.2, the effects this frame calls for
             view = View(engine, camera, geometry.volume_from_camera, settings.reach_m, self._sampler.sampling)
             placed = objects.placed(volume.volume_from_world())
-            order, plan = make_plan(EFFECTS, "picture", _GIVEN, gather_facts(view, placed, estimate.sh))
+            order, plan = make_plan(EFFECTS, "picture", _GIVEN, gather_facts(view, placed, estimate.sh, indirect))
             given = {
                 "view": view,
                 "objects": placed,
@@ -110,18 +112,21 @@ class Pipeline:
                 "measurement": measurement,
                 "surface": surface,
                 "transfer": transfer,
-                "light": upload_light(engine, estimate.sh, self._sampler.rays, self._room_light.planes),
+                "indirect": indirect,
+                "light": upload_light(
+                    engine, estimate.sh, self._sampler.rays, self._room_light.planes, indirect, geometry.exposure
+                ),
             }
             picture: NDArray[np.uint8] = execute(order, given, "picture")
-        if self._given_light is None:  # B4, for the frames to come
+        if not self._room_light.is_given:  # B4, for the frames to come
             with stage("light_estimation"):
-                self._lamps.work(measurement.radiance, surface, volume)
+                self._lamps.work(geometry.scene_radiance, surface, volume)
 
         engine.queue.finish()
         rows, self.kernel_ms = engine.profile.collect()
         return FrameResult(
             color=picture,
-            light=self._light_message(frame, estimate, volume),
+            light=self._light_message(frame, geometry, estimate, volume),
             world_from_camera=geometry.world_from_camera,
             tracking=geometry.tracking,
             timings=Timings(**rows, total=(time.perf_counter() - started) * 1e3),
@@ -134,12 +139,12 @@ class Pipeline:
         with self._engine.profile.stage("rendering"):
             picture = shown_picture(self._engine, self._camera, frame.color, geometry.measurement.radiance)
         left_out = tuple(LeftOut(effect=e.name, reason="the camera is lost", error_bound=255.0) for e in EFFECTS)
-        estimate = self._given_light or self._room_light.estimate()
+        estimate = self._room_light.estimate()
         self._engine.queue.finish()
         rows, self.kernel_ms = self._engine.profile.collect()
         return FrameResult(
             color=picture,
-            light=self._light_message(frame, estimate, volume),
+            light=self._light_message(frame, geometry, estimate, volume),
             world_from_camera=geometry.world_from_camera,
             tracking="lost",
             timings=Timings(**rows, total=(time.perf_counter() - started) * 1e3),
@@ -147,14 +152,34 @@ class Pipeline:
             notes=(*geometry.notes, *_notes(estimate)),
         )
 
-    def _light_message(self, frame: RgbdFrame, estimate: LightEstimate, volume: Volume) -> Light:
-        lamps = self._lamps.lamps_at(volume.origin_world)
-        return light_message(frame.index, frame.timestamp_s, estimate, self._webxr_from_world, lamps)
+    def _smooth(self, geometry: GeometryFrame) -> cl_array.Array:
+        """Radiance that the light is estimated from, denoised as the picture shows it, in the first picture's units."""
+        settings = self._settings
+        if settings.denoise == "none":
+            return geometry.scene_radiance
+        smooth = denoise_radiance(self._engine, geometry.measurement, settings.denoise, settings.denoise_iterations)
+        return scene_radiance(self._engine, smooth, geometry.exposure, "smooth_scene_radiance")
+
+    def _observe_indirect(self, geometry: GeometryFrame, volume: Volume, transfer: Transfer) -> Indirect | None:
+        """What surfaces send one another, if that is wanted."""
+        if self._settings.indirect == "none":
+            return None
+        engine, camera, rays, reach_m = self._engine, self._camera, self._sampler.rays, self._settings.reach_m
+        return observe_indirect(engine, camera, volume, geometry.surface, transfer, rays, reach_m)
+
+    def _light_message(
+        self, frame: RgbdFrame, geometry: GeometryFrame, estimate: LightEstimate, volume: Volume
+    ) -> Light:
+        lamps, exposure = self._lamps.lamps_at(volume.origin_world), geometry.exposure
+        return light_message(frame.index, frame.timestamp_s, estimate, self._webxr_from_world, lamps, exposure)
 
     def place_object(self, object_id: str, mesh: Mesh, placement: Placement) -> tuple[str, ...]:
-        """Put a mesh into the scene, in the place of one with the same id; returns notes about it."""
+        """Put a mesh into the scene, in the place of one with the same id; returns notes. Raises ValueError, one line."""
         if self._objects is None:
-            self._waiting = [w for w in self._waiting if w[0] != object_id] + [(object_id, mesh, placement)]
+            others = [w for w in self._waiting if w[0] != object_id]
+            check_room((other for _, other, _ in others), mesh)
+            check_size(mesh, placement)
+            self._waiting = [*others, (object_id, mesh, placement)]
         else:
             self._objects.place(object_id, mesh, placement)
         return mesh.notes
@@ -165,6 +190,7 @@ class Pipeline:
             self._objects.move(object_id, placement)
             return
         index = self._waiting_index(object_id)
+        check_size(self._waiting[index][1], placement)
         self._waiting[index] = (object_id, self._waiting[index][1], placement)
 
     def remove_object(self, object_id: str) -> None:
@@ -186,6 +212,7 @@ class Pipeline:
         if volume is None:
             raise MeshingError("there is no surface to mesh: no frame has been fused yet")
         bricks = volume.download_bricks()
+        bricks = replace(bricks, colors=np.float32(self._geometry.usual_exposure) * bricks.colors)
         return scene_mesh(bricks, volume.voxel_m, volume.origin_world, self._webxr_from_world, progress)
 
     def close(self) -> None:
@@ -207,7 +234,9 @@ class Pipeline:
             up = np.array(self._wishes.up or camera_up, np.float64)
             up /= np.linalg.norm(up)
             self._webxr_from_world = webxr_from_world(up, forward)
-            self._given_light = static_estimate(self._wishes, self._settings.bands, self._webxr_from_world)
+            given = static_estimate(self._wishes, self._settings.bands, self._webxr_from_world)  # S2
+            if given:
+                self._room_light.give(given)
             self._objects = SceneObjects(self._engine, up)
             for object_id, mesh, placement in self._waiting:
                 self._objects.place(object_id, mesh, placement)
@@ -225,7 +254,9 @@ def _notes(estimate: LightEstimate) -> tuple[str, ...]:
     return ("no usable surface has been seen yet, the light is unknown",) if estimate.std is None else ()
 
 
-_GIVEN = frozenset({"view", "objects", "volume", "rays", "shown", "measurement", "surface", "transfer", "light"})
+_GIVEN = frozenset(
+    {"view", "objects", "volume", "rays", "shown", "measurement", "surface", "transfer", "indirect", "light"}
+)
 
 
 def warm_up(device: Device) -> None:
@@ -248,4 +279,5 @@ def warm_up(device: Device) -> None:
         world_from_camera=np.eye(4),
     )
     pipeline.process(frame)
+    pipeline.process(replace(frame, index=1, color=np.full((48, 64, 3), 96, np.uint8)))  # of another exposure
     pipeline.close()

@@ -37,6 +37,8 @@ class Settings:
     bands: int
     reach_m: float
     as_thesis: bool
+    robustness: frozenset[str]
+    """P3: which of `openness`, `normals`, `normals_printed`, `memory`, `outliers` are on."""
     albedo: Literal["constant", "estimated"]
     indirect: Literal["none", "observed"]
     denoise: DenoiseMethod
@@ -53,6 +55,7 @@ def read_wishes(wishes: Wishes) -> Settings:
         bands=wishes.bands,
         reach_m=THESIS_REACH_M if wishes.as_thesis else reach_m,
         as_thesis=wishes.as_thesis,
+        robustness=frozenset(wishes.robustness),
         albedo="constant" if wishes.as_thesis else wishes.albedo,
         indirect="none" if wishes.as_thesis else wishes.indirect,
         denoise=wishes.denoise,

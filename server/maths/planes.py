@@ -17,11 +17,11 @@ STEPS_M = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0)
 """How far a plane may go on beyond each of its four sides."""
 SIDES = 4
 _THICKNESS_M = 0.02
-_LEAST_SHARE = 0.04
+_LEAST_SHARE = 0.02
 _ALIKE = 0.95  # cosine between a point's normal and its plane's
 _UPRIGHT = 0.2  # cosine between normals of planes that meet at about a right angle
 _TRIALS = 48
-_MOST = 6
+_MOST = 8
 
 
 @dataclass

@@ -15,10 +15,19 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.opencl.engine import Engine, KernelArgument
+from server.opencl.engine import Engine
 from server.opencl.transfer import fill_bytes
-from server.stages.differential_rendering import DeviceLight, SampleGrid, ball_around, object_arguments
-from server.stages.radiance_transfer import Directions, Transfer
+from server.stages.differential_rendering import (
+    Changed,
+    DeviceLight,
+    RealShadow,
+    SampleGrid,
+    ball_around,
+    light_arguments,
+    object_arguments,
+)
+from server.stages.object_glow import Glow
+from server.stages.radiance_transfer import Directions
 from server.stages.rasterize import Placed, VirtualSurface
 from server.stages.raycast import Surface
 from server.stages.volume import Volume
@@ -41,6 +50,8 @@ def refine_virtual(
     rays: Directions,
     reach_m: float,
     table: ObjectTable,
+    glow: Glow | None = None,
+    changed: Changed | None = None,
 ) -> cl_array.Array:
     """[h, w] float4: radiance that occluders take from the virtual surface near its edges; w = 0 elsewhere."""
     occluded = _empty(engine, camera, "refined_occluded")
@@ -59,8 +70,8 @@ def refine_virtual(
         virtual.position,
         virtual.normal,
         *volume.arguments(),
-        *_light(engine, light, rays, reach_m),
-        *object_arguments(table),
+        *light_arguments(engine, light, rays, reach_m, volume, changed),
+        *object_arguments(engine, table, glow),
         max(table.cell_m, default=0.0),
         occluded,
     )
@@ -71,23 +82,24 @@ def refine_real(
     engine: Engine,
     camera: CameraModel,
     surface: Surface,
-    transfer: Transfer,
+    bands: int,
     volume: Volume,
     light: DeviceLight,
     rays: Directions,
     reach_m: float,
     objects: Sequence[Placed],
     table: ObjectTable,
-    ratio: SampleGrid,
+    ratio: RealShadow,
+    glow: Glow | None = None,
 ) -> cl_array.Array:
     """[h, w] float4: R' / R of real surface (eq. 7.1) where it varies among the samples of `ratio`; w = 0 elsewhere."""
     refined = _empty(engine, camera, "refined_ratio")
-    cells = varying_cells(engine, ratio, transfer.bands)
+    cells = varying_cells(engine, ratio, bands)
     if not cells.any():
         return refined
     listed, pixels = _list_pixels(engine, "varying_pixels", pixels_of(cells, ratio.stride, camera.width, camera.height))
     engine.launch(
-        engine.kernel("adaptive.cl", "refine_real", **_defines(engine, transfer.bands)),
+        engine.kernel("adaptive.cl", "refine_real", **_defines(engine, bands)),
         (listed,),
         listed,
         pixels,
@@ -95,14 +107,14 @@ def refine_real(
         surface.positions,
         surface.normals,
         *volume.arguments(),
-        *_light(engine, light, rays, reach_m),
-        *object_arguments(table),
+        *light_arguments(engine, light, rays, reach_m, volume),
+        *object_arguments(engine, table, glow),
         ball_around(objects),
         light.coefficients,
         ratio.cols,
         ratio.rows,
         ratio.stride,
-        _shade_samples(engine, transfer, light),
+        ratio.shaded,
         refined,
     )
     return refined
@@ -140,22 +152,6 @@ def grown(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
     return result
 
 
-def _shade_samples(engine: Engine, transfer: Transfer, light: DeviceLight) -> cl_array.Array:
-    """[rows, cols] float4: radiance of the samples, white, without objects."""
-    shaded = engine.workspace.array("shaded_samples", (transfer.rows, transfer.cols), cl_types.float4)
-    count = transfer.rows * transfer.cols
-    engine.launch(
-        engine.kernel("adaptive.cl", "shade_samples", **_defines(engine, transfer.bands)),
-        (count,),
-        count,
-        transfer.coefficients,
-        transfer.openness,
-        light.coefficients,
-        shaded,
-    )
-    return shaded
-
-
 def _list_pixels(engine: Engine, name: str, mask: NDArray[np.bool_]) -> tuple[int, cl_array.Array]:
     """Number and numbers (y width + x) of the pixels of a mask; the array is longer, so that it seldom changes size."""
     pixels = np.flatnonzero(mask).astype(np.int32)
@@ -167,10 +163,6 @@ def _empty(engine: Engine, camera: CameraModel, name: str) -> cl_array.Array:
     array = engine.workspace.array(name, (camera.height, camera.width), cl_types.float4)
     fill_bytes(engine.queue, array, 0)
     return array
-
-
-def _light(engine: Engine, light: DeviceLight, rays: Directions, reach_m: float) -> tuple[KernelArgument, ...]:
-    return rays.count, rays.on_device(engine), light.arriving, reach_m, *light.continued
 
 
 def _defines(engine: Engine, bands: int) -> dict[str, int]:

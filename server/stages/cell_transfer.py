@@ -21,6 +21,7 @@ from protocol.frames import CameraModel
 from server.maths.lobes import CELL_SR, CELLS, CellEquations, cell_directions
 from server.opencl.engine import Engine, float4
 from server.stages.continuation import PlaneArrays, plane_arguments, spokes
+from server.stages.indirect import Indirect
 from server.stages.radiance_transfer import Directions, Transfer, own_sets
 from server.stages.raycast import Surface
 
@@ -111,14 +112,12 @@ class PoolWindow:
         transfer: Transfer,
         rays: Directions,
         observed: cl_array.Array,
-        hits: cl_array.Array,
-        unseen: Floats,
+        indirect: Indirect,
         voxel_m: float,
     ) -> Pools:
         """Pool a frame's usable samples into `slot`.
 
-        observed: [rows, cols] float4 of the samples, w = 1 usable; hits: see indirect.py; unseen: [3] radiance that is
-        put in place of surfaces no picture shows.
+        observed: [rows, cols] float4 of the samples, w = 1 usable.
         """
         engine, grid, space = self._engine, self.grid, self._engine.workspace
         sets = own_sets(engine, transfer.rows, transfer.cols) if transfer.sets is None else transfer.sets
@@ -139,13 +138,13 @@ class PoolWindow:
             transfer.free_mask,
             sets,
             observed,
-            hits,
+            indirect.hits,
             rays.count,
             rays.on_device(engine),
             space.constant(f"cells_of_{rays.interleave}", cells_of(rays.directions.tobytes(), rays.count)),
             space.constant("cell_centers", centers.view(cl_types.float4)),
             _HALF_CELL,
-            float4(*unseen, 0),
+            float4(*indirect.mean, 0),
             voxel_m,
             slot,
             self.raw,
@@ -155,7 +154,15 @@ class PoolWindow:
         rows = engine.download(seen).astype(np.float64)
         place = engine.download(self._places[slot]).astype(np.float64)
         return Pools(
-            grid, rows[:, :3], rows[:, 3:6], rows[:, 6], rows[:, 7], place[:, :3], place[:, 4:7], place[:, 7], unseen
+            grid=grid,
+            seen=rows[:, :3],
+            sent=rows[:, 3:6],
+            unseen=rows[:, 6],
+            weights=rows[:, 7],
+            positions=place[:, :3],
+            normals=place[:, 4:7],
+            open=place[:, 7],
+            beyond=indirect.mean,
         )
 
     def hide(self, slots: Iterable[int], planes: PlaneArrays) -> None:

@@ -5,9 +5,12 @@ Kernel: indirect.cl. Surfaces are taken as Lambertian, so the colour that the vo
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
@@ -19,6 +22,30 @@ EVERY = 4
 """Of how many hidden directions a sample follows one; its neighbours follow the others."""
 LEAST_COSINE = 0.05
 """Of directions that count, as in cell_transfer.cl."""
+
+
+@dataclass(frozen=True)
+class Indirect:
+    """What surfaces of one frame send one another."""
+
+    hits: cl_array.Array
+    """[rows, cols] float4, see gather_hits."""
+    mean: NDArray[np.float64]
+    """[3] radiance: the mean of what was met, taken for surface that no picture shows."""
+
+
+def observe_indirect(
+    engine: Engine,
+    camera: CameraModel,
+    volume: Volume,
+    surface: Surface,
+    transfer: Transfer,
+    rays: Directions,
+    reach_m: float,
+) -> Indirect:
+    """What the surfaces that hide directions from `transfer`'s samples send."""
+    hits = gather_hits(engine, camera, volume, surface, transfer, rays, reach_m)
+    return Indirect(hits, mean_sent(engine, hits))
 
 
 def gather_hits(
@@ -64,7 +91,7 @@ def no_hits(engine: Engine, transfer: Transfer) -> cl_array.Array:
     return engine.workspace.constant("no_hits", np.zeros((transfer.rows, transfer.cols), cl_types.float4))
 
 
-def mean_sent(engine: Engine, hits: cl_array.Array) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def mean_sent(engine: Engine, hits: cl_array.Array) -> NDArray[np.float64]:
     """[3] mean radiance of what `hits` met; 0 where nothing was."""
     total = engine.download(hits).view(np.float32).reshape(-1, 4).sum(axis=0, dtype=np.float64)
     return np.asarray(total[:3] / total[3] if total[3] > 0 else np.zeros(3))

@@ -92,12 +92,13 @@ def sum_tiles(
     surface: Surface,
     transfer: Transfer,
     voxel_m: float,
+    least_openness: float = LEAST_OPENNESS,
 ) -> TileSums:
     """Normal equations of the frame's samples: static surface, open enough, neither clipped nor black.
 
     radiance: [h, w] float4 as in Measurement.
     """
-    observed = gather_samples(engine, camera, radiance, surface, transfer)
+    observed = gather_samples(engine, camera, radiance, surface, transfer, least_openness)
     pooled_transfer, pooled = _pool(engine, camera, surface, transfer, observed, voxel_m)
     return unpack_tiles(_accumulate(engine, pooled_transfer, pooled), transfer.bands**2)
 
@@ -107,7 +108,12 @@ def _kernel(engine: Engine, name: str, coefficients: int) -> cl.Kernel:
 
 
 def gather_samples(
-    engine: Engine, camera: CameraModel, radiance: cl_array.Array, surface: Surface, transfer: Transfer
+    engine: Engine,
+    camera: CameraModel,
+    radiance: cl_array.Array,
+    surface: Surface,
+    transfer: Transfer,
+    least_openness: float = LEAST_OPENNESS,
 ) -> cl_array.Array:
     """[rows, cols] float4: what the camera saw at each sample, w = 1 where usable; `radiance` as in Measurement."""
     observed = engine.workspace.array("observed", (transfer.rows, transfer.cols), cl_types.float4)
@@ -123,7 +129,7 @@ def gather_samples(
         surface.labels,
         transfer.openness,
         transfer.flatness,
-        LEAST_OPENNESS,
+        least_openness,
         LEAST_FLATNESS,
         observed,
     )
@@ -197,8 +203,12 @@ def unpack_tiles(partial: NDArray[np.float64], n: int) -> TileSums:
 class LightEstimator:
     """The running estimate of one session's light."""
 
-    def __init__(self, bands: int, *, as_thesis: bool = False) -> None:
-        """`as_thesis`: white light by plain least squares, a memory as long as a moving average of 10 (5.4)."""
+    def __init__(self, bands: int, *, as_thesis: bool = False, memory: bool = True) -> None:
+        """`as_thesis`: white light by plain least squares, a memory as long as a moving average of 10 (5.4).
+
+        `memory`: earlier frames count (P3).
+        """
+        self._memory = memory
         self._bands = bands
         self._as_thesis = as_thesis
         self._precision = prior_precision(bands)
@@ -236,10 +246,10 @@ class LightEstimator:
 
     def _forgetting_for(self, frame: NormalEquations) -> float:
         """How much of the evidence so far to keep beside `frame`."""
+        if self._evidence is None or not self._memory:
+            return 0.0
         if self._as_thesis:
             return THESIS_FORGETTING
-        if self._evidence is None:
-            return 0.0
         luminance = frame.channels(0, 1)
         misfit = float(luminance.less(self._solve_luminance(self._evidence).mean).energy[0])
         own = solve_with_evidence(luminance.scaled(1 / self._dependence), self._precision).mean

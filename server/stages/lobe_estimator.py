@@ -27,7 +27,7 @@ from server.opencl.engine import Engine
 from server.stages.cell_light import solve_cells
 from server.stages.cell_transfer import PoolGrid, Pools, PoolWindow, pool_grid
 from server.stages.continuation import MOST_ROWS, NO_PLANES, Continuation, Judged
-from server.stages.indirect import mean_sent
+from server.stages.indirect import Indirect
 from server.stages.light_estimation import ASSUMED_ALBEDO, LightEstimate
 from server.stages.light_model import (
     COLOR_PULL,
@@ -77,9 +77,17 @@ class LobeEstimator:
     """The running estimate of one session's light."""
 
     def __init__(
-        self, engine: Engine, bands: int, model: LightModel | None = None, continuation: Continuation | None = None
+        self,
+        engine: Engine,
+        bands: int,
+        model: LightModel | None = None,
+        continuation: Continuation | None = None,
+        known: Floats | None = None,
     ) -> None:
+        """`known`: radiances [CELLS] of the light, if only its brightness, albedos and the room are to be found."""
         self._engine = engine
+        self._known = known
+        self._family = lobe_family(WIDTHS_DEG[0]) if known is None else known[:, None] / max(float(known.sum()), 1e-12)
         self._model = model or LightModel()
         self.continuation = continuation
         self._bands = bands
@@ -109,21 +117,19 @@ class LobeEstimator:
         transfer: Transfer,
         rays: Directions,
         observed: cl_array.Array,
-        hits: cl_array.Array,
+        indirect: Indirect,
         voxel_m: float,
         volume_from_camera: Floats,
         depth_m: cl_array.Array,
     ) -> LightEstimate:
         """Fold one frame in and solve. A frame that saw nothing leaves the estimate as it was.
 
-        observed: [rows, cols] float4 of the samples, w = 1 usable; hits: see indirect.py; depth_m: [h, w] as measured.
+        observed: [rows, cols] float4 of the samples, w = 1 usable; depth_m: [h, w] as measured.
         """
         window = self._window_for(pool_grid(transfer))
         slot = self._next
         self._frames.pop(slot, None)
-        pools = window.pool(
-            slot, surface, camera, transfer, rays, observed, hits, mean_sent(self._engine, hits), voxel_m
-        )
+        pools = window.pool(slot, surface, camera, transfer, rays, observed, indirect, voxel_m)
         if pools.weights.sum() < LEAST_WEIGHT or not (pools.seen > 0).any():
             return self._estimate
         self._next = (slot + 1) % SLOTS
@@ -137,7 +143,7 @@ class LobeEstimator:
                 self._is_fresh |= self.continuation.explained < UNDERSTOOD * before
                 window.hide(self._frames, self.continuation.arrays())
                 for held, frame in self._frames.items():
-                    frame.columns = window.shading(held, _lobes_and_all())
+                    frame.columns = window.shading(held, self._lobes_and_all())
                 estimate = self._refresh(slot, ROUNDS)
             self._is_fresh |= was_searching and not self.continuation.is_searching
         self._estimate = self._averaged(estimate)
@@ -153,7 +159,7 @@ class LobeEstimator:
     def fold(self, slot: int, pools: Pools) -> LightEstimate:
         """The light with `pools`, whose transfer lies in `slot` of the window, not averaged."""
         assert self._window is not None
-        columns = self._window.shading(slot, _lobes_and_all())
+        columns = self._window.shading(slot, self._lobes_and_all())
         newest = Frame(pools, columns)
         with self._engine.profile.host():
             rounds = self._forget(newest)
@@ -186,11 +192,20 @@ class LobeEstimator:
         return Judged(
             positions=np.array([frame.positions[place] for frame, place in pools]),
             transfer=raw,
-            lobes=lobe_family(min(JUDGED_WIDTH_DEG, self.light.width_deg if self.light else JUDGED_WIDTH_DEG)),
+            lobes=self._judged_lobes(),
             target=target[some] - mean_albedo * sent,
             beyond=mean_albedo * np.array([frame.beyond @ LUMINANCE for frame, _ in pools]),
             weights=scaled[some],
         )
+
+    def _judged_lobes(self) -> Floats:
+        if self._known is not None:
+            return self._family
+        return lobe_family(min(JUDGED_WIDTH_DEG, self.light.width_deg if self.light else JUDGED_WIDTH_DEG))
+
+    def _lobes_and_all(self) -> Floats:
+        """[CELLS, lobes + 1] the widest family, and a sky of radiance 1 all over."""
+        return np.column_stack([self._family, np.ones(CELLS)])
 
     def _refresh(self, slot: int, rounds: int) -> LightEstimate:
         """Light and albedos from the window, whose newest frame lies in `slot`."""
@@ -202,6 +217,8 @@ class LobeEstimator:
         self._last = (rows, albedos, weights)
         assert self._window is not None
         assert self._solution is not None
+        if self._known is not None:
+            return self._estimate
         self.light, estimate = solve_cells(
             self._window,
             rows,
@@ -279,8 +296,3 @@ class LobeEstimator:
         keep = np.array([self._frames[slot].keep for slot in rows.slots])
         ages = np.array([age[slot] for slot in rows.slots])
         return [solve_amounts(columns, target, scaled / keep * memory**ages) for memory in MEMORIES]
-
-
-def _lobes_and_all() -> Floats:
-    """[CELLS, lobes + 1] the widest family, and a sky of radiance 1 all over."""
-    return np.column_stack([lobe_family(WIDTHS_DEG[0]), np.ones(CELLS)])

@@ -12,6 +12,7 @@ from tests.bench.finished import Part
 from tests.bench.light_e1 import SEQUENCES, sequence_part
 from tests.bench.light_honesty import honesty_part
 from tests.bench.light_places import halves_part, kitchen_part
+from tests.bench.light_robustness import robustness_part
 from tests.bench.light_room import room_part
 from tests.bench.light_speed import speed_part
 from tests.bench.run import Run
@@ -43,6 +44,7 @@ PARTS: dict[str, Callable[[Run], Part]] = {
     ROOM: room_part,
     **{sequence.name: partial(sequence_part, sequence=sequence) for sequence in SEQUENCES},
     "half black room": halves_part,
+    "robustness": robustness_part,
     "honesty": honesty_part,
     KITCHEN: kitchen_part,
     "speed": speed_part,

@@ -12,7 +12,7 @@ from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine
 from server.scene.virtual_object import VirtualObject
 from server.stages import adaptive, differential_rendering
-from server.stages.differential_rendering import SampleGrid, shadow_real, shadow_virtual, upload_light
+from server.stages.differential_rendering import RealShadow, SampleGrid, shadow_real, shadow_virtual, upload_light
 from server.stages.radiance_transfer import direction_sets, transfer_radiance
 from server.stages.rasterize import rasterize
 from server.stages.raycast import LABEL_STATIC, Surface, raycast
@@ -53,26 +53,26 @@ class Stage:
         self.table = object_table(engine, self.objects)
         self.virtual = rasterize(engine, CAMERA, inverse_rigid(VIEW), self.objects)
 
-    def ratio(self) -> SampleGrid:
+    def ratio(self) -> RealShadow:
         return shadow_real(
             self.engine,
             CAMERA,
             self.surface,
             self.transfer,
+            self.volume,
             self.light,
             self.rays,
             ROOM_M,
             self.objects,
             self.table,
-            VOXEL_M,
         )
 
-    def refined(self, ratio: SampleGrid) -> Floats:
+    def refined(self, ratio: RealShadow) -> Floats:
         found = adaptive.refine_real(
             self.engine,
             CAMERA,
             self.surface,
-            self.transfer,
+            self.transfer.bands,
             self.volume,
             self.light,
             self.rays,

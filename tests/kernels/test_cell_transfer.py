@@ -14,6 +14,7 @@ from server.maths.planes import CELL_M
 from server.opencl.engine import Engine
 from server.stages.cell_transfer import MOST_POOLS, POOL_PX, PoolGrid, Pools, PoolWindow, cells_of, pool_grid
 from server.stages.continuation import LEAST_M, NO_PLANES, SPOKES, spokes
+from server.stages.indirect import Indirect
 from server.stages.radiance_transfer import Directions, Transfer, direction_sets, own_sets
 from server.stages.raycast import Surface
 from tests.analytic import Floats
@@ -112,7 +113,7 @@ class Samples:
         surface, camera, transfer, observed, hits = self.upload(engine, own=own)
         window = PoolWindow(engine, PoolGrid(step, -(-rows // step), -(-cols // step)), SLOTS)
         window.raw.fill(-1.0)
-        pools = window.pool(slot, surface, camera, transfer, self.rays, observed, hits, UNSEEN, VOXEL_M)
+        pools = window.pool(slot, surface, camera, transfer, self.rays, observed, Indirect(hits, UNSEEN), VOXEL_M)
         return pools, window
 
     def twin(self, step: int) -> twin.Pools:

@@ -131,7 +131,7 @@ def shade_floor(
     transfer = transfer_radiance(engine, camera, volume, surface, STRIDE, directions, reach_m)
     objects = [placed(engine, solid)]
     table, device_light = object_table(engine, objects), upload_light(engine, light, directions)
-    ratio = shadow_real(engine, camera, surface, transfer, device_light, directions, reach_m, objects, table, VOXEL_M)
+    ratio = shadow_real(engine, camera, surface, transfer, volume, device_light, directions, reach_m, objects, table)
     bits = np.unpackbits(engine.download(transfer.free_mask).view(np.uint8), axis=-1, bitorder="little")[..., :rays]
     return Shaded(
         download4(engine, ratio.values),
@@ -257,7 +257,7 @@ def test_no_surface_has_no_ratio(engine: Engine) -> None:
     transfer = transfer_radiance(engine, camera, volume, surface, STRIDE, rays, FAR_M)
     objects = [placed(engine, PLATE)]
     table, light = object_table(engine, objects), upload_light(engine, LIGHT, rays)
-    ratio = shadow_real(engine, camera, surface, transfer, light, rays, FAR_M, objects, table, VOXEL_M)
+    ratio = shadow_real(engine, camera, surface, transfer, volume, light, rays, FAR_M, objects, table)
     np.testing.assert_array_equal(download4(engine, ratio.values)[..., 3], np.repeat([1, 0], 4)[:, None] * np.ones(8))
 
 

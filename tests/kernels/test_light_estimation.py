@@ -342,3 +342,20 @@ def test_spread_of_the_direction() -> None:
         estimator.update(sums)
         spreads.append(direction_spread_rad(luminance(sums.total())))
     assert 0 < spreads[0] < np.deg2rad(1) < spreads[1] < np.pi
+
+
+def test_without_memory_only_the_newest_frame_counts(engine: Engine) -> None:
+    """P3: the thesis's moving average is a switch."""
+    one, other = (sum_tiles(engine, *random_frame(97, 131, 2, seed=seed).upload(engine), VOXEL_M) for seed in (1, 2))
+    forgetful, fresh, plain = LightEstimator(4, memory=False), LightEstimator(4), LightEstimator(4)
+    forgetful.update(one)
+    plain.update(one)
+    found, expected = forgetful.update(other), fresh.update(other)
+    np.testing.assert_allclose(found.sh, expected.sh, rtol=1e-9)
+    assert not np.allclose(plain.update(other).sh, expected.sh, rtol=1e-3)
+
+
+def test_dark_corners_count_if_they_are_asked_to(engine: Engine) -> None:
+    frame = random_frame(97, 131, 2).upload(engine)
+    counts = [sum_tiles(engine, *frame, VOXEL_M, least).total().count for least in (0.0, LEAST_OPENNESS, 0.5)]
+    assert counts[0] > counts[1] > counts[2]

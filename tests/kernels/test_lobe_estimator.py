@@ -11,6 +11,7 @@ from server.maths.lobes import CELL_SR, cell_directions, cells_to_sh
 from server.maths.sh import LUMINANCE, spherical_fibonacci
 from server.opencl.engine import Engine
 from server.stages.cell_transfer import PoolGrid, Pools
+from server.stages.indirect import Indirect, mean_sent
 from server.stages.light_estimation import ASSUMED_ALBEDO, LightEstimate
 from server.stages.light_model import LightModel
 from server.stages.lobe_estimator import SLOTS, LobeEstimator
@@ -350,7 +351,8 @@ def test_a_frame_that_sees_nothing_leaves_the_estimate(engine: Engine) -> None:
     def update(of: Samples) -> LightEstimate:
         surface, camera, transfer, observed, hits = of.upload(engine)
         depth = engine.workspace.upload("d", np.ones((camera.height, camera.width), np.float32))
-        return run.update(surface, camera, transfer, of.rays, observed, hits, 0.01, np.eye(4), depth)
+        indirect = Indirect(hits, mean_sent(engine, hits))
+        return run.update(surface, camera, transfer, of.rays, observed, indirect, 0.01, np.eye(4), depth)
 
     for nothing in (none, black):
         estimate = update(nothing)

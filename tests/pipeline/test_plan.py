@@ -155,7 +155,13 @@ def test_two_writers_are_refused() -> None:
         (
             SceneFacts(objects=2, objects_in_view=0, has_light=True),
             {"tabulate", "shadow_real", "composite"},  # what is out of view may still cast a shadow into it
-            {"rasterize": "in view", "shade_virtual": "in view", "refine_virtual": "in view", "refine_real": "refine"},
+            {
+                "rasterize": "in view",
+                "light_objects": "left out",
+                "shade_virtual": "in view",
+                "refine_virtual": "in view",
+                "refine_real": "refine",
+            },
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=False),
@@ -165,11 +171,20 @@ def test_two_writers_are_refused() -> None:
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=True),
             {"rasterize", "tabulate", "shade_virtual", "shadow_real", "composite"},
-            {"refine_virtual": "does not refine", "refine_real": "does not refine"},
+            {"refine_virtual": "does not refine", "refine_real": "does not refine", "light_objects": "left out"},
         ),
         (
-            SceneFacts(objects=1, objects_in_view=1, has_light=True, adaptive=True),
-            {"rasterize", "tabulate", "shade_virtual", "refine_virtual", "shadow_real", "refine_real", "composite"},
+            SceneFacts(objects=1, objects_in_view=1, has_light=True, adaptive=True, indirect=True),
+            {
+                "rasterize",
+                "tabulate",
+                "light_objects",
+                "shade_virtual",
+                "refine_virtual",
+                "shadow_real",
+                "refine_real",
+                "composite",
+            },
             {},
         ),
     ],

@@ -1,0 +1,192 @@
+"""What virtual objects send: one bounce of light off a few points of each (thesis 7.3.3, eq. 7.3-7.7).
+
+The points are dealt over an object's surface once, on both of its sides. Every frame they are lit as its pixels are;
+rays that meet the object take what the points around send. Kernels: differential_rendering.cl (light_points),
+include/object_glow.clh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from server.maths.sh import spherical_fibonacci
+from server.opencl.engine import Engine, KernelArgument, int4
+from server.scene.coarse_colors import colors_at
+
+if TYPE_CHECKING:
+    from server.scene.mesh import Mesh
+    from server.stages.rasterize import Placed
+    from server.stages.voxelize import DistanceGrid
+
+POINTS = 128
+"""Places on an object; at each, a point on either side."""
+CELLS = 8
+"""Cells of the table of nearest points along the longest side of an object's grid, as in object_glow.clh."""
+SIDES = 6
+_LATTICE = 64
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points on one object."""
+
+    points: Floats
+    """[n <= 2 POINTS, 3] in cells of the object's distance grid."""
+    normals: Floats
+    """[n, 3] unit, model axes, which are the grid's."""
+    albedos: Floats
+    """[n, 3] linear base colour."""
+    nearest: NDArray[np.int32]
+    """[z, y, x, SIDES] the point nearest to each cell of those that face +x, +y, +z, -x, -y, -z most; -1: none."""
+
+
+def deal_points(engine: Engine, mesh: Mesh, grid: DistanceGrid) -> SurfacePoints:
+    """Points at POINTS places evenly over the mesh's area, the same for the same mesh; none inside what is closed."""
+    corners = mesh.vertices[mesh.triangles].astype(np.float64)
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    upto = np.cumsum(areas)
+    triangle = np.searchsorted(upto, (np.arange(POINTS) + 0.5) / POINTS * upto[-1]).clip(0, len(areas) - 1)
+    first, second = (np.arange(1, POINTS + 1)[:, None] * _PLASTIC % 1.0).T
+    first, second = np.where(first + second > 1, 1 - first, first), np.where(first + second > 1, 1 - second, second)
+    shares = np.stack([1 - first - second, first, second], axis=1)[..., None]
+    points, normals = (
+        (values[mesh.triangles[triangle]].astype(np.float64) * shares).sum(axis=1)
+        for values in (mesh.vertices, mesh.normals)
+    )
+    albedos = colors_at(mesh, triangle, shares[..., 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    in_grid = points @ grid.grid_from_model[:3, :3].T + grid.grid_from_model[:3, 3]
+    in_grid, normals = np.concatenate([in_grid, in_grid]), np.concatenate([normals, -normals])
+    is_open = _count_open(engine, in_grid, normals, grid) > 0
+    is_open |= ~is_open.any()
+    in_grid, normals, albedos = in_grid[is_open], normals[is_open], np.concatenate([albedos, albedos])[is_open]
+    return SurfacePoints(in_grid, normals, albedos, _nearest(in_grid, normals, grid.dims))
+
+
+def _count_open(engine: Engine, points: Floats, normals: Floats, grid: DistanceGrid) -> NDArray[np.int32]:
+    """[n] directions, out of a lattice, in which the object does not hide the outside from its own points."""
+    space, lattice = engine.workspace, spherical_fibonacci(_LATTICE)
+    found = space.array("glow_open", (len(points),), np.int32)
+    kernel = engine.kernel("differential_rendering.cl", "count_open", BANDS=2, MASK_WORDS=1, LANES=engine.lanes)
+    engine.launch(
+        kernel,
+        (len(points),),
+        len(points),
+        space.upload("glow_tested", _float4(points)),
+        space.upload("glow_tested_normals", _float4(normals)),
+        _LATTICE,
+        space.constant("glow_lattice", _float4(lattice)),
+        int4(*grid.dims, 0),
+        grid.distance,
+        found,
+    )
+    result: NDArray[np.int32] = engine.download(found)
+    return result
+
+
+_PLASTIC = np.array([0.7548776662466927, 0.5698402909980532])  # steps of the R2 sequence: 1/g, 1/g^2, g^3 = g + 1
+
+
+def _nearest(points: Floats, normals: Floats, dims: tuple[int, int, int]) -> NDArray[np.int32]:
+    side = max(dims) / CELLS
+    cells = np.ceil(np.array(dims) / side - 1e-6).astype(int)
+    z, y, x = np.mgrid[: cells[2], : cells[1], : cells[0]]
+    centers = (np.stack([x, y, z], axis=-1) + 0.5) * side
+    axis = np.abs(normals).argmax(axis=1)
+    facing = axis + 3 * (normals[np.arange(len(normals)), axis] < 0)
+    nearest = np.full((*x.shape, SIDES), -1, np.int32)
+    for which in range(SIDES):
+        own = np.flatnonzero(facing == which)
+        if len(own):
+            nearest[..., which] = own[cKDTree(points[own]).query(centers)[1]]
+    return nearest
+
+
+@dataclass(frozen=True)
+class Glow:
+    """What Glow of object_glow.clh takes; arrays of the engine's workspace, valid until the next frame."""
+
+    nearest: cl_array.Array
+    cells: cl_array.Array
+    points: cl_array.Array
+    normals: cl_array.Array
+    radiances: cl_array.Array
+
+    def arguments(self) -> tuple[KernelArgument, ...]:
+        """In the order of OBJECT_PARAMETERS of include/shadows.clh."""
+        return self.nearest, self.cells, self.points, self.normals, self.radiances
+
+
+@dataclass(frozen=True)
+class PlacedPoints:
+    """The points of all objects, to be lit."""
+
+    count: int
+    points: cl_array.Array
+    """[count] float4: volume metres, w = 1."""
+    normals: cl_array.Array
+    """[count] float4: unit, volume axes."""
+    albedos: cl_array.Array
+    """[count] float4."""
+    offsets_m: cl_array.Array
+    """[count] float32: how far off its surface rays of a point begin."""
+    glow: Glow
+    """With nothing sent yet."""
+
+
+def no_glow(engine: Engine) -> Glow:
+    """Objects that send nothing."""
+    empty = engine.workspace.constant("no_glow", np.zeros(1, cl_types.float4))
+    return Glow(
+        engine.workspace.constant("no_glow_nearest", np.full(SIDES, -1, np.int32)),
+        engine.workspace.constant("no_glow_cells", np.zeros(1, cl_types.int4)),
+        empty,
+        empty,
+        empty,
+    )
+
+
+def place_points(engine: Engine, objects: Sequence[Placed]) -> PlacedPoints:
+    """The points of `objects`, each with its `volume_from_model`, where they are now."""
+    space, surfaces = engine.workspace, [thing.surface_points for thing, _ in objects]
+    counts, sizes = [len(s.points) for s in surfaces], [s.nearest[..., 0].size for s in surfaces]
+    first, start = np.cumsum([0, *counts]), np.cumsum([0, *sizes])
+    nearest = [np.where(s.nearest >= 0, s.nearest + f, -1).ravel() for s, f in zip(surfaces, first, strict=False)]
+    cells = [(*s.nearest.shape[2::-1], at) for s, at in zip(surfaces, start, strict=False)]
+    points, normals, offsets = [], [], []
+    for surface, (thing, matrix) in zip(surfaces, objects, strict=True):
+        volume_from_grid = matrix @ np.linalg.inv(thing.grid.grid_from_model)
+        points.append(surface.points @ volume_from_grid[:3, :3].T + volume_from_grid[:3, 3])
+        turned = surface.normals @ matrix[:3, :3].T
+        normals.append(turned / np.linalg.norm(turned, axis=1, keepdims=True))
+        offsets.append(np.full(len(surface.points), np.linalg.norm(volume_from_grid[:3, 0])))
+    return PlacedPoints(
+        int(first[-1]),
+        space.upload("glow_places", _float4(np.concatenate(points), 1.0)),
+        space.upload("glow_place_normals", _float4(np.concatenate(normals))),
+        space.upload("glow_albedos", _float4(np.concatenate([s.albedos for s in surfaces]))),
+        space.upload("glow_offsets", np.concatenate(offsets).astype(np.float32)),
+        Glow(
+            space.upload("glow_nearest", np.concatenate(nearest).astype(np.int32)),
+            space.upload("glow_cells", np.array(cells, np.int32).view(cl_types.int4)[:, 0]),
+            space.upload("glow_points", _float4(np.concatenate([s.points for s in surfaces]))),
+            space.upload("glow_normals", _float4(np.concatenate([s.normals for s in surfaces]))),
+            space.upload("glow_nothing", np.zeros(int(first[-1]), cl_types.float4)),
+        ),
+    )
+
+
+def _float4(values: Floats, w: float = 0.0) -> NDArray[np.float32]:
+    padded = np.full((len(values), 4), w, np.float32)
+    padded[:, :3] = values
+    return padded.view(cl_types.float4)[:, 0]

@@ -15,7 +15,7 @@ from server.maths.lobes import cell_directions
 from server.maths.sh import LUMINANCE, sh_basis
 from server.opencl.engine import Engine
 from server.settings import Settings
-from server.stages.continuation import NO_PLANES, Continuation, PlaneArrays
+from server.stages.continuation import LEAST_GAIN_KNOWN, NO_PLANES, Continuation, PlaneArrays
 from server.stages.indirect import Indirect, no_hits
 from server.stages.light_estimation import LEAST_OPENNESS, LightEstimate, LightEstimator, gather_samples, sum_tiles
 from server.stages.light_model import LightModel
@@ -48,9 +48,8 @@ class RoomLight:
         """Take this light (S2); what is then found is what of the room hides it."""
         radiances = sh_basis(cell_directions(), round(len(light.sh) ** 0.5)) @ (light.sh @ LUMINANCE)
         self._given = light
-        self._lobes = LobeEstimator(
-            self._engine, self._settings.bands, self._model, Continuation(), np.maximum(radiances, 0.0)
-        )
+        around = Continuation(LEAST_GAIN_KNOWN)
+        self._lobes = LobeEstimator(self._engine, self._settings.bands, self._model, around, np.maximum(radiances, 0.0))
 
     def estimate(self) -> LightEstimate:
         """The light as it stands."""

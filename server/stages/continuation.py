@@ -33,6 +33,8 @@ LEAST_M = 0.03
 """A pool does not hide from itself."""
 LEAST_GAIN = 0.01
 """A longer extent must leave so much less of the residual's energy; a shorter one may leave a fifth of that more."""
+LEAST_GAIN_KNOWN = 0.003
+"""The same where the light is known, and so cannot make up for extents."""
 FIRST_TRIES = 400
 """Extents tried in each of the first frames, until all have been settled."""
 TRIES, RESUME_FRAMES, RETRY_FRAMES = 40, 4, 16
@@ -72,7 +74,8 @@ class Judged:
 class Continuation:
     """The planes of one session's room."""
 
-    def __init__(self) -> None:
+    def __init__(self, least_gain: float = LEAST_GAIN) -> None:
+        self._least_gain = least_gain
         self.planes: list[PlanePatch] = []
         self._looked: list[PlanePatch] = []
         self._views: deque[tuple[Floats, Floats]] = deque(maxlen=VIEWS)
@@ -119,7 +122,7 @@ class Continuation:
             return False
         sides = SIDES * len(self.planes)
         tries = TRIES if self._was_settled else FIRST_TRIES
-        trial = _Trial(self.planes, judged)
+        trial = _Trial(self.planes, judged, self._least_gain)
         while tries > 0:
             tries -= trial.settle(*divmod(self._turn, SIDES))
             self._turn = (self._turn + 1) % sides
@@ -202,8 +205,9 @@ def spokes() -> Floats:
 class _Trial:
     """Extents and how well the light they leave explains some pools."""
 
-    def __init__(self, planes: list[PlanePatch], judged: Judged) -> None:
+    def __init__(self, planes: list[PlanePatch], judged: Judged, least_gain: float) -> None:
         self._planes = planes
+        self._least_gain = least_gain
         self._judged = judged
         self._open = judged.transfer.sum(axis=1)
         steps = np.array(STEPS_M)
@@ -237,7 +241,7 @@ class _Trial:
                 continue
             tried += 1
             misfit = self._misfit_of(others | hidden)
-            allowed = 1 - LEAST_GAIN if step > patch.steps[side] else 1 + 0.2 * LEAST_GAIN
+            allowed = 1 - self._least_gain if step > patch.steps[side] else 1 + 0.2 * self._least_gain
             if misfit < allowed * self.misfit:
                 patch.steps, self._hidden[plane], self.misfit = steps, hidden, misfit
         return max(tried, 1)

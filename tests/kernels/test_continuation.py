@@ -168,3 +168,22 @@ def test_the_light_of_a_room_seen_in_part(device: Device, name: str, bound_deg: 
         pipeline.close()
     assert errors_deg[True] < bound_deg
     assert gain * errors_deg[True] < errors_deg[False]  # seen: 2 to 4 of 25, and 3 to 10 of 18 degrees
+
+
+@pytest.mark.data
+def test_a_light_that_is_given_shows_the_room_too(device: Device) -> None:
+    """What the pictures show of a known light says how far walls go on; the light stays what was given."""
+    source = open_source(str(data_folder("mitsuba_room") / "key_white_direct"))
+    light = np.array(json.loads((data_folder("mitsuba_room") / "key_white_direct" / "light.json").read_text())["sh"])
+    bounds = default_volume(source, range(len(source)))
+    given = tuple(tuple(float(v) for v in row) for row in light)
+    wishes = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), albedo="estimated", up=source.up, light=given)
+    pipeline = Pipeline(device, source.camera, wishes)
+    for index in range(3):
+        found = pipeline.process(source[index]).light
+    shapes = pipeline._room_light.planes[0]
+    pipeline.close()
+    np.testing.assert_array_equal(np.array(found.sh), light)
+    assert len(shapes) >= 3
+    sides_m = shapes[:, 3, 1::2] - shapes[:, 3, ::2]  # seen and beyond
+    assert sides_m.max() > 2.5  # of a wall 3.4 m wide of which the pictures show 2

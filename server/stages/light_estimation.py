@@ -31,6 +31,8 @@ LEAST_OPENNESS = 0.05
 """Samples that see less of the sky say more about indirect light than about the sky (thesis 5.2)."""
 LEAST_FLATNESS = 0.95
 """Samples nearer to an edge have a normal and a colour that may belong to two surfaces."""
+LEAST_FLAT_SHARE = 0.1
+"""Of the samples that are used at least, the flattest: one picture's depth, not fused yet, is nowhere flat."""
 FORGETTING = 0.9
 """What remains of earlier frames' evidence a frame later while the light is steady: a memory of ten frames (5.4)."""
 CHANGED_FORGETTING = 0.3
@@ -130,10 +132,18 @@ def gather_samples(
         transfer.openness,
         transfer.flatness,
         least_openness,
-        LEAST_FLATNESS,
+        flatness_gate(engine.download(transfer.flatness)),
         observed,
     )
     return observed
+
+
+def flatness_gate(flatness: NDArray[np.float32]) -> float:
+    """The least flatness of samples to use; flatness [rows, cols], 0 where there is no surface."""
+    valid = flatness[flatness > 0]
+    if not len(valid):
+        return LEAST_FLATNESS
+    return min(LEAST_FLATNESS, float(np.quantile(valid, 1 - LEAST_FLAT_SHARE)))
 
 
 def _pool(

@@ -15,12 +15,14 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.stages.light_estimation import (
     ASSUMED_ALBEDO,
+    LEAST_FLAT_SHARE,
     LEAST_FLATNESS,
     LEAST_OPENNESS,
     LightEstimate,
     LightEstimator,
     TileSums,
     direction_spread_rad,
+    flatness_gate,
     sum_tiles,
     unpack_tiles,
 )
@@ -359,3 +361,14 @@ def test_dark_corners_count_if_they_are_asked_to(engine: Engine) -> None:
     frame = random_frame(97, 131, 2).upload(engine)
     counts = [sum_tiles(engine, *frame, VOXEL_M, least).total().count for least in (0.0, LEAST_OPENNESS, 0.5)]
     assert counts[0] > counts[1] > counts[2]
+
+
+def test_where_nothing_is_flat_the_flattest_samples_are_used() -> None:
+    """As on a single unfused depth map; holes do not count, and where enough is flat nothing else is used."""
+    rough = np.zeros((40, 50), np.float32)
+    rough[:20] = np.linspace(0.2, 0.8, 1000, dtype=np.float32).reshape(20, 50)
+    assert flatness_gate(rough) == pytest.approx(0.74, abs=0.001)
+    assert (rough >= flatness_gate(rough)).sum() == pytest.approx(LEAST_FLAT_SHARE * 1000, abs=2)
+    rough[:3] = 1.0
+    assert flatness_gate(rough) == LEAST_FLATNESS
+    assert flatness_gate(np.zeros((4, 4), np.float32)) == LEAST_FLATNESS

@@ -1,5 +1,5 @@
-"""What each measure against bad samples buys (thesis 5.2 and 5.4): a table under lights from all around, one measure left
-out at a time, and the weights by normals, which are off by default, put in."""
+"""What each measure against bad samples buys (thesis 5.2 and 5.4): a table under lights from all around, one measure
+left out at a time, and the weights by normals, which are off by default, put in."""
 
 from __future__ import annotations
 

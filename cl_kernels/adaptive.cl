@@ -68,8 +68,7 @@ kernel void mark_varying(const int cols, const int rows, global const float4 *ra
 // What occluders take from the virtual surface at `pixels` [listed]; positions, normals [h][w]: the virtual geometry buffer.
 // -> occluded [h][w] (rgb, w = 1); other pixels are left as they are.
 kernel void refine_virtual(const int listed, global const int *pixels, const int width,
-                           global const float4 *positions, global const float4 *normals, VOLUME_PARAMETERS, LIGHT_PARAMETERS,
-                           OBJECT_PARAMETERS, const float offset_m, global float4 *occluded) {
+                           global const float4 *positions, global const float4 *normals, SCENE_PARAMETERS, const float offset_m, global float4 *occluded) {
     const int item = get_global_id(0);
     if (item >= listed) return;
     const int pixel = pixels[item];
@@ -84,8 +83,7 @@ kernel void refine_virtual(const int listed, global const int *pixels, const int
 // objects take is sampled at the pixel; R changes little from sample to sample and is taken from them: shaded [rows][cols].
 // -> ratio [h][w] (rgb, w = 1), w = 0 where there is no surface; other pixels are left as they are.
 kernel void refine_real(const int listed, global const int *pixels, const int width,
-                        global const float4 *positions, global const float4 *normals, VOLUME_PARAMETERS, LIGHT_PARAMETERS,
-                        OBJECT_PARAMETERS, const float4 ball, global const float4 *light,
+                        global const float4 *positions, global const float4 *normals, SCENE_PARAMETERS, const float4 ball, global const float4 *light,
                         const int cols, const int rows, const int stride, global const float4 *shaded, global float4 *ratio) {
     const int item = get_global_id(0);
     if (item >= listed) return;

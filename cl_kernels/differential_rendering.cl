@@ -15,6 +15,12 @@
 #define INTERLEAVE 1
 #endif
 
+// Samples of the transfer, every `stride` pixels of a picture `width` wide: the real geometry buffer [h][w]; openness [rows][cols],
+// free_mask [rows][cols][MASK_WORDS], sets [rows][cols][INTERLEAVE]: see radiance_transfer.cl.
+#define SAMPLE_PARAMETERS \
+    const int cols, const int rows, const int stride, const int width, global const float4 *positions, \
+        global const float4 *normals, global const float *openness, global const uint *free_mask, global const uchar *sets
+
 // What reaches a sample of real surface, over pi, without virtual objects: free directions bring the light, or what planes that
 // go on beyond the pictures send; hidden ones what their surfaces send. hit: of indirect.cl.
 static float3 shading_without(const Arriving light, const float3 position, const float3 normal, const float3 from_free,
@@ -32,15 +38,11 @@ static float3 shading_without(const Arriving light, const float3 position, const
 }
 
 // Real surface: the ratio R' / R of shading with virtual objects to shading without, at the samples of the transfer.
-// transfer [rows][cols][COEFFICIENTS], openness [rows][cols], free_mask [rows][cols][MASK_WORDS], sets [rows][cols][INTERLEAVE]:
-// see radiance_transfer.cl; hits [rows][cols]: see indirect.cl. ball: center and radius of a ball around all objects.
-// light [COEFFICIENTS] rgb; directions, arriving ... glow: see shadows.clh.
+// transfer [rows][cols][COEFFICIENTS]; hits [rows][cols]: see indirect.cl; light [COEFFICIENTS] rgb.
+// ball: center and radius of a ball around all objects.
 // -> ratio [rows][cols] (rgb, w = 1), shaded [rows][cols] (rgb of R, w = 1); w = 0 where there is no surface.
-kernel void shadow_real(const int cols, const int rows, const int stride, const int width,
-                        global const float4 *positions, global const float4 *normals, global const float *transfer,
-                        global const float *openness, global const uint *free_mask, global const uchar *sets,
-                        global const float4 *hits, global const float4 *light, VOLUME_PARAMETERS, LIGHT_PARAMETERS,
-                        OBJECT_PARAMETERS, const float4 ball, global float4 *ratio, global float4 *shaded) {
+kernel void shadow_real(SAMPLE_PARAMETERS, global const float *transfer, global const float4 *hits, global const float4 *light,
+                        SCENE_PARAMETERS, const float4 ball, global float4 *ratio, global float4 *shaded) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= cols || row >= rows) return;
@@ -69,10 +71,8 @@ kernel void shadow_real(const int cols, const int rows, const int stride, const 
 // What a sample of real surface gains from other real surface whose own shading virtual objects changed (eq. 7.6: R'_ID - R_ID),
 // added to the ratio. It follows every `every`-th of its hidden directions, beginning with another one than its neighbours do.
 // ratio, shaded [rows][cols]: of shadow_real; changed: that ratio. -> bounced [rows][cols] (rgb, w = 1), w = 0 as in ratio.
-kernel void bounce_real(const int cols, const int rows, const int stride, const int width,
-                        global const float4 *positions, global const float4 *normals, global const float *openness,
-                        global const uint *free_mask, global const uchar *sets, global const float4 *light,
-                        VOLUME_PARAMETERS, LIGHT_PARAMETERS, const int every, global const float4 *shaded, global float4 *bounced) {
+kernel void bounce_real(SAMPLE_PARAMETERS, global const float4 *light, SCENE_PARAMETERS, const int every,
+                        global const float4 *shaded, global float4 *bounced) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= cols || row >= rows) return;
@@ -114,8 +114,7 @@ kernel void bounce_real(const int cols, const int rows, const int stride, const 
 // Virtual surface: the radiance that real and virtual occluders take from it, at every `stride`-th pixel it covers.
 // positions, normals [h][w] (w = 1 where covered): the virtual geometry buffer. -> occluded [rows][cols] (rgb, w = 1 valid).
 kernel void shadow_virtual(const int cols, const int rows, const int stride, const int width,
-                           global const float4 *positions, global const float4 *normals, VOLUME_PARAMETERS, LIGHT_PARAMETERS,
-                           OBJECT_PARAMETERS, const float offset_m, global float4 *occluded) {
+                           global const float4 *positions, global const float4 *normals, SCENE_PARAMETERS, const float offset_m, global float4 *occluded) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= cols || row >= rows) return;
@@ -130,7 +129,7 @@ kernel void shadow_virtual(const int cols, const int rows, const int stride, con
 // offsets_m [points_count]: how far off the surface rays begin.
 kernel void light_points(const int points_count, global const float4 *points, global const float4 *normals,
                          global const float4 *albedos, global const float *offsets_m, global const float4 *light,
-                         VOLUME_PARAMETERS, LIGHT_PARAMETERS, OBJECT_PARAMETERS, global float4 *radiances) {
+                         SCENE_PARAMETERS, global float4 *radiances) {
     const int index = get_global_id(0);
     if (index >= points_count) return;
     const Volume volume = VOLUME_OF_PARAMETERS;

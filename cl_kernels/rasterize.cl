@@ -1,230 +1,383 @@
 // Draws triangle meshes into the virtual geometry buffer (the rasterised buffer of section 7.2, fig. 7.5).
 //
-// setup_triangles -> scan_tiles -> fill_tiles -> raster_tiles -> clear_uncovered -> shade_surface, once per object the
-// first and the last. Screen positions are snapped to 1/256 pixel and edges evaluated in exact integers, so that
-// triangles sharing an edge cover each pixel centre once (top-left rule). Pixel centres lie at integers.
+// clear_picture -> project_vertices -> setup_triangles -> scan_tiles -> fill_tiles -> raster_tiles -> settle_fragments
+// -> shade_surface, each once for all objects. Screen positions are snapped to 1/256 pixel and edges evaluated in exact
+// integers, so that triangles sharing an edge cover each pixel centre once (top-left rule). Pixel centres lie at
+// integers. Triangles that can cover but a few pixels are drawn at once, as fragments, all others by way of lists of
+// tiles. Of both the nearest depth of a pixel is found first, then the lowest triangle that has it: the result does not
+// depend on the order in which they come.
 //
+// The meshes of all objects lie one after the other (server/scene/arena.py). `objects` [n] int8, one row an object of
+// the picture: its mesh's first vertex, first triangle and first material; how many vertices and triangles it has; the
+// numbers of its first triangle and of its first vertex in this picture. Rows out of view have no triangles.
+// `matrices` [3 n] float16, three an object: pixel_from_model, model_from_pixel (see shade_surface), volume_from_model.
+// `chunks` int2, one a work-group: an object, and the first of the CHUNK vertices or triangles of it that it does.
+//
+// `projected` [vertices] int4: x and y in subpixels, 1 / depth as bits (0: outside, to be clipped), 1 if behind.
 // A piece is a triangle after clipping. `corners` [pieces] int8: x0 y0 x1 y1 x2 y2 in subpixels, turned to positive
-// area; the triangle's number among all objects, -1 for no piece; the object's index.
-// `inverse_depths` [pieces] float4: 1 / z at the corners, 1/metre.
+// area; the triangle's number in this picture. `inverse_depths` [pieces] float4: 1 / depth at the corners, 1/metre.
+// A fragment is what a small piece shows at one pixel: the pixel, the bits of 1 / depth, the triangle's number, 0.
+// `nearest` [h][w] bits of the greatest 1 / depth so far, which order as the numbers do; 0 where there is none.
+// `counts` [2 + tiles] pieces, fragments, and the pieces of each tile.
 #pragma OPENCL FP_CONTRACT OFF  // the same vertex must land on the same subpixel in every triangle that shares it
 #include "camera.clh"
-#include "clip.clh"
-#include "edges.clh"
+#include "pieces.clh"
+#include "surface_point.clh"
+#include "textures.clh"
 
+#define CHUNK 128  // vertices or triangles of one object that a work-group does
 #define SCAN_ITEMS 256
-
-static inline int2 snapped(const float3 point) {
-    return convert_int2_rte(point.xy / point.z * (float)SUBPIXELS);
-}
-
-// The piece with corners a, b, c, turned to positive area; its triangle is -1 if it covers no pixel centre.
-static int8 make_piece(const float3 a, const float3 b, const float3 c, const int2 ids, const int2 size,
-                       float4 *inverse_depths) {
-    const int2 p = snapped(a), q = snapped(b), r = snapped(c);
-    const long area = (long)(q.x - p.x) * (r.y - p.y) - (long)(q.y - p.y) * (r.x - p.x);
-    const bool turn = area < 0;
-    const int8 piece = (int8)(p, turn ? r : q, turn ? q : r, ids);
-    *inverse_depths = 1.0f / (float4)(a.z, turn ? c.z : b.z, turn ? b.z : c.z, 1.0f);
-    const int4 bounds = pixel_bounds(piece, size);
-    return area == 0 || bounds.x > bounds.z || bounds.y > bounds.w ? (int8)(-1) : piece;
-}
+#define FEW 16         // pieces that a tile's pixels look through themselves
+#define COLOR_PROBES 4  // most samples of a base colour along a pixel's footprint; more look the same
+#define NOBODY 0x7fffffff
 
 static void count_tiles(const int8 piece, const int2 size, global int *tile_counts) {
-    if (piece.s6 < 0) return;
     const int4 tiles = pixel_bounds(piece, size) / TILE;
     for (int y = tiles.y; y <= tiles.w; y++)
         for (int x = tiles.x; x <= tiles.z; x++)
             if (touches_tile(piece, tiles, (int2)(x, y))) atomic_inc(&tile_counts[y * tile_columns(size) + x]);
 }
 
-// Ready for a new picture: no extra pieces (counts[0]), no piece in any tile (the rest).
-kernel void clear_counts(const int count, global int *counts) {
-    const int index = get_global_id(0);
-    if (index < count) counts[index] = 0;
+static void write_piece(const int8 piece, const float4 depths, const int slot, const int room, const int2 size,
+                        global int *tile_counts, global int8 *corners, global float4 *inverse_depths) {
+    if (slot >= room) return;
+    corners[slot] = piece;
+    inverse_depths[slot] = depths;
+    count_tiles(piece, size, tile_counts);
 }
 
-// One triangle of one object: to pixels, clipped, its pieces written and counted in the tiles they touch. Its first
-// piece has the place of its number; others are appended after those of all triangles. counts[0] counts the appended,
-// also those for which there is no room; counts[1 + tile] the pieces of each tile.
-// sizes: triangles, number of the first one, triangles of all objects, room after them. picture: width, height, object.
-kernel void setup_triangles(const int4 sizes, const int4 picture, const global float *vertices,
-                            const global int *triangles, const float16 pixel_from_model, const float near_m,
-                            global int *counts, global int8 *corners, global float4 *inverse_depths) {
-    const int triangle = get_global_id(0);
-    if (triangle >= sizes.x) return;
-    const int3 vertex = vload3(triangle, triangles);
+// Ready for a new picture: nothing counted, nothing near.
+kernel void clear_picture(const int count, const int pixels, global int *counts, global uint *nearest) {
+    const int index = get_global_id(0);
+    if (index < count) counts[index] = 0;
+    if (index < pixels) nearest[index] = 0;
+}
+
+// Every vertex of the objects in view on the screen.
+kernel __attribute__((reqd_work_group_size(CHUNK, 1, 1)))
+void project_vertices(const global int2 *chunks, const global int8 *objects, const global float16 *matrices,
+                      const float near_m, const global float *vertices, global int4 *projected) {
+    const int2 chunk = chunks[get_group_id(0)];
+    const int8 object = objects[chunk.x];
+    const int vertex = chunk.y + get_local_id(0);
+    if (vertex >= object.s3) return;
+    const float3 point = transform_point(matrices[3 * chunk.x], vload3(object.s0 + vertex, vertices));
+    projected[object.s6 + vertex] = on_screen(point, near_m);
+}
+
+// A triangle that passes through the near plane or leaves the guard band: cut, and what is left of it written.
+static void write_clipped(const float16 pixel_from_model, const global float *vertices, const int3 vertex,
+                          const float near_m, const int triangle, const int room, const int2 size, global int *counts,
+                          global int8 *corners, global float4 *inverse_depths) {
     float3 corner[MAX_CORNERS];
     corner[0] = transform_point(pixel_from_model, vload3(vertex.x, vertices));
     corner[1] = transform_point(pixel_from_model, vload3(vertex.y, vertices));
     corner[2] = transform_point(pixel_from_model, vload3(vertex.z, vertices));
     const int count = clip_triangle(near_m, corner);
-    const int2 ids = (int2)(sizes.y + triangle, picture.z);
-    int written = 0;
     for (int i = 2; i < count; i++) {
         float4 depths;
-        const int8 piece = make_piece(corner[0], corner[i - 1], corner[i], ids, picture.xy, &depths);
+        const int4 a = on_subpixel(corner[0]), b = on_subpixel(corner[i - 1]), c = on_subpixel(corner[i]);
+        const int8 piece = make_piece(a, b, c, triangle, size, &depths);
         if (piece.s6 < 0) continue;
-        const int slot = written++ ? sizes.z + atomic_inc(counts) : ids.x;
-        if (slot >= sizes.z + sizes.w) continue;
-        corners[slot] = piece;
-        inverse_depths[slot] = depths;
-        count_tiles(piece, picture.xy, counts + 1);
+        write_piece(piece, depths, atomic_inc(counts), room, size, counts + 2, corners, inverse_depths);
     }
-    if (!written) corners[ids.x] = (int8)(-1);
 }
 
-// Exclusive running sum over the tiles' counts, by one work-group. starts[tiles] is the sum of all, and the last
-// number counts[0], for the host to read both at once.
+// Notes how near a small piece is where it covers pixels, bits SMALL y + x from `corner` on. Returns those with nothing
+// nearer so far.
+static ulong note_nearest(const ulong covered, const int2 corner, const int2 size, const long8 edges,
+                          const float4 depths, global uint *nearest) {
+    ulong shown = covered;
+    for (ulong left = covered; left; left &= left - 1) {
+        const int bit = lowest_bit(left);
+        const int2 pixel = (int2)(bit % SMALL, bit / SMALL);
+        const uint depth = depth_at(edges, depths, pixel);
+        const int index = (corner.y + pixel.y) * size.x + corner.x + pixel.x;
+        if (atomic_max(&nearest[index], depth) > depth) shown ^= left & -left;
+    }
+    return shown;
+}
+
+static void write_fragments(ulong left, const int8 piece, const int2 size, const float4 depths, int place,
+                            const int room, global int4 *fragments) {
+    const int2 corner = pixel_bounds(piece, size).xy;
+    const long8 edges = edges_of(piece, corner);
+    for (; left && place < room; left &= left - 1, place++) {
+        const int bit = lowest_bit(left);
+        const int2 pixel = (int2)(bit % SMALL, bit / SMALL);
+        const int index = (corner.y + pixel.y) * size.x + corner.x + pixel.x;
+        fragments[place] = (int4)(index, (int)depth_at(edges, depths, pixel), piece.s6, 0);
+    }
+}
+
+// The piece of a triangle of which no corner must be clipped; NO_PIECE for others. `behind`: all corners are; `whole`:
+// none must be clipped.
+static int8 piece_of(const int8 object, const int triangle, const int2 size, const global int *triangles,
+                     const global int4 *projected, float4 *depths, bool *whole, bool *behind) {
+    const int3 vertex = vload3(object.s1 + triangle, triangles) + object.s6;
+    const int4 a = projected[vertex.x], b = projected[vertex.y], c = projected[vertex.z];
+    *whole = a.z != 0 && b.z != 0 && c.z != 0;
+    *behind = a.w && b.w && c.w;
+    return *whole ? make_piece(a, b, c, object.s5 + triangle, size, depths) : NO_PIECE;
+}
+
+// Every triangle of the objects in view: its pieces written, in no order, and counted in the tiles they touch, or its
+// fragments, less those that something nearer hides already. What there is no room for is counted all the same.
+// room: pieces, fragments.
+kernel __attribute__((reqd_work_group_size(CHUNK, 1, 1)))
+void setup_triangles(const int2 size, const int2 room, const global int2 *chunks, const global int8 *objects,
+                     const global float16 *matrices, const float near_m, const global float *vertices,
+                     const global int *triangles, const global int4 *projected, global int *counts,
+                     global int8 *corners, global float4 *inverse_depths, global uint *nearest,
+                     global int4 *fragments) {
+    local int kept[2], first[2];
+    const int2 chunk = chunks[get_group_id(0)];
+    const int8 object = objects[chunk.x];
+    const int item = get_local_id(0), triangle = chunk.y + item;
+    if (item < 2) kept[item] = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    int8 piece = NO_PIECE;
+    float4 depths = (float4)(0.0f);
+    if (triangle < object.s4) {
+        bool whole, behind;
+        piece = piece_of(object, triangle, size, triangles, projected, &depths, &whole, &behind);
+        if (!whole && !behind)
+            write_clipped(matrices[3 * chunk.x], vertices + 3 * object.s0, vload3(object.s1 + triangle, triangles),
+                          near_m, object.s5 + triangle, room.x, size, counts, corners, inverse_depths);
+    }
+    const int4 bounds = pixel_bounds(piece, size);
+    const bool small = is_small(bounds);
+    ulong shown = 0;
+    int place = 0;
+    if (piece.s6 >= 0 && small) {
+        shown = small_coverage(piece, bounds.xy, bounds.zw - bounds.xy);
+        if (shown) {
+            const long8 edges = edges_of(piece, bounds.xy);
+            depths /= (float)edges.s6;
+            shown = note_nearest(shown, bounds.xy, size, edges, depths, nearest);
+            if (shown) place = atomic_add(&kept[1], (int)popcount(shown));
+        }
+    } else if (piece.s6 >= 0) {
+        place = atomic_inc(&kept[0]);
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item < 2) first[item] = kept[item] > 0 ? atomic_add(&counts[item], kept[item]) : 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (piece.s6 >= 0 && !small)
+        write_piece(piece, depths, first[0] + place, room.x, size, counts + 2, corners, inverse_depths);
+    if (shown) write_fragments(shown, piece, size, depths, first[1] + place, room.y, fragments);
+}
+
+// Where the fragments were more than there is room for: settle_fragments, from the triangles themselves.
+kernel __attribute__((reqd_work_group_size(CHUNK, 1, 1)))
+void settle_triangles(const int2 size, const global int2 *chunks, const global int8 *objects,
+                      const global int *triangles, const global int4 *projected, const global uint *nearest,
+                      global int *visible) {
+    const int2 chunk = chunks[get_group_id(0)];
+    const int8 object = objects[chunk.x];
+    const int triangle = chunk.y + get_local_id(0);
+    if (triangle >= object.s4) return;
+    bool whole, behind;
+    float4 depths = (float4)(0.0f);
+    const int8 piece = piece_of(object, triangle, size, triangles, projected, &depths, &whole, &behind);
+    const int4 bounds = pixel_bounds(piece, size);
+    if (piece.s6 < 0 || !is_small(bounds)) return;
+    const long8 edges = edges_of(piece, bounds.xy);
+    depths /= (float)edges.s6;
+    for (ulong left = small_coverage(piece, bounds.xy, bounds.zw - bounds.xy); left; left &= left - 1) {
+        const int2 pixel = (int2)(lowest_bit(left) % SMALL, lowest_bit(left) / SMALL);
+        const int index = (bounds.y + pixel.y) * size.x + bounds.x + pixel.x;
+        if (depth_at(edges, depths, pixel) == nearest[index]) atomic_min(&visible[index], piece.s6);
+    }
+}
+
+// Exclusive running sum over the tiles' counts, by one work-group. starts[tiles] is the sum of all, and the last two
+// numbers are the pieces and the fragments, for the host to read all at once.
+// A tile lists no more than `most` pieces: what has more could not be looked through in time either.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1)))
-void scan_tiles(const int tiles, const global int *counts, global int *starts) {
-    const global int *tile_counts = counts + 1;
+void scan_tiles(const int tiles, const int most, const global int *counts, global int *starts) {
+    const global int *tile_counts = counts + 2;
     local int sums[SCAN_ITEMS];
     const int item = get_local_id(0);
     const int share = (tiles + SCAN_ITEMS - 1) / SCAN_ITEMS;
     const int begin = min(item * share, tiles), end = min(begin + share, tiles);
     int sum = 0;
-    for (int tile = begin; tile < end; tile++) sum += tile_counts[tile];
+    for (int tile = begin; tile < end; tile++) sum += min(tile_counts[tile], most);
     sums[item] = sum;
     barrier(CLK_LOCAL_MEM_FENCE);
     int before = 0;
     for (int i = 0; i < item; i++) before += sums[i];
     for (int tile = begin; tile < end; tile++) {
         starts[tile] = before;
-        before += tile_counts[tile];
+        before += min(tile_counts[tile], most);
     }
     if (item == SCAN_ITEMS - 1) {
         starts[tiles] = before;
         starts[tiles + 1] = counts[0];
+        starts[tiles + 2] = counts[1];
     }
 }
 
 // Lists each piece in the tiles it touches. Counts the tiles down to 0; the order within a tile does not matter.
-kernel void fill_tiles(const int pieces, const int width, const int height, const global int8 *corners,
-                       const global int *starts, global int *counts, global int *entries) {
-    const int2 size = (int2)(width, height);
+kernel void fill_tiles(const int pieces, const int2 size, const global int8 *corners, const global int *starts,
+                       global int *counts, global int *entries) {
     const int index = get_global_id(0);
     if (index >= pieces) return;
     const int8 piece = corners[index];
-    if (piece.s6 < 0) return;
     const int4 tiles = pixel_bounds(piece, size) / TILE;
     for (int y = tiles.y; y <= tiles.w; y++)
         for (int x = tiles.x; x <= tiles.z; x++) {
             if (!touches_tile(piece, tiles, (int2)(x, y))) continue;
-            const int tile = y * tile_columns(size) + x;
-            entries[starts[tile] + atomic_dec(&counts[1 + tile]) - 1] = index;
+            const int tile = y * tile_columns(size) + x, slot = starts[tile] + atomic_dec(&counts[2 + tile]) - 1;
+            if (slot < starts[tile + 1]) entries[slot] = index;
         }
 }
 
-// The nearer of the best so far and a piece that covers the pixel, as (triangle, object); the lower triangle number
-// where they are equally far. Depth is interpolated as 1 / z, which is linear on the screen.
-static int2 nearer(const int8 piece, const float4 inverse_depths, const int2 pixel, const int2 best, float *nearest) {
-    const float3 share = convert_float3(edges_at(piece, pixel));
-    const float inverse_depth = dot(share, inverse_depths.xyz) / (share.x + share.y + share.z);
-    if (inverse_depth < *nearest || (inverse_depth == *nearest && piece.s6 > best.x)) return best;
-    *nearest = inverse_depth;
-    return piece.s67;
-}
+static inline int2 pixel_of(const int bit) { return (int2)(bit % TILE, bit / TILE); }
 
-// One work-group a tile, one work-item a pixel: 64 entries at a time, first their coverage, one entry an item, then
-// each pixel looks through those that cover it.
+// One work-group a tile. Of its entries, up to 64 at a time: where there are few, each pixel looks through those that
+// cover it; where there are many, they are mostly small, and each entry goes over the pixels it covers: first the
+// nearest depth of each pixel is found, then the lowest triangle that has it.
+// -> visible: the triangle of each pixel, the lower number where two are equally near; NOBODY where a fragment is
+// nearer or nothing is there. nearest: of fragments and pieces.
 kernel __attribute__((reqd_work_group_size(TILE * TILE, 1, 1)))
-void raster_tiles(const int width, const int height, const global int8 *corners, const global float4 *inverse_depths,
-                  const global int *starts, const global int *entries, global int *visible, global int *objects) {
-    const int2 size = (int2)(width, height);
+void raster_tiles(const int2 size, const global int8 *corners, const global float4 *inverse_depths,
+                  const global int *starts, const global int *entries, global uint *nearest, global int *visible) {
     local ulong masks[TILE * TILE];
+    local long8 edges[TILE * TILE];
+    local float4 depths[TILE * TILE];
+    local int numbers[TILE * TILE];
+    local uint best[TILE * TILE];
+    local int winners[TILE * TILE];
     const int tile = get_group_id(0), item = get_local_id(0);
     const int2 origin = TILE * (int2)(tile % tile_columns(size), tile / tile_columns(size));
-    const int2 pixel = origin + (int2)(item % TILE, item / TILE);
-    int2 best = (int2)(-1);
-    float nearest = 0.0f;
+    const int2 pixel = origin + pixel_of(item);
+    const bool inside = pixel.x < size.x && pixel.y < size.y;
+    const int index = pixel.y * size.x + pixel.x;
+    best[item] = inside ? nearest[index] : 0;
+    winners[item] = NOBODY;
     for (int begin = starts[tile]; begin < starts[tile + 1]; begin += TILE * TILE) {
         const int count = min(starts[tile + 1] - begin, TILE * TILE);
-        masks[item] = item < count ? coverage(corners[entries[begin + item]], origin, size) : 0;
+        if (item < count) {
+            const int entry = entries[begin + item];
+            const int8 piece = corners[entry];
+            masks[item] = coverage(piece, origin, size);
+            edges[item] = edges_of(piece, origin);
+            depths[item] = inverse_depths[entry] / (float)edges[item].s6;
+            numbers[item] = piece.s6;
+        }
+        const uint before = best[item];
         barrier(CLK_LOCAL_MEM_FENCE);
-        for (int i = 0; i < count; i++) {
-            const int piece = entries[begin + i];
-            if ((masks[i] >> item) & 1) best = nearer(corners[piece], inverse_depths[piece], pixel, best, &nearest);
+        if (count <= FEW) {
+            for (int i = 0; i < count; i++) {
+                if (!((masks[i] >> item) & 1)) continue;
+                const uint depth = depth_at(edges[i], depths[i], pixel_of(item));
+                if (depth < best[item] || (depth == best[item] && numbers[i] > winners[item])) continue;
+                best[item] = depth;
+                winners[item] = numbers[i];
+            }
+        } else {
+            for (ulong left = item < count ? masks[item] : 0; left; left &= left - 1) {
+                const int bit = lowest_bit(left);
+                const uint depth = depth_at(edges[item], depths[item], pixel_of(bit));
+                atomic_max(&best[bit], depth);
+            }
+            barrier(CLK_LOCAL_MEM_FENCE);
+            if (best[item] > before) winners[item] = NOBODY;
+            barrier(CLK_LOCAL_MEM_FENCE);
+            for (ulong left = item < count ? masks[item] : 0; left; left &= left - 1) {
+                const int bit = lowest_bit(left);
+                if (depth_at(edges[item], depths[item], pixel_of(bit)) != best[bit]) continue;
+                atomic_min(&winners[bit], numbers[item]);
+            }
         }
         barrier(CLK_LOCAL_MEM_FENCE);
     }
-    if (pixel.x < size.x && pixel.y < size.y) {
-        visible[pixel.y * size.x + pixel.x] = best.x;
-        objects[pixel.y * size.x + pixel.x] = best.y;
+    if (inside) {
+        nearest[index] = best[item];
+        visible[index] = winners[item];
     }
 }
 
-// Says where there is no virtual surface: w = 0.
-kernel void clear_uncovered(const int pixels, const global int *visible, global float4 *position, global float4 *normal,
-                            global float4 *base_color) {
-    const int pixel = get_global_id(0);
-    if (pixel >= pixels || visible[pixel] >= 0) return;
-    position[pixel] = normal[pixel] = base_color[pixel] = (float4)(0.0f);
+// The fragments that are nearest, the lowest triangle's of those at one pixel.
+kernel void settle_fragments(const int count, const global int4 *fragments, const global uint *nearest,
+                             global int *visible) {
+    const int index = get_global_id(0);
+    if (index >= count) return;
+    const int4 fragment = fragments[index];
+    if ((uint)fragment.y == nearest[fragment.x]) atomic_min(&visible[fragment.x], fragment.z);
 }
 
-// Where the ray origin + t * direction meets the plane of a, a + ab, a + ac (Moeller and Trumbore): the shares of the
-// second and third corner, and t. A plane seen edge on is met nowhere: its middle is taken, and t = 0.
-static float3 intersect_plane(const float3 a, const float3 ab, const float3 ac, const float3 origin,
-                              const float3 direction) {
-    const float3 p = cross(direction, ac), q = cross(origin - a, ab);
-    const float determinant = dot(ab, p);
-    if (determinant == 0.0f) return (float3)(1.0f / 3.0f, 1.0f / 3.0f, 0.0f);
-    return (float3)(dot(origin - a, p), dot(direction, q), dot(ac, q)) / determinant;
+static float3 textured(const Textures textures, const int texture, const float2 a, const float2 ab, const float2 ac,
+                       const float2 share, const float4 changes, const int most_probes) {
+    const Footprint footprint = {a + share.x * ab + share.y * ac, changes.x * ab + changes.y * ac,
+                                 changes.z * ab + changes.w * ac};
+    return sample_texture(textures, texture, footprint, most_probes);
 }
 
-// The shares of all three corners, none below 0: a pixel that is covered may lie outside by half a subpixel.
-static inline float3 shares_inside(const float3 hit) {
-    const float2 share = clamp(hit.xy, 0.0f, 1.0f);
-    const float sum = fmax(share.x + share.y, 1.0f);
-    return (float3)(1.0f - (share.x + share.y) / sum, share / sum);
+// Index of the object that a triangle's number belongs to: the last row that begins at or before it.
+static int object_of(const int triangle, const int count, const global int8 *objects) {
+    int low = 0, high = count;
+    while (high - low > 1) {
+        const int middle = (low + high) / 2;
+        if (objects[middle].s5 <= triangle) low = middle;
+        else high = middle;
+    }
+    return low;
 }
 
-// The point at which the ray is as deep as it meets the plane, but no nearer or farther than the triangle is.
-static inline float3 point_on_ray(const float16 model_from_pixel, const float3 a, const float3 ab, const float3 ac,
-                                  const float3 direction, const float t) {
-    const float3 slope = model_from_pixel.scde;
-    const float depth = dot(slope, a) + model_from_pixel.sf, to_b = dot(slope, ab), to_c = dot(slope, ac);
-    const float nearest = depth + fmin(fmin(to_b, to_c), 0.0f), farthest = depth + fmax(fmax(to_b, to_c), 0.0f);
-    return model_from_pixel.s37b + fmin(fmax(t, fmax(nearest, 0.0f)), farthest) * direction;
-}
-
-static float3 unit_or(const float3 vector, const float3 otherwise) {
-    const float length_squared = dot(vector, vector);
-    return length_squared > 1e-30f ? vector / sqrt(length_squared) : otherwise;
-}
-
-// `normal` on the side of the triangle's own `facing` that is seen, bent where it would still turn its back on the
-// camera: so it never flips from one pixel to the next along a smooth outline. All of any length but `to_camera`.
-static float3 facing_camera(const float3 normal, const float3 facing, const float3 to_camera) {
-    const float3 flat = unit_or(dot(facing, to_camera) < 0.0f ? -facing : facing, to_camera);
-    const float3 smooth = unit_or(normal, flat);
-    const float3 turned = dot(smooth, flat) < 0.0f ? -smooth : smooth;
-    return unit_or(turned - fmin(dot(turned, to_camera), 0.0f) * to_camera, flat);
-}
-
-// The surface that one object shows: position in volume metres, unit normal, linear base colour; w = 1.
-// sizes: width, height, number of the object's first triangle, its triangles. `attributes` [v, 6]: normal, base colour.
+// The surface that each pixel shows: the object's index, -1 where there is none; position in volume metres, unit
+// normal, linear base colour, and roughness, metalness and 0, each with w = 1, all 0 where there is none.
+// `attributes` [v, 3] float4: normal; linear base colour; texture coordinates of base colour and of roughness and
+// metalness. `materials` [m] float4: roughness, metalness, numbers of the textures of base colour and of roughness (G)
+// and metalness (B), -1 for none. `material_of` [t] a triangle's, in its mesh.
 // The ray of pixel (u, v) is model_from_pixel's column 3 + t * its columns 0 to 2 times (u, v, 1), with t the depth;
 // its last row is not part of that: it takes a model point to its depth.
-kernel void shade_surface(const int4 sizes, const global int *visible, const global float *vertices,
-                          const global int *triangles, const global float *attributes, const float16 model_from_pixel,
-                          const float16 volume_from_model, global float4 *position, global float4 *normal,
-                          global float4 *base_color) {
+kernel void shade_surface(const int2 size, const global int *visible, const int object_count,
+                          const global int8 *objects, const global float16 *matrices, const global float *vertices,
+                          const global int *triangles, const global float4 *attributes, const global int *material_of,
+                          const global float4 *materials, const global int4 *texture_table, const global int4 *levels,
+                          const global uchar4 *texels, const global float *values, global int *object_index,
+                          global float4 *position, global float4 *normal, global float4 *base_color,
+                          global float4 *surface) {
     const int2 pixel = (int2)(get_global_id(0), get_global_id(1));
-    if (pixel.x >= sizes.x || pixel.y >= sizes.y) return;
-    const int index = pixel.y * sizes.x + pixel.x, triangle = visible[index] - sizes.z;
-    if (triangle < 0 || triangle >= sizes.w) return;
-    const int3 v = vload3(triangle, triangles);
+    if (pixel.x >= size.x || pixel.y >= size.y) return;
+    const int index = pixel.y * size.x + pixel.x;
+    if (visible[index] == NOBODY) {
+        object_index[index] = -1;
+        position[index] = normal[index] = base_color[index] = surface[index] = (float4)(0.0f);
+        return;
+    }
+    const int number = object_index[index] = object_of(visible[index], object_count, objects);
+    const int8 object = objects[number];
+    const float16 model_from_pixel = matrices[3 * number + 1];
+    const int triangle = object.s1 + visible[index] - object.s5;
+    const int3 v = vload3(triangle, triangles) + object.s0;
     const float3 a = vload3(v.x, vertices), ab = vload3(v.y, vertices) - a, ac = vload3(v.z, vertices) - a;
     const float3 direction = transform_vector(model_from_pixel, (float3)(pixel.x, pixel.y, 1.0f));
     const float3 hit = intersect_plane(a, ab, ac, model_from_pixel.s37b, direction);
     const float3 share = shares_inside(hit), point = point_on_ray(model_from_pixel, a, ab, ac, direction, hit.z);
-    const float3 mean_normal = share.x * vload3(2 * v.x, attributes) + share.y * vload3(2 * v.y, attributes)
-                               + share.z * vload3(2 * v.z, attributes);
-    const float3 mean_color = share.x * vload3(2 * v.x + 1, attributes) + share.y * vload3(2 * v.y + 1, attributes)
-                              + share.z * vload3(2 * v.z + 1, attributes);
-    const float3 seen_normal = facing_camera(mean_normal, cross(ab, ac), -normalize(direction));
+    const global float4 *at_a = attributes + 3 * v.x, *at_b = attributes + 3 * v.y, *at_c = attributes + 3 * v.z;
+    const float4 mean_normal = share.x * at_a[0] + share.y * at_b[0] + share.z * at_c[0];
+    float4 color = share.x * at_a[1] + share.y * at_b[1] + share.z * at_c[1];
+    const float4 material = materials[object.s2 + material_of[triangle]];
+    float2 roughness_metalness = material.xy;
+    if (material.z >= 0.0f || material.w >= 0.0f) {
+        const Textures textures = {texture_table, levels, texels, values};
+        const float4 changes = share_changes(ab, ac, model_from_pixel, model_from_pixel.s37b - a, direction);
+        const float4 uv = at_a[2], to_b = at_b[2] - uv, to_c = at_c[2] - uv;
+        if (material.z >= 0.0f)
+            color.xyz *= textured(textures, (int)material.z, uv.xy, to_b.xy, to_c.xy, share.yz, changes, COLOR_PROBES);
+        if (material.w >= 0.0f)
+            roughness_metalness *=
+                textured(textures, (int)material.w, uv.zw, to_b.zw, to_c.zw, share.yz, changes, 1).yz;
+    }
+    const float3 to_camera = -direction / sqrt(dot(direction, direction));
+    const float3 seen_normal = facing_camera(mean_normal.xyz, cross(ab, ac), to_camera);
+    const float16 volume_from_model = matrices[3 * number + 2];
     position[index] = (float4)(transform_point(volume_from_model, point), 1.0f);
-    normal[index] = (float4)(normalize(transform_vector(volume_from_model, seen_normal)), 1.0f);
-    base_color[index] = (float4)(mean_color, 1.0f);
+    const float3 turned = transform_vector(volume_from_model, seen_normal);
+    normal[index] = (float4)(turned / sqrt(dot(turned, turned)), 1.0f);
+    base_color[index] = (float4)(color.xyz, 1.0f);
+    surface[index] = (float4)(roughness_metalness, 0.0f, 1.0f);
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -16,7 +16,7 @@ from server.plan import Effect, Omission
 from server.stages import adaptive
 from server.stages import composite as composite_stage
 from server.stages import differential_rendering as differential
-from server.stages.differential_rendering import Changed, DeviceLight, RealShadow, SampleGrid
+from server.stages.differential_rendering import RealShadow
 from server.stages.indirect import Indirect
 from server.stages.measure import Measurement
 from server.stages.object_glow import Glow
@@ -24,9 +24,10 @@ from server.stages.radiance_transfer import Directions, Transfer
 from server.stages.rasterize import Placed, VirtualSurface, boxes_in_view
 from server.stages.rasterize import rasterize as rasterize_stage
 from server.stages.raycast import Surface
+from server.stages.sample_grid import SampleGrid
 from server.stages.sampling import PRESETS, Sampling
+from server.stages.traced_scene import Changed, DeviceLight, TracedScene, trace_scene
 from server.stages.volume import Volume
-from server.stages.voxelize import ObjectTable, object_table
 
 
 @dataclass(frozen=True)
@@ -73,140 +74,75 @@ def rasterize(view: View, objects: Sequence[Placed]) -> VirtualSurface:
     return rasterize_stage(view.engine, view.camera, inverse_rigid(view.volume_from_camera), objects)
 
 
-def tabulate(view: View, objects: Sequence[Placed]) -> ObjectTable:
-    """Bring the objects' distance grids into one table that rays are traced through."""
-    return object_table(view.engine, objects)
+def prepare_rays(
+    view: View, objects: Sequence[Placed], volume: Volume, rays: Directions, light: DeviceLight
+) -> TracedScene:
+    """Bring together what rays are traced through: the volume, the objects' distance grids, the light beyond."""
+    return trace_scene(view.engine, volume, light, rays, view.reach_m, objects)
 
 
-def light_objects(
-    view: View, objects: Sequence[Placed], volume: Volume, rays: Directions, light: DeviceLight, table: ObjectTable
-) -> Glow:
+def light_objects(view: View, scene: TracedScene) -> Glow:
     """What virtual objects send to real surface and to one another."""
-    return differential.light_points(view.engine, objects, volume, light, rays, view.reach_m, table)
+    return differential.light_points(view.engine, scene)
 
 
 def shadow_real(
     view: View,
     surface: Surface,
     transfer: Transfer,
-    volume: Volume,
-    rays: Directions,
-    light: DeviceLight,
-    objects: Sequence[Placed],
-    table: ObjectTable,
+    scene: TracedScene,
     indirect: Indirect | None,
     glow: Glow | None = None,
 ) -> RealShadow:
     """What virtual things take from real ones, less what they send them, and what those then send one another."""
-    shadow = differential.shadow_real(
-        view.engine,
-        view.camera,
-        surface,
-        transfer,
-        volume,
-        light,
-        rays,
-        view.reach_m,
-        objects,
-        table,
-        indirect,
-        glow,
-    )
+    lit = replace(scene, glow=glow)
+    shadow = differential.shadow_real(view.engine, view.camera, surface, transfer, lit, indirect)
     if indirect is None:
         return shadow
-    return differential.bounce_real(
-        view.engine,
-        view.camera,
-        surface,
-        transfer,
-        volume,
-        light,
-        rays,
-        view.reach_m,
-        inverse_rigid(view.volume_from_camera),
-        shadow,
-    )
-
-
-def _changed(view: View, surface: Surface, ratio: RealShadow | None) -> Changed | None:
-    """How the picture shows what real surface sends to change."""
-    if ratio is None:
-        return None
-    return Changed(view.camera, inverse_rigid(view.volume_from_camera), surface.positions, ratio)
+    camera_from_volume = inverse_rigid(view.volume_from_camera)
+    return differential.bounce_real(view.engine, view.camera, camera_from_volume, surface, transfer, lit, shadow)
 
 
 def shade_virtual(
     view: View,
     virtual: VirtualSurface,
-    volume: Volume,
-    rays: Directions,
-    light: DeviceLight,
-    table: ObjectTable,
     surface: Surface,
+    scene: TracedScene,
     glow: Glow | None = None,
     ratio: RealShadow | None = None,
 ) -> SampleGrid:
     """What real and virtual things take from virtual ones, less what they send them."""
-    bands = round(light.coefficients.shape[0] ** 0.5)
-    return differential.shadow_virtual(
-        view.engine,
-        view.camera,
-        virtual,
-        volume,
-        bands,
-        light,
-        rays,
-        view.reach_m,
-        table,
-        glow,
-        _changed(view, surface, ratio),
-    )
+    changed = _with_objects(view, surface, scene, glow, ratio)
+    return differential.shadow_virtual(view.engine, view.camera, virtual, changed)
 
 
 def refine_virtual(
     view: View,
     virtual: VirtualSurface,
-    volume: Volume,
-    rays: Directions,
-    light: DeviceLight,
-    table: ObjectTable,
     surface: Surface,
+    scene: TracedScene,
     glow: Glow | None = None,
     ratio: RealShadow | None = None,
 ) -> cl_array.Array:
     """Shadows on virtual things at every pixel near their edges."""
-    bands = round(light.coefficients.shape[0] ** 0.5)
-    return adaptive.refine_virtual(
-        view.engine,
-        view.camera,
-        virtual,
-        volume,
-        bands,
-        light,
-        rays,
-        view.reach_m,
-        table,
-        glow,
-        _changed(view, surface, ratio),
-    )
+    return adaptive.refine_virtual(view.engine, view.camera, virtual, _with_objects(view, surface, scene, glow, ratio))
 
 
 def refine_real(
-    view: View,
-    surface: Surface,
-    volume: Volume,
-    rays: Directions,
-    light: DeviceLight,
-    objects: Sequence[Placed],
-    table: ObjectTable,
-    ratio: RealShadow,
-    glow: Glow | None = None,
+    view: View, surface: Surface, scene: TracedScene, ratio: RealShadow, glow: Glow | None = None
 ) -> cl_array.Array:
     """Shadows on real things at every pixel of their rims."""
-    bands = round(light.coefficients.shape[0] ** 0.5)
-    return adaptive.refine_real(
-        view.engine, view.camera, surface, bands, volume, light, rays, view.reach_m, objects, table, ratio, glow
-    )
+    return adaptive.refine_real(view.engine, view.camera, surface, replace(scene, glow=glow), ratio)
+
+
+def _with_objects(
+    view: View, surface: Surface, scene: TracedScene, glow: Glow | None, ratio: RealShadow | None
+) -> TracedScene:
+    """The scene as the objects have changed it."""
+    if ratio is None:
+        return replace(scene, glow=glow)
+    changed = Changed(view.camera, inverse_rigid(view.volume_from_camera), surface.positions, ratio)
+    return replace(scene, glow=glow, changed=changed)
 
 
 def composite(
@@ -273,7 +209,7 @@ def _not_refined(facts: SceneFacts) -> Omission | None:
 
 EFFECTS: tuple[Effect[SceneFacts], ...] = (
     Effect(rasterize, writes="virtual", omitted=_nothing_in_view),
-    Effect(tabulate, writes="table", omitted=_nothing_casts),
+    Effect(prepare_rays, writes="scene", omitted=_nothing_casts),
     Effect(light_objects, writes="glow", omitted=lambda f: _nothing_casts(f) or _nothing_sent(f)),
     Effect(shade_virtual, writes="occluded", omitted=_nothing_to_shade),
     Effect(shadow_real, writes="ratio", omitted=_nothing_casts),

@@ -29,7 +29,6 @@ from server.scene.placement import Placement, check_size
 from server.settings import Settings, read_wishes, sampling_of
 from server.stages.composite import shown_picture
 from server.stages.denoise import denoise_radiance
-from server.stages.differential_rendering import upload_light
 from server.stages.exposure import scene_radiance
 from server.stages.indirect import Indirect, observe_indirect
 from server.stages.lamp_finder import LampFinder
@@ -37,6 +36,7 @@ from server.stages.light_estimation import LightEstimate
 from server.stages.near_light import remove_lamps
 from server.stages.radiance_transfer import Transfer
 from server.stages.sampling import Sampling, TransferSampler
+from server.stages.traced_scene import upload_light
 from server.stages.volume import Volume
 from server.static_light import static_estimate
 
@@ -174,7 +174,7 @@ class Pipeline:
         return light_message(frame.index, frame.timestamp_s, estimate, self._webxr_from_world, lamps, exposure)
 
     def place_object(self, object_id: str, mesh: Mesh, placement: Placement) -> tuple[str, ...]:
-        """Put a mesh into the scene, in the place of one with the same id; returns notes. Raises ValueError, one line."""
+        """Put a mesh into the scene, in the place of one with the same id; returns notes. Raises ValueError."""
         if self._objects is None:
             others = [w for w in self._waiting if w[0] != object_id]
             check_room((other for _, other, _ in others), mesh)

@@ -24,6 +24,10 @@ class Workspace:
             found = self._arrays[name] = cl_array.empty(self._queue, shape, dtype)
         return found
 
+    def find(self, name: str) -> cl_array.Array | None:
+        """The array called `name` as it is, None before its first use."""
+        return self._arrays.get(name)
+
     def upload(self, name: str, values: NDArray[Any]) -> cl_array.Array:
         """Copy `values` into the array called `name`."""
         array = self.array(name, values.shape, values.dtype)

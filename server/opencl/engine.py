@@ -95,6 +95,11 @@ def float16(matrix: NDArray[np.float64]) -> np.generic:
     return _vector("float16", np.asarray(matrix, np.float32).ravel())
 
 
+def int2(*values: int) -> np.generic:
+    """An int2 kernel argument."""
+    return _vector("int2", values)
+
+
 def int4(*values: int) -> np.generic:
     """An int4 kernel argument."""
     return _vector("int4", values)

@@ -24,6 +24,12 @@ def copy_beginning(queue: cl.CommandQueue, array: cl_array.Array, values: cl_arr
         cl.enqueue_copy(queue, _memory(array), np.ascontiguousarray(values), is_blocking=True)
 
 
+def copy_into(queue: cl.CommandQueue, whole: cl_array.Array, start: int, part: cl_array.Array) -> None:
+    """Copy all of `part` into `whole`, from its byte `start` on."""
+    if part.nbytes:
+        cl.enqueue_copy(queue, _memory(whole), _memory(part), byte_count=part.nbytes, dst_offset=start)
+
+
 def _memory(array: cl_array.Array) -> cl.Buffer:
     assert isinstance(array.data, cl.Buffer)
     return array.data

@@ -1,51 +1,76 @@
-"""What is read of a glTF file before trimesh gets it: limits, and the base colour of every material.
+"""What is read of a glTF file before trimesh gets it: limits, and which material each part has.
 
-trimesh keeps factors as 8-bit numbers and needs Pillow for textures, so both are read here; a material's name is
-replaced by its index, which is how a part finds its colour again. (glTF 2.0: factors are linear, textures are sRGB.)
+trimesh keeps factors as 8-bit numbers and needs Pillow for textures, so materials are read by gltf_materials.py; here a
+material's name is replaced by its index, which is how a part finds it again, and the texture coordinates that it wants
+are given names that trimesh hands on as they are.
 """
 
 from __future__ import annotations
 
-import base64
 import json
 import struct
-from dataclasses import dataclass
+from collections import Counter
 from typing import Any
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
+from server.scene.gltf_materials import GltfMaterial, Json, read_materials
+from server.scene.limits import MAX_PARTS, MAX_TRIANGLES, MAX_VERTICES, MeshError
 
-from protocol.picture_headers import PNG_SIGNATURE, jpeg_size
-from server.scene.limits import MAX_TEXTURE_PIXELS, MAX_TRIANGLES, MAX_VERTICES, MeshError
+COLOR_UV, SURFACE_UV = "_COLOR_UV", "_SURFACE_UV"
+"""Attributes of a primitive: coordinates of its base colour's texture, and of roughness and metalness."""
 
 _MAGIC, _JSON, _BIN = b"glTF", 0x4E4F534A, 0x004E4942
 _COMPRESSIONS = {"KHR_draco_mesh_compression", "EXT_meshopt_compression"}
-
-Json = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class BaseColor:
-    """One material's base colour: linear factor, and a texture (sRGB [h, w, 3] uint8) to multiply it with."""
-
-    factor: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    texture: NDArray[np.uint8] | None = None
+_KNOWN_EXTENSIONS = {"KHR_texture_transform", "KHR_materials_unlit"}
+_MOST_DEPTH = 256
+_MOST_NOTES, _NOTE_CHARS = 8, 200
+_TRIANGLES, _STRIP = 4, 5
 
 
-def prepare_gltf(data: bytes) -> tuple[bytes, list[BaseColor], tuple[str, ...]]:
-    """The file (GLB or JSON) as trimesh should see it, the base colour of each material, and notes.
+def prepare_gltf(data: bytes) -> tuple[bytes, list[GltfMaterial], tuple[str, ...]]:
+    """The file (GLB or JSON) as trimesh should see it, its materials, and notes.
 
     Raises MeshError for what is refused, and whatever indexing raises where the file names what is not there.
     """
     header, binary = _split_glb(data) if data.startswith(_MAGIC) else (_parse(data), None)
     _refuse_unsupported(header)
+    _refuse_tangled(header)
     _refuse_oversized(header)
-    colors, notes = _base_colors(header, binary)
-    for index, material in enumerate(header.get("materials", [])):
-        material["name"] = str(index)
-    header.pop("images", None)  # trimesh would decode them again
-    return _join_glb(header, binary) if data.startswith(_MAGIC) else json.dumps(header).encode(), colors, notes
+    materials, notes = read_materials(header, binary)
+    notes += _connect_materials(header, materials) + _told(header)
+    for key in ("images", "textures", "samplers", "animations", "skins"):  # not trimesh's to read
+        header.pop(key, None)
+    header["materials"] = [{"name": str(index)} for index in range(len(materials))]
+    return _join_glb(header, binary) if data.startswith(_MAGIC) else json.dumps(header).encode(), materials, notes
+
+
+def _connect_materials(header: Json, materials: list[GltfMaterial]) -> tuple[str, ...]:
+    """Give each primitive the coordinates that its material's textures want; returns notes."""
+    problems: Counter[str] = Counter()
+    for primitive in (primitive for mesh in header.get("meshes", []) for primitive in mesh["primitives"]):
+        attributes, index = primitive["attributes"], primitive.get("material")
+        if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP):
+            problems["are points, lines or fans and were not read"] += 1
+        if index is not None and not (isinstance(index, int) and 0 <= index < len(materials)):
+            problems["name a material that does not exist; they keep the plain colour"] += 1
+            del primitive["material"]
+        elif index is not None:
+            for name, use in ((COLOR_UV, materials[index].color_use), (SURFACE_UV, materials[index].surface_use)):
+                if use is not None and f"TEXCOORD_{use.uv_set}" in attributes:
+                    attributes[name] = attributes[f"TEXCOORD_{use.uv_set}"]
+                elif use is not None:
+                    problems["have a texture but no coordinates for it; they keep the plain colour"] += 1
+        attributes.pop("TEXCOORD_0", None)
+    return tuple(f"{count} parts {what}" for what, count in problems.items())
+
+
+def _told(header: Json) -> tuple[str, ...]:
+    """What whoever made the file has to say (client/laptop/obj_to_glb.py does), and what it asks for in vain."""
+    notes = header["asset"].get("extras", {}).get("notes", [])
+    told = tuple(" ".join(str(note).split())[:_NOTE_CHARS] for note in notes[:_MOST_NOTES])
+    missing = {str(name) for name in header.get("extensionsRequired", [])} - _KNOWN_EXTENSIONS
+    if missing:
+        told += (f"the file needs {', '.join(sorted(missing))[:_NOTE_CHARS]}, which is not read: it may look wrong",)
+    return told
 
 
 def _parse(text: bytes) -> Json:
@@ -92,6 +117,25 @@ def _refuse_unsupported(header: Json) -> None:
             raise MeshError("the glTF keeps its data in another file: export it as GLB, or with embedded buffers")
 
 
+def _refuse_tangled(header: Json) -> None:
+    """Refuse a scene graph that is no tree: a node of two parents, or its own ancestor."""
+    nodes: list[Any] = header.get("nodes", [])
+    parent: dict[int, int] = {}
+    for index, node in enumerate(nodes):
+        for child in node.get("children", []):
+            if not 0 <= child < len(nodes):
+                raise MeshError(f"damaged glTF: node {index} has child {child}, there are {len(nodes)} nodes")
+            if child in parent:
+                raise MeshError(f"damaged glTF: node {child} has two parents, its scene graph is no tree")
+            parent[child] = index
+    for index in range(len(nodes)):
+        at, steps = index, 0
+        while at in parent and steps <= _MOST_DEPTH:
+            at, steps = parent[at], steps + 1
+        if steps > _MOST_DEPTH:
+            raise MeshError(f"damaged glTF: node {index} is in a circle, or more than {_MOST_DEPTH} levels deep")
+
+
 def _refuse_oversized(header: Json) -> None:
     """Refuse what a small file may ask to be unfolded into: many primitives that read the same bytes."""
     accessors = [int(accessor["count"]) for accessor in header.get("accessors", [])]
@@ -99,83 +143,8 @@ def _refuse_oversized(header: Json) -> None:
     corners = sum(accessors[p["indices"]] for p in primitives if "indices" in p)
     vertices = sum(accessors[p["attributes"]["POSITION"]] for p in primitives)
     if corners > MAX_VERTICES or vertices > MAX_VERTICES:
-        raise MeshError(f"more than {MAX_TRIANGLES} triangles: {max(corners, vertices)} vertices")
+        raise MeshError(f"more than {MAX_TRIANGLES} triangles: {max(corners, vertices)} vertices; simplify the model")
     if min(accessors, default=0) < 0 or sum(accessors) > 8 * MAX_VERTICES:
         raise MeshError("damaged glTF: its accessors are too large")
-
-
-def _base_colors(header: Json, binary: bytes | None) -> tuple[list[BaseColor], tuple[str, ...]]:
-    """The base colour of each material, and a note for each image that could not be read."""
-    images = [_image_index(header, material) for material in header.get("materials", [])]
-    pictures = _decode_images(header, binary, sorted({index for index in images if index is not None}))
-    colors = [
-        BaseColor(_factor(material), None if image is None else pictures[image])
-        for material, image in zip(header.get("materials", []), images, strict=True)
-    ]
-    return colors, tuple(
-        f"image {index} could not be read; its material keeps its plain colour"
-        for index, picture in pictures.items()
-        if picture is None
-    )
-
-
-def _factor(material: Json) -> tuple[float, float, float]:
-    values = material.get("pbrMetallicRoughness", {}).get("baseColorFactor", (1.0, 1.0, 1.0, 1.0))
-    red, green, blue = (float(value) for value in np.clip(np.nan_to_num(values[:3]), 0.0, 1.0))
-    return red, green, blue
-
-
-def _image_index(header: Json, material: Json) -> int | None:
-    reference = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
-    if reference is None:
-        return None
-    source = header["textures"][reference["index"]].get("source")
-    return None if source is None else int(source)
-
-
-def _decode_images(header: Json, binary: bytes | None, wanted: list[int]) -> dict[int, NDArray[np.uint8] | None]:
-    """Each wanted image as [h, w, 3] RGB, None where it cannot be read. Raises MeshError where they are too large."""
-    pictures: dict[int, NDArray[np.uint8] | None] = {}
-    left = MAX_TEXTURE_PIXELS
-    for index in wanted:
-        try:
-            encoded = _image_bytes(header, binary, header["images"][index])
-            width, height = _picture_size(encoded)
-        except (KeyError, IndexError, TypeError, ValueError):
-            pictures[index] = None
-            continue
-        left -= width * height
-        if left < 0:
-            raise MeshError(f"the textures have more than {MAX_TEXTURE_PIXELS} pixels together: make them smaller")
-        pictures[index] = _decode(encoded)
-    return pictures
-
-
-def _decode(encoded: bytes) -> NDArray[np.uint8] | None:
-    try:
-        picture = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:
-        return None
-    return None if picture is None else picture.astype(np.uint8, copy=False)
-
-
-def _picture_size(encoded: bytes) -> tuple[int, int]:
-    """Width and height that a PNG or JPEG announces, the two kinds glTF has. Raises ValueError."""
-    if encoded.startswith(PNG_SIGNATURE) and len(encoded) > 24:
-        width, height = struct.unpack_from(">II", encoded, 16)
-        return width, height
-    return jpeg_size(encoded)
-
-
-def _image_bytes(header: Json, binary: bytes | None, image: Json) -> bytes:
-    if "uri" in image:
-        return _data_uri(image["uri"])
-    view = header["bufferViews"][image["bufferView"]]
-    uri = header["buffers"][view["buffer"]].get("uri")
-    buffer = (binary or b"") if uri is None else _data_uri(uri)
-    start = int(view.get("byteOffset", 0))
-    return buffer[start : start + int(view["byteLength"])]
-
-
-def _data_uri(uri: str) -> bytes:
-    return base64.b64decode(uri.split(",", 1)[1])
+    if len(primitives) > MAX_PARTS or len(header.get("nodes", [])) > MAX_PARTS:
+        raise MeshError(f"the glTF has more than {MAX_PARTS} parts: join them")

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.scene.limits import MAX_COORDINATE_M, MeshError
+from server.scene.materials import MATTE, Material
 from server.scene.mesh_parts import FORMATS, MeshPart, read_parts
 from server.scene.normals import creased_normals, face_crosses, numbered, unit
 
@@ -30,13 +31,28 @@ class Mesh:
     triangles: NDArray[np.int32]
     """[t, 3] indices into the vertices, counter-clockwise seen from outside where the file says so."""
     vertex_colors: NDArray[np.float32]
-    """[v, 3] linear base colour, 0 to 1."""
+    """[v, 3] linear base colour, 0 to 1; the materials' textures multiply it."""
     normals: NDArray[np.float32]
     """[v, 3] unit, model axes."""
     up_axis: UpAxis
     """The model axis that points up: +y for obj, glb and gltf, +z for ply and stl."""
     notes: tuple[str, ...] = ()
     """What was dropped or not read, one line each."""
+    uv: NDArray[np.float32] | None = None
+    """[v, 4] texture coordinates of base colour, and of roughness and metalness; (0, 0) is the upper left corner."""
+    triangle_materials: NDArray[np.int32] | None = None
+    """[t] which of the materials; None: the first."""
+    materials: tuple[Material, ...] = (MATTE,)
+
+    @property
+    def texture_uv(self) -> NDArray[np.float32]:
+        """[v, 4] `uv`, zeros where there are none."""
+        return np.zeros((len(self.vertices), 4), np.float32) if self.uv is None else self.uv
+
+    @property
+    def material_of(self) -> NDArray[np.int32]:
+        """[t] `triangle_materials`, zeros where all have the first."""
+        return np.zeros(len(self.triangles), np.int32) if self.triangle_materials is None else self.triangle_materials
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -71,7 +87,14 @@ def _without_bad(part: MeshPart, dropped: Counter[str]) -> MeshPart:
     triangles = _kept(triangles, _has_area(vertices, triangles), "without area", dropped)
     used, inverse = np.unique(triangles, return_inverse=True)
     normals = None if part.normals is None else part.normals[used]
-    return MeshPart(vertices[used].astype(np.float64), inverse.reshape(-1, 3), part.colors[used], normals)
+    return replace(
+        part,
+        vertices=vertices[used].astype(np.float64),
+        triangles=inverse.reshape(-1, 3),
+        colors=part.colors[used],
+        normals=normals,
+        uv=part.uv[used],
+    )
 
 
 def _all_corners(good: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -101,16 +124,25 @@ def _with_normals(part: MeshPart) -> MeshPart:
         lengths = np.linalg.norm(part.normals, axis=1)
         if (np.isfinite(lengths) & (lengths > 1e-6)).all():
             return replace(part, normals=unit(part.normals))
-    same = numbered(np.hstack([part.vertices, part.colors]))  # an STL repeats its vertices in every triangle
+    # An STL repeats its vertices in every triangle.
+    same = numbered(np.hstack([part.vertices, part.colors, part.uv]))
     _, first = np.unique(same, return_index=True)
-    vertices, colors = part.vertices[first], part.colors[first]
-    source, triangles, normals = creased_normals(vertices, same[part.triangles])
-    return MeshPart(vertices[source], triangles, colors[source], normals)
+    source, triangles, normals = creased_normals(part.vertices[first], same[part.triangles])
+    kept = first[source]
+    return replace(
+        part,
+        vertices=part.vertices[kept],
+        triangles=triangles,
+        colors=part.colors[kept],
+        normals=normals,
+        uv=part.uv[kept],
+    )
 
 
 def _joined(parts: list[MeshPart], up_axis: UpAxis, notes: tuple[str, ...]) -> Mesh:
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])
     normals = [part.normals for part in parts if part.normals is not None]
+    numbers = {material: k for k, material in enumerate(dict.fromkeys(part.material for part in parts))}
     return Mesh(
         vertices=np.concatenate([part.vertices for part in parts]).astype(np.float32),
         triangles=np.concatenate([p.triangles + f for p, f in zip(parts, first, strict=False)]).astype(np.int32),
@@ -118,4 +150,9 @@ def _joined(parts: list[MeshPart], up_axis: UpAxis, notes: tuple[str, ...]) -> M
         normals=np.concatenate(normals).astype(np.float32),
         up_axis=up_axis,
         notes=notes,
+        uv=np.concatenate([part.uv for part in parts]).astype(np.float32),
+        triangle_materials=np.repeat(
+            np.array([numbers[part.material] for part in parts], np.int32), [len(part.triangles) for part in parts]
+        ),
+        materials=tuple(numbers),
     )

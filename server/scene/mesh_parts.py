@@ -1,10 +1,14 @@
-"""The parts of a mesh file as trimesh reads them: placed by the file's scene graph, coloured in linear light."""
+"""The parts of a mesh file as trimesh reads them: placed by the file's scene graph, coloured in linear light.
+
+Vertex colours are sRGB in every format, glTF's COLOR_0 included (the command line's contract), factors are linear.
+"""
 
 from __future__ import annotations
 
 import io
+import re
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 from typing import Any
 
@@ -12,11 +16,14 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from server.scene.colors import linear_from_srgb, sample_texture, unit_range
-from server.scene.gltf import BaseColor, prepare_gltf
+from server.scene.colors import linear_from_srgb, unit_range
+from server.scene.gltf import COLOR_UV, SURFACE_UV, prepare_gltf
+from server.scene.gltf_materials import GltfMaterial, TextureUse
 from server.scene.limits import MAX_TRIANGLES, MAX_VERTICES, MeshError
+from server.scene.materials import MATTE, Beyond, Material, Texture
 
 DEFAULT_BASE_COLOR = 0.8
+_FARTHEST_UV = 1e6
 FORMATS = ("glb", "gltf", "obj", "ply", "stl")
 
 _loading = Lock()  # warnings.catch_warnings changes what the whole process warns of
@@ -31,13 +38,18 @@ class MeshPart:
     triangles: NDArray[np.int64]
     """[t, 3] vertex numbers, which may not exist."""
     colors: NDArray[np.float32]
-    """[v, 3] linear base colour."""
+    """[v, 3] linear base colour, less its texture."""
     normals: NDArray[np.float64] | None
     """[v, 3] of any length; None where the file has none."""
+    uv: NDArray[np.float32]
+    """[v, 4] texture coordinates of base colour, and of roughness and metalness."""
+    material: Material = MATTE
 
 
 def read_parts(data: bytes, file_format: str) -> tuple[list[MeshPart], tuple[str, ...]]:
     """Every part of a file of one of FORMATS, and notes on what was not read. Raises MeshError."""
+    if not data:
+        raise MeshError(f"the {file_format} file is empty: export it again")
     with _loading, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -50,12 +62,14 @@ def read_parts(data: bytes, file_format: str) -> tuple[list[MeshPart], tuple[str
 
 
 def _read(data: bytes, file_format: str) -> tuple[list[MeshPart], tuple[str, ...]]:
-    materials: list[BaseColor] = []
+    materials: list[GltfMaterial] = []
     notes: tuple[str, ...] = ()
     if file_format in {"glb", "gltf"}:
         data, materials, notes = prepare_gltf(data)
     elif file_format == "obj":
         data, notes = _without_materials(data)
+    else:
+        _refuse_announced(data, file_format)
     scene: Any = trimesh.load_scene(io.BytesIO(data), file_type=file_format, process=False)
     places = [scene.graph[node] for node in scene.graph.nodes_geometry]
     meshes = [(matrix, scene.geometry[name]) for matrix, name in places]
@@ -73,32 +87,49 @@ def _without_materials(obj: bytes) -> tuple[bytes, tuple[str, ...]]:
     return b"\n".join(kept), ("the OBJ's materials are in another file and were not read: send a GLB for its colours",)
 
 
+def _refuse_announced(data: bytes, file_format: str) -> None:
+    """Refuse a PLY or binary STL by the size that its header announces, before it is read."""
+    vertices, triangles = 0, 0
+    if file_format == "ply":
+        header = data[: data.find(b"end_header") + 1][:65536]
+        counts = dict(re.findall(rb"element\s+(vertex|face)\s+(\d{1,18})", header))
+        vertices, triangles = int(counts.get(b"vertex", 0)), int(counts.get(b"face", 0))
+    elif len(data) >= 84 and not data.lstrip().startswith(b"solid"):
+        triangles = int.from_bytes(data[80:84], "little")
+    if triangles > MAX_TRIANGLES or vertices > MAX_VERTICES:
+        raise MeshError(
+            f"the mesh has {triangles} triangles and {vertices or 3 * triangles} vertices, more than "
+            f"{MAX_TRIANGLES} and {MAX_VERTICES}: simplify it"
+        )
+
+
 def _refuse_oversized(meshes: list[Any]) -> None:
     triangles = sum(len(mesh.faces) for mesh in meshes)
     if triangles > MAX_TRIANGLES or sum(len(mesh.vertices) for mesh in meshes) > MAX_VERTICES:
         raise MeshError(f"the mesh has {triangles} triangles, more than {MAX_TRIANGLES}: simplify it")
 
 
-def _part(mesh: Any, matrix: NDArray[np.float64], materials: list[BaseColor]) -> MeshPart:
+def _part(mesh: Any, matrix: NDArray[np.float64], materials: list[GltfMaterial]) -> MeshPart:
     vertices, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     # Only what the file brought: the property itself would compute them.
     normals = mesh._cache.cache.get("vertex_normals")
-    colors = _base_colors(mesh, materials)
+    found = _material(mesh, materials)
+    colors, (uv, material) = _base_colors(mesh, found), _texture_uv(mesh, found)
     if mesh.visual.kind == "face":  # one colour a triangle: give each its own vertices
         safe = np.clip(triangles.reshape(-1), 0, len(vertices) - 1)
-        vertices, colors = vertices[safe], np.repeat(colors, 3, axis=0)
+        vertices, colors, uv = vertices[safe], np.repeat(colors, 3, axis=0), uv[safe]
         normals = None if normals is None else normals[safe]
         triangles = np.arange(len(vertices)).reshape(-1, 3)
-    return _placed(vertices, triangles, colors, normals, np.asarray(matrix, np.float64))
+    vertices, triangles, normals = _placed(vertices, triangles, normals, np.asarray(matrix, np.float64))
+    return MeshPart(vertices, triangles, colors, normals, uv, material)
 
 
 def _placed(
     vertices: NDArray[np.float64],
     triangles: NDArray[np.int64],
-    colors: NDArray[np.float32],
     normals: NDArray[np.float64] | None,
     matrix: NDArray[np.float64],
-) -> MeshPart:
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
     """The part moved by its node's `matrix`; a mirroring one turns the triangles back round."""
     with np.errstate(over="ignore", invalid="ignore"):
         linear = matrix[:3, :3]
@@ -107,24 +138,63 @@ def _placed(
         if normals is not None:
             cofactors = np.stack([np.cross(linear[(k + 1) % 3], linear[(k + 2) % 3]) for k in range(3)])
             normals = np.asarray(normals, np.float64) @ cofactors.T * (-1.0 if mirrored else 1.0)
-    return MeshPart(vertices, triangles[:, ::-1] if mirrored else triangles, colors, normals)
+    return vertices, triangles[:, ::-1] if mirrored else triangles, normals
 
 
-def _base_colors(mesh: Any, materials: list[BaseColor]) -> NDArray[np.float32]:
-    """[v, 3] linear (face colours: [t, 3]): material times texture times vertex colours; grey where there is none."""
+def _material(mesh: Any, materials: list[GltfMaterial]) -> GltfMaterial | None:
+    """What prepare_gltf said of the part's material; None where the file names none."""
+    name = str(getattr(getattr(mesh.visual, "material", None), "name", None))
+    return materials[int(name)] if name.isdigit() and int(name) < len(materials) else None
+
+
+def _base_colors(mesh: Any, material: GltfMaterial | None) -> NDArray[np.float32]:
+    """[v, 3] linear (face colours: [t, 3]): the material's factor times vertex colours; grey where there is neither."""
     visual, count = mesh.visual, len(mesh.vertices)
     if visual.kind == "face":
         return linear_from_srgb(unit_range(np.asarray(visual.face_colors))[:, :3])
     if visual.kind == "vertex":
         return linear_from_srgb(unit_range(np.asarray(visual.vertex_colors))[:, :3])
-    name = str(getattr(getattr(visual, "material", None), "name", None))
-    if not name.isdigit() or int(name) >= len(materials):
+    if material is None:
         return np.full((count, 3), DEFAULT_BASE_COLOR, np.float32)
-    colors = np.tile(np.asarray(materials[int(name)].factor, np.float32), (count, 1))
-    texture, uv = materials[int(name)].texture, visual.uv
-    if texture is not None and uv is not None and len(uv) == count:
-        colors *= sample_texture(texture, np.asarray(uv, np.float64) * (1, -1) + (0, 1))
+    colors = np.tile(np.asarray(material.factor, np.float32), (count, 1))
     own = visual.vertex_attributes.get("color")
     if own is not None and len(own) == count:
         colors *= linear_from_srgb(unit_range(np.asarray(own))[:, :3])
     return colors
+
+
+def _texture_uv(mesh: Any, found: GltfMaterial | None) -> tuple[NDArray[np.float32], Material]:
+    """[v, 4] where the part's vertices read its textures, 0 where they do not; its material less what has no places."""
+    uv = np.zeros((len(mesh.vertices), 4), np.float32)
+    if found is None:
+        return uv, MATTE
+    material = found.material
+    color = _changed_uv(mesh.vertex_attributes.get(COLOR_UV), found.color_use, material.color_texture, len(uv))
+    surface = _changed_uv(mesh.vertex_attributes.get(SURFACE_UV), found.surface_use, material.surface_texture, len(uv))
+    if color is not None:
+        uv[:, :2] = color
+    elif material.color_texture is not None:
+        material = replace(material, color_texture=None)
+    if surface is not None:
+        uv[:, 2:] = surface
+    elif material.surface_texture is not None:
+        material = replace(material, surface_texture=None)
+    return uv, material
+
+
+def _changed_uv(
+    given: NDArray[Any] | None, use: TextureUse | None, texture: Texture | None, count: int
+) -> NDArray[np.float64] | None:
+    """[count, 2] coordinates as the device reads them: transformed, finite, and near 0 where the texture repeats.
+
+    None where there are none, or no texture.
+    """
+    if given is None or use is None or texture is None or np.shape(given) != (count, 2):
+        return None
+    # Integers are normalised; floats of any size are coordinates.
+    values = given / np.iinfo(given.dtype).max if np.issubdtype(given.dtype, np.integer) else given.astype(np.float64)
+    values = np.clip(np.nan_to_num(values), -_FARTHEST_UV, _FARTHEST_UV)
+    values = values @ use.transform[:, :2].T + use.transform[:, 2]
+    values = np.clip(np.nan_to_num(values), -_FARTHEST_UV, _FARTHEST_UV)
+    repeats = np.array([beyond is not Beyond.CLAMP for beyond in texture.beyond])
+    return values - np.where(repeats, 2 * np.floor(np.median(values, axis=0) / 2), 0.0)

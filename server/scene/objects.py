@@ -2,49 +2,78 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import pyopencl as cl
 from numpy.typing import NDArray
 
 from server.opencl.engine import Engine
+from server.scene.limits import MAX_OBJECTS, MAX_SCENE_TRIANGLES, MeshError
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement, world_from_model
 from server.scene.virtual_object import VirtualObject
 from server.stages.rasterize import Placed
 
+CELLS, FEWER_CELLS = 64, 24
+"""Along the longest side of an object's distance grid; the fewer once FINE_GRIDS different meshes have the more."""
+FINE_GRIDS = 64
+
 
 @dataclass(frozen=True)
 class _Entry:
     mesh: Mesh
-    thing: VirtualObject
+    digest: bytes
     world_from_model: NDArray[np.float64]
 
 
 class SceneObjects:
-    """Objects by id, in the order in which they came."""
+    """Objects by id, in the order in which they came. Meshes that are equal are on the device once."""
 
     def __init__(self, engine: Engine, up: NDArray[np.float64]) -> None:
         self._engine = engine
         self.up = up
         self._entries: dict[str, _Entry] = {}
+        self._things: dict[bytes, VirtualObject] = {}
+        self._uses: Counter[bytes] = Counter()
 
     def place(self, object_id: str, mesh: Mesh, placement: Placement) -> None:
-        """Add a mesh, in the place of one with the same id."""
-        entry = _Entry(mesh, VirtualObject.upload(self._engine, mesh), world_from_model(mesh, placement, self.up))
+        """Add a mesh, in the place of one with the same id.
+
+        Raises ValueError, one line, where it cannot stand there or the scene is full; the scene is then as it was.
+        """
+        others = (entry.mesh for name, entry in self._entries.items() if name != object_id)
+        check_room(others, mesh)
+        matrix = world_from_model(mesh, placement, self.up)
+        digest = mesh_digest(mesh)
+        if digest not in self._things:
+            cells = CELLS if len(self._things) < FINE_GRIDS else FEWER_CELLS
+            try:
+                self._things[digest] = VirtualObject.upload(self._engine, mesh, cells)
+            except cl.MemoryError as error:
+                raise MeshError("the device has no memory left for this object: remove others") from error
+        self._uses[digest] += 1
         if object_id in self._entries:
             self.remove(object_id)
-        self._entries[object_id] = entry
+        self._entries[object_id] = _Entry(mesh, digest, matrix)
 
     def move(self, object_id: str, placement: Placement) -> None:
-        """Give an object another place. Raises KeyError if there is none of that id."""
+        """Give an object another place. Raises KeyError if there is none of that id, ValueError as place() does."""
         entry = self._entries[object_id]
         placed = world_from_model(entry.mesh, placement, self.up)
-        self._entries[object_id] = _Entry(entry.mesh, entry.thing, placed)
+        self._entries[object_id] = _Entry(entry.mesh, entry.digest, placed)
 
     def remove(self, object_id: str) -> None:
         """Take an object away. Raises KeyError if there is none of that id."""
-        self._entries.pop(object_id).thing.release()
+        digest = self._entries.pop(object_id).digest
+        self._uses[digest] -= 1
+        if self._uses[digest] == 0:
+            del self._uses[digest]
+            self._things.pop(digest).release()
 
     def clear(self) -> None:
         """Take all objects away."""
@@ -53,4 +82,40 @@ class SceneObjects:
 
     def placed(self, volume_from_world: NDArray[np.float64]) -> list[Placed]:
         """Each object with its volume_from_model."""
-        return [(entry.thing, volume_from_world @ entry.world_from_model) for entry in self._entries.values()]
+        entries = self._entries.values()
+        return [(self._things[entry.digest], volume_from_world @ entry.world_from_model) for entry in entries]
+
+
+def check_room(others: Iterable[Mesh], mesh: Mesh) -> None:
+    """Raises MeshError, one line, if `mesh` is too much beside `others`, the meshes of a scene's other objects."""
+    counts = [len(other.triangles) for other in others]
+    if len(counts) >= MAX_OBJECTS:
+        raise MeshError(f"the scene has {len(counts)} objects, more are not shown: remove some")
+    if sum(counts) + len(mesh.triangles) > MAX_SCENE_TRIANGLES:
+        raise MeshError(
+            f"with this object the scene would have {sum(counts) + len(mesh.triangles)} triangles, "
+            f"more than {MAX_SCENE_TRIANGLES}: remove objects or simplify them"
+        )
+
+
+def mesh_digest(mesh: Mesh) -> bytes:
+    """The same for meshes that look the same."""
+    digest = hashlib.blake2b(digest_size=16)
+    arrays: list[NDArray[Any]] = [
+        mesh.vertices,
+        mesh.triangles,
+        mesh.vertex_colors,
+        mesh.normals,
+        mesh.texture_uv,
+        mesh.material_of,
+    ]
+    for material in mesh.materials:
+        digest.update(f"{material.roughness} {material.metalness} ".encode())
+        for texture in (material.color_texture, material.surface_texture):
+            digest.update(b"none" if texture is None else f"{texture.image.shape} {texture.beyond}".encode())
+            if texture is not None:
+                arrays.append(texture.image)
+    for array in arrays:
+        digest.update(f"{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.digest()

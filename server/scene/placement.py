@@ -12,6 +12,9 @@ from server.scene.mesh import Mesh, UpAxis
 
 Matrix = NDArray[np.float64]
 
+SMALLEST_M, LARGEST_M = 1e-4, 1e5
+"""Of an object's longest side, and of its distance from the world's origin."""
+
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _LEAST_HORIZONTAL = 1e-3
 """Below this length the horizontal part of the world's x axis says nothing of a heading."""
@@ -41,8 +44,10 @@ def world_from_model(mesh: Mesh, placement: Placement, up: NDArray[np.float64]) 
     Heading at yaw 0: the model's +x points along the horizontal direction nearest to the world's +x. A model thus keeps
     the axes it was made in where the world is upright in the same way, and faces the first camera (front: +z of a y-up
     model, -y of a z-up one) where the world is that camera's. The heading changes continuously with `up`, except near
-    the world's x axis, where the world's +y takes the place of its +x. Raises ValueError if `up` has no direction.
+    the world's x axis, where the world's +y takes the place of its +x. Raises ValueError if `up` has no direction, and
+    as check_size() does.
     """
+    check_size(mesh, placement)
     if placement.position_m is None:
         return np.eye(4)
     linear = placement.scale * _yaw(up, placement.yaw_deg) @ _upright(up) @ _y_up(mesh.up_axis)
@@ -50,6 +55,21 @@ def world_from_model(mesh: Mesh, placement: Placement, up: NDArray[np.float64]) 
     matrix[:3, :3] = linear
     matrix[:3, 3] = np.asarray(placement.position_m) - linear @ bottom_center(mesh)
     return matrix
+
+
+def check_size(mesh: Mesh, placement: Placement) -> None:
+    """Raises ValueError, one line, for what float32 cannot draw: a speck, a planet, or a thing beyond the horizon."""
+    low, high = mesh.bounds
+    scale = 1.0 if placement.position_m is None else placement.scale
+    size_m = float((high - low).max()) * scale
+    away_m = max(map(abs, placement.position_m or (*low.tolist(), *high.tolist())))
+    if not SMALLEST_M <= size_m <= LARGEST_M:
+        raise ValueError(
+            f"the object would be {size_m:.3g} m long, must be between {SMALLEST_M:g} and {LARGEST_M:g} m: "
+            "choose another scale"
+        )
+    if away_m > LARGEST_M:
+        raise ValueError(f"the object would be {away_m:.3g} m away, more than {LARGEST_M:g} m: choose another place")
 
 
 def bottom_center(mesh: Mesh) -> NDArray[np.float64]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl as cl
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from server.opencl.engine import Engine
 from server.scene.mesh import Mesh
+from server.scene.mipmaps import MaterialTables, material_tables
+from server.stages.object_glow import SurfacePoints, deal_points
 from server.stages.voxelize import DistanceGrid, voxelize
 
 
@@ -23,19 +25,42 @@ class VirtualObject:
     triangles: cl_array.Array
     """[t, 3] int32."""
     attributes: cl_array.Array
-    """[v, 6] float32: unit normal in model axes, linear base colour."""
+    """[v, 12] float32: unit normal in model axes, 0; linear base colour, 0; texture coordinates of base colour and of
+    roughness and metalness.
+    """
+    material_of: cl_array.Array
+    """[t] int32: row of `tables.materials`."""
+    texels: cl_array.Array
+    """[n, 4] uint8: all mip levels of all textures."""
+    tables: MaterialTables
+    """Materials and textures, on the host, less their texels."""
     bounds: tuple[NDArray[np.float64], NDArray[np.float64]]
     """Lowest and highest corner of the box around the vertices, model metres."""
     grid: DistanceGrid
+    surface_points: SurfacePoints
+    """Where what it sends is known."""
 
     @classmethod
     def upload(cls, engine: Engine, mesh: Mesh, cells: int = 64) -> VirtualObject:
         """Copy `mesh` to the device and voxelise it, `cells` along the longest side of its grid."""
-        vertices = cl_array.to_device(engine.queue, mesh.vertices)
-        triangles = cl_array.to_device(engine.queue, mesh.triangles)
-        attributes = np.hstack([mesh.normals, mesh.vertex_colors])
+        tables = material_tables(mesh.materials)
+        texels = tables.texels if len(tables.texels) else np.zeros((1, 4), np.uint8)
+        vertices, triangles, attributes, material_of, texels_there = (
+            cl_array.to_device(engine.queue, array)
+            for array in (mesh.vertices, mesh.triangles, _attributes(mesh), mesh.material_of, texels)
+        )
         grid = voxelize(engine, vertices, triangles, mesh.bounds, cells)
-        return cls(vertices, triangles, cl_array.to_device(engine.queue, attributes), mesh.bounds, grid)
+        return cls(
+            vertices,
+            triangles,
+            attributes,
+            material_of,
+            texels_there,
+            replace(tables, texels=np.zeros((0, 4), np.uint8)),
+            mesh.bounds,
+            grid,
+            deal_points(engine, mesh, grid),
+        )
 
     @property
     def bytes_held(self) -> int:
@@ -50,4 +75,11 @@ class VirtualObject:
 
     @property
     def _arrays(self) -> tuple[cl_array.Array, ...]:
-        return self.vertices, self.triangles, self.attributes, self.grid.distance
+        return self.vertices, self.triangles, self.attributes, self.material_of, self.texels, self.grid.distance
+
+
+def _attributes(mesh: Mesh) -> NDArray[np.float32]:
+    """[v, 12], see VirtualObject."""
+    attributes = np.zeros((len(mesh.vertices), 12), np.float32)
+    attributes[:, :3], attributes[:, 4:7], attributes[:, 8:] = mesh.normals, mesh.vertex_colors, mesh.texture_uv
+    return attributes

@@ -7,8 +7,6 @@ without, so what is marked is where that changes from sample to sample: the rims
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
@@ -17,21 +15,11 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
 from server.opencl.transfer import fill_bytes
-from server.stages.differential_rendering import (
-    Changed,
-    DeviceLight,
-    RealShadow,
-    SampleGrid,
-    ball_around,
-    light_arguments,
-    object_arguments,
-)
-from server.stages.object_glow import Glow
-from server.stages.radiance_transfer import Directions
-from server.stages.rasterize import Placed, VirtualSurface
+from server.stages.differential_rendering import RealShadow, ball_around
+from server.stages.rasterize import VirtualSurface
 from server.stages.raycast import Surface
-from server.stages.volume import Volume
-from server.stages.voxelize import ObjectTable
+from server.stages.sample_grid import SampleGrid
+from server.stages.traced_scene import TracedScene
 
 LEAST_CHANGE = 1 / 16
 """Of R' / R from the 4 x 4 samples to one side to those to the other, from which on it is sampled at every pixel."""
@@ -40,77 +28,50 @@ MARGIN_PX = 2
 _LEAST_LISTED = 1024
 
 
-def refine_virtual(
-    engine: Engine,
-    camera: CameraModel,
-    virtual: VirtualSurface,
-    volume: Volume,
-    bands: int,
-    light: DeviceLight,
-    rays: Directions,
-    reach_m: float,
-    table: ObjectTable,
-    glow: Glow | None = None,
-    changed: Changed | None = None,
-) -> cl_array.Array:
+def refine_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, scene: TracedScene) -> cl_array.Array:
     """[h, w] float4: radiance that occluders take from the virtual surface near its edges; w = 0 elsewhere."""
     occluded = _empty(engine, camera, "refined_occluded")
     edges = engine.workspace.array("virtual_edges", (camera.height, camera.width), np.uint8)
-    kernel = engine.kernel("adaptive.cl", "mark_edges", **_defines(engine, bands))
+    kernel = engine.kernel("adaptive.cl", "mark_edges", **_defines(engine, scene.bands))
     size = (camera.width, camera.height)
-    engine.launch(kernel, size, *size, virtual.position, virtual.normal, volume.voxel_m, edges)
+    engine.launch(kernel, size, *size, virtual.position, virtual.normal, scene.volume.voxel_m, edges)
     near = grown(engine.download(edges) > 0, MARGIN_PX)
     listed, pixels = _list_pixels(engine, "edge_pixels", near)
     engine.launch(
-        engine.kernel("adaptive.cl", "refine_virtual", **_defines(engine, bands)),
+        engine.kernel("adaptive.cl", "refine_virtual", **_defines(engine, scene.bands)),
         (listed,),
         listed,
         pixels,
         camera.width,
         virtual.position,
         virtual.normal,
-        *volume.arguments(),
-        *light_arguments(engine, light, rays, reach_m, volume, changed),
-        *object_arguments(engine, table, glow),
-        max(table.cell_m, default=0.0),
+        *scene.arguments(engine),
+        scene.offset_m,
         occluded,
     )
     return occluded
 
 
 def refine_real(
-    engine: Engine,
-    camera: CameraModel,
-    surface: Surface,
-    bands: int,
-    volume: Volume,
-    light: DeviceLight,
-    rays: Directions,
-    reach_m: float,
-    objects: Sequence[Placed],
-    table: ObjectTable,
-    ratio: RealShadow,
-    glow: Glow | None = None,
+    engine: Engine, camera: CameraModel, surface: Surface, scene: TracedScene, ratio: RealShadow
 ) -> cl_array.Array:
     """[h, w] float4: R' / R of real surface (eq. 7.1) where it varies among the samples of `ratio`; w = 0 elsewhere."""
     refined = _empty(engine, camera, "refined_ratio")
-    cells = varying_cells(engine, ratio, bands)
+    cells = varying_cells(engine, ratio, scene.bands)
     if not cells.any():
         return refined
     listed, pixels = _list_pixels(engine, "varying_pixels", pixels_of(cells, ratio.stride, camera.width, camera.height))
     engine.launch(
-        engine.kernel("adaptive.cl", "refine_real", **_defines(engine, bands)),
+        engine.kernel("adaptive.cl", "refine_real", **_defines(engine, scene.bands)),
         (listed,),
         listed,
         pixels,
         camera.width,
         surface.positions,
         surface.normals,
-        *volume.arguments(),
-        *light_arguments(engine, light, rays, reach_m, volume),
-        *object_arguments(engine, table, glow),
-        ball_around(objects),
-        light.coefficients,
+        *scene.arguments(engine),
+        ball_around(scene.objects),
+        scene.light.coefficients,
         ratio.cols,
         ratio.rows,
         ratio.stride,

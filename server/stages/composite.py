@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine, KernelArgument, float16
-from server.stages.differential_rendering import DeviceLight, SampleGrid
 from server.stages.measure import linear_values
 from server.stages.rasterize import VirtualSurface
 from server.stages.raycast import Surface
+from server.stages.sample_grid import SampleGrid
 from server.stages.sampling import Upsampling
+from server.stages.traced_scene import DeviceLight
 
 
 def srgb_codes(linear: NDArray[np.float64]) -> NDArray[np.uint8]:

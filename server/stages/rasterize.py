@@ -1,40 +1,48 @@
-"""Virtual geometry buffer (thesis 7.2, fig. 7.5): meshes drawn as position, normal and base colour.
+"""Virtual geometry buffer (thesis 7.2, fig. 7.5): meshes drawn as position, normal, base colour and material.
 
 Kernels: rasterize.cl. A pixel belongs to the nearest triangle that covers its centre; where two are equally near, to
 the one with the lower number (objects in their order, triangles in the mesh's). The result does not depend on how work
-is scheduled.
+is scheduled. All objects are drawn together: the number of launches does not depend on theirs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate, product
 
 import numpy as np
+import pyopencl as cl
 import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.opencl.engine import Engine, float16, int4
+from server.opencl.engine import Engine, int2
 from server.scene.virtual_object import VirtualObject
+from server.stages.pixel_boxes import NEAR_M, PixelBox, pixel_boxes
+from server.stages.raster_tables import CHUNK, TILE, Picture, tabulate
 
-NEAR_M = 0.05
-"""Nothing nearer to the camera's plane is drawn."""
-_TILE = 8
+__all__ = ["NEAR_M", "PixelBox", "Placed", "VirtualSurface", "boxes_in_view", "rasterize"]
+
 _SCAN_ITEMS = 256
 _LEAST_ENTRIES = 1 << 16
 _LEAST_ROOM = 1 << 10
+_PIECES_PER_PIXEL = 4
+"""Room for so many at first, if there are triangles for them; made larger when they need it."""
+_FRAGMENTS_PER_PIXEL = 2
+"""Room for so many; where there are more, their triangles are gone through a second time."""
+_FRAGMENTS_PER_TRIANGLE = 40
+"""More than a triangle in a square of 8 pixels covers."""
+_MOST_ENTRIES = 1 << 27
+"""Of all tiles together: 512 MiB."""
 
 Matrix = NDArray[np.float64]
-PixelBox = tuple[int, int, int, int]
 Placed = tuple[VirtualObject, Matrix]
 
 
 @dataclass(frozen=True)
 class VirtualSurface:
-    """What the virtual objects show to one camera; arrays of the engine's workspace, valid until the next call."""
+    """What the virtual objects show to one camera; arrays of the workspace, valid until the next call of that name."""
 
     position: cl_array.Array
     """[h, w] float4: volume space metres (world axes, origin at the volume's), w = 1; all 0 where there is none."""
@@ -46,198 +54,195 @@ class VirtualSurface:
     """[h, w] int32: position in the sequence of objects, -1 where there is none."""
     boxes: tuple[PixelBox | None, ...]
     """For each object x0, y0, x1, y1 (half-open, inside the picture) that holds all its pixels; None: not in view."""
+    material: cl_array.Array | None = None
+    """[h, w] float4: perceptual roughness, metalness, 0, w = 1; 0 where there is none; rasterize() always has it."""
 
 
 @dataclass(frozen=True)
-class _Pieces:
-    """Device lists of one picture's clipped triangles."""
+class _Lists:
+    """Device lists of one picture's triangles: of some size as pieces, sorted into tiles; small ones as fragments."""
 
+    projected: cl_array.Array
     corners: cl_array.Array
     inverse_depths: cl_array.Array
     starts: cl_array.Array
     entries: cl_array.Array
-
-
-@dataclass(frozen=True)
-class _Drawn:
-    """An object in view: its number, and the number of its first triangle."""
-
-    index: int
-    first: int
-    thing: VirtualObject
-    volume_from_model: Matrix
+    nearest: cl_array.Array
+    fragments: cl_array.Array
+    fragment_count: int
+    """Also of those that had no room."""
 
 
 def rasterize(
-    engine: Engine, camera: CameraModel, camera_from_volume: Matrix, objects: Sequence[Placed]
+    engine: Engine,
+    camera: CameraModel,
+    camera_from_volume: Matrix,
+    objects: Sequence[Placed],
+    name: str = "virtual",
 ) -> VirtualSurface:
     """Draw `objects`, each with its `volume_from_model`, as a pinhole camera sees them (its distortion is ignored).
 
-    `camera_from_volume` [4, 4] float64, rigid: camera axes x right, y down, z forward. Waits for the device once.
+    `camera_from_volume` [4, 4] float64, rigid: camera axes x right, y down, z forward. `name` tells the workspace's
+    arrays of one view from those of another. Waits for the device once.
     """
-    camera_from_model = [camera_from_volume @ volume_from_model for _, volume_from_model in objects]
-    pairs = list(zip(objects, camera_from_model, strict=True))
-    boxes = tuple(pixel_box(camera, matrix, *thing.bounds) for (thing, _), matrix in pairs)
-    in_view = [index for index, box in enumerate(boxes) if box is not None]
-    firsts = accumulate((len(objects[index][0].triangles) for index in in_view), initial=0)
-    drawn = [_Drawn(index, first, *objects[index]) for index, first in zip(in_view, firsts, strict=False)]
-    pieces = _make_pieces(engine, camera, camera_from_volume, drawn)
-    visible, object_index = _raster(engine, camera, pieces)
-    position, normal, base_color = _shade(engine, camera, camera_from_volume, drawn, visible)
-    return VirtualSurface(position, normal, base_color, object_index, boxes)
+    boxes = boxes_in_view(camera, camera_from_volume, objects)
+    picture = tabulate(engine, camera, camera_from_volume, objects, boxes)
+    visible = _raster(engine, picture, _make_lists(engine, picture))
+    object_index, position, normal, base_color, material = _shade(engine, picture, visible, name)
+    return VirtualSurface(position, normal, base_color, object_index, boxes, material)
 
 
-def pixel_box(
-    camera: CameraModel, camera_from_model: Matrix, low: NDArray[np.float64], high: NDArray[np.float64]
-) -> PixelBox | None:
-    """Box of pixels that holds everything of the model box `low` to `high` that is in view; None if nothing is."""
-    corners = np.array(list(product(*zip(low, high, strict=True))))
-    corners = corners @ camera_from_model[:3, :3].T + camera_from_model[:3, 3]
-    points = _in_front(corners)
-    if not len(points):
-        return None
-    pixels = points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    size = (camera.width, camera.height)
-    x0, y0 = np.clip(np.floor(pixels.min(axis=0)), 0, size).astype(int).tolist()
-    x1, y1 = np.clip(np.ceil(pixels.max(axis=0)) + 1, 0, size).astype(int).tolist()
-    return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
+def boxes_in_view(
+    camera: CameraModel, camera_from_volume: Matrix, objects: Sequence[Placed]
+) -> tuple[PixelBox | None, ...]:
+    """For each object the box of pixels that holds all of it that is in view, as VirtualSurface has it."""
+    matrices = np.array([matrix for _, matrix in objects], np.float64).reshape(-1, 4, 4)
+    low, high = (np.array([thing.bounds[k] for thing, _ in objects], np.float64).reshape(-1, 3) for k in (0, 1))
+    return pixel_boxes(camera, camera_from_volume @ matrices, low, high)
 
 
-def _in_front(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Corners of a box [8, 3] beyond the near plane, and where its edges pass through it."""
-    beyond = corners[:, 2] >= NEAR_M
-    start, end = _BOX_EDGES.T
-    crossing = beyond[start] != beyond[end]
-    a, b = corners[start][crossing], corners[end][crossing]
-    share = (NEAR_M - a[:, 2:]) / (b[:, 2:] - a[:, 2:])
-    return np.concatenate([corners[beyond], a + share * (b - a)])
-
-
-_BOX_EDGES = np.array([(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
-"""Pairs of corners that differ in one axis."""
-
-
-def _pixel_from_camera(camera: CameraModel) -> Matrix:
-    matrix = np.eye(4)
-    matrix[:2, :3] = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy]]
-    return matrix
-
-
-def _tiles(camera: CameraModel) -> int:
-    return -(-camera.width // _TILE) * -(-camera.height // _TILE)
+def _kernel(engine: Engine, name: str) -> cl.Kernel:
+    return engine.kernel("rasterize.cl", name)
 
 
 def _power_of_two(count: int) -> int:
     return 1 << max(count - 1, 0).bit_length()
 
 
-def _make_pieces(engine: Engine, camera: CameraModel, camera_from_volume: Matrix, drawn: list[_Drawn]) -> _Pieces:
-    """Project, clip and sort into tiles; what is too small is made larger, so nothing is lost."""
-    space, tiles = engine.workspace, _tiles(camera)
-    triangles = sum(len(item.thing.triangles) for item in drawn)
-    starts = space.array("raster_starts", (tiles + 2,), np.int32)
-    room, appended = 0, _LEAST_ROOM
-    while appended > room:
-        room = _power_of_two(appended)
-        corners = space.array("raster_corners", (triangles + room,), cl_types.int8)
-        inverse_depths = space.array("raster_inverse_depths", (triangles + room,), cl_types.float4)
-        counts = _setup(engine, camera, camera_from_volume, drawn, corners, inverse_depths)
-        scan = engine.kernel("rasterize.cl", "scan_tiles")
-        engine.launch(scan, (_SCAN_ITEMS,), tiles, counts, starts, local=(_SCAN_ITEMS,))
-        total, appended = (int(value) for value in engine.download(starts[tiles:]))
+def _make_lists(engine: Engine, picture: Picture) -> _Lists:
+    """Project, clip and sort; what is too small is made larger, so nothing is lost."""
+    space, tiles, shape = engine.workspace, picture.tiles, (picture.camera.height, picture.camera.width)
+    projected = _project(engine, picture)
+    starts = space.array("raster_starts", (tiles + 3,), np.int32)
+    counts = space.array("raster_counts", (2 + tiles,), np.int32)
+    nearest = space.array("raster_nearest", shape, np.uint32)
+    pixels = shape[0] * shape[1]
+    fragment_room = min(_FRAGMENTS_PER_TRIANGLE * picture.triangles, _FRAGMENTS_PER_PIXEL * pixels)
+    fragments = space.array("raster_fragments", (_power_of_two(max(fragment_room, 1)),), cl_types.int4)
+    room, pieces = 0, min(picture.triangles, _PIECES_PER_PIXEL * pixels) + _LEAST_ROOM
+    while pieces > room:
+        room = _power_of_two(pieces)
+        corners = space.array("raster_corners", (room,), cl_types.int8)
+        inverse_depths = space.array("raster_inverse_depths", (room,), cl_types.float4)
+        _setup(engine, picture, projected, counts, corners, inverse_depths, nearest, fragments)
+        scan = _kernel(engine, "scan_tiles")
+        engine.launch(scan, (_SCAN_ITEMS,), tiles, _MOST_ENTRIES // tiles, counts, starts, local=(_SCAN_ITEMS,))
+        total, pieces, fragment_count = (int(value) for value in engine.download(starts[tiles:]))
     entries = space.array("raster_entries", (_power_of_two(max(total, _LEAST_ENTRIES)),), np.int32)
-    fill = engine.kernel("rasterize.cl", "fill_tiles")
-    used = triangles + appended
-    engine.launch(fill, (used,), used, camera.width, camera.height, corners, starts, counts, entries)
-    return _Pieces(corners, inverse_depths, starts, entries)
+    engine.launch(_kernel(engine, "fill_tiles"), (pieces,), pieces, picture.size, corners, starts, counts, entries)
+    return _Lists(projected, corners, inverse_depths, starts, entries, nearest, fragments, fragment_count)
+
+
+def _project(engine: Engine, picture: Picture) -> cl_array.Array:
+    """The vertices of the objects in view on the screen, [vertices] int4."""
+    room = _power_of_two(max(picture.vertices, _LEAST_ROOM))
+    projected = engine.workspace.array("raster_projected", (room,), cl_types.int4)
+    engine.launch(
+        _kernel(engine, "project_vertices"),
+        (len(picture.vertex_chunks) * CHUNK if picture.vertices else 0,),
+        picture.vertex_chunks,
+        picture.objects,
+        picture.matrices,
+        NEAR_M,
+        picture.arena.vertices,
+        projected,
+        local=(CHUNK,),
+    )
+    return projected
 
 
 def _setup(
     engine: Engine,
-    camera: CameraModel,
-    camera_from_volume: Matrix,
-    drawn: list[_Drawn],
+    picture: Picture,
+    projected: cl_array.Array,
+    counts: cl_array.Array,
     corners: cl_array.Array,
     inverse_depths: cl_array.Array,
-) -> cl_array.Array:
-    """Fill `corners` and `inverse_depths` [pieces]; returns counts [1 + tiles]."""
-    counts = engine.workspace.array("raster_counts", (1 + _tiles(camera),), np.int32)
-    engine.launch(engine.kernel("rasterize.cl", "clear_counts"), counts.shape, counts.size, counts)
-    triangles = sum(len(item.thing.triangles) for item in drawn)
-    for item in drawn:
-        pixel_from_model = _pixel_from_camera(camera) @ camera_from_volume @ item.volume_from_model
-        count = len(item.thing.triangles)
-        engine.launch(
-            engine.kernel("rasterize.cl", "setup_triangles"),
-            (count,),
-            int4(count, item.first, triangles, len(corners) - triangles),
-            int4(camera.width, camera.height, item.index, 0),
-            item.thing.vertices,
-            item.thing.triangles,
-            float16(pixel_from_model),
-            NEAR_M,
-            counts,
-            corners,
-            inverse_depths,
-        )
-    return counts
-
-
-def _raster(engine: Engine, camera: CameraModel, pieces: _Pieces) -> tuple[cl_array.Array, cl_array.Array]:
-    """Number of the triangle and index of the object that each pixel shows, [h, w] int32, -1 where there is none."""
-    shape = (camera.height, camera.width)
-    visible = engine.workspace.array("raster_visible", shape, np.int32)
-    object_index = engine.workspace.array("virtual_object_index", shape, np.int32)
+    nearest: cl_array.Array,
+    fragments: cl_array.Array,
+) -> None:
+    """Fill the lists of pieces and fragments, as far as there is room, and count them."""
+    most = max(counts.size, nearest.size)
+    engine.launch(_kernel(engine, "clear_picture"), (most,), counts.size, nearest.size, counts, nearest)
     engine.launch(
-        engine.kernel("rasterize.cl", "raster_tiles"),
-        (_tiles(camera) * _TILE * _TILE,),
-        camera.width,
-        camera.height,
-        pieces.corners,
-        pieces.inverse_depths,
-        pieces.starts,
-        pieces.entries,
-        visible,
-        object_index,
-        local=(_TILE * _TILE,),
+        _kernel(engine, "setup_triangles"),
+        (len(picture.triangle_chunks) * CHUNK if picture.triangles else 0,),
+        picture.size,
+        int2(len(corners), len(fragments)),
+        picture.triangle_chunks,
+        picture.objects,
+        picture.matrices,
+        NEAR_M,
+        picture.arena.vertices,
+        picture.arena.triangles,
+        projected,
+        counts,
+        corners,
+        inverse_depths,
+        nearest,
+        fragments,
+        local=(CHUNK,),
     )
-    return visible, object_index
 
 
-def _shade(
-    engine: Engine, camera: CameraModel, camera_from_volume: Matrix, drawn: list[_Drawn], visible: cl_array.Array
-) -> tuple[cl_array.Array, cl_array.Array, cl_array.Array]:
-    """Position, normal and base colour of each pixel's triangle, [h, w] float4."""
-    space, shape = engine.workspace, visible.shape
-    position = space.array("virtual_position", shape, cl_types.float4)
-    normal = space.array("virtual_normal", shape, cl_types.float4)
-    base_color = space.array("virtual_base_color", shape, cl_types.float4)
-    clear = engine.kernel("rasterize.cl", "clear_uncovered")
-    engine.launch(clear, (visible.size,), visible.size, visible, position, normal, base_color)
-    for item in drawn:
+def _raster(engine: Engine, picture: Picture, lists: _Lists) -> cl_array.Array:
+    """Number of the triangle that each pixel shows, [h, w] int32, 2^31 - 1 where there is none."""
+    visible = engine.workspace.array("raster_visible", lists.nearest.shape, np.int32)
+    engine.launch(
+        _kernel(engine, "raster_tiles"),
+        (picture.tiles * TILE * TILE,),
+        picture.size,
+        lists.corners,
+        lists.inverse_depths,
+        lists.starts,
+        lists.entries,
+        lists.nearest,
+        visible,
+        local=(TILE * TILE,),
+    )
+    count = lists.fragment_count
+    if count <= len(lists.fragments):
+        engine.launch(_kernel(engine, "settle_fragments"), (count,), count, lists.fragments, lists.nearest, visible)
+    else:
         engine.launch(
-            engine.kernel("rasterize.cl", "shade_surface"),
-            (camera.width, camera.height),
-            int4(camera.width, camera.height, item.first, len(item.thing.triangles)),
+            _kernel(engine, "settle_triangles"),
+            (len(picture.triangle_chunks) * CHUNK,),
+            picture.size,
+            picture.triangle_chunks,
+            picture.objects,
+            picture.arena.triangles,
+            lists.projected,
+            lists.nearest,
             visible,
-            item.thing.vertices,
-            item.thing.triangles,
-            item.thing.attributes,
-            float16(_model_from_pixel(camera, camera_from_volume @ item.volume_from_model)),
-            float16(item.volume_from_model),
-            position,
-            normal,
-            base_color,
+            local=(CHUNK,),
         )
-    return position, normal, base_color
+    return visible
 
 
-def _model_from_pixel(camera: CameraModel, camera_from_model: Matrix) -> Matrix:
-    """Columns 0 to 2 take (u, v, 1) to a ray's direction in model space, column 3 is the camera's place there; the last
-    row takes a model point to its depth.
-    """
-    camera_from_pixel = np.linalg.inv(_pixel_from_camera(camera))
-    camera_from_pixel[:3, 3] = 0.0
-    matrix: Matrix = np.linalg.inv(camera_from_model) @ camera_from_pixel
-    matrix[3] = camera_from_model[2]
-    return matrix
+def _shade(engine: Engine, picture: Picture, visible: cl_array.Array, name: str) -> list[cl_array.Array]:
+    """Index of each pixel's object [h, w] int32; position, normal, base colour and material, [h, w] float4."""
+    space, arena = engine.workspace, picture.arena
+    object_index = space.array(f"{name}_object_index", visible.shape, np.int32)
+    parts = ("position", "normal", "base_color", "material")
+    fields = [space.array(f"{name}_{part}", visible.shape, cl_types.float4) for part in parts]
+    engine.launch(
+        _kernel(engine, "shade_surface"),
+        (picture.camera.width, picture.camera.height),
+        picture.size,
+        visible,
+        picture.count,
+        picture.objects,
+        picture.matrices,
+        arena.vertices,
+        arena.triangles,
+        arena.attributes,
+        arena.material_of,
+        arena.materials,
+        arena.textures,
+        arena.levels,
+        arena.texels,
+        arena.channel_values,
+        object_index,
+        *fields,
+    )
+    return [object_index, *fields]

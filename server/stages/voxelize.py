@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pyopencl as cl
@@ -16,6 +18,8 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from server.opencl.engine import Engine, float16, int4
+from server.opencl.transfer import copy_into
+from server.stages.object_tree import FEW_OBJECTS, grid_boxes, tree_rows
 
 if TYPE_CHECKING:
     from server.scene.virtual_object import VirtualObject
@@ -61,11 +65,11 @@ class ObjectTable:
 
     count: int
     grid_from_volume: cl_array.Array
-    """[count] float16: row-major 4x4, volume metres to cells."""
+    """[count] float16: row-major 4x4, volume metres to cells; where there are many, then a tree of their boxes."""
     dims: cl_array.Array
     """[count] int4: cells in x, y, z, and where the object's distances begin in the pool."""
     distances: cl_array.Array
-    """All distance grids one after the other, float32, cells."""
+    """All distance grids one after the other, each once, float32, cells."""
     cell_m: tuple[float, ...]
     """Side of each object's cells in volume metres: how far off its surface a ray must start."""
 
@@ -135,20 +139,47 @@ def squared_distance(engine: Engine, occupied: cl_array.Array) -> cl_array.Array
 
 
 def object_table(engine: Engine, objects: Sequence[tuple[VirtualObject, Matrix]]) -> ObjectTable:
-    """The table of `objects`, each with its `volume_from_model` [4, 4]: rotation, uniform scale and translation."""
-    space = engine.workspace
-    matrices = [thing.grid.grid_from_model @ np.linalg.inv(matrix) for thing, matrix in objects]
-    sizes = [thing.grid.distance.size for thing, _ in objects]
-    starts = [sum(sizes[:index]) for index in range(len(sizes))]
-    pool = space.array("object_distances", (max(sum(sizes), 1),), np.float32)
-    for (thing, _), start in zip(objects, starts, strict=True):
-        pool[start : start + thing.grid.distance.size] = thing.grid.distance.reshape(-1)  # type: ignore[no-untyped-call]
-    rows = np.array([matrix.ravel() for matrix in matrices] or np.zeros((1, 16)), np.float32)
-    dims = [(*thing.grid.dims, start) for (thing, _), start in zip(objects, starts, strict=True)] or [(0, 0, 0, 0)]
+    """The table of `objects`, each with its `volume_from_model` [4, 4]: rotation, uniform scale and translation.
+
+    A mesh that is placed several times is kept once; distances are copied only when the set of meshes changes.
+    """
+    space, count = engine.workspace, len(objects)
+    grids = [thing.grid for thing, _ in objects]
+    pool, starts = _gather_distances(engine, [grid.distance for grid in grids])
+    dims = np.array([(*grid.dims, starts[id(grid.distance)]) for grid in grids] or [(0, 0, 0, 0)], np.int32)
+    grid_from_model = np.array([grid.grid_from_model for grid in grids]).reshape(-1, 4, 4)
+    matrices = grid_from_model @ np.linalg.inv(np.array([matrix for _, matrix in objects]).reshape(-1, 4, 4))
+    rows = [matrices.reshape(-1, 16)]
+    if count > FEW_OBJECTS:
+        rows.append(tree_rows(*grid_boxes(matrices, dims[:, :3])))
+    table = np.concatenate(rows if count else [np.zeros((1, 16))]).astype(np.float32)
     return ObjectTable(
-        count=len(objects),
-        grid_from_volume=space.upload("object_grid_from_volume", rows.view(cl_types.float16)[:, 0]),
-        dims=space.upload("object_dims", np.array(dims, np.int32).view(cl_types.int4)[:, 0]),
+        count=count,
+        grid_from_volume=space.upload("object_grid_from_volume", table.view(cl_types.float16)[:, 0]),
+        dims=space.upload("object_dims", dims.view(cl_types.int4)[:, 0]),
         distances=pool,
-        cell_m=tuple(float(1 / np.linalg.norm(matrix[0, :3])) for matrix in matrices),
+        cell_m=tuple((1 / np.linalg.norm(matrices[:, 0, :3], axis=1)).tolist()),
     )
+
+
+_POOLED: WeakKeyDictionary[Engine, tuple[cl_array.Array, ...]] = WeakKeyDictionary()
+"""The grids whose distances are in each engine's pool, in their order."""
+
+
+def _gather_distances(engine: Engine, grids: list[cl_array.Array]) -> tuple[cl_array.Array, dict[int, int]]:
+    """Each of the `grids` once, one after the other, and by a grid's id where it begins; a single one is not copied."""
+    unique = tuple({id(grid): grid for grid in grids}.values())
+    first = accumulate((grid.size for grid in unique), initial=0)
+    starts = {id(grid): start for grid, start in zip(unique, first, strict=False)}
+    if len(unique) == 1:
+        return unique[0], starts
+    total = sum(grid.size for grid in unique)
+    if total >= 1 << 31:
+        raise ValueError(f"the objects' distance grids have {total} cells, more than 2^31: place fewer objects")
+    held, before = _POOLED.get(engine, ()), engine.workspace.find("object_distances")
+    pool = engine.workspace.array("object_distances", (max(total, 1),), np.float32)
+    if pool is not before or [*map(id, held)] != [*map(id, unique)]:
+        for grid in unique:
+            copy_into(engine.queue, pool, 4 * starts[id(grid)], grid)
+        _POOLED[engine] = unique
+    return pool, starts

@@ -12,11 +12,12 @@ from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine
 from server.scene.virtual_object import VirtualObject
 from server.stages import adaptive, differential_rendering
-from server.stages.differential_rendering import RealShadow, SampleGrid, shadow_real, shadow_virtual, upload_light
+from server.stages.differential_rendering import RealShadow, shadow_real, shadow_virtual
 from server.stages.radiance_transfer import direction_sets, transfer_radiance
 from server.stages.rasterize import rasterize
 from server.stages.raycast import LABEL_STATIC, Surface, raycast
-from server.stages.voxelize import object_table
+from server.stages.sample_grid import SampleGrid
+from server.stages.traced_scene import trace_scene, upload_light
 from tests.analytic import look_at
 from tests.meshes import shape_of
 from tests.reference import adaptive as twin
@@ -45,42 +46,18 @@ class Stage:
         self.transfer = transfer_radiance(engine, CAMERA, self.volume, self.surface, stride, self.rays, ROOM_M)
         sh = np.zeros((16, 3))
         sh[:4] = [[3.0, 2.8, 2.6], [1.2, 1.2, 1.2], [0.5, 0.4, 0.3], [1.0, 0.9, 0.8]]
-        self.light = upload_light(engine, sh, self.rays)
         placed = np.eye(4)
         placed[:3, 3] = (0.3, 0.17, 0.35)
         thing = VirtualObject.upload(engine, shape_of(trimesh.creation.box((0.06, 0.1, 0.06))))
-        self.objects = [(thing, placed)]
-        self.table = object_table(engine, self.objects)
-        self.virtual = rasterize(engine, CAMERA, inverse_rigid(VIEW), self.objects)
+        objects, light = [(thing, placed)], upload_light(engine, sh, self.rays)
+        self.scene = trace_scene(engine, self.volume, light, self.rays, ROOM_M, objects)
+        self.virtual = rasterize(engine, CAMERA, inverse_rigid(VIEW), objects)
 
     def ratio(self) -> RealShadow:
-        return shadow_real(
-            self.engine,
-            CAMERA,
-            self.surface,
-            self.transfer,
-            self.volume,
-            self.light,
-            self.rays,
-            ROOM_M,
-            self.objects,
-            self.table,
-        )
+        return shadow_real(self.engine, CAMERA, self.surface, self.transfer, self.scene)
 
     def refined(self, ratio: RealShadow) -> Floats:
-        found = adaptive.refine_real(
-            self.engine,
-            CAMERA,
-            self.surface,
-            self.transfer.bands,
-            self.volume,
-            self.light,
-            self.rays,
-            ROOM_M,
-            self.objects,
-            self.table,
-            ratio,
-        )
+        found = adaptive.refine_real(self.engine, CAMERA, self.surface, self.scene, ratio)
         return download4(self.engine, found).astype(float)
 
 
@@ -93,7 +70,7 @@ def test_real_surface_loses_what_samples_at_every_pixel_lose(engine: Engine) -> 
     listed = refined[..., 3] > 0
     assert 100 < listed.sum() < 0.6 * listed.size
     transfer = engine.download(stage.transfer.coefficients).astype(float)
-    light = download4(engine, stage.light.coefficients)[:, :3].astype(float)
+    light = download4(engine, stage.scene.light.coefficients)[:, :3].astype(float)
     shaded = np.concatenate([transfer @ light, engine.download(stage.transfer.openness)[..., None] >= 0], -1)
     surface = buffer_of(engine, stage.surface)
     for y, x in np.argwhere(listed)[::23]:
@@ -123,7 +100,7 @@ def test_refined_rims_are_nearer_to_every_pixel(engine: Engine) -> None:
 
 def test_virtual_surface_near_edges_is_as_at_every_pixel(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     stage = Stage(engine, STRIDE)
-    arguments = (engine, CAMERA, stage.virtual, stage.volume, 4, stage.light, stage.rays, ROOM_M, stage.table)
+    arguments = (engine, CAMERA, stage.virtual, stage.scene)
     refined = download4(engine, adaptive.refine_virtual(*arguments))
     monkeypatch.setattr(differential_rendering, "VIRTUAL_STRIDE", 1)
     every = download4(engine, shadow_virtual(*arguments).values)

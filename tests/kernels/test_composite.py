@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
 from server.stages.composite import composite, mark_touched, shown_picture, srgb_codes
-from server.stages.differential_rendering import SampleGrid, upload_light
 from server.stages.measure import linear_values
 from server.stages.radiance_transfer import direction_sets
 from server.stages.rasterize import VirtualSurface
 from server.stages.raycast import Surface
+from server.stages.sample_grid import SampleGrid
 from server.stages.sampling import Upsampling
+from server.stages.traced_scene import upload_light
 from tests import lights
 from tests.meshes import pose
 from tests.reference import composite as twin

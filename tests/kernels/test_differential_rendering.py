@@ -21,11 +21,11 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.scene.virtual_object import VirtualObject
 from server.stages.continuation import NO_PLANES, Continuation, PlaneArrays
-from server.stages.differential_rendering import SampleGrid, shadow_real, shadow_virtual, upload_light
+from server.stages.differential_rendering import shadow_real, shadow_virtual
 from server.stages.radiance_transfer import Directions, direction_sets, transfer_radiance
 from server.stages.rasterize import Placed, VirtualSurface
-from server.stages.volume import Volume
-from server.stages.voxelize import object_table
+from server.stages.sample_grid import SampleGrid
+from server.stages.traced_scene import trace_scene, upload_light
 from tests import lights
 from tests.meshes import pose, shape_of
 from tests.reference import differential_rendering as twin
@@ -130,8 +130,9 @@ def shade_floor(
     volume = fill_volume(engine, scene, VOXEL_M)
     transfer = transfer_radiance(engine, camera, volume, surface, STRIDE, directions, reach_m)
     objects = [placed(engine, solid)]
-    table, device_light = object_table(engine, objects), upload_light(engine, light, directions)
-    ratio = shadow_real(engine, camera, surface, transfer, volume, device_light, directions, reach_m, objects, table)
+    device_light = upload_light(engine, light, directions)
+    traced = trace_scene(engine, volume, device_light, directions, reach_m, objects)
+    ratio = shadow_real(engine, camera, surface, transfer, traced)
     bits = np.unpackbits(engine.download(transfer.free_mask).view(np.uint8), axis=-1, bitorder="little")[..., :rays]
     return Shaded(
         download4(engine, ratio.values),
@@ -141,7 +142,7 @@ def shade_floor(
         bits.astype(bool),
         light,
         directions,
-        table.cell_m[0],
+        traced.offset_m,
         reach_m,
     )
 
@@ -256,8 +257,8 @@ def test_no_surface_has_no_ratio(engine: Engine) -> None:
     volume = fill_volume(engine, (floor(),), VOXEL_M)
     transfer = transfer_radiance(engine, camera, volume, surface, STRIDE, rays, FAR_M)
     objects = [placed(engine, PLATE)]
-    table, light = object_table(engine, objects), upload_light(engine, LIGHT, rays)
-    ratio = shadow_real(engine, camera, surface, transfer, volume, light, rays, FAR_M, objects, table)
+    traced = trace_scene(engine, volume, upload_light(engine, LIGHT, rays), rays, FAR_M, objects)
+    ratio = shadow_real(engine, camera, surface, transfer, traced)
     np.testing.assert_array_equal(download4(engine, ratio.values)[..., 3], np.repeat([1, 0], 4)[:, None] * np.ones(8))
 
 
@@ -287,13 +288,11 @@ def shade_top(
         ((0, 4, valid.shape[1], valid.shape[0]),),
     )
     directions = direction_sets(rays, 4)
-    table = object_table(engine, [placed(engine, solid) for solid in solids])
-    volume: Volume = fill_volume(engine, scene, VOXEL_M)
     device_light = upload_light(engine, light, directions, planes)
-    found: SampleGrid = shadow_virtual(
-        engine, camera_of(positions), surface, volume, 4, device_light, directions, FAR_M, table
-    )
-    return download4(engine, found.values), positions, normals, max(table.cell_m)
+    objects, volume = [placed(engine, solid) for solid in solids], fill_volume(engine, scene, VOXEL_M)
+    traced = trace_scene(engine, volume, device_light, directions, FAR_M, objects)
+    found: SampleGrid = shadow_virtual(engine, camera_of(positions), surface, traced)
+    return download4(engine, found.values), positions, normals, traced.offset_m
 
 
 @pytest.mark.parametrize("name", ["uniform", "directional"])

@@ -23,14 +23,13 @@ from server.stages.differential_rendering import (
     light_points,
     shadow_real,
     shadow_virtual,
-    upload_light,
 )
 from server.stages.indirect import Indirect, gather_hits, no_hits, observe_indirect
 from server.stages.object_glow import CELLS, POINTS, deal_points, place_points
 from server.stages.radiance_transfer import direction_sets, transfer_radiance
 from server.stages.rasterize import Placed, VirtualSurface
 from server.stages.raycast import LABEL_STATIC, Surface, raycast
-from server.stages.voxelize import object_table
+from server.stages.traced_scene import trace_scene, upload_light
 from tests import lights
 from tests.analytic import Floats, look_at
 from tests.kernels.test_differential_rendering import buffer, camera_of, floor_points
@@ -90,11 +89,10 @@ def light_floor(
     hits = gather_hits(engine, camera, volume, surface, transfer, rays, ROOM_M, every=1)
     indirect = Indirect(hits, np.asarray(unseen, float))
     device_light = upload_light(engine, light, rays, indirect=indirect, exposure=exposure)
-    table = object_table(engine, objects)
-    glow = light_points(engine, objects, volume, device_light, rays, ROOM_M, table)
-    arguments = (volume, device_light, rays, ROOM_M, objects, table)
-    shadow: RealShadow = shadow_real(engine, camera, surface, transfer, *arguments, indirect, glow)
-    refined = refine_real(engine, camera, surface, 4, *arguments, shadow, glow)
+    traced = trace_scene(engine, volume, device_light, rays, ROOM_M, objects)
+    traced = replace(traced, glow=light_points(engine, traced))
+    shadow: RealShadow = shadow_real(engine, camera, surface, transfer, traced, indirect)
+    refined = refine_real(engine, camera, surface, traced, shadow)
     return Lit(
         download4(engine, shadow.values).astype(float),
         download4(engine, shadow.shaded).astype(float),
@@ -136,8 +134,8 @@ def test_without_indirect_light_nothing_is_sent(engine: Engine) -> None:
     ratios = []
     for color in (WHITE, (0.0, 0.0, 0.0)):
         objects = [placed(engine, PLATE, color)]
-        table = object_table(engine, objects)
-        shadow = shadow_real(engine, camera, surface, transfer, volume, light, rays, ROOM_M, objects, table)
+        traced = trace_scene(engine, volume, light, rays, ROOM_M, objects)
+        shadow = shadow_real(engine, camera, surface, transfer, traced)
         ratios.append(download4(engine, shadow.values).copy())
     np.testing.assert_array_equal(*ratios)
     shaded = download4(engine, shadow.shaded)[..., 0]
@@ -199,9 +197,8 @@ def taken_from_top(
     paint(engine, volume, np.broadcast_to(np.asarray(color, float), (*voxels_of(volume), 3)))
     empty = Indirect(space.constant("test_no_hits", np.zeros((1, 1, 4), np.float32)), np.asarray(unseen, float))
     device_light = upload_light(engine, light, rays, indirect=empty)
-    table = object_table(engine, objects)
-    glow = light_points(engine, objects, volume, device_light, rays, ROOM_M, table)
-    found = shadow_virtual(engine, camera, surface, volume, 4, device_light, rays, ROOM_M, table, glow)
+    traced = trace_scene(engine, volume, device_light, rays, ROOM_M, objects)
+    found = shadow_virtual(engine, camera, surface, replace(traced, glow=light_points(engine, traced)))
     return download4(engine, found.values).astype(float)
 
 
@@ -302,7 +299,7 @@ def test_points_are_lit_as_pixels_are(device: Device, engine: Engine) -> None:
     objects = [placed(engine, box((0.45, 0.45, 0.45), (0.5, 0.5, 0.5)), (0.2, 0.5, 0.8))]
     volume, rays = fill_volume(engine, (floor(-0.5),), VOXEL_M), direction_sets(81, 4)
     device_light = upload_light(engine, light, rays)
-    glow = light_points(engine, objects, volume, device_light, rays, ROOM_M, object_table(engine, objects))
+    glow = light_points(engine, trace_scene(engine, volume, device_light, rays, ROOM_M, objects))
     radiances = download4(engine, glow.radiances)[:, :3]
     normals = objects[0][0].surface_points.normals
     expected = np.array([0.2, 0.5, 0.8]) * np.maximum(lambert_transfer(normals, 4) @ light, 0.0)
@@ -340,8 +337,8 @@ def bounced_wall(engine: Engine, stride: int, color: ArrayLike = WHITE) -> tuple
     shaded = engine.workspace.upload("test_shaded", float4(np.ones_like(ratio), valid))
     shadow = RealShadow(stride, engine.workspace.upload("test_ratio", float4(ratio, valid)), shaded)
     light = upload_light(engine, lights.uniform(), rays, indirect=Indirect(shaded, np.ones(3)))
-    arguments = (surface, transfer, volume, light, rays, ROOM_M, inverse_rigid(view), shadow)
-    bounced = bounce_real(engine, CAMERA, *arguments)
+    traced = trace_scene(engine, volume, light, rays, ROOM_M, [])
+    bounced = bounce_real(engine, CAMERA, inverse_rigid(view), surface, transfer, traced, shadow)
     return download4(engine, bounced.values).astype(float), points, normals[..., :3]
 
 

@@ -16,6 +16,7 @@ from protocol.frames import CameraModel
 from server.opencl.engine import Engine
 from server.scene.mesh import Mesh
 from server.scene.virtual_object import VirtualObject
+from server.stages import rasterize as rasterize_module
 from server.stages.rasterize import NEAR_M, VirtualSurface, rasterize
 from tests.data import data_folder
 from tests.meshes import mesh_file, mesh_of, pose, public_mesh, shape_of, soup_of
@@ -45,14 +46,15 @@ class Picture:
 
 
 def download(engine: Engine, surface: VirtualSurface) -> Picture:
-    fields = [surface.position, surface.normal, surface.base_color]
+    assert surface.material is not None
+    fields = [surface.position, surface.normal, surface.base_color, surface.material]
     arrays = [engine.download(a).view(np.float32).reshape(*a.shape, 4) for a in fields]
     index = engine.download(surface.object_index)
     for array in arrays:
         assert np.isfinite(array).all()
         np.testing.assert_array_equal(array[..., 3], index >= 0)
         assert not array[index < 0].any()
-    position, normal, color = (array[..., :3] for array in arrays)
+    position, normal, color, _ = (array[..., :3] for array in arrays)
     return Picture(index >= 0, position, normal, color, index, surface.boxes)
 
 
@@ -345,6 +347,72 @@ def test_equally_near_triangles_show_the_first(engine: Engine) -> None:
     assert set(np.unique(twice.index)) == {-1, 1}
 
 
+@pytest.mark.parametrize("size_px", [3, 7, 9, 40])
+def test_equally_near_triangles_of_any_size_show_the_first(engine: Engine, size_px: float) -> None:
+    """Small ones are drawn as fragments, large ones in tiles; each of them three times."""
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform((10, 10), (140, 90), (60, 1, 2)) + rng.uniform(-0.5, 0.5, (60, 3, 2)) * size_px
+    corners = at_pixels(CAMERA, pixels) * rng.uniform(0.5, 2, (60, 1, 1))
+    picture = draw(engine, (soup_of(np.concatenate([corners, corners, corners])), EYE))
+    once = draw(engine, (soup_of(corners), EYE))
+    assert once.covered.sum() > 30
+    np.testing.assert_array_equal(picture.triangle, once.triangle)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_triangles_of_all_sizes_match_twin(engine: Engine, seed: int) -> None:
+    """Fragments and tiles meet at the same pixels, in either order of depth."""
+    rng = np.random.default_rng(seed)
+    size_px = 10 ** rng.uniform(-0.5, 2, (500, 1, 1))
+    pixels = rng.uniform((0, 0), (CAMERA.width, CAMERA.height), (500, 1, 2)) + rng.normal(size=(500, 3, 2)) * size_px
+    soup = soup_of(at_pixels(CAMERA, pixels) * rng.uniform(0.5, 4, (500, 3, 1)))
+    picture = draw(engine, (soup, EYE))
+    vertices, triangles = soup.vertices.astype(np.float64), soup.triangles.astype(np.int64)
+    visible = twin.raster_tiles(CAMERA, twin.setup_triangles(CAMERA, EYE, vertices, triangles))
+    assert (picture.triangle != visible).mean() < FLIPS
+    shown = np.unique(visible[visible >= 0])
+    assert (size_px.ravel()[shown] < 4).sum() > 3
+    assert (size_px.ravel()[shown] > 10).sum() > 15
+
+
+def test_more_triangles_in_a_tile_than_are_looked_at_at_once(engine: Engine) -> None:
+    """What one batch found, the next must beat."""
+    rng = np.random.default_rng(7)
+    pixels = np.array([60.0, 40.0]) + rng.normal(size=(250, 3, 2)) * 30
+    for order in (np.linspace(0.5, 4, 250), rng.uniform(0.5, 4, 250)):
+        soup = soup_of(at_pixels(CAMERA, pixels) * order[:, None, None])
+        vertices, triangles = soup.vertices.astype(np.float64), soup.triangles.astype(np.int64)
+        visible = twin.raster_tiles(CAMERA, twin.setup_triangles(CAMERA, EYE, vertices, triangles))
+        assert (draw(engine, (soup, EYE)).triangle != visible).mean() < FLIPS
+
+
+@pytest.mark.parametrize("setting", ["_PIECES_PER_PIXEL", "_FRAGMENTS_PER_PIXEL"])
+def test_lists_without_room(engine: Engine, monkeypatch: pytest.MonkeyPatch, setting: str) -> None:
+    """Pieces get more, of fragments the triangles are gone through again; the picture is the same."""
+    soup = random_soup(3, 2000, 0.05, (0.0, 0.0, 1.0), 0.6)
+    twice = soup_of(np.concatenate([soup.vertices, soup.vertices]).reshape(-1, 3, 3))
+    expected = draw(engine, (twice, EYE))
+    monkeypatch.setattr(rasterize_module, setting, 0)
+    monkeypatch.setattr(rasterize_module, "_LEAST_ROOM", 1)
+    other = Engine(engine.device)
+    found = draw(other, (twice, EYE))
+    other.close()
+    np.testing.assert_array_equal(found.triangle, expected.triangle)
+    np.testing.assert_array_equal(found.position, expected.position)
+
+
+def test_tiles_with_more_than_they_may_list(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some is not drawn, what is drawn is right, and nothing is written beyond the lists."""
+    monkeypatch.setattr(rasterize_module, "_MOST_ENTRIES", 5 * 20 * 13)
+    monkeypatch.setattr(rasterize_module, "_LEAST_ENTRIES", 1)
+    pixels = np.array([60.0, 40.0]) + np.random.default_rng(7).normal(size=(200, 3, 2)) * 30
+    soup = soup_of(at_pixels(CAMERA, pixels) * np.linspace(0.5, 4, 200)[:, None, None])
+    picture = draw(engine, (soup, EYE))
+    assert 0.2 < picture.covered.mean() < 0.95
+    depths = np.linspace(0.5, 4, 200)[picture.triangle[picture.covered]]
+    np.testing.assert_allclose(picture.position[picture.covered][:, 2], depths, rtol=1e-5)
+
+
 def test_nearest_object_wins(engine: Engine) -> None:
     near = shape_of(trimesh.creation.icosphere(subdivisions=3, radius=0.3))
     far = shape_of(trimesh.creation.box((1.5, 1.0, 0.2)))
@@ -361,6 +429,15 @@ def test_nearest_object_wins(engine: Engine) -> None:
         if index == 1:  # a ball fills its box, up to perspective
             assert abs(x0 - columns.min()) < 12
             assert abs(y1 - rows.max()) < 12
+
+
+def test_two_views_by_name(engine: Engine) -> None:
+    thing = VirtualObject.upload(engine, shape_of(trimesh.creation.box()), cells=8)
+    first = rasterize(engine, CAMERA, EYE, [(thing, pose((0, 0, 3.0)))])
+    expected = download(engine, first)
+    rasterize(engine, CAMERA, EYE, [(thing, pose((0.5, 0, 4.0)))], name="other")
+    np.testing.assert_array_equal(download(engine, first).position, expected.position)
+    np.testing.assert_array_equal(download(engine, first).index, expected.index)
 
 
 def test_order_of_triangles_does_not_matter(engine: Engine) -> None:
@@ -395,9 +472,9 @@ def test_smooth_normals_of_a_ball(engine: Engine) -> None:
 @pytest.mark.parametrize("tiles", [1, 7, 255, 256, 257, 4800])
 def test_scan_tiles(engine: Engine, tiles: int) -> None:
     rng = np.random.default_rng(tiles)
-    counts = rng.integers(0, 9, tiles + 1).astype(np.int32)
-    starts = engine.workspace.array("starts", (tiles + 2,), np.int32)
+    counts = rng.integers(0, 9, tiles + 2).astype(np.int32)
+    starts = engine.workspace.array("starts", (tiles + 3,), np.int32)
     scan = engine.kernel("rasterize.cl", "scan_tiles")
-    engine.launch(scan, (256,), tiles, engine.workspace.upload("counts", counts), starts, local=(256,))
-    expected = [0, *np.cumsum(counts[1:]), counts[0]]
+    engine.launch(scan, (256,), tiles, 6, engine.workspace.upload("counts", counts), starts, local=(256,))
+    expected = [0, *np.cumsum(np.minimum(counts[2:], 6)), *counts[:2]]
     np.testing.assert_array_equal(engine.download(starts), expected)

@@ -15,6 +15,7 @@ from server.opencl.engine import Engine
 from server.opencl.program import KERNEL_FOLDER
 from server.scene.mesh import Mesh
 from server.scene.virtual_object import VirtualObject
+from server.stages.object_tree import FEW_OBJECTS, tree_rows
 from server.stages.voxelize import ObjectTable, object_table
 from tests.meshes import mesh_of, pose, public_mesh, shape_of
 from tests.reference import voxelize as twin
@@ -173,6 +174,67 @@ def test_several_objects(engine: Engine, trace: Any) -> None:
     np.testing.assert_array_equal(visibility, [0, 0, 0, 1, 1, 1, 1, 1])
     both = table_of(engine, *placed[1:])
     np.testing.assert_array_equal(trace(both, np.zeros((3, 3)), directions[:3]), [1, 0, 0])
+
+
+@pytest.mark.parametrize("count", [FEW_OBJECTS, FEW_OBJECTS + 1, 64, 300])
+def test_many_objects_block_as_each_does(engine: Engine, trace: Any, count: int) -> None:
+    """The tree finds every object that a ray meets, whatever their number, sizes and turns."""
+    rng = np.random.default_rng(count)
+    things = [
+        VirtualObject.upload(engine, shape_of(s), 12) for s in (trimesh.creation.icosphere(), trimesh.creation.box())
+    ]
+    places = [
+        pose(rng.uniform(-4, 4, 3), rng.normal(size=3), rng.uniform(0, 3), 10 ** rng.uniform(-1.5, -0.2))
+        for _ in range(count)
+    ]
+    objects = [(things[k % 2], place) for k, place in enumerate(places)]
+    origins = rng.uniform(-5, 5, (4000, 3))
+    aims = np.array([place[:3, 3] for place in places])[rng.integers(0, count, 4000)] + rng.normal(size=(4000, 3)) / 4
+    directions = unit(aims - origins)
+    directions[:60] = np.tile(np.concatenate([np.eye(3), -np.eye(3)]), (10, 1))
+    for reach_m in (3.0, FAR_M):
+        together = trace(object_table(engine, objects), origins, directions, reach_m)
+        apart = np.ones(len(origins), np.float32)
+        for begin in range(0, count, FEW_OBJECTS):
+            few = object_table(engine, objects[begin : begin + FEW_OBJECTS])
+            apart = np.minimum(apart, trace(few, origins, directions, reach_m))
+        assert 40 < (apart == 0).sum() < 3960
+        np.testing.assert_array_equal(together, apart)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 9, 31, 1000])
+def test_tree_holds_every_box(count: int) -> None:
+    """Depth first: the nodes under one follow it, up to where it points; each box holds those under it."""
+    rng = np.random.default_rng(count)
+    low = rng.normal(size=(count, 3))
+    high = low + rng.random((count, 3))
+    rows = tree_rows(low, high)
+    leaves = rows[:, 7] >= 0
+    np.testing.assert_array_equal(np.sort(rows[leaves, 7]), np.arange(count))
+    numbers = rows[leaves, 7].astype(int)
+    np.testing.assert_array_equal(rows[leaves, :3], low[numbers])
+    np.testing.assert_array_equal(rows[leaves, 3:6], high[numbers])
+    assert rows[0, 6] == len(rows)
+    for at, row in enumerate(rows):
+        under = rows[at + 1 : int(row[6])]
+        assert at < row[6] <= len(rows)
+        assert (under[:, 6] <= row[6]).all()
+        filled = under[under[:, 0] <= under[:, 3]]
+        assert (filled[:, :3] >= row[:3]).all()
+        assert (filled[:, 3:6] <= row[3:6]).all()
+
+
+def test_a_mesh_placed_twice_is_kept_once_and_copied_once(engine: Engine) -> None:
+    things = [VirtualObject.upload(engine, shape_of(BALL), cells) for cells in (16, 8)]
+    several = [(things[0], np.eye(4)), (things[1], pose((2, 0, 0))), (things[0], pose((3, 0, 0)))]
+    table = object_table(engine, several)
+    assert table.distances.size == 16**3 + 8**3
+    np.testing.assert_array_equal(engine.download(table.dims).view(np.int32).reshape(3, 4)[:, 3], [0, 16**3, 0])
+    table.distances.fill(7.0)
+    assert (engine.download(object_table(engine, several).distances) == 7).all(), "the same set was copied again"
+    pool = engine.download(object_table(engine, several[1:]).distances)
+    np.testing.assert_array_equal(pool[: 8**3], engine.download(things[1].grid.distance).ravel())
+    np.testing.assert_array_equal(pool[8**3 :], engine.download(things[0].grid.distance).ravel())
 
 
 @pytest.mark.data

@@ -14,7 +14,9 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from server.scene import gltf_pictures
 from server.scene.limits import MAX_TRIANGLES
+from server.scene.materials import MATTE, Beyond, Texture
 from server.scene.mesh import Mesh, MeshError, load_mesh
 from tests.data import data_folder
 from tests.meshes import public_mesh
@@ -169,21 +171,113 @@ def test_base_color_factor_is_linear() -> None:
     np.testing.assert_allclose(load_mesh(file.glb(), "glb").vertex_colors[0], [0.9433962, 0.0123, 0.5], rtol=1e-6)
 
 
+def shown_texture(mesh: Mesh) -> Texture:
+    texture = mesh.materials[0].color_texture
+    assert texture is not None
+    return texture
+
+
+def color_uv(mesh: Mesh) -> dict[tuple[float, ...], NDArray[np.float32]]:
+    """Base colour coordinates by the place of their vertex."""
+    assert mesh.uv is not None
+    return {tuple(v): uv[:2] for v, uv in zip(mesh.vertices.tolist(), mesh.uv, strict=True)}
+
+
 @pytest.mark.parametrize("kind", [".png", ".jpg"])
-def test_texture_is_read_at_the_vertices_the_right_way_up(kind: str) -> None:
-    picture = np.zeros((16, 16, 3), np.uint8)
-    picture[:8, :8], picture[:8, 8:] = (200, 0, 0), (0, 200, 0)  # upper row: red, green
-    picture[8:, :8], picture[8:, 8:] = (0, 0, 200), (200, 200, 200)  # lower row: blue, white
+@pytest.mark.parametrize("as_uint16", [False, True])
+def test_texture_and_its_coordinates_are_kept(kind: str, as_uint16: bool) -> None:
+    picture = np.zeros((16, 24, 3), np.uint8)
+    picture[:8, :8], picture[:8, 8:] = (200, 0, 0), (0, 200, 0)
     file = Gltf()
-    file.quad(file.texture(picture, kind) | {"baseColorFactor": [0.5, 1, 1, 1]}, TEXCOORD_0=QUAD_UV)
+    uv = np.rint(QUAD_UV * 65535).astype(np.uint16) if as_uint16 else QUAD_UV
+    file.quad(file.texture(picture, kind) | {"baseColorFactor": [0.5, 1, 1, 1]}, TEXCOORD_0=uv)
     mesh = load_mesh(file.glb(), "glb")
-    full = float(linear(200 / 255))
-    at = {tuple(v): c for v, c in zip(mesh.vertices.tolist(), mesh.vertex_colors, strict=True)}
-    tolerance = 1e-5 if kind == ".png" else 0.03
-    np.testing.assert_allclose(at[0.0, 0.0, 0.0], [0, 0, full], atol=tolerance)  # v runs down in glTF
-    np.testing.assert_allclose(at[1.0, 0.0, 0.0], [full / 2, full, full], atol=tolerance)
-    np.testing.assert_allclose(at[1.0, 1.0, 0.0], [0, full, 0], atol=tolerance)
-    np.testing.assert_allclose(at[0.0, 1.0, 0.0], [full / 2, 0, 0], atol=tolerance)
+    assert_well_formed(mesh)
+    np.testing.assert_allclose(mesh.vertex_colors, np.tile((0.5, 1, 1), (4, 1)))  # the factor, not the texture
+    error = np.abs(shown_texture(mesh).image.astype(int) - picture)
+    assert error.max() == 0 if kind == ".png" else np.median(error) < 12  # JPEG's chroma is coarse
+    for place, at in zip(QUAD.tolist(), QUAD_UV, strict=True):
+        np.testing.assert_allclose(color_uv(mesh)[tuple(place)], at, atol=1e-4)
+
+
+def test_far_repeats_are_brought_near() -> None:
+    """A shift by whole textures, even so that it suits mirrors, keeps float32's digits for what is inside."""
+    file = Gltf()
+    file.quad(file.texture(np.zeros((4, 4, 3), np.uint8)), TEXCOORD_0=QUAD_UV + np.float32([5000, -300]))
+    found = color_uv(load_mesh(file.glb(), "glb"))
+    for place, at in zip(QUAD.tolist(), QUAD_UV, strict=True):
+        np.testing.assert_allclose(found[tuple(place)], at, atol=1e-3)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -3e38])
+def test_bad_coordinates_become_finite(bad: float) -> None:
+    uv = QUAD_UV.copy()
+    uv[1] = bad
+    file = Gltf()
+    file.quad(file.texture(np.zeros((4, 4, 3), np.uint8)), TEXCOORD_0=uv)
+    mesh = load_mesh(file.glb(), "glb")
+    assert mesh.uv is not None
+    assert np.isfinite(mesh.uv).all()
+    assert np.abs(mesh.uv).max() <= 2e6
+
+
+def test_second_coordinates_transform_and_wrapping() -> None:
+    """TEXCOORD_1, KHR_texture_transform (the extension's own example: the lower left quadrant, turned) and sampler."""
+    file = Gltf()
+    material = file.texture(np.zeros((4, 4, 3), np.uint8))
+    change = {"offset": [0, 1], "rotation": np.pi / 2, "scale": [0.5, 0.5], "texCoord": 1}
+    material["baseColorTexture"] |= {"extensions": {"KHR_texture_transform": change}}
+    file.header["samplers"] = [{"wrapS": 33071, "wrapT": 33648}]
+    file.header["textures"][0]["sampler"] = 0
+    unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    file.quad(material, TEXCOORD_0=QUAD_UV, TEXCOORD_1=unit)
+    mesh = load_mesh(file.glb(), "glb")
+    assert shown_texture(mesh).beyond == (Beyond.CLAMP, Beyond.MIRROR)
+    found = color_uv(mesh)
+    for place, (u, v) in zip(QUAD.tolist(), unit, strict=True):
+        np.testing.assert_allclose(found[tuple(place)], (0.5 * v, 1 - 0.5 * u), atol=1e-6)
+
+
+def test_roughness_and_metalness_are_read() -> None:
+    picture = np.tile(np.array([1, 2, 3], np.uint8), (4, 4, 1))
+    file = Gltf()
+    reference = file.texture(picture)["baseColorTexture"]
+    material = {"roughnessFactor": 0.25, "metallicFactor": 0.5, "metallicRoughnessTexture": reference | {"texCoord": 1}}
+    file.quad(material, TEXCOORD_1=QUAD_UV)
+    mesh = load_mesh(file.glb(), "glb")
+    (found,) = mesh.materials
+    assert (found.roughness, found.metalness, found.color_texture) == (0.25, 0.5, None)
+    assert found.surface_texture is not None
+    np.testing.assert_array_equal(found.surface_texture.image, picture)
+    assert mesh.uv is not None
+    np.testing.assert_allclose(np.sort(mesh.uv[:, 2:], axis=0), np.sort(QUAD_UV, axis=0))
+    assert not mesh.uv[:, :2].any()
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"), [({}, (1.0, 1.0)), ({"roughnessFactor": 9, "metallicFactor": -1}, (1, 0))]
+)
+def test_what_a_gltf_material_leaves_unsaid(values: Json, expected: tuple[float, float]) -> None:
+    """glTF's own defaults where there is a material; matte where there is none."""
+    file = Gltf()
+    file.quad(values)
+    (found,) = load_mesh(file.glb(), "glb").materials
+    assert (found.roughness, found.metalness) == expected
+    plain = Gltf()
+    plain.quad()
+    for mesh in (load_mesh(plain.glb(), "glb"), load_mesh(trimesh.creation.box().export(file_type="ply"), "ply")):
+        assert mesh.materials == (MATTE,)
+        assert (MATTE.roughness, MATTE.metalness) == (1.0, 0.0)
+
+
+def test_parts_keep_their_materials() -> None:
+    file = Gltf()
+    first = file.quad({"roughnessFactor": 0.1})
+    file.header["materials"] += [{"pbrMetallicRoughness": {"roughnessFactor": r}} for r in (0.2, 0.3)]
+    file.header["meshes"][0]["primitives"] = [first | {"material": m} for m in (2, 0, 2)]
+    mesh = load_mesh(file.glb(), "glb")
+    assert [m.roughness for m in mesh.materials] == [0.3, 0.1]
+    np.testing.assert_array_equal(mesh.material_of, [0, 0, 1, 1, 0, 0])
 
 
 def test_unreadable_texture_is_noted() -> None:
@@ -194,6 +288,108 @@ def test_unreadable_texture_is_noted() -> None:
     mesh = load_mesh(file.glb(), "glb")
     assert any("image 0" in note for note in mesh.notes)
     np.testing.assert_allclose(mesh.vertex_colors[0], [0.1, 0.2, 0.3], rtol=1e-6)
+    assert mesh.materials[0].color_texture is None
+
+
+@pytest.mark.parametrize(
+    ("broken", "words"),
+    [
+        ({"materials": 7}, "material that does not exist"),
+        ({"textures": 7}, "texture that does not exist"),
+        ({"images": 7}, "image 7 could not be read"),
+    ],
+)
+def test_broken_references_are_noted(broken: Json, words: str) -> None:
+    file = Gltf()
+    material = file.texture(np.zeros((4, 4, 3), np.uint8))
+    if "textures" in broken:
+        material["baseColorTexture"]["index"] = 7
+    if "images" in broken:
+        file.header["textures"][0]["source"] = 7
+    primitive = file.quad(material, TEXCOORD_0=QUAD_UV)
+    if "materials" in broken:
+        primitive["material"] = 7
+    mesh = load_mesh(file.glb(), "glb")
+    assert_well_formed(mesh)
+    assert len(mesh.notes) == 1
+    assert words in mesh.notes[0]
+
+
+def test_texture_without_coordinates_is_noted_and_left_out() -> None:
+    file = Gltf()
+    file.quad(file.texture(np.zeros((4, 4, 3), np.uint8)) | {"baseColorFactor": [0.1, 0.2, 0.3, 1]})
+    mesh = load_mesh(file.glb(), "glb")
+    assert mesh.notes == ("1 parts have a texture but no coordinates for it; they keep the plain colour",)
+    assert mesh.materials[0].color_texture is None
+    np.testing.assert_allclose(mesh.vertex_colors[0], [0.1, 0.2, 0.3], rtol=1e-6)
+
+
+def test_parts_that_are_no_triangles_are_noted() -> None:
+    file = Gltf()
+    primitive = file.quad()
+    file.header["meshes"][0]["primitives"].append(primitive | {"mode": 1, "attributes": dict(primitive["attributes"])})
+    mesh = load_mesh(file.glb(), "glb")
+    assert len(mesh.triangles) == 2
+    assert mesh.notes == ("1 parts are points, lines or fans and were not read",)
+
+
+@pytest.mark.parametrize("format", ["glb", "gltf", "obj", "ply", "stl"])
+def test_empty_file_says_so(format: str) -> None:
+    with pytest.raises(MeshError, match=f"the {format} file is empty"):
+        load_mesh(b"", format)
+
+
+def test_extensions_that_are_needed_and_not_read_are_noted() -> None:
+    file = Gltf()
+    file.quad()
+    file.header["extensionsRequired"] = ["KHR_texture_transform", "KHR_something_new"]
+    assert load_mesh(file.glb(), "glb").notes == (
+        "the file needs KHR_something_new, which is not read: it may look wrong",
+    )
+
+
+@pytest.mark.parametrize("notes", [["a\nb " * 100] * 30, 7, "x", {"a": 1}, [None]])
+def test_notes_inside_the_file_stay_short(notes: Any) -> None:
+    file = Gltf()
+    file.quad()
+    file.header["asset"]["extras"] = {"notes": notes}
+    with suppress(MeshError):
+        found = load_mesh(file.glb(), "glb").notes
+        assert len(found) <= 8
+        assert all(len(note) <= 200 and "\n" not in note for note in found)
+
+
+def test_transparent_materials_are_noted() -> None:
+    file = Gltf()
+    file.quad({})
+    file.header["materials"][0]["alphaMode"] = "BLEND"
+    assert any("transparent" in note for note in load_mesh(file.glb(), "glb").notes)
+
+
+def test_large_texture_is_scaled_down_with_a_note() -> None:
+    """16k wide, and uniform so that the file is small."""
+    file = Gltf()
+    file.quad(file.texture(np.full((64, 16384, 3), 77, np.uint8)), TEXCOORD_0=QUAD_UV)
+    mesh = load_mesh(file.glb(), "glb")
+    image = shown_texture(mesh).image
+    assert image.shape == (16, 4096, 3)
+    assert (image == 77).all()
+    assert mesh.notes == ("image 0 was scaled down from 16384 x 64 to 4096 x 16 pixels",)
+
+
+def test_many_large_textures_are_scaled_until_they_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gltf_pictures, "MAX_KEPT_PIXELS", 3 * 64 * 64)
+    file = Gltf()
+    material = file.texture(np.zeros((128, 128, 3), np.uint8))
+    file.header["images"] = [dict(file.header["images"][0]) for _ in range(6)]
+    file.header["textures"] = [{"source": k} for k in range(6)]
+    file.quad(material, TEXCOORD_0=QUAD_UV)
+    file.header["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": k}}} for k in range(6)]
+    first = file.header["meshes"][0]["primitives"][0]
+    file.header["meshes"][0]["primitives"] = [first | {"material": k} for k in range(6)]
+    mesh = load_mesh(file.glb(), "glb")
+    assert [m.color_texture.image.shape[0] for m in mesh.materials if m.color_texture] == [32] * 6
+    assert len(mesh.notes) == 6
 
 
 def test_texture_bomb_is_refused_before_it_is_decoded() -> None:
@@ -202,7 +398,7 @@ def test_texture_bomb_is_refused_before_it_is_decoded() -> None:
     file.header["images"] = [{"bufferView": file.view(header), "mimeType": "image/png"}]
     file.header["textures"] = [{"source": 0}]
     file.quad({"baseColorTexture": {"index": 0}}, TEXCOORD_0=QUAD_UV)
-    with pytest.raises(MeshError, match="textures"):
+    with pytest.raises(MeshError, match="textures has 60000 x 60000"):
         load_mesh(file.glb(), "glb")
 
 
@@ -370,6 +566,16 @@ def test_too_many_triangles_by_repetition() -> None:
         load_mesh(file.glb(), "glb")
 
 
+def test_ten_million_triangles_are_refused_by_their_header() -> None:
+    """Before anything is read: what follows the header is not even there."""
+    text = b"ply\nformat binary_little_endian 1.0\nelement vertex 5000000\nproperty float x\nelement face 10000000\n"
+    files = {"ply": text + b"property list uchar int vertex_indices\nend_header\n"}
+    files["stl"] = bytes(80) + struct.pack("<I", 10_000_000)
+    for format, data in files.items():
+        with pytest.raises(MeshError, match=f"10000000 triangles.*more than {MAX_TRIANGLES}.*simplify"):
+            load_mesh(data, format)
+
+
 def test_accessor_bomb() -> None:
     file = Gltf()
     primitive = file.quad()
@@ -409,6 +615,24 @@ def test_external_buffer() -> None:
         load_mesh(json.dumps(file.header).encode(), "gltf")
 
 
+@pytest.mark.parametrize(
+    ("nodes", "words"),
+    [
+        ([{"mesh": 0, "children": [0]}], "circle|two parents"),
+        ([{"mesh": 0, "children": [1]}, {"children": [0]}], "circle"),
+        ([{"children": [1, 2]}, {"children": [2]}, {"mesh": 0}], "two parents"),
+        ([{"mesh": 0, "children": [9]}], "child 9"),
+        ([{"children": [i + 1]} for i in range(400)] + [{"mesh": 0}], "levels deep"),
+    ],
+)
+def test_scene_graph_that_is_no_tree(nodes: list[Json], words: str) -> None:
+    file = Gltf()
+    file.quad()
+    file.nodes(*nodes)
+    with pytest.raises(MeshError, match=words):
+        load_mesh(file.glb(), "glb")
+
+
 @pytest.mark.parametrize("damage", ["accessors", "meshes", "nodes", "bufferViews", "materials", "textures"])
 @pytest.mark.parametrize("value", [[], {}, None, [None], [{}], 7, "x"])
 def test_damaged_gltf_never_ends_in_a_traceback(damage: str, value: Any) -> None:
@@ -437,5 +661,8 @@ def test_duck_is_yellow_with_an_orange_beak() -> None:
     duck = public_mesh("Duck.glb")
     low, high = duck.bounds
     assert (high - low)[1] == pytest.approx(1.54, abs=0.01)
-    body = np.median(duck.vertex_colors, axis=0)
-    np.testing.assert_allclose(body, linear(np.array([255, 216, 0]) / 255), atol=0.05)
+    body = np.median(shown_texture(duck).image.reshape(-1, 3), axis=0)
+    np.testing.assert_allclose(body, (255, 216, 0), atol=12)
+    assert duck.uv is not None
+    assert duck.uv[:, :2].min() > 0
+    assert duck.uv[:, :2].max() < 1

@@ -110,3 +110,26 @@ def test_impossible_position(position: tuple[float, float, float]) -> None:
 def test_impossible_up(up: ArrayLike) -> None:
     with pytest.raises(ValueError, match="no direction"):
         place(up)
+
+
+@pytest.mark.parametrize(
+    ("placement", "words"),
+    [
+        (Placement(POINT, scale=1e6), "8e\\+06 m long.*another scale"),
+        (Placement(POINT, scale=1e-6), "8e-06 m long.*another scale"),
+        (Placement((0.0, 0.0, 1e7)), "1e\\+07 m away"),
+        (Placement((0.0, -1e300, 0.0)), "m away"),
+        (Placement(POINT, scale=1e300), "m long"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(placement: Placement, words: str) -> None:
+    with pytest.raises(ValueError, match=words) as caught:
+        world_from_model(mesh_of("y"), placement, np.array([0.0, 1.0, 0.0]))
+    assert "\n" not in str(caught.value)
+
+
+def test_vertices_that_are_world_coordinates_are_held_to_the_same() -> None:
+    vertices = np.array([[3e5, 0, 0], [3e5 + 1, 0, 0], [3e5, 1, 0]], np.float32)
+    far = Mesh(vertices, np.array([[0, 1, 2]], np.int32), vertices * 0, vertices, "y")
+    with pytest.raises(ValueError, match="m away"):
+        world_from_model(far, Placement(None, scale=9.0), np.array([0.0, 1.0, 0.0]))

@@ -154,7 +154,7 @@ def test_two_writers_are_refused() -> None:
         ),
         (
             SceneFacts(objects=2, objects_in_view=0, has_light=True),
-            {"tabulate", "shadow_real", "composite"},  # what is out of view may still cast a shadow into it
+            {"prepare_rays", "shadow_real", "composite"},  # what is out of view may still cast a shadow into it
             {
                 "rasterize": "in view",
                 "light_objects": "left out",
@@ -170,14 +170,14 @@ def test_two_writers_are_refused() -> None:
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=True),
-            {"rasterize", "tabulate", "shade_virtual", "shadow_real", "composite"},
+            {"rasterize", "prepare_rays", "shade_virtual", "shadow_real", "composite"},
             {"refine_virtual": "does not refine", "refine_real": "does not refine", "light_objects": "left out"},
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=True, adaptive=True, indirect=True),
             {
                 "rasterize",
-                "tabulate",
+                "prepare_rays",
                 "light_objects",
                 "shade_virtual",
                 "refine_virtual",

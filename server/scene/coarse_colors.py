@@ -1,0 +1,47 @@
+"""Base colour at a few points of a mesh, on the host: its textures read coarsely, as what lies around a point."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.scene.materials import Beyond, Texture
+from server.scene.mesh import Mesh
+from server.scene.mipmaps import decoded, shrunk
+
+COARSE_SIDE = 32
+"""Textures are read from a level with no longer side."""
+
+Floats = NDArray[np.float64]
+
+
+def colors_at(mesh: Mesh, triangles: NDArray[np.int64], shares: Floats) -> Floats:
+    """[n, 3] linear base colour in `triangles` [n], at `shares` [n, 3] of their corners."""
+    corners = mesh.triangles[triangles]
+    colors: Floats = (mesh.vertex_colors[corners].astype(np.float64) * shares[..., None]).sum(axis=1)
+    uv = (mesh.texture_uv[corners, :2].astype(np.float64) * shares[..., None]).sum(axis=1)
+    number = mesh.material_of[triangles]
+    for k, material in enumerate(mesh.materials):
+        own = number == k
+        if material.color_texture is not None and own.any():
+            colors[own] *= _nearest_texels(material.color_texture, uv[own])
+    return colors
+
+
+def _nearest_texels(texture: Texture, uv: Floats) -> NDArray[np.float32]:
+    """[n, 3] linear."""
+    image = decoded(shrunk(texture.image, COARSE_SIDE, is_srgb=True), is_srgb=True)
+    height, width = image.shape[:2]
+    x, y = (_texel(uv[:, k], size, texture.beyond[k]) for k, size in ((0, width), (1, height)))
+    texels: NDArray[np.float32] = image[y, x]
+    return texels
+
+
+def _texel(at: Floats, size: int, beyond: Beyond) -> NDArray[np.int64]:
+    if beyond is Beyond.CLAMP:
+        inside = at
+    elif beyond is Beyond.REPEAT:
+        inside = at - np.floor(at)
+    else:
+        inside = 1 - np.abs(at - 2 * np.floor(at / 2) - 1)
+    return np.clip(np.floor(inside * size), 0, size - 1).astype(np.int64)

@@ -1,7 +1,7 @@
 """An OBJ with its material libraries and textures as one GLB: the same vertices, axes and units.
 
 `Kd` is taken as sRGB, as textures are; glTF's factors are linear. Roughness is `Pr`, or what shines as `Ns` does;
-metalness is `Pm`. Of the maps, `map_Kd` is read, with its options -s, -o and -clamp.
+metalness is `Pm`. Of the maps, `map_Kd` is read, with its options -s, -o and -clamp; others are told in a note.
 """
 
 from __future__ import annotations
@@ -60,6 +60,8 @@ class Material:
     """Of Phong's highlight."""
     given_roughness: float | None = None
     metalness: float = 0.0
+    unread: frozenset[str] = frozenset()
+    """Maps it has that are not read."""
 
     @property
     def roughness(self) -> float:
@@ -85,8 +87,9 @@ def counts_backwards(text: str) -> bool:
 
 
 def convert(path: Path, text: str, mtl_files: list[Path]) -> bytes:
-    """GLB bytes. Raises ObjectError naming the file and line."""
+    """GLB bytes; what was not found is told in `asset.extras.notes`. Raises ObjectError naming the file and line."""
     materials = {name: m for file in mtl_files for name, m in _read_materials(file).items()}
+    unread = sorted({key for m in materials.values() for key in m.unread})
     model = _read_obj(path, text)
     document: dict[str, Any] = {
         "asset": {"version": "2.0"},
@@ -95,12 +98,19 @@ def convert(path: Path, text: str, mtl_files: list[Path]) -> bytes:
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": []}],
     }
-    body, images = bytearray(), dict[Path, int]()
+    body, images, notes = bytearray(), dict[Path, int](), list[str]()
+    if unread:
+        notes.append(f"of the OBJ's materials, {', '.join(unread)} were not read")
     for name, group in model.groups.items():
         if group.triangles:
             primitive = _primitive(document, body, model, group)
-            primitive["material"] = _add_material(document, body, materials.get(name, Material()), images)
+            if name in materials:
+                primitive["material"] = _add_material(document, body, materials[name], images)
+            elif name:
+                notes.append(f"no library of the OBJ has its material {name[:40]!r}; what names it is plain grey")
             document["meshes"][0]["primitives"].append(primitive)
+    if notes:
+        document["asset"]["extras"] = {"notes": notes}
     return glb.to_bytes(document, body)
 
 
@@ -190,6 +200,11 @@ def _read_materials(path: Path) -> dict[str, Material]:
                 materials[name] = Material()
             case ["map_Kd", *words] if name in materials and words:
                 materials[name] = replace(materials[name], texture=_color_map(path, words))
+            case [
+                ("map_Pr" | "map_Pm" | "map_Ns" | "map_Ks" | "map_d" | "map_Bump" | "map_bump" | "norm") as key,
+                *_,
+            ] if name in materials:
+                materials[name] = replace(materials[name], unread=materials[name].unread | {key})
             case [key, *words] if name in materials and key in _FIELDS:
                 field, count = _FIELDS[key]
                 values = _numbers(path, number, key, words, count)

@@ -16,6 +16,7 @@ from client.laptop.errors import ObjectError
 from client.laptop.objects import pack_mesh, parse_object
 from client.laptop.vase import HEIGHT_M, vase_glb
 from protocol.limits import MAX_MESH_BYTES
+from server.scene.mesh import load_mesh
 from tests.data import data_folder
 
 OBJ = """mtllib model.mtl
@@ -142,6 +143,19 @@ def test_material_that_is_broken(line: str, obj: Path) -> None:
     (obj.parent / "model.mtl").write_text(MTL.replace("Kd 1 0.5 0", f"Kd 1 0.5 0\n{line}"))
     with pytest.raises(ObjectError, match=r"model\.mtl, line 3: .* needs (one|three) number"):
         pack_mesh(obj)
+
+
+def test_what_an_obj_lacks_is_told(obj: Path) -> None:
+    """From the client's reader, inside the GLB, to the notes of the mesh."""
+    obj.write_text(OBJ.replace("usemtl red paint", "usemtl gone"))
+    (obj.parent / "model.mtl").write_text(MTL + "map_Bump bumps.png\nmap_Pr rough.png\n")
+    format_, data = pack_mesh(obj)
+    mesh = load_mesh(data, format_)
+    assert mesh.notes[-2:] == (
+        "of the OBJ's materials, map_Bump, map_Pr were not read",
+        "no library of the OBJ has its material 'gone'; what names it is plain grey",
+    )
+    np.testing.assert_allclose(mesh.vertex_colors[mesh.triangles[0]], 0.8)
 
 
 def test_obj_texture_options(obj: Path) -> None:

@@ -13,6 +13,7 @@ from protocol.messages import Wishes
 from server.opencl.buffers import Workspace
 from server.opencl.device import Device
 from server.opencl.engine import Engine
+from server.opencl.transfer import copy_into
 from server.pipeline import Pipeline
 from server.scene.placement import Placement
 from tests.analytic import look, plane, room
@@ -33,6 +34,19 @@ def test_same_name_and_shape_is_the_same_memory(workspace: Workspace) -> None:
     assert (again.get() == 4).all()
     assert workspace.array("b", (3, 5), np.float32) is not first
     assert workspace.bytes_held == 2 * 3 * 5 * 4
+
+
+def test_find_makes_nothing(workspace: Workspace) -> None:
+    assert workspace.find("a") is None
+    made = workspace.array("a", (3,), np.float32)
+    assert workspace.find("a") is made
+
+
+def test_copy_into(engine: Engine) -> None:
+    """From a byte on, and no farther than the part is long."""
+    whole = engine.workspace.upload("whole", np.arange(10, dtype=np.int32))
+    copy_into(engine.queue, whole, 12, engine.workspace.upload("part", np.array([70, 80], np.int32)))
+    np.testing.assert_array_equal(engine.download(whole), [0, 1, 2, 70, 80, 5, 6, 7, 8, 9])
 
 
 @pytest.mark.parametrize(("shape", "dtype"), [((5, 3), np.float32), ((3, 6), np.float32), ((3, 5), np.int32)])

@@ -3,6 +3,9 @@
 #include "camera.clh"
 #include "upsample.clh"
 
+#ifndef SUBPIXELS
+#define SUBPIXELS 0
+#endif
 #ifndef BANDS
 #error BANDS must be defined: the number of spherical-harmonics bands
 #endif
@@ -47,8 +50,55 @@ kernel void mark_touched(const int cols, const int rows, global const float4 *ra
     touched[(cell_row + 1) * (cols + 1) + cell_col + 1] = (uchar)any;
 }
 
+// The virtual geometry buffer and what occluders take from it.
+typedef struct {
+    global const float4 *positions;
+    global const float4 *normals;
+    global const float4 *colors;
+    Grid grid;
+    global const float4 *occluded;
+    global const float4 *refined;
+    int has_refined;
+} Virtual;
+
+// Radiance of the virtual surface at pixel (x, y), which it covers.
+static float3 virtual_color(const Virtual things, global const float4 *light, const int x, const int y, const int height,
+                            const float tolerance_m) {
+    const int pixel = y * things.grid.width + x;
+    const float4 taken = value_at(things.grid, things.occluded, things.refined, things.has_refined, things.positions, things.normals,
+                                  x, y, height, tolerance_m);
+    return things.colors[pixel].xyz * fmax(open_shading(things.normals[pixel].xyz, light) - taken.xyz, (float3)(0.0f));
+}
+
+#if SUBPIXELS > 0
+// Of the pixel's parts, the share at which an object is no farther than `tolerance_m` behind the real surface, of depth
+// `real_z`, 0 where there is none. nearest [SUBPIXELS h][SUBPIXELS w]: bits of 1 / depth, 0 where there is no object.
+static float share_covered(global const uint *nearest, const int x, const int y, const int width, const float real_z,
+                           const float tolerance_m) {
+    int covered = 0;
+    for (int part = 0; part < SUBPIXELS * SUBPIXELS; part++) {
+        const int row = SUBPIXELS * y + part / SUBPIXELS, col = SUBPIXELS * x + part % SUBPIXELS;
+        const float inverse_z = as_float(nearest[row * SUBPIXELS * width + col]);
+        covered += inverse_z > 0.0f && (real_z <= 0.0f || (real_z + tolerance_m) * inverse_z > 1.0f);
+    }
+    return (float)covered / (SUBPIXELS * SUBPIXELS);
+}
+
+// The pixel itself where the virtual surface covers its middle, else one beside it that has it, else -1: x + y width.
+static int covered_near(global const float4 *positions, const int x, const int y, const int width, const int height) {
+    const int2 steps[9] = {(int2)(0, 0), (int2)(-1, 0), (int2)(1, 0), (int2)(0, -1), (int2)(0, 1),
+                           (int2)(-1, -1), (int2)(1, -1), (int2)(-1, 1), (int2)(1, 1)};
+    for (int k = 0; k < 9; k++) {
+        const int u = x + steps[k].x, v = y + steps[k].y;
+        if (u >= 0 && v >= 0 && u < width && v < height && positions[v * width + u].w > 0.0f) return v * width + u;
+    }
+    return -1;
+}
+#endif
+
 // shown [h][w][3]: the camera picture as sRGB codes; radiance [h][w] linear. positions, normals: the real geometry buffer.
-// virtual_positions, virtual_normals, virtual_colors [h][w] (w = 1 where covered): the virtual one, or none without HAS_OBJECTS.
+// virtual_positions, virtual_normals, virtual_colors [h][w] (w = 1 where covered): the virtual one, or none without HAS_OBJECTS;
+// nearest: see share_covered, where SUBPIXELS is not 0; else pixels are covered as their middles are.
 // occluded [object_rows][object_cols]: radiance that occluders take from virtual samples (w = 1 valid);
 // ratio [rows][cols]: shaded with over without virtual objects on real samples (w = 1 valid), touched: see mark_touched; or
 // none without HAS_SHADOWS. refined_occluded, refined_ratio [h][w]: the same at pixels that have w = 1, or none where has_... is 0.
@@ -58,7 +108,7 @@ kernel void composite(const int width, const int height, global const uchar *sho
                       global const float4 *positions, global const float4 *normals, const float16 camera_from_volume,
                       const float tolerance_m,
                       global const float4 *virtual_positions, global const float4 *virtual_normals,
-                      global const float4 *virtual_colors, global const float4 *light,
+                      global const float4 *virtual_colors, global const uint *nearest, global const float4 *light,
                       const int object_cols, const int object_rows, const int object_stride, global const float4 *occluded,
                       const int cols, const int rows, const int stride, global const float4 *ratio,
                       global const uchar *touched, const int has_refined_occluded, global const float4 *refined_occluded,
@@ -69,31 +119,37 @@ kernel void composite(const int width, const int height, global const uchar *sho
     if (x >= width || y >= height) return;
     const int pixel = y * width + x;
     const float4 real = positions[pixel];
-#ifdef HAS_OBJECTS
-    const float4 object = virtual_positions[pixel];
-    if (object.w > 0.0f) {
-        const float in_front = transform_point(camera_from_volume, real.xyz).z - transform_point(camera_from_volume, object.xyz).z;
-        if (real.w <= 0.0f || in_front > -tolerance_m) {
-            const float3 normal = virtual_normals[pixel].xyz;
-            const Grid grid = {object_cols, object_rows, object_stride, width};
-            const float4 taken = value_at(grid, occluded, refined_occluded, has_refined_occluded, virtual_positions, virtual_normals, x, y, height, tolerance_m);
-            const float3 shading = fmax(open_shading(normal, light) - taken.xyz, (float3)(0.0f));
-            write_color(picture, pixel, virtual_colors[pixel].xyz * shading, codes);
-            return;
-        }
-    }
-#endif
+    float4 color = radiance[pixel];  // of the real surface; w: whether anything virtual has to do with it
+    color.w = 0.0f;
 #ifdef HAS_SHADOWS
     const Grid grid = {cols, rows, stride, width};
     const int cell = (cell_of(y, stride) + 1) * (cols + 1) + cell_of(x, stride) + 1;
     if (touched[cell] && real.w > 0.0f && radiance[pixel].w >= 0.0f) {
         const float4 factor = value_at(grid, ratio, refined_ratio, has_refined_ratio, positions, normals, x, y, height, tolerance_m);
         const float3 change = fabs(factor.xyz - 1.0f);
-        if (factor.w > 0.0f && fmax(fmax(change.x, change.y), change.z) > UNTOUCHED) {
-            write_color(picture, pixel, radiance[pixel].xyz * factor.xyz, codes);
-            return;
-        }
+        if (factor.w > 0.0f && fmax(fmax(change.x, change.y), change.z) > UNTOUCHED) color = (float4)(color.xyz * factor.xyz, 1.0f);
     }
 #endif
-    for (int i = 0; i < 3; i++) picture[3 * pixel + i] = shown[3 * pixel + i];
+#ifdef HAS_OBJECTS
+    const Virtual things = {virtual_positions, virtual_normals, virtual_colors, {object_cols, object_rows, object_stride, width},
+                            occluded, refined_occluded, has_refined_occluded};
+    const float real_z = real.w > 0.0f ? transform_point(camera_from_volume, real.xyz).z : 0.0f;
+#if SUBPIXELS > 0
+    const float share = share_covered(nearest, x, y, width, real_z, tolerance_m);
+    const int source = share > 0.0f ? covered_near(virtual_positions, x, y, width, height) : -1;
+#else
+    const float ahead = real_z - transform_point(camera_from_volume, virtual_positions[pixel].xyz).z;
+    const float share = virtual_positions[pixel].w > 0.0f && (real.w <= 0.0f || ahead > -tolerance_m) ? 1.0f : 0.0f;
+    const int source = share > 0.0f ? pixel : -1;
+#endif
+    if (source >= 0) {
+        const float3 own = virtual_color(things, light, source % width, source / width, height, tolerance_m);
+        const float part = radiance[pixel].w < 0.0f ? 1.0f : share;  // outside the camera's picture there is nothing to mix with
+        color = (float4)(color.xyz + part * (own - color.xyz), 1.0f);
+    }
+#endif
+    if (color.w > 0.0f)
+        write_color(picture, pixel, color.xyz, codes);
+    else
+        for (int i = 0; i < 3; i++) picture[3 * pixel + i] = shown[3 * pixel + i];
 }

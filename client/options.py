@@ -65,6 +65,9 @@ Robustness = Annotated[
     str | None,
     typer.Option(metavar="LIST|none", help=f"of {', '.join(ROBUSTNESS)}; default: openness,memory,outliers"),
 ]
+Edges = Annotated[
+    str | None, typer.Option(metavar="smooth|hard", help="of virtual things; hard: as in point-sampled pictures")
+]
 Mesh = Annotated[bool, typer.Option("--mesh", help="write mesh.ply and mesh.glb")]
 BudgetMs = Annotated[float | None, typer.Option(metavar="N", help="choose the operating point for this time")]
 MaxLightError = Annotated[float | None, typer.Option(metavar="DEG", help="choose it for this light error")]
@@ -96,6 +99,7 @@ class CaptureOptions:
     lamps: str | None = None
     exposure: str | None = None
     robustness: str | None = None
+    edges: str | None = None
     budget_ms: float | None = None
     max_light_error: float | None = None
 
@@ -149,6 +153,7 @@ def refuse_unbuilt(options: CaptureOptions) -> None:
     _choice("--albedo", options.albedo, ("constant", "estimated"))
     _choice("--indirect", options.indirect, ("none", "observed"))
     _choice("--lamps", options.lamps, ("on", "off"))
+    _choice("--edges", options.edges, ("smooth", "hard"))
     _choice("--exposure", options.exposure, ("auto", "constant"))
     unbuilt = {
         f"--preset {options.preset}": (options.preset not in BUILT_PRESETS, f"use {', '.join(BUILT_PRESETS)}"),
@@ -245,6 +250,7 @@ def _wishes_of_options(options: CaptureOptions) -> dict[str, Any]:
         "lamps": options.lamps or "auto",
         "exposure": options.exposure or "auto",
         **_robustness(options.robustness),
+        "edges": options.edges or "smooth",
         **_given_light(options),
     }
 

@@ -107,6 +107,8 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Whether lights inside the room are looked for; `auto`: where distant light does not explain what is seen."""
     exposure: Literal["auto", "constant"] = "auto"
     """`auto`: of each frame as it says, estimated where it does not say; `constant`: the same for all frames."""
+    edges: Literal["smooth", "hard"] = "smooth"
+    """Of virtual things: by how much of a pixel they cover, or by its middle, as in pictures that are point samples."""
     robustness: tuple[Robustness, ...] = ("openness", "memory", "outliers")
     """Measures that light estimation takes (thesis 5.2, 5.4): samples that see little sky are left out; weights by how
     common a normal is (`normals_printed`: as eq. 5.7 has them); earlier frames count; what fits badly counts less."""

@@ -21,7 +21,7 @@ from server.stages.indirect import Indirect
 from server.stages.measure import Measurement
 from server.stages.object_glow import Glow
 from server.stages.radiance_transfer import Directions, Transfer
-from server.stages.rasterize import Placed, VirtualSurface, boxes_in_view
+from server.stages.rasterize import Placed, VirtualSurface, boxes_in_view, nearest_depths
 from server.stages.rasterize import rasterize as rasterize_stage
 from server.stages.raycast import Surface
 from server.stages.sample_grid import SampleGrid
@@ -40,6 +40,8 @@ class View:
     reach_m: float
     """Length of visibility rays."""
     sampling: Sampling = PRESETS["reg4"]
+    smooth_edges: bool = True
+    """Whether virtual things cover parts of pixels."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,7 @@ class SceneFacts:
     adaptive: bool = False
     indirect: bool = False
     """Whether surfaces send light."""
+    smooth_edges: bool = True
 
 
 def gather_facts(
@@ -66,12 +69,18 @@ def gather_facts(
         has_light=bool(light.any()),
         adaptive=view.sampling.adaptive,
         indirect=indirect is not None,
+        smooth_edges=view.smooth_edges,
     )
 
 
 def rasterize(view: View, objects: Sequence[Placed]) -> VirtualSurface:
     """Draw the virtual objects into their geometry buffer."""
     return rasterize_stage(view.engine, view.camera, inverse_rigid(view.volume_from_camera), objects)
+
+
+def cover(view: View, objects: Sequence[Placed]) -> cl_array.Array:
+    """How much of each pixel the virtual objects cover."""
+    return nearest_depths(view.engine, view.camera, inverse_rigid(view.volume_from_camera), objects)
 
 
 def prepare_rays(
@@ -157,6 +166,7 @@ def composite(
     ratio: SampleGrid | None = None,
     refined_occluded: cl_array.Array | None = None,
     refined_ratio: cl_array.Array | None = None,
+    coverage: cl_array.Array | None = None,
 ) -> NDArray[np.uint8]:
     """The finished picture; with nothing virtual it is the camera's, byte for byte."""
     return composite_stage.composite(
@@ -174,6 +184,7 @@ def composite(
         refined_occluded,
         refined_ratio,
         view.sampling.upsampling,
+        coverage,
     )
 
 
@@ -203,12 +214,17 @@ def _nothing_sent(facts: SceneFacts) -> Omission | None:
     return None if facts.indirect else Omission("indirect light is left out", 255.0)
 
 
+def _hard_edges(facts: SceneFacts) -> Omission | None:
+    return None if facts.smooth_edges else Omission("hard edges are asked for", 255.0)
+
+
 def _not_refined(facts: SceneFacts) -> Omission | None:
     return None if facts.adaptive else Omission("the preset does not refine", 255.0)
 
 
 EFFECTS: tuple[Effect[SceneFacts], ...] = (
     Effect(rasterize, writes="virtual", omitted=_nothing_in_view),
+    Effect(cover, writes="coverage", omitted=lambda f: _nothing_in_view(f) or _hard_edges(f)),
     Effect(prepare_rays, writes="scene", omitted=_nothing_casts),
     Effect(light_objects, writes="glow", omitted=lambda f: _nothing_casts(f) or _nothing_sent(f)),
     Effect(shade_virtual, writes="occluded", omitted=_nothing_to_shade),

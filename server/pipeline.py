@@ -100,7 +100,10 @@ class Pipeline:
                 distant, measurement.depth_m, geometry, volume, transfer, self._sampler.rays, indirect
             )
         with stage("rendering"):  # 7.1-7.2, the effects this frame calls for
-            view = View(engine, camera, geometry.volume_from_camera, settings.reach_m, self._sampler.sampling)
+            is_smooth = settings.edges == "smooth"
+            view = View(
+                engine, camera, geometry.volume_from_camera, settings.reach_m, self._sampler.sampling, is_smooth
+            )
             placed = objects.placed(volume.volume_from_world())
             order, plan = make_plan(EFFECTS, "picture", _GIVEN, gather_facts(view, placed, estimate.sh, indirect))
             given = {

@@ -39,6 +39,7 @@ class Settings:
     as_thesis: bool
     robustness: frozenset[str]
     """P3: which of `openness`, `normals`, `normals_printed`, `memory`, `outliers` are on."""
+    edges: Literal["smooth", "hard"]
     albedo: Literal["constant", "estimated"]
     indirect: Literal["none", "observed"]
     denoise: DenoiseMethod
@@ -56,6 +57,7 @@ def read_wishes(wishes: Wishes) -> Settings:
         reach_m=THESIS_REACH_M if wishes.as_thesis else reach_m,
         as_thesis=wishes.as_thesis,
         robustness=frozenset(wishes.robustness),
+        edges=wishes.edges,
         albedo="constant" if wishes.as_thesis else wishes.albedo,
         indirect="none" if wishes.as_thesis else wishes.indirect,
         denoise=wishes.denoise,

@@ -13,7 +13,7 @@ from protocol.frames import CameraModel
 from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine, KernelArgument, float16
 from server.stages.measure import linear_values
-from server.stages.rasterize import VirtualSurface
+from server.stages.rasterize import SUBPIXELS, VirtualSurface
 from server.stages.raycast import Surface
 from server.stages.sample_grid import SampleGrid
 from server.stages.sampling import Upsampling
@@ -62,10 +62,12 @@ def composite(
     refined_occluded: cl_array.Array | None = None,
     refined_ratio: cl_array.Array | None = None,
     upsampling: Upsampling = "bilateral",
+    coverage: cl_array.Array | None = None,
 ) -> NDArray[np.uint8]:
     """Picture [h, w, 3] sRGB of the camera picture `shown` with what is virtual; unchanged where nothing virtual is.
 
-    `refined_occluded`, `refined_ratio` [h, w] float4: what stands for `occluded` and `ratio` where w = 1.
+    `refined_occluded`, `refined_ratio` [h, w] float4: what stands for `occluded` and `ratio` where w = 1. `coverage`:
+    of nearest_depths, for smooth edges; without it a pixel is covered as its middle is.
 
     `tolerance_m`: how far behind a real surface a virtual one still shows, for objects that stand on it.
     """
@@ -74,7 +76,12 @@ def composite(
     space = engine.workspace
     picture = space.array("picture", (camera.height, camera.width, 3), np.uint8)
     bands = round(light.coefficients.shape[0] ** 0.5)
-    defines = {"HAS_OBJECTS": virtual is not None, "HAS_SHADOWS": ratio is not None, "BICUBIC": upsampling == "bicubic"}
+    defines = {
+        "HAS_OBJECTS": virtual is not None,
+        "HAS_SHADOWS": ratio is not None,
+        "BICUBIC": upsampling == "bicubic",
+        "SUBPIXELS": 0 if coverage is None else SUBPIXELS,
+    }
     kernel = engine.kernel("composite.cl", "composite", BANDS=bands, **defines)
     unused = space.array("unused", (1,), cl_types.float4)
     touched = mark_touched(engine, ratio, bands) if ratio else unused
@@ -90,6 +97,7 @@ def composite(
         float16(inverse_rigid(volume_from_camera)),
         tolerance_m,
         *((virtual.position, virtual.normal, virtual.base_color) if virtual else (unused, unused, unused)),
+        unused if coverage is None else coverage,
         light.coefficients,
         *_grid(occluded, unused),
         *_grid(ratio, unused),

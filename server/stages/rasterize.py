@@ -14,6 +14,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
+from msgspec import structs
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
@@ -22,8 +23,19 @@ from server.scene.virtual_object import VirtualObject
 from server.stages.pixel_boxes import NEAR_M, PixelBox, pixel_boxes
 from server.stages.raster_tables import CHUNK, TILE, Picture, tabulate
 
-__all__ = ["NEAR_M", "PixelBox", "Placed", "VirtualSurface", "boxes_in_view", "rasterize"]
+__all__ = [
+    "NEAR_M",
+    "SUBPIXELS",
+    "PixelBox",
+    "Placed",
+    "VirtualSurface",
+    "boxes_in_view",
+    "nearest_depths",
+    "rasterize",
+]
 
+SUBPIXELS = 2
+"""Parts of a pixel along either side, for how much of it objects cover."""
 _SCAN_ITEMS = 256
 _LEAST_ENTRIES = 1 << 16
 _LEAST_ROOM = 1 << 10
@@ -87,9 +99,36 @@ def rasterize(
     """
     boxes = boxes_in_view(camera, camera_from_volume, objects)
     picture = tabulate(engine, camera, camera_from_volume, objects, boxes)
-    visible = _raster(engine, picture, _make_lists(engine, picture))
+    visible = _raster(engine, picture, _make_lists(engine, picture, "raster"), "raster")
     object_index, position, normal, base_color, material = _shade(engine, picture, visible, name)
     return VirtualSurface(position, normal, base_color, object_index, boxes, material)
+
+
+def nearest_depths(
+    engine: Engine, camera: CameraModel, camera_from_volume: Matrix, objects: Sequence[Placed]
+) -> cl_array.Array:
+    """[SUBPIXELS h, SUBPIXELS w] uint32: bits of 1 / depth (1/metre) of the nearest object at the middles of the parts
+    of each pixel, 0 where there is none."""
+    finer = _finer(camera)
+    boxes = boxes_in_view(finer, camera_from_volume, objects)
+    picture = tabulate(engine, finer, camera_from_volume, objects, boxes)
+    lists = _make_lists(engine, picture, "fine")
+    _raster(engine, picture, lists, "fine")
+    return lists.nearest
+
+
+def _finer(camera: CameraModel) -> CameraModel:
+    """The camera with SUBPIXELS times as many pixels along either side."""
+    more, shift = SUBPIXELS, (SUBPIXELS - 1) / 2
+    return structs.replace(
+        camera,
+        width=more * camera.width,
+        height=more * camera.height,
+        fx=more * camera.fx,
+        fy=more * camera.fy,
+        cx=more * camera.cx + shift,
+        cy=more * camera.cy + shift,
+    )
 
 
 def boxes_in_view(
@@ -109,26 +148,26 @@ def _power_of_two(count: int) -> int:
     return 1 << max(count - 1, 0).bit_length()
 
 
-def _make_lists(engine: Engine, picture: Picture) -> _Lists:
-    """Project, clip and sort; what is too small is made larger, so nothing is lost."""
+def _make_lists(engine: Engine, picture: Picture, name: str) -> _Lists:
+    """Project, clip and sort; what is too small is made larger, so nothing is lost. name: of the arrays."""
     space, tiles, shape = engine.workspace, picture.tiles, (picture.camera.height, picture.camera.width)
     projected = _project(engine, picture)
-    starts = space.array("raster_starts", (tiles + 3,), np.int32)
-    counts = space.array("raster_counts", (2 + tiles,), np.int32)
-    nearest = space.array("raster_nearest", shape, np.uint32)
+    starts = space.array(f"{name}_starts", (tiles + 3,), np.int32)
+    counts = space.array(f"{name}_counts", (2 + tiles,), np.int32)
+    nearest = space.array(f"{name}_nearest", shape, np.uint32)
     pixels = shape[0] * shape[1]
     fragment_room = min(_FRAGMENTS_PER_TRIANGLE * picture.triangles, _FRAGMENTS_PER_PIXEL * pixels)
-    fragments = space.array("raster_fragments", (_power_of_two(max(fragment_room, 1)),), cl_types.int4)
+    fragments = space.array(f"{name}_fragments", (_power_of_two(max(fragment_room, 1)),), cl_types.int4)
     room, pieces = 0, min(picture.triangles, _PIECES_PER_PIXEL * pixels) + _LEAST_ROOM
     while pieces > room:
         room = _power_of_two(pieces)
-        corners = space.array("raster_corners", (room,), cl_types.int8)
-        inverse_depths = space.array("raster_inverse_depths", (room,), cl_types.float4)
+        corners = space.array(f"{name}_corners", (room,), cl_types.int8)
+        inverse_depths = space.array(f"{name}_inverse_depths", (room,), cl_types.float4)
         _setup(engine, picture, projected, counts, corners, inverse_depths, nearest, fragments)
         scan = _kernel(engine, "scan_tiles")
         engine.launch(scan, (_SCAN_ITEMS,), tiles, _MOST_ENTRIES // tiles, counts, starts, local=(_SCAN_ITEMS,))
         total, pieces, fragment_count = (int(value) for value in engine.download(starts[tiles:]))
-    entries = space.array("raster_entries", (_power_of_two(max(total, _LEAST_ENTRIES)),), np.int32)
+    entries = space.array(f"{name}_entries", (_power_of_two(max(total, _LEAST_ENTRIES)),), np.int32)
     engine.launch(_kernel(engine, "fill_tiles"), (pieces,), pieces, picture.size, corners, starts, counts, entries)
     return _Lists(projected, corners, inverse_depths, starts, entries, nearest, fragments, fragment_count)
 
@@ -185,9 +224,9 @@ def _setup(
     )
 
 
-def _raster(engine: Engine, picture: Picture, lists: _Lists) -> cl_array.Array:
+def _raster(engine: Engine, picture: Picture, lists: _Lists, name: str) -> cl_array.Array:
     """Number of the triangle that each pixel shows, [h, w] int32, 2^31 - 1 where there is none."""
-    visible = engine.workspace.array("raster_visible", lists.nearest.shape, np.int32)
+    visible = engine.workspace.array(f"{name}_visible", lists.nearest.shape, np.int32)
     engine.launch(
         _kernel(engine, "raster_tiles"),
         (picture.tiles * TILE * TILE,),

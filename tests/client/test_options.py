@@ -29,6 +29,7 @@ def test_defaults_fit_the_source(source: str) -> None:
     assert (wishes.albedo, wishes.indirect, wishes.poses) == ("estimated", "observed", "given")
     assert (wishes.lamps, wishes.exposure) == ("auto", "auto")
     assert wishes.robustness == ("openness", "memory", "outliers")
+    assert wishes.edges == "smooth"
     assert not wishes.as_thesis
     assert not wishes.lossless
 
@@ -48,6 +49,7 @@ def test_everything_said(source: str) -> None:
         indirect="none",
         lamps="on",
         robustness="normals, memory",
+        edges="hard",
         exposure="constant",
         up="0,0,1",
         object=[f"{source}/meta.json@1,2,3", f"{source}/meta.json"],
@@ -62,6 +64,7 @@ def test_everything_said(source: str) -> None:
     assert wishes.up == (0.0, 0.0, 1.0)
     assert (wishes.lamps, wishes.exposure) == ("on", "constant")
     assert wishes.robustness == ("normals", "memory")
+    assert wishes.edges == "hard"
     assert wishes.lossless
 
 
@@ -120,6 +123,7 @@ REFUSED = [
     ({"poses": "guess"}, "--poses"),
     ({"lamps": "bright"}, "--lamps"),
     ({"robustness": "normal"}, "--robustness"),
+    ({"edges": "sharp"}, "--edges"),
     ({"robustness": "none,memory"}, "--robustness"),
     ({"robustness": "normals,normals_printed"}, "--robustness"),
     ({"as_thesis": True, "robustness": "normals"}, "--as-thesis"),

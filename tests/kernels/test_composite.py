@@ -8,23 +8,25 @@ import msgspec
 import numpy as np
 import pyopencl.array as cl_array
 import pytest
+import trimesh
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
+from server.scene.virtual_object import VirtualObject
 from server.stages.composite import composite, mark_touched, shown_picture, srgb_codes
 from server.stages.measure import linear_values
 from server.stages.radiance_transfer import direction_sets
-from server.stages.rasterize import VirtualSurface
+from server.stages.rasterize import VirtualSurface, nearest_depths, rasterize
 from server.stages.raycast import Surface
 from server.stages.sample_grid import SampleGrid
 from server.stages.sampling import Upsampling
 from server.stages.traced_scene import upload_light
 from tests import lights
-from tests.meshes import pose
+from tests.meshes import pose, shape_of
 from tests.reference import composite as twin
 from tests.reference.composite import Buffer, Samples
-from tests.solids import float4, upload_surface
+from tests.solids import download4, float4, upload_surface
 
 HEIGHT, WIDTH = 44, 60
 CAMERA = CameraModel(width=WIDTH, height=HEIGHT, fx=60.0, fy=60.0, cx=29.5, cy=21.5)
@@ -93,6 +95,7 @@ def compose(
     refined_occluded: Samples | None = None,
     refined_ratio: Samples | None = None,
     upsampling: Upsampling = "bilateral",
+    inverse_depths: Floats | None = None,
 ) -> Codes:
     surface: Surface = upload_surface(
         engine, real.positions[..., :3], real.normals[..., :3], real.positions[..., 3] > 0
@@ -112,6 +115,7 @@ def compose(
         upload_every(engine, "refined_occluded", refined_occluded),
         upload_every(engine, "refined_ratio", refined_ratio),
         upsampling,
+        None if inverse_depths is None else engine.workspace.upload("fine", inverse_depths.astype(np.float32)),
     )
 
 
@@ -188,6 +192,55 @@ def test_refined_and_bicubic_values_are_the_twins(engine: Engine, stride: int, u
     assert difference.max() <= 1
     assert (difference > 0).mean() < 5e-3
     assert (expected != twin.composite(*arguments, bicubic=upsampling == "bicubic")).any()
+
+
+def test_partly_covered_pixels_are_the_twins(engine: Engine) -> None:
+    """Four parts a pixel; edges of a leaning disc against a wall that cuts through it, beyond the picture too."""
+    random = np.random.default_rng(8)
+    shown, radiance = camera_picture()
+    radiance[..., 3] = random.choice([1, 0, -1], (HEIGHT, WIDTH), p=[0.8, 0.1, 0.1])
+    v, u = np.mgrid[: 2 * HEIGHT, : 2 * WIDTH] / 2 - 0.25
+    fine = (u - 30) ** 2 + (v - 20) ** 2 < 300
+    depth = 1.0 + 0.01 * (u - 30)
+    inverse_depths = np.where(fine, 1 / depth, 0).astype(np.float32).astype(float)
+    virtual = buffer(*plane(0.8, 0.7), fine.reshape(HEIGHT, 2, WIDTH, 2).sum((1, 3)) >= 3)
+    real = buffer(*plane(1.0), random.random((HEIGHT, WIDTH)) < 0.9)
+    ratio = samples(4, random.uniform(0.3, 1, (HEIGHT // 4, WIDTH // 4, 3)))
+    occluded = samples(2, random.uniform(0, 0.2, (HEIGHT // 2, WIDTH // 2, 3)))
+    occluded.values[..., 3] = virtual.positions[1::2, 1::2, 3]
+    found = compose(engine, shown, radiance, real, virtual, occluded, ratio, inverse_depths=inverse_depths)
+    pose = np.linalg.inv(VOLUME_FROM_CAMERA)
+    arguments = (shown, radiance, real, pose, TOLERANCE_M, LIGHT, virtual, occluded, ratio)
+    expected = twin.composite(*arguments, inverse_depths=inverse_depths)
+    difference = np.abs(found.astype(int) - expected)
+    assert difference.max() <= 1
+    assert (difference > 0).mean() < 5e-3
+    assert (expected != twin.composite(*arguments)).any(-1).sum() > 50
+
+
+def test_a_slanted_edge_covers_what_it_covers(engine: Engine) -> None:
+    """Of a white quad before a black wall, the picture's mean is the quad's area: not of whole pixels only."""
+    corners = np.array([[-0.196, -0.143, 0.8], [0.204, -0.143, 0.8], [0.174, 0.117, 0.8], [-0.226, 0.127, 0.8]])
+    mesh = shape_of(trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]]))
+    objects = [(VirtualObject.upload(engine, mesh), VOLUME_FROM_CAMERA)]
+    pose = np.linalg.inv(VOLUME_FROM_CAMERA)
+    fine = engine.download(nearest_depths(engine, CAMERA, pose, objects)).view(np.float32)
+    assert fine.shape == (2 * HEIGHT, 2 * WIDTH)
+    np.testing.assert_allclose(1 / fine[fine > 0], 0.8, rtol=1e-5)
+    pixels = corners[:, :2] / corners[:, 2:] * [CAMERA.fx, CAMERA.fy]
+    x, y = pixels.T
+    area = 0.5 * abs(x @ np.roll(y, 1) - y @ np.roll(x, 1))
+    assert (fine > 0).sum() / 4 == pytest.approx(area, rel=0.01)
+    black = np.zeros((HEIGHT, WIDTH, 4))
+    black[..., 3] = 1
+    middle = rasterize(engine, CAMERA, pose, objects)
+    surface = (download4(engine, a).astype(float) for a in (middle.position, middle.normal))
+    virtual = Buffer(*surface, np.ones((HEIGHT, WIDTH, 3)))
+    light, nothing = lights.uniform((0.5, 0.5, 0.5)), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    picture = compose(engine, nothing, black, WALL, virtual, NONE_TAKEN, light=light, inverse_depths=fine)
+    linear = linear_values("srgb8")[picture].mean(-1)
+    assert linear.sum() / 0.5 == pytest.approx(area, rel=0.01)
+    assert ((linear > 0.05) & (linear < 0.45)).sum() > 40  # the edge is smooth
 
 
 @pytest.mark.parametrize("shape", [(11, 15), (1, 1), (5, 40)])

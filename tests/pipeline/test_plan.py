@@ -146,6 +146,7 @@ def test_two_writers_are_refused() -> None:
             {"composite"},
             {
                 "rasterize": "no virtual object",
+                "cover": "no virtual object",
                 "shade_virtual": "no virtual object",
                 "shadow_real": "no virtual object",
                 "refine_virtual": "no virtual object",
@@ -157,6 +158,7 @@ def test_two_writers_are_refused() -> None:
             {"prepare_rays", "shadow_real", "composite"},  # what is out of view may still cast a shadow into it
             {
                 "rasterize": "in view",
+                "cover": "in view",
                 "light_objects": "left out",
                 "shade_virtual": "in view",
                 "refine_virtual": "in view",
@@ -165,18 +167,19 @@ def test_two_writers_are_refused() -> None:
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=False),
-            {"rasterize", "composite"},
+            {"rasterize", "cover", "composite"},
             dict.fromkeys(("shade_virtual", "shadow_real", "refine_virtual", "refine_real"), "no light"),
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=True),
-            {"rasterize", "prepare_rays", "shade_virtual", "shadow_real", "composite"},
+            {"rasterize", "cover", "prepare_rays", "shade_virtual", "shadow_real", "composite"},
             {"refine_virtual": "does not refine", "refine_real": "does not refine", "light_objects": "left out"},
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=True, adaptive=True, indirect=True),
             {
                 "rasterize",
+                "cover",
                 "prepare_rays",
                 "light_objects",
                 "shade_virtual",

@@ -104,10 +104,12 @@ def composite(
     refined_occluded: Samples | None = None,
     refined_ratio: Samples | None = None,
     bicubic: bool = False,
+    inverse_depths: Floats | None = None,
 ) -> NDArray[np.uint8]:
     """The picture [h, w, 3]: the nearer of virtual and real surface, real ones times `ratio`, untouched ones as shown.
 
     radiance [h, w, 4]; light [n, 3]. A virtual surface at most `tolerance_m` behind a real one is in front.
+    inverse_depths [f h, f w] of the nearest object at the parts of each pixel, 0 for none; else the middle counts.
     """
 
     def value_at(samples: Samples, refined: Samples | None, surface: Buffer, x: int, y: int) -> Floats:
@@ -115,19 +117,38 @@ def composite(
             return upsample(refined, surface, x, y, tolerance_m)
         return upsample_bicubic(samples, x, y) if bicubic else upsample(samples, surface, x, y, tolerance_m)
 
+    def depth(point: Floats) -> float:
+        return float(camera_from_volume[2, :3] @ point[:3] + camera_from_volume[2, 3])
+
+    def share_and_source(x: int, y: int) -> tuple[float, tuple[int, int] | None]:
+        assert virtual is not None
+        real_z = depth(real.positions[y, x]) if real.positions[y, x, 3] > 0 else np.inf
+        if inverse_depths is None:
+            is_front = virtual.positions[y, x, 3] > 0 and real_z - depth(virtual.positions[y, x]) > -tolerance_m
+            return float(is_front), (x, y)
+        f = inverse_depths.shape[0] // shown.shape[0]
+        parts = inverse_depths[f * y : f * y + f, f * x : f * x + f]
+        share = float(((parts > 0) & (real_z + tolerance_m > 1 / np.maximum(parts, 1e-9))).mean())
+        steps = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, -1), (-1, 1), (1, 1)]
+        near = [(x + a, y + b) for a, b in steps if 0 <= x + a < shown.shape[1] and 0 <= y + b < shown.shape[0]]
+        return share, next(((u, v) for u, v in near if virtual.positions[v, u, 3] > 0), None)
+
     picture = shown.copy()
     for y, x in np.ndindex(shown.shape[:2]):
-        here = real.positions[y, x]
-        if virtual is not None and occluded is not None and virtual.positions[y, x, 3] > 0:
-            ahead = camera_from_volume[2, :3] @ (here[:3] - virtual.positions[y, x, :3])
-            if here[3] <= 0 or ahead > -tolerance_m:
-                taken = value_at(occluded, refined_occluded, virtual, x, y)[:3]
-                bands = round(len(light) ** 0.5)
-                shading = np.maximum(open_transfer(virtual.normals[y, x, :3], bands) @ light - taken, 0)
-                picture[y, x] = srgb_codes(virtual.colors[y, x] * shading)
-                continue
+        here, color, is_changed = real.positions[y, x], radiance[y, x, :3].copy(), False
         if ratio is not None and here[3] > 0 and radiance[y, x, 3] >= 0:
             factor = value_at(ratio, refined_ratio, real, x, y)
             if factor[3] > 0 and np.abs(factor[:3] - 1).max() > UNTOUCHED:
-                picture[y, x] = srgb_codes(radiance[y, x, :3] * factor[:3])
+                color, is_changed = color * factor[:3], True
+        if virtual is not None and occluded is not None:
+            share, source = share_and_source(x, y)
+            if share > 0 and source is not None:
+                u, v = source
+                taken = value_at(occluded, refined_occluded, virtual, u, v)[:3]
+                bands = round(len(light) ** 0.5)
+                shading = np.maximum(open_transfer(virtual.normals[v, u, :3], bands) @ light - taken, 0)
+                part = 1.0 if radiance[y, x, 3] < 0 else share
+                color, is_changed = (1 - part) * color + part * virtual.colors[v, u] * shading, True
+        if is_changed:
+            picture[y, x] = srgb_codes(color)
     return picture

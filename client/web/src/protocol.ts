@@ -75,6 +75,8 @@ export interface Wishes {
   lamps?: "auto" | "off" | "on";
   /** `auto`: of each frame as it says, estimated where it does not say; `constant`: the same for all frames. */
   exposure?: "auto" | "constant";
+  /** Of virtual things: by how much of a pixel they cover, or by its middle, as in pictures that are point samples. */
+  edges?: "hard" | "smooth";
   /**
    * Measures that light estimation takes (thesis 5.2, 5.4): samples that see little sky are left out; weights by how
    * common a normal is (`normals_printed`: as eq. 5.7 has them); earlier frames count; what fits badly counts less.

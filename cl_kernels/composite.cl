@@ -59,6 +59,7 @@ typedef struct {
     global const float4 *occluded;
     global const float4 *refined;
     int has_refined;
+    global const float4 *reflected;
 } Virtual;
 
 // Radiance of the virtual surface at pixel (x, y), which it covers.
@@ -67,7 +68,12 @@ static float3 virtual_color(const Virtual things, global const float4 *light, co
     const int pixel = y * things.grid.width + x;
     const float4 taken = value_at(things.grid, things.occluded, things.refined, things.has_refined, things.positions, things.normals,
                                   x, y, height, tolerance_m);
-    return things.colors[pixel].xyz * fmax(open_shading(things.normals[pixel].xyz, light) - taken.xyz, (float3)(0.0f));
+    const float3 diffuse = things.colors[pixel].xyz * fmax(open_shading(things.normals[pixel].xyz, light) - taken.xyz, (float3)(0.0f));
+#ifdef HAS_GLOSS
+    return things.reflected[pixel].w * diffuse + things.reflected[pixel].xyz;
+#else
+    return diffuse;
+#endif
 }
 
 #if SUBPIXELS > 0
@@ -99,6 +105,7 @@ static int covered_near(global const float4 *positions, const int x, const int y
 // shown [h][w][3]: the camera picture as sRGB codes; radiance [h][w] linear. positions, normals: the real geometry buffer.
 // virtual_positions, virtual_normals, virtual_colors [h][w] (w = 1 where covered): the virtual one, or none without HAS_OBJECTS;
 // nearest: see share_covered, where SUBPIXELS is not 0; else pixels are covered as their middles are.
+// reflected [h][w]: see reflect.cl, or none without HAS_GLOSS.
 // occluded [object_rows][object_cols]: radiance that occluders take from virtual samples (w = 1 valid);
 // ratio [rows][cols]: shaded with over without virtual objects on real samples (w = 1 valid), touched: see mark_touched; or
 // none without HAS_SHADOWS. refined_occluded, refined_ratio [h][w]: the same at pixels that have w = 1, or none where has_... is 0.
@@ -108,7 +115,8 @@ kernel void composite(const int width, const int height, global const uchar *sho
                       global const float4 *positions, global const float4 *normals, const float16 camera_from_volume,
                       const float tolerance_m,
                       global const float4 *virtual_positions, global const float4 *virtual_normals,
-                      global const float4 *virtual_colors, global const uint *nearest, global const float4 *light,
+                      global const float4 *virtual_colors, global const uint *nearest, global const float4 *reflected,
+                      global const float4 *light,
                       const int object_cols, const int object_rows, const int object_stride, global const float4 *occluded,
                       const int cols, const int rows, const int stride, global const float4 *ratio,
                       global const uchar *touched, const int has_refined_occluded, global const float4 *refined_occluded,
@@ -132,7 +140,7 @@ kernel void composite(const int width, const int height, global const uchar *sho
 #endif
 #ifdef HAS_OBJECTS
     const Virtual things = {virtual_positions, virtual_normals, virtual_colors, {object_cols, object_rows, object_stride, width},
-                            occluded, refined_occluded, has_refined_occluded};
+                            occluded, refined_occluded, has_refined_occluded, reflected};
     const float real_z = real.w > 0.0f ? transform_point(camera_from_volume, real.xyz).z : 0.0f;
 #if SUBPIXELS > 0
     const float share = share_covered(nearest, x, y, width, real_z, tolerance_m);

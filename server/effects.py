@@ -24,6 +24,7 @@ from server.stages.radiance_transfer import Directions, Transfer
 from server.stages.rasterize import Placed, VirtualSurface, boxes_in_view, nearest_depths
 from server.stages.rasterize import rasterize as rasterize_stage
 from server.stages.raycast import Surface
+from server.stages.reflect import is_glossy, reflect_surroundings
 from server.stages.sample_grid import SampleGrid
 from server.stages.sampling import PRESETS, Sampling
 from server.stages.traced_scene import Changed, DeviceLight, TracedScene, trace_scene
@@ -55,6 +56,8 @@ class SceneFacts:
     indirect: bool = False
     """Whether surfaces send light."""
     smooth_edges: bool = True
+    glossy: bool = False
+    """Whether any virtual surface is not matt."""
 
 
 def gather_facts(
@@ -70,6 +73,7 @@ def gather_facts(
         adaptive=view.sampling.adaptive,
         indirect=indirect is not None,
         smooth_edges=view.smooth_edges,
+        glossy=any(is_glossy(thing.tables.materials) for thing, _ in objects),
     )
 
 
@@ -125,6 +129,19 @@ def shade_virtual(
     return differential.shadow_virtual(view.engine, view.camera, virtual, changed)
 
 
+def reflect(
+    view: View,
+    virtual: VirtualSurface,
+    surface: Surface,
+    scene: TracedScene,
+    glow: Glow | None = None,
+    ratio: RealShadow | None = None,
+) -> cl_array.Array:
+    """What glossy virtual things reflect."""
+    changed = _with_objects(view, surface, scene, glow, ratio)
+    return reflect_surroundings(view.engine, view.camera, view.volume_from_camera, virtual, changed)
+
+
 def refine_virtual(
     view: View,
     virtual: VirtualSurface,
@@ -167,6 +184,7 @@ def composite(
     refined_occluded: cl_array.Array | None = None,
     refined_ratio: cl_array.Array | None = None,
     coverage: cl_array.Array | None = None,
+    reflected: cl_array.Array | None = None,
 ) -> NDArray[np.uint8]:
     """The finished picture; with nothing virtual it is the camera's, byte for byte."""
     return composite_stage.composite(
@@ -185,6 +203,7 @@ def composite(
         refined_ratio,
         view.sampling.upsampling,
         coverage,
+        reflected,
     )
 
 
@@ -214,6 +233,10 @@ def _nothing_sent(facts: SceneFacts) -> Omission | None:
     return None if facts.indirect else Omission("indirect light is left out", 255.0)
 
 
+def _matt(facts: SceneFacts) -> Omission | None:
+    return None if facts.glossy else Omission("no virtual object is glossy", 0.0)
+
+
 def _hard_edges(facts: SceneFacts) -> Omission | None:
     return None if facts.smooth_edges else Omission("hard edges are asked for", 255.0)
 
@@ -227,6 +250,7 @@ EFFECTS: tuple[Effect[SceneFacts], ...] = (
     Effect(cover, writes="coverage", omitted=lambda f: _nothing_in_view(f) or _hard_edges(f)),
     Effect(prepare_rays, writes="scene", omitted=_nothing_casts),
     Effect(light_objects, writes="glow", omitted=lambda f: _nothing_casts(f) or _nothing_sent(f)),
+    Effect(reflect, writes="reflected", omitted=lambda f: _nothing_to_shade(f) or _matt(f)),
     Effect(shade_virtual, writes="occluded", omitted=_nothing_to_shade),
     Effect(shadow_real, writes="ratio", omitted=_nothing_casts),
     Effect(refine_virtual, writes="refined_occluded", omitted=lambda f: _nothing_to_shade(f) or _not_refined(f)),

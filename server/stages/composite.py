@@ -63,11 +63,12 @@ def composite(
     refined_ratio: cl_array.Array | None = None,
     upsampling: Upsampling = "bilateral",
     coverage: cl_array.Array | None = None,
+    reflected: cl_array.Array | None = None,
 ) -> NDArray[np.uint8]:
     """Picture [h, w, 3] sRGB of the camera picture `shown` with what is virtual; unchanged where nothing virtual is.
 
     `refined_occluded`, `refined_ratio` [h, w] float4: what stands for `occluded` and `ratio` where w = 1. `coverage`:
-    of nearest_depths, for smooth edges; without it a pixel is covered as its middle is.
+    of nearest_depths, for smooth edges; without it a pixel is covered as its middle is. `reflected`: of reflect.py.
 
     `tolerance_m`: how far behind a real surface a virtual one still shows, for objects that stand on it.
     """
@@ -81,6 +82,7 @@ def composite(
         "HAS_SHADOWS": ratio is not None,
         "BICUBIC": upsampling == "bicubic",
         "SUBPIXELS": 0 if coverage is None else SUBPIXELS,
+        "HAS_GLOSS": reflected is not None,
     }
     kernel = engine.kernel("composite.cl", "composite", BANDS=bands, **defines)
     unused = space.array("unused", (1,), cl_types.float4)
@@ -98,6 +100,7 @@ def composite(
         tolerance_m,
         *((virtual.position, virtual.normal, virtual.base_color) if virtual else (unused, unused, unused)),
         unused if coverage is None else coverage,
+        unused if reflected is None else reflected,
         light.coefficients,
         *_grid(occluded, unused),
         *_grid(ratio, unused),

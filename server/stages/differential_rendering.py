@@ -30,6 +30,10 @@ BOUNCE_EVERY = 4
 """Of how many hidden directions a sample follows one, for what its surroundings send it less; its neighbours others."""
 
 
+MOST_POINTS = 8192
+"""Points on objects that are lit one by one, the first objects'; others are taken to see an even light."""
+
+
 @dataclass(frozen=True)
 class RealShadow(SampleGrid):
     """Ratios R' / R (eq. 7.1) at samples of real surface."""
@@ -146,11 +150,12 @@ def shadow_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface,
 def light_points(engine: Engine, scene: TracedScene) -> Glow:
     """What the objects send: their points lit as their pixels are (eq. 7.3), but not by one another."""
     placed = place_points(engine, scene.objects)
-    radiances = engine.workspace.array("glow_radiances", (placed.count,), cl_types.float4)
+    radiances = engine.workspace.upload("glow_radiances", placed.under_even_light(scene.light.mean))
+    lit = min(placed.count, MOST_POINTS)
     engine.launch(
         engine.kernel("differential_rendering.cl", "light_points", **scene.defines(engine)),
-        (placed.count,),
-        placed.count,
+        (lit,),
+        lit,
         placed.points,
         placed.normals,
         placed.albedos,

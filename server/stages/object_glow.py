@@ -136,12 +136,18 @@ class PlacedPoints:
     """[count] float4: volume metres, w = 1."""
     normals: cl_array.Array
     """[count] float4: unit, volume axes."""
+    colors: Floats
+    """[count, 3] albedos on the host."""
     albedos: cl_array.Array
     """[count] float4."""
     offsets_m: cl_array.Array
     """[count] float32: how far off its surface rays of a point begin."""
     glow: Glow
     """With nothing sent yet."""
+
+    def under_even_light(self, radiance: Floats) -> NDArray[np.float32]:
+        """[count] float4: what the points send under a light [3] from everywhere."""
+        return _float4(self.colors * radiance, 1.0)
 
 
 def no_glow(engine: Engine) -> Glow:
@@ -170,11 +176,13 @@ def place_points(engine: Engine, objects: Sequence[Placed]) -> PlacedPoints:
         turned = surface.normals @ matrix[:3, :3].T
         normals.append(turned / np.linalg.norm(turned, axis=1, keepdims=True))
         offsets.append(np.full(len(surface.points), np.linalg.norm(volume_from_grid[:3, 0])))
+    albedos = np.concatenate([s.albedos for s in surfaces])
     return PlacedPoints(
         int(first[-1]),
         space.upload("glow_places", _float4(np.concatenate(points), 1.0)),
         space.upload("glow_place_normals", _float4(np.concatenate(normals))),
-        space.upload("glow_albedos", _float4(np.concatenate([s.albedos for s in surfaces]))),
+        albedos,
+        space.upload("glow_albedos", _float4(albedos)),
         space.upload("glow_offsets", np.concatenate(offsets).astype(np.float32)),
         Glow(
             space.upload("glow_nearest", np.concatenate(nearest).astype(np.int32)),

@@ -33,6 +33,8 @@ class DeviceLight:
 
     coefficients: cl_array.Array
     """[bands^2] float4: RGB radiance coefficients."""
+    mean: NDArray[np.float64]
+    """[3] radiance, over all directions."""
     arriving: cl_array.Array
     """[SETS, count] float4: RGB radiance from each direction that visibility is tested along; not below 0, as that of
     few harmonics may be: to hide darkness would light up."""
@@ -128,6 +130,7 @@ def upload_light(
     sh = exposure * sh
     return DeviceLight(
         engine.workspace.upload("light", _float4(sh)),
+        np.maximum(0.5 / np.sqrt(np.pi) * sh[0], 0.0),
         engine.workspace.upload("arriving", _float4(np.maximum(rays.basis @ sh.astype(np.float32), 0.0))),
         plane_arguments(engine, "light_planes", planes),
         exposure * indirect.mean if indirect else np.zeros(3),

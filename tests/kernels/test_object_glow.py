@@ -16,6 +16,7 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.scene.mesh import Mesh
 from server.scene.virtual_object import VirtualObject
+from server.stages import differential_rendering
 from server.stages.adaptive import refine_real
 from server.stages.differential_rendering import (
     RealShadow,
@@ -384,3 +385,18 @@ def test_a_dark_floor_has_nothing_to_lose(engine: Engine) -> None:
     ratio, points, normals = bounced_wall(engine, 4, (0.0, 0.0, 0.0))
     is_wall = (points[..., 3] > 0) & (normals[..., 2] > 0.9)
     np.testing.assert_array_equal(ratio[is_wall][:, :3], 1.0)
+
+
+def test_of_very_many_things_the_first_are_lit_one_by_one(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The others send what an even light of the same mean makes of them."""
+    colors = [(0.2, 0.5, 0.8), (0.9, 0.1, 0.4)]
+    cubes = [box((0.2 + 0.3 * k, 0.45, 0.45), (0.25 + 0.3 * k, 0.5, 0.5)) for k in range(2)]
+    objects = [placed(engine, cube, color) for cube, color in zip(cubes, colors, strict=True)]
+    volume, rays = fill_volume(engine, (floor(-0.5),), VOXEL_M), direction_sets(81, 4)
+    light = lights.lobe_and_sky((0.6, 0.7, 0.2))
+    traced = trace_scene(engine, volume, upload_light(engine, light, rays), rays, ROOM_M, objects)
+    every = download4(engine, light_points(engine, traced).radiances)[:, :3].copy()
+    monkeypatch.setattr(differential_rendering, "MOST_POINTS", POINTS)
+    some = download4(engine, light_points(engine, traced).radiances)[:, :3]
+    np.testing.assert_array_equal(some[:POINTS], every[:POINTS])
+    np.testing.assert_allclose(some[POINTS:], np.tile(light[0] * 0.2820948 * colors[1], (POINTS, 1)), rtol=1e-4)

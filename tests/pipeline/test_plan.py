@@ -147,6 +147,7 @@ def test_two_writers_are_refused() -> None:
             {
                 "rasterize": "no virtual object",
                 "cover": "no virtual object",
+                "reflect": "no virtual object",
                 "shade_virtual": "no virtual object",
                 "shadow_real": "no virtual object",
                 "refine_virtual": "no virtual object",
@@ -159,6 +160,7 @@ def test_two_writers_are_refused() -> None:
             {
                 "rasterize": "in view",
                 "cover": "in view",
+                "reflect": "in view",
                 "light_objects": "left out",
                 "shade_virtual": "in view",
                 "refine_virtual": "in view",
@@ -168,20 +170,26 @@ def test_two_writers_are_refused() -> None:
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=False),
             {"rasterize", "cover", "composite"},
-            dict.fromkeys(("shade_virtual", "shadow_real", "refine_virtual", "refine_real"), "no light"),
+            dict.fromkeys(("shade_virtual", "shadow_real", "refine_virtual", "refine_real", "reflect"), "no light"),
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=True),
             {"rasterize", "cover", "prepare_rays", "shade_virtual", "shadow_real", "composite"},
-            {"refine_virtual": "does not refine", "refine_real": "does not refine", "light_objects": "left out"},
+            {
+                "refine_virtual": "does not refine",
+                "refine_real": "does not refine",
+                "light_objects": "left out",
+                "reflect": "glossy",
+            },
         ),
         (
-            SceneFacts(objects=1, objects_in_view=1, has_light=True, adaptive=True, indirect=True),
+            SceneFacts(objects=1, objects_in_view=1, has_light=True, adaptive=True, indirect=True, glossy=True),
             {
                 "rasterize",
                 "cover",
                 "prepare_rays",
                 "light_objects",
+                "reflect",
                 "shade_virtual",
                 "refine_virtual",
                 "shadow_real",

@@ -152,7 +152,7 @@ kernel void count_open(const int points_count, global const float4 *points, glob
     int sum = 0;
     for (int j = 0; j < count; j++) {
         const float3 direction = directions[j].xyz;
-        if (dot(normal, direction) > 0.0f) sum += trace_object(same, dims, distances, origin, direction, reach) > 0.0f;
+        if (dot(normal, direction) > 0.0f) sum += distance_to_object(same, dims, distances, origin, direction, reach) >= reach;
     }
     open[index] = sum;
 }

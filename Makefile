@@ -27,6 +27,7 @@ lint: .venv/installed-test
 bench: .venv/installed-bench
 	$(BIN)/probeless bench geometry
 	$(BIN)/probeless bench light
+	$(BIN)/probeless bench rendering
 	$(BIN)/probeless bench service
 
 web: .venv/installed-test

@@ -17,7 +17,14 @@ from server.evaluation.report import Row, Unmeasured, commit
 
 ROOT = Path(__file__).resolve().parents[2]
 CODE = ("cl_kernels", "client", "protocol", "server", "tests/bench")
-LIBRARIES = ("numpy", "open3d", "opencv-contrib-python-headless", "pocl-binary-distribution", "pyopencl")
+LIBRARIES = (
+    "flip-evaluator",
+    "numpy",
+    "open3d",
+    "opencv-contrib-python-headless",
+    "pocl-binary-distribution",
+    "pyopencl",
+)
 
 
 class UnmeasurableError(Exception):

@@ -51,6 +51,11 @@ class PlanePatch:
         reach = np.array(STEPS_M)[self.steps]
         return np.array([low_x - reach[0], high_x + reach[1], low_y - reach[2], high_y + reach[3]])
 
+    @property
+    def longest_m(self) -> float:
+        """The longer side of what was seen."""
+        return float((self.seen[1] - self.seen[0]).max())
+
     def coordinates(self, points: Floats) -> Floats:
         """[..., 2] of points [..., 3] on the plane, relative to `corner`."""
         return np.stack([points @ self.across, points @ self.along], axis=-1) - self.corner

@@ -37,6 +37,8 @@ LEAST_GAIN_KNOWN = 0.003
 """The same where the light is known, and so cannot make up for extents."""
 FIRST_TRIES = 400
 """Extents tried in each of the first frames, until all have been settled."""
+MOST_GROWTH = 1.5
+"""Beyond a side a plane goes on for so many times the longer side of what was seen of it, at most."""
 TRIES, RESUME_FRAMES, RETRY_FRAMES = 40, 4, 16
 """Extents tried at a time from then on, and how often: while new planes are not settled, and while all are."""
 SETTLED_PASSES = 2
@@ -233,7 +235,7 @@ class _Trial:
         for k, hidden in enumerate(self._hidden):
             if k != plane:
                 others |= hidden
-        for step in self._candidates(int(patch.steps[side])):
+        for step in self._candidates(int(patch.steps[side]), MOST_GROWTH * patch.longest_m):
             steps = patch.steps.copy()
             steps[side] = step
             hidden = self._hidden_by(plane, steps)
@@ -246,10 +248,10 @@ class _Trial:
                 patch.steps, self._hidden[plane], self.misfit = steps, hidden, misfit
         return max(tried, 1)
 
-    def _candidates(self, now: int) -> Iterator[int]:
-        """Other extents: all where nothing is known, else the next ones."""
+    def _candidates(self, now: int, most_m: float) -> Iterator[int]:
+        """Other extents of at most `most_m`: all where nothing is known, else the next ones."""
         everything = range(len(STEPS_M)) if now == 0 else (now - 2, now - 1, now + 1, now + 2)
-        return (step for step in everything if step != now and 0 <= step < len(STEPS_M))
+        return (step for step in everything if step != now and 0 <= step < len(STEPS_M) and STEPS_M[step] <= most_m)
 
     def _hidden_by(self, plane: int, steps: NDArray[np.int64]) -> NDArray[np.bool_]:
         """[n, CELLS * SPOKES]."""

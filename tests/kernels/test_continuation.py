@@ -13,12 +13,12 @@ from protocol.frames import CameraModel
 from protocol.messages import Wishes
 from server.evaluation.environment import direction_error_deg
 from server.maths.lobes import CELLS, cell_directions, lobe_family
-from server.maths.planes import STEPS_M, find_planes
+from server.maths.planes import STEPS_M, PlanePatch, find_planes
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import Pipeline
 from server.stages.cell_transfer import PoolGrid, PoolWindow
-from server.stages.continuation import LEAST_M, NO_PLANES, Continuation, Judged, spokes
+from server.stages.continuation import LEAST_M, MOST_GROWTH, NO_PLANES, Continuation, Judged, _Trial, spokes
 from server.stages.light_model import LightModel
 from server.stages.lobe_estimator import LobeEstimator
 from tests.analytic import Floats
@@ -187,3 +187,19 @@ def test_a_light_that_is_given_shows_the_room_too(device: Device) -> None:
     assert len(shapes) >= 3
     sides_m = shapes[:, 3, 1::2] - shapes[:, 3, ::2]  # seen and beyond
     assert sides_m.max() > 2.5  # of a wall 3.4 m wide of which the pictures show 2
+
+
+@pytest.mark.parametrize(("seen_m", "most_m"), [(0.2, 0.3), (0.6, 0.8), (2.0, 3.0)])
+def test_a_small_face_does_not_become_a_wall(seen_m: float, most_m: float) -> None:
+    """Beyond a side a plane goes on for so many times what was seen of it, at most."""
+    face = PlanePatch(
+        normal=np.array([0.0, 0, 1]),
+        offset_m=0.0,
+        across=np.array([1.0, 0, 0]),
+        along=np.array([0.0, 1, 0]),
+        corner=np.zeros(2),
+        empty=np.zeros((4, 4), np.bool_),
+        seen=np.array([[1.0, 1.0], [1.0 + seen_m, 1.1]]),
+    )
+    steps = _Trial._candidates(object.__new__(_Trial), 0, MOST_GROWTH * face.longest_m)
+    assert max(STEPS_M[step] for step in steps) == most_m

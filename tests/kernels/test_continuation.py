@@ -189,7 +189,7 @@ def test_a_light_that_is_given_shows_the_room_too(device: Device) -> None:
     assert sides_m.max() > 2.5  # of a wall 3.4 m wide of which the pictures show 2
 
 
-@pytest.mark.parametrize(("seen_m", "most_m"), [(0.2, 0.3), (0.6, 0.8), (2.0, 3.0)])
+@pytest.mark.parametrize(("seen_m", "most_m"), [(0.21, 0.3), (0.6, 0.8), (2.1, 3.0)])
 def test_a_small_face_does_not_become_a_wall(seen_m: float, most_m: float) -> None:
     """Beyond a side a plane goes on for so many times what was seen of it, at most."""
     face = PlanePatch(

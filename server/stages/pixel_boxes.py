@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from server.stages.pinhole import Pinhole
 
 NEAR_M = 0.05
 """Nothing nearer to the camera's plane is drawn."""
@@ -21,7 +22,7 @@ _EDGES = np.array([(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i 
 
 
 def pixel_boxes(
-    camera: CameraModel, camera_from_model: Floats, low: Floats, high: Floats
+    camera: CameraModel | Pinhole, camera_from_model: Floats, low: Floats, high: Floats
 ) -> tuple[PixelBox | None, ...]:
     """Box of pixels that holds everything of each model box `low` to `high` that is in view; None if nothing is.
 

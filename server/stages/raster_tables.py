@@ -14,6 +14,7 @@ from protocol.frames import CameraModel
 from server.opencl.engine import Engine, int2
 from server.scene.arena import Arena, gather
 from server.scene.virtual_object import VirtualObject
+from server.stages.pinhole import Pinhole
 from server.stages.pixel_boxes import PixelBox
 
 TILE = 8
@@ -26,7 +27,7 @@ Matrix = NDArray[np.float64]
 class Picture:
     """The objects as one camera sees them: the tables of rasterize.cl."""
 
-    camera: CameraModel
+    camera: CameraModel | Pinhole
     arena: Arena
     objects: cl_array.Array
     matrices: cl_array.Array
@@ -49,7 +50,7 @@ class Picture:
 
 def tabulate(
     engine: Engine,
-    camera: CameraModel,
+    camera: CameraModel | Pinhole,
     camera_from_volume: Matrix,
     objects: Sequence[tuple[VirtualObject, Matrix]],
     boxes: tuple[PixelBox | None, ...],
@@ -78,7 +79,9 @@ def tabulate(
     )
 
 
-def _matrices(camera: CameraModel, camera_from_volume: Matrix, volume_from_model: Matrix) -> NDArray[np.float32]:
+def _matrices(
+    camera: CameraModel | Pinhole, camera_from_volume: Matrix, volume_from_model: Matrix
+) -> NDArray[np.float32]:
     """[3 n] float16: for each object pixel_from_model, model_from_pixel (see rasterize.cl) and volume_from_model."""
     pixel_from_camera = np.eye(4)
     pixel_from_camera[:2, :3] = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy]]

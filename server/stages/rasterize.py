@@ -14,12 +14,12 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
-from msgspec import structs
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine, int2
 from server.scene.virtual_object import VirtualObject
+from server.stages.pinhole import Pinhole, finer
 from server.stages.pixel_boxes import NEAR_M, PixelBox, pixel_boxes
 from server.stages.raster_tables import CHUNK, TILE, Picture, tabulate
 
@@ -109,30 +109,16 @@ def nearest_depths(
 ) -> cl_array.Array:
     """[SUBPIXELS h, SUBPIXELS w] uint32: bits of 1 / depth (1/metre) of the nearest object at the middles of the parts
     of each pixel, 0 where there is none."""
-    finer = _finer(camera)
-    boxes = boxes_in_view(finer, camera_from_volume, objects)
-    picture = tabulate(engine, finer, camera_from_volume, objects, boxes)
+    fine = finer(camera, SUBPIXELS)
+    boxes = boxes_in_view(fine, camera_from_volume, objects)
+    picture = tabulate(engine, fine, camera_from_volume, objects, boxes)
     lists = _make_lists(engine, picture, "fine")
     _raster(engine, picture, lists, "fine")
     return lists.nearest
 
 
-def _finer(camera: CameraModel) -> CameraModel:
-    """The camera with SUBPIXELS times as many pixels along either side."""
-    more, shift = SUBPIXELS, (SUBPIXELS - 1) / 2
-    return structs.replace(
-        camera,
-        width=more * camera.width,
-        height=more * camera.height,
-        fx=more * camera.fx,
-        fy=more * camera.fy,
-        cx=more * camera.cx + shift,
-        cy=more * camera.cy + shift,
-    )
-
-
 def boxes_in_view(
-    camera: CameraModel, camera_from_volume: Matrix, objects: Sequence[Placed]
+    camera: CameraModel | Pinhole, camera_from_volume: Matrix, objects: Sequence[Placed]
 ) -> tuple[PixelBox | None, ...]:
     """For each object the box of pixels that holds all of it that is in view, as VirtualSurface has it."""
     matrices = np.array([matrix for _, matrix in objects], np.float64).reshape(-1, 4, 4)

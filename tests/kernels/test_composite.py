@@ -243,6 +243,15 @@ def test_a_slanted_edge_covers_what_it_covers(engine: Engine) -> None:
     assert ((linear > 0.05) & (linear < 0.45)).sum() > 40  # the edge is smooth
 
 
+def test_the_largest_camera_has_smooth_edges_too(engine: Engine) -> None:
+    """What is drawn finer may be larger than any camera's picture is allowed to be."""
+    camera = msgspec.structs.replace(CAMERA, width=1920, height=1200, fx=1500.0, fy=1500.0, cx=960.0, cy=600.0)
+    thing = VirtualObject.upload(engine, shape_of(trimesh.creation.box((0.05, 0.05, 0.05))))
+    fine = engine.download(nearest_depths(engine, camera, np.eye(4), [(thing, pose((0.0, 0.0, 1.0)))]))
+    assert fine.shape == (2400, 3840)
+    assert (fine > 0).sum() / 4 == pytest.approx((0.05 / 0.975 * 1500) ** 2, rel=0.01)
+
+
 @pytest.mark.parametrize("shape", [(11, 15), (1, 1), (5, 40)])
 def test_touched_cells_are_the_twins(engine: Engine, shape: tuple[int, int]) -> None:
     random = np.random.default_rng(3)

@@ -1,0 +1,32 @@
+"""A pinhole camera, as drawing wants it: of any size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from protocol.frames import CameraModel
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """Picture size and intrinsics in pixels; centres of pixels lie at integers."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+def finer(camera: CameraModel, parts: int) -> Pinhole:
+    """The camera, its distortion ignored, with `parts` times as many pixels along either side."""
+    shift = (parts - 1) / 2
+    return Pinhole(
+        width=parts * camera.width,
+        height=parts * camera.height,
+        fx=parts * camera.fx,
+        fy=parts * camera.fy,
+        cx=parts * camera.cx + shift,
+        cy=parts * camera.cy + shift,
+    )

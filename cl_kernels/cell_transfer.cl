@@ -32,7 +32,7 @@ static inline float clamped_mean(const float x, const float reach) {
 // usable, on its surface and of its colour. Each was traced along other directions, and together they fill the cells.
 // positions, normals [h][w]; free_mask [rows][cols][MASK_WORDS], sets [rows][cols][INTERLEAVE] (see Transfer), observed
 // [rows][cols] (rgb, w = 1 usable), hits [rows][cols]: what was seen of the surfaces that hide directions, see indirect.cl;
-// directions [64][count] (unit, sr), cell_of [64][count], centers [CELLS]; unseen: radiance of surface that no picture shows
+// directions [256][count] (unit, sr), cell_of [256][count], centers [CELLS]; unseen: radiance of surface that no picture shows
 // -> of every pool, of white surface: pools [CELLS]: the share of its cosine-weighted sky that is each cell and is free (what
 // is sampled is how much of a cell is hidden; an open surface has no sampling error); seen: its mean radiance, what surfaces
 // send it, the share of its sky that is surface no picture shows, and the share of the samples used; place: where its middle

@@ -9,7 +9,7 @@
 
 // One item a sample. It follows every `every`-th of its hidden directions, beginning with another one than its neighbours do.
 // positions, normals [h][w]; free_mask [rows][cols][MASK_WORDS], sets [rows][cols][INTERLEAVE] (see Transfer); directions
-// [64][count] (unit, sr); colors: of the volume
+// [256][count] (unit, sr); colors: of the volume
 // -> hits [rows][cols]: sum over them of radiance times cosine, and of cosine (w), where the surface met has a colour; both
 // times `every`.
 kernel void gather_hits(const int cols, const int rows, const int stride, const int width, global const float4 *positions,

@@ -28,7 +28,7 @@ static int usable_pixel(const int width, const int height, global const float4 *
 }
 
 // One item a pool of 4 x 4 samples, which traced 16 direction sets: an even lattice together. Members lie on the surface
-// of the first usable one. Samples: as transfer_radiance left them. lobes [64][count][LOBES]: radiance of each lobe
+// of the first usable one. Samples: as transfer_radiance left them. lobes [256][count][LOBES]: radiance of each lobe
 // along each direction. -> of each pool [pool_rows][pool_cols]: mean position (volume space metres; w = share of samples
 // in it, 0 = unusable), mean normal (unit), mean colour, and transfer of the lobes over white [LOBES].
 kernel void pool_sky(const int pool_cols, const int pool_rows, const int cols, const int stride, const int width, const int height,

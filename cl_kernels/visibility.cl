@@ -3,7 +3,7 @@
 #include "hemisphere.clh"
 
 // One item a sample; samples lie every `stride` pixels from stride / 2. positions, normals [h][w]: the geometry buffer.
-// directions [64][count]: unit directions, see direction_sets.clh. -> free, blocked [rows][cols][MASK_WORDS]: bit j: direction j
+// directions [256][count]: unit directions, see direction_sets.clh. -> free, blocked [rows][cols][MASK_WORDS]: bit j: direction j
 // lies above the surface, and is free for `reach_m` or is not; zeros where there is no surface.
 kernel void trace_visibility(const int cols, const int rows, const int stride, const int width,
                              global const float4 *positions, global const float4 *normals, const int4 bricks,

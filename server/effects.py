@@ -116,42 +116,29 @@ def shadow_real(
     return differential.bounce_real(view.engine, view.camera, camera_from_volume, surface, transfer, lit, shadow)
 
 
-def shade_virtual(
-    view: View,
-    virtual: VirtualSurface,
-    surface: Surface,
-    scene: TracedScene,
-    glow: Glow | None = None,
-    ratio: RealShadow | None = None,
-) -> SampleGrid:
+def add_objects(
+    view: View, surface: Surface, scene: TracedScene, glow: Glow | None = None, ratio: RealShadow | None = None
+) -> TracedScene:
+    """The scene as virtual objects have changed it: what they send, and what real surface sends besides them."""
+    if ratio is None:
+        return replace(scene, glow=glow)
+    changed = Changed(view.camera, inverse_rigid(view.volume_from_camera), surface.positions, ratio)
+    return replace(scene, glow=glow, changed=changed)
+
+
+def shade_virtual(view: View, virtual: VirtualSurface, changed_scene: TracedScene) -> SampleGrid:
     """What real and virtual things take from virtual ones, less what they send them."""
-    changed = _with_objects(view, surface, scene, glow, ratio)
-    return differential.shadow_virtual(view.engine, view.camera, virtual, changed)
+    return differential.shadow_virtual(view.engine, view.camera, virtual, changed_scene)
 
 
-def reflect(
-    view: View,
-    virtual: VirtualSurface,
-    surface: Surface,
-    scene: TracedScene,
-    glow: Glow | None = None,
-    ratio: RealShadow | None = None,
-) -> cl_array.Array:
+def reflect(view: View, virtual: VirtualSurface, changed_scene: TracedScene) -> cl_array.Array:
     """What glossy virtual things reflect."""
-    changed = _with_objects(view, surface, scene, glow, ratio)
-    return reflect_surroundings(view.engine, view.camera, view.volume_from_camera, virtual, changed)
+    return reflect_surroundings(view.engine, view.camera, view.volume_from_camera, virtual, changed_scene)
 
 
-def refine_virtual(
-    view: View,
-    virtual: VirtualSurface,
-    surface: Surface,
-    scene: TracedScene,
-    glow: Glow | None = None,
-    ratio: RealShadow | None = None,
-) -> cl_array.Array:
+def refine_virtual(view: View, virtual: VirtualSurface, changed_scene: TracedScene) -> cl_array.Array:
     """Shadows on virtual things at every pixel near their edges."""
-    return adaptive.refine_virtual(view.engine, view.camera, virtual, _with_objects(view, surface, scene, glow, ratio))
+    return adaptive.refine_virtual(view.engine, view.camera, virtual, changed_scene)
 
 
 def refine_real(
@@ -159,16 +146,6 @@ def refine_real(
 ) -> cl_array.Array:
     """Shadows on real things at every pixel of their rims."""
     return adaptive.refine_real(view.engine, view.camera, surface, replace(scene, glow=glow), ratio)
-
-
-def _with_objects(
-    view: View, surface: Surface, scene: TracedScene, glow: Glow | None, ratio: RealShadow | None
-) -> TracedScene:
-    """The scene as the objects have changed it."""
-    if ratio is None:
-        return replace(scene, glow=glow)
-    changed = Changed(view.camera, inverse_rigid(view.volume_from_camera), surface.positions, ratio)
-    return replace(scene, glow=glow, changed=changed)
 
 
 def composite(
@@ -250,6 +227,7 @@ EFFECTS: tuple[Effect[SceneFacts], ...] = (
     Effect(cover, writes="coverage", omitted=lambda f: _nothing_in_view(f) or _hard_edges(f)),
     Effect(prepare_rays, writes="scene", omitted=_nothing_casts),
     Effect(light_objects, writes="glow", omitted=lambda f: _nothing_casts(f) or _nothing_sent(f)),
+    Effect(add_objects, writes="changed_scene", omitted=_nothing_casts),
     Effect(reflect, writes="reflected", omitted=lambda f: _nothing_to_shade(f) or _matt(f)),
     Effect(shade_virtual, writes="occluded", omitted=_nothing_to_shade),
     Effect(shadow_real, writes="ratio", omitted=_nothing_casts),

@@ -174,7 +174,7 @@ def test_two_writers_are_refused() -> None:
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=True),
-            {"rasterize", "cover", "prepare_rays", "shade_virtual", "shadow_real", "composite"},
+            {"rasterize", "cover", "prepare_rays", "add_objects", "shade_virtual", "shadow_real", "composite"},
             {
                 "refine_virtual": "does not refine",
                 "refine_real": "does not refine",
@@ -189,6 +189,7 @@ def test_two_writers_are_refused() -> None:
                 "cover",
                 "prepare_rays",
                 "light_objects",
+                "add_objects",
                 "reflect",
                 "shade_virtual",
                 "refine_virtual",

@@ -263,9 +263,9 @@ def test_a_guest_changes_only_what_it_touches(index: int) -> None:
     np.testing.assert_array_equal(bare.depth_m[elsewhere], with_ball.depth_m[elsewhere])
     np.testing.assert_array_equal(bare.albedo[elsewhere], with_ball.albedo[elsewhere])
     taken = (bare.radiance - with_ball.radiance)[elsewhere]
-    assert taken.min() >= 0  # a shadow only takes light away
+    assert taken.min() > -1e-12  # a shadow only takes light away, but for the last bits of its sums
     assert taken.max() > (0.1 if index == 0 else 0.005)
-    untouched = (taken == 0).all(axis=1)
+    untouched = (np.abs(taken) < 1e-12).all(axis=1)
     assert untouched.mean() > 0.3
     if index == 0:
         (ball,) = GUESTS["ball"]

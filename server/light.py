@@ -11,6 +11,7 @@ import pyopencl.array as cl_array
 
 from protocol.frames import CameraModel
 from server.geometry import GeometryFrame
+from server.maths.light_change import Shot
 from server.maths.lobes import cell_directions
 from server.maths.sh import LUMINANCE, sh_basis
 from server.opencl.engine import Engine
@@ -93,10 +94,10 @@ class RoomLight:
             observed,
             indirect or Indirect(no_hits(engine, transfer), np.zeros(3)),
             volume.voxel_m,
-            geometry.volume_from_camera,
+            Shot(geometry.volume_from_camera, geometry.exposure),
             depth_m,
         )
-        return self._given or estimate
+        return self._given or self._colored(estimate)
 
 
 def _model_of(settings: Settings) -> LightModel:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.maths.bayes import NormalEquations, Posterior, solve_plain, solve_with_evidence, solve_with_ratio
+from server.maths.memory import remembered
 from server.maths.nonnegative import nonnegative_mean, nonnegative_sum
 from server.maths.sh import LUMINANCE, band_of
 from server.opencl.engine import Engine
@@ -34,7 +35,8 @@ LEAST_FLATNESS = 0.95
 LEAST_FLAT_SHARE = 0.1
 """Of the samples that are used at least, the flattest: one picture's depth, not fused yet, is nowhere flat."""
 FORGETTING = 0.9
-"""What remains of earlier frames' evidence a frame later while the light is steady: a memory of ten frames (5.4)."""
+"""What remains of earlier frames' evidence a frame later while the light is steady: a memory of ten frames (5.4), for
+what these frames see."""
 CHANGED_FORGETTING = 0.3
 """The same where the frame contradicts the light so far: a new light has 97 % of the weight after 3 frames."""
 CHANGE = 3.0
@@ -231,8 +233,7 @@ class LightEstimator:
         frame = tiles.total()
         if frame.count >= _LEAST_POOLS:
             forgetting = self._forgetting_for(frame)
-            kept = self._evidence.scaled(forgetting) if self._evidence else frame.scaled(0.0)
-            self._evidence = kept + frame
+            self._evidence = self._beside(frame, forgetting) + frame
             self._weight = forgetting * self._weight + 1.0
             for _ in range(_DEPENDENCE_STEPS):
                 luminance = self._solve_luminance(self._evidence)
@@ -253,6 +254,14 @@ class LightEstimator:
             mean, std = self._solve_color(self._evidence, luminance)
         std = MODEL_DOUBT * std / ASSUMED_ALBEDO
         return LightEstimate(mean / ASSUMED_ALBEDO, std, luminance.condition, valid=bool(fixed))
+
+    def _beside(self, frame: NormalEquations, forgetting: float) -> NormalEquations:
+        """What is kept of earlier frames; while the light is steady, all that `frame` says nothing about."""
+        if self._evidence is None:
+            return frame.scaled(0.0)
+        if forgetting != FORGETTING or self._as_thesis:
+            return self._evidence.scaled(forgetting)
+        return remembered(self._evidence, frame, forgetting)
 
     def _forgetting_for(self, frame: NormalEquations) -> float:
         """How much of the evidence so far to keep beside `frame`."""

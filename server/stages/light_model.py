@@ -150,14 +150,24 @@ def system_of(rows: Rows, albedos: Albedos, weights: Floats) -> tuple[Floats, Fl
     return columns, rows.luminance / albedos.lightness, weights * albedos.lightness**2
 
 
-def solve_amounts(columns: Floats, target: Floats, weights: Floats) -> Floats:
-    """[lobes + 1] >= 0: amounts, and the mean albedo, drawn to ASSUMED_ALBEDO."""
+def solve_amounts(
+    columns: Floats, target: Floats, weights: Floats, near: Floats | None = None, hold: float = 0.0
+) -> Floats:
+    """[lobes + 1] >= 0: amounts, and the mean albedo, drawn to ASSUMED_ALBEDO.
+
+    Drawn to the shape of `near` [lobes] as well, `hold` times as much as pools say of a lobe on average.
+    """
     weighted = weights[:, None] * columns
     matrix, vector = weighted.T @ columns, weighted.T @ target
     lobes = len(matrix) - 1
     pull = np.full(lobes + 1, RIDGE * max(float(np.trace(matrix[:lobes, :lobes])) / lobes, 1e-300))
     independent = max(len(target) / ALIKE, 1.0)
     noise = max(float(weights @ target**2) * NOISE**2 / independent, 1e-300)
+    if near is not None:
+        held = hold / RIDGE * pull[:lobes]
+        brightness = float(near @ vector[:lobes]) / max(float(near @ matrix[:lobes, :lobes] @ near), 1e-300)
+        pull[:lobes] += held
+        vector[:lobes] += held * brightness * near
     pull[-1] = noise / ALBEDO_SPREAD**2
     vector[-1] += pull[-1] * ASSUMED_ALBEDO
     amounts, _ = solve_nonnegative(matrix + np.diag(pull), vector)

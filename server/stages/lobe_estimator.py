@@ -1,9 +1,9 @@
 """Light estimation (thesis 5.1.3) as it is in a room: non-negative, from everywhere, off surfaces of unknown albedo.
 
-Model: radiance = albedo (visible sky + what surfaces send). The pools of the last frames are kept; their albedos and
-the light are found in turn, each given the other, a few rounds a frame. Luminance comes first. A colour channel is
-drawn to a multiple of it, as surfaces have more colour than light: without evidence for coloured light, shadows are
-neutral. How fast earlier frames are forgotten is what would have predicted the newest one best.
+Model: radiance = albedo (visible sky + what surfaces send). The pools of some frames are kept (frame_window.py); their
+albedos and the light are found in turn, each given the other, a few rounds a frame. Luminance comes first. A colour
+channel is drawn to a multiple of it, as surfaces have more colour than light: without evidence for coloured light,
+shadows are neutral. Frames count until surface that they share with the newest says that the light has changed.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import pyopencl.array as cl_array
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from server.maths.light_change import Shot
 from server.maths.lobes import (
     CELLS,
     WIDTHS_DEG,
@@ -27,6 +28,7 @@ from server.opencl.engine import Engine
 from server.stages.cell_light import solve_cells
 from server.stages.cell_transfer import PoolGrid, Pools, PoolWindow, pool_grid
 from server.stages.continuation import MOST_ROWS, NO_PLANES, Continuation, Judged
+from server.stages.frame_window import SLOTS, FrameWindow
 from server.stages.indirect import Indirect
 from server.stages.light_estimation import ASSUMED_ALBEDO, LightEstimate
 from server.stages.light_model import (
@@ -49,27 +51,31 @@ from server.stages.raycast import Surface
 
 Floats = NDArray[np.float64]
 
-SLOTS = 10
-"""Frames that are kept."""
-MEMORIES = (0.95, 0.8, 0.5, 0.1)
-"""What may remain of a frame's weight a frame later."""
-WORTH_FORGETTING = 1.5
-"""Frames are forgotten sooner only where the longest memory's misfits are so many times the least, over some frames."""
 UNDERSTOOD = 0.8
-"""Earlier estimates do not count once the room's extents leave less than this share of what they left."""
-AVERAGE = 0.15
+"""Of a young session: its earlier estimates do not count once the room's extents leave less than this share of what
+they left. Later a mind is changed slowly."""
+YOUNG = 12
+"""Frames."""
+HOLD = 1.0
+"""How much a light that has long been steady is held, over what pools say of it: what these do not tell stays as it
+was, while new views turn it slowly."""
+LONG = 30
+"""Frames."""
+AVERAGE = 0.1
 """Share that a new estimate has in the mean while the light is steady."""
 CHANGE = 3.0
-"""The light has changed if the frame's misfit under it is this many times what the frame's own best fit leaves."""
+"""Where a frame shares no surface with another, the light has changed if its misfit is this many times what its own
+best fit leaves."""
 CHANGED_WEIGHT = 0.03
 """What then remains of earlier frames."""
+SOON = 3
+"""A light that changed fewer frames ago is found anew; the mean goes back a third of the way to the change."""
 LEAST_WEIGHT = 8.0
 """Pools without which a frame says nothing."""
 ROUNDS, FIRST_ROUNDS, COLOR_ROUNDS = 4, 16, 4
 """Of light and albedos in turn: in a frame, in the first and after a change, and how many of those by colour alone."""
 JUDGED_WIDTH_DEG = 25.0
 """Of the lobes that extents are judged with: a light of wide lobes alone would have planes make its edges."""
-_SCORE_MEMORY = 0.8  # so a lasting excess of a tenth adds up to a half
 _LEAST_MISFIT = 1e-4  # of the frame's energy: below it a ratio of misfits says nothing
 
 
@@ -92,15 +98,12 @@ class LobeEstimator:
         self.continuation = continuation
         self._bands = bands
         self._window: PoolWindow | None = None
-        self._frames: dict[int, Frame] = {}
-        self._next = 0
+        self._kept = FrameWindow()
         self._surfaces = Surfaces()
         self._solution: Solution | None = None
         self._one_color = True
-        self._memory = 0
-        self._steady, self._is_fresh = 0, True
-        self._scores = np.zeros(len(MEMORIES))
-        self._predictions: list[Floats] = []
+        self._steady = 0
+        self._mean: Floats | None = None
         self._last: tuple[Rows, Albedos, Floats] | None = None
         self.light: LobeFit | None = None
         self.materials = 0
@@ -119,7 +122,7 @@ class LobeEstimator:
         observed: cl_array.Array,
         indirect: Indirect,
         voxel_m: float,
-        volume_from_camera: Floats,
+        shot: Shot,
         depth_m: cl_array.Array,
     ) -> LightEstimate:
         """Fold one frame in and solve. A frame that saw nothing leaves the estimate as it was.
@@ -127,51 +130,51 @@ class LobeEstimator:
         observed: [rows, cols] float4 of the samples, w = 1 usable; depth_m: [h, w] as measured.
         """
         window = self._window_for(pool_grid(transfer))
-        slot = self._next
-        self._frames.pop(slot, None)
+        slot = self._kept.free_slot()
         pools = window.pool(slot, surface, camera, transfer, rays, observed, indirect, voxel_m)
         if pools.weights.sum() < LEAST_WEIGHT or not (pools.seen > 0).any():
             return self._estimate
-        self._next = (slot + 1) % SLOTS
         window.hide([slot], self.continuation.arrays() if self.continuation else NO_PLANES)
         was_searching = self.continuation is not None and self.continuation.is_searching
-        estimate = self.fold(slot, pools)
+        estimate = self.fold(slot, pools, shot)
         if self.continuation:
-            self._look_around(self.continuation, camera, volume_from_camera, self._engine.download(depth_m))
+            self._look_around(self.continuation, camera, shot.volume_from_camera, self._engine.download(depth_m))
             before = self.continuation.explained
             if self.continuation.try_extents(self._judged()):
-                self._is_fresh |= self.continuation.explained < UNDERSTOOD * before
-                window.hide(self._frames, self.continuation.arrays())
-                for held, frame in self._frames.items():
+                self._understand(anew=self.continuation.explained < UNDERSTOOD * before)
+                window.hide(self._kept.frames, self.continuation.arrays())
+                for held, frame in self._kept.frames.items():
                     frame.columns = window.shading(held, self._lobes_and_all())
                 estimate = self._refresh(slot, ROUNDS)
-            self._is_fresh |= was_searching and not self.continuation.is_searching
+            self._understand(anew=was_searching and not self.continuation.is_searching)
         self._estimate = self._averaged(estimate)
         return self._estimate
 
+    def _understand(self, *, anew: bool) -> None:
+        """Where the room is seen `anew`, the estimates of a young session do not count any more."""
+        if anew and self._kept.count <= YOUNG:
+            self._steady = 1
+
     def _averaged(self, estimate: LightEstimate) -> LightEstimate:
-        """P3 (thesis 5.4): the mean of the last estimates, as long as the light is steady and understood alike."""
-        self._steady = 1 if self._is_fresh or not self._model.memory else self._steady + 1
+        """P3 (thesis 5.4): the mean of the last estimates, as long as the light is steady."""
         rate = max(1.0 / self._steady, AVERAGE)
-        self._is_fresh = False
         return replace(estimate, sh=self._estimate.sh + rate * (estimate.sh - self._estimate.sh))
 
-    def fold(self, slot: int, pools: Pools) -> LightEstimate:
+    def fold(self, slot: int, pools: Pools, shot: Shot) -> LightEstimate:
         """The light with `pools`, whose transfer lies in `slot` of the window, not averaged."""
         assert self._window is not None
         columns = self._window.shading(slot, self._lobes_and_all())
         newest = Frame(pools, columns)
+        self._kept.add(slot, newest, shot)
         with self._engine.profile.host():
-            rounds = self._forget(newest)
-        self._is_fresh |= rounds == FIRST_ROUNDS or self._memory > 0
-        self._frames[slot] = newest
-        return self._refresh(slot, rounds)
+            self._steady = min(self._steady + 1, self._forget(slot, newest))
+        return self._refresh(slot, FIRST_ROUNDS if self._steady == 1 else ROUNDS)
 
     def _look_around(self, continuation: Continuation, camera: CameraModel, pose: Floats, depth_m: Columns) -> None:
         """Find planes in what is seen, and what of them cannot be."""
-        used = [frame.pools.weights > 0 for frame in self._frames.values()]
-        positions = [frame.pools.positions[own] for frame, own in zip(self._frames.values(), used, strict=True)]
-        normals = [frame.pools.normals[own] for frame, own in zip(self._frames.values(), used, strict=True)]
+        used = [frame.pools.weights > 0 for frame in self._kept.frames.values()]
+        positions = [frame.pools.positions[own] for frame, own in zip(self._kept.frames.values(), used, strict=True)]
+        normals = [frame.pools.normals[own] for frame, own in zip(self._kept.frames.values(), used, strict=True)]
         with self._engine.profile.host():
             continuation.find(np.concatenate(positions), np.concatenate(normals))
             continuation.look(camera, pose, depth_m.astype(np.float64))
@@ -185,9 +188,8 @@ class LobeEstimator:
         raw = self._engine.download(self._window.raw)[rows.slots[some], rows.places[some]].astype(np.float64)
         mean_albedo = self._solution.mean_albedo if self._solution else ASSUMED_ALBEDO
         _, target, scaled = system_of(rows, albedos, weights)
-        pools = [
-            (self._frames[slot].pools, place) for slot, place in zip(rows.slots[some], rows.places[some], strict=True)
-        ]
+        frames = self._kept.frames
+        pools = [(frames[slot].pools, place) for slot, place in zip(rows.slots[some], rows.places[some], strict=True)]
         sent = np.array([frame.sent[place] @ LUMINANCE for frame, place in pools])
         return Judged(
             positions=np.array([frame.positions[place] for frame, place in pools]),
@@ -209,10 +211,9 @@ class LobeEstimator:
 
     def _refresh(self, slot: int, rounds: int) -> LightEstimate:
         """Light and albedos from the window, whose newest frame lies in `slot`."""
-        rows = rows_of(self._frames, self._model.normals)
+        rows = rows_of(self._kept.frames, self._model.normals)
         with self._engine.profile.host():
             albedos, weights = self._in_turn(rows, rounds)
-            self._predictions = self._predict(albedos, weights, rows)
         self.materials = albedos.count
         self._last = (rows, albedos, weights)
         assert self._window is not None
@@ -235,39 +236,38 @@ class LobeEstimator:
         """The window, empty where pictures are cut otherwise than before."""
         if self._window is None or self._window.grid != grid:
             self._window = PoolWindow(self._engine, grid, SLOTS)
-            self._frames, self._next, self._predictions = {}, 0, []
+            self._kept = FrameWindow()
         return self._window
 
-    def _forget(self, newest: Frame) -> int:
-        """Weigh earlier frames by what the newest one says of them; how many rounds to take."""
-        if self._solution is None or not self._frames:
-            return FIRST_ROUNDS
+    def _forget(self, slot: int, newest: Frame) -> int:
+        """Weigh earlier frames by what the newest one says of them; how many frames the mean may go back."""
+        if self._solution is None or not self._model.memory:
+            self._kept.forget(slot, 0.0)
+            return 1
+        told = self._kept.weigh(slot)
+        if told.frames_ago:
+            return 1 + told.frames_ago // SOON
+        if not told.is_told and self._contradicts(newest, self._solution):
+            self._kept.forget(slot, CHANGED_WEIGHT)
+            return 1
+        return self._steady + 1
+
+    def _contradicts(self, newest: Frame, solution: Solution) -> bool:
+        """Whether a frame that shares no surface with others shows another light."""
         rows = rows_of({0: newest}, self._model.normals)
-        albedos, weights = (
-            self._albedos(rows, self._solution, materials=True),
-            weights_of(rows, None, None, outliers=False),
-        )
+        albedos, weights = self._albedos(rows, solution, materials=True), weights_of(rows, None, None, outliers=False)
         columns, target, scaled = system_of(rows, albedos, weights)
+        own = misfit_of(columns, target, scaled, solve_amounts(columns, target, scaled))
+        known = np.append(solution.amounts, solution.mean_albedo)
         energy = float(scaled @ target**2)
-        own = misfit_of(columns, target, scaled, solve_amounts(columns, target, scaled)) + _LEAST_MISFIT * energy
-        misfits = np.array([misfit_of(columns, target, scaled, x) for x in self._predictions])
-        if len(misfits):
-            self._scores = _SCORE_MEMORY * self._scores + np.log(misfits + _LEAST_MISFIT * energy)
-        known = np.append(self._solution.amounts, self._solution.mean_albedo)
-        changed = misfit_of(columns, target, scaled, known) > CHANGE * own
-        self._memory = int(np.flatnonzero(self._scores <= self._scores.min() + np.log(WORTH_FORGETTING))[0])
-        memory = MEMORIES[self._memory]
-        for frame in self._frames.values():
-            frame.keep *= (CHANGED_WEIGHT if changed else memory) if self._model.memory else 0.0
-        if changed:
-            self._scores = np.zeros(len(MEMORIES))
-        return FIRST_ROUNDS if changed else ROUNDS
+        return misfit_of(columns, target, scaled, known) > CHANGE * (own + _LEAST_MISFIT * energy)
 
     def _in_turn(self, rows: Rows, rounds: int) -> tuple[Albedos, Floats]:
         """Light and albedos given each other, `rounds` times; leaves the light in `_solution`."""
         if not self._model.albedos:
             rounds = min(rounds, 2)
         solution, first = self._solution, rounds == FIRST_ROUNDS
+        hold = HOLD * min((self._steady - 1) / LONG, 1.0)
         albedos, weights = one_albedo(len(rows.seen)), weights_of(rows, None, None, outliers=False)
         self._one_color = not self._model.albedos or is_of_one_color(rows)
         pull = COLOR_PULL if self._one_color else None
@@ -276,9 +276,12 @@ class LobeEstimator:
                 albedos = self._albedos(rows, solution, materials=not first or number > COLOR_ROUNDS)
                 weights = weights_of(rows, solution, albedos, outliers=self._model.outliers)
             columns, target, scaled = system_of(rows, albedos, weights)
-            amounts = solve_amounts(columns, target, scaled)
+            amounts = solve_amounts(columns, target, scaled, self._mean, hold)
             solution = with_colors(rows, albedos, weights, amounts[:-1], float(amounts[-1]), pull)
         self._solution = solution
+        assert solution is not None
+        shape = solution.amounts / max(float(solution.amounts.sum()), 1e-300)
+        self._mean = shape if self._mean is None else self._mean + (shape - self._mean) / self._steady
         return albedos, weights
 
     def _albedos(self, rows: Rows, solution: Solution, *, materials: bool) -> Albedos:
@@ -287,12 +290,3 @@ class LobeEstimator:
         materials = materials and (self.continuation is None or not self.continuation.is_searching)
         shading = rows.columns @ solution.colors + solution.mean_albedo * rows.sent
         return self._surfaces.albedos(rows.seen, shading, rows.weights, materials=materials, one_color=self._one_color)
-
-    def _predict(self, albedos: Albedos, weights: Floats, rows: Rows) -> list[Floats]:
-        """For each memory, the light that all frames so far make under it."""
-        columns, target, scaled = system_of(rows, albedos, weights)
-        order = sorted(self._frames, key=lambda s: (s - self._next) % SLOTS)  # oldest first
-        age = {slot: len(order) - 1 - place for place, slot in enumerate(order)}
-        keep = np.array([self._frames[slot].keep for slot in rows.slots])
-        ages = np.array([age[slot] for slot in rows.slots])
-        return [solve_amounts(columns, target, scaled / keep * memory**ages) for memory in MEMORIES]

@@ -295,6 +295,25 @@ def test_steady_light_is_averaged() -> None:
     assert np.mean(errors[20:]) < errors[0] / 3
 
 
+def test_what_the_camera_turned_away_from_is_not_forgotten() -> None:
+    """P2: three frames of everything, then 300 of one wall: the direction stays, and stays valid."""
+    light = lights.lobe_and_sky((1, 0.5, 0))
+    estimator, thesis = LightEstimator(4), LightEstimator(4, as_thesis=True)
+    wall = np.tile([0.0, 0.0, 1.0], (48 * 64, 1))
+    for each in (estimator, thesis):
+        for seed in range(3):
+            each.update(samples_of(light, random_directions(48 * 64, seed), 0.01, seed))
+        for seed in range(300):
+            each.update(samples_of(light, wall, 0.01, 10 + seed))
+    assert estimator.estimate().valid
+    errors = [
+        degrees_between(each.estimate().sh[[3, 1, 2]] @ [0.2126, 0.7152, 0.0722], (1, 0.5, 0))
+        for each in (estimator, thesis)
+    ]
+    assert errors[0] < 6.0
+    assert errors[1] > 30.0
+
+
 def test_light_is_not_negative() -> None:
     """A plane and a half see only part of the sky: what fits them best is negative elsewhere."""
     normals = random_directions(48 * 64, 7)

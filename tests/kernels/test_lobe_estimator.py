@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from server.maths.light_change import Shot
 from server.maths.lobes import CELL_SR, cell_directions, cells_to_sh
 from server.maths.sh import LUMINANCE, spherical_fibonacci
 from server.opencl.engine import Engine
@@ -14,7 +15,7 @@ from server.stages.cell_transfer import PoolGrid, Pools
 from server.stages.indirect import Indirect, mean_sent
 from server.stages.light_estimation import ASSUMED_ALBEDO, LightEstimate
 from server.stages.light_model import LightModel
-from server.stages.lobe_estimator import SLOTS, LobeEstimator
+from server.stages.lobe_estimator import LobeEstimator
 from server.stages.radiance_transfer import direction_sets
 from tests.analytic import Floats
 from tests.kernels.test_cell_transfer import Samples
@@ -69,7 +70,7 @@ class View:
             sent=self.sent,
             unseen=np.zeros(GRID.count),
             weights=np.ones(GRID.count),
-            positions=np.zeros((GRID.count, 3)),
+            positions=2.0 * self.normals,  # the inside of a ball: the same surface in every frame
             normals=self.normals,
             open=self.transfer.sum(axis=1),
             beyond=np.zeros(3),
@@ -80,12 +81,10 @@ class Run(LobeEstimator):
     """An estimator that is given pools instead of pictures."""
 
     def add(self, view: View, pools: Pools) -> LightEstimate:
-        window, slot = self._window_for(GRID), self._next
-        self._frames.pop(slot, None)
+        window, slot = self._window_for(GRID), self._kept.free_slot()
         for array in (window.raw, window.values):
             array[slot].set(view.transfer.astype(np.float32))
-        self._next = (slot + 1) % SLOTS
-        return self.fold(slot, pools)
+        return self.fold(slot, pools, Shot(np.eye(4)))
 
     @property
     def lightness(self) -> Floats:
@@ -337,7 +336,7 @@ def test_pictures_cut_otherwise_begin_anew(engine: Engine) -> None:
     run.add(view, view.under(light))
     window = run._window_for(GRID)
     assert run._window_for(PoolGrid(4, 40, 50)) is not window
-    assert not run._frames
+    assert not run._kept.frames
     again = run.add(view, view.under(sun((-0.8, -0.3, -0.1))))
     assert error_deg(again.sh, sun((-0.8, -0.3, -0.1))) < 1.0
 
@@ -352,7 +351,7 @@ def test_a_frame_that_sees_nothing_leaves_the_estimate(engine: Engine) -> None:
         surface, camera, transfer, observed, hits = of.upload(engine)
         depth = engine.workspace.upload("d", np.ones((camera.height, camera.width), np.float32))
         indirect = Indirect(hits, mean_sent(engine, hits))
-        return run.update(surface, camera, transfer, of.rays, observed, indirect, 0.01, np.eye(4), depth)
+        return run.update(surface, camera, transfer, of.rays, observed, indirect, 0.01, Shot(np.eye(4)), depth)
 
     for nothing in (none, black):
         estimate = update(nothing)

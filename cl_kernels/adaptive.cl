@@ -1,5 +1,5 @@
 // Adaptive refinement (thesis 6.1.1, step 1): shading at every pixel where that of samples changes from one to the next.
-// Provides mark_edges, mark_varying, refine_virtual, refine_real.
+// Provides mark_edges, mark_varying, mark_shown, refine_virtual, refine_real.
 #include "direction_sets.clh"
 #include "shadows.clh"
 #include "upsample.clh"
@@ -65,25 +65,39 @@ kernel void mark_varying(const int cols, const int rows, global const float4 *ra
     varying[(cell_row + 1) * (cols + 1) + cell_col + 1] = (uchar)(fmax(across, along) > least_change);
 }
 
-// What occluders take from the virtual surface at `pixels` [listed]; positions, normals [h][w]: the virtual geometry buffer.
-// -> occluded [h][w] (rgb, w = 1); other pixels are left as they are.
+// real, virtual [h][w]: positions (w = 1 where there is surface); eye: the camera's. -> shown [h][w]: 0 where the virtual one hides
+// the real one.
+kernel void mark_shown(const int width, const int height, global const float4 *real, global const float4 *virtual_positions,
+                       const float4 eye, global uchar *shown) {
+    const int x = get_global_id(0);
+    const int y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    const float4 there = real[y * width + x], here = virtual_positions[y * width + x];
+    const float3 to_real = there.xyz - eye.xyz, to_virtual = here.xyz - eye.xyz;
+    shown[y * width + x] = !(here.w > 0.0f && (there.w <= 0.0f || dot(to_virtual, to_virtual) < dot(to_real, to_real)));
+}
+
+// What occluders take from the virtual surface at `pixels` [listed]; positions, normals, shown [h][w]: the virtual geometry buffer.
+// every: as in shadow_virtual; the picture is a mean over 4 x 4 pixels (upsample.clh). -> occluded [h][w] (rgb, w = 1); other pixels are left as they are.
 kernel void refine_virtual(const int listed, global const int *pixels, const int width,
-                           global const float4 *positions, global const float4 *normals, SCENE_PARAMETERS, const float offset_m, global float4 *occluded) {
+                           global const float4 *positions, global const float4 *normals, global const int *shown,
+                           SCENE_PARAMETERS, const int every, global float4 *occluded) {
     const int item = get_global_id(0);
     if (item >= listed) return;
     const int pixel = pixels[item];
     const Volume volume = VOLUME_OF_PARAMETERS;
-    const Objects things = OBJECTS_OF_PARAMETERS(offset_m);
+    const Objects things = OBJECTS_OF_PARAMETERS(own_offset_m(objects, grid_from_volume, shown[pixel]));
     const Arriving arrives = LIGHT_OF_PARAMETERS;
-    const int set = direction_set(pixel / width, pixel % width);
-    occluded[pixel] = taken_from_virtual(volume, things, arrives, positions[pixel], normals[pixel].xyz, set);
+    const int x = pixel % width, y = pixel / width;
+    occluded[pixel] = taken_from_virtual(volume, things, arrives, positions[pixel], normals[pixel].xyz, direction_set(y, x),
+                                         direction_subset(y, x, every), every);
 }
 
 // The ratio R' / R of shading with virtual objects to shading without, at `pixels` [listed] of the real surface. What the
 // objects take is sampled at the pixel; R changes little from sample to sample and is taken from them: shaded [rows][cols].
 // -> ratio [h][w] (rgb, w = 1), w = 0 where there is no surface; other pixels are left as they are.
 kernel void refine_real(const int listed, global const int *pixels, const int width,
-                        global const float4 *positions, global const float4 *normals, SCENE_PARAMETERS, const float4 ball, global const float4 *light,
+                        global const float4 *positions, global const float4 *normals, SCENE_PARAMETERS, const int every, const float4 ball, global const float4 *light,
                         const int cols, const int rows, const int stride, global const float4 *shaded, global float4 *ratio) {
     const int item = get_global_id(0);
     if (item >= listed) return;
@@ -97,7 +111,7 @@ kernel void refine_real(const int listed, global const int *pixels, const int wi
         const Objects things = OBJECTS_OF_PARAMETERS(0.0f);
         const Arriving arrives = LIGHT_OF_PARAMETERS;
         const float3 taken = taken_from_real(volume, things, arrives, ball, positions[pixel].xyz, normals[pixel].xyz,
-                                             direction_set(y, x), 0, 1, 0);
+                                             direction_set(y, x), direction_subset(y, x, every), every, 0, 1, 0);
         const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
         result = (float4)(fmax(without.xyz - taken, floor) / fmax(without.xyz, floor), without.w);
     }

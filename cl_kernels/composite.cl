@@ -1,7 +1,7 @@
 // Compositing (thesis 7.2.1, R3): real hides virtual and virtual hides real; linear inside, sRGB at the end.
 // Provides mark_touched, composite.
 #include "camera.clh"
-#include "upsample.clh"
+#include "sampled_value.clh"
 
 #ifndef SUBPIXELS
 #define SUBPIXELS 0
@@ -17,21 +17,6 @@ static inline void write_color(global uchar *picture, const int pixel, const flo
     picture[3 * pixel] = codes[(int)level.x];
     picture[3 * pixel + 1] = codes[(int)level.y];
     picture[3 * pixel + 2] = codes[(int)level.z];
-}
-
-// A pixel's value: from the refined ones around it where it has one, else from the samples of `grid`.
-static float4 value_at(const Grid grid, global const float4 *values, global const float4 *refined, const int has_refined,
-                       global const float4 *positions, global const float4 *normals, const int x, const int y,
-                       const int height, const float tolerance_m) {
-    if (has_refined && refined[y * grid.width + x].w > 0.0f) {
-        const Grid every = {grid.width, height, 1, grid.width};
-        return upsample(every, refined, positions, normals, x, y, tolerance_m);
-    }
-#ifdef BICUBIC
-    return upsample_bicubic(grid, values, x, y);
-#else
-    return upsample(grid, values, positions, normals, x, y, tolerance_m);
-#endif
 }
 
 // ratio [rows][cols] (w = 1 valid) -> touched [rows + 1][cols + 1]: whether the 6 x 6 samples around a cell hold one that is
@@ -60,6 +45,7 @@ typedef struct {
     global const float4 *refined;
     int has_refined;
     global const float4 *reflected;
+    global const float4 *direct;
 } Virtual;
 
 // Radiance of the virtual surface at pixel (x, y), which it covers.
@@ -68,7 +54,11 @@ static float3 virtual_color(const Virtual things, global const float4 *light, co
     const int pixel = y * things.grid.width + x;
     const float4 taken = value_at(things.grid, things.occluded, things.refined, things.has_refined, things.positions, things.normals,
                                   x, y, height, tolerance_m);
-    const float3 diffuse = things.colors[pixel].xyz * fmax(open_shading(things.normals[pixel].xyz, light) - taken.xyz, (float3)(0.0f));
+    float3 shading = fmax(open_shading(things.normals[pixel].xyz, light) - taken.xyz, (float3)(0.0f));
+#ifdef HAS_DIRECT
+    shading += things.direct[pixel].xyz;
+#endif
+    const float3 diffuse = things.colors[pixel].xyz * shading;
 #ifdef HAS_GLOSS
     return things.reflected[pixel].w * diffuse + things.reflected[pixel].xyz;
 #else
@@ -105,10 +95,12 @@ static int covered_near(global const float4 *positions, const int x, const int y
 // shown [h][w][3]: the camera picture as sRGB codes; radiance [h][w] linear. positions, normals: the real geometry buffer.
 // virtual_positions, virtual_normals, virtual_colors [h][w] (w = 1 where covered): the virtual one, or none without HAS_OBJECTS;
 // nearest: see share_covered, where SUBPIXELS is not 0; else pixels are covered as their middles are.
-// reflected [h][w]: see reflect.cl, or none without HAS_GLOSS.
+// reflected [h][w]: see reflect.cl, or none without HAS_GLOSS. virtual_gain: picture radiance over the light's, on virtual surface.
 // occluded [object_rows][object_cols]: radiance that occluders take from virtual samples (w = 1 valid);
 // ratio [rows][cols]: shaded with over without virtual objects on real samples (w = 1 valid), touched: see mark_touched; or
 // none without HAS_SHADOWS. refined_occluded, refined_ratio [h][w]: the same at pixels that have w = 1, or none where has_... is 0.
+// HAS_DIRECT: `light` and occluded are of the rest of the light; direct_virtual [h][w]: what its discs bring to virtual surface;
+// direct_ratio [h][w] (w = 1 where it counts): ratio of all of it, which then stands for `ratio`.
 // BICUBIC: samples are mixed across edges. codes [65536]: sRGB code of linear radiance i / 65535.
 // -> picture [h][w][3] sRGB. A pixel that nothing virtual touches is the camera's, byte for byte.
 kernel void composite(const int width, const int height, global const uchar *shown, global const float4 *radiance,
@@ -116,12 +108,12 @@ kernel void composite(const int width, const int height, global const uchar *sho
                       const float tolerance_m,
                       global const float4 *virtual_positions, global const float4 *virtual_normals,
                       global const float4 *virtual_colors, global const uint *nearest, global const float4 *reflected,
-                      global const float4 *light,
+                      global const float4 *light, const float virtual_gain,
                       const int object_cols, const int object_rows, const int object_stride, global const float4 *occluded,
                       const int cols, const int rows, const int stride, global const float4 *ratio,
                       global const uchar *touched, const int has_refined_occluded, global const float4 *refined_occluded,
                       const int has_refined_ratio, global const float4 *refined_ratio,
-                      global const uchar *codes, global uchar *picture) {
+                      global const float4 *direct_virtual, global const float4 *direct_ratio, global const uchar *codes, global uchar *picture) {
     const int x = get_global_id(0);
     const int y = get_global_id(1);
     if (x >= width || y >= height) return;
@@ -130,17 +122,22 @@ kernel void composite(const int width, const int height, global const uchar *sho
     float4 color = radiance[pixel];  // of the real surface; w: whether anything virtual has to do with it
     color.w = 0.0f;
 #ifdef HAS_SHADOWS
+#ifdef HAS_DIRECT
+    if (direct_ratio[pixel].w > 0.0f && radiance[pixel].w >= 0.0f) {
+        const float4 factor = direct_ratio[pixel];
+#else
     const Grid grid = {cols, rows, stride, width};
     const int cell = (cell_of(y, stride) + 1) * (cols + 1) + cell_of(x, stride) + 1;
     if (touched[cell] && real.w > 0.0f && radiance[pixel].w >= 0.0f) {
         const float4 factor = value_at(grid, ratio, refined_ratio, has_refined_ratio, positions, normals, x, y, height, tolerance_m);
+#endif
         const float3 change = fabs(factor.xyz - 1.0f);
         if (factor.w > 0.0f && fmax(fmax(change.x, change.y), change.z) > UNTOUCHED) color = (float4)(color.xyz * factor.xyz, 1.0f);
     }
 #endif
 #ifdef HAS_OBJECTS
     const Virtual things = {virtual_positions, virtual_normals, virtual_colors, {object_cols, object_rows, object_stride, width},
-                            occluded, refined_occluded, has_refined_occluded, reflected};
+                            occluded, refined_occluded, has_refined_occluded, reflected, direct_virtual};
     const float real_z = real.w > 0.0f ? transform_point(camera_from_volume, real.xyz).z : 0.0f;
 #if SUBPIXELS > 0
     const float share = share_covered(nearest, x, y, width, real_z, tolerance_m);
@@ -151,7 +148,7 @@ kernel void composite(const int width, const int height, global const uchar *sho
     const int source = share > 0.0f ? pixel : -1;
 #endif
     if (source >= 0) {
-        const float3 own = virtual_color(things, light, source % width, source / width, height, tolerance_m);
+        const float3 own = virtual_gain * virtual_color(things, light, source % width, source / width, height, tolerance_m);
         const float part = radiance[pixel].w < 0.0f ? 1.0f : share;  // outside the camera's picture there is nothing to mix with
         color = (float4)(color.xyz + part * (own - color.xyz), 1.0f);
     }

@@ -6,36 +6,8 @@
 // Where surfaces send light too (7.3.3), R and R' hold one bounce of it: seen surface sends what the camera saw of it.
 #include "direction_sets.clh"
 #include "open_shading.clh"
+#include "real_shading.clh"
 #include "shadows.clh"
-
-#ifndef MASK_WORDS
-#error MASK_WORDS must be defined: 32-bit words that hold one bit a direction
-#endif
-#ifndef INTERLEAVE
-#define INTERLEAVE 1
-#endif
-
-// Samples of the transfer, every `stride` pixels of a picture `width` wide: the real geometry buffer [h][w]; openness [rows][cols],
-// free_mask [rows][cols][MASK_WORDS], sets [rows][cols][INTERLEAVE]: see radiance_transfer.cl.
-#define SAMPLE_PARAMETERS \
-    const int cols, const int rows, const int stride, const int width, global const float4 *positions, \
-        global const float4 *normals, global const float *openness, global const uint *free_mask, global const uchar *sets
-
-// What reaches a sample of real surface, over pi, without virtual objects: free directions bring the light, or what planes that
-// go on beyond the pictures send; hidden ones what their surfaces send. hit: of indirect.cl.
-static float3 shading_without(const Arriving light, const float3 position, const float3 normal, const float3 from_free,
-                              const float openness, const float4 hit, global const uchar *sets, global const uint *free) {
-    float3 sum = from_free;
-    for (int j = 0; j < light.count && light.continued.count > 0; j++) {
-        if (!((free[j >> 5] >> (j & 31)) & 1)) continue;
-        const int index = sets[j % INTERLEAVE] * light.count + j;
-        sum += share_of(light, index, normal) * (arriving_from(light, index, position) - light.arriving[index].xyz);
-    }
-    const float hidden = clamp(1.0f - openness, 0.0f, 1.0f);
-    const float known = fmin(hit.w / fmax(0.25f * light.count * hidden, 1e-6f), 1.0f);  // directions' cosines add up to count / 4
-    const float3 sent = known * light.unseen.w * hit.xyz / fmax(hit.w, 1e-6f) + (1.0f - known) * light.unseen.xyz;
-    return sum + hidden * sent;
-}
 
 // Real surface: the ratio R' / R of shading with virtual objects to shading without, at the samples of the transfer.
 // transfer [rows][cols][COEFFICIENTS]; hits [rows][cols]: see indirect.cl; light [COEFFICIENTS] rgb.
@@ -60,7 +32,7 @@ kernel void shadow_real(SAMPLE_PARAMETERS, global const float *transfer, global 
     global const uchar *own = sets + sample * INTERLEAVE;
     float3 without = (float3)(0.0f);
     for (int i = 0; i < COEFFICIENTS; i++) without += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
-    const float3 taken = taken_from_real(volume, things, arrives, ball, position.xyz, normal.xyz, 0, own, INTERLEAVE, free);
+    const float3 taken = taken_from_real(volume, things, arrives, ball, position.xyz, normal.xyz, 0, 0, 1, own, INTERLEAVE, free);
     if (any(taken != 0.0f))
         without = shading_without(arrives, position.xyz, normal.xyz, without, openness[sample], hits[sample], own, free);
     const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
@@ -89,6 +61,7 @@ kernel void bounce_real(SAMPLE_PARAMETERS, global const float4 *light, SCENE_PAR
     float4 sum = (float4)(0.0f);
     int chosen[LANES];
     float met[LANES];
+    float3 at[LANES];
     int waiting = 0, hidden = (col + 2 * row) % every;
     for (int j = 0; j < count; j++) {
         const int from = sets[sample * INTERLEAVE + j % INTERLEAVE] * count + j;
@@ -96,12 +69,12 @@ kernel void bounce_real(SAMPLE_PARAMETERS, global const float4 *light, SCENE_PAR
         if (is_hidden_one && hidden++ % every == 0) chosen[waiting++] = from;
         if (waiting == 0 || (waiting < LANES && j < count - 1)) continue;
         for (int lane = waiting; lane < LANES; lane++) chosen[lane] = chosen[0];
-        meet_surface(volume, arrives, origin, chosen, met);
+        meet_surface(volume, arrives, origin, normal.xyz, chosen, met, at);
         for (int lane = 0; lane < waiting; lane++) {
             if (met[lane] < 0.0f) continue;
-            const float3 direction = directions[chosen[lane]].xyz;
-            const float3 change = sent_from(volume, arrives, origin, direction, met[lane], 1) - sent_from(volume, arrives, origin, direction, met[lane], 0);
-            sum += dot(normal.xyz, direction) * (float4)(change, 1.0f);
+            const float3 change = change_at(arrives.changed, at[lane] * voxel_m, SAME_POINT * voxel_m) - 1.0f;
+            const float3 more = any(change != 0.0f) ? change * sent_at(volume, arrives, at[lane], 0) : (float3)(0.0f);
+            sum += dot(normal.xyz, directions[chosen[lane]].xyz) * (float4)(more, 1.0f);
         }
         waiting = 0;
     }
@@ -112,17 +85,20 @@ kernel void bounce_real(SAMPLE_PARAMETERS, global const float4 *light, SCENE_PAR
 }
 
 // Virtual surface: the radiance that real and virtual occluders take from it, at every `stride`-th pixel it covers.
-// positions, normals [h][w] (w = 1 where covered): the virtual geometry buffer. -> occluded [rows][cols] (rgb, w = 1 valid).
+// positions, normals [h][w] (w = 1 where covered), shown [h][w] (which object, -1 none): the virtual geometry buffer.
+// every: of how many directions of its set a sample traces one, its neighbours others. -> occluded [rows][cols] (rgb, w = 1 valid).
 kernel void shadow_virtual(const int cols, const int rows, const int stride, const int width,
-                           global const float4 *positions, global const float4 *normals, SCENE_PARAMETERS, const float offset_m, global float4 *occluded) {
+                           global const float4 *positions, global const float4 *normals, global const int *shown,
+                           SCENE_PARAMETERS, const int every, global float4 *occluded) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= cols || row >= rows) return;
     const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
     const Volume volume = VOLUME_OF_PARAMETERS;
-    const Objects things = OBJECTS_OF_PARAMETERS(offset_m);
+    const Objects things = OBJECTS_OF_PARAMETERS(own_offset_m(objects, grid_from_volume, shown[pixel]));
     const Arriving arrives = LIGHT_OF_PARAMETERS;
-    occluded[row * cols + col] = taken_from_virtual(volume, things, arrives, positions[pixel], normals[pixel].xyz, direction_set(row, col));
+    occluded[row * cols + col] = taken_from_virtual(volume, things, arrives, positions[pixel], normals[pixel].xyz, direction_set(row, col),
+                                                    direction_subset(row, col, every), every);
 }
 
 // Points on virtual objects: what they send. points, normals (volume space), albedos [points_count] -> radiances [points_count] (rgb).
@@ -136,7 +112,7 @@ kernel void light_points(const int points_count, global const float4 *points, gl
     const Objects things = OBJECTS_OF_PARAMETERS(offsets_m[index]);
     const Arriving arrives = LIGHT_OF_PARAMETERS;
     const float3 normal = normals[index].xyz;
-    const float4 taken = taken_from_virtual(volume, things, arrives, points[index], normal, direction_set(index >> 3, index & 7));
+    const float4 taken = taken_from_virtual(volume, things, arrives, points[index], normal, direction_set(index >> 3, index & 7), 0, 1);
     radiances[index] = (float4)(albedos[index].xyz * fmax(open_shading(normal, light) - taken.xyz, 0.0f), 1.0f);
 }
 

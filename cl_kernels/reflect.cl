@@ -30,7 +30,7 @@ static float3 mean_arriving(const Volume volume, const Objects things, const Arr
                             const float3 position, const float3 normal, const float3 mirrored, const float spread, const float turn) {
     const float3 side = normalize(cross(mirrored, fabs(mirrored.x) < 0.7f ? (float3)(1, 0, 0) : (float3)(0, 1, 0)));
     const float3 other = cross(mirrored, side);
-    const float3 origin = position + volume.voxel_m * normal;
+    const float3 origin = clear_origin(volume, position, normal);
     float3 sum = (float3)(0.0f);
     float weight = 0.0f;
     for (int k = 0; k < RAYS; k++) {
@@ -67,7 +67,7 @@ static float3 mean_arriving(const Volume volume, const Objects things, const Arr
 // -> reflected [h][w]: radiance to add (rgb) and what remains of the diffuse one (w); (0, 0, 0, 1) for what is matt.
 kernel void reflect_surroundings(const int width, const int height, global const float4 *positions, global const float4 *normals,
                                  global const float4 *base_colors, global const float4 *materials, const float4 eye,
-                                 const float least_gloss, global const float4 *light, SCENE_PARAMETERS, const float offset_m,
+                                 const float least_gloss, global const float4 *light, SCENE_PARAMETERS, global const int *shown,
                                  global float4 *reflected) {
     const int x = get_global_id(0);
     const int y = get_global_id(1);
@@ -77,7 +77,7 @@ kernel void reflect_surroundings(const int width, const int height, global const
     float4 result = (float4)(0.0f, 0.0f, 0.0f, 1.0f);
     if (position.w > 0.0f && fmax(1.0f - material.x, material.y) >= least_gloss) {
         const Volume volume = VOLUME_OF_PARAMETERS;
-        const Objects things = OBJECTS_OF_PARAMETERS(offset_m);
+        const Objects things = OBJECTS_OF_PARAMETERS(own_offset_m(objects, grid_from_volume, shown[pixel]));
         const Arriving arrives = LIGHT_OF_PARAMETERS;
         const float3 normal = normals[pixel].xyz, back = normalize(eye.xyz - position.xyz);
         const float cosine = clamp(dot(normal, back), 0.0f, 1.0f), metal = clamp(material.y, 0.0f, 1.0f);

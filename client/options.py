@@ -68,6 +68,15 @@ Robustness = Annotated[
 Edges = Annotated[
     str | None, typer.Option(metavar="smooth|hard", help="of virtual things; hard: as in point-sampled pictures")
 ]
+ToneMapping = Annotated[
+    str | None,
+    typer.Option(
+        metavar="light|average", help="what virtual things' brightness rests on; default: average, light with --light"
+    ),
+]
+LightColor = Annotated[
+    str | None, typer.Option(metavar="estimated|white", help="white: the light without its colours, as the thesis")
+]
 Mesh = Annotated[bool, typer.Option("--mesh", help="write mesh.ply and mesh.glb")]
 BudgetMs = Annotated[float | None, typer.Option(metavar="N", help="choose the operating point for this time")]
 MaxLightError = Annotated[float | None, typer.Option(metavar="DEG", help="choose it for this light error")]
@@ -100,6 +109,8 @@ class CaptureOptions:
     exposure: str | None = None
     robustness: str | None = None
     edges: str | None = None
+    tone_mapping: str | None = None
+    light_color: str | None = None
     budget_ms: float | None = None
     max_light_error: float | None = None
 
@@ -154,6 +165,8 @@ def refuse_unbuilt(options: CaptureOptions) -> None:
     _choice("--indirect", options.indirect, ("none", "observed"))
     _choice("--lamps", options.lamps, ("on", "off"))
     _choice("--edges", options.edges, ("smooth", "hard"))
+    _choice("--tone-mapping", options.tone_mapping, ("light", "average"))
+    _choice("--light-color", options.light_color, ("estimated", "white"))
     _choice("--exposure", options.exposure, ("auto", "constant"))
     unbuilt = {
         f"--preset {options.preset}": (options.preset not in BUILT_PRESETS, f"use {', '.join(BUILT_PRESETS)}"),
@@ -251,6 +264,8 @@ def _wishes_of_options(options: CaptureOptions) -> dict[str, Any]:
         "exposure": options.exposure or "auto",
         **_robustness(options.robustness),
         "edges": options.edges or "smooth",
+        "tone_mapping": options.tone_mapping or "auto",
+        "light_color": options.light_color or "estimated",
         **_given_light(options),
     }
 

@@ -109,6 +109,11 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """`auto`: of each frame as it says, estimated where it does not say; `constant`: the same for all frames."""
     edges: Literal["smooth", "hard"] = "smooth"
     """Of virtual things: by how much of a pixel they cover, or by its middle, as in pictures that are point samples."""
+    tone_mapping: Literal["auto", "light", "average"] = "auto"
+    """What virtual things' brightness rests on: the light's scale, or the averages of the picture and of its shading;
+    `auto`: the scale of a light that is given, the averages under one that is estimated."""
+    light_color: Literal["estimated", "white"] = "estimated"
+    """`white`: as the thesis assumes, the light's luminance without its colours."""
     robustness: tuple[Robustness, ...] = ("openness", "memory", "outliers")
     """Measures that light estimation takes (thesis 5.2, 5.4): samples that see little sky are left out; weights by how
     common a normal is (`normals_printed`: as eq. 5.7 has them); earlier frames count; what fits badly counts less."""

@@ -10,16 +10,20 @@ import pyopencl.array as cl_array
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from server.maths.direct_lights import split_light
 from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine
 from server.plan import Effect, Omission
 from server.stages import adaptive
 from server.stages import composite as composite_stage
 from server.stages import differential_rendering as differential
+from server.stages import shadow_map as shadow_maps
 from server.stages.differential_rendering import RealShadow
+from server.stages.image_space_rendering import Looks, RealLooks
+from server.stages.image_space_rendering import look_around as look_around_stage
 from server.stages.indirect import Indirect
 from server.stages.measure import Measurement
-from server.stages.object_glow import Glow
+from server.stages.object_glow import Glow, place_points
 from server.stages.radiance_transfer import Directions, Transfer
 from server.stages.rasterize import Placed, VirtualSurface, boxes_in_view, nearest_depths
 from server.stages.rasterize import rasterize as rasterize_stage
@@ -27,6 +31,8 @@ from server.stages.raycast import Surface
 from server.stages.reflect import is_glossy, reflect_surroundings
 from server.stages.sample_grid import SampleGrid
 from server.stages.sampling import PRESETS, Sampling
+from server.stages.shadow_map import ShadowMaps
+from server.stages.tone_mapping import Averages
 from server.stages.traced_scene import Changed, DeviceLight, TracedScene, trace_scene
 from server.stages.volume import Volume
 
@@ -56,14 +62,24 @@ class SceneFacts:
     indirect: bool = False
     """Whether surfaces send light."""
     smooth_edges: bool = True
+    image_space: bool = False
+    """Whether visibility is looked up in depth pictures."""
     glossy: bool = False
     """Whether any virtual surface is not matt."""
+    sharp_lights: int = 0
+    """That shadow maps are for."""
+    averages: Averages | None = None
+    """Of the picture and its shading, None where they are not to be matched."""
 
 
 def gather_facts(
-    view: View, objects: Sequence[Placed], light: NDArray[np.float64], indirect: Indirect | None
+    view: View,
+    objects: Sequence[Placed],
+    light: NDArray[np.float64],
+    indirect: Indirect | None,
+    averages: Averages | None = None,
 ) -> SceneFacts:
-    """Facts of a frame. light: SH radiance [bands^2, 3]."""
+    """Facts of a frame. light: SH radiance [bands^2, 3]; averages: to be matched, None: none are."""
     camera_from_volume = inverse_rigid(view.volume_from_camera)
     boxes = boxes_in_view(view.camera, camera_from_volume, objects)
     return SceneFacts(
@@ -71,9 +87,12 @@ def gather_facts(
         sum(box is not None for box in boxes),
         has_light=bool(light.any()),
         adaptive=view.sampling.adaptive,
+        image_space=view.sampling.image_space,
         indirect=indirect is not None,
         smooth_edges=view.smooth_edges,
         glossy=any(is_glossy(thing.tables.materials) for thing, _ in objects),
+        sharp_lights=len(split_light(light).discs),
+        averages=averages,
     )
 
 
@@ -87,16 +106,35 @@ def cover(view: View, objects: Sequence[Placed]) -> cl_array.Array:
     return nearest_depths(view.engine, view.camera, inverse_rigid(view.volume_from_camera), objects)
 
 
+def look_around(view: View, objects: Sequence[Placed], real_looks: RealLooks) -> Looks:
+    """Depth pictures that visibility is looked up in, of real surface and of each object."""
+    return look_around_stage(view.engine, real_looks, objects)
+
+
 def prepare_rays(
-    view: View, objects: Sequence[Placed], volume: Volume, rays: Directions, light: DeviceLight
+    view: View,
+    objects: Sequence[Placed],
+    volume: Volume,
+    rays: Directions,
+    light: DeviceLight,
+    looks: Looks | None = None,
 ) -> TracedScene:
     """Bring together what rays are traced through: the volume, the objects' distance grids, the light beyond."""
-    return trace_scene(view.engine, volume, light, rays, view.reach_m, objects)
+    return replace(trace_scene(view.engine, volume, light, rays, view.reach_m, objects), looks=looks)
 
 
-def light_objects(view: View, scene: TracedScene) -> Glow:
+def shadow_map(view: View, objects: Sequence[Placed], volume: Volume, light: DeviceLight) -> ShadowMaps:
+    """Pictures of what stands in the light's sharp parts."""
+    return shadow_maps.draw_shadow_maps(view.engine, volume, light, objects, view.reach_m)
+
+
+def light_objects(view: View, scene: TracedScene, maps: ShadowMaps | None = None) -> Glow:
     """What virtual objects send to real surface and to one another."""
-    return differential.light_points(view.engine, scene)
+    placed = place_points(view.engine, scene.objects)
+    glow = differential.light_points(view.engine, scene, placed)
+    if maps is not None:
+        shadow_maps.light_glow(view.engine, placed, glow, maps)
+    return glow
 
 
 def shadow_real(
@@ -106,6 +144,7 @@ def shadow_real(
     scene: TracedScene,
     indirect: Indirect | None,
     glow: Glow | None = None,
+    maps: ShadowMaps | None = None,
 ) -> RealShadow:
     """What virtual things take from real ones, less what they send them, and what those then send one another."""
     lit = replace(scene, glow=glow)
@@ -113,7 +152,13 @@ def shadow_real(
     if indirect is None:
         return shadow
     camera_from_volume = inverse_rigid(view.volume_from_camera)
-    return differential.bounce_real(view.engine, view.camera, camera_from_volume, surface, transfer, lit, shadow)
+    if maps is None:
+        return differential.bounce_real(view.engine, view.camera, camera_from_volume, surface, transfer, lit, shadow)
+    parts = shadow_maps.trace_real(view.engine, view.camera, surface, shadow, maps)
+    samples = shadow_maps.light_samples(view.engine, view.camera, surface, parts, maps)
+    whole = shadow_maps.with_direct(view.engine, shadow, samples, maps)
+    whole = differential.bounce_real(view.engine, view.camera, camera_from_volume, surface, transfer, lit, whole)
+    return shadow_maps.without_direct(view.engine, whole, shadow, samples, maps)
 
 
 def add_objects(
@@ -122,7 +167,7 @@ def add_objects(
     """The scene as virtual objects have changed it: what they send, and what real surface sends besides them."""
     if ratio is None:
         return replace(scene, glow=glow)
-    changed = Changed(view.camera, inverse_rigid(view.volume_from_camera), surface.positions, ratio)
+    changed = Changed(view.camera, inverse_rigid(view.volume_from_camera), surface.positions, ratio.whole or ratio)
     return replace(scene, glow=glow, changed=changed)
 
 
@@ -132,20 +177,49 @@ def shade_virtual(view: View, virtual: VirtualSurface, changed_scene: TracedScen
 
 
 def reflect(view: View, virtual: VirtualSurface, changed_scene: TracedScene) -> cl_array.Array:
-    """What glossy virtual things reflect."""
-    return reflect_surroundings(view.engine, view.camera, view.volume_from_camera, virtual, changed_scene)
+    """What glossy virtual things reflect; traced in both families."""
+    return reflect_surroundings(view.engine, view.camera, view.volume_from_camera, virtual, changed_scene.by_rays())
 
 
 def refine_virtual(view: View, virtual: VirtualSurface, changed_scene: TracedScene) -> cl_array.Array:
     """Shadows on virtual things at every pixel near their edges."""
-    return adaptive.refine_virtual(view.engine, view.camera, virtual, changed_scene)
+    return adaptive.refine_virtual(view.engine, view.camera, virtual, changed_scene.by_rays())
 
 
 def refine_real(
-    view: View, surface: Surface, scene: TracedScene, ratio: RealShadow, glow: Glow | None = None
+    view: View,
+    surface: Surface,
+    scene: TracedScene,
+    ratio: RealShadow,
+    glow: Glow | None = None,
+    virtual: VirtualSurface | None = None,
 ) -> cl_array.Array:
     """Shadows on real things at every pixel of their rims."""
-    return adaptive.refine_real(view.engine, view.camera, surface, replace(scene, glow=glow), ratio)
+    lit, eye = replace(scene.by_rays(), glow=glow), view.volume_from_camera[:3, 3]
+    return adaptive.refine_real(view.engine, view.camera, surface, lit, ratio, virtual, eye)
+
+
+def direct_virtual(view: View, virtual: VirtualSurface, maps: ShadowMaps) -> cl_array.Array:
+    """What the light's sharp parts bring to virtual surface."""
+    return shadow_maps.light_virtual(view.engine, view.camera, virtual, maps)
+
+
+def direct_real(
+    view: View,
+    surface: Surface,
+    ratio: RealShadow,
+    maps: ShadowMaps,
+    refined_ratio: cl_array.Array | None = None,
+) -> cl_array.Array:
+    """What virtual things take from real ones of the whole light, its sharp parts at every pixel."""
+    parts = shadow_maps.trace_real(view.engine, view.camera, surface, ratio, maps)
+    upsampling = view.sampling.upsampling
+    return shadow_maps.light_real(view.engine, view.camera, surface, ratio, parts, maps, refined_ratio, upsampling)
+
+
+def match_average(averages: Averages) -> float:
+    """How much brighter than the light's own scale virtual things are (7.1, H)."""
+    return averages.gain
 
 
 def composite(
@@ -162,6 +236,9 @@ def composite(
     refined_ratio: cl_array.Array | None = None,
     coverage: cl_array.Array | None = None,
     reflected: cl_array.Array | None = None,
+    gain: float = 1.0,
+    lit_virtual: cl_array.Array | None = None,
+    whole_ratio: cl_array.Array | None = None,
 ) -> NDArray[np.uint8]:
     """The finished picture; with nothing virtual it is the camera's, byte for byte."""
     return composite_stage.composite(
@@ -181,6 +258,9 @@ def composite(
         view.sampling.upsampling,
         coverage,
         reflected,
+        gain,
+        lit_virtual,
+        whole_ratio,
     )
 
 
@@ -210,8 +290,24 @@ def _nothing_sent(facts: SceneFacts) -> Omission | None:
     return None if facts.indirect else Omission("indirect light is left out", 255.0)
 
 
+def _traced(facts: SceneFacts) -> Omission | None:
+    return None if facts.image_space else Omission("the preset traces rays through the volume", 255.0)
+
+
 def _matt(facts: SceneFacts) -> Omission | None:
     return None if facts.glossy else Omission("no virtual object is glossy", 0.0)
+
+
+def _soft(facts: SceneFacts) -> Omission | None:
+    return None if facts.sharp_lights else Omission("the light is soft", 0.0)
+
+
+def _not_matched(facts: SceneFacts) -> Omission | None:
+    if facts.averages is None:
+        return Omission("virtual things keep the light's own scale", 255.0)
+    if not facts.averages.are_known:
+        return Omission("the picture or its shading is empty or black: the light's own scale holds", 255.0)
+    return None
 
 
 def _hard_edges(facts: SceneFacts) -> Omission | None:
@@ -225,7 +321,9 @@ def _not_refined(facts: SceneFacts) -> Omission | None:
 EFFECTS: tuple[Effect[SceneFacts], ...] = (
     Effect(rasterize, writes="virtual", omitted=_nothing_in_view),
     Effect(cover, writes="coverage", omitted=lambda f: _nothing_in_view(f) or _hard_edges(f)),
+    Effect(look_around, writes="looks", omitted=lambda f: _nothing_casts(f) or _traced(f)),
     Effect(prepare_rays, writes="scene", omitted=_nothing_casts),
+    Effect(shadow_map, writes="maps", omitted=lambda f: _nothing_casts(f) or _soft(f)),
     Effect(light_objects, writes="glow", omitted=lambda f: _nothing_casts(f) or _nothing_sent(f)),
     Effect(add_objects, writes="changed_scene", omitted=_nothing_casts),
     Effect(reflect, writes="reflected", omitted=lambda f: _nothing_to_shade(f) or _matt(f)),
@@ -233,6 +331,9 @@ EFFECTS: tuple[Effect[SceneFacts], ...] = (
     Effect(shadow_real, writes="ratio", omitted=_nothing_casts),
     Effect(refine_virtual, writes="refined_occluded", omitted=lambda f: _nothing_to_shade(f) or _not_refined(f)),
     Effect(refine_real, writes="refined_ratio", omitted=lambda f: _nothing_casts(f) or _not_refined(f)),
+    Effect(direct_virtual, writes="lit_virtual", omitted=lambda f: _nothing_to_shade(f) or _soft(f)),
+    Effect(direct_real, writes="whole_ratio", omitted=lambda f: _nothing_casts(f) or _soft(f)),
+    Effect(match_average, writes="gain", omitted=lambda f: _nothing_to_shade(f) or _not_matched(f)),
     Effect(composite, writes="picture"),
 )
 """One writer a resource; `composite` is what a frame wants."""

@@ -47,6 +47,7 @@ class RoomLight:
 
     def give(self, light: LightEstimate) -> None:
         """Take this light (S2); what is then found is what of the room hides it."""
+        light = self._colored(light)
         radiances = sh_basis(cell_directions(), round(len(light.sh) ** 0.5)) @ (light.sh @ LUMINANCE)
         self._given = light
         around = Continuation(LEAST_GAIN_KNOWN)
@@ -56,7 +57,10 @@ class RoomLight:
         """The light as it stands."""
         if self._given:
             return self._given
-        return self._harmonics.estimate() if self._harmonics else self._lobes.estimate()
+        return self._colored(self._harmonics.estimate() if self._harmonics else self._lobes.estimate())
+
+    def _colored(self, estimate: LightEstimate) -> LightEstimate:
+        return estimate.whitened() if self._settings.light_color == "white" else estimate
 
     @property
     def planes(self) -> PlaneArrays:
@@ -84,7 +88,7 @@ class RoomLight:
         if self._harmonics:
             tiles = sum_tiles(engine, camera, radiance, surface, transfer, volume.voxel_m, self._least_openness)
             with engine.profile.host():
-                return self._harmonics.update(tiles)
+                return self._colored(self._harmonics.update(tiles))
         observed = gather_samples(engine, camera, radiance, surface, transfer, self._least_openness)
         estimate = self._lobes.update(
             surface,

@@ -17,6 +17,7 @@ from server.effects import EFFECTS, View, gather_facts
 from server.geometry import Geometry, GeometryFrame
 from server.light import RoomLight
 from server.light_message import light_message
+from server.maths.direct_lights import split_light
 from server.maths.sh import webxr_from_world
 from server.meshing.scene_mesh import SceneMesh, scene_mesh
 from server.meshing.surface import MeshingError
@@ -36,7 +37,8 @@ from server.stages.light_estimation import LightEstimate
 from server.stages.near_light import remove_lamps
 from server.stages.radiance_transfer import Transfer
 from server.stages.sampling import Sampling, TransferSampler
-from server.stages.traced_scene import upload_light
+from server.stages.tone_mapping import AverageMemory, Averages, measure_averages
+from server.stages.traced_scene import DeviceLight, take_discs, upload_light
 from server.stages.volume import Volume
 from server.static_light import static_estimate
 
@@ -68,6 +70,7 @@ class Pipeline:
         self._sampler = self._make_sampler(self._settings.sampling)
         self._room_light = RoomLight(self._engine, camera, self._settings)
         self._lamps = LampFinder(self._engine, camera, self._settings.lamps)
+        self._average_memory = AverageMemory()
         self._objects: SceneObjects | None = None
         self._waiting: list[tuple[str, Mesh, Placement]] = []
         self._webxr_from_world = np.eye(3)
@@ -105,20 +108,27 @@ class Pipeline:
                 engine, camera, geometry.volume_from_camera, settings.reach_m, self._sampler.sampling, is_smooth
             )
             placed = objects.placed(volume.volume_from_world())
-            order, plan = make_plan(EFFECTS, "picture", _GIVEN, gather_facts(view, placed, estimate.sh, indirect))
+            light = upload_light(
+                engine, estimate.sh, self._sampler.rays, self._room_light.planes, indirect, geometry.exposure
+            )
+            averages = self._averages(geometry, volume, transfer, light, indirect) if placed else None  # 7.1, H
+            if placed:  # 7.2.3
+                light = take_discs(engine, light, split_light(estimate.sh), self._sampler.rays, geometry.exposure)
+            facts = gather_facts(view, placed, estimate.sh, indirect, averages)
+            order, plan = make_plan(EFFECTS, "picture", _GIVEN, facts)
             given = {
                 "view": view,
                 "objects": placed,
                 "volume": volume,
                 "rays": self._sampler.rays,
+                "real_looks": self._sampler.looks,
                 "shown": shown_picture(engine, camera, frame.color, measurement.radiance),
                 "measurement": measurement,
                 "surface": surface,
                 "transfer": transfer,
                 "indirect": indirect,
-                "light": upload_light(
-                    engine, estimate.sh, self._sampler.rays, self._room_light.planes, indirect, geometry.exposure
-                ),
+                "light": light,
+                "averages": averages,
             }
             picture: NDArray[np.uint8] = execute(order, given, "picture")
         if not self._room_light.is_given:  # B4, for the frames to come
@@ -169,6 +179,18 @@ class Pipeline:
             return None
         engine, camera, rays, reach_m = self._engine, self._camera, self._sampler.rays, self._settings.reach_m
         return observe_indirect(engine, camera, volume, geometry.surface, transfer, rays, reach_m)
+
+    def _averages(
+        self, geometry: GeometryFrame, volume: Volume, transfer: Transfer, light: DeviceLight, indirect: Indirect | None
+    ) -> Averages | None:
+        """What pictures and their shading are on average, if virtual things are to match them."""
+        asked = self._settings.tone_mapping
+        if asked == "light" or (asked == "auto" and self._room_light.is_given):
+            return None
+        engine, camera, rays, reach_m = self._engine, self._camera, self._sampler.rays, self._settings.reach_m
+        radiance, surface = geometry.measurement.radiance, geometry.surface
+        frame = measure_averages(engine, camera, radiance, surface, transfer, volume, rays, light, indirect, reach_m)
+        return self._average_memory.update(frame, geometry.exposure)
 
     def _light_message(
         self, frame: RgbdFrame, geometry: GeometryFrame, estimate: LightEstimate, volume: Volume
@@ -258,7 +280,20 @@ def _notes(estimate: LightEstimate) -> tuple[str, ...]:
 
 
 _GIVEN = frozenset(
-    {"view", "objects", "volume", "rays", "shown", "measurement", "surface", "transfer", "indirect", "light"}
+    {
+        "view",
+        "objects",
+        "volume",
+        "rays",
+        "real_looks",
+        "shown",
+        "measurement",
+        "surface",
+        "transfer",
+        "indirect",
+        "light",
+        "averages",
+    }
 )
 
 

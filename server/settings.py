@@ -40,6 +40,9 @@ class Settings:
     robustness: frozenset[str]
     """P3: which of `openness`, `normals`, `normals_printed`, `memory`, `outliers` are on."""
     edges: Literal["smooth", "hard"]
+    tone_mapping: Literal["auto", "light", "average"]
+    """What virtual things' brightness rests on: the light's scale, or the averages of picture and shading."""
+    light_color: Literal["estimated", "white"]
     albedo: Literal["constant", "estimated"]
     indirect: Literal["none", "observed"]
     denoise: DenoiseMethod
@@ -58,6 +61,8 @@ def read_wishes(wishes: Wishes) -> Settings:
         as_thesis=wishes.as_thesis,
         robustness=frozenset(wishes.robustness),
         edges=wishes.edges,
+        tone_mapping=wishes.tone_mapping,
+        light_color=wishes.light_color,
         albedo="constant" if wishes.as_thesis else wishes.albedo,
         indirect="none" if wishes.as_thesis else wishes.indirect,
         denoise=wishes.denoise,

@@ -1,7 +1,8 @@
 """An OBJ with its material libraries and textures as one GLB: the same vertices, axes and units.
 
 `Kd` is taken as sRGB, as textures are; glTF's factors are linear. Roughness is `Pr`, or what shines as `Ns` does;
-metalness is `Pm`. Of the maps, `map_Kd` is read, with its options -s, -o and -clamp; others are told in a note.
+metalness is `Pm`. Of the maps, `map_Kd`, `map_Pr` and `map_Pm` are read, with their options -s, -o and -clamp; others
+are told in a note.
 """
 
 from __future__ import annotations
@@ -11,11 +12,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from client.laptop import glb
 from client.laptop.errors import ObjectError
+from client.laptop.mtl import Material, TextureMap, read_materials
 
 Corner = tuple[int, int, int]
 """Indices of position, texture coordinate and normal; -1 = none."""
@@ -38,43 +41,6 @@ class _Model:
     groups: dict[str, _Group] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class ColorMap:
-    """A `map_Kd`."""
-
-    file: Path
-    scale: tuple[float, float] = (1.0, 1.0)
-    offset: tuple[float, float] = (0.0, 0.0)
-    clamp: bool = False
-
-
-@dataclass(frozen=True)
-class Material:
-    """What is kept of an MTL material."""
-
-    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """sRGB, 0 to 1."""
-    texture: ColorMap | None = None
-    specular: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    exponent: float | None = None
-    """Of Phong's highlight."""
-    given_roughness: float | None = None
-    metalness: float = 0.0
-    unread: frozenset[str] = frozenset()
-    """Maps it has that are not read."""
-
-    @property
-    def roughness(self) -> float:
-        """Perceptual, 0 to 1. A highlight of exponent n is that of microfacets with alpha^2 = 2 / (n + 2) (Karis 2013).
-
-        Without one, or where it is black: 1.
-        """
-        if self.given_roughness is not None:
-            return self.given_roughness
-        shines = self.exponent is not None and any(self.specular)
-        return (2 / (max(self.exponent or 0.0, 0.0) + 2)) ** 0.25 if shines else 1.0
-
-
 def libraries(path: Path, text: str) -> list[Path]:
     """The material libraries of an OBJ that exist."""
     names = [line.split(maxsplit=1)[1].strip() for line in text.splitlines() if line.startswith("mtllib ")]
@@ -88,7 +54,7 @@ def counts_backwards(text: str) -> bool:
 
 def convert(path: Path, text: str, mtl_files: list[Path]) -> bytes:
     """GLB bytes; what was not found is told in `asset.extras.notes`. Raises ObjectError naming the file and line."""
-    materials = {name: m for file in mtl_files for name, m in _read_materials(file).items()}
+    materials = {name: m for file in mtl_files for name, m in read_materials(file).items()}
     unread = sorted({key for m in materials.values() for key in m.unread})
     model = _read_obj(path, text)
     document: dict[str, Any] = {
@@ -98,7 +64,7 @@ def convert(path: Path, text: str, mtl_files: list[Path]) -> bytes:
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": []}],
     }
-    body, images, notes = bytearray(), dict[Path, int](), list[str]()
+    body, images, notes = bytearray(), dict[tuple[Path, ...], int](), list[str]()
     if unread:
         notes.append(f"of the OBJ's materials, {', '.join(unread)} were not read")
     for name, group in model.groups.items():
@@ -190,75 +156,9 @@ def _floats(rows: list[list[float]], columns: int) -> NDArray[np.float32]:
     return values
 
 
-def _read_materials(path: Path) -> dict[str, Material]:
-    materials: dict[str, Material] = {}
-    name = ""
-    for number, line in enumerate(path.read_text("utf-8", errors="replace").splitlines(), 1):
-        match line.split("#")[0].split():
-            case ["newmtl", *words]:
-                name = " ".join(words)
-                materials[name] = Material()
-            case ["map_Kd", *words] if name in materials and words:
-                materials[name] = replace(materials[name], texture=_color_map(path, words))
-            case [
-                ("map_Pr" | "map_Pm" | "map_Ns" | "map_Ks" | "map_d" | "map_Bump" | "map_bump" | "norm") as key,
-                *_,
-            ] if name in materials:
-                materials[name] = replace(materials[name], unread=materials[name].unread | {key})
-            case [key, *words] if name in materials and key in _FIELDS:
-                field, count = _FIELDS[key]
-                values = _numbers(path, number, key, words, count)
-                if key != "Ns":
-                    values = [min(max(value, 0.0), 1.0) for value in values]
-                change = {field: tuple(values) if count > 1 else values[0]}
-                materials[name] = replace(materials[name], **change)  # type: ignore[arg-type]
-    return materials
-
-
-_FIELDS = {
-    "Kd": ("color", 3),
-    "Ks": ("specular", 3),
-    "Ns": ("exponent", 1),
-    "Pr": ("given_roughness", 1),
-    "Pm": ("metalness", 1),
-}
-"""By the MTL's name: the field of Material, and how many numbers it has."""
-
-
-def _numbers(path: Path, number: int, key: str, words: list[str], count: int) -> list[float]:
-    try:
-        values = [float(word) for word in words[:count]]
-    except ValueError:
-        values = []
-    if len(values) < count or not np.isfinite(values).all():
-        counted = {1: "one number", 2: "two numbers", 3: "three numbers"}[count]
-        raise ObjectError(f"{path}, line {number}: {key} needs {counted}")
-    return values
-
-
-def _color_map(path: Path, words: list[str]) -> ColorMap:
-    """The file after map_Kd's options; file names may have spaces, so the longest tail that exists wins."""
-    for start in range(len(words)):
-        file = path.parent / " ".join(words[start:]).replace("\\", "/")
-        if file.is_file():
-            scale, offset = (_option(words[:start], name, default) for name, default in (("-s", 1.0), ("-o", 0.0)))
-            return ColorMap(file, scale, offset, clamp="-clamp on" in " ".join(words[:start]).lower())
-    raise ObjectError(f"{path.parent / words[-1]}: the texture that {path.name} names is missing")
-
-
-def _option(words: list[str], name: str, default: float) -> tuple[float, float]:
-    """The first two numbers after an option that has up to three."""
-    values = [default, default]
-    if name in words:
-        for k, word in enumerate(words[words.index(name) + 1 :][:2]):
-            try:
-                values[k] = float(word)
-            except ValueError:
-                break
-    return values[0], values[1]
-
-
-def _add_material(document: dict[str, Any], body: bytearray, material: Material, images: dict[Path, int]) -> int:
+def _add_material(
+    document: dict[str, Any], body: bytearray, material: Material, images: dict[tuple[Path, ...], int]
+) -> int:
     srgb = np.array(material.color)
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     surface: dict[str, Any] = {
@@ -267,18 +167,54 @@ def _add_material(document: dict[str, Any], body: bytearray, material: Material,
         "roughnessFactor": material.roughness,
     }
     if material.texture is not None:
-        surface["baseColorTexture"] = _add_texture(document, body, material.texture, images)
+        files = (material.texture.file,)
+        if files not in images:
+            images[files] = glb.add_image(document, body, material.texture.file.read_bytes(), material.texture.file)
+        surface["baseColorTexture"] = _add_texture(document, material.texture, images[files])
+    if material.roughness_map is not None or material.metalness_map is not None:
+        surface["metallicRoughnessTexture"] = _add_surface(document, body, material, images)
     document.setdefault("materials", []).append({"pbrMetallicRoughness": surface, "doubleSided": True})
     return len(document["materials"]) - 1
 
 
-def _add_texture(
-    document: dict[str, Any], body: bytearray, texture: ColorMap, images: dict[Path, int]
+def _add_surface(
+    document: dict[str, Any], body: bytearray, material: Material, images: dict[tuple[Path, ...], int]
 ) -> dict[str, Any]:
-    """A reference to the texture. OBJ's v counts from the bottom: v' = s v + o is 1 - v' = s (1 - v) + 1 - s - o."""
-    if texture.file not in images:
-        images[texture.file] = glb.add_image(document, body, texture.file.read_bytes(), texture.file)
-    entry = {"source": images[texture.file]}
+    """A reference to one picture of both maps, as glTF has them: roughness green, metalness blue, white for none.
+
+    Raises ObjectError where they are not read at the same places.
+    """
+    roughness, metalness = material.roughness_map, material.metalness_map
+    if roughness and metalness and replace(roughness, file=metalness.file) != metalness:
+        raise ObjectError(
+            f"{metalness.file.name} and {roughness.file.name} have different options: give map_Pm those of map_Pr"
+        )
+    place = roughness or metalness
+    assert place is not None
+    files = tuple(each.file if each else Path() for each in (roughness, metalness))
+    if files not in images:
+        green, blue = (None if each is None else _read_grey(each.file) for each in (roughness, metalness))
+        height, width = np.max([picture.shape for picture in (green, blue) if picture is not None], axis=0)
+        channels = [
+            np.full((height, width), 255, np.uint8) if picture is None else cv2.resize(picture, (width, height))
+            for picture in (blue, green, None)
+        ]
+        data = cv2.imencode(".png", np.stack(channels, axis=-1))[1].tobytes()  # blue, green, red, as cv2 has them
+        images[files] = glb.add_image(document, body, data, place.file)
+    return _add_texture(document, place, images[files])
+
+
+def _read_grey(file: Path) -> NDArray[np.uint8]:
+    """[h, w] the red of a picture, as it is written. Raises ObjectError."""
+    picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise ObjectError(f"{file}: the texture cannot be decoded; save it as PNG or JPEG")
+    return np.ascontiguousarray(picture[..., 2], np.uint8)
+
+
+def _add_texture(document: dict[str, Any], texture: TextureMap, image: int) -> dict[str, Any]:
+    """A reference to an image. OBJ's v counts from the bottom: v' = s v + o is 1 - v' = s (1 - v) + 1 - s - o."""
+    entry = {"source": image}
     if texture.clamp:
         document.setdefault("samplers", []).append({"wrapS": 33071, "wrapT": 33071})
         entry["sampler"] = len(document["samplers"]) - 1

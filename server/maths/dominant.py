@@ -65,11 +65,13 @@ def dominant_lights(
     *,
     most: int = MOST_LIGHTS,
     sharp: bool = False,
+    least_gain: float = LEAST_GAIN,
 ) -> tuple[DominantLight, ...]:
     """The lights that `coefficients` [n, 3] of radiance are made of, strongest first; () where there is none.
 
     Minimises (x - model)^T `precision` (x - model) of luminance: with none, the error of the radiance; with an
     estimate's own information matrix [n, n], the error of the picture it was made from. `sharp`: no spread.
+    `least_gain`: of the energy that an even sky leaves, what a further light must explain.
     Colours are fitted to the found directions by the same error.
     """
     light = luminance_sh(coefficients)
@@ -82,7 +84,7 @@ def dominant_lights(
     for _ in range(min(most, len(light) // 4)):
         tried = fit.refined(fit.with_next(found))
         misfit = fit.misfit(tried)
-        if left - misfit < LEAST_GAIN * energy:
+        if left - misfit < least_gain * energy:
             break
         found, left = tried, misfit
     return _colored(fit, found, root @ coefficients)

@@ -113,7 +113,7 @@ def change_between(older: Shown, newer: Shown) -> Change:
     matrix: Floats = ridge
     for _ in range(_ROUNDS):
         matrix = columns.T @ (weights[:, None] * columns) + ridge
-        amounts = np.linalg.solve(matrix, columns.T @ (weights * ratio))
+        amounts = np.asarray(np.linalg.solve(matrix, columns.T @ (weights * ratio)), np.float64)
         apart = np.abs(ratio - columns @ amounts)
         scatter = 1.4826 * float(np.median(apart)) + _LEAST_SCATTER
         weights = np.asarray(1.0 / (1.0 + (apart / (2.0 * scatter)) ** 2), np.float64)

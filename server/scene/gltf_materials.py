@@ -1,6 +1,7 @@
 """Materials of a glTF file: factors and textures of base colour, roughness and metalness (glTF 2.0, 3.9.2).
 
-Factors are linear, base colour textures are sRGB, roughness and metalness are a texture's green and blue.
+Factors are linear, base colour textures are sRGB, roughness and metalness are a texture's green and blue. Materials of
+alphaMode MASK are cut out, and of BLEND those whose texture says where they are opaque, at half; others are opaque.
 """
 
 from __future__ import annotations
@@ -47,31 +48,46 @@ def read_materials(header: Json, binary: bytes | None) -> tuple[list[GltfMateria
     references = [(_reference(m, "baseColorTexture"), _reference(m, "metallicRoughnessTexture")) for m in entries]
     pictures = Pictures(header, binary)
     pictures.load({index for pair in references for ref in pair if (index := _image_of(header, ref)) is not None})
-    textures: dict[tuple[int, tuple[Beyond, Beyond], bool], Texture] = {}
+    textures: dict[tuple[int, tuple[Beyond, Beyond], bool, bool], Texture] = {}
 
-    def texture_of(reference: Json | None, *, is_srgb: bool) -> Texture | None:
+    def texture_of(reference: Json | None, *, is_srgb: bool, with_alpha: bool = False) -> Texture | None:
         index = _image_of(header, reference)
         image = None if index is None else pictures.image(index, is_srgb=is_srgb)
         if reference is None or index is None or image is None:
             return None
-        key = (index, _beyond(header, reference), is_srgb)
-        return textures.setdefault(key, Texture(image, key[1]))
+        key = (index, _beyond(header, reference), is_srgb, with_alpha)
+        if key not in textures:
+            textures[key] = Texture(image, key[1], pictures.alpha(index) if with_alpha else None)
+        return textures[key]
 
     materials = []
     for entry, (color, surface) in zip(entries, references, strict=True):
         values = _metallic_roughness(entry)
-        color_texture, surface_texture = texture_of(color, is_srgb=True), texture_of(surface, is_srgb=False)
+        mode = entry.get("alphaMode", "OPAQUE")
+        color_texture = texture_of(color, is_srgb=True, with_alpha=mode in {"MASK", "BLEND"})
+        surface_texture = texture_of(surface, is_srgb=False)
         material = Material(
             roughness=_unit(values.get("roughnessFactor", 1.0)),
             metalness=_unit(values.get("metallicFactor", 1.0)),
             color_texture=color_texture,
             surface_texture=surface_texture,
+            cutoff=_cutoff(entry, mode, color_texture),
+            opacity=_unit((*values.get("baseColorFactor", ()), 1.0, 1.0, 1.0, 1.0)[3]),
         )
         uses = (_use(ref) if found else None for ref, found in ((color, color_texture), (surface, surface_texture)))
         materials.append(GltfMaterial(_factor(values), material, *uses))
-    see_through = sum(entry.get("alphaMode", "OPAQUE") != "OPAQUE" for entry in entries)
-    notes = (f"{see_through} materials are transparent; they are shown opaque",) if see_through else ()
+    blended = [m.material.cutoff for m, e in zip(materials, entries, strict=True) if e.get("alphaMode") == "BLEND"]
+    cut = sum(cutoff is not None for cutoff in blended)
+    notes = [f"{cut} materials are transparent in places; what is less than half opaque is left out"] if cut else []
+    if len(blended) > cut:
+        notes.append(f"{len(blended) - cut} materials are transparent; they are shown opaque")
     return materials, (*pictures.notes, *notes)
+
+
+def _cutoff(material: Json, mode: str, color: Texture | None) -> float | None:
+    if mode == "MASK":
+        return float(np.nan_to_num(float(material.get("alphaCutoff", 0.5))))
+    return 0.5 if mode == "BLEND" and color is not None and color.alpha is not None else None
 
 
 def _metallic_roughness(material: Json) -> Json:

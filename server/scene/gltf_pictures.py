@@ -64,6 +64,14 @@ class Pictures:
                     self._unreadable(index)
         return self._images[key]
 
+    def alpha(self, index: int) -> Image | None:
+        """[h, w] the picture's alpha, None where it has none or all of it is opaque; scaled down as it is."""
+        encoded = self._encoded.get(index)
+        found = None if encoded is None else _decode(encoded, cv2.IMREAD_UNCHANGED)
+        if found is None or found.ndim != 3 or found.shape[2] != 4 or found[..., 3].min() == 255:
+            return None
+        return np.asarray(shrunk(np.ascontiguousarray(found[..., 1:]), self._most_side, is_srgb=False)[..., 2])
+
     def _unreadable(self, index: int) -> None:
         self._encoded.pop(index, None)
         name = f"image {index}" if index >= 0 else "a texture that does not exist"
@@ -90,12 +98,14 @@ def _kept_pixels(sizes: Any, most_side: int) -> int:
     return total
 
 
-def _decode(encoded: bytes) -> Image | None:
+def _decode(encoded: bytes, flags: int = cv2.IMREAD_COLOR_RGB) -> Image | None:
     try:
-        picture = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+        picture = cv2.imdecode(np.frombuffer(encoded, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         return None
-    return None if picture is None else picture.astype(np.uint8, copy=False)
+    if picture is None:
+        return None
+    return np.asarray(picture // (257 if picture.dtype == np.uint16 else 1), np.uint8)
 
 
 def _picture_size(encoded: bytes) -> tuple[int, int]:

@@ -25,6 +25,8 @@ class Texture:
     """[h, w, 3] RGB, rows from the top: sRGB where it is a base colour, linear where it is roughness and metalness."""
     beyond: tuple[Beyond, Beyond] = (Beyond.REPEAT, Beyond.REPEAT)
     """In u and in v."""
+    alpha: NDArray[np.uint8] | None = None
+    """[h, w] opacity; None: opaque, or not asked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +40,10 @@ class Material:
     """Multiplies the vertex colours."""
     surface_texture: Texture | None = None
     """Its green multiplies the roughness, its blue the metalness."""
+    cutoff: float | None = None
+    """What is less opaque is left out; None: all is opaque."""
+    opacity: float = 1.0
+    """Multiplies the alpha of the base colour's texture."""
 
 
 MATTE = Material()

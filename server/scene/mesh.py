@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from server.scene.cutout import cut_out
 from server.scene.limits import MAX_COORDINATE_M, MeshError
 from server.scene.materials import MATTE, Material
 from server.scene.mesh_parts import FORMATS, MeshPart, read_parts
@@ -71,6 +72,9 @@ def load_mesh(data: bytes, format: str) -> Mesh:
     dropped: Counter[str] = Counter()
     usable = [_with_normals(part) for part in (_without_bad(part, dropped) for part in parts) if len(part.triangles)]
     notes += tuple(f"{count} triangles {reason} were dropped" for reason, count in dropped.items())
+    if usable:
+        usable = cut_out(usable)
+        notes += () if usable else ("all of it is less opaque than its materials' cutoff",)
     if not usable:
         raise MeshError("; ".join((f"the {format} file has no triangles that can be shown", *notes)))
     return _joined(usable, "y" if format in {"obj", "glb", "gltf"} else "z", notes)

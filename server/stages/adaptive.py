@@ -13,7 +13,7 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.opencl.engine import Engine
+from server.opencl.engine import Engine, float4
 from server.opencl.transfer import fill_bytes
 from server.stages.differential_rendering import RealShadow, ball_around
 from server.stages.rasterize import VirtualSurface
@@ -21,10 +21,12 @@ from server.stages.raycast import Surface
 from server.stages.sample_grid import SampleGrid
 from server.stages.traced_scene import TracedScene
 
-LEAST_CHANGE = 1 / 16
+LEAST_CHANGE = 1 / 8
 """Of R' / R from the 4 x 4 samples to one side to those to the other, from which on it is sampled at every pixel."""
 MARGIN_PX = 2
 """Around an edge: half of what a pixel's mean draws on, see upsample.clh."""
+SHOWN_MARGIN_PX = 4
+"""Around real surface that is shown: what a pixel's mean draws on, and one for pixels that are covered in part."""
 _LEAST_LISTED = 1024
 
 
@@ -45,22 +47,35 @@ def refine_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface,
         camera.width,
         virtual.position,
         virtual.normal,
+        virtual.object_index,
         *scene.arguments(engine),
-        scene.offset_m,
+        scene.rays.interleave,
         occluded,
     )
     return occluded
 
 
 def refine_real(
-    engine: Engine, camera: CameraModel, surface: Surface, scene: TracedScene, ratio: RealShadow
+    engine: Engine,
+    camera: CameraModel,
+    surface: Surface,
+    scene: TracedScene,
+    ratio: RealShadow,
+    virtual: VirtualSurface | None = None,
+    eye: NDArray[np.float64] | None = None,
 ) -> cl_array.Array:
-    """[h, w] float4: R' / R of real surface (eq. 7.1) where it varies among the samples of `ratio`; w = 0 elsewhere."""
+    """[h, w] float4: R' / R of real surface (eq. 7.1) where it varies among the samples of `ratio`; w = 0 elsewhere.
+
+    What `virtual` hides from `eye` ([3], volume space) is left out, if they are given.
+    """
     refined = _empty(engine, camera, "refined_ratio")
     cells = varying_cells(engine, ratio, scene.bands)
     if not cells.any():
         return refined
-    listed, pixels = _list_pixels(engine, "varying_pixels", pixels_of(cells, ratio.stride, camera.width, camera.height))
+    varying = pixels_of(cells, ratio.stride, camera.width, camera.height)
+    if virtual is not None and eye is not None:
+        varying &= grown(_shown(engine, camera, surface, virtual, eye), SHOWN_MARGIN_PX)
+    listed, pixels = _list_pixels(engine, "varying_pixels", varying)
     engine.launch(
         engine.kernel("adaptive.cl", "refine_real", **_defines(engine, scene.bands)),
         (listed,),
@@ -70,6 +85,7 @@ def refine_real(
         surface.positions,
         surface.normals,
         *scene.arguments(engine),
+        scene.rays.interleave,
         ball_around(scene.objects),
         scene.light.coefficients,
         ratio.cols,
@@ -79,6 +95,16 @@ def refine_real(
         refined,
     )
     return refined
+
+
+def _shown(
+    engine: Engine, camera: CameraModel, surface: Surface, virtual: VirtualSurface, eye: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """[h, w] pixels whose middle the virtual surface does not hide."""
+    shown = engine.workspace.array("shown_pixels", (camera.height, camera.width), np.uint8)
+    size, kernel = (camera.width, camera.height), engine.kernel("adaptive.cl", "mark_shown", **_defines(engine, 2))
+    engine.launch(kernel, size, *size, surface.positions, virtual.position, float4(*eye, 0), shown)
+    return np.asarray(engine.download(shown) > 0)
 
 
 def varying_cells(engine: Engine, ratio: SampleGrid, bands: int) -> NDArray[np.bool_]:

@@ -64,11 +64,16 @@ def composite(
     upsampling: Upsampling = "bilateral",
     coverage: cl_array.Array | None = None,
     reflected: cl_array.Array | None = None,
+    gain: float = 1.0,
+    direct_virtual: cl_array.Array | None = None,
+    direct_ratio: cl_array.Array | None = None,
 ) -> NDArray[np.uint8]:
     """Picture [h, w, 3] sRGB of the camera picture `shown` with what is virtual; unchanged where nothing virtual is.
 
     `refined_occluded`, `refined_ratio` [h, w] float4: what stands for `occluded` and `ratio` where w = 1. `coverage`:
     of nearest_depths, for smooth edges; without it a pixel is covered as its middle is. `reflected`: of reflect.py.
+    `gain`: by which virtual surface is brighter than `light` makes it (tone_mapping.py). `direct_virtual`:
+    what the light's discs bring besides; `direct_ratio`: stands for `ratio` and `refined_ratio` then (shadow_map.py).
 
     `tolerance_m`: how far behind a real surface a virtual one still shows, for objects that stand on it.
     """
@@ -83,6 +88,7 @@ def composite(
         "BICUBIC": upsampling == "bicubic",
         "SUBPIXELS": 0 if coverage is None else SUBPIXELS,
         "HAS_GLOSS": reflected is not None,
+        "HAS_DIRECT": bool(light.discs),
     }
     kernel = engine.kernel("composite.cl", "composite", BANDS=bands, **defines)
     unused = space.array("unused", (1,), cl_types.float4)
@@ -102,6 +108,7 @@ def composite(
         unused if coverage is None else coverage,
         unused if reflected is None else reflected,
         light.coefficients,
+        gain,
         *_grid(occluded, unused),
         *_grid(ratio, unused),
         touched,
@@ -109,6 +116,8 @@ def composite(
         unused if refined_occluded is None else refined_occluded,
         refined_ratio is not None,
         unused if refined_ratio is None else refined_ratio,
+        unused if direct_virtual is None else direct_virtual,
+        unused if direct_ratio is None else direct_ratio,
         space.constant("srgb_codes", _shown_codes()),
         picture,
     )

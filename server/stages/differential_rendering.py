@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine, KernelArgument, float4
 from server.stages.indirect import Indirect, no_hits
-from server.stages.object_glow import Glow, place_points
+from server.stages.object_glow import Glow, PlacedPoints, place_points
 from server.stages.radiance_transfer import Transfer, own_sets
 from server.stages.rasterize import Placed, VirtualSurface
 from server.stages.raycast import Surface
@@ -40,6 +39,8 @@ class RealShadow(SampleGrid):
 
     shaded: cl_array.Array
     """[rows, cols] float4: R, what reaches white surface without objects, w = 1 valid."""
+    whole: SampleGrid | None = None
+    """The ratio with the discs' light (shadow_map.py), None where that is this one."""
 
 
 def shadow_real(
@@ -58,7 +59,7 @@ def shadow_real(
     ratio = space.array("shadow_ratio", shape, cl_types.float4)
     shaded = space.array("shadow_shaded", shape, cl_types.float4)
     engine.launch(
-        engine.kernel("differential_rendering.cl", "shadow_real", **_sample_defines(engine, transfer)),
+        engine.kernel("differential_rendering.cl", "shadow_real", **_sample_defines(engine, transfer, scene)),
         (transfer.cols, transfer.rows),
         *_sample_arguments(engine, camera, surface, transfer),
         transfer.coefficients,
@@ -85,7 +86,7 @@ def bounce_real(
     bounced = engine.workspace.array("shadow_bounced", (transfer.rows, transfer.cols), cl_types.float4)
     shadowed = replace(scene, changed=Changed(camera, camera_from_volume, surface.positions, shadow))
     engine.launch(
-        engine.kernel("differential_rendering.cl", "bounce_real", **_sample_defines(engine, transfer)),
+        engine.kernel("differential_rendering.cl", "bounce_real", **_sample_defines(engine, transfer, scene)),
         (transfer.cols, transfer.rows),
         *_sample_arguments(engine, camera, surface, transfer),
         scene.light.coefficients,
@@ -97,9 +98,8 @@ def bounce_real(
     return replace(shadow, values=bounced)
 
 
-def _sample_defines(engine: Engine, transfer: Transfer) -> dict[str, int]:
-    words = transfer.free_mask.shape[2]
-    return {"BANDS": transfer.bands, "MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": transfer.interleave}
+def _sample_defines(engine: Engine, transfer: Transfer, scene: TracedScene) -> dict[str, int]:
+    return scene.defines(engine) | {"MASK_WORDS": transfer.free_mask.shape[2], "INTERLEAVE": transfer.interleave}
 
 
 def _sample_arguments(
@@ -119,10 +119,16 @@ def _sample_arguments(
     )
 
 
+_CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
+"""[8, 3] of a box: 0 for its low side, 1 for its high one."""
+
+
 def ball_around(objects: Sequence[Placed]) -> np.generic:
     """Centre (volume space) and radius in metres of a ball that holds all objects, as a float4."""
-    boxes = [np.array(list(product(*zip(*thing.bounds, strict=True)))) for thing, _ in objects]
-    corners = np.concatenate([b @ m[:3, :3].T + m[:3, 3] for b, (_, m) in zip(boxes, objects, strict=True)])
+    matrices = np.array([matrix for _, matrix in objects])
+    bounds = np.array([thing.bounds for thing, _ in objects])
+    in_model = bounds[:, _CORNERS, np.arange(3)]  # [n, 8, 3]
+    corners = (in_model @ matrices[:, :3, :3].swapaxes(1, 2) + matrices[:, None, :3, 3]).reshape(-1, 3)
     center = (corners.min(axis=0) + corners.max(axis=0)) / 2
     return float4(*center, float(np.linalg.norm(corners - center, axis=1).max()) * 1.02)
 
@@ -140,16 +146,20 @@ def shadow_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface,
         camera.width,
         virtual.position,
         virtual.normal,
+        virtual.object_index,
         *scene.arguments(engine),
-        scene.offset_m,
+        scene.rays.interleave,
         occluded.values,
     )
     return occluded
 
 
-def light_points(engine: Engine, scene: TracedScene) -> Glow:
-    """What the objects send: their points lit as their pixels are (eq. 7.3), but not by one another."""
-    placed = place_points(engine, scene.objects)
+def light_points(engine: Engine, scene: TracedScene, placed: PlacedPoints | None = None) -> Glow:
+    """What the objects send: their points lit as their pixels are (eq. 7.3), but not by one another.
+
+    placed: of place_points for the scene's objects, None: to be placed.
+    """
+    placed = placed or place_points(engine, scene.objects)
     radiances = engine.workspace.upload("glow_radiances", placed.under_even_light(scene.light.mean))
     lit = min(placed.count, MOST_POINTS)
     engine.launch(

@@ -23,6 +23,7 @@ from server.maths.self_occlusion import occlusion_threshold
 from server.maths.sh import GOLDEN_TURN
 from server.opencl.engine import Engine, float16
 from server.stages.auxiliary_views import VIEWS, AuxiliaryViews, ViewsAround, look_into_views
+from server.stages.image_space_rendering import RealLooks
 from server.stages.measure import intrinsics
 from server.stages.radiance_transfer import Directions, Transfer, first_set, own_sets, room_for_transfer, window_px
 from server.stages.raycast import Surface
@@ -62,6 +63,7 @@ class ImageSpaceTransfer:
         self._around = ViewsAround(engine, views, views_per_frame)
         self._cosines, self._nearest = nearest_views(rays, self._around.lattice)
         self._threshold = occlusion_threshold(rays.directions[0, :, :3].astype(np.float64))
+        self.looks: RealLooks | None = None
 
     def transfer(
         self,
@@ -83,6 +85,19 @@ class ImageSpaceTransfer:
         inside the scene, a thing behind which another is out of reach may be missed. turn: as in `transfer_radiance`.
         """
         views = self._around.update(volume, dominant_direction)
+        view_of = self._views_for(views)
+        near_m = near_reach_m(views, reach_m)
+        self.looks = RealLooks(
+            views,
+            view_of,
+            camera,
+            inverse_rigid(volume_from_camera),
+            surface,
+            depth_room(self._engine, camera),
+            near_m,
+            near_distances(self._rays.count, volume.voxel_m, near_m)[1],
+            threshold or self._threshold,
+        )
         return transfer_from_views(
             self._engine,
             camera,
@@ -90,7 +105,7 @@ class ImageSpaceTransfer:
             volume,
             surface,
             views,
-            self._views_for(views),
+            view_of,
             stride,
             self._rays,
             reach_m,
@@ -130,12 +145,22 @@ def near_distances(rays: int, voxel_m: float, near_m: float) -> tuple[NDArray[np
     return (begin_m * ratio ** sample_phases(rays)).astype(np.float32), ratio
 
 
+def near_reach_m(views: AuxiliaryViews, reach_m: float) -> float:
+    """Up to where the camera's own picture is looked into."""
+    return min(NEAR_PIXELS * views.pixel_m, reach_m)
+
+
+def depth_room(engine: Engine, camera: CameraModel) -> cl_array.Array:
+    """[h, w] float32 that `camera_depths` fills."""
+    return engine.workspace.array("camera_depths", (camera.height, camera.width), np.float32)
+
+
 def camera_depths(
     engine: Engine, camera: CameraModel, volume_from_camera: Floats, surface: Surface, defines: dict[str, int]
 ) -> tuple[cl_array.Array, cl_array.Array]:
     """[h, w] float32 metres along the optical axis of the geometry buffer, 0 = no surface or one guessed from its
     neighbours, negative where the sensor alone knows it; [1] int32: 1 if there is such a pixel."""
-    depths = engine.workspace.array("camera_depths", (camera.height, camera.width), np.float32)
+    depths = depth_room(engine, camera)
     any_unknown = engine.workspace.array("any_unknown", (1,), np.int32)
     any_unknown.fill(np.int32(0))
     engine.launch(
@@ -169,7 +194,7 @@ def transfer_from_views(
     """The same for given views. view_of [SETS, count]: the view for each direction."""
     cols, rows = camera.width // stride, camera.height // stride
     result = room_for_transfer(engine, rows, cols, stride, rays, own_sets(engine, rows, cols, turn))
-    near_m = min(NEAR_PIXELS * views.pixel_m, reach_m)
+    near_m = near_reach_m(views, reach_m)
     starts, ratio = near_distances(rays.count, volume.voxel_m, near_m)
     lift_m = LIFT_VOXELS * volume.voxel_m
     defines = {"BANDS": result.bands, "MASK_WORDS": result.free_mask.shape[2], "LANES": engine.lanes}

@@ -9,7 +9,7 @@ is tighter, and without evidence for coloured light from somewhere, shadows are 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl as cl
@@ -67,6 +67,12 @@ class LightEstimate:
     """Condition number of the unregularised normal equations; infinite if singular."""
     valid: bool
     """Whether the pictures fix the dominant direction to 15 degrees (95 %)."""
+
+    def whitened(self) -> LightEstimate:
+        """The same luminance without colours, as the thesis assumes light to be (7.1)."""
+        white = np.ones(3)
+        std = None if self.std is None else np.outer(self.std @ LUMINANCE, white)  # as of channels that err alike
+        return replace(self, sh=np.outer(self.sh @ LUMINANCE, white), std=std)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -162,36 +163,77 @@ def no_glow(engine: Engine) -> Glow:
     )
 
 
+@dataclass(frozen=True)
+class _Gathered:
+    """The points of several objects, one object's after the other's, apart from where they stand."""
+
+    surfaces: tuple[SurfacePoints, ...]
+    owners: NDArray[np.int64]
+    """[n] which object."""
+    points: Floats
+    normals: Floats
+    albedos: Floats
+    nearest: NDArray[np.int32]
+    """As Glow has it."""
+    cells: NDArray[np.int32]
+    """[objects, 4]."""
+
+
+_GATHERED: WeakKeyDictionary[Engine, _Gathered] = WeakKeyDictionary()
+"""Of each engine's last objects: they move from frame to frame, but seldom change."""
+
+
+def _gather(engine: Engine, surfaces: tuple[SurfacePoints, ...]) -> _Gathered:
+    held = _GATHERED.get(engine)
+    if held is not None and [*map(id, held.surfaces)] == [*map(id, surfaces)]:
+        return held
+    counts, sizes = [len(s.points) for s in surfaces], [s.nearest[..., 0].size for s in surfaces]
+    first, start = np.cumsum([0, *counts[:-1]]), np.cumsum([0, *sizes[:-1]])
+    nearest = np.concatenate([s.nearest.ravel() for s in surfaces])
+    shift = np.repeat(first, np.multiply(sizes, SIDES))
+    gathered = _Gathered(
+        surfaces,
+        np.repeat(np.arange(len(surfaces)), counts),
+        np.concatenate([s.points for s in surfaces]),
+        np.concatenate([s.normals for s in surfaces]),
+        np.concatenate([s.albedos for s in surfaces]),
+        np.where(nearest >= 0, nearest + shift, -1).astype(np.int32),
+        np.column_stack([[s.nearest.shape[2::-1] for s in surfaces], start]).astype(np.int32),
+    )
+    _GATHERED[engine] = gathered
+    return gathered
+
+
 def place_points(engine: Engine, objects: Sequence[Placed]) -> PlacedPoints:
     """The points of `objects`, each with its `volume_from_model`, where they are now."""
-    space, surfaces = engine.workspace, [thing.surface_points for thing, _ in objects]
-    counts, sizes = [len(s.points) for s in surfaces], [s.nearest[..., 0].size for s in surfaces]
-    first, start = np.cumsum([0, *counts]), np.cumsum([0, *sizes])
-    nearest = [np.where(s.nearest >= 0, s.nearest + f, -1).ravel() for s, f in zip(surfaces, first, strict=False)]
-    cells = [(*s.nearest.shape[2::-1], at) for s, at in zip(surfaces, start, strict=False)]
-    points, normals, offsets = [], [], []
-    for surface, (thing, matrix) in zip(surfaces, objects, strict=True):
-        volume_from_grid = matrix @ np.linalg.inv(thing.grid.grid_from_model)
-        points.append(surface.points @ volume_from_grid[:3, :3].T + volume_from_grid[:3, 3])
-        turned = surface.normals @ matrix[:3, :3].T
-        normals.append(turned / np.linalg.norm(turned, axis=1, keepdims=True))
-        offsets.append(np.full(len(surface.points), np.linalg.norm(volume_from_grid[:3, 0])))
-    albedos = np.concatenate([s.albedos for s in surfaces])
+    space, every = engine.workspace, _gather(engine, tuple(thing.surface_points for thing, _ in objects))
+    volume_from_model = np.array([matrix for _, matrix in objects])
+    volume_from_grid = volume_from_model @ np.linalg.inv(np.array([thing.grid.grid_from_model for thing, _ in objects]))
+    points = _turned(volume_from_grid[:, :3, :3], every.owners, every.points) + volume_from_grid[every.owners, :3, 3]
+    normals = _turned(volume_from_model[:, :3, :3], every.owners, every.normals)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    cells_m = np.linalg.norm(volume_from_grid[:, :3, 0], axis=1)
     return PlacedPoints(
-        int(first[-1]),
-        space.upload("glow_places", _float4(np.concatenate(points), 1.0)),
-        space.upload("glow_place_normals", _float4(np.concatenate(normals))),
-        albedos,
-        space.upload("glow_albedos", _float4(albedos)),
-        space.upload("glow_offsets", np.concatenate(offsets).astype(np.float32)),
+        len(points),
+        space.upload("glow_places", _float4(points, 1.0)),
+        space.upload("glow_place_normals", _float4(normals)),
+        every.albedos,
+        space.upload("glow_albedos", _float4(every.albedos)),
+        space.upload("glow_offsets", cells_m[every.owners].astype(np.float32)),
         Glow(
-            space.upload("glow_nearest", np.concatenate(nearest).astype(np.int32)),
-            space.upload("glow_cells", np.array(cells, np.int32).view(cl_types.int4)[:, 0]),
-            space.upload("glow_points", _float4(np.concatenate([s.points for s in surfaces]))),
-            space.upload("glow_normals", _float4(np.concatenate([s.normals for s in surfaces]))),
-            space.upload("glow_nothing", np.zeros(int(first[-1]), cl_types.float4)),
+            space.upload("glow_nearest", every.nearest),
+            space.upload("glow_cells", every.cells.view(cl_types.int4)[:, 0]),
+            space.upload("glow_points", _float4(every.points)),
+            space.upload("glow_normals", _float4(every.normals)),
+            space.upload("glow_nothing", np.zeros(len(points), cl_types.float4)),
         ),
     )
+
+
+def _turned(matrices: Floats, owners: NDArray[np.int64], vectors: Floats) -> Floats:
+    """[n, 3] each of `vectors` by its owner's matrix [objects, 3, 3]."""
+    turned: Floats = np.einsum("nij,nj->ni", matrices[owners], vectors)
+    return turned
 
 
 def _float4(values: Floats, w: float = 0.0) -> NDArray[np.float32]:

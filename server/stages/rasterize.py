@@ -109,11 +109,20 @@ def nearest_depths(
 ) -> cl_array.Array:
     """[SUBPIXELS h, SUBPIXELS w] uint32: bits of 1 / depth (1/metre) of the nearest object at the middles of the parts
     of each pixel, 0 where there is none."""
-    fine = finer(camera, SUBPIXELS)
-    boxes = boxes_in_view(fine, camera_from_volume, objects)
-    picture = tabulate(engine, fine, camera_from_volume, objects, boxes)
-    lists = _make_lists(engine, picture, "fine")
-    _raster(engine, picture, lists, "fine")
+    return drawn_depths(engine, finer(camera, SUBPIXELS), camera_from_volume, objects, "fine")
+
+
+def drawn_depths(
+    engine: Engine, camera: CameraModel | Pinhole, camera_from_volume: Matrix, objects: Sequence[Placed], name: str
+) -> cl_array.Array:
+    """[h, w] uint32: bits of 1 / depth (1/metre) of the nearest object at the pixels' middles, 0 where there is none.
+
+    The array is valid until the next call with that `name`.
+    """
+    boxes = boxes_in_view(camera, camera_from_volume, objects)
+    picture = tabulate(engine, camera, camera_from_volume, objects, boxes)
+    lists = _make_lists(engine, picture, name)
+    _raster(engine, picture, lists, name)
     return lists.nearest
 
 

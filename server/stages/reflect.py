@@ -47,9 +47,9 @@ def reflect_surroundings(
         virtual.material,
         float4(*volume_from_camera[:3, 3], 1.0),
         LEAST_GLOSS,
-        scene.light.coefficients,
+        scene.light.whole,
         *scene.arguments(engine),
-        scene.offset_m,
+        virtual.object_index,
         reflected,
     )
     return reflected

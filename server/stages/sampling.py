@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
 from server.stages.image_space import ImageSpaceTransfer
+from server.stages.image_space_rendering import RealLooks
 from server.stages.radiance_transfer import Directions, Transfer, direction_sets, transfer_radiance
 from server.stages.raycast import Surface
 from server.stages.visibility_cache import VisibilityCaches
@@ -80,6 +81,11 @@ class TransferSampler:
         self._state: VisibilityState | None = None
         self._frame = -1
         self._image_space = ImageSpaceTransfer(engine, self.rays) if sampling.image_space else None
+
+    @property
+    def looks(self) -> RealLooks | None:
+        """What the last transfer looked into; None where rays are traced."""
+        return self._image_space.looks if self._image_space else None
 
     def transfer(
         self,

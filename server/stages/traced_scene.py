@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -15,8 +15,10 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from server.maths.direct_lights import DirectLight, SplitLight
 from server.opencl.engine import Engine, KernelArgument, float4, float16, int4
 from server.stages.continuation import NO_PLANES, PlaneArrays, plane_arguments
+from server.stages.image_space_rendering import Looks
 from server.stages.indirect import Indirect
 from server.stages.measure import intrinsics
 from server.stages.object_glow import Glow, no_glow
@@ -44,6 +46,20 @@ class DeviceLight:
     """[3] radiance that hidden directions bring where no picture shows what hides them; 0 without indirect light."""
     surface_gain: float
     """Radiance in the picture's units over that of the volume's colours; 0: surfaces send nothing."""
+    discs: tuple[DirectLight, ...] = ()
+    """What is not in `coefficients` and `arriving`, for shadow maps to bring (shadow_map.py); volume axes."""
+    with_discs: cl_array.Array | None = None
+    """[bands^2] float4: coefficients of all of it, None where those are `coefficients`."""
+
+    @property
+    def bands(self) -> int:
+        """Of the coefficients."""
+        return math.isqrt(int(self.coefficients.shape[0]))
+
+    @property
+    def whole(self) -> cl_array.Array:
+        """[bands^2] float4: coefficients of all of the light."""
+        return self.coefficients if self.with_discs is None else self.with_discs
 
 
 @dataclass(frozen=True)
@@ -72,40 +88,57 @@ class TracedScene:
     """What the objects send; None: nothing."""
     changed: Changed | None = None
     """What they change of what real surface sends; None: nothing."""
+    looks: Looks | None = None
+    """Pictures that visibility is looked up in; None: rays are traced."""
 
     @property
     def bands(self) -> int:
         """Of the light."""
         return math.isqrt(int(self.light.coefficients.shape[0]))
 
-    @property
-    def offset_m(self) -> float:
-        """How far off a virtual surface rays begin."""
-        return max(self.table.cell_m, default=0.0)
-
     def defines(self, engine: Engine) -> dict[str, int]:
         """Shapes that kernels are compiled for."""
-        return {"BANDS": self.bands, "MASK_WORDS": -(-self.rays.count // 32), "LANES": engine.lanes}
+        shapes = {"BANDS": self.bands, "MASK_WORDS": -(-self.rays.count // 32), "LANES": engine.lanes}
+        return shapes | (self.looks.defines() if self.looks else {})
+
+    def by_rays(self) -> TracedScene:
+        """The same, with visibility traced."""
+        return replace(self, looks=None)
 
     def arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
         """SCENE_PARAMETERS of include/shadows.clh."""
-        light, table, sent = self.light, self.table, self.glow or no_glow(engine)
+        table, sent = self.table, self.glow or no_glow(engine)
         return (
             *self.volume.arguments(),
-            self.rays.count,
-            self.rays.on_device(engine),
-            light.arriving,
-            self.reach_m,
-            *light.continued,
-            self.volume.colors,
-            float4(*light.unseen, light.surface_gain),
-            *_changed_arguments(engine, self.changed),
+            *light_arguments(engine, self.light, self.volume, self.rays, self.reach_m, self.changed),
             table.count,
             table.grid_from_volume,
             table.dims,
             table.distances,
             *sent.arguments(),
+            *(self.looks.arguments(engine) if self.looks else ()),
         )
+
+
+def light_arguments(
+    engine: Engine,
+    light: DeviceLight,
+    volume: Volume,
+    rays: Directions,
+    reach_m: float,
+    changed: Changed | None = None,
+) -> tuple[KernelArgument, ...]:
+    """LIGHT_PARAMETERS of include/shadows.clh."""
+    return (
+        rays.count,
+        rays.on_device(engine),
+        light.arriving,
+        reach_m,
+        *light.continued,
+        volume.colors,
+        float4(*light.unseen, light.surface_gain),
+        *_changed_arguments(engine, changed),
+    )
 
 
 def trace_scene(
@@ -131,11 +164,31 @@ def upload_light(
     return DeviceLight(
         engine.workspace.upload("light", _float4(sh)),
         np.maximum(0.5 / np.sqrt(np.pi) * sh[0], 0.0),
-        engine.workspace.upload("arriving", _float4(np.maximum(rays.basis @ sh.astype(np.float32), 0.0))),
+        engine.workspace.upload("arriving", _arriving(rays, sh)),
         plane_arguments(engine, "light_planes", planes),
         exposure * indirect.mean if indirect else np.zeros(3),
         exposure if indirect else 0.0,
     )
+
+
+def take_discs(
+    engine: Engine, light: DeviceLight, split: SplitLight, rays: Directions, exposure: float = 1.0
+) -> DeviceLight:
+    """`light`, of the same radiance and `exposure` as `split`, less its discs."""
+    if not split.discs:
+        return light
+    rest = exposure * split.rest
+    return replace(
+        light,
+        coefficients=engine.workspace.upload("light_rest", _float4(rest)),
+        arriving=engine.workspace.upload("arriving_rest", _arriving(rays, rest)),
+        discs=tuple(replace(disc, irradiance=exposure * disc.irradiance) for disc in split.discs),
+        with_discs=light.coefficients,
+    )
+
+
+def _arriving(rays: Directions, sh: NDArray[np.float64]) -> NDArray[np.float32]:
+    return _float4(np.maximum(rays.basis @ sh.astype(np.float32), 0.0))
 
 
 def _changed_arguments(engine: Engine, changed: Changed | None) -> tuple[KernelArgument, ...]:

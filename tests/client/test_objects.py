@@ -148,14 +148,50 @@ def test_material_that_is_broken(line: str, obj: Path) -> None:
 def test_what_an_obj_lacks_is_told(obj: Path) -> None:
     """From the client's reader, inside the GLB, to the notes of the mesh."""
     obj.write_text(OBJ.replace("usemtl red paint", "usemtl gone"))
-    (obj.parent / "model.mtl").write_text(MTL + "map_Bump bumps.png\nmap_Pr rough.png\n")
+    (obj.parent / "model.mtl").write_text(MTL + "map_Bump bumps.png\nmap_Ns shine.png\n")
     format_, data = pack_mesh(obj)
     mesh = load_mesh(data, format_)
     assert mesh.notes[-2:] == (
-        "of the OBJ's materials, map_Bump, map_Pr were not read",
+        "of the OBJ's materials, map_Bump, map_Ns were not read",
         "no library of the OBJ has its material 'gone'; what names it is plain grey",
     )
     np.testing.assert_allclose(mesh.vertex_colors[mesh.triangles[0]], 0.8)
+
+
+@pytest.mark.parametrize(
+    ("lines", "roughness", "metalness", "texel"),
+    [
+        ("map_Pr rough.png\nmap_Pm metal.png\n", 1.0, 1.0, (90, 200)),
+        ("map_Pr -s 2 2 1 rough.png\nPr 0.5\nPm 0.25\n", 0.5, 0.25, (90, 255)),
+        ("Ks 1 1 1\nNs 30\nmap_Pm metal.png\n", (2 / 32) ** 0.25, 1.0, (255, 200)),
+    ],
+)
+def test_maps_of_roughness_and_metalness(
+    lines: str, roughness: float, metalness: float, texel: tuple[int, int], obj: Path
+) -> None:
+    """One picture of both, of the larger's size; what a map has none of is white; the numbers multiply it."""
+    cv2.imwrite(str(obj.parent / "rough.png"), np.full((4, 6), 90, np.uint8))
+    cv2.imwrite(str(obj.parent / "metal.png"), np.full((2, 3), 200, np.uint8))
+    (obj.parent / "model.mtl").write_text(MTL.replace("newmtl picture", lines + "newmtl picture"))
+    mesh = load_mesh(pack_mesh(obj)[1], "glb")
+    assert not any("not read" in note for note in mesh.notes)
+    (found,) = [m for m in mesh.materials if m.surface_texture is not None]
+    assert (found.roughness, found.metalness) == pytest.approx((roughness, metalness))
+    assert found.surface_texture is not None
+    image = found.surface_texture.image
+    assert image.shape == ((4, 6, 3) if "Pr" in lines else (2, 3, 3))
+    assert (image[..., 1:] == texel).all()
+
+
+def test_maps_that_do_not_fit_are_refused(obj: Path) -> None:
+    cv2.imwrite(str(obj.parent / "rough.png"), np.full((4, 4), 90, np.uint8))
+    (obj.parent / "model.mtl").write_text(MTL + "map_Pr rough.png\nmap_Pm -s 2 2 1 rough.png\n")
+    with pytest.raises(ObjectError, match="different options"):
+        pack_mesh(obj)
+    (obj.parent / "rough.png").write_bytes(b"no picture")
+    (obj.parent / "model.mtl").write_text(MTL + "map_Pr rough.png\n")
+    with pytest.raises(ObjectError, match=r"rough\.png: the texture cannot be decoded"):
+        pack_mesh(obj)
 
 
 def test_obj_texture_options(obj: Path) -> None:

@@ -30,6 +30,7 @@ def test_defaults_fit_the_source(source: str) -> None:
     assert (wishes.lamps, wishes.exposure) == ("auto", "auto")
     assert wishes.robustness == ("openness", "memory", "outliers")
     assert wishes.edges == "smooth"
+    assert (wishes.tone_mapping, wishes.light_color) == ("auto", "estimated")
     assert not wishes.as_thesis
     assert not wishes.lossless
 
@@ -50,6 +51,8 @@ def test_everything_said(source: str) -> None:
         lamps="on",
         robustness="normals, memory",
         edges="hard",
+        tone_mapping="average",
+        light_color="white",
         exposure="constant",
         up="0,0,1",
         object=[f"{source}/meta.json@1,2,3", f"{source}/meta.json"],
@@ -65,6 +68,7 @@ def test_everything_said(source: str) -> None:
     assert (wishes.lamps, wishes.exposure) == ("on", "constant")
     assert wishes.robustness == ("normals", "memory")
     assert wishes.edges == "hard"
+    assert (wishes.tone_mapping, wishes.light_color) == ("average", "white")
     assert wishes.lossless
 
 
@@ -124,6 +128,8 @@ REFUSED = [
     ({"lamps": "bright"}, "--lamps"),
     ({"robustness": "normal"}, "--robustness"),
     ({"edges": "sharp"}, "--edges"),
+    ({"tone_mapping": "filmic"}, "--tone-mapping"),
+    ({"light_color": "red"}, "--light-color"),
     ({"robustness": "none,memory"}, "--robustness"),
     ({"robustness": "normals,normals_printed"}, "--robustness"),
     ({"as_thesis": True, "robustness": "normals"}, "--as-thesis"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -13,7 +15,7 @@ from server.opencl.engine import Engine
 from server.scene.virtual_object import VirtualObject
 from server.stages import adaptive, differential_rendering
 from server.stages.differential_rendering import RealShadow, shadow_real, shadow_virtual
-from server.stages.radiance_transfer import direction_sets, transfer_radiance
+from server.stages.radiance_transfer import Directions, direction_sets, transfer_radiance
 from server.stages.rasterize import rasterize
 from server.stages.raycast import LABEL_STATIC, Surface, raycast
 from server.stages.sample_grid import SampleGrid
@@ -36,14 +38,15 @@ Floats = NDArray[np.float64]
 class Stage:
     """A ball above a floor, a virtual box beside it, and a light from one side."""
 
-    def __init__(self, engine: Engine, stride: int) -> None:
+    def __init__(self, engine: Engine, stride: int, rays: Directions | None = None) -> None:
         self.engine = engine
         self.volume = fill_volume(engine, SCENES["ball above a floor"], VOXEL_M)
         model = raycast(engine, CAMERA, VIEW, self.volume)
         labels = np.full(SIZE, LABEL_STATIC, np.uint8)
         self.surface = Surface(model.positions, model.normals, engine.workspace.upload("test_labels", labels))
-        self.rays = direction_sets(81, 4)
-        self.transfer = transfer_radiance(engine, CAMERA, self.volume, self.surface, stride, self.rays, ROOM_M)
+        self.rays = rays or direction_sets(81, 4)
+        plain = direction_sets(self.rays.count, 4)
+        self.transfer = transfer_radiance(engine, CAMERA, self.volume, self.surface, stride, plain, ROOM_M)
         sh = np.zeros((16, 3))
         sh[:4] = [[3.0, 2.8, 2.6], [1.2, 1.2, 1.2], [0.5, 0.4, 0.3], [1.0, 0.9, 0.8]]
         placed = np.eye(4)
@@ -112,6 +115,38 @@ def test_virtual_surface_near_edges_is_as_at_every_pixel(engine: Engine, monkeyp
     np.testing.assert_array_equal(refined[..., 3] > 0, near & covered)
     np.testing.assert_array_equal(refined[near & covered], every[near & covered])
     assert (every[near & covered][:, :3] > 0).any()
+
+
+def test_what_virtual_things_hide_is_left_out(engine: Engine) -> None:
+    """All that is shown, and a margin around it, is as without; what they are behind of is shown."""
+    stage = Stage(engine, STRIDE)
+    ratio, eye = stage.ratio(), VIEW[:3, 3]
+    whole = stage.refined(ratio)
+    real = download4(engine, stage.surface.positions).astype(float)
+    half = np.arange(CAMERA.width) < CAMERA.width // 2
+    share = np.where(half, 0.5, 1.5)[None, :, None]  # of the way to what is real
+    covered = np.broadcast_to((np.arange(CAMERA.height) > 8)[:, None], SIZE).astype(float)
+    places = engine.workspace.upload("test_places", float4(eye + share * (real[..., :3] - eye), covered))
+    virtual = replace(stage.virtual, position=places)
+    found = download4(engine, adaptive.refine_real(engine, CAMERA, stage.surface, stage.scene, ratio, virtual, eye))
+    kept = adaptive.grown((covered == 0) | ~half, adaptive.SHOWN_MARGIN_PX)
+    np.testing.assert_array_equal(found[kept], whole[kept].astype(np.float32))
+    assert not found[~kept].any()
+    assert (whole[~kept][:, 3] > 0).sum() > 10
+    assert (whole[kept][:, 3] > 0).sum() > 10
+
+
+def test_subsets_of_directions_are_the_whole_on_average(engine: Engine) -> None:
+    """Each pixel traces one of four subsets; over the rims they say what all directions say."""
+    stage = Stage(engine, STRIDE, direction_sets(324, 4))
+    ratio = stage.ratio()
+    every = stage.refined(ratio)
+    some = Stage(engine, STRIDE, direction_sets(324, 4, 4)).refined(ratio)
+    listed = (every[..., 3] > 0) & (some[..., 3] > 0)
+    apart = (some - every)[listed][:, :3]
+    assert listed.sum() > 100
+    assert 0.001 < np.sqrt((apart**2).mean()) < 0.06
+    assert np.abs(apart.mean(axis=0)).max() < 0.01
 
 
 @pytest.mark.parametrize("stride", [1, 4, 8])

@@ -30,7 +30,7 @@ from tests import lights
 from tests.meshes import pose, shape_of
 from tests.reference import differential_rendering as twin
 from tests.reference.sh import open_transfer, sh_basis
-from tests.solids import Box, Scene, box, download4, fill_volume, float4, floor, hit, upload_surface
+from tests.solids import Ball, Box, Scene, ball, box, download4, fill_volume, float4, floor, hit, upload_surface
 from tests.tolerance import relative_tolerance
 
 VOXEL_M = 0.01
@@ -45,8 +45,10 @@ LIGHTS = {"uniform": lights.uniform((1.0, 0.5, 2.0)), "directional": LIGHT, "fro
 Floats = NDArray[np.float64]
 
 
-def placed(engine: Engine, solid: Box) -> Placed:
-    """A box as a virtual object, its place given by its pose."""
+def placed(engine: Engine, solid: Box | Ball) -> Placed:
+    """A body as a virtual object, its place given by its pose."""
+    if isinstance(solid, Ball):
+        return VirtualObject.upload(engine, shape_of(trimesh.creation.icosphere(4, solid.radius))), pose(solid.center)
     mesh = shape_of(trimesh.creation.box(solid.high - solid.low))
     return VirtualObject.upload(engine, mesh), pose((solid.low + solid.high) / 2)
 
@@ -96,7 +98,6 @@ class Shaded:
             self.light,
             directions,
             arriving,
-            VOXEL_M,
             lambda o, d: hit([solid], o, d, grown_m) >= self.reach_m,
         )
 
@@ -110,7 +111,7 @@ STRIDE = 3
 
 def shade_floor(
     engine: Engine,
-    solid: Box,
+    solid: Box | Ball,
     light: Floats = LIGHT,
     *,
     scene: Scene = FLOOR,
@@ -142,7 +143,7 @@ def shade_floor(
         bits.astype(bool),
         light,
         directions,
-        traced.offset_m,
+        traced.table.cell_m[0],
         reach_m,
     )
 
@@ -175,13 +176,11 @@ def test_real_shadow_is_not_cast_twice(engine: Engine) -> None:
         for scene in ((floor(),), (floor(), ceiling))
     )
     taken = [(1 - s.ratio[..., 0]) * (s.transfer @ light)[..., 0] for s in (open_sky, covered)]
-    assert taken[0].mean() == pytest.approx(
-        sky_behind(PLATE.grown(0.5 * open_sky.cell_m), below[0] + VOXEL_M * UP), rel=0.03
-    )
+    assert taken[0].mean() == pytest.approx(sky_behind(PLATE.grown(0.5 * open_sky.cell_m), below[0]), rel=0.03)
     assert taken[1].mean() < 0.1 * taken[0].mean()
 
 
-def sky_behind(solid: Box, point: Floats) -> float:
+def sky_behind(solid: Box | Ball, point: Floats) -> float:
     """Share of an upward point's cosine-weighted sky behind a box: dense directions, closed-form rays."""
     random = np.random.default_rng(1)
     radius, azimuth = np.sqrt(random.random(400_000)), 2 * np.pi * random.random(400_000)  # density cos / pi
@@ -200,13 +199,26 @@ def test_ratio_matches_a_brute_force_integral(engine: Engine) -> None:
     without = open_transfer(UP, 4) @ LIGHT
     errors = []
     for row, col in [(12, 12), (12, 8), (12, 10), (8, 12), (10, 9), (4, 4), (20, 20), (13, 6)]:
-        origins = np.tile(shaded.points[row, col] + VOXEL_M * UP, (len(rays), 1))
+        origins = np.tile(shaded.points[row, col], (len(rays), 1))
         taken = (np.isfinite(plate.hit(origins, rays))[:, None] * arriving).mean(0)
         errors.append(shaded.ratio[row, col, :3] - (1 - taken / without))
     # 1024 directions over the sphere, one set a sample: each stands for 0.4 % of the sky at the zenith, and the plate's
     # outline crosses some twenty of them.
     assert np.abs(errors).max() < 0.02
     assert np.sqrt(np.mean(np.square(errors))) < 0.008
+
+
+def test_beside_where_it_stands_a_ball_takes_only_what_is_above(engine: Engine) -> None:
+    """A voxel off the floor these points would lie inside it; closed-form rays from the floor itself."""
+    standing, away_m = ball((0.48, 0.2, 0.48), 0.1), 0.035
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    ring = np.array([0.48, 0.1, 0.48]) + away_m * np.stack([np.cos(turn), 0 * turn, np.sin(turn)], -1)
+    shaded = shade_floor(engine, standing, lights.uniform(), rays=1024, points=np.tile(ring, (24, 1)))
+    assert np.linalg.norm(ring[0] + VOXEL_M * UP - standing.center) < standing.radius
+    hidden = [sky_behind(standing.grown(grown), ring[0]) for grown in (0.0, 0.72 * shaded.cell_m)]
+    taken = 1 - shaded.ratio[..., 0].mean()
+    assert hidden[0] < 0.9
+    assert hidden[0] - 0.03 < taken < hidden[1] + 0.03
 
 
 def test_shadow_lies_away_from_the_light(engine: Engine) -> None:
@@ -292,7 +304,7 @@ def shade_top(
     objects, volume = [placed(engine, solid) for solid in solids], fill_volume(engine, scene, VOXEL_M)
     traced = trace_scene(engine, volume, device_light, directions, FAR_M, objects)
     found: SampleGrid = shadow_virtual(engine, camera_of(positions), surface, traced)
-    return download4(engine, found.values), positions, normals, traced.offset_m
+    return download4(engine, found.values), positions, normals, max(traced.table.cell_m)
 
 
 @pytest.mark.parametrize("name", ["uniform", "directional"])
@@ -321,6 +333,37 @@ def test_occlusion_is_the_twins(device: Device, engine: Engine, name: str) -> No
     assert (occluded[..., :3] <= most[..., :3] + tolerance).all()
     assert (occluded[..., :3] >= least[..., :3] - tolerance).all()
     assert least[..., 0].max() > 0.1
+
+
+def test_real_surface_that_it_touches_takes_its_own_half_alone(engine: Engine) -> None:
+    """A slope that leans towards a wall 2 mm away: rays that begin a voxel off it would begin in the wall."""
+    wall, normal = box((0.5, -1.0, -1.0), (2.0, 2.0, 2.0)), lights.unit([1.0, 1.0, 0.0])
+    points = np.full((1600, 3), (0.498, 0.4, 0.48))
+    points[:, 1] += np.linspace(0, 0.2, 1600)
+    occluded = shade_points(engine, (wall,), points.reshape(40, 40, 3), normal)
+    random = np.random.default_rng(1)
+    rays = lights.unit(random.normal(size=(100_000, 3)))
+    shares = np.maximum(rays @ normal, 0)
+    hidden = shares[rays[:, 0] > 0].sum() / shares.sum()
+    assert 0.8 < hidden < 0.9  # the wall's share of the slope's sky
+    assert occluded[..., 0].mean() == pytest.approx(hidden, abs=0.03)
+
+
+def shade_points(engine: Engine, scene: Scene, points: Floats, normal: Floats) -> Floats:
+    """Radiance [20, 20, 4] that `scene` takes of an even sky of 1 from virtual points [40, 40, 3]."""
+    space, covered = engine.workspace, np.ones(points.shape[:2])
+    surface = VirtualSurface(
+        space.upload("virtual_positions", float4(points, covered)),
+        space.upload("virtual_normals", float4(np.broadcast_to(normal, points.shape), covered)),
+        space.upload("virtual_colors", float4(0.5 * np.ones(points.shape), covered)),
+        space.upload("virtual_index", np.zeros(points.shape[:2], np.int32)),
+        ((0, 0, 40, 40),),
+    )
+    directions = direction_sets(81, 4)
+    device_light, volume = upload_light(engine, lights.uniform(), directions), fill_volume(engine, scene, VOXEL_M)
+    far = [placed(engine, box((5, 5, 5), (5.1, 5.1, 5.1)))]
+    traced = trace_scene(engine, volume, device_light, directions, FAR_M, far)
+    return download4(engine, shadow_virtual(engine, camera_of(points), surface, traced).values)
 
 
 def test_real_overhang_darkens_what_is_below(engine: Engine) -> None:

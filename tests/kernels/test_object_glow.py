@@ -16,7 +16,7 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.scene.mesh import Mesh
 from server.scene.virtual_object import VirtualObject
-from server.stages import differential_rendering
+from server.stages import adaptive, differential_rendering
 from server.stages.adaptive import refine_real
 from server.stages.differential_rendering import (
     RealShadow,
@@ -153,8 +153,9 @@ def test_a_red_thing_reddens_the_floor(engine: Engine) -> None:
     assert (lit.ratio[..., 0] < 1.0 + CODED).all()  # it sends no more than the sky it hides
 
 
-def test_rims_say_what_samples_say(engine: Engine) -> None:
+def test_rims_say_what_samples_say(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     """Refined pixels trace what samples know from the transfer: the same ratio, with indirect light too."""
+    monkeypatch.setattr(adaptive, "LEAST_CHANGE", 1 / 32)  # wide rims, so that means say something
     lit = light_floor(engine, [placed(engine, PLATE, (0.1, 0.1, 0.1))], scene=(floor(), WALL), color=(0.5, 0.6, 0.7))
     middle = lit.refined[1::3, 1::3]
     both = (middle[..., 3] > 0) & (lit.ratio[..., 3] > 0)
@@ -191,6 +192,7 @@ def taken_from_top(
             **dict.fromkeys(VirtualSurface.__dataclass_fields__),
             "position": space.upload("virtual_positions", float4(positions[..., :3], covered)),
             "normal": space.upload("virtual_normals", float4(normals[..., :3], covered)),
+            "object_index": space.upload("virtual_index", np.zeros(covered.shape, np.int32)),
         }
     )
     rays, camera = direction_sets(81, 4), camera_of(positions)

@@ -10,6 +10,7 @@ import pytest
 from server.effects import EFFECTS, SceneFacts
 from server.pipeline import _GIVEN
 from server.plan import Effect, Omission, PlanError, execute, make_plan
+from server.stages.tone_mapping import Averages
 
 Toy = Effect[frozenset[str]]
 
@@ -135,6 +136,8 @@ def test_two_writers_are_refused() -> None:
         make_plan([*TOYS, Effect(glow, writes="shade")], "picture", GIVEN, frozenset())
 
 
+KNOWN = Averages(picture=0.2, shading=0.5, samples=9)
+
 # ---- the real table ----------------------------------------------------------------------------------------------
 
 
@@ -148,6 +151,9 @@ def test_two_writers_are_refused() -> None:
                 "rasterize": "no virtual object",
                 "cover": "no virtual object",
                 "reflect": "no virtual object",
+                "match_average": "no virtual object",
+                "direct_virtual": "no virtual object",
+                "direct_real": "no virtual object",
                 "shade_virtual": "no virtual object",
                 "shadow_real": "no virtual object",
                 "refine_virtual": "no virtual object",
@@ -161,16 +167,33 @@ def test_two_writers_are_refused() -> None:
                 "rasterize": "in view",
                 "cover": "in view",
                 "reflect": "in view",
+                "match_average": "in view",
+                "direct_virtual": "in view",
+                "direct_real": "soft",
+                "shadow_map": "soft",
                 "light_objects": "left out",
                 "shade_virtual": "in view",
                 "refine_virtual": "in view",
                 "refine_real": "refine",
+                "look_around": "traces rays",
             },
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=False),
             {"rasterize", "cover", "composite"},
-            dict.fromkeys(("shade_virtual", "shadow_real", "refine_virtual", "refine_real", "reflect"), "no light"),
+            dict.fromkeys(
+                (
+                    "shade_virtual",
+                    "shadow_real",
+                    "refine_virtual",
+                    "refine_real",
+                    "reflect",
+                    "match_average",
+                    "direct_virtual",
+                    "direct_real",
+                ),
+                "no light",
+            ),
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=True),
@@ -180,13 +203,47 @@ def test_two_writers_are_refused() -> None:
                 "refine_real": "does not refine",
                 "light_objects": "left out",
                 "reflect": "glossy",
+                "direct_virtual": "soft",
+                "direct_real": "soft",
+                "shadow_map": "soft",
+                "look_around": "traces rays",
+                "match_average": "own scale",
             },
         ),
         (
-            SceneFacts(objects=1, objects_in_view=1, has_light=True, adaptive=True, indirect=True, glossy=True),
+            SceneFacts(objects=1, objects_in_view=1, has_light=True, averages=Averages(0.0, 1.0, 9)),
+            {"rasterize", "cover", "prepare_rays", "add_objects", "shade_virtual", "shadow_real", "composite"},
+            {
+                "refine_virtual": "does not refine",
+                "refine_real": "does not refine",
+                "light_objects": "left out",
+                "reflect": "glossy",
+                "direct_virtual": "soft",
+                "direct_real": "soft",
+                "shadow_map": "soft",
+                "look_around": "traces rays",
+                "match_average": "empty or black",
+            },
+        ),
+        (
+            SceneFacts(
+                objects=1,
+                objects_in_view=1,
+                has_light=True,
+                adaptive=True,
+                indirect=True,
+                image_space=True,
+                glossy=True,
+                sharp_lights=1,
+                averages=KNOWN,
+            ),
             {
                 "rasterize",
                 "cover",
+                "shadow_map",
+                "direct_virtual",
+                "direct_real",
+                "look_around",
                 "prepare_rays",
                 "light_objects",
                 "add_objects",
@@ -195,6 +252,7 @@ def test_two_writers_are_refused() -> None:
                 "refine_virtual",
                 "shadow_real",
                 "refine_real",
+                "match_average",
                 "composite",
             },
             {},
@@ -213,4 +271,4 @@ def test_effects_of_a_scene(facts: SceneFacts, run: set[str], reasons: dict[str,
     for item in plan.left_out:
         assert reasons[item.effect] in item.reason
         assert item.error_bound is not None
-        assert item.error_bound == (0.0 if "object" in item.reason else 255.0)
+        assert item.error_bound == (0.0 if "object" in item.reason or "soft" in item.reason else 255.0)

@@ -29,7 +29,6 @@ def shadow_real(
     light: Floats,
     directions: Floats,
     arriving: Floats,
-    offset_m: float,
     passes_objects: IsFree,
 ) -> Floats:
     """R' / R [rows, cols, 4] at the samples, w = 0 without surface; passes_objects(origins, directions).
@@ -47,7 +46,7 @@ def shadow_real(
                 continue
             turned = direction_set(row, col)
             rays = directions[turned]
-            origins = np.tile(position[:3] + offset_m * normal[:3], (len(rays), 1))
+            origins = np.tile(position[:3], (len(rays), 1))
             taken = free[row, col] & ~passes_objects(origins, rays[:, :3])
             without = transfer[row, col] @ light
             left = without - (_shares(normal[:3], rays) * taken) @ arriving[turned]

@@ -78,6 +78,13 @@ export interface Wishes {
   /** Of virtual things: by how much of a pixel they cover, or by its middle, as in pictures that are point samples. */
   edges?: "hard" | "smooth";
   /**
+   * What virtual things' brightness rests on: the light's scale, or the averages of the picture and of its shading;
+   * `auto`: the scale of a light that is given, the averages under one that is estimated.
+   */
+  tone_mapping?: "auto" | "average" | "light";
+  /** `white`: as the thesis assumes, the light's luminance without its colours. */
+  light_color?: "estimated" | "white";
+  /**
    * Measures that light estimation takes (thesis 5.2, 5.4): samples that see little sky are left out; weights by how
    * common a normal is (`normals_printed`: as eq. 5.7 has them); earlier frames count; what fits badly counts less.
    */

@@ -1,0 +1,459 @@
+"""Shadow maps against their float64 twin, and against the exact light of a disc past a box, a ball and a wall."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike, NDArray
+
+from server.effects import View, add_objects
+from server.maths.direct_lights import DirectLight, SplitLight, split_light
+from server.maths.directional_fit import directional_sh
+from server.maths.disc_places import disc_places, ray_places, search_places
+from server.maths.planes import PlanePatch
+from server.opencl.device import Device
+from server.opencl.engine import Engine
+from server.stages.continuation import NO_PLANES, Continuation, PlaneArrays
+from server.stages.differential_rendering import RealShadow
+from server.stages.object_glow import place_points
+from server.stages.radiance_transfer import Directions, direction_sets
+from server.stages.rasterize import VirtualSurface
+from server.stages.sample_grid import SampleGrid
+from server.stages.shadow_map import (
+    MAP_SIDE,
+    DirectSamples,
+    ShadowMaps,
+    draw_shadow_maps,
+    light_glow,
+    light_real,
+    light_samples,
+    light_virtual,
+    trace_real,
+    with_direct,
+    without_direct,
+)
+from server.stages.traced_scene import DeviceLight, take_discs, trace_scene, upload_light
+from tests import lights
+from tests.kernels import test_reflect
+from tests.kernels.test_differential_rendering import camera_of, placed
+from tests.kernels.test_lanes import Narrow, Wide
+from tests.reference import shadow_map as twin
+from tests.solids import Ball, Box, Scene, ball, box, download4, fill_volume, float4, floor, hit, upload_surface
+from tests.tolerance import relative_tolerance
+
+VOXEL_M, FAR_M = 0.01, 1000.0
+UP = np.array([0.0, 1.0, 0.0])
+FLOOR_Y = 0.1
+FLOOR: Scene = (floor(FLOOR_Y),)
+CRATE = box((0.38, 0.1, 0.4), (0.54, 0.26, 0.52))
+TOWARD = lights.unit((0.5, 0.8, 0.15))
+BEHIND = lights.unit((-0.3, 0.6, 0.6))
+KINDS = pytest.mark.parametrize("kind", [Narrow, Wide])
+
+Floats = NDArray[np.float64]
+
+
+def disc(half_angle_deg: float, toward: ArrayLike = TOWARD, color: ArrayLike = (1.0, 1.0, 1.0)) -> DirectLight:
+    return DirectLight(lights.unit(toward), np.asarray(color, float), float(np.radians(half_angle_deg)))
+
+
+@dataclass(frozen=True)
+class Lit:
+    """Maps of a scene, ready to light surfaces."""
+
+    engine: Engine
+    maps: ShadowMaps
+
+    def reference(self, light: int = 0) -> twin.Disc:
+        """The twin with the same finest map."""
+        texels = self.engine.download(self.maps.objects).view(np.float32).reshape(len(self.maps.light.discs), -1, 2)
+        level = texels[light, : MAP_SIDE**2].astype(float).reshape(MAP_SIDE, MAP_SIDE, 2)
+        rows = download4(self.engine, self.maps.rows).astype(float)[light]
+        return twin.Disc(
+            twin.pyramid(level[..., 0] > 0, level[..., 1]),
+            rows[:3, :3],
+            rows[2, 3],
+            self.maps.ball,
+            search_places(),
+            disc_places(),
+        )
+
+    def floor(self, points: Floats, normal: ArrayLike = UP) -> tuple[Floats, Floats]:
+        """[n, 3] what discs bring to real points without and with the objects."""
+        side = (8, max(-(-len(points) // 8), 8))
+        positions = np.resize(points, (*side, 3))  # a picture's least height; the last are the first again
+        normals = np.broadcast_to(np.asarray(normal, float), positions.shape)
+        surface = upload_surface(self.engine, positions, normals, np.ones(side, bool))
+        samples = SampleGrid(1, self.engine.workspace.upload("ones", float4(np.ones((*side, 3)))))
+        camera = camera_of(positions)
+        parts = trace_real(self.engine, camera, surface, samples, self.maps)
+        found = light_samples(self.engine, camera, surface, parts, self.maps)
+        both = (download4(self.engine, a)[..., :3] for a in (found.without, found.with_objects))
+        without, past = (a.reshape(-1, 3)[: len(points)].astype(float) for a in both)
+        return without, past
+
+    def virtual(self, points: Floats, normals: Floats) -> Floats:
+        """[h, w, 3] what they bring to points [h, w, 3] on the objects."""
+        space, covered = self.engine.workspace, np.ones(points.shape[:2])
+        covered[0, 0] = 0
+        position, normal = (space.upload(n, float4(a, covered)) for n, a in (("v_p", points), ("v_n", normals)))
+        unused = space.array("unused", (1,), np.float32)
+        surface = VirtualSurface(position, normal, unused, unused, ())
+        return download4(self.engine, light_virtual(self.engine, camera_of(points), surface, self.maps)).astype(float)
+
+
+def lit(
+    engine: Engine,
+    *discs: DirectLight,
+    solids: tuple[Box | Ball, ...] = (CRATE,),
+    scene: Scene = FLOOR,
+    planes: PlaneArrays = NO_PLANES,
+    reach_m: float = FAR_M,
+) -> Lit:
+    rays, volume = direction_sets(81, 4), fill_volume(engine, scene, VOXEL_M)
+    light = upload_light(engine, lights.uniform(), rays, planes)
+    light = take_discs(engine, light, SplitLight(lights.uniform(), discs), rays)
+    objects = [placed(engine, solid) for solid in solids]
+    return Lit(engine, draw_shadow_maps(engine, volume, light, objects, reach_m))
+
+
+def floor_points(count: int = 300, seed: int = 1, around: float = 0.3) -> Floats:
+    random = np.random.default_rng(seed)
+    points = np.array([0.46, 0.0, 0.46]) + random.uniform(-around, around, (count, 3))
+    points[:, 1] = FLOOR_Y
+    return points
+
+
+def exact(points: Floats, light: DirectLight, solids: Scene, normal: ArrayLike = UP, lift_m: float = 1e-6) -> Floats:
+    """[n] what reaches white points past `solids`, over the disc's irradiance."""
+    normal = np.asarray(normal, float)
+    return twin.irradiance(
+        points + lift_m * normal,
+        normal,
+        light.direction,
+        light.half_angle_rad,
+        lambda o, d: hit(solids, o, d) == np.inf if solids else np.ones(len(o), bool),
+    )
+
+
+# ---- against the twin --------------------------------------------------------------------------------------------
+
+
+@KINDS
+def test_pyramid_and_free_parts_are_the_twins(device: Device, kind: type[Engine]) -> None:
+    engine = kind(device)
+    light = disc(12.0), disc(25.0, BEHIND, (0.2, 0.5, 1.0))
+    scene = lit(engine, *light, solids=(CRATE, ball((0.62, 0.22, 0.5), 0.08)))
+    texels = engine.download(scene.maps.objects).view(np.float32).reshape(2, -1, 2).astype(float)
+    references = [scene.reference(k) for k in range(2)]
+    for found, reference in zip(texels, references, strict=True):
+        expected = np.concatenate([np.stack(level, -1).reshape(-1, 2) for level in reference.levels])
+        np.testing.assert_allclose(found, expected, atol=1e-5)  # means of floats, four at a time
+    points = floor_points(200)
+    without, found = scene.floor(points)
+    opens = [float(r.open_part(UP[None])[0]) for r in references]
+    free = np.array([[r.free_part(p, UP, False) for r in references] for p in points])
+    colors = np.array([d.irradiance for d in light])
+    np.testing.assert_allclose(without, np.tile(opens @ colors, (len(points), 1)), rtol=relative_tolerance(device))
+    error = np.abs(found - (free * opens) @ colors).max(axis=1)
+    assert 0.2 < (free < 1).any(axis=1).mean() < 0.9
+    assert (error > 1e-4).mean() < 0.03  # a look-up on the border of two texels takes either
+    assert error.max() < 0.15
+
+
+def test_virtual_surface_is_the_twins(engine: Engine) -> None:
+    light = disc(20.0)
+    scene = lit(engine, light, solids=(ball((0.46, 0.3, 0.46), 0.12), CRATE))
+    normals = lights.random_directions(220, 3).reshape(10, 22, 3)
+    points = [0.46, 0.3, 0.46] + 0.12 * normals
+    found, reference = scene.virtual(points, normals)[..., :3], scene.reference()
+    free = np.array(
+        [reference.free_part(p, n, True) for p, n in zip(points.reshape(-1, 3), normals.reshape(-1, 3), strict=True)]
+    )
+    expected = (free * reference.open_part(normals.reshape(-1, 3))).reshape(10, 22)
+    expected[0, 0] = 0  # not covered
+    error = np.abs(found - expected[..., None]).max(axis=-1)
+    assert (error > 1e-4).mean() < 0.03
+    assert error.max() < 0.15
+    assert 0.2 < (expected > 0).mean() < 0.8
+
+
+# ---- against the exact light of a disc ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("half_angle_deg", "bound"), [(2.0, 0.02), (6.0, 0.03), (14.0, 0.05), (25.0, 0.08)])
+@pytest.mark.parametrize("solid", [CRATE, ball((0.46, 0.2, 0.46), 0.1)], ids=["box", "ball"])
+def test_floor_darkens_as_the_disc_is_hidden(
+    engine: Engine, solid: Box | Ball, half_angle_deg: float, bound: float
+) -> None:
+    """The share of the light that a thing on the floor takes, from where it touches through all of the penumbra.
+
+    Seen, root mean square: 0.004, 0.010, 0.022, 0.036 of the box; 0.011, 0.017, 0.036, 0.065 of the ball, which is as
+    far from flat as can be. In the mean over the floor 0.0005 and 0.007 at most.
+    """
+    light = disc(half_angle_deg)
+    points = floor_points(500)
+    points = points[solid.distance(points) > 0.004]
+    without, found = (a[:, 0] for a in lit(engine, light, solids=(solid,)).floor(points))
+    darker, true = 1 - found / without, 1 - exact(points, light, (solid,)) / exact(points, light, ())
+    assert (true > 0.9).any()
+    assert np.sqrt(np.mean((darker - true) ** 2)) < bound
+    assert np.corrcoef(darker, true)[0, 1] > 0.96
+    assert abs(darker.mean() - true.mean()) < 0.012
+    assert darker[true == 0].mean() < 0.005
+
+
+def test_penumbra_widens_with_distance(engine: Engine) -> None:
+    """A plate's edge, twice as high: from 10 % to 90 % of the darkening it is twice as far, as tan(half angle) says."""
+    widths, light = [], disc(10.0, UP)
+    for height in (0.1, 0.2):
+        plate = box((0.1, FLOOR_Y + height, 0.1), (0.46, FLOOR_Y + height + 0.01, 0.86))
+        x = np.linspace(0.3, 0.62, 400)
+        points = np.stack([x, np.full_like(x, FLOOR_Y), np.full_like(x, 0.48)], -1)
+        without, found = (a[:, 0] for a in lit(engine, light, solids=(plate,)).floor(points))
+        true = exact(points, light, (plate,)) / exact(points, light, ())
+        shares = found / without
+        ends = [[x[np.argmax(s > level)] for level in (0.1, 0.9)] for s in (shares, true)]
+        widths.append(ends[0][1] - ends[0][0])
+        assert abs(np.mean(ends[0]) - np.mean(ends[1])) < 0.004
+        assert widths[-1] == pytest.approx(ends[1][1] - ends[1][0], rel=0.2)
+    assert widths[1] == pytest.approx(2 * widths[0], rel=0.15)
+
+
+def test_shadow_is_attached(engine: Engine) -> None:
+    """Floor right behind the box, from 1 mm on, and along all of that edge: no light leaks in between."""
+    light = disc(5.0, (1.0, 1.0, 0.0))
+    z = np.linspace(0.42, 0.50, 30)
+    for away in (0.001, 0.003, 0.01, 0.03):
+        points = np.stack([np.full_like(z, 0.38 - away), np.full_like(z, FLOOR_Y), z], -1)
+        without, found = lit(engine, light).floor(points)
+        assert (found < 0.02 * without).all()
+
+
+def test_lit_floor_has_no_acne(engine: Engine) -> None:
+    """Everywhere that the disc is seen whole: exactly nothing is taken, at grazing light too."""
+    for toward in (TOWARD, (1.0, 0.25, 0.1)):
+        light = disc(4.0, toward)
+        points = floor_points(600, around=0.4)
+        points = points[
+            exact(points, disc(5.0, toward), (CRATE.grown(0.006),)) >= 0.999 * exact(points[:1], disc(5.0, toward), ())
+        ]
+        without, found = lit(engine, light).floor(points)
+        assert len(points) > 200
+        np.testing.assert_array_equal(found, without)
+
+
+@pytest.mark.parametrize("half_angle_deg", [4.0, 20.0])
+def test_ball_does_not_shade_itself(engine: Engine, half_angle_deg: float) -> None:
+    """A convex body is lit as if it were alone with its normals, up to its terminator."""
+    center, radius, light = np.array([0.46, 0.4, 0.46]), 0.15, disc(half_angle_deg)
+    normals = lights.random_directions(900, 7).reshape(30, 30, 3)
+    found = lit(engine, light, solids=(Ball(center, radius),)).virtual(center + radius * normals, normals)[..., 0]
+    expected = np.array([exact(np.zeros((1, 3)), light, (), n)[0] for n in normals.reshape(-1, 3)]).reshape(30, 30)
+    expected[0, 0] = 0
+    assert np.abs(found - expected).max() < 0.05
+    assert np.abs(found - expected).mean() < 0.004
+
+
+def test_faces_that_face_the_light_are_lit(engine: Engine) -> None:
+    """Where depths are the face's own but for their rounding, and there is no slope to allow for."""
+    x, z = np.meshgrid(np.linspace(0.385, 0.535, 40), np.linspace(0.405, 0.515, 40))
+    points = np.stack([x, np.full_like(x, 0.26), z], -1)
+    light = disc(5.0, UP)
+    found = lit(engine, light).virtual(points, np.broadcast_to(UP, points.shape))[..., 0].ravel()[1:]
+    np.testing.assert_allclose(found, exact(points[0, :1], light, ())[0], rtol=0.005)
+
+
+def test_one_object_shades_another(engine: Engine) -> None:
+    """A plate above a box: what it takes from the box's top is what it takes of the disc."""
+    light, plate = disc(8.0), box((0.5, 0.4, 0.44), (0.7, 0.42, 0.64))
+    x, z = np.meshgrid(np.linspace(0.385, 0.535, 24), np.linspace(0.405, 0.515, 24))
+    points = np.stack([x, np.full_like(x, 0.26), z], -1)
+    found = lit(engine, light, solids=(CRATE, plate)).virtual(points, np.broadcast_to(UP, points.shape))[..., 0]
+    expected = exact(points.reshape(-1, 3), light, (plate, CRATE)).reshape(24, 24)
+    error = np.abs(found - expected)[1:, 1:]
+    assert expected.min() < 0.1
+    assert expected.max() > 0.7
+    assert np.sqrt(np.mean(error**2)) < 0.05
+
+
+# ---- real things that hide the light already ---------------------------------------------------------------------
+
+
+WALL = box((0.62, 0.1, 0.1), (0.72, 0.7, 0.86))
+
+
+@KINDS
+def test_nothing_is_darkened_twice(device: Device, kind: type[Engine]) -> None:
+    """A wall's shadow over the box's: where the wall hides the disc, the box takes nothing; virtual things are dark."""
+    engine, light = kind(device), disc(6.0, (0.9, 0.5, 0.0))
+    scene = lit(engine, light, scene=(*FLOOR, WALL))
+    points = floor_points(400, around=0.15) - [0.1, 0, 0]
+    without, found = (a[:, 0] for a in scene.floor(points))
+    real = exact(points, light, (WALL,), lift_m=VOXEL_M)
+    hidden = exact(points, light, (WALL.grown(-2 * VOXEL_M),), lift_m=VOXEL_M) == 0
+    assert hidden.mean() > 0.3
+    np.testing.assert_array_equal(found[hidden], without[hidden])
+    assert without[hidden].max() == 0
+    assert np.sqrt(np.mean((without - real) ** 2)) < 0.08  # 8 rays, voxels taken whole
+    assert (found <= without).all()
+    top = np.stack(np.meshgrid(np.linspace(0.39, 0.53, 8), [0.26], np.linspace(0.41, 0.51, 8), indexing="ij"), -1)[:, 0]
+    assert scene.virtual(top, np.broadcast_to(UP, top.shape)).max() < 0.02
+
+
+def test_real_surface_that_a_virtual_one_touches_does_not_hide_the_disc(engine: Engine) -> None:
+    """Tops of boxes that stand 2 mm within a wall: rays that began there would begin in its voxels."""
+    light = disc(6.0, (-0.7, 0.7, 0.0))
+    points = np.full((8, 16, 3), (0.622, 0.26, 0.0))
+    points[..., 2] = np.linspace(0.4, 0.52, 128).reshape(8, 16)
+    found = lit(engine, light, scene=(*FLOOR, WALL)).virtual(points, np.broadcast_to(UP, points.shape))[..., 0]
+    np.testing.assert_allclose(found.ravel()[1:], exact(points[0, :1], light, ())[0], rtol=0.02)
+
+
+def test_a_plane_that_goes_on_hides_the_disc(engine: Engine) -> None:
+    """As the wall would that it is taken to be, of which the volume knows nothing."""
+    patch = PlanePatch(
+        normal=np.array([1.0, 0, 0]),
+        offset_m=0.9,
+        across=np.array([0.0, 0, 1]),
+        along=np.array([0.0, 1, 0]),
+        corner=np.zeros(2),
+        empty=np.zeros((40, 40), np.bool_),
+        seen=np.array([[0.0, 0], [0.8, 0.8]]),
+    )
+    continuation = Continuation()
+    continuation.planes, continuation._boxes = [patch], [patch.box]
+    light = disc(6.0, (1.0, 0.5, 0.0))
+    points = floor_points(200) - [0.1, 0, 0]
+    hidden, past = lit(engine, light, planes=continuation.arrays()).floor(points)
+    free, _ = lit(engine, light).floor(points)
+    deep = (points[:, 2] > 0.3) & (points[:, 2] < 0.6)
+    assert free[:, 0].min() > 0.3
+    assert not hidden[deep].any()
+    assert not past[deep].any()
+
+
+def test_rays_are_as_long_as_they_are_said_to_be(engine: Engine) -> None:
+    scene = lit(engine, disc(6.0, (0.9, 0.5, 0.0)), scene=(*FLOOR, WALL), reach_m=0.05)
+    points = floor_points(100, around=0.05) - [0.2, 0, 0]
+    np.testing.assert_allclose(scene.floor(points)[0], exact(points[:1], disc(6.0, (0.9, 0.5, 0.0)), ())[0], rtol=0.01)
+
+
+# ---- both parts of the light together ----------------------------------------------------------------------------
+
+
+def test_mixed_ratios_are_the_twins_and_come_apart_again(device: Device, engine: Engine) -> None:
+    random, shape = np.random.default_rng(3), (12, 20)
+    ratio, rest, without = (random.uniform(0, high, (*shape, 3)) for high in (1.2, 1.5, 2.0))
+    lit_part = without * random.uniform(0, 1, (*shape, 3))
+    rest[:3] = random.uniform(-0.1, 0.001, (3, 20, 3))  # nothing but ringing
+    space, maps = engine.workspace, lit(engine, disc(5.0)).maps
+    values = {"ratio": ratio, "rest": rest, "without": without, "lit": lit_part}
+    on_device = {name: space.upload(f"mixed_{name}", float4(a)) for name, a in values.items()}
+    shadow = RealShadow(4, on_device["ratio"], on_device["rest"])
+    samples = DirectSamples(on_device["without"], on_device["lit"])
+    whole = with_direct(engine, shadow, samples, maps)
+    expected = twin.mixed_ratio(ratio, rest, without, lit_part, maps.least)
+    np.testing.assert_allclose(download4(engine, whole.values)[..., :3], expected, rtol=relative_tolerance(device))
+    assert (expected <= np.maximum(ratio, 1) + 1e-6).all()
+    apart = without_direct(engine, whole, shadow, samples, maps)
+    bright = (rest > 0.05) & (ratio * rest + lit_part > 1.01 * maps.least)
+    np.testing.assert_allclose(download4(engine, apart.values)[..., :3][bright], ratio[bright], atol=2e-4)
+    assert apart.whole is whole
+
+
+def test_pixels_of_real_surface_hold_the_whole_ratio(engine: Engine) -> None:
+    """Rest and discs at every pixel, from samples of the one: 1 where nothing is touched, by nothing at all."""
+    light, side, stride = disc(8.0), 48, 4
+    scene = lit(engine, light)
+    x, z = np.meshgrid(np.linspace(0.1, 0.8, side), np.linspace(0.1, 0.8, side))
+    points = np.stack([x, np.full_like(x, FLOOR_Y), z], -1).astype(np.float32).astype(float)
+    surface = upload_surface(engine, points, np.broadcast_to(UP, points.shape), np.ones((side, side), bool))
+    samples, camera, space = (side // stride, side // stride), camera_of(points), engine.workspace
+    ratio = np.ones((*samples, 3))
+    ratio[-4:] = 0.7
+    rest = np.full((*samples, 3), 0.4)
+    shadow = RealShadow(stride, space.upload("m_ratio", float4(ratio)), space.upload("m_rest", float4(rest)))
+    parts = trace_real(engine, camera, surface, shadow, scene.maps)
+    found = download4(engine, light_real(engine, camera, surface, shadow, parts, scene.maps)).astype(float)
+    without, past = scene.floor(points.reshape(-1, 3))
+    for rows, factor in ((slice(42, None), 0.7), (slice(0, 20), 1.0)):
+        expected = twin.mixed_ratio(
+            np.full(3, factor),
+            np.full(3, 0.4),
+            *(a.reshape(side, side, 3)[rows] for a in (without, past)),
+            scene.maps.least,
+        )
+        counted = found[rows][..., 3] > 0
+        np.testing.assert_allclose(found[rows][counted][:, :3], expected[counted], rtol=1e-4)
+        np.testing.assert_allclose(expected[~counted], 1.0, atol=1e-6)
+    assert found[42:, :, 3].all()
+    assert 0.05 < (found[:20, :, 3] > 0).mean() < 0.9
+    assert not found[found[..., 3] == 0].any()
+
+
+def test_points_on_objects_send_what_the_disc_brings_them(engine: Engine) -> None:
+    """Besides what they sent already: their albedo times the disc's light, past the other object and themselves."""
+    light = disc(7.0, TOWARD, (1.0, 0.5, 0.2))
+    plate = box((0.5, 0.4, 0.44), (0.7, 0.42, 0.64))
+    scene = lit(engine, light, solids=(CRATE, plate))
+    points = place_points(engine, [placed(engine, solid) for solid in (CRATE, plate)])
+    before = np.full((points.count, 3), 0.25)
+    glow = replace(points.glow, radiances=engine.workspace.upload("sent", float4(before)))
+    light_glow(engine, points, glow, scene.maps)
+    sent = download4(engine, glow.radiances)[:, :3].astype(float) - before
+    places, normals = (download4(engine, a)[:, :3].astype(float) for a in (points.points, points.normals))
+    expected = [exact(p[None], light, (CRATE, plate), n, lift_m=1e-4)[0] for p, n in zip(places, normals, strict=True)]
+    expected = np.array(expected)[:, None] * points.colors * light.irradiance
+    assert expected.max() > 0.3
+    assert np.sqrt(np.mean((sent - expected) ** 2)) < 0.03
+
+
+def test_mirrors_show_all_of_the_light(engine: Engine) -> None:
+    """Byte for byte what they show of a light that nothing was taken out of."""
+    light = lights.uniform((0.3,) * 3) + np.outer(directional_sh(BEHIND * [1, 1, -1], 0.2, 4), (1.0, 0.8, 0.5))
+    assert split_light(light).discs
+
+    def split_upload(engine: Engine, sh: Floats, rays: Directions, **rest: Any) -> DeviceLight:
+        return take_discs(engine, upload_light(engine, sh, rays, **rest), split_light(sh), rays)
+
+    whole, _ = test_reflect.reflect(engine, *test_reflect.surfaces(), light=light)
+    with patch.object(test_reflect, "upload_light", split_upload):
+        split, _ = test_reflect.reflect(engine, *test_reflect.surfaces(), light=light)
+    np.testing.assert_array_equal(split, whole)
+    assert split.max() > 0.5
+
+
+def test_exposure_brightens_both_parts(engine: Engine) -> None:
+    light = lights.uniform((0.3,) * 3) + np.outer(directional_sh(TOWARD, 0.2, 4), (1.0, 0.8, 0.5))
+    rays, split = direction_sets(81, 4), split_light(light)
+    one, three = (take_discs(engine, upload_light(engine, light, rays, exposure=e), split, rays, e) for e in (1.0, 3.0))
+    np.testing.assert_allclose(three.discs[0].irradiance, 3 * one.discs[0].irradiance)
+    np.testing.assert_allclose(download4(engine, three.coefficients)[:, :3], 3 * split.rest, atol=1e-5)
+    np.testing.assert_allclose(download4(engine, three.whole)[:, :3], 3 * light, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(three.mean, 3 * one.mean)
+
+
+def test_surfaces_send_what_the_whole_light_is_changed_to(engine: Engine) -> None:
+    scene, samples = lit(engine, disc(5.0)), engine.workspace.upload("r", float4(np.ones((4, 4, 3))))
+    rays, camera = direction_sets(81, 4), camera_of(np.zeros((16, 16, 3)))
+    traced = trace_scene(engine, scene.maps.volume, scene.maps.light, rays, FAR_M, [placed(engine, CRATE)])
+    surface = upload_surface(engine, np.zeros((16, 16, 3)), np.zeros((16, 16, 3)), np.zeros((16, 16), bool))
+    whole, view = SampleGrid(4, samples), View(engine, camera, np.eye(4), FAR_M)
+    for ratio, expected in ((RealShadow(4, samples, samples, whole), whole), (RealShadow(4, samples, samples), None)):
+        changed = add_objects(view, surface, traced, None, ratio).changed
+        assert changed is not None
+        assert changed.ratio is (expected or ratio)
+
+
+def test_places_cover_their_disc_evenly() -> None:
+    for places in (disc_places(), ray_places(), *ray_places().reshape(16, 8, 2)):
+        radius2 = (places**2).sum(axis=1)
+        assert radius2.max() < 1
+        assert radius2.mean() == pytest.approx(0.5, abs=0.1)
+        assert np.linalg.norm(places.mean(axis=0)) < 0.25
+    np.testing.assert_allclose(disc_places().sum(axis=0), 0, atol=1e-9)

@@ -291,7 +291,7 @@ def _nothing_sent(facts: SceneFacts) -> Omission | None:
 
 
 def _traced(facts: SceneFacts) -> Omission | None:
-    return None if facts.image_space else Omission("the preset traces rays through the volume", 255.0)
+    return None if facts.image_space else Omission("the preset traces rays through the volume", 0.0)
 
 
 def _matt(facts: SceneFacts) -> Omission | None:

@@ -295,27 +295,3 @@ _GIVEN = frozenset(
         "averages",
     }
 )
-
-
-def warm_up(device: Device) -> None:
-    """Compile every kernel by running one small frame with one object through the spine."""
-    camera = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
-    pipeline = Pipeline(device, camera, Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.02))
-    triangle = Mesh(
-        vertices=np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], np.float32),
-        triangles=np.array([[0, 1, 2]], np.int32),
-        vertex_colors=np.full((3, 3), 0.5, np.float32),
-        normals=np.tile(np.array([[0, 0, 1]], np.float32), (3, 1)),
-        up_axis="y",
-    )
-    pipeline.place_object("warm-up", triangle, Placement(position_m=(0.0, 0.0, 0.8)))
-    frame = RgbdFrame(
-        index=0,
-        timestamp_s=0.0,
-        color=np.full((48, 64, 3), 128, np.uint8),
-        depth=np.full((48, 64), 1000, np.uint16),
-        world_from_camera=np.eye(4),
-    )
-    pipeline.process(frame)
-    pipeline.process(replace(frame, index=1, color=np.full((48, 64, 3), 96, np.uint8)))  # of another exposure
-    pipeline.close()

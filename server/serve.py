@@ -176,7 +176,7 @@ def _server(service: Service) -> _Server:
 
 
 def _warm_up(device: Device) -> None:
-    from server.pipeline import warm_up
+    from server.warm_up import warm_up
 
     warm_up(device)
 

@@ -271,4 +271,4 @@ def test_effects_of_a_scene(facts: SceneFacts, run: set[str], reasons: dict[str,
     for item in plan.left_out:
         assert reasons[item.effect] in item.reason
         assert item.error_bound is not None
-        assert item.error_bound == (0.0 if "object" in item.reason or "soft" in item.reason else 255.0)
+        assert item.error_bound == (0.0 if any(word in item.reason for word in ("object", "soft", "traces")) else 255.0)

@@ -1,0 +1,39 @@
+"""What warming up is for: no session waits for a compiler in the middle of its frames."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from server.maths.direct_lights import split_light
+from server.opencl.device import open_device
+from server.pipeline import Pipeline
+from server.scene.mesh import Mesh
+from server.scene.placement import Placement
+from server.warm_up import SHARP_LIGHT, warm_up
+from tests.rooms import CAMERA, frame_at, view_at, wishes
+
+
+@pytest.mark.parametrize("asked", [{}, {"preset": "gr15fast"}, {"preset": "art4"}, {"light": SHARP_LIGHT}])
+def test_later_sessions_compile_nothing(asked: dict[str, object]) -> None:
+    device = open_device(None)
+    warm_up(device)
+    built = set(device.programs._programs)
+    pipeline = Pipeline(device, CAMERA, wishes("given", **asked))
+    square = Mesh(
+        vertices=np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0.3, 0.3, 0]], np.float32),
+        triangles=np.array([[0, 1, 2], [1, 3, 2]], np.int32),
+        vertex_colors=np.full((4, 3), 0.5, np.float32),
+        normals=np.tile(np.array([[0, 0, 1]], np.float32), (4, 1)),
+        up_axis="y",
+    )
+    pipeline.place_object("square", square, Placement(position_m=(-0.6, 0.6, 0.6)))
+    for step in range(2):
+        plan = pipeline.process(frame_at(view_at(step), step, given=view_at(step))).plan
+    pipeline.close()
+    assert "shadow_map" in plan.run or "light" not in asked
+    assert set(device.programs._programs) == built
+
+
+def test_the_light_of_the_warm_up_is_sharp() -> None:
+    assert split_light(np.array(SHARP_LIGHT)).discs

@@ -123,6 +123,8 @@ def _largest(points: Floats, normals: Floats, left: NDArray[np.bool_], rng: np.r
         own = _of_plane(points, normals, normals[k], float(normals[k] @ points[k])) & left
         if own.sum() > best.sum():
             best = own
+    if best.sum() < 3:
+        return best
     normal, offset_m = _fit(points[best], normals[best])
     return _of_plane(points, normals, normal, offset_m) & left
 

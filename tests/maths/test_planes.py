@@ -93,3 +93,11 @@ def test_the_box_is_what_was_seen_and_what_it_is_taken_to_go_on() -> None:
     wall.steps[:] = [0, 2, 0, 4]
     (low_x, low_y), (high_x, high_y) = wall.seen
     np.testing.assert_allclose(wall.box, [low_x, high_x + STEPS_M[2], low_y, high_y + STEPS_M[4]])
+
+
+def test_scattered_points_are_of_no_plane() -> None:
+    """Fewer than three on any: as of a first picture whose depth is nothing but noise."""
+    rng = np.random.default_rng(3)
+    normals = rng.normal(size=(40, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    assert find_planes(rng.uniform(0, 50, (40, 3)), normals, []) == []

@@ -3,11 +3,12 @@ PYTHON ?= python3
 BIN := .venv/bin
 DATA ?= ../shared/data
 
-.PHONY: help install install-bench demo test lint bench web lock clean
+.PHONY: help install install-bench demo test lint bench check-races web lock clean
 help:
 	@echo "make demo    the main job: server, streaming client, pictures in out/demo"
 	@echo "make test    the tests           make lint   formatting, types"
 	@echo "make bench   the benchmarks      make web    rebuild the page from its sources"
+	@echo "make check-races   the kernels in a simulator that finds data races (downloads it)"
 	@echo "make install the program alone, as .venv/bin/probeless"
 
 install: .venv/installed
@@ -28,7 +29,13 @@ bench: .venv/installed-bench
 	$(BIN)/probeless bench geometry
 	$(BIN)/probeless bench light
 	$(BIN)/probeless bench rendering
+	$(BIN)/probeless bench plan
+	$(BIN)/probeless bench stability
 	$(BIN)/probeless bench service
+
+# Oclgrind has a folder of its own: in .venv its simulator would pass for a GPU and be preferred.
+check-races: .venv/installed-test .oclgrind/installed
+	$(BIN)/python -m tests.bench.stability_races .oclgrind $(FAMILIES)
 
 web: .venv/installed-test
 	$(BIN)/python -m protocol.typescript
@@ -62,5 +69,9 @@ lock: .venv/installed-test
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-bench.lock
 	@touch $@
 
+.oclgrind/installed: requirements-races.lock | .venv/bin/python
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes --no-deps --target .oclgrind -r $<
+	@touch $@
+
 clean:
-	rm -rf .venv out
+	rm -rf .venv .oclgrind out

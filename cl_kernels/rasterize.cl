@@ -268,28 +268,28 @@ void raster_tiles(const int2 size, const global int8 *corners, const global floa
         }
         const uint before = best[item];
         barrier(CLK_LOCAL_MEM_FENCE);
-        if (count <= FEW) {
-            for (int i = 0; i < count; i++) {
-                if (!((masks[i] >> item) & 1)) continue;
-                const uint depth = depth_at(edges[i], depths[i], pixel_of(item));
-                if (depth < best[item] || (depth == best[item] && numbers[i] > winners[item])) continue;
-                best[item] = depth;
-                winners[item] = numbers[i];
-            }
-        } else {
-            for (ulong left = item < count ? masks[item] : 0; left; left &= left - 1) {
-                const int bit = lowest_bit(left);
-                const uint depth = depth_at(edges[item], depths[item], pixel_of(bit));
-                atomic_max(&best[bit], depth);
-            }
-            barrier(CLK_LOCAL_MEM_FENCE);
-            if (best[item] > before) winners[item] = NOBODY;
-            barrier(CLK_LOCAL_MEM_FENCE);
-            for (ulong left = item < count ? masks[item] : 0; left; left &= left - 1) {
-                const int bit = lowest_bit(left);
-                if (depth_at(edges[item], depths[item], pixel_of(bit)) != best[bit]) continue;
-                atomic_min(&winners[bit], numbers[item]);
-            }
+        // All pass every barrier, whichever way is taken: PoCL's plain loops go wrong on barriers under a condition.
+        const bool few = count <= FEW;
+        const ulong own = !few && item < count ? masks[item] : 0;
+        for (int i = 0; i < (few ? count : 0); i++) {
+            if (!((masks[i] >> item) & 1)) continue;
+            const uint depth = depth_at(edges[i], depths[i], pixel_of(item));
+            if (depth < best[item] || (depth == best[item] && numbers[i] > winners[item])) continue;
+            best[item] = depth;
+            winners[item] = numbers[i];
+        }
+        for (ulong left = own; left; left &= left - 1) {
+            const int bit = lowest_bit(left);
+            const uint depth = depth_at(edges[item], depths[item], pixel_of(bit));
+            atomic_max(&best[bit], depth);
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (!few && best[item] > before) winners[item] = NOBODY;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (ulong left = own; left; left &= left - 1) {
+            const int bit = lowest_bit(left);
+            if (depth_at(edges[item], depths[item], pixel_of(bit)) != best[bit]) continue;
+            atomic_min(&winners[bit], numbers[item]);
         }
         barrier(CLK_LOCAL_MEM_FENCE);
     }

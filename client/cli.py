@@ -92,6 +92,7 @@ def run(
     edges: o.Edges = None,
     tone_mapping: o.ToneMapping = None,
     light_color: o.LightColor = None,
+    plan: o.Plan = None,
     mesh: o.Mesh = False,
     budget_ms: o.BudgetMs = None,
     max_light_error: o.MaxLightError = None,
@@ -115,6 +116,46 @@ def run(
             with progress_bar("mesh") as progress:
                 writer.write_mesh(pipeline.mesh(progress))
     say(f"{watch.summary()}, written to {out}")
+
+
+@app.command()
+def explain(
+    source: o.SourceArgument,
+    frame: Annotated[int | None, typer.Option(metavar="N", help="position in the source; default: the fifth")] = None,
+    frames: o.Frames = None,
+    poses: o.PosesOption = None,
+    volume: o.VolumeOption = None,
+    voxel: o.Voxel = None,
+    preset: o.Preset = "reg4",
+    rays: o.Rays = 81,
+    ray_length: o.RayLength = None,
+    bands: o.Bands = 4,
+    albedo: o.Albedo = None,
+    indirect: o.Indirect = None,
+    as_thesis: o.AsThesis = False,
+    denoise: o.Denoise = "none",
+    denoise_iterations: o.DenoiseIterations = 20,
+    object: o.Object = None,
+    up: o.Up = None,
+    light: o.LightFile = None,
+    panorama: o.Panorama = None,
+    lamps: o.Lamps = None,
+    exposure: o.Exposure = None,
+    robustness: o.Robustness = None,
+    edges: o.Edges = None,
+    tone_mapping: o.ToneMapping = None,
+    light_color: o.LightColor = None,
+    plan: o.Plan = None,
+    budget_ms: o.BudgetMs = None,
+    max_light_error: o.MaxLightError = None,
+    device: o.DeviceOption = None,
+) -> None:
+    """The plan of a frame in words: what runs and what for, what is left out and why."""
+    capture = o.prepare(o.CaptureOptions.of(locals()))
+    from client.explain import explain as explain_frame
+
+    for line in explain_frame(capture, frame, device):
+        say(line)
 
 
 @app.command()
@@ -147,6 +188,7 @@ def stream(
     edges: o.Edges = None,
     tone_mapping: o.ToneMapping = None,
     light_color: o.LightColor = None,
+    plan: o.Plan = None,
     mesh: o.Mesh = False,
     budget_ms: o.BudgetMs = None,
     max_light_error: o.MaxLightError = None,

@@ -77,6 +77,9 @@ ToneMapping = Annotated[
 LightColor = Annotated[
     str | None, typer.Option(metavar="estimated|white", help="white: the light without its colours, as the thesis")
 ]
+Plan = Annotated[
+    str | None, typer.Option(metavar="needed|everything", help="everything: also what would hardly be seen")
+]
 Mesh = Annotated[bool, typer.Option("--mesh", help="write mesh.ply and mesh.glb")]
 BudgetMs = Annotated[float | None, typer.Option(metavar="N", help="choose the operating point for this time")]
 MaxLightError = Annotated[float | None, typer.Option(metavar="DEG", help="choose it for this light error")]
@@ -111,6 +114,7 @@ class CaptureOptions:
     edges: str | None = None
     tone_mapping: str | None = None
     light_color: str | None = None
+    plan: str | None = None
     budget_ms: float | None = None
     max_light_error: float | None = None
 
@@ -167,6 +171,7 @@ def refuse_unbuilt(options: CaptureOptions) -> None:
     _choice("--edges", options.edges, ("smooth", "hard"))
     _choice("--tone-mapping", options.tone_mapping, ("light", "average"))
     _choice("--light-color", options.light_color, ("estimated", "white"))
+    _choice("--plan", options.plan, ("needed", "everything"))
     _choice("--exposure", options.exposure, ("auto", "constant"))
     unbuilt = {
         f"--preset {options.preset}": (options.preset not in BUILT_PRESETS, f"use {', '.join(BUILT_PRESETS)}"),
@@ -266,6 +271,7 @@ def _wishes_of_options(options: CaptureOptions) -> dict[str, Any]:
         "edges": options.edges or "smooth",
         "tone_mapping": options.tone_mapping or "auto",
         "light_color": options.light_color or "estimated",
+        "plan": options.plan or "needed",
         **_given_light(options),
     }
 

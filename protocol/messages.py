@@ -117,6 +117,8 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     robustness: tuple[Robustness, ...] = ("openness", "memory", "outliers")
     """Measures that light estimation takes (thesis 5.2, 5.4): samples that see little sky are left out; weights by how
     common a normal is (`normals_printed`: as eq. 5.7 has them); earlier frames count; what fits badly counts less."""
+    plan: Literal["needed", "everything"] = "needed"
+    """`everything`: what would hardly be seen is simulated too, to check the bounds of leaving it out."""
     lossless: bool = False
     """Answers carry PNG pictures, and every frame is answered in order instead of latest-wins."""
 

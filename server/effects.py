@@ -7,13 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.maths.direct_lights import split_light
+from server import omissions as o
 from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine
 from server.plan import Effect, Omission
+from server.scene_facts import SceneFacts
 from server.stages import adaptive
 from server.stages import composite as composite_stage
 from server.stages import differential_rendering as differential
@@ -25,13 +27,13 @@ from server.stages.indirect import Indirect
 from server.stages.measure import Measurement
 from server.stages.object_glow import Glow, place_points
 from server.stages.radiance_transfer import Directions, Transfer
-from server.stages.rasterize import Placed, VirtualSurface, boxes_in_view, nearest_depths
+from server.stages.rasterize import Placed, VirtualSurface, nearest_depths
 from server.stages.rasterize import rasterize as rasterize_stage
 from server.stages.raycast import Surface
-from server.stages.reflect import is_glossy, reflect_surroundings
+from server.stages.reflect import reflect_surroundings
 from server.stages.sample_grid import SampleGrid
 from server.stages.sampling import PRESETS, Sampling
-from server.stages.shadow_map import ShadowMaps
+from server.stages.shadow_map import DirectSamples, ShadowMaps
 from server.stages.tone_mapping import Averages
 from server.stages.traced_scene import Changed, DeviceLight, TracedScene, trace_scene
 from server.stages.volume import Volume
@@ -49,51 +51,6 @@ class View:
     sampling: Sampling = PRESETS["reg4"]
     smooth_edges: bool = True
     """Whether virtual things cover parts of pixels."""
-
-
-@dataclass(frozen=True)
-class SceneFacts:
-    """Cheap facts about a frame that decide which effects it calls for."""
-
-    objects: int
-    objects_in_view: int
-    has_light: bool
-    adaptive: bool = False
-    indirect: bool = False
-    """Whether surfaces send light."""
-    smooth_edges: bool = True
-    image_space: bool = False
-    """Whether visibility is looked up in depth pictures."""
-    glossy: bool = False
-    """Whether any virtual surface is not matt."""
-    sharp_lights: int = 0
-    """That shadow maps are for."""
-    averages: Averages | None = None
-    """Of the picture and its shading, None where they are not to be matched."""
-
-
-def gather_facts(
-    view: View,
-    objects: Sequence[Placed],
-    light: NDArray[np.float64],
-    indirect: Indirect | None,
-    averages: Averages | None = None,
-) -> SceneFacts:
-    """Facts of a frame. light: SH radiance [bands^2, 3]; averages: to be matched, None: none are."""
-    camera_from_volume = inverse_rigid(view.volume_from_camera)
-    boxes = boxes_in_view(view.camera, camera_from_volume, objects)
-    return SceneFacts(
-        len(objects),
-        sum(box is not None for box in boxes),
-        has_light=bool(light.any()),
-        adaptive=view.sampling.adaptive,
-        image_space=view.sampling.image_space,
-        indirect=indirect is not None,
-        smooth_edges=view.smooth_edges,
-        glossy=any(is_glossy(thing.tables.materials) for thing, _ in objects),
-        sharp_lights=len(split_light(light).discs),
-        averages=averages,
-    )
 
 
 def rasterize(view: View, objects: Sequence[Placed]) -> VirtualSurface:
@@ -137,6 +94,13 @@ def light_objects(view: View, scene: TracedScene, maps: ShadowMaps | None = None
     return glow
 
 
+def light_samples(view: View, surface: Surface, transfer: Transfer, maps: ShadowMaps) -> DirectSamples:
+    """What the light's sharp parts bring to the samples of real surface, with objects and without."""
+    samples = SampleGrid(transfer.stride, transfer.openness)
+    parts = shadow_maps.trace_real(view.engine, view.camera, surface, samples, maps)
+    return shadow_maps.light_samples(view.engine, view.camera, surface, parts, maps)
+
+
 def shadow_real(
     view: View,
     surface: Surface,
@@ -145,29 +109,49 @@ def shadow_real(
     indirect: Indirect | None,
     glow: Glow | None = None,
     maps: ShadowMaps | None = None,
+    samples: DirectSamples | None = None,
 ) -> RealShadow:
-    """What virtual things take from real ones, less what they send them, and what those then send one another."""
+    """What virtual things take from real ones, less what they send them."""
     lit = replace(scene, glow=glow)
     shadow = differential.shadow_real(view.engine, view.camera, surface, transfer, lit, indirect)
-    if indirect is None:
+    if maps is None or samples is None:
         return shadow
+    return replace(shadow, whole=shadow_maps.with_direct(view.engine, shadow, samples, maps))
+
+
+def bounce_real(
+    view: View,
+    surface: Surface,
+    transfer: Transfer,
+    scene: TracedScene,
+    ratio: RealShadow,
+    glow: Glow | None = None,
+    maps: ShadowMaps | None = None,
+    samples: DirectSamples | None = None,
+) -> RealShadow:
+    """`ratio` with what real things then send one another less or more."""
+    engine, camera, lit = view.engine, view.camera, replace(scene, glow=glow)
     camera_from_volume = inverse_rigid(view.volume_from_camera)
-    if maps is None:
-        return differential.bounce_real(view.engine, view.camera, camera_from_volume, surface, transfer, lit, shadow)
-    parts = shadow_maps.trace_real(view.engine, view.camera, surface, shadow, maps)
-    samples = shadow_maps.light_samples(view.engine, view.camera, surface, parts, maps)
-    whole = shadow_maps.with_direct(view.engine, shadow, samples, maps)
-    whole = differential.bounce_real(view.engine, view.camera, camera_from_volume, surface, transfer, lit, whole)
-    return shadow_maps.without_direct(view.engine, whole, shadow, samples, maps)
+    if maps is None or samples is None or not isinstance(ratio.whole, RealShadow):
+        return differential.bounce_real(engine, camera, camera_from_volume, surface, transfer, lit, ratio)
+    whole = differential.bounce_real(engine, camera, camera_from_volume, surface, transfer, lit, ratio.whole)
+    return shadow_maps.without_direct(engine, whole, ratio, samples, maps)
 
 
 def add_objects(
-    view: View, surface: Surface, scene: TracedScene, glow: Glow | None = None, ratio: RealShadow | None = None
+    view: View,
+    surface: Surface,
+    scene: TracedScene,
+    glow: Glow | None = None,
+    ratio: RealShadow | None = None,
+    bounced: RealShadow | None = None,
 ) -> TracedScene:
     """The scene as virtual objects have changed it: what they send, and what real surface sends besides them."""
-    if ratio is None:
+    settled = bounced or ratio
+    if settled is None:
         return replace(scene, glow=glow)
-    changed = Changed(view.camera, inverse_rigid(view.volume_from_camera), surface.positions, ratio.whole or ratio)
+    change = settled.whole or settled
+    changed = Changed(view.camera, inverse_rigid(view.volume_from_camera), surface.positions, change)
     return replace(scene, glow=glow, changed=changed)
 
 
@@ -191,12 +175,13 @@ def refine_real(
     surface: Surface,
     scene: TracedScene,
     ratio: RealShadow,
+    bounced: RealShadow | None = None,
     glow: Glow | None = None,
     virtual: VirtualSurface | None = None,
 ) -> cl_array.Array:
     """Shadows on real things at every pixel of their rims."""
     lit, eye = replace(scene.by_rays(), glow=glow), view.volume_from_camera[:3, 3]
-    return adaptive.refine_real(view.engine, view.camera, surface, lit, ratio, virtual, eye)
+    return adaptive.refine_real(view.engine, view.camera, surface, lit, bounced or ratio, virtual, eye)
 
 
 def direct_virtual(view: View, virtual: VirtualSurface, maps: ShadowMaps) -> cl_array.Array:
@@ -209,12 +194,13 @@ def direct_real(
     surface: Surface,
     ratio: RealShadow,
     maps: ShadowMaps,
+    bounced: RealShadow | None = None,
     refined_ratio: cl_array.Array | None = None,
 ) -> cl_array.Array:
     """What virtual things take from real ones of the whole light, its sharp parts at every pixel."""
-    parts = shadow_maps.trace_real(view.engine, view.camera, surface, ratio, maps)
-    upsampling = view.sampling.upsampling
-    return shadow_maps.light_real(view.engine, view.camera, surface, ratio, parts, maps, refined_ratio, upsampling)
+    engine, camera, upsampling, ratio = view.engine, view.camera, view.sampling.upsampling, bounced or ratio
+    parts = shadow_maps.trace_real(engine, camera, surface, ratio, maps)
+    return shadow_maps.light_real(engine, camera, surface, ratio, parts, maps, refined_ratio, upsampling)
 
 
 def match_average(averages: Averages) -> float:
@@ -232,6 +218,7 @@ def composite(
     virtual: VirtualSurface | None = None,
     occluded: SampleGrid | None = None,
     ratio: SampleGrid | None = None,
+    bounced: SampleGrid | None = None,
     refined_occluded: cl_array.Array | None = None,
     refined_ratio: cl_array.Array | None = None,
     coverage: cl_array.Array | None = None,
@@ -241,6 +228,8 @@ def composite(
     whole_ratio: cl_array.Array | None = None,
 ) -> NDArray[np.uint8]:
     """The finished picture; with nothing virtual it is the camera's, byte for byte."""
+    if lit_virtual is None and virtual is not None and light.discs:
+        lit_virtual = view.engine.workspace.constant("unlit", np.zeros(surface.positions.shape, cl_types.float4))
     return composite_stage.composite(
         view.engine,
         view.camera,
@@ -252,7 +241,7 @@ def composite(
         light,
         virtual,
         occluded,
-        ratio,
+        bounced or ratio,
         refined_occluded,
         refined_ratio,
         view.sampling.upsampling,
@@ -264,76 +253,43 @@ def composite(
     )
 
 
-def _nothing_in_view(facts: SceneFacts) -> Omission | None:
-    if facts.objects == 0:
-        return Omission("there is no virtual object", 0.0)
-    if facts.objects_in_view == 0:
-        return Omission("no virtual object is in view", 0.0)
-    return None
-
-
-def _nothing_to_shade(facts: SceneFacts) -> Omission | None:
-    return _nothing_in_view(facts) or _no_light(facts)
-
-
-def _nothing_casts(facts: SceneFacts) -> Omission | None:
-    if facts.objects == 0:
-        return Omission("there is no virtual object", 0.0)
-    return _no_light(facts)
-
-
-def _no_light(facts: SceneFacts) -> Omission | None:
-    return None if facts.has_light else Omission("no light has been found yet", 255.0)
-
-
-def _nothing_sent(facts: SceneFacts) -> Omission | None:
-    return None if facts.indirect else Omission("indirect light is left out", 255.0)
-
-
-def _traced(facts: SceneFacts) -> Omission | None:
-    return None if facts.image_space else Omission("the preset traces rays through the volume", 0.0)
-
-
-def _matt(facts: SceneFacts) -> Omission | None:
-    return None if facts.glossy else Omission("no virtual object is glossy", 0.0)
-
-
-def _soft(facts: SceneFacts) -> Omission | None:
-    return None if facts.sharp_lights else Omission("the light is soft", 0.0)
-
-
-def _not_matched(facts: SceneFacts) -> Omission | None:
-    if facts.averages is None:
-        return Omission("virtual things keep the light's own scale", 255.0)
-    if not facts.averages.are_known:
-        return Omission("the picture or its shading is empty or black: the light's own scale holds", 255.0)
-    return None
-
-
-def _hard_edges(facts: SceneFacts) -> Omission | None:
-    return None if facts.smooth_edges else Omission("hard edges are asked for", 255.0)
-
-
-def _not_refined(facts: SceneFacts) -> Omission | None:
-    return None if facts.adaptive else Omission("the preset does not refine", 255.0)
+def _shades_virtual(facts: SceneFacts) -> Omission | None:
+    return o.out_of_view(facts) or o.unlit(facts)
 
 
 EFFECTS: tuple[Effect[SceneFacts], ...] = (
-    Effect(rasterize, writes="virtual", omitted=_nothing_in_view),
-    Effect(cover, writes="coverage", omitted=lambda f: _nothing_in_view(f) or _hard_edges(f)),
-    Effect(look_around, writes="looks", omitted=lambda f: _nothing_casts(f) or _traced(f)),
-    Effect(prepare_rays, writes="scene", omitted=_nothing_casts),
-    Effect(shadow_map, writes="maps", omitted=lambda f: _nothing_casts(f) or _soft(f)),
-    Effect(light_objects, writes="glow", omitted=lambda f: _nothing_casts(f) or _nothing_sent(f)),
-    Effect(add_objects, writes="changed_scene", omitted=_nothing_casts),
-    Effect(reflect, writes="reflected", omitted=lambda f: _nothing_to_shade(f) or _matt(f)),
-    Effect(shade_virtual, writes="occluded", omitted=_nothing_to_shade),
-    Effect(shadow_real, writes="ratio", omitted=_nothing_casts),
-    Effect(refine_virtual, writes="refined_occluded", omitted=lambda f: _nothing_to_shade(f) or _not_refined(f)),
-    Effect(refine_real, writes="refined_ratio", omitted=lambda f: _nothing_casts(f) or _not_refined(f)),
-    Effect(direct_virtual, writes="lit_virtual", omitted=lambda f: _nothing_to_shade(f) or _soft(f)),
-    Effect(direct_real, writes="whole_ratio", omitted=lambda f: _nothing_casts(f) or _soft(f)),
-    Effect(match_average, writes="gain", omitted=lambda f: _nothing_to_shade(f) or _not_matched(f)),
-    Effect(composite, writes="picture"),
+    Effect(rasterize, "virtual", o.no_object, o.out_of_view),
+    Effect(cover, "coverage", lambda f: o.no_object(f) or o.hard_edges(f), o.out_of_view),
+    Effect(look_around, "looks", lambda f: o.no_object(f) or o.traced(f)),
+    Effect(prepare_rays, "scene", lambda f: o.no_object(f) or o.no_light(f)),
+    Effect(shadow_map, "maps", lambda f: o.no_object(f) or o.no_light(f) or o.soft(f)),
+    Effect(light_objects, "glow", lambda f: o.no_object(f) or o.no_light(f) or o.no_indirect(f), o.dark_things),
+    Effect(add_objects, "changed_scene", lambda f: o.no_object(f) or o.no_light(f)),
+    Effect(reflect, "reflected", lambda f: o.no_object(f) or o.no_light(f), lambda f: _shades_virtual(f) or o.matt(f)),
+    Effect(shade_virtual, "occluded", lambda f: o.no_object(f) or o.no_light(f), _shades_virtual),
+    Effect(shadow_real, "ratio", lambda f: o.no_object(f) or o.no_light(f), o.out_of_reach),
+    Effect(light_samples, "samples", lambda f: o.no_object(f) or o.no_light(f) or o.no_indirect(f) or o.soft(f)),
+    Effect(
+        bounce_real,
+        "bounced",
+        lambda f: o.no_object(f) or o.no_light(f) or o.no_indirect(f),
+        lambda f: o.out_of_reach(f) or o.nothing_bounces(f),
+    ),
+    Effect(
+        refine_virtual,
+        "refined_occluded",
+        lambda f: o.no_object(f) or o.no_light(f) or o.not_refined(f),
+        _shades_virtual,
+    ),
+    Effect(
+        refine_real,
+        "refined_ratio",
+        lambda f: o.no_object(f) or o.no_light(f) or o.not_refined(f),
+        lambda f: o.out_of_reach(f) or o.no_rims(f),
+    ),
+    Effect(direct_virtual, "lit_virtual", lambda f: o.no_object(f) or o.no_light(f) or o.soft(f), _shades_virtual),
+    Effect(direct_real, "whole_ratio", lambda f: o.no_object(f) or o.no_light(f) or o.soft(f), o.out_of_reach),
+    Effect(match_average, "gain", lambda f: o.no_object(f) or o.no_light(f) or o.not_matched(f), _shades_virtual),
+    Effect(composite, "picture"),
 )
 """One writer a resource; `composite` is what a frame wants."""

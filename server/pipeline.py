@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import LeftOut, Light, Plan, Timings, Tracking, Wishes
-from server.effects import EFFECTS, View, gather_facts
+from server.effects import EFFECTS, View
+from server.facts_finder import FactsFinder
 from server.geometry import Geometry, GeometryFrame
 from server.light import RoomLight
 from server.light_message import light_message
@@ -24,6 +25,7 @@ from server.meshing.surface import MeshingError
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.plan import execute, make_plan
+from server.rest import Rest
 from server.scene.mesh import Mesh
 from server.scene.objects import SceneObjects, check_room
 from server.scene.placement import Placement, check_size
@@ -71,6 +73,8 @@ class Pipeline:
         self._room_light = RoomLight(self._engine, camera, self._settings)
         self._lamps = LampFinder(self._engine, camera, self._settings.lamps)
         self._average_memory = AverageMemory()
+        self._rest = Rest()
+        self._facts = FactsFinder(everything=self._settings.plan == "everything")
         self._objects: SceneObjects | None = None
         self._waiting: list[tuple[str, Mesh, Placement]] = []
         self._webxr_from_world = np.eye(3)
@@ -91,38 +95,64 @@ class Pipeline:
             return self._lost(frame, geometry, volume, started)
         measurement, surface = geometry.measurement, geometry.surface
 
+        placed = objects.placed(volume.volume_from_world())
+        rest = None if settings.plan == "everything" else self._rest.found(frame, geometry, self._lamps.lamps)
+        left_out = {} if rest is None else {"estimate_light": rest}
+        if rest is not None and not placed:
+            left_out["transfer_radiance"] = rest
         with stage("radiance_transfer"):  # 5.1.2, eq. 5.2
-            transfer = self._sampler.transfer(
-                volume, surface, geometry.volume_from_camera, objects.up, settings.reach_m
-            )
-            indirect = self._observe_indirect(geometry, volume, transfer)  # 7.3.3
+            transfer, indirect = None, None
+            if "transfer_radiance" not in left_out:
+                transfer = self._sampler.transfer(
+                    volume, surface, geometry.volume_from_camera, objects.up, settings.reach_m
+                )
+                indirect = self._observe_indirect(geometry, volume, transfer)  # 7.3.3
         with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
-            smooth = self._smooth(geometry)
-            distant = remove_lamps(engine, smooth, surface, volume, self._lamps.lamps)  # B4
-            estimate = self._room_light.update(
-                distant, measurement.depth_m, geometry, volume, transfer, self._sampler.rays, indirect
-            )
+            estimate = self._room_light.estimate()
+            if "estimate_light" not in left_out and transfer is not None:
+                smooth = self._smooth(geometry)
+                distant = remove_lamps(engine, smooth, surface, volume, self._lamps.lamps)  # B4
+                estimate = self._room_light.update(
+                    distant, measurement.depth_m, geometry, volume, transfer, self._sampler.rays, indirect
+                )
+                self._rest.learn(estimate.sh, self._room_light.planes)
         with stage("rendering"):  # 7.1-7.2, the effects this frame calls for
             is_smooth = settings.edges == "smooth"
             view = View(
                 engine, camera, geometry.volume_from_camera, settings.reach_m, self._sampler.sampling, is_smooth
             )
-            placed = objects.placed(volume.volume_from_world())
             light = upload_light(
                 engine, estimate.sh, self._sampler.rays, self._room_light.planes, indirect, geometry.exposure
             )
-            averages = self._averages(geometry, volume, transfer, light, indirect) if placed else None  # 7.1, H
+            averages = None
+            if placed and transfer is not None:
+                averages = self._averages(geometry, volume, transfer, light, indirect)  # 7.1, H
             if placed:  # 7.2.3
                 light = take_discs(engine, light, split_light(estimate.sh), self._sampler.rays, geometry.exposure)
-            facts = gather_facts(view, placed, estimate.sh, indirect, averages)
-            order, plan = make_plan(EFFECTS, "picture", _GIVEN, facts)
+            shown = shown_picture(engine, camera, frame.color, measurement.radiance)
+            facts = self._facts.find(
+                view,
+                geometry,
+                volume,
+                self._sampler.rays,
+                transfer,
+                indirect,
+                placed,
+                light,
+                estimate.sh,
+                shown,
+                averages,
+            )
+            order, plan = make_plan(
+                EFFECTS, "picture", _GIVEN, facts, everything=settings.plan == "everything", stages=left_out
+            )
             given = {
                 "view": view,
                 "objects": placed,
                 "volume": volume,
                 "rays": self._sampler.rays,
                 "real_looks": self._sampler.looks,
-                "shown": shown_picture(engine, camera, frame.color, measurement.radiance),
+                "shown": shown,
                 "measurement": measurement,
                 "surface": surface,
                 "transfer": transfer,
@@ -230,6 +260,7 @@ class Pipeline:
         sampling = sampling_of(preset)
         if sampling != self._sampler.sampling:
             self._sampler = self._make_sampler(sampling)
+            self._rest = Rest()
 
     def scene_mesh(self, progress: Callable[[int, int], None] = lambda _done, _total: None) -> SceneMesh:
         """The surface fused so far as triangles. Raises MeshingError, one line, where there is none."""

@@ -2,6 +2,7 @@
 
 An effect is a pure function. Its parameters are what it reads; a parameter with a default is an optional read. The plan
 walks back from the wanted resource; an effect that its scene does not call for is left out with its reason and a bound.
+All that is left out because it would hardly be seen shares one allowance, so that no pixel changes by more than that.
 """
 
 from __future__ import annotations
@@ -15,14 +16,22 @@ from protocol.messages import LeftOut, Plan
 
 Facts = TypeVar("Facts")
 
+ALLOWANCE = 1.0
+"""Display units (1 is 1/255) that a pixel may change by, before it is rounded, by all that is left out as needless.
+Numbers that are less than one apart round to the same code or to neighbours."""
+
 
 @dataclass(frozen=True)
 class Omission:
-    """Why a scene does not call for an effect."""
+    """Why a scene does not call for an effect. Equal ones are one: what they change is counted once."""
 
     reason: str
     error_bound: float
-    """Greatest change of any pixel by leaving the effect out, in display units (1 is 1/255)."""
+    """Greatest change of any pixel by leaving the effect out, in display units (1 is 1/255), before rounding."""
+
+
+def _never(_: Any) -> None:
+    return None
 
 
 @dataclass(frozen=True)
@@ -31,8 +40,10 @@ class Effect(Generic[Facts]):
 
     run: Callable[..., Any]
     writes: str
-    omitted: Callable[[Facts], Omission | None] = lambda _: None
-    """None where the scene calls for the effect."""
+    omitted: Callable[[Facts], Omission | None] = _never
+    """Where it cannot run, or was asked not to: whatever that changes."""
+    needless: Callable[[Facts], Omission | None] = _never
+    """Where leaving it out changes no more than is said. None where the scene calls for the effect."""
     reads: tuple[str, ...] = field(init=False)
     optional: frozenset[str] = field(init=False)
 
@@ -52,19 +63,54 @@ class PlanError(LookupError):
     """The table of effects cannot make what is wanted."""
 
 
+class _Allowance:
+    """What may still change; the same omission is asked for by several effects and granted to all or none of them."""
+
+    def __init__(self, left: float | None) -> None:
+        """`left`: None grants nothing."""
+        self._left = left
+        self._granted: dict[Omission, bool] = {}
+
+    def grants(self, omission: Omission) -> bool:
+        if self._left is None:
+            return False
+        if omission not in self._granted:
+            self._granted[omission] = omission.error_bound <= self._left
+            self._left -= omission.error_bound if self._granted[omission] else 0.0
+        return self._granted[omission]
+
+
 def make_plan(
-    effects: Sequence[Effect[Facts]], wanted: str, given: Collection[str], facts: Facts
+    effects: Sequence[Effect[Facts]],
+    wanted: str,
+    given: Collection[str],
+    facts: Facts,
+    *,
+    everything: bool = False,
+    stages: Mapping[str, Omission] | None = None,
 ) -> tuple[list[Effect[Facts]], Plan]:
     """Effects that make `wanted` from `given` in order, and the plan that says what was left out.
 
-    Raises PlanError if two effects write one resource, one is missing, or they need each other.
+    `everything`: effects that are needless run too. `stages`: what was left out before the effects; the allowance is
+    theirs too. Raises PlanError if two effects write one resource, one is missing,
+    or they need each other.
     """
     writers = {effect.writes: effect for effect in effects}
     if len(writers) != len(effects):
         raise PlanError("two effects write one resource")
+    before = dict(stages or {})
+    allowance = _Allowance(None if everything else ALLOWANCE - sum(o.error_bound for o in {*before.values()}))
     left_out: dict[str, Omission] = {}
     order: list[Effect[Facts]] = []
     path: list[str] = []
+
+    def omission_of(effect: Effect[Facts]) -> Omission | None:
+        if effect.writes in left_out:
+            return left_out[effect.writes]
+        needless = None if everything else effect.needless(facts)
+        if needless is not None and allowance.grants(needless):
+            return needless
+        return effect.omitted(facts)
 
     def visit(resource: str, *, optional: bool) -> bool:
         """Whether `resource` will be there; appends what makes it to `order`."""
@@ -73,7 +119,7 @@ def make_plan(
         if resource in path:
             raise PlanError(" -> ".join([*path, resource]))
         effect = writers.get(resource)
-        omission = left_out.get(resource) or (effect.omitted(facts) if effect else None)
+        omission = omission_of(effect) if effect else None
         if effect is None or omission is not None:
             if omission is not None:
                 left_out[resource] = omission
@@ -92,8 +138,8 @@ def make_plan(
     plan = Plan(
         run=tuple(effect.name for effect in order),
         left_out=tuple(
-            LeftOut(effect=names[resource], reason=omission.reason, error_bound=omission.error_bound)
-            for resource, omission in left_out.items()
+            LeftOut(effect=names.get(what, what), reason=omission.reason, error_bound=omission.error_bound)
+            for what, omission in (before | left_out).items()
         ),
     )
     return order, plan

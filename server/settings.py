@@ -47,6 +47,8 @@ class Settings:
     indirect: Literal["none", "observed"]
     denoise: DenoiseMethod
     denoise_iterations: int
+    plan: Literal["needed", "everything"]
+    """Whether what would hardly be seen is left out."""
 
 
 def read_wishes(wishes: Wishes) -> Settings:
@@ -67,6 +69,7 @@ def read_wishes(wishes: Wishes) -> Settings:
         indirect="none" if wishes.as_thesis else wishes.indirect,
         denoise=wishes.denoise,
         denoise_iterations=wishes.denoise_iterations,
+        plan=wishes.plan,
     )
 
 

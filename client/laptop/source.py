@@ -11,6 +11,7 @@ from protocol.frames import CameraModel, RgbdFrame
 __all__ = ["Source", "SourceError", "open_source"]
 
 SYNTHETIC_PREFIX = "synthetic:"
+GALLERY_PREFIX = "synthetic:gallery/"
 
 
 class Source(Protocol):
@@ -45,6 +46,10 @@ def open_source(spec: str) -> Source:
     """
     if spec == "oak":
         return _open_oak()
+    if spec.startswith(GALLERY_PREFIX):
+        from client.laptop.gallery.source import GallerySource
+
+        return GallerySource(spec.removeprefix(GALLERY_PREFIX))
     if spec.startswith(SYNTHETIC_PREFIX):
         from client.laptop.synthetic.source import open_synthetic
 

@@ -151,12 +151,13 @@ class PlacedPoints:
         return _float4(self.colors * radiance, 1.0)
 
 
-def no_glow(engine: Engine) -> Glow:
-    """Objects that send nothing."""
+def no_glow(engine: Engine, objects: int = 1) -> Glow:
+    """So many objects that send nothing: they have no cells."""
+    count = max(objects, 1)
     empty = engine.workspace.constant("no_glow", np.zeros(1, cl_types.float4))
     return Glow(
         engine.workspace.constant("no_glow_nearest", np.full(SIDES, -1, np.int32)),
-        engine.workspace.constant("no_glow_cells", np.zeros(1, cl_types.int4)),
+        engine.workspace.constant(f"no_glow_cells_{count}", np.zeros(count, cl_types.int4)),
         empty,
         empty,
         empty,

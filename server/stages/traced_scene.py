@@ -107,7 +107,7 @@ class TracedScene:
 
     def arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
         """SCENE_PARAMETERS of include/shadows.clh."""
-        table, sent = self.table, self.glow or no_glow(engine)
+        table, sent = self.table, self.glow or no_glow(engine, self.table.count)
         return (
             *self.volume.arguments(),
             *light_arguments(engine, self.light, self.volume, self.rays, self.reach_m, self.changed),

@@ -5,9 +5,11 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
+from client.laptop.source import Source
 from client.laptop.synthetic.source import open_synthetic
 from protocol.messages import Wishes
 from server.evaluation.environment import direction_error_deg
+from server.pipeline import FrameResult
 from tests.bench.finished import Part
 from tests.bench.light_runs import at_preset, light_in, refusal, results_of, wishes_for
 from tests.bench.run import Run, data_source
@@ -50,21 +52,29 @@ def _ways(wishes: Wishes) -> dict[str, Wishes]:
 
 
 def kitchen_part(run: Run) -> Part:
-    """Angles between the dominant directions of consecutive frames, with the wishes of `probeless run`."""
+    """Angles between the dominant directions of consecutive frames: as `probeless run` has it, and of one albedo."""
     source = data_source(KITCHEN)
     frames = range(run.of(QUICK_KITCHEN_FRAMES, KITCHEN_FRAMES))
     part = Part(sizes={"frames of the kitchen": len(frames)})
-    wishes = at_preset(wishes_for(source, frames), Wishes().preset)
-    found = results_of(run.device, source, (source[i] for i in frames), wishes)
+    plain = at_preset(wishes_for(source, frames), Wishes().preset)
+    asked = msgspec.structs.replace(plain, albedo="estimated", indirect="observed")
+    _add_turns(part, run, "kitchen, one albedo, no indirect light", source, frames, plain, "")
+    last = _add_turns(part, run, "kitchen", source, frames, asked, f"<= {FLICKER_GOAL_DEG}")
+    up = asked.up or -np.array(source[0].world_from_camera)[:3, 1]
+    view = last.world_from_camera[:3, 2].tolist()
+    part.details = {"light": light_in(last).tolist(), "up": list(map(float, up)), "view": view}
+    return part
+
+
+def _add_turns(
+    part: Part, run: Run, words: str, source: Source, frames: range, asked: Wishes, goal: str
+) -> FrameResult:
+    run.say(words)
+    found = results_of(run.device, source, (source[i] for i in frames), asked)
     directions = np.array([result.light.dominant_direction for result in found])
     turns = np.degrees(np.arccos(np.clip((directions[1:] * directions[:-1]).sum(axis=1), -1, 1)))
-    row = "kitchen: dominant direction"
-    part.add(
-        f"{row}, frame to frame, standard deviation", float(np.sqrt((turns**2).mean())), "deg", f"<= {FLICKER_GOAL_DEG}"
-    )
+    row = f"{words}: dominant direction"
+    part.add(f"{row}, frame to frame, standard deviation", float(np.sqrt((turns**2).mean())), "deg", goal)
     part.add(f"{row}, frame to frame, greatest", float(turns.max()), "deg")
     part.add(f"{row}, valid frames", 100 * float(np.mean([result.light.valid for result in found])), "%")
-    pose = found[-1].world_from_camera
-    up = wishes.up or -found[0].world_from_camera[:3, 1]
-    part.details = {"light": light_in(found[-1]).tolist(), "up": list(map(float, up)), "view": pose[:3, 2].tolist()}
-    return part
+    return found[-1]

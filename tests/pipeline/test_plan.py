@@ -7,9 +7,11 @@ from typing import Any
 
 import pytest
 
-from server.effects import EFFECTS, SceneFacts
+from server.effects import EFFECTS
 from server.pipeline import _GIVEN
-from server.plan import Effect, Omission, PlanError, execute, make_plan
+from server.plan import ALLOWANCE, Effect, Omission, PlanError, execute, make_plan
+from server.scene_facts import Brightness, SceneFacts
+from server.stages.reach import NOWHERE
 from server.stages.tone_mapping import Averages
 
 Toy = Effect[frozenset[str]]
@@ -136,94 +138,121 @@ def test_two_writers_are_refused() -> None:
         make_plan([*TOYS, Effect(glow, writes="shade")], "picture", GIVEN, frozenset())
 
 
-KNOWN = Averages(picture=0.2, shading=0.5, samples=9)
+# ---- what may be left out as needless ----------------------------------------------------------------------------
+
+
+def hidden(bound: float, reason: str = "hardly seen") -> Callable[[frozenset[str]], Omission | None]:
+    """Needless, whatever the facts are."""
+    return lambda _facts: Omission(reason, bound)
+
+
+def test_needless_effects_run_where_everything_is_asked_for() -> None:
+    toys = [TOYS[0], Effect(glow, "glow", needless=hidden(0.4)), *TOYS[2:]]
+    facts = frozenset({"object"})
+    order, plan = make_plan(toys, "picture", GIVEN, facts)
+    assert names(order) == ["render", "shade", "picture"]
+    assert [(item.effect, item.error_bound) for item in plan.left_out] == [("glow", 0.4)]
+    order, plan = make_plan(toys, "picture", GIVEN, facts, everything=True)
+    assert names(order) == ["render", "shade", "glow", "picture"]
+    assert plan.left_out == ()
+
+
+def test_what_was_asked_for_is_left_out_of_everything_too() -> None:
+    toys = [TOYS[0], Effect(glow, "glow", omitted=hidden(255.0), needless=hidden(0.1)), *TOYS[2:]]
+    for everything, bound in ((False, 0.1), (True, 255.0)):
+        _, plan = make_plan(toys, "picture", GIVEN, frozenset({"object"}), everything=everything)
+        assert [(item.effect, item.error_bound) for item in plan.left_out] == [("glow", bound)]
+
+
+@pytest.mark.parametrize(
+    ("bounds", "reasons", "left_out"),
+    [
+        ((0.4, 0.4), "ab", {"glow", "shade"}),
+        ((0.6, 0.6), "ab", {"shade"}),  # the first to be asked for
+        ((1.1, 0.6), "ab", {"glow"}),
+        ((0.6, 0.6), "aa", {"glow", "shade"}),  # one omission, of both
+        ((1.1, 1.1), "aa", set()),
+    ],
+)
+def test_omissions_share_one_allowance(bounds: tuple[float, float], reasons: str, left_out: set[str]) -> None:
+    toys = [
+        Effect(picture, "picture"),
+        Effect(shade, "shade", needless=hidden(bounds[0], reasons[0])),
+        Effect(glow, "glow", needless=hidden(bounds[1], reasons[1])),
+        Effect(render, "render"),
+    ]
+    _, plan = make_plan(toys, "picture", GIVEN, frozenset())
+    assert {item.effect for item in plan.left_out} == left_out
+    assert sum({item.reason: item.error_bound or 0.0 for item in plan.left_out}.values()) <= ALLOWANCE
+
 
 # ---- the real table ----------------------------------------------------------------------------------------------
+
+KNOWN = Averages(picture=0.2, shading=0.5, samples=9)
+DRAWN = {"rasterize", "cover", "composite"}
+SHADED = DRAWN | {"prepare_rays", "add_objects", "shade_virtual"}
+BOUNDED = Brightness(picture=0.9, arriving=2.0, shading=1.0, object_sent=0.8, real_sent=0.9)
+ASKED = {
+    "refine_virtual": "does not refine",
+    "refine_real": "does not refine",
+    "light_objects": "no indirect",
+    "light_samples": "no indirect",
+    "bounce_real": "no indirect",
+}
+SOFT = dict.fromkeys(("direct_virtual", "direct_real", "shadow_map", "light_samples"), "soft")
+TRACED = {"look_around": "traces rays"}
+LIT = ("shade_virtual", "reflect", "match_average", "direct_virtual", "refine_virtual")
+OF_REAL = ("shadow_real", "bounce_real", "direct_real", "refine_real")
 
 
 @pytest.mark.parametrize(
     ("facts", "run", "reasons"),
     [
         (
-            SceneFacts(objects=0, objects_in_view=0, has_light=True),
+            SceneFacts(objects=0, objects_in_view=0, has_light=True, reach=NOWHERE),
             {"composite"},
-            {
-                "rasterize": "no virtual object",
-                "cover": "no virtual object",
-                "reflect": "no virtual object",
-                "match_average": "no virtual object",
-                "direct_virtual": "no virtual object",
-                "direct_real": "no virtual object",
-                "shade_virtual": "no virtual object",
-                "shadow_real": "no virtual object",
-                "refine_virtual": "no virtual object",
-                "refine_real": "no virtual object",
-            },
+            dict.fromkeys(("rasterize", "cover", *LIT, *OF_REAL), "there is no virtual object"),
         ),
         (
             SceneFacts(objects=2, objects_in_view=0, has_light=True),
             {"prepare_rays", "shadow_real", "composite"},  # what is out of view may still cast a shadow into it
-            {
-                "rasterize": "in view",
-                "cover": "in view",
-                "reflect": "in view",
-                "match_average": "in view",
-                "direct_virtual": "in view",
-                "direct_real": "soft",
-                "shadow_map": "soft",
-                "light_objects": "left out",
-                "shade_virtual": "in view",
-                "refine_virtual": "in view",
-                "refine_real": "refine",
-                "look_around": "traces rays",
-            },
+            {**ASKED, **SOFT, **TRACED, "light_samples": "no indirect"}
+            | dict.fromkeys(("rasterize", "cover", *LIT), "in view"),
+        ),
+        (
+            SceneFacts(objects=2, objects_in_view=0, has_light=True, reach=NOWHERE, brightness=BOUNDED),
+            {"composite"},
+            dict.fromkeys(("rasterize", "cover", *LIT), "in view") | dict.fromkeys(OF_REAL, "hardly change"),
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=False),
-            {"rasterize", "cover", "composite"},
-            dict.fromkeys(
-                (
-                    "shade_virtual",
-                    "shadow_real",
-                    "refine_virtual",
-                    "refine_real",
-                    "reflect",
-                    "match_average",
-                    "direct_virtual",
-                    "direct_real",
-                ),
-                "no light",
-            ),
+            DRAWN,
+            dict.fromkeys((*LIT, *OF_REAL), "no light") | {"reflect": "glossy"},
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=True),
-            {"rasterize", "cover", "prepare_rays", "add_objects", "shade_virtual", "shadow_real", "composite"},
-            {
-                "refine_virtual": "does not refine",
-                "refine_real": "does not refine",
-                "light_objects": "left out",
-                "reflect": "glossy",
-                "direct_virtual": "soft",
-                "direct_real": "soft",
-                "shadow_map": "soft",
-                "look_around": "traces rays",
-                "match_average": "own scale",
-            },
+            SHADED | {"shadow_real"},
+            {**SOFT, **ASKED, **TRACED, "reflect": "glossy", "match_average": "own scale"},
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=True, averages=Averages(0.0, 1.0, 9)),
-            {"rasterize", "cover", "prepare_rays", "add_objects", "shade_virtual", "shadow_real", "composite"},
-            {
-                "refine_virtual": "does not refine",
-                "refine_real": "does not refine",
-                "light_objects": "left out",
-                "reflect": "glossy",
-                "direct_virtual": "soft",
-                "direct_real": "soft",
-                "shadow_map": "soft",
-                "look_around": "traces rays",
-                "match_average": "empty or black",
-            },
+            SHADED | {"shadow_real"},
+            {**SOFT, **ASKED, **TRACED, "reflect": "glossy", "match_average": "empty or black"},
+        ),
+        (
+            SceneFacts(
+                objects=1,
+                objects_in_view=1,
+                has_light=True,
+                adaptive=True,
+                indirect=True,
+                sharp_lights=1,
+                averages=KNOWN,
+                brightness=BOUNDED,
+                reach=NOWHERE,
+            ),
+            SHADED | {"light_objects", "refine_virtual", "match_average", "shadow_map", "direct_virtual"},
+            {**TRACED, "reflect": "glossy"} | dict.fromkeys(OF_REAL, "hardly change"),
         ),
         (
             SceneFacts(
@@ -237,24 +266,7 @@ KNOWN = Averages(picture=0.2, shading=0.5, samples=9)
                 sharp_lights=1,
                 averages=KNOWN,
             ),
-            {
-                "rasterize",
-                "cover",
-                "shadow_map",
-                "direct_virtual",
-                "direct_real",
-                "look_around",
-                "prepare_rays",
-                "light_objects",
-                "add_objects",
-                "reflect",
-                "shade_virtual",
-                "refine_virtual",
-                "shadow_real",
-                "refine_real",
-                "match_average",
-                "composite",
-            },
+            {effect.name for effect in EFFECTS},
             {},
         ),
     ],
@@ -267,8 +279,7 @@ def test_effects_of_a_scene(facts: SceneFacts, run: set[str], reasons: dict[str,
     for effect in order:  # everything an effect reads is there before it
         assert set(effect.reads) - effect.optional <= made
         made.add(effect.writes)
-    assert {item.effect for item in plan.left_out} == set(reasons)
+    assert {item.effect: item.reason for item in plan.left_out}.keys() == reasons.keys()
     for item in plan.left_out:
         assert reasons[item.effect] in item.reason
-        assert item.error_bound is not None
-        assert item.error_bound == (0.0 if any(word in item.reason for word in ("object", "soft", "traces")) else 255.0)
+        assert item.error_bound == (255.0 if any(w in item.reason for w in ("asked", "no light", "black")) else 0.0)

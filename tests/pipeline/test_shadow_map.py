@@ -121,10 +121,7 @@ def test_small_light_throws_its_shadow(device: Device, preset: Preset) -> None:
 
 def test_shadow_is_sharper_than_the_harmonics_can_show(device: Device) -> None:
     light = light_of(9.0)
-    with (
-        patch.object(spine, "split_light", lambda sh: SplitLight(sh, ())),
-        patch("server.effects.split_light", lambda sh: SplitLight(sh, ())),
-    ):
+    with patch.object(spine, "split_light", lambda sh: SplitLight(sh, ())):
         blurred = shown(device, light)
     assert "shadow_map" not in blurred.plan.run
     expected, is_floor = exact_ratio(9.0)

@@ -128,7 +128,8 @@ def test_far_object_changes_no_pixel(device: Device, preset: str) -> None:
     """The whole spine, with an object that neither is seen nor shadows anything: the camera's bytes come back."""
     random = np.random.default_rng(1)
     color = random.integers(60, 220, (CAMERA.height, CAMERA.width, 3), np.uint8)
-    wishes = Wishes(preset=preset, volume_m=BOUNDS, voxel_m=VOXEL_M, ray_length_m=2.0)  # type: ignore[arg-type]
+    asked: Any = {"preset": preset, "plan": "everything"}
+    wishes = Wishes(volume_m=BOUNDS, voxel_m=VOXEL_M, ray_length_m=2.0, **asked)
     pipeline = Pipeline(device, CAMERA, wishes)
     pipeline.place_object(
         "far", shape_of(trimesh.creation.icosphere(radius=0.2)), Placement(position_m=(0.0, 5.0, -60.0))

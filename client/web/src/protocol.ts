@@ -89,6 +89,8 @@ export interface Wishes {
    * common a normal is (`normals_printed`: as eq. 5.7 has them); earlier frames count; what fits badly counts less.
    */
   robustness?: Array<"memory" | "normals" | "normals_printed" | "openness" | "outliers">;
+  /** `everything`: what would hardly be seen is simulated too, to check the bounds of leaving it out. */
+  plan?: "everything" | "needed";
   /** Answers carry PNG pictures, and every frame is answered in order instead of latest-wins. */
   lossless?: boolean;
 }

@@ -1,0 +1,128 @@
+"""Whole sessions: pictures of nothing, of half of everything, and the same session again."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+from msgspec.structs import replace
+
+from client.laptop.source import open_source
+from client.laptop.synthetic.source import SyntheticSource
+from client.laptop.volume import default_volume, default_voxel
+from protocol.frames import RgbdFrame
+from protocol.messages import Wishes
+from server.pipeline import FrameResult, Pipeline
+from server.scene.placement import Placement
+from tests.analytic import look_at
+from tests.hard_cases.catalogue import Family, Found, Trial, share_beyond
+from tests.hard_cases.test_bad_depth import (
+    BAD_DEPTH,
+    CAMERA,
+    PYRAMID,
+    SIZE,
+    WISHES,
+    assert_sound,
+    frame_of,
+    good_depth,
+)
+from tests.lights import unit
+from tests.meshes import soup_of
+
+SESSIONS = Family("sessions")
+_TABLE = "synthetic:table?light=1&frames=12&size=160x120"
+"""Exact pictures of a table under a light of 16 coefficients."""
+_VIEWS = tuple(look_at((x, -0.2, 0.0), (0.1, 0.3, 1.2)) for x in (0.0, 0.1, 0.2))
+
+
+def _frames(code: int | None = None) -> list[RgbdFrame]:
+    """Three frames of a room, all of whose pixels have that code."""
+    frames = [frame_of(good_depth(view), view, index) for index, view in enumerate(_VIEWS)]
+    if code is None:
+        return frames
+    color = np.full((*SIZE, 3), code, np.uint8)
+    return [RgbdFrame(f.index, f.timestamp_s, color, f.depth, f.world_from_camera) for f in frames]
+
+
+def _session(trial: Trial, frames: list[RgbdFrame], preset: str = "reg4") -> FrameResult:
+    """The last frame's result, with one object in the room."""
+    pipeline = Pipeline(trial.device, CAMERA, replace(WISHES, preset=preset))
+    try:
+        pipeline.place_object("pyramid", soup_of(PYRAMID), Placement(position_m=(-0.2, 0.7, 1.1)))
+        for frame in frames:
+            result = pipeline.process(frame)
+            assert_sound(result)
+    finally:
+        pipeline.close()
+    return result
+
+
+@cache
+def _table() -> SyntheticSource:
+    source = open_source(_TABLE)
+    assert isinstance(source, SyntheticSource)
+    return source
+
+
+def _table_light(trial: Trial, preset: str, saturated: slice | None = None) -> Found:
+    """Dominant direction after 12 frames, some columns of each picture saturated."""
+    source = _table()
+    bounds = default_volume(source, range(len(source)))
+    wishes = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), preset=preset)
+    pipeline = Pipeline(trial.device, source.camera, wishes)
+    try:
+        for frame in source:
+            color = frame.color.copy()
+            if saturated is not None:
+                color[:, saturated] = 255
+            light = pipeline.process(dataclasses.replace(frame, color=color)).light
+    finally:
+        pipeline.close()
+    assert np.isfinite(light.sh).all()
+    return Found(unit(light.dominant_direction), source.truth(len(source) - 1).light_direction)
+
+
+for _name, _code in {"all black": 0, "all white": 255}.items():
+
+    @SESSIONS.case(_name, 0, "radiance", "no pixel is usable, so nothing is found: exactly zero.", known=False)
+    def one_code(trial: Trial, code: int = _code) -> Found:
+        light = _session(trial, _frames(code)).light
+        return Found(light.sh, 0, known=light.valid)
+
+
+@SESSIONS.case("no depth at all", 0, "radiance", "there is no surface to find light from: exactly zero.", known=False)
+def no_depth(trial: Trial) -> Found:
+    frames = [frame_of(BAD_DEPTH["empty"], view, index) for index, view in enumerate(_VIEWS)]
+    light = _session(trial, frames).light
+    return Found(light.sh, 0, known=light.valid)
+
+
+_MODEL = "what of a table 12 frames do not show leaves the direction open to 10 degrees, the light page's worst scene."
+for _name, _columns in {"the left half saturated": slice(0, 80), "the right half saturated": slice(80, 160)}.items():
+
+    @SESSIONS.case(
+        _name, np.deg2rad(15), "rad", _MODEL + " Half of it, half as much again.", apart=0.02, checkable=False
+    )
+    def half_saturated(trial: Trial, columns: slice = _columns) -> Found:
+        return _table_light(trial, "reg4", columns)
+
+
+for _preset in ("reg4", "art4", "gr15fast"):
+
+    @SESSIONS.case(f"{_preset}: the light", np.deg2rad(10), "rad", _MODEL, apart=0.02, checkable=False)
+    def direction(trial: Trial, preset: str = _preset) -> Found:
+        return _table_light(trial, preset)
+
+    @SESSIONS.case(
+        f"{_preset}: the picture again",
+        0,
+        "share of codes",
+        "replay on one device is exact to the bit; between builds a code may round to its neighbours, or an edge move.",
+        distance=share_beyond(2.5),
+        apart=5e-3,
+        checkable=False,
+    )
+    def picture(trial: Trial, preset: str = _preset) -> Found:
+        first, again = (_session(trial, _frames(), preset).color.astype(np.float64) for _ in range(2))
+        return Found(first, np.where(first == again, first, first + 1000))

@@ -23,7 +23,7 @@ from tests.bench.finished import ROOT
 from tests.hard_cases.cases import CASES
 from tests.hard_cases.catalogue import Case
 
-LIMIT_S = 240
+LIMIT_S = 300
 _FOUND = re.compile(
     r"^(Read-write|Write-write|Invalid|Work-group divergence|Work-item has|.*data race).*", re.MULTILINE
 )

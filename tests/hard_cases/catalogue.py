@@ -120,13 +120,16 @@ class Family:
     """Cases of one subject."""
 
     name: str
+    checkable: bool = True
+    """Of its cases, where they do not say."""
     cases: list[Case] = field(default_factory=list)
 
     def case(self, name: str, bound: float, unit: str, reason: str, **more: Any) -> Callable[[Any], Any]:
         """Decorator: the function measures a case of this name."""
 
         def add(measure: Callable[[Trial], Found]) -> Callable[[Trial], Found]:
-            self.cases.append(Case(name, self.name, measure, bound, unit, reason, **more))
+            settings = {"checkable": self.checkable} | more
+            self.cases.append(Case(name, self.name, measure, bound, unit, reason, **settings))
             return measure
 
         return add

@@ -18,7 +18,7 @@ from tests.lights import unit
 
 Floats = NDArray[np.float64]
 
-LOBES = Family("light by lobes")
+LOBES = Family("light by lobes", checkable=False)
 UP = np.array([[0.0, -1.0, 0.0]])
 _WALLS = {
     "one plane": UP,

@@ -62,7 +62,7 @@ def solve_cells(
     scale = mean_albedo if rows.sent.any() else ASSUMED_ALBEDO
     return light, LightEstimate(
         to_sh @ radiances / scale,
-        std / scale if light.cells.any() else None,  # spread is relative to the light: of none it would be nothing
+        std / scale if light.cells.any() else None,  # relative to the light: of none it would be nothing
         _condition(luminance.matrix),
         valid=bool(_direction_spread_rad(vector, root[_LINEAR]) <= _VALID_RAD),
     )

@@ -62,7 +62,7 @@ class LightEstimate:
     sh: NDArray[np.float64]
     """[bands^2, 3] radiance, RGB, world axes."""
     std: NDArray[np.float64] | None
-    """[bands^2, 3] one standard deviation; None where nothing has been seen."""
+    """[bands^2, 3] one standard deviation; None where no light has been seen."""
     condition: float
     """Condition number of the unregularised normal equations; infinite if singular."""
     valid: bool

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.maths.direct_lights import DirectLight
 from server.maths.disc_places import disc_places, ray_places, search_places
+from server.maths.dominant import MOST_LIGHTS
 from server.opencl.engine import Engine, KernelArgument, float4
 from server.opencl.program import Define
 from server.stages.auxiliary_views import view_axes
@@ -55,11 +56,11 @@ class ShadowMaps:
     reach_m: float
     """Length of rays to real things."""
     rows: cl_array.Array
-    """[lights, 4] float4: right, down, towards the light (w: tangent of its half angle), irradiance (w: see _rows)."""
+    """[MOST_LIGHTS, 4] float4: right, down, towards the light (w: tangent of half its angle), irradiance (w: _rows)."""
     ball: Floats
     """Middle and radius of the ball around all objects, volume metres."""
     objects: cl_array.Array
-    """[lights, texels of the pyramid] float2: covered part, mean depth in metres from the ball's middle."""
+    """[MOST_LIGHTS, texels of the pyramid] float2: covered part, mean depth in metres from the ball's middle."""
 
     @property
     def least(self) -> Floats:
@@ -230,7 +231,7 @@ def without_direct(
 def _draw_objects(engine: Engine, axes: Floats, ball: Floats, objects: Sequence[Placed]) -> cl_array.Array:
     """The pyramids. axes: [lights, 3, 3]."""
     texels, distance_m = (4 * MAP_SIDE**2 - _COARSEST_SIDE**2) // 3, DISTANCE * float(ball[3])
-    maps = engine.workspace.array("object_maps", (len(axes), texels), cl_types.float2)
+    maps = engine.workspace.array("object_maps", (MOST_LIGHTS, texels), cl_types.float2)
     middle, focal_px = (MAP_SIDE - 1) / 2, DISTANCE * MAP_SIDE / 2
     camera = Pinhole(MAP_SIDE, MAP_SIDE, focal_px, focal_px, middle, middle)
     for light, rotation in enumerate(axes):
@@ -275,15 +276,16 @@ def _grid(grid: SampleGrid) -> tuple[KernelArgument, ...]:
 
 
 def _rows(discs: Sequence[DirectLight], axes: Floats) -> NDArray[np.float32]:
-    """[lights, 4] float4. Right, down, towards the light with the tangent of the disc's half angle, and the irradiance
-    with what surface that faces the disc gets of it: the mean cosine of its parts."""
-    rows = np.zeros((len(discs), 4, 4), np.float32)
-    rows[:, :3, :3] = axes * np.array([1.0, 1.0, -1.0])[:, None]
+    """[MOST_LIGHTS, 4] float4. Right, down, towards the light with the tangent of the disc's half angle, and the
+    irradiance with what surface that faces the disc gets of it: the mean cosine of its parts."""
+    rows = np.zeros((MOST_LIGHTS, 4, 4), np.float32)  # always as many: lights come and go, arrays do not
+    count = len(discs)
+    rows[:count, :3, :3] = axes * np.array([1.0, 1.0, -1.0])[:, None]
     tangent = np.tan([disc.half_angle_rad for disc in discs])
-    rows[:, 2, 3] = tangent
-    rows[:, 3, :3] = [disc.irradiance for disc in discs]
+    rows[:count, 2, 3] = tangent
+    rows[:count, 3, :3] = [disc.irradiance for disc in discs]
     distance = np.linalg.norm(disc_places(), axis=1)
-    rows[:, 3, 3] = (1 / np.sqrt(1 + np.outer(tangent, distance) ** 2)).mean(axis=1)
+    rows[:count, 3, 3] = (1 / np.sqrt(1 + np.outer(tangent, distance) ** 2)).mean(axis=1)
     return rows.view(cl_types.float4)[..., 0]
 
 

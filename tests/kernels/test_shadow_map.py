@@ -70,7 +70,8 @@ class Lit:
 
     def reference(self, light: int = 0) -> twin.Disc:
         """The twin with the same finest map."""
-        texels = self.engine.download(self.maps.objects).view(np.float32).reshape(len(self.maps.light.discs), -1, 2)
+        count = len(self.maps.light.discs)
+        texels = self.engine.download(self.maps.objects)[:count].view(np.float32).reshape(count, -1, 2)
         level = texels[light, : MAP_SIDE**2].astype(float).reshape(MAP_SIDE, MAP_SIDE, 2)
         rows = download4(self.engine, self.maps.rows).astype(float)[light]
         return twin.Disc(
@@ -148,7 +149,7 @@ def test_pyramid_and_free_parts_are_the_twins(device: Device, kind: type[Engine]
     engine = kind(device)
     light = disc(12.0), disc(25.0, BEHIND, (0.2, 0.5, 1.0))
     scene = lit(engine, *light, solids=(CRATE, ball((0.62, 0.22, 0.5), 0.08)))
-    texels = engine.download(scene.maps.objects).view(np.float32).reshape(2, -1, 2).astype(float)
+    texels = engine.download(scene.maps.objects)[:2].view(np.float32).reshape(2, -1, 2).astype(float)
     references = [scene.reference(k) for k in range(2)]
     for found, reference in zip(texels, references, strict=True):
         expected = np.concatenate([np.stack(level, -1).reshape(-1, 2) for level in reference.levels])

@@ -10,8 +10,10 @@ from typing import Annotated
 
 import typer
 
-from client import options as o
+from client import capture_options as o
+from client.capture_options import CaptureOptions, capturing
 from client.laptop.errors import OptionError
+from client.options import prepare
 from client.progress import Stopwatch, note, progress_bar, say, track
 
 USAGE_STATUS, FAILURE_STATUS, INTERRUPTED_STATUS = 2, 1, 130
@@ -66,40 +68,15 @@ def common(
 
 
 @app.command()
+@capturing
 def run(
-    source: o.SourceArgument,
+    options: CaptureOptions,
     out: Annotated[Path, typer.Option(metavar="DIR", help="folder for what is written")],
-    frames: o.Frames = None,
-    poses: o.PosesOption = None,
-    volume: o.VolumeOption = None,
-    voxel: o.Voxel = None,
-    preset: o.Preset = "reg4",
-    rays: o.Rays = 81,
-    ray_length: o.RayLength = None,
-    bands: o.Bands = 4,
-    albedo: o.Albedo = None,
-    indirect: o.Indirect = None,
-    as_thesis: o.AsThesis = False,
-    denoise: o.Denoise = "none",
-    denoise_iterations: o.DenoiseIterations = 20,
-    object: o.Object = None,
-    up: o.Up = None,
-    light: o.LightFile = None,
-    panorama: o.Panorama = None,
-    lamps: o.Lamps = None,
-    exposure: o.Exposure = None,
-    robustness: o.Robustness = None,
-    edges: o.Edges = None,
-    tone_mapping: o.ToneMapping = None,
-    light_color: o.LightColor = None,
-    plan: o.Plan = None,
     mesh: o.Mesh = False,
-    budget_ms: o.BudgetMs = None,
-    max_light_error: o.MaxLightError = None,
     device: o.DeviceOption = None,
 ) -> None:
     """The pipeline in one process, no network."""
-    capture = o.prepare(o.CaptureOptions.of(locals()))
+    capture = prepare(options)
     from client.laptop.output import OutputWriter
     from client.laptop.run import Run
 
@@ -119,39 +96,14 @@ def run(
 
 
 @app.command()
+@capturing
 def explain(
-    source: o.SourceArgument,
+    options: CaptureOptions,
     frame: Annotated[int | None, typer.Option(metavar="N", help="position in the source; default: the fifth")] = None,
-    frames: o.Frames = None,
-    poses: o.PosesOption = None,
-    volume: o.VolumeOption = None,
-    voxel: o.Voxel = None,
-    preset: o.Preset = "reg4",
-    rays: o.Rays = 81,
-    ray_length: o.RayLength = None,
-    bands: o.Bands = 4,
-    albedo: o.Albedo = None,
-    indirect: o.Indirect = None,
-    as_thesis: o.AsThesis = False,
-    denoise: o.Denoise = "none",
-    denoise_iterations: o.DenoiseIterations = 20,
-    object: o.Object = None,
-    up: o.Up = None,
-    light: o.LightFile = None,
-    panorama: o.Panorama = None,
-    lamps: o.Lamps = None,
-    exposure: o.Exposure = None,
-    robustness: o.Robustness = None,
-    edges: o.Edges = None,
-    tone_mapping: o.ToneMapping = None,
-    light_color: o.LightColor = None,
-    plan: o.Plan = None,
-    budget_ms: o.BudgetMs = None,
-    max_light_error: o.MaxLightError = None,
     device: o.DeviceOption = None,
 ) -> None:
     """The plan of a frame in words: what runs and what for, what is left out and why."""
-    capture = o.prepare(o.CaptureOptions.of(locals()))
+    capture = prepare(options)
     from client.explain import explain as explain_frame
 
     for line in explain_frame(capture, frame, device):
@@ -159,39 +111,14 @@ def explain(
 
 
 @app.command()
+@capturing
 def stream(
-    source: o.SourceArgument,
+    options: CaptureOptions,
     server: Annotated[str, typer.Option(metavar="URL", help="for example http://localhost:8080")],
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for what is written")] = None,
     record: Annotated[Path | None, typer.Option(metavar="FILE", help="keep what is sent as a recording")] = None,
     lossless: Annotated[bool, typer.Option("--lossless", help="raw colour, and every frame is waited for")] = False,
-    frames: o.Frames = None,
-    poses: o.PosesOption = None,
-    volume: o.VolumeOption = None,
-    voxel: o.Voxel = None,
-    preset: o.Preset = "reg4",
-    rays: o.Rays = 81,
-    ray_length: o.RayLength = None,
-    bands: o.Bands = 4,
-    albedo: o.Albedo = None,
-    indirect: o.Indirect = None,
-    as_thesis: o.AsThesis = False,
-    denoise: o.Denoise = "none",
-    denoise_iterations: o.DenoiseIterations = 20,
-    object: o.Object = None,
-    up: o.Up = None,
-    light: o.LightFile = None,
-    panorama: o.Panorama = None,
-    lamps: o.Lamps = None,
-    exposure: o.Exposure = None,
-    robustness: o.Robustness = None,
-    edges: o.Edges = None,
-    tone_mapping: o.ToneMapping = None,
-    light_color: o.LightColor = None,
-    plan: o.Plan = None,
     mesh: o.Mesh = False,
-    budget_ms: o.BudgetMs = None,
-    max_light_error: o.MaxLightError = None,
     device: o.DeviceOption = None,
 ) -> None:
     """The laptop client: sends a source to a server and shows what comes back."""
@@ -199,11 +126,11 @@ def stream(
         raise OptionError("--device: the server has the device; name it there with probeless serve --device")
     if mesh and out is None:
         raise OptionError("--mesh writes files: say where with --out")
-    capture = o.prepare(o.CaptureOptions.of(locals()), lossless=lossless)
+    capture = prepare(options, lossless=lossless)
     from client.laptop.stream import stream as send
 
-    options = {"frames": capture.frames, "mesh": mesh}
-    done = send(capture.source, server, capture.objects, capture.wishes, out, lossless, record, **options)
+    others = {"frames": capture.frames, "mesh": mesh}
+    done = send(capture.source, server, capture.objects, capture.wishes, out, lossless, record, **others)
     written = f", written to {out}" if out is not None else ""
     speed = done.answered / done.seconds if done.seconds > 0 else 0.0
     say(
@@ -267,6 +194,21 @@ def devices() -> None:
     from client.laptop.devices import show_devices
 
     show_devices()
+
+
+@app.command()
+def tune(device: o.DeviceOption = None) -> None:
+    """This device's front of accuracy against time, measured once and kept for --budget-ms and --preset auto."""
+    from client.laptop.tune import lines_of
+    from client.laptop.tune import tune as measure
+    from server.fronts import write_front
+    from server.opencl.device import open_device
+
+    with progress_bar("points") as progress:
+        front = measure(open_device(device), progress)
+    for line in lines_of(front):
+        say(line)
+    say(f"kept in {write_front(front)}")
 
 
 @app.command()

@@ -33,6 +33,7 @@ from protocol.messages import (
     MeshPart,
     MoveObject,
     PlaceObject,
+    Preset,
     Quality,
     RemoveObject,
     RequestMesh,
@@ -191,9 +192,12 @@ class StreamClient:
         """Take an object away."""
         return await self._ask(RemoveObject(request=next(self._requests), object=name))
 
-    async def set_preset(self, preset: str) -> Acknowledged:
-        """Change the preset of the running session."""
-        return await self._ask(Quality(request=next(self._requests), preset=preset))
+    async def set_quality(
+        self, preset: Preset, budget_ms: float | None = None, max_light_error_deg: float | None = None
+    ) -> Acknowledged:
+        """Change the preset of the running session; of `auto`, by what it is chosen. Raises ValueError."""
+        chosen_by = {"budget_ms": budget_ms, "max_light_error_deg": max_light_error_deg}
+        return await self._ask(Quality(request=next(self._requests), preset=preset, **chosen_by))
 
     async def request_mesh(
         self, progress: Callable[[int, int], None] = lambda _done, _total: None

@@ -74,6 +74,8 @@ def lines(title: str, plan: Plan) -> Iterator[str]:
     most = sum(bound or 0.0 for _, bound in unseen)
     yield f"{title}: {len(plan.run)} effects run, {len(plan.left_out)} are left out."
     width = max(map(len, (*plan.run, *(left.effect for left in plan.left_out))))
+    if plan.point is not None:
+        yield f"Sampled with {plan.point.settings}: {plan.point.reason}."
     yield "Runs:"
     for name in plan.run:
         yield f"  {name:{width}}  {PURPOSES.get(name, '')}".rstrip()

@@ -1,127 +1,22 @@
-"""The options that `run` and `stream` share, and the wishes, volume and objects that they amount to."""
+"""What the options of a capture amount to: its source, frames, wishes, volume and objects."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Any
 
-import typer
-
+from client.capture_options import DENOISE, PRESETS, ROBUSTNESS, CaptureOptions
 from client.laptop.datasets.ground_truth import GroundTruthSource
 from client.laptop.errors import OptionError
 from client.laptop.light_file import read_light, read_panorama_light
 from client.laptop.objects import ObjectFile, parse_object
 from client.laptop.source import Source, open_source
 from client.laptop.volume import Volume, default_volume, default_voxel, with_room_to_move
-from protocol.limits import MAX_SH_BANDS
-from protocol.messages import Robustness as RobustnessName
 from protocol.messages import Wishes
 
-BUILT_PRESETS = ("rm", "reg4", "reg8", "art1", "art4", "art8", "gr15", "gr15fast")
-PRESETS = (*BUILT_PRESETS, "auto")
 THESIS_RAY_LENGTH_M = 0.1
-DENOISE = ("none", "bilateral", "tv_l1")
-ROBUSTNESS = get_args(RobustnessName)
-
-SourceArgument = Annotated[
-    str, typer.Argument(metavar="SOURCE", help="data-set folder, synthetic:NAME, recording or oak")
-]
-Frames = Annotated[str | None, typer.Option(metavar="A:B", help="half-open range of positions in the source")]
-PosesOption = Annotated[
-    str | None, typer.Option(metavar="given|track|refine", help="default: given where there are any")
-]
-VolumeOption = Annotated[
-    str | None, typer.Option(metavar="x0,y0,z0,x1,y1,z1", help="metres; default: what the source sees")
-]
-Voxel = Annotated[float | None, typer.Option(metavar="M", help="voxel side in metres; default: fits the volume")]
-Preset = Annotated[str, typer.Option(metavar="|".join(PRESETS), help="where and how transfer is sampled")]
-Rays = Annotated[int, typer.Option(min=4, max=1024, help="visibility rays per sample")]
-RayLength = Annotated[
-    str | None, typer.Option(metavar="M|room", help="how far occluders are looked for; default: room")
-]
-Bands = Annotated[int, typer.Option(min=2, max=MAX_SH_BANDS, help="spherical-harmonics bands")]
-Albedo = Annotated[str | None, typer.Option(metavar="constant|estimated", help="default: estimated")]
-Indirect = Annotated[str | None, typer.Option(metavar="none|observed", help="default: observed")]
-AsThesis = Annotated[bool, typer.Option("--as-thesis", help="--ray-length 0.1 --albedo constant --indirect none")]
-Denoise = Annotated[
-    str, typer.Option(metavar="|".join(DENOISE), help="of the lightness that the light is estimated from")
-]
-DenoiseIterations = Annotated[int, typer.Option(min=1, max=1000, help="of TV-L1")]
-Object = Annotated[
-    list[str] | None, typer.Option(metavar="FILE[@x,y,z[,scale[,yaw]]]", help="virtual object; may be repeated")
-]
-Up = Annotated[str | None, typer.Option(metavar="x,y,z", help="default: what the source says, else the camera's -y")]
-LightFile = Annotated[str | None, typer.Option("--light", metavar="FILE", help="use this light, estimate none")]
-Panorama = Annotated[str | None, typer.Option(metavar="FILE", help="light from a panorama")]
-Lamps = Annotated[
-    str | None, typer.Option(metavar="on|off", help="look for lights inside the room; default: where called for")
-]
-Exposure = Annotated[
-    str | None, typer.Option(metavar="auto|constant", help="default: auto, as frames say it, else estimated")
-]
-Robustness = Annotated[
-    str | None,
-    typer.Option(metavar="LIST|none", help=f"of {', '.join(ROBUSTNESS)}; default: openness,memory,outliers"),
-]
-Edges = Annotated[
-    str | None, typer.Option(metavar="smooth|hard", help="of virtual things; hard: as in point-sampled pictures")
-]
-ToneMapping = Annotated[
-    str | None,
-    typer.Option(
-        metavar="light|average", help="what virtual things' brightness rests on; default: average, light with --light"
-    ),
-]
-LightColor = Annotated[
-    str | None, typer.Option(metavar="estimated|white", help="white: the light without its colours, as the thesis")
-]
-Plan = Annotated[
-    str | None, typer.Option(metavar="needed|everything", help="everything: also what would hardly be seen")
-]
-Mesh = Annotated[bool, typer.Option("--mesh", help="write mesh.ply and mesh.glb")]
-BudgetMs = Annotated[float | None, typer.Option(metavar="N", help="choose the operating point for this time")]
-MaxLightError = Annotated[float | None, typer.Option(metavar="DEG", help="choose it for this light error")]
-DeviceOption = Annotated[str | None, typer.Option(metavar="NAME", help="part of an OpenCL device's name")]
-
-
-@dataclass(frozen=True)
-class CaptureOptions:
-    """The shared options as they were typed; None where nothing was said."""
-
-    source: str
-    frames: str | None = None
-    poses: str | None = None
-    volume: str | None = None
-    voxel: float | None = None
-    preset: str = "reg4"
-    rays: int = 81
-    ray_length: str | None = None
-    bands: int = 4
-    albedo: str | None = None
-    indirect: str | None = None
-    as_thesis: bool = False
-    denoise: str = "none"
-    denoise_iterations: int = 20
-    object: list[str] | None = None
-    up: str | None = None
-    light: str | None = None
-    panorama: str | None = None
-    lamps: str | None = None
-    exposure: str | None = None
-    robustness: str | None = None
-    edges: str | None = None
-    tone_mapping: str | None = None
-    light_color: str | None = None
-    plan: str | None = None
-    budget_ms: float | None = None
-    max_light_error: float | None = None
-
-    @classmethod
-    def of(cls, parameters: dict[str, Any]) -> CaptureOptions:
-        """From a command's parameters by name; others are left out."""
-        return cls(**{field.name: parameters[field.name] for field in fields(cls)})
 
 
 @dataclass(frozen=True)
@@ -136,7 +31,7 @@ class Capture:
 
 def prepare(options: CaptureOptions, lossless: bool = False) -> Capture:
     """Open the source and settle every default. Raises OptionError, SourceError, ObjectError."""
-    refuse_unbuilt(options)
+    refuse_unknown(options)
     objects = tuple(parse_object(text) for text in options.object or ())
     up, volume = parse_up(options.up), parse_volume(options.volume)
     wishes = _wishes_of_options(options)
@@ -160,8 +55,8 @@ def choose_poses(asked: str | None, source: Source) -> str:
     return poses
 
 
-def refuse_unbuilt(options: CaptureOptions) -> None:
-    """Raise OptionError for an option whose system does not exist yet, naming what does."""
+def refuse_unknown(options: CaptureOptions) -> None:
+    """Raise OptionError for a word that an option does not know, naming those that it does."""
     _choice("--preset", options.preset, PRESETS)
     _choice("--denoise", options.denoise, DENOISE)
     _choice("--poses", options.poses, ("given", "track", "refine"))
@@ -173,14 +68,28 @@ def refuse_unbuilt(options: CaptureOptions) -> None:
     _choice("--light-color", options.light_color, ("estimated", "white"))
     _choice("--plan", options.plan, ("needed", "everything"))
     _choice("--exposure", options.exposure, ("auto", "constant"))
-    unbuilt = {
-        f"--preset {options.preset}": (options.preset not in BUILT_PRESETS, f"use {', '.join(BUILT_PRESETS)}"),
-        "--budget-ms": (options.budget_ms is not None, "choose a --preset and --rays instead"),
-        "--max-light-error": (options.max_light_error is not None, "choose a --preset and --rays instead"),
-    }
-    for name, (asked, instead) in unbuilt.items():
-        if asked:
-            raise OptionError(f"{name} is not built yet; {instead}")
+    _choice("--upsampling", options.upsampling, ("bilateral", "bicubic"))
+    _choice("--interleave", options.interleave, (1, 2, 4, 8))
+
+
+_SAMPLED_BY = ("rays", "stride", "interleave", "upsampling", "visibility_state", "auxiliary_views")
+
+
+def _sampling(options: CaptureOptions) -> dict[str, Any]:
+    """Where and how transfer is sampled, or by what the server chooses that. Raises OptionError."""
+    chosen_by = {"budget_ms": options.budget_ms, "max_light_error_deg": options.max_light_error}
+    is_chosen = options.preset == "auto" or any(value is not None for value in chosen_by.values())
+    said = [name for name in _SAMPLED_BY if getattr(options, name) is not None]
+    if is_chosen and (said or options.preset not in (None, "auto")):
+        flag = "--" + (said[0] if said else "preset").replace("_", "-")
+        raise OptionError(f"{flag} is what --preset auto, --budget-ms and --max-light-error choose; leave one out")
+    for flag, value in (("--budget-ms", options.budget_ms), ("--max-light-error", options.max_light_error)):
+        most = 60000 if flag == "--budget-ms" else 180
+        if value is not None and not 0 < value <= most:
+            raise OptionError(f"{flag} {value:g}: expected more than 0 and at most {most}")
+    if is_chosen:
+        return {"preset": "auto", **chosen_by}
+    return {"preset": options.preset or "reg4", **{name: getattr(options, name) for name in said}}
 
 
 def parse_frames(text: str | None, count: int) -> range:
@@ -256,8 +165,8 @@ def _wishes_of_options(options: CaptureOptions) -> dict[str, Any]:
             raise OptionError(f"--as-thesis sets {name}; leave one of the two out")
     ray_length_m = THESIS_RAY_LENGTH_M if options.as_thesis else parse_ray_length(options.ray_length)
     return {
-        "preset": options.preset,
-        "rays": options.rays,
+        **_sampling(options),
+        "smooth_depth": options.smooth_depth,
         "ray_length_m": ray_length_m,
         "bands": options.bands,
         "albedo": options.albedo or ("constant" if options.as_thesis else "estimated"),
@@ -287,9 +196,9 @@ def _given_light(options: CaptureOptions) -> dict[str, Any]:
     return {}
 
 
-def _choice(name: str, value: str | None, allowed: tuple[str, ...]) -> None:
+def _choice(name: str, value: str | int | None, allowed: tuple[str | int, ...]) -> None:
     if value is not None and value not in allowed:
-        raise OptionError(f"{name} {value}: expected one of {', '.join(allowed)}")
+        raise OptionError(f"{name} {value}: expected one of {', '.join(str(word) for word in allowed)}")
 
 
 def _numbers(name: str, text: str, form: str) -> list[float]:

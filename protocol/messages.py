@@ -42,6 +42,11 @@ Tracking = Literal["given", "tracked", "lost"]
 MeshFormat = Literal["ply", "glb"]
 
 
+def _require_auto(where: str, preset: str, *chosen_by: float | None) -> None:
+    if preset != "auto" and any(value is not None for value in chosen_by):
+        raise ValueError(f"{where}: a budget or a greatest light error chooses the preset: it must be auto")
+
+
 def _require_finite(owner: str, **fields: object) -> None:
     """Raise ValueError naming the field if any number in it is NaN or infinite."""
     for name, value in fields.items():
@@ -78,11 +83,33 @@ class DepthImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True)
     codec: Literal["raw", "zdelta", "zstd-delta"]
 
 
+BudgetMs = Annotated[float, Meta(gt=0, le=60000)]
+LightErrorDeg = Annotated[float, Meta(gt=0, le=180)]
+
+
 class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What a capturing client asks of its session; the command line's options of the same names."""
 
     preset: Preset = "reg4"
+    """`auto`: the server chooses where and how transfer is sampled, and the rays, from what its device was measured to
+    take and to err (`probeless tune`)."""
+    budget_ms: BudgetMs | None = None
+    """Of `auto`: a frame shall take no longer."""
+    max_light_error_deg: LightErrorDeg | None = None
+    """Of `auto`: the fastest point whose dominant direction errs by no more, where the device was measured."""
     rays: Annotated[int, Meta(ge=4, le=1024)] = 81
+    stride: Annotated[int, Meta(ge=1, le=16)] | None = None
+    """A1: every how many pixels transfer is sampled; None, as of the four below: what the preset says."""
+    interleave: Literal[1, 2, 4, 8] | None = None
+    """A3, A4: a frame traces one of so many subsets of the directions; of presets that trace rays."""
+    upsampling: Literal["bilateral", "bicubic"] | None = None
+    """A5."""
+    visibility_state: bool | None = None
+    """A6: no rays where the volume is known to be open; of presets that trace rays."""
+    auxiliary_views: Annotated[int, Meta(ge=16, le=4096)] | None = None
+    """R5, A7: depth pictures from all around that visibility is looked up in; of GR15 and GR15FAST."""
+    smooth_depth: bool = True
+    """G3: D''', the median of the merged depth; without it, D'' is the last."""
     ray_length_m: Annotated[float, Meta(ge=0, le=1000)] | None = None
     """None: the whole room."""
     bands: Annotated[int, Meta(ge=2, le=MAX_SH_BANDS)] = 4
@@ -126,6 +153,7 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         _require_finite(
             "wishes", ray_length_m=self.ray_length_m, volume_m=self.volume_m, voxel_m=self.voxel_m, up=self.up
         )
+        _require_auto("wishes", self.preset, self.budget_ms, self.max_light_error_deg)
         if self.volume_m is not None and not all(self.volume_m[a] < self.volume_m[a + 3] for a in range(3)):
             raise ValueError("wishes.volume_m must be x0,y0,z0,x1,y1,z1 with each x0 < x1")
         if self.up is not None and math.hypot(*self.up) < 1e-6:
@@ -213,10 +241,15 @@ class RemoveObject(Message, frozen=True, kw_only=True, tag="remove_object"):
 
 
 class Quality(Message, frozen=True, kw_only=True, tag="quality"):
-    """Change the preset of the running session; acknowledged."""
+    """Change the preset of the running session, or the budget by which it is chosen; acknowledged."""
 
     request: Index
     preset: Preset
+    budget_ms: BudgetMs | None = None
+    max_light_error_deg: LightErrorDeg | None = None
+
+    def __post_init__(self) -> None:
+        _require_auto("quality", self.preset, self.budget_ms, self.max_light_error_deg)
 
 
 class RequestMesh(Message, frozen=True, kw_only=True, tag="request_mesh"):
@@ -252,11 +285,25 @@ class LeftOut(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     error_bound: float | None
 
 
+class OperatingPoint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Where and how finely a frame was sampled, and why."""
+
+    settings: str
+    """As options of the command line."""
+    reason: str
+    expected_ms: float | None = None
+    """What a frame was expected to take; of points that were chosen, like the next."""
+    light_error_deg: float | None = None
+    """Error of the dominant direction where the device was measured."""
+
+
 class Plan(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which effects ran for a frame, in order, and which did not."""
+    """Which effects ran for a frame, in order, which did not, and how finely it was sampled."""
 
     run: tuple[str, ...]
     left_out: tuple[LeftOut, ...]
+    point: OperatingPoint | None = None
+    """None: a camera that is lost samples nothing."""
 
 
 class Timings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

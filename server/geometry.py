@@ -89,7 +89,8 @@ class Geometry:
             if located.fuse:
                 self._tracking.remember(frame, located, model, volume_from_camera)
         with stage("dynamic_geometry"):  # 4.2.2
-            surface = merge_depth(engine, camera, volume_from_camera, measurement, model, volume)
+            smooth = self._wishes.smooth_depth
+            surface = merge_depth(engine, camera, volume_from_camera, measurement, model, volume, smooth)
         result = GeometryFrame(
             measurement=measurement,
             exposure=exposure,

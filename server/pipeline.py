@@ -12,35 +12,35 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
-from protocol.messages import LeftOut, Light, Plan, Timings, Tracking, Wishes
-from server.effects import EFFECTS, View
-from server.facts_finder import FactsFinder
+from protocol.messages import LeftOut, Light, OperatingPoint, Plan, Preset, Timings, Tracking, Wishes
+from server.effects import EFFECTS
 from server.geometry import Geometry, GeometryFrame
+from server.held import Sampled
 from server.light import RoomLight
 from server.light_message import light_message
-from server.maths.direct_lights import split_light
 from server.maths.sh import webxr_from_world
 from server.meshing.scene_mesh import SceneMesh, scene_mesh
 from server.meshing.surface import MeshingError
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.plan import execute, make_plan
+from server.operating_points import Point, asked_for
+from server.plan import Omission
+from server.point_control import control_for
+from server.rendering import Made, Rendering
 from server.rest import Rest
 from server.scene.mesh import Mesh
-from server.scene.objects import SceneObjects, check_room
-from server.scene.placement import Placement, check_size
-from server.settings import Settings, read_wishes, sampling_of
+from server.scene.placement import Placement
+from server.session_objects import SessionObjects
+from server.settings import Settings, read_wishes
 from server.stages.composite import shown_picture
 from server.stages.denoise import denoise_radiance
 from server.stages.exposure import scene_radiance
-from server.stages.indirect import Indirect, observe_indirect
+from server.stages.indirect import observe_indirect
 from server.stages.lamp_finder import LampFinder
 from server.stages.light_estimation import LightEstimate
 from server.stages.near_light import remove_lamps
-from server.stages.radiance_transfer import Transfer
-from server.stages.sampling import Sampling, TransferSampler
-from server.stages.tone_mapping import AverageMemory, Averages, measure_averages
-from server.stages.traced_scene import DeviceLight, take_discs, upload_light
+from server.stages.rasterize import Placed
+from server.stages.sampling import TransferSampler
 from server.stages.volume import Volume
 from server.static_light import static_estimate
 
@@ -64,19 +64,20 @@ class Pipeline:
     """One session's spine and its state. Owned by one thread."""
 
     def __init__(self, device: Device, camera: CameraModel, wishes: Wishes) -> None:
-        self._settings: Settings = read_wishes(wishes)
+        self._device = device
+        self._asked = wishes
+        self._control = control_for(device, wishes)  # U1
+        self._wishes = self._control.chosen.point.wishes(wishes) if self._control else wishes
+        self._settings: Settings = read_wishes(self._wishes)
         self._camera = camera
-        self._wishes = wishes
         self._engine = Engine(device)
         self._geometry = Geometry(self._engine, camera, wishes)
-        self._sampler = self._make_sampler(self._settings.sampling)
+        self._sampler = self._make_sampler()
         self._room_light = RoomLight(self._engine, camera, self._settings)
         self._lamps = LampFinder(self._engine, camera, self._settings.lamps)
-        self._average_memory = AverageMemory()
-        self._rest = Rest()
-        self._facts = FactsFinder(everything=self._settings.plan == "everything")
-        self._objects: SceneObjects | None = None
-        self._waiting: list[tuple[str, Mesh, Placement]] = []
+        self._rendering = Rendering(self._engine, camera, self._settings)
+        self._rest = self._make_rest()
+        self._objects = SessionObjects(self._engine)
         self._webxr_from_world = np.eye(3)
         self.device_name = device.name
         self.kernel_ms: dict[str, float] = {}
@@ -87,98 +88,57 @@ class Pipeline:
         Raises ValueError with one line for a frame that is refused; the session's state is then as it was.
         """
         started = time.perf_counter()
-        engine, camera, settings, stage = self._engine, self._camera, self._settings, self._engine.profile.stage
+        engine, settings, stage = self._engine, self._settings, self._engine.profile.stage
         engine.profile.forget()
-        geometry = self._geometry.update(frame)  # ch. 4
-        volume, objects = self._scene(geometry)
+        geometry = self._geometry.update(frame, self._holds)  # ch. 4
+        volume, objects = self._scene(geometry), self._objects
         if geometry.tracking == "lost":
             return self._lost(frame, geometry, volume, started)
         measurement, surface = geometry.measurement, geometry.surface
 
         placed = objects.placed(volume.volume_from_world())
-        rest = None if settings.plan == "everything" else self._rest.found(frame, geometry, self._lamps.lamps)
-        left_out = {} if rest is None else {"estimate_light": rest}
-        if rest is not None and not placed:
-            left_out["transfer_radiance"] = rest
         with stage("radiance_transfer"):  # 5.1.2, eq. 5.2
-            transfer, indirect = None, None
-            if "transfer_radiance" not in left_out:
-                transfer = self._sampler.transfer(
-                    volume, surface, geometry.volume_from_camera, objects.up, settings.reach_m
-                )
-                indirect = self._observe_indirect(geometry, volume, transfer)  # 7.3.3
+            sampled, left_out = self._sample(geometry, volume, placed)
         with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
             estimate = self._room_light.estimate()
-            if "estimate_light" not in left_out and transfer is not None:
+            if "estimate_light" not in left_out and sampled.transfer is not None:
                 smooth = self._smooth(geometry)
                 distant = remove_lamps(engine, smooth, surface, volume, self._lamps.lamps)  # B4
                 estimate = self._room_light.update(
-                    distant, measurement.depth_m, geometry, volume, transfer, self._sampler.rays, indirect
+                    distant,
+                    measurement.depth_m,
+                    geometry,
+                    volume,
+                    sampled.transfer,
+                    self._sampler.rays,
+                    sampled.indirect,
                 )
-                self._rest.learn(estimate.sh, self._room_light.planes)
         with stage("rendering"):  # 7.1-7.2, the effects this frame calls for
-            is_smooth = settings.edges == "smooth"
-            view = View(
-                engine, camera, geometry.volume_from_camera, settings.reach_m, self._sampler.sampling, is_smooth
-            )
-            light = upload_light(
-                engine, estimate.sh, self._sampler.rays, self._room_light.planes, indirect, geometry.exposure
-            )
-            averages = None
-            if placed and transfer is not None:
-                averages = self._averages(geometry, volume, transfer, light, indirect)  # 7.1, H
-            if placed:  # 7.2.3
-                light = take_discs(engine, light, split_light(estimate.sh), self._sampler.rays, geometry.exposure)
-            shown = shown_picture(engine, camera, frame.color, measurement.radiance)
-            facts = self._facts.find(
-                view,
-                geometry,
-                volume,
-                self._sampler.rays,
-                transfer,
-                indirect,
-                placed,
-                light,
-                estimate.sh,
-                shown,
-                averages,
-            )
-            order, plan = make_plan(
-                EFFECTS, "picture", _GIVEN, facts, everything=settings.plan == "everything", stages=left_out
-            )
-            given = {
-                "view": view,
-                "objects": placed,
-                "volume": volume,
-                "rays": self._sampler.rays,
-                "real_looks": self._sampler.looks,
-                "shown": shown,
-                "measurement": measurement,
-                "surface": surface,
-                "transfer": transfer,
-                "indirect": indirect,
-                "light": light,
-                "averages": averages,
-            }
-            picture: NDArray[np.uint8] = execute(order, given, "picture")
+            planes, is_given = self._room_light.planes, self._room_light.is_given
+            made = Made(frame, geometry, volume, placed, self._sampler, sampled, estimate.sh, planes, is_given)
+            picture, plan = self._rendering.draw(made, settings, left_out, self._rest)
         if not self._room_light.is_given:  # B4, for the frames to come
             with stage("light_estimation"):
                 self._lamps.work(geometry.scene_radiance, surface, volume)
 
         engine.queue.finish()
         rows, self.kernel_ms = engine.profile.collect()
+        timings = Timings(**rows, total=(time.perf_counter() - started) * 1e3)
+        point = self._next_point(timings, is_held=geometry.is_held)
+        left_out_too = (*plan.left_out, *self._lamps.left_out())
         return FrameResult(
             color=picture,
             light=self._light_message(frame, geometry, estimate, volume),
             world_from_camera=geometry.world_from_camera,
             tracking=geometry.tracking,
-            timings=Timings(**rows, total=(time.perf_counter() - started) * 1e3),
-            plan=structs.replace(plan, left_out=(*plan.left_out, *self._lamps.left_out())),
+            timings=timings,
+            plan=structs.replace(plan, left_out=left_out_too, point=point),
             notes=(*geometry.notes, *_notes(estimate)),
         )
 
     def _lost(self, frame: RgbdFrame, geometry: GeometryFrame, volume: Volume, started: float) -> FrameResult:
         """The camera's own picture and the last light: where it is not known, nothing can be drawn or learnt."""
+        self._wake()
         with self._engine.profile.stage("rendering"):
             picture = shown_picture(self._engine, self._camera, frame.color, geometry.measurement.radiance)
         left_out = tuple(LeftOut(effect=e.name, reason="the camera is lost", error_bound=255.0) for e in EFFECTS)
@@ -203,24 +163,36 @@ class Pipeline:
         smooth = denoise_radiance(self._engine, geometry.measurement, settings.denoise, settings.denoise_iterations)
         return scene_radiance(self._engine, smooth, geometry.exposure, "smooth_scene_radiance")
 
-    def _observe_indirect(self, geometry: GeometryFrame, volume: Volume, transfer: Transfer) -> Indirect | None:
-        """What surfaces send one another, if that is wanted."""
-        if self._settings.indirect == "none":
-            return None
-        engine, camera, rays, reach_m = self._engine, self._camera, self._sampler.rays, self._settings.reach_m
-        return observe_indirect(engine, camera, volume, geometry.surface, transfer, rays, reach_m)
+    def _holds(self, frame: RgbdFrame) -> bool:
+        """Whether what was made of the last frame holds for this one."""
+        return self._rest is not None and self._rest.holds(frame, self._lamps.lamps)
 
-    def _averages(
-        self, geometry: GeometryFrame, volume: Volume, transfer: Transfer, light: DeviceLight, indirect: Indirect | None
-    ) -> Averages | None:
-        """What pictures and their shading are on average, if virtual things are to match them."""
-        asked = self._settings.tone_mapping
-        if asked == "light" or (asked == "auto" and self._room_light.is_given):
-            return None
-        engine, camera, rays, reach_m = self._engine, self._camera, self._sampler.rays, self._settings.reach_m
-        radiance, surface = geometry.measurement.radiance, geometry.surface
-        frame = measure_averages(engine, camera, radiance, surface, transfer, volume, rays, light, indirect, reach_m)
-        return self._average_memory.update(frame, geometry.exposure)
+    def _sample(
+        self, geometry: GeometryFrame, volume: Volume, placed: list[Placed]
+    ) -> tuple[Sampled, dict[str, Omission]]:
+        """Transfer, and what surfaces send (7.3.3); what of the spine is left out of this frame."""
+        rest = self._rest
+        if rest is not None:
+            rest.place(placed)
+        if rest is None or rest.omission is None or not geometry.is_held:
+            return self._sample_anew(geometry, volume), {}
+        left_out = dict.fromkeys(HELD_STAGES, rest.omission)
+        kept = rest.held.sampled.get(rest.turn) if placed else Sampled(None, None)
+        if kept is None:
+            kept = self._sample_anew(geometry, volume)
+            rest.held.keep_sampled(rest.turn, kept)
+            return kept, left_out
+        self._sampler.pass_frame()
+        return kept, left_out | {"transfer_radiance": rest.omission}
+
+    def _sample_anew(self, geometry: GeometryFrame, volume: Volume) -> Sampled:
+        engine, camera, reach_m, surface = self._engine, self._camera, self._settings.reach_m, geometry.surface
+        pose, up = geometry.volume_from_camera, self._objects.up
+        transfer = self._sampler.transfer(volume, surface, pose, up, reach_m)
+        if self._settings.indirect == "none":
+            return Sampled(transfer, None)
+        rays = self._sampler.rays
+        return Sampled(transfer, observe_indirect(engine, camera, volume, surface, transfer, rays, reach_m))
 
     def _light_message(
         self, frame: RgbdFrame, geometry: GeometryFrame, estimate: LightEstimate, volume: Volume
@@ -230,37 +202,54 @@ class Pipeline:
 
     def place_object(self, object_id: str, mesh: Mesh, placement: Placement) -> tuple[str, ...]:
         """Put a mesh into the scene, in the place of one with the same id; returns notes. Raises ValueError."""
-        if self._objects is None:
-            others = [w for w in self._waiting if w[0] != object_id]
-            check_room((other for _, other, _ in others), mesh)
-            check_size(mesh, placement)
-            self._waiting = [*others, (object_id, mesh, placement)]
-        else:
-            self._objects.place(object_id, mesh, placement)
+        self._objects.place(object_id, mesh, placement)
+        self._wake()
         return mesh.notes
 
     def move_object(self, object_id: str, placement: Placement) -> None:
         """Give an object another place. Raises KeyError if there is none of that id."""
-        if self._objects is not None:
-            self._objects.move(object_id, placement)
-            return
-        index = self._waiting_index(object_id)
-        check_size(self._waiting[index][1], placement)
-        self._waiting[index] = (object_id, self._waiting[index][1], placement)
+        self._objects.move(object_id, placement)
 
     def remove_object(self, object_id: str) -> None:
         """Take an object away. Raises KeyError if there is none of that id."""
-        if self._objects is not None:
-            self._objects.remove(object_id)
-        else:
-            del self._waiting[self._waiting_index(object_id)]
+        self._objects.remove(object_id)
+        self._wake()
 
-    def set_preset(self, preset: str) -> None:
-        """Change the sampling preset from the next frame on. Raises ValueError for one that does not exist."""
-        sampling = sampling_of(preset)
-        if sampling != self._sampler.sampling:
-            self._sampler = self._make_sampler(sampling)
-            self._rest = Rest()
+    def set_quality(
+        self, preset: Preset, budget_ms: float | None = None, max_light_error_deg: float | None = None
+    ) -> None:
+        """Sample transfer in another way from the next frame on, or as a budget or a light error asks for.
+
+        Raises ValueError for a preset that does not exist, and where the device's front is not known.
+        """
+        asked = structs.replace(
+            self._wishes, preset=preset, budget_ms=budget_ms, max_light_error_deg=max_light_error_deg
+        )
+        control = control_for(self._device, asked)
+        self._sample_at(control.chosen.point if control else Point(preset=preset, rays=self._asked.rays))
+        self._control = control
+
+    def _next_point(self, timings: Timings, *, is_held: bool) -> OperatingPoint:
+        """What this frame's point was; the next frame's is settled by what this one took, unless little had to be made:
+        that says nothing of frames of which all has to be."""
+        if self._control is None:
+            return asked_for(self._wishes)
+        said = self._control.said
+        if is_held:
+            return said
+        self._control.observe(timings)
+        self._sample_at(self._control.chosen.point)
+        return said
+
+    def _sample_at(self, point: Point) -> None:
+        """Nothing is remembered from another point but the room and its light. Raises ValueError."""
+        wishes = point.wishes(self._wishes)
+        settings = read_wishes(wishes)
+        is_same = (settings.sampling, settings.rays) == (self._settings.sampling, self._settings.rays)
+        self._wishes, self._settings = wishes, settings
+        if not is_same:
+            self._sampler = self._make_sampler()
+            self._rest = self._make_rest()
 
     def scene_mesh(self, progress: Callable[[int, int], None] = lambda _done, _total: None) -> SceneMesh:
         """The surface fused so far as triangles. Raises MeshingError, one line, where there is none."""
@@ -273,19 +262,30 @@ class Pipeline:
 
     def close(self) -> None:
         """Give the device's memory back."""
-        if self._objects is not None:
-            self._objects.clear()
+        self._objects.clear()
         self._engine.close()
 
-    def _make_sampler(self, sampling: Sampling) -> TransferSampler:
-        """Transfer sampled from the start: nothing is remembered from another preset."""
-        return TransferSampler(self._engine, self._camera, sampling, self._settings.rays, self._settings.bands)
+    def _make_sampler(self) -> TransferSampler:
+        settings = self._settings
+        return TransferSampler(self._engine, self._camera, settings.sampling, settings.rays, settings.bands)
 
-    def _scene(self, geometry: GeometryFrame) -> tuple[Volume, SceneObjects]:
-        """The volume and the objects; the first frame says what is up."""
+    def _make_rest(self) -> Rest | None:
+        """None where everything is to be simulated."""
+        if self._settings.plan == "everything":
+            return None
+        given = self._asked.poses != "track"
+        return Rest(self._engine, self._camera, poses_are_given=given, period=self._sampler.period)
+
+    def _wake(self) -> None:
+        """Something that pictures do not show is new."""
+        if self._rest is not None:
+            self._rest.forget()
+
+    def _scene(self, geometry: GeometryFrame) -> Volume:
+        """The volume; the first frame says what is up for the objects."""
         volume = self._geometry.volume
         assert volume is not None
-        if self._objects is None:
+        if not self._objects.has_begun:
             camera_up, forward = -geometry.world_from_camera[:3, 1], geometry.world_from_camera[:3, 2]
             up = np.array(self._wishes.up or camera_up, np.float64)
             up /= np.linalg.norm(up)
@@ -293,36 +293,13 @@ class Pipeline:
             given = static_estimate(self._wishes, self._settings.bands, self._webxr_from_world)  # S2
             if given:
                 self._room_light.give(given)
-            self._objects = SceneObjects(self._engine, up)
-            for object_id, mesh, placement in self._waiting:
-                self._objects.place(object_id, mesh, placement)
-            self._waiting.clear()
-        return volume, self._objects
-
-    def _waiting_index(self, object_id: str) -> int:
-        names = [name for name, _, _ in self._waiting]
-        if object_id not in names:
-            raise KeyError(object_id)
-        return names.index(object_id)
+            self._objects.begin(up)
+        return volume
 
 
 def _notes(estimate: LightEstimate) -> tuple[str, ...]:
     return ("no usable surface has been seen yet, the light is unknown",) if estimate.std is None else ()
 
 
-_GIVEN = frozenset(
-    {
-        "view",
-        "objects",
-        "volume",
-        "rays",
-        "real_looks",
-        "shown",
-        "measurement",
-        "surface",
-        "transfer",
-        "indirect",
-        "light",
-        "averages",
-    }
-)
+HELD_STAGES = ("locate", "integrate", "raycast", "merge_depth", "estimate_light")
+"""Of the spine, what is not done where nothing has changed."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ _TRUSTED_DEPTH_M = 5.0
 _MARGIN_M = 0.15
 _LEAST_SIDE_M = 0.5
 
+T = TypeVar("T")
 Bounds = tuple[float, float, float, float, float, float]
 
 
@@ -49,13 +50,15 @@ class Settings:
     denoise_iterations: int
     plan: Literal["needed", "everything"]
     """Whether what would hardly be seen is left out."""
+    smooth_depth: bool
+    """Whether merged depth is smoothed once more (D''')."""
 
 
 def read_wishes(wishes: Wishes) -> Settings:
     """Settings for `wishes`. Raises ValueError, one line, for what this server cannot do."""
     reach_m = WHOLE_ROOM_M if wishes.ray_length_m is None else wishes.ray_length_m
     return Settings(
-        sampling=sampling_of(wishes.preset),
+        sampling=sampling_of(wishes),
         lamps="off" if wishes.as_thesis else wishes.lamps,
         rays=wishes.rays,
         bands=wishes.bands,
@@ -70,14 +73,34 @@ def read_wishes(wishes: Wishes) -> Settings:
         denoise=wishes.denoise,
         denoise_iterations=wishes.denoise_iterations,
         plan=wishes.plan,
+        smooth_depth=wishes.smooth_depth,
     )
 
 
-def sampling_of(preset: str) -> Sampling:
-    """How a preset samples transfer. Raises ValueError for one that does not exist."""
-    if preset not in PRESETS:
-        raise ValueError(f"preset {preset!r} is not available: use one of {', '.join(PRESETS)}")
-    return PRESETS[preset]
+def sampling_of(wishes: Wishes) -> Sampling:
+    """How the preset samples transfer, with what is wished otherwise.
+
+    Raises ValueError for a preset that does not exist, and for wishes that mean nothing to it.
+    """
+    if wishes.preset not in PRESETS:
+        raise ValueError(f"preset {wishes.preset!r} is not available: use one of {', '.join(PRESETS)}")
+    sampling = PRESETS[wishes.preset]
+    if sampling.image_space and (wishes.interleave not in (None, 1) or wishes.visibility_state):
+        raise ValueError(f"preset {wishes.preset} traces no rays that --interleave or --visibility-state could spare")
+    if not sampling.image_space and wishes.auxiliary_views is not None:
+        raise ValueError(f"preset {wishes.preset} looks into no --auxiliary-views: use gr15 or gr15fast")
+    return replace(
+        sampling,
+        stride=_or(wishes.stride, sampling.stride),
+        interleave=_or(wishes.interleave, sampling.interleave),
+        upsampling=_or(wishes.upsampling, sampling.upsampling),
+        visibility_state=_or(wishes.visibility_state, sampling.visibility_state),
+        views=_or(wishes.auxiliary_views, sampling.views),
+    )
+
+
+def _or(wished: T | None, usual: T) -> T:
+    return usual if wished is None else wished
 
 
 def bounds_seen(camera: CameraModel, frame: RgbdFrame, world_from_camera: NDArray[np.float64]) -> Bounds:

@@ -196,7 +196,7 @@ def _apply(pipeline: Pipeline, message: SceneControl, load_mesh: Callable[[bytes
             with _object_known(message.object):
                 pipeline.remove_object(message.object)
         case Quality():
-            pipeline.set_preset(message.preset)
+            pipeline.set_quality(message.preset, message.budget_ms, message.max_light_error_deg)
     return ()
 
 

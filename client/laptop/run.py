@@ -34,7 +34,7 @@ class Run:
         Raises UserError, DeviceError or MeshError, each with one clear line.
         """
         self._capture = capture
-        self._pipeline = _open_pipeline(device_name, capture.source.camera, capture.wishes)
+        self._pipeline = _open_pipeline(device_name, capture.source.camera, capture.wishes, note)
         try:
             place_objects(self._pipeline, capture.objects, note)
         except BaseException:
@@ -96,8 +96,14 @@ def object_id(number: int) -> str:
     return f"object-{number}"
 
 
-def _open_pipeline(device_name: str | None, camera: CameraModel, wishes: Wishes) -> Pipeline:
+def _open_pipeline(
+    device_name: str | None, camera: CameraModel, wishes: Wishes, note: Callable[[str], None]
+) -> Pipeline:
     device = open_device(device_name)
+    if wishes.preset == "auto":
+        from client.laptop.tune import ensure_front
+
+        ensure_front(device, note)
     try:
         return Pipeline(device, camera, wishes)
     except ValueError as error:

@@ -52,8 +52,11 @@ def merge_depth(
     measurement: Measurement,
     model: Surface,
     volume: Volume,
+    smooth: bool = True,
 ) -> Surface:
     """The hybrid geometry buffer, in buffers of its own. Its colour is `measurement.radiance`, pixel by pixel.
+
+    smooth: whether the median D''' is taken of D''.
 
     Labels: static where it is the volume's surface; dynamic where the sensor says otherwise, or the volume nothing;
     filled where the depth is neither's but the neighbourhood's median; none where nothing is known.
@@ -99,7 +102,10 @@ def merge_depth(
         "merge.cl", "merge_depth", groups, sensed, trusted, shade, volume.voxel_m, LAMBDA_INTENSITY, merged
     )  # eq. 4.3
     launch("merge.cl", "align_depth", groups, merged, shade, LAMBDA_INTENSITY, aligned)  # eq. 4.4
-    launch("merge.cl", "smooth_depth", groups, aligned, smoothed)  # eq. 4.5
+    if smooth:
+        launch("merge.cl", "smooth_depth", groups, aligned, smoothed)  # eq. 4.5
+    else:
+        smoothed = aligned
 
     surface = Surface(
         space.array("merged_positions", shape, cl_types.float4),

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
+from server.stages.auxiliary_views import VIEWS
 from server.stages.image_space import ImageSpaceTransfer
 from server.stages.image_space_rendering import RealLooks
-from server.stages.radiance_transfer import Directions, Transfer, direction_sets, transfer_radiance
+from server.stages.radiance_transfer import TURNS, Directions, Transfer, direction_sets, transfer_radiance
 from server.stages.raycast import Surface
 from server.stages.visibility_cache import VisibilityCaches
 from server.stages.visibility_state import VisibilityState
@@ -43,6 +44,8 @@ class Sampling:
     always the same: light from several frames is nearer to the truth, shading of a still view is not quite still."""
     image_space: bool = False
     """A7, A8: visibility is looked up in depth pictures, not traced; A3, A4 and A6 are about rays, and do not apply."""
+    views: int = VIEWS
+    """Of these depth pictures, besides the camera's own."""
 
     def __post_init__(self) -> None:
         if self.image_space and (self.interleave > 1 or self.visibility_state):
@@ -80,12 +83,21 @@ class TransferSampler:
         self._caches = VisibilityCaches(engine, sampling.interleave) if sampling.interleave > 1 else None
         self._state: VisibilityState | None = None
         self._frame = -1
-        self._image_space = ImageSpaceTransfer(engine, self.rays) if sampling.image_space else None
+        self._image_space = ImageSpaceTransfer(engine, self.rays, sampling.views) if sampling.image_space else None
 
     @property
     def looks(self) -> RealLooks | None:
         """What the last transfer looked into; None where rays are traced."""
         return self._image_space.looks if self._image_space else None
+
+    @property
+    def period(self) -> int:
+        """Frames after which a still view is sampled the same again; one of subsets needs as many for itself."""
+        return (TURNS if self.sampling.turning else 1) * self.sampling.interleave
+
+    def pass_frame(self) -> None:
+        """A frame that does without transfer has its turn all the same."""
+        self._frame += 1
 
     def transfer(
         self,

@@ -5,12 +5,10 @@ Its guests are real in the true picture and virtual in ours. Light is of exactly
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import msgspec
 import numpy as np
 
-from client.laptop.synthetic.export import guest_ply
+from client.laptop.synthetic.export import write_guests
 from client.laptop.synthetic.source import SyntheticSource, open_synthetic
 from server.evaluation.composite_truth import CompositeTruth
 from server.evaluation.flip import Codes
@@ -74,12 +72,3 @@ def stage_truth(bare: SyntheticSource, with_guests: SyntheticSource) -> Composit
         for picture, truth in zip(pictures, exact, strict=True)
     ]
     return CompositeTruth(pictures, [truth.radiance for truth in exact], [truth.guest for truth in exact], baseline)
-
-
-def write_guests(folder: Path, source: SyntheticSource) -> list[Path]:
-    """Meshes of a source's guests in world coordinates."""
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{guest.name}.ply" for guest in source.guests]
-    for path, guest in zip(paths, source.guests, strict=True):
-        path.write_bytes(guest_ply(guest))
-    return paths

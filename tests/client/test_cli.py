@@ -55,7 +55,7 @@ def assert_one_line(done: subprocess.CompletedProcess[str], status: int, words: 
         (["run", TABLE, "--out", "{tmp}", "--bands", "9"], "--bands"),
         (["run", TABLE, "--out", "{tmp}", "--wrong"], "--wrong"),
         (["run", TABLE, "--out", "{tmp}", "--frames", "0:9"], "0:4"),
-        (["run", TABLE, "--out", "{tmp}", "--preset", "auto"], "not built yet"),
+        (["run", TABLE, "--out", "{tmp}", "--preset", "auto", "--rays", "9"], "leave one out"),
         (["stream", TABLE], "--server"),
         (["stream", TABLE, "--server", "localhost:1", "--device", "x"], "probeless serve --device"),
         (["stream", TABLE, "--server", "http://127.0.0.1:9", "--mesh"], "say where with --out"),
@@ -170,7 +170,7 @@ def test_interrupt_ends_quietly_with_130(tmp_path: Path) -> None:
 def test_an_error_of_the_program_itself_is_told_too(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("client.options.prepare", None)
+    monkeypatch.setattr("client.cli.prepare", None)
     assert run_command(["run", "x", "--out", "y"]) == 1
     error = capsys.readouterr().err
     assert error.startswith("probeless: internal error, TypeError: ")

@@ -134,11 +134,13 @@ REFUSED = [
     ({"robustness": "normals,normals_printed"}, "--robustness"),
     ({"as_thesis": True, "robustness": "normals"}, "--as-thesis"),
     ({"exposure": "given"}, "--exposure"),
-]
-UNBUILT = [
-    {"preset": "auto"},
-    {"budget_ms": 40.0},
-    {"max_light_error": 3.0},
+    ({"upsampling": "nearest"}, "--upsampling"),
+    ({"interleave": 3}, "--interleave"),
+    ({"budget_ms": 0.0}, "--budget-ms"),
+    ({"max_light_error": 200.0}, "--max-light-error"),
+    ({"budget_ms": 40.0, "preset": "rm"}, "--preset is what"),
+    ({"budget_ms": 40.0, "rays": 81}, "--rays is what"),
+    ({"preset": "auto", "stride": 2}, "--stride is what"),
 ]
 
 
@@ -149,11 +151,29 @@ def test_values_that_cannot_be(said: dict, words: str, source: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("said", UNBUILT, ids=str)
-def test_what_is_not_built_yet_names_the_alternative(said: dict, source: str) -> None:
-    with pytest.raises(OptionError, match=r"is not built yet; \w+") as caught:
-        prepare(CaptureOptions(source, **said))
-    assert "\n" not in str(caught.value)
+@pytest.mark.parametrize(
+    ("said", "chosen_by"),
+    [
+        ({"preset": "auto"}, (None, None)),
+        ({"budget_ms": 40.0}, (40.0, None)),
+        ({"max_light_error": 3.0}, (None, 3.0)),
+        ({"preset": "auto", "budget_ms": 40.0, "max_light_error": 3.0}, (40.0, 3.0)),
+    ],
+    ids=str,
+)
+def test_a_budget_leaves_the_preset_to_the_server(
+    said: dict, chosen_by: tuple[float | None, float | None], source: str
+) -> None:
+    wishes = prepare(CaptureOptions(source, **said)).wishes
+    assert (wishes.preset, wishes.budget_ms, wishes.max_light_error_deg) == ("auto", *chosen_by)
+
+
+def test_how_transfer_is_sampled_is_wished_only_where_it_was_said(source: str) -> None:
+    usual = prepare(CaptureOptions(source)).wishes
+    assert (usual.stride, usual.interleave, usual.upsampling) == (None, None, None)
+    said = {"stride": 2, "interleave": 4, "upsampling": "bicubic", "visibility_state": True, "smooth_depth": False}
+    wishes = prepare(CaptureOptions(source, preset="rm", **said)).wishes
+    assert {name: getattr(wishes, name) for name in said} == said
 
 
 @pytest.mark.parametrize("albedo", ["constant", "estimated"])

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from msgspec import structs
 from numpy.typing import NDArray
 
 from client.laptop.source import open_source
@@ -47,7 +48,7 @@ def test_the_presets_are_the_thesis_s() -> None:
     with pytest.raises(ValueError, match="image-space"):
         Sampling(4, interleave=4, image_space=True)
     with pytest.raises(ValueError, match="best"):
-        sampling_of("best")
+        sampling_of(structs.replace(Wishes(), preset="best"))
 
 
 @pytest.mark.parametrize("moving", [False, True])
@@ -125,7 +126,7 @@ def test_every_preset_runs_and_can_be_left(device: Device) -> None:
     pipeline = Pipeline(device, source.camera, wishes)
     pipeline.place_object("a", shape_of(trimesh.creation.box((0.1, 0.1, 0.1))), Placement(position_m=(0.0, 0.0, 0.0)))
     for number, preset in enumerate([*PRESETS, "art4"]):
-        pipeline.set_preset(preset)
+        pipeline.set_quality(preset)
         for again in range(2):
             result = pipeline.process(source[2 * number + again])
             assert np.isfinite(result.light.sh).all()

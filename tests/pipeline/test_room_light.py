@@ -102,7 +102,7 @@ def test_presets_can_be_changed_on_the_way(
     """Pools lie elsewhere then, and the window begins anew; coming back too."""
     pipeline = Pipeline(device, table.camera, wishes_for(table, albedo="estimated", indirect="observed"))
     for number, frame in enumerate(frames):
-        pipeline.set_preset(other if number in (2, 3) else "reg4")
+        pipeline.set_quality(other if number in (2, 3) else "reg4")
         light = pipeline.process(frame).light
         assert np.isfinite(light.sh).all()
         assert light.sh[0][1] > 0

@@ -22,6 +22,7 @@ from protocol.messages import (
     Light,
     MeshPart,
     MoveObject,
+    OperatingPoint,
     PlaceObject,
     Plan,
     Quality,
@@ -83,7 +84,7 @@ CLIENT: dict[str, ClientMessage] = {
     "place_object": PlaceObject(request=1, object="sofa", format="glb", data=b"glTF\x02", position_m=(0.5, 0.25, 1.5)),
     "move_object": MoveObject(request=2, object="sofa", position_m=(0.0, 0.0, 1.0), scale=2.0, yaw_deg=-90.0),
     "remove_object": RemoveObject(request=3, object="sofa"),
-    "quality": Quality(request=4, preset="gr15fast"),
+    "quality": Quality(request=4, preset="auto", budget_ms=40.0),
     "request_mesh": RequestMesh(request=5),
     "client_bye": Bye(reason="the sequence is over"),
 }
@@ -102,6 +103,12 @@ SERVER: dict[str, ServerMessage] = {
             left_out=(
                 LeftOut(effect="shadow", reason="no object is near a surface", error_bound=0.5),
                 LeftOut(effect="gloss", reason="not modelled", error_bound=None),
+            ),
+            point=OperatingPoint(
+                settings="--preset reg8 --rays 49",
+                reason="the most accurate that is expected within the budget of 150 ms",
+                expected_ms=131.5,
+                light_error_deg=3.25,
             ),
         ),
         notes=("depth is missing in 31 % of the pixels",),

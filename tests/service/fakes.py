@@ -91,8 +91,8 @@ class FakePipeline:
         self.lab.log.append(("remove", object_id))
         self.objects.remove(object_id)
 
-    def set_preset(self, preset: str) -> None:
-        self.lab.log.append(("preset", preset))
+    def set_quality(self, preset: str, budget_ms: float | None, max_light_error_deg: float | None) -> None:
+        self.lab.log.append(("preset", preset, budget_ms, max_light_error_deg))
 
     def scene_mesh(self) -> SceneMesh:
         self.lab.log.append(("mesh",))

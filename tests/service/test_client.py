@@ -102,7 +102,7 @@ def test_objects_are_placed_moved_and_removed(server, lab) -> None:
         placed = await client.place_object("chair", "glb", b"mesh", (1.0, 2.0, 3.0), 2.0, 45.0)
         assert (placed.error, placed.notes) == (None, ("chair has no texture",))
         assert (await client.move_object("chair", (0.0, 0.0, 0.0))).error is None
-        assert (await client.set_preset("rm")).error is None
+        assert (await client.set_quality("rm")).error is None
         assert (await client.remove_object("chair")).error is None
         assert "no object" in (await client.remove_object("chair")).error
         assert "no GLB" in (await client.place_object("junk", "glb", b"no mesh")).error

@@ -55,7 +55,7 @@ def test_a_session_that_has_fused_nothing_says_so_and_goes_on(server) -> None:
     async def talk(client: StreamClient) -> None:
         with pytest.raises(ClientError, match="no frame has been fused yet"):
             await fetched(client)
-        assert (await client.set_preset("rm")).error is None
+        assert (await client.set_quality("rm")).error is None
 
     with_client(server.url, talk)
 

@@ -61,6 +61,15 @@ def guest_ply(guest: Guest) -> bytes:
     return _ply(triangles_of([guest.solid]), guest.srgb)
 
 
+def write_guests(folder: Path, source: SyntheticSource) -> list[Path]:
+    """Files with the meshes of a source's guests in world coordinates. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{guest.name}.ply" for guest in source.guests]
+    for path, guest in zip(paths, source.guests, strict=True):
+        path.write_bytes(guest_ply(guest))
+    return paths
+
+
 def linear16(radiance: NDArray[np.float64]) -> NDArray[np.uint16]:
     """[h, w, 3] the picture of linear radiance, 1 at 65535."""
     return (np.clip(radiance, 0, 1) * 65535).round().astype(np.uint16)

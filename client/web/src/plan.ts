@@ -2,15 +2,17 @@
 
 import { byId, make } from "./dom";
 import type { LeftOut, Plan } from "./protocol";
-import { describeBound, plain } from "./words";
+import { describeBound, describePoint, plain } from "./words";
 
+const point = byId("plan-point");
 const run = byId("plan-run");
 const leftOut = byId("plan-left-out");
 let shown = "";
 
 /** Show a plan; the page is touched only when it differs from the one before. */
 export function showPlan(plan: Plan): void {
-  const key = JSON.stringify(plan);
+  point.textContent = describePoint(plan.point ?? null); // its expectation changes with every frame
+  const key = JSON.stringify([plan.run, plan.left_out]);
   if (key === shown) return;
   shown = key;
   run.replaceChildren(...plan.run.map((effect) => make("li", "chip", plain(effect))));

@@ -49,8 +49,28 @@ export interface CameraModel {
 
 /** What a capturing client asks of its session; the command line's options of the same names. */
 export interface Wishes {
+  /**
+   * `auto`: the server chooses where and how transfer is sampled, and the rays, from what its device was measured to
+   * take and to err (`probeless tune`).
+   */
   preset?: "art1" | "art4" | "art8" | "auto" | "gr15" | "gr15fast" | "reg4" | "reg8" | "rm";
+  /** Of `auto`: a frame shall take no longer. */
+  budget_ms?: number | null;
+  /** Of `auto`: the fastest point whose dominant direction errs by no more, where the device was measured. */
+  max_light_error_deg?: number | null;
   rays?: number;
+  /** A1: every how many pixels transfer is sampled; null, as of the four below: what the preset says. */
+  stride?: number | null;
+  /** A3, A4: a frame traces one of so many subsets of the directions; of presets that trace rays. */
+  interleave?: 1 | 2 | 4 | 8 | null;
+  /** A5. */
+  upsampling?: "bicubic" | "bilateral" | null;
+  /** A6: no rays where the volume is known to be open; of presets that trace rays. */
+  visibility_state?: boolean | null;
+  /** R5, A7: depth pictures from all around that visibility is looked up in; of GR15 and GR15FAST. */
+  auxiliary_views?: number | null;
+  /** G3: D''', the median of the merged depth; without it, D'' is the last. */
+  smooth_depth?: boolean;
   /** null: the whole room. */
   ray_length_m?: number | null;
   bands?: number;
@@ -177,11 +197,13 @@ export interface RemoveObject {
   object: string;
 }
 
-/** Change the preset of the running session; acknowledged. */
+/** Change the preset of the running session, or the budget by which it is chosen; acknowledged. */
 export interface Quality {
   type: "quality";
   request: number;
   preset: "art1" | "art4" | "art8" | "auto" | "gr15" | "gr15fast" | "reg4" | "reg8" | "rm";
+  budget_ms?: number | null;
+  max_light_error_deg?: number | null;
 }
 
 /** Ask for the surface fused so far, as files; answered by the parts of each and then acknowledged. */
@@ -225,10 +247,23 @@ export interface LeftOut {
   error_bound: number | null;
 }
 
-/** Which effects ran for a frame, in order, and which did not. */
+/** Where and how finely a frame was sampled, and why. */
+export interface OperatingPoint {
+  /** As options of the command line. */
+  settings: string;
+  reason: string;
+  /** What a frame was expected to take; of points that were chosen, like the next. */
+  expected_ms: number | null;
+  /** Error of the dominant direction where the device was measured. */
+  light_error_deg: number | null;
+}
+
+/** Which effects ran for a frame, in order, which did not, and how finely it was sampled. */
 export interface Plan {
   run: Array<string>;
   left_out: Array<LeftOut>;
+  /** null: a camera that is lost samples nothing. */
+  point: OperatingPoint | null;
 }
 
 /** The finished picture of one frame. */

@@ -1,5 +1,6 @@
 // Numbers and names of the protocol in words.
 
+import type { OperatingPoint } from "./protocol";
 import type { Vector3 } from "./sh";
 
 const degrees = (rad: number): number => Math.round((rad * 180) / Math.PI);
@@ -25,6 +26,14 @@ export function describeBound(bound: number | null): string {
   const most = `at most ${number(bound)}/255`;
   if (bound < 0.5) return `invisible: ${most}`;
   return bound <= 3 ? `hardly visible: ${most}` : `may be visible: ${most}`;
+}
+
+/** Where and how finely a frame was sampled, and why. */
+export function describePoint(point: OperatingPoint | null): string {
+  if (point === null) return "none: the camera is lost";
+  const expected = point.expected_ms == null ? "" : `, ${milliseconds(point.expected_ms)} ms expected`;
+  const error = point.light_error_deg == null ? "" : `, light off by ${number(point.light_error_deg)}° where measured`;
+  return `${point.settings} (${point.reason})${expected}${error}`;
 }
 
 /** Three significant digits, without an exponent where that is short enough to read. */

@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 import { pause_ms, streamUrl } from "../src/connection";
 import { FrameRate } from "../src/rate";
-import { describeBound, describeDirection, milliseconds, number, plain } from "../src/words";
+import { describeBound, describeDirection, describePoint, milliseconds, number, plain } from "../src/words";
 
 test("directions", () => {
   assert.equal(describeDirection([0, -1, 0]), "from behind the camera, 90° up");
@@ -20,6 +20,16 @@ test("bounds", () => {
   assert.match(describeBound(0.31), /^invisible: at most 0\.31\/255$/);
   assert.match(describeBound(2), /^hardly visible/);
   assert.match(describeBound(40), /^may be visible: at most 40\/255$/);
+});
+
+test("operating points", () => {
+  const point = { settings: "--preset reg8 --rays 49", reason: "asked for" };
+  assert.equal(describePoint(point), "--preset reg8 --rays 49 (asked for)");
+  assert.equal(
+    describePoint({ ...point, expected_ms: 131.5, light_error_deg: 3.25 }),
+    "--preset reg8 --rays 49 (asked for), 132 ms expected, light off by 3.25° where measured",
+  );
+  assert.equal(describePoint(null), "none: the camera is lost");
 });
 
 test("numbers", () => {

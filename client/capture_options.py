@@ -1,0 +1,158 @@
+"""The options that commands with a SOURCE share, declared once: a command takes them all as one `CaptureOptions`."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, get_args, get_type_hints
+
+import typer
+
+from protocol.limits import MAX_SH_BANDS
+from protocol.messages import Preset as PresetName
+from protocol.messages import Robustness as RobustnessName
+
+PRESETS = get_args(PresetName)
+DENOISE = ("none", "bilateral", "tv_l1")
+ROBUSTNESS = get_args(RobustnessName)
+
+SourceArgument = Annotated[
+    str, typer.Argument(metavar="SOURCE", help="data-set folder, synthetic:NAME, recording or oak")
+]
+Frames = Annotated[str | None, typer.Option(metavar="A:B", help="half-open range of positions in the source")]
+PosesOption = Annotated[
+    str | None, typer.Option(metavar="given|track|refine", help="default: given where there are any")
+]
+VolumeOption = Annotated[
+    str | None, typer.Option(metavar="x0,y0,z0,x1,y1,z1", help="metres; default: what the source sees")
+]
+Voxel = Annotated[float | None, typer.Option(metavar="M", help="voxel side in metres; default: fits the volume")]
+Preset = Annotated[
+    str | None, typer.Option(metavar="|".join(PRESETS), help="where and how transfer is sampled; default: reg4")
+]
+Rays = Annotated[int | None, typer.Option(min=4, max=1024, help="visibility rays per sample; default: 81")]
+Stride = Annotated[
+    int | None, typer.Option(min=1, max=16, metavar="PX", help="of samples; default, as of the next four: the preset's")
+]
+Interleave = Annotated[int | None, typer.Option(metavar="1|2|4|8", help="frames that share the directions")]
+Upsampling = Annotated[str | None, typer.Option(metavar="bilateral|bicubic", help="of shading, to all pixels")]
+VisibilityState = Annotated[
+    bool | None, typer.Option("--visibility-state/--no-visibility-state", help="no rays where the volume is open")
+]
+AuxiliaryViews = Annotated[
+    int | None, typer.Option(min=16, max=4096, metavar="N", help="depth pictures that GR15 looks visibility up in")
+]
+SmoothDepth = Annotated[bool, typer.Option("--smooth-depth/--no-smooth-depth", help="the last median of merged depth")]
+RayLength = Annotated[
+    str | None, typer.Option(metavar="M|room", help="how far occluders are looked for; default: room")
+]
+Bands = Annotated[int, typer.Option(min=2, max=MAX_SH_BANDS, help="spherical-harmonics bands")]
+Albedo = Annotated[str | None, typer.Option(metavar="constant|estimated", help="default: estimated")]
+Indirect = Annotated[str | None, typer.Option(metavar="none|observed", help="default: observed")]
+AsThesis = Annotated[bool, typer.Option("--as-thesis", help="--ray-length 0.1 --albedo constant --indirect none")]
+Denoise = Annotated[
+    str, typer.Option(metavar="|".join(DENOISE), help="of the lightness that the light is estimated from")
+]
+DenoiseIterations = Annotated[int, typer.Option(min=1, max=1000, help="of TV-L1")]
+Object = Annotated[
+    list[str] | None, typer.Option(metavar="FILE[@x,y,z[,scale[,yaw]]]", help="virtual object; may be repeated")
+]
+Up = Annotated[str | None, typer.Option(metavar="x,y,z", help="default: what the source says, else the camera's -y")]
+LightFile = Annotated[str | None, typer.Option("--light", metavar="FILE", help="use this light, estimate none")]
+Panorama = Annotated[str | None, typer.Option(metavar="FILE", help="light from a panorama")]
+Lamps = Annotated[
+    str | None, typer.Option(metavar="on|off", help="look for lights inside the room; default: where called for")
+]
+Exposure = Annotated[
+    str | None, typer.Option(metavar="auto|constant", help="default: auto, as frames say it, else estimated")
+]
+Robustness = Annotated[
+    str | None,
+    typer.Option(metavar="LIST|none", help=f"of {', '.join(ROBUSTNESS)}; default: openness,memory,outliers"),
+]
+Edges = Annotated[
+    str | None, typer.Option(metavar="smooth|hard", help="of virtual things; hard: as in point-sampled pictures")
+]
+ToneMapping = Annotated[
+    str | None,
+    typer.Option(
+        metavar="light|average", help="what virtual things' brightness rests on; default: average, light with --light"
+    ),
+]
+LightColor = Annotated[
+    str | None, typer.Option(metavar="estimated|white", help="white: the light without its colours, as the thesis")
+]
+Plan = Annotated[
+    str | None, typer.Option(metavar="needed|everything", help="everything: also what would hardly be seen")
+]
+Mesh = Annotated[bool, typer.Option("--mesh", help="write mesh.ply and mesh.glb")]
+BudgetMs = Annotated[float | None, typer.Option(metavar="N", help="choose the operating point for this time")]
+MaxLightError = Annotated[float | None, typer.Option(metavar="DEG", help="choose it for this light error")]
+DeviceOption = Annotated[str | None, typer.Option(metavar="NAME", help="part of an OpenCL device's name")]
+
+
+@dataclass(frozen=True)
+class CaptureOptions:
+    """The shared options as they were typed; None where nothing was said."""
+
+    source: SourceArgument
+    frames: Frames = None
+    poses: PosesOption = None
+    volume: VolumeOption = None
+    voxel: Voxel = None
+    preset: Preset = None
+    rays: Rays = None
+    stride: Stride = None
+    interleave: Interleave = None
+    upsampling: Upsampling = None
+    visibility_state: VisibilityState = None
+    auxiliary_views: AuxiliaryViews = None
+    smooth_depth: SmoothDepth = True
+    ray_length: RayLength = None
+    bands: Bands = 4
+    albedo: Albedo = None
+    indirect: Indirect = None
+    as_thesis: AsThesis = False
+    denoise: Denoise = "none"
+    denoise_iterations: DenoiseIterations = 20
+    object: Object = None
+    up: Up = None
+    light: LightFile = None
+    panorama: Panorama = None
+    lamps: Lamps = None
+    exposure: Exposure = None
+    robustness: Robustness = None
+    edges: Edges = None
+    tone_mapping: ToneMapping = None
+    light_color: LightColor = None
+    plan: Plan = None
+    budget_ms: BudgetMs = None
+    max_light_error: MaxLightError = None
+
+
+def capturing(command: Callable[..., None]) -> Callable[..., None]:
+    """A command whose first parameter is a `CaptureOptions`, as one that takes each of its fields: what typer reads."""
+    hints = get_type_hints(CaptureOptions, include_extras=True)
+    shared = [
+        inspect.Parameter(
+            field.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            annotation=hints[field.name],
+            default=inspect.Parameter.empty if field.name == "source" else field.default,
+        )
+        for field in fields(CaptureOptions)
+    ]
+    own = list(inspect.signature(command, eval_str=True).parameters.values())[1:]
+    own = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in own]
+    names = [parameter.name for parameter in shared]
+
+    def run(**said: Any) -> None:
+        options = CaptureOptions(**{name: said.pop(name) for name in names})
+        command(options, **said)
+
+    parameters = [shared[0], *own, *shared[1:]]
+    run.__name__, run.__doc__ = command.__name__, command.__doc__
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run

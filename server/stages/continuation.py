@@ -8,7 +8,7 @@ changed one at a time, a few tries a frame, and kept where the light they leave 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +41,8 @@ MOST_GROWTH = 1.5
 """Beyond a side a plane goes on for so many times the longer side of what was seen of it, at most."""
 TRIES, RESUME_FRAMES, RETRY_FRAMES = 40, 4, 16
 """Extents tried at a time from then on, and how often: while new planes are not settled, and while all are."""
+TRIES_OF_A_TABLE = 8
+"""What making one plane's table takes, in tries."""
 SETTLED_PASSES = 2
 """Times that every side is settled before the extents are believed."""
 BELIEVED = 0.9
@@ -52,6 +54,7 @@ LEAST_FRAMES = 2
 """Frames before extents are tried: one picture can be explained in too many ways."""
 MOST_ROWS = 700
 """Pools that extents are judged by."""
+_STEPS = np.array(STEPS_M)
 _BEHIND_M = 0.05  # a camera that measures so much farther looked through
 
 
@@ -83,6 +86,8 @@ class Continuation:
         self._views: deque[tuple[Floats, Floats]] = deque(maxlen=VIEWS)
         self._frames = 0
         self._turn, self._passes, self._was_settled = 0, 0, False
+        self._trial: _Trial | None = None
+        self._tries, self._share = 0, 0
         self._boxes: list[Floats] = []
         self.explained = 1.0
 
@@ -114,23 +119,26 @@ class Continuation:
             if len(self.planes) != known:
                 self._turn, self._passes = 0, 0
 
-    def try_extents(self, judged: Judged) -> bool:
+    def try_extents(self, judge: Callable[[], Judged]) -> bool:
         """Try some other extents; whether what is taken for true has changed.
 
-        The extents explain the pictures together, so none is believed before all have been settled twice.
+        The extents explain the pictures together, so none is believed before all have been settled twice. But for the
+        first ones, what is tried at a time is spread evenly over the frames until the next time: none is a slow one.
+        judge: gives the pools to judge by; asked once each time.
         """
-        wait = 1 if not self._was_settled else RETRY_FRAMES if self.is_settled else RESUME_FRAMES
-        if not self.planes or self._frames < LEAST_FRAMES or self._frames % wait:
+        if not self.planes or self._frames < LEAST_FRAMES:
             return False
-        sides = SIDES * len(self.planes)
-        tries = TRIES if self._was_settled else FIRST_TRIES
-        trial = _Trial(self.planes, judged, self._least_gain)
-        while tries > 0:
-            tries -= trial.settle(*divmod(self._turn, SIDES))
-            self._turn = (self._turn + 1) % sides
-            self._passes += self._turn == 0
-            if self._turn == 0 and self._passes >= SETTLED_PASSES:
-                break
+        wait = 1 if not self._was_settled else RETRY_FRAMES if self.is_settled else RESUME_FRAMES
+        if self._trial is None or not self._trial.is_of(self.planes):
+            self._trial = None
+            if self._frames % wait:
+                return False
+            self._tries = TRIES if self._was_settled else FIRST_TRIES
+            self._trial = _Trial(self.planes, judge(), self._least_gain)
+            self._share = -(-(self._trial.unprepared * TRIES_OF_A_TABLE + self._tries) // wait)
+        if not self._go_on(self._trial):
+            return False
+        trial, self._trial = self._trial, None
         if self._turn != 0 or self._passes < SETTLED_PASSES:
             return False
         self._was_settled = True
@@ -138,6 +146,21 @@ class Continuation:
         believed = self.planes if self.explained < BELIEVED else []
         before, self._boxes = self._boxes, [plane.box for plane in believed]
         return len(before) != len(self._boxes) or not np.array_equal(before, self._boxes)
+
+    def _go_on(self, trial: _Trial) -> bool:
+        """A frame's share of a trial; whether it is through."""
+        left = self._share
+        while trial.unprepared and left > 0:
+            trial.prepare()
+            left -= TRIES_OF_A_TABLE
+        while not trial.unprepared and left > 0:
+            tried = trial.settle(*divmod(self._turn, SIDES))
+            left, self._tries = left - tried, self._tries - tried
+            self._turn = (self._turn + 1) % (SIDES * len(self.planes))
+            self._passes += self._turn == 0
+            if self._tries <= 0 or (self._turn == 0 and self._passes >= SETTLED_PASSES):
+                return True
+        return False
 
     def arrays(self) -> PlaneArrays:
         """What is continued, for the device."""
@@ -212,17 +235,28 @@ class _Trial:
         self._least_gain = least_gain
         self._judged = judged
         self._open = judged.transfer.sum(axis=1)
-        steps = np.array(STEPS_M)
-        directions = spokes().reshape(-1, 3)
-        self._needed = [
-            [
-                np.searchsorted(steps, side).astype(np.uint8)
-                for side in plane.beyond(judged.positions, directions, LEAST_M)
-            ]
-            for plane in planes
-        ]
-        self._hidden = [self._hidden_by(k, plane.steps) for k, plane in enumerate(planes)]
-        self.misfit = self._misfit_of(np.logical_or.reduce(self._hidden))
+        self._needed: list[list[NDArray[np.uint8]]] = []
+        self._hidden: list[NDArray[np.bool_]] = []
+        self.misfit = np.inf
+
+    @property
+    def unprepared(self) -> int:
+        """Planes without a table of what they would hide; what is tried needs all."""
+        return len(self._planes) - len(self._needed)
+
+    def is_of(self, planes: list[PlanePatch]) -> bool:
+        """Whether these are the planes, and they are as they were."""
+        return self._planes is planes
+
+    def prepare(self) -> None:
+        """Make the next plane's table."""
+        number = len(self._needed)
+        plane = self._planes[number]
+        beyond = plane.beyond(self._judged.positions, spokes().reshape(-1, 3), LEAST_M)
+        self._needed.append([np.searchsorted(_STEPS, side).astype(np.uint8) for side in beyond])
+        self._hidden.append(self._hidden_by(number, plane.steps))
+        if not self.unprepared:
+            self.misfit = self._misfit_of(np.logical_or.reduce(self._hidden))
 
     def misfit_of_none(self) -> float:
         """The same where no plane goes on."""

@@ -140,7 +140,7 @@ class LobeEstimator:
         if self.continuation:
             self._look_around(self.continuation, camera, shot.volume_from_camera, self._engine.download(depth_m))
             before = self.continuation.explained
-            if self.continuation.try_extents(self._judged()):
+            if self.continuation.try_extents(self._judged):
                 self._understand(anew=self.continuation.explained < UNDERSTOOD * before)
                 window.hide(self._kept.frames, self.continuation.arrays())
                 for held, frame in self._kept.frames.items():

@@ -18,7 +18,18 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import Pipeline
 from server.stages.cell_transfer import PoolGrid, PoolWindow
-from server.stages.continuation import LEAST_M, MOST_GROWTH, NO_PLANES, Continuation, Judged, _Trial, spokes
+from server.stages.continuation import (
+    LEAST_M,
+    MOST_GROWTH,
+    NO_PLANES,
+    RETRY_FRAMES,
+    TRIES,
+    TRIES_OF_A_TABLE,
+    Continuation,
+    Judged,
+    _Trial,
+    spokes,
+)
 from server.stages.light_model import LightModel
 from server.stages.lobe_estimator import LobeEstimator
 from tests.analytic import Floats
@@ -31,7 +42,7 @@ CAMERA = CameraModel(width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
 def settled(continuation: Continuation, judged: Judged) -> None:
     """Let extents be tried until they are believed, or not."""
     for _ in range(10):
-        continuation.try_extents(judged)
+        continuation.try_extents(lambda: judged)
 
 
 def looking(points: Floats, normals: Floats) -> Continuation:
@@ -122,11 +133,41 @@ def test_nothing_is_believed_that_explains_little() -> None:
     assert continuation.arrays()[0].shape[0] == 0
 
 
+def test_later_trials_are_spread_over_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is tried from then on is about the same for every frame, and as much in all."""
+    points, normals, judged = shaded_corner(1.0)
+    continuation = looking(points, normals)
+    settled(continuation, judged)
+    work: list[int] = []
+    prepare, settle = _Trial.prepare, _Trial.settle
+
+    def counted_prepare(trial: _Trial) -> None:
+        work[-1] += TRIES_OF_A_TABLE
+        prepare(trial)
+
+    def counted_settle(trial: _Trial, plane: int, side: int) -> int:
+        tried = settle(trial, plane, side)
+        work[-1] += tried
+        return tried
+
+    monkeypatch.setattr(_Trial, "prepare", counted_prepare)
+    monkeypatch.setattr(_Trial, "settle", counted_settle)
+    asked = []
+    for _ in range(3 * RETRY_FRAMES):
+        continuation._frames += 1
+        work.append(0)
+        continuation.try_extents(lambda: asked.append(1) or judged)
+    whole = len(continuation.planes) * TRIES_OF_A_TABLE + TRIES
+    assert 2 <= len(asked) <= 4
+    assert max(work) <= whole / RETRY_FRAMES + TRIES_OF_A_TABLE + 4
+    assert sum(work) >= 2 * len(continuation.planes) * TRIES_OF_A_TABLE
+
+
 def test_the_first_frame_is_left_alone() -> None:
     points, normals, judged = shaded_corner(1.0)
     continuation = Continuation()
     continuation.find(points, normals)
-    assert not continuation.try_extents(judged)
+    assert not continuation.try_extents(lambda: judged)
     assert not continuation.is_settled
 
 

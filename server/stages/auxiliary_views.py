@@ -33,6 +33,13 @@ DISTANCE = 50.0
 _SET_STEP = 8  # samples so far apart along an axis have the same directions
 LEAST_TURN = float(np.cos(np.deg2rad(3.0)))
 """The view from the dominant light is drawn anew once the light has turned by 3 degrees."""
+GROWTH = 0.02
+"""A view is out of date once the volume has so many more bricks than it was drawn of, as a share: whoever enters a room
+sees much of it for the first time within a second, and light would come through it."""
+YOUNG_FRAMES = 16
+"""Likewise a view of a volume of fewer frames, once there are twice as many: surface of a few noisy frames has holes."""
+MOST_PER_FRAME = 128
+"""Views that a frame draws at the most, where many are out of date."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +76,8 @@ class ViewsAround:
     """The views of one session and volume. Owned by one thread."""
 
     def __init__(self, engine: Engine, count: int = VIEWS, per_frame: int | None = None) -> None:
-        """`per_frame`: views drawn anew each frame, in turn, after the first; None draws all."""
+        """`per_frame`: views drawn anew each frame, in turn, after the first, and more while the volume grows; None
+        draws all."""
         self.lattice = spherical_fibonacci(count)
         self._engine = engine
         scattered = np.argsort(np.arange(count) * GOLDEN_TURN % 1)
@@ -79,6 +87,7 @@ class ViewsAround:
         self._light = np.zeros(3)
         self._per_frame = count if per_frame is None else min(per_frame, count)
         self._next: int | None = None
+        self._drawn_of = np.zeros((2, count + 1), np.int64)  # bricks and frames, by view
 
     def update(self, volume: Volume, dominant_direction: Floats | None = None) -> AuxiliaryViews:
         """The views, as of this frame. dominant_direction: world, unit, towards the light; None or zeros: not known."""
@@ -89,20 +98,27 @@ class ViewsAround:
         ):
             self._light = np.array(dominant_direction, np.float64)
             self._axes[-1, :, :3] = view_axes(self._light)
-            due = np.union1d(self._due(), len(self.lattice))
+            due = np.union1d(self._due(volume), len(self.lattice))
         else:
-            due = self._due()
+            due = self._due(volume)
+        self._drawn_of[:, due] = [[volume.allocated_bricks], [volume.frames]]
         views = self._views(volume)
         draw_views(self._engine, volume, views, due.astype(np.int32))
         return views
 
-    def _due(self) -> NDArray[np.int64]:
-        """The views whose turn it is, the light's after the others."""
+    def _due(self, volume: Volume) -> NDArray[np.int64]:
+        """The views whose turn it is, the light's after the others; the oldest come first."""
         count = len(self.lattice)
         if self._next is None:
             self._next = 0
             return np.arange(count)
-        turns = (self._next + np.arange(self._per_frame)) % (count + bool(self._light.any()))
+        bricks, frames = self._drawn_of[:, :count]
+        has_grown = volume.allocated_bricks > (1 + GROWTH) * bricks
+        has_aged = (frames < YOUNG_FRAMES) & (volume.frames >= np.maximum(2 * frames, 1))
+        outdated = int((has_grown | has_aged).sum())
+        most = max(self._per_frame, min(MOST_PER_FRAME, count))
+        share = min(self._per_frame + outdated, most)
+        turns = (self._next + np.arange(share)) % (count + bool(self._light.any()))
         self._next = int(turns[-1]) + 1
         return self._order[turns]
 

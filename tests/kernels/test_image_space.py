@@ -20,7 +20,7 @@ from server.maths.self_occlusion import (
 )
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.stages import image_space
+from server.stages import auxiliary_views, image_space
 from server.stages.auxiliary_views import AuxiliaryViews, ViewsAround
 from server.stages.image_space import ImageSpaceTransfer, near_distances, nearest_views, sample_phases
 from server.stages.radiance_transfer import Directions, Transfer, direction_sets
@@ -199,6 +199,36 @@ def test_views_are_drawn_in_turn(engine: Engine) -> None:
         depths = engine.download(around.update(after).depths)[:7]
         drawn.append([bool((depth == want).all()) for depth, want in zip(depths, expected, strict=True)])
     assert [sum(views) for views in drawn] == [3, 6, 7]
+
+
+@pytest.mark.parametrize(
+    ("bricks", "frames", "expected"),
+    [
+        # of 12, those of 100 or 101 bricks: 12, 7, 2, none
+        ((100, 101, 120, 120, 120, 120, 122, 200), (99,) * 8, [12, 2, 5, 5, 4, 2, 2, 5]),
+        # of one frame at 2; then of 2 and 3 at 4 to 6 ...; none of 16 or more
+        ((100,) * 8, (1, 2, 3, 4, 30, 31, 32, 90), [12, 5, 5, 5, 5, 5, 4, 2]),
+    ],
+    ids=["more bricks", "more frames"],
+)
+def test_more_views_are_drawn_while_the_volume_grows(
+    engine: Engine,
+    monkeypatch: pytest.MonkeyPatch,
+    bricks: tuple[int, ...],
+    frames: tuple[int, ...],
+    expected: list[int],
+) -> None:
+    """Those out of date besides those whose turn it is, oldest first, up to the most that a frame draws."""
+    monkeypatch.setattr(auxiliary_views, "MOST_PER_FRAME", 5)
+    monkeypatch.setattr(auxiliary_views, "draw_views", lambda *args: drawn.append(len(args[-1])))
+    volume = fill_volume(engine, SCENES["ball above a floor"], VOXEL_M)
+    drawn: list[int] = []
+    around = ViewsAround(engine, 12, per_frame=2)
+    for counts in zip(bricks, frames, strict=True):
+        monkeypatch.setattr(Volume, "allocated_bricks", counts[0])
+        monkeypatch.setattr(volume, "frames", counts[1])
+        around.update(volume)
+    assert drawn == expected
 
 
 def test_the_lights_view_has_its_turn(engine: Engine) -> None:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from importlib.util import find_spec
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +25,23 @@ SUITES = ("geometry", "light", "rendering", "accuracy", "stability", "plan", "se
 _CHECKOUT = Path(__file__).resolve().parents[1]
 PACKAGES = ("server.evaluation", "tests.bench")
 
-Suite = Callable[[bool, Callable[[str], None]], dict[str, Any]]
+Suite = Callable[..., dict[str, Any]]
 
 
-def run_bench(name: str, as_json: bool, quick: bool) -> None:
-    """Run a suite and print what it measured. Raises OptionError, listing the suites that exist."""
+def run_bench(name: str, as_json: bool, quick: bool, options: Mapping[str, Any] | None = None) -> None:
+    """Run a suite and print what it measured. `options`: those that only some suites take; None where nothing was said.
+
+    Raises OptionError, listing the suites that exist, and for an option that the suite does not take.
+    """
     suite = find_suite(name)
     if suite is None:
         existing = ", ".join(known for known in SUITES if find_suite(known) is not None)
         raise OptionError(f"there is no suite {name!r} here; there are: {existing or 'none yet'}")
-    result = suite(quick, note)
+    said = {option: value for option, value in (options or {}).items() if value is not None}
+    for option in said:
+        if option not in signature(suite).parameters:
+            raise OptionError(f"--{option}: bench {name} has no such option; leave it out")
+    result = suite(quick, note, **said)
     if as_json:
         say(json.dumps(result, allow_nan=False))
     else:

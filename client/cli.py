@@ -216,8 +216,12 @@ def bench(
     suite: Annotated[str, typer.Argument(metavar="SUITE", help="what to measure")],
     json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="fewer frames and trials")] = False,
+    scenes: Annotated[str | None, typer.Option(metavar="LIST", help="of accuracy; default: all that are here")] = None,
+    engine: Annotated[str | None, typer.Option(metavar="serial|ray", help="of accuracy: where points are run")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="of accuracy; default: out/bench/accuracy")] = None,
+    device: o.DeviceOption = None,
 ) -> None:
     """Measure, and compare with the goals."""
     from client.bench import run_bench
 
-    run_bench(suite, json, quick)
+    run_bench(suite, json, quick, {"scenes": scenes, "engine": engine, "out": out, "device": device})

@@ -1,0 +1,156 @@
+"""Budgets on the living room: are frames in time, and is the light as good as the best point that fits (U1)?
+
+The device's front is measured first, as `probeless tune` does, and kept beside the benchmark's figures. What each of
+its points costs in the living room is then measured by itself, for what fits a budget there.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from statistics import fmean, median
+
+import numpy as np
+from msgspec import structs
+
+from client.laptop.source import Source
+from client.laptop.tune import tune
+from client.laptop.volume import default_volume, default_voxel
+from protocol.messages import Wishes
+from server.fronts import Front, FrontPoint, write_front
+from server.pipeline import FrameResult, Pipeline
+from server.point_control import TOLERANCE
+from tests.bench.finished import ROOT, Part
+from tests.bench.run import Run, data_source
+
+BUDGETS_MS = (150.0, 300.0, 600.0)
+SCENE = "rgbd_livingroom1_synth"
+FRAMES, QUICK_FRAMES = 200, 60
+FIXED_FRAMES, FIXED_SETTLING = 12, 4
+IN_TIME_GOAL, ERROR_GOAL = ">= 0.95", "<= 0.5"
+_FRONTS = ROOT / "out" / "bench" / "accuracy" / "fronts"
+
+
+@dataclass(frozen=True)
+class Driven:
+    """A run under a budget."""
+
+    totals_ms: list[float]
+    settings: list[str]
+    errors_deg: list[float]
+    """Of the front, by frame."""
+
+    @property
+    def changes(self) -> int:
+        """Of the point."""
+        return sum(a != b for a, b in zip(self.settings, self.settings[1:], strict=False))
+
+
+def budget_part(run: Run) -> Part:
+    """Rows of every budget. Raises UnmeasurableError where the living room is not at hand."""
+    source = data_source(SCENE)
+    frames = min(run.of(QUICK_FRAMES, FRAMES), len(source))
+    part = Part(sizes={"frames under each budget": frames})
+    with _fronts_kept_here():
+        front = _front(run)
+        part.details["front"] = [_plain(point) for point in front.points]
+        fixed = {p.point.settings: _fixed_ms(run, source, p) for p in front.best()}
+        part.details["fixed_ms"] = fixed
+        for budget_ms in BUDGETS_MS:
+            run.say(f"a budget of {budget_ms:g} ms")
+            driven = _driven(run, source, frames, budget_ms)
+            _add_rows(part, budget_ms, driven, front, fixed)
+            part.details[f"{budget_ms:g}"] = {"totals_ms": driven.totals_ms, "settings": driven.settings}
+    return part
+
+
+def _add_rows(part: Part, budget_ms: float, driven: Driven, front: Front, fixed: dict[str, float]) -> None:
+    row = f"living room, budget of {budget_ms:g} ms"
+    in_time = float(np.mean(np.array(driven.totals_ms) <= TOLERANCE * budget_ms))
+    part.add(f"{row}: frames within {TOLERANCE:g} times the budget", in_time, "share", IN_TIME_GOAL)
+    part.add(f"{row}: frame, median", median(driven.totals_ms), "ms")
+    part.add(f"{row}: changes of the point", driven.changes, "")
+    fitting = [point.light_error_deg for point in front.best() if fixed[point.point.settings] <= budget_ms]
+    if not fitting:
+        least = min(fixed.values())
+        part.leave_out(
+            f"{row}: light error above the best that fits", f"no point fits: the fastest takes {least:.0f} ms"
+        )
+        return
+    half = len(driven.errors_deg) // 2  # the first frames learn what the scene costs
+    above = fmean(driven.errors_deg[half:]) - min(fitting)
+    part.add(f"{row}: light error above that of the best point that fits", above, "deg", ERROR_GOAL)
+
+
+def _front(run: Run) -> Front:
+    told = [0]
+
+    def progress(done: int, total: int) -> None:
+        if 10 * done // total > told[0]:
+            told[0] = 10 * done // total
+            run.say(f"the device's front: {done} of {total} frames")
+
+    front = tune(run.device, progress)
+    write_front(front)
+    return front
+
+
+@contextmanager
+def _fronts_kept_here() -> Iterator[None]:
+    """The user's own front stays as it is."""
+    before = os.environ.get("PROBELESS_FRONTS")
+    os.environ["PROBELESS_FRONTS"] = str(_FRONTS)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PROBELESS_FRONTS"]
+        else:
+            os.environ["PROBELESS_FRONTS"] = before
+
+
+def _wishes(source: Source) -> Wishes:
+    """As `probeless run` with nothing else said."""
+    volume_m = default_volume(source, range(len(source)))
+    usual = Wishes(volume_m=volume_m, voxel_m=default_voxel(volume_m), up=source.up)
+    return structs.replace(usual, albedo="estimated", indirect="observed")
+
+
+def _fixed_ms(run: Run, source: Source, point: FrontPoint) -> float:
+    """Median time of a frame at one point."""
+    totals = [
+        result.timings.total for result in _results(run, source, FIXED_FRAMES, point.point.wishes(_wishes(source)))
+    ]
+    return median(totals[FIXED_SETTLING:])
+
+
+def _driven(run: Run, source: Source, frames: int, budget_ms: float) -> Driven:
+    wishes = structs.replace(_wishes(source), preset="auto", budget_ms=budget_ms)
+    results = list(_results(run, source, frames, wishes))
+    points = [result.plan.point for result in results if result.plan.point is not None]
+    return Driven(
+        [result.timings.total for result in results],
+        [point.settings for point in points],
+        [point.light_error_deg or 0.0 for point in points],
+    )
+
+
+def _results(run: Run, source: Source, frames: int, wishes: Wishes) -> Iterator[FrameResult]:
+    pipeline = Pipeline(run.device, source.camera, wishes)
+    close: Callable[[], None] = pipeline.close
+    try:
+        for index in range(frames):
+            yield pipeline.process(source[index])
+    finally:
+        close()
+
+
+def _plain(point: FrontPoint) -> dict[str, object]:
+    return {
+        "settings": point.point.settings,
+        "ms": point.total_ms,
+        "light_error_deg": point.light_error_deg,
+        "picture_error": point.picture_error,
+    }

@@ -1,0 +1,70 @@
+"""`probeless tune`: a front is measured, kept, shown, and used by `run --budget-ms`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from client.cli import run_command
+from client.laptop import tune as tuning
+from client.laptop import tune_scenes
+from client.laptop.tune import lines_of, tune
+from server.fronts import read_front, write_front
+from server.opencl.device import Device
+from server.operating_points import Point
+
+FEW = (Point(preset="reg8", rays=9), Point(preset="reg4", rays=49))
+TABLE = "synthetic:table?size=96x72&frames=4"
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Small scenes, and a folder of its own for fronts."""
+    monkeypatch.setattr(tune_scenes, "SIZE", "160x120")
+    monkeypatch.setattr(tune_scenes, "LIT_SIZE", "160x120")
+    for module in (tuning, tune_scenes):
+        monkeypatch.setattr(module, "FRAMES", 3)
+        monkeypatch.setattr(module, "SETTLING", 1)
+        monkeypatch.setattr(module, "LIT_FRAMES", 4)
+    monkeypatch.setattr(tune_scenes, "LIT_SETTLING", 1)
+    monkeypatch.setattr(tuning, "POINTS", FEW)
+    monkeypatch.setenv("PROBELESS_FRONTS", str(tmp_path / "fronts"))
+
+
+def test_points_are_measured_and_kept(device: Device) -> None:
+    told: list[tuple[int, int]] = []
+    front = tune(device, lambda done, total: told.append((done, total)), FEW)
+    assert [p.point for p in front.points] == list(FEW)
+    for point in front.points:
+        assert 0 < point.total_ms < 60_000
+        assert 0 <= point.light_error_deg <= 180
+        assert 0 < point.picture_error < 255
+    assert front.points[0].light_error_deg > front.points[1].light_error_deg  # 9 rays err more than 49
+    assert told[-1] == (18, 18)
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    write_front(front)
+    assert read_front(device.name) == front
+    lines = list(lines_of(front))
+    assert all(any(line.endswith(point.settings) for line in lines) for point in FEW)
+
+
+def test_a_first_budget_measures_the_device(tmp_path: Path, capsys: pytest.CaptureFixture[str], device: Device) -> None:
+    """And a second one does not; every frame says its point."""
+    for again in (False, True):
+        assert run_command(["run", TABLE, "--out", str(tmp_path / "out"), "--budget-ms", "60000"]) == 0
+        assert ("measuring once" in capsys.readouterr().err) is not again
+    rows = (tmp_path / "out" / "timings.jsonl").read_text().splitlines()
+    assert len(rows) == 4
+    assert all('"reason": "the first frames of a budget of 60000 ms' in row for row in rows)
+    best = read_front(device.name).best()[-1].point.settings
+    assert all(f'"settings": "{best}"' in row for row in rows)
+
+
+def test_without_a_front_the_server_says_what_to_do(device: Device) -> None:
+    from client.laptop.synthetic.source import open_synthetic
+    from protocol.messages import Wishes
+    from server.pipeline import Pipeline
+
+    with pytest.raises(ValueError, match="probeless tune"):
+        Pipeline(device, open_synthetic(TABLE).camera, Wishes(preset="auto", budget_ms=50.0))

@@ -12,6 +12,7 @@ from client.laptop.run import Run
 from client.options import Capture
 from protocol.messages import LeftOut, Plan, Wishes
 from server.opencl.device import open_device
+from server.rest import ECHO, NOISE
 
 PURPOSES = {
     "rasterize": "draws the virtual objects",
@@ -83,12 +84,18 @@ def lines(title: str, plan: Plan) -> Iterator[str]:
         yield "Left out:"
     for left in plan.left_out:
         yield f"  {left.effect:{width}}  {left.reason} ({_bound(left)})"
-    yield f"By all that would hardly be seen no pixel changes by more than {most:.2f}/255, before rounding."
+    which = "in a thousand hardly one pixel" if any(map(is_of_noise, plan.left_out)) else "no pixel"
+    yield f"By all that would hardly be seen {which} changes by more than {most:.2f}/255, before rounding."
 
 
 def is_unseen(left: LeftOut) -> bool:
     """Whether it was left out for what it changes, and not because it was asked for or could not run."""
     return left.error_bound is not None and left.error_bound <= 1.0
+
+
+def is_of_noise(left: LeftOut) -> bool:
+    """Whether its bound is not of every pixel, but of all but a thousandth."""
+    return left.reason in (NOISE, ECHO)
 
 
 def _bound(left: LeftOut) -> str:
@@ -98,4 +105,5 @@ def _bound(left: LeftOut) -> str:
         return "changes nothing"
     if not is_unseen(left):
         return "what that changes is not bounded"
-    return f"changes no pixel by more than {left.error_bound:.2f}/255"
+    which = "in a thousand hardly one pixel" if is_of_noise(left) else "no pixel"
+    return f"changes {which} by more than {left.error_bound:.2f}/255"

@@ -1,256 +1,30 @@
-"""The table of effects: pure functions of what the spine made, each with the scenes that do not call for it."""
+"""The table of effects: which functions there are, and the scenes that do not call for each."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-
-import numpy as np
-import pyopencl.array as cl_array
-import pyopencl.cltypes as cl_types
-from numpy.typing import NDArray
-
-from protocol.frames import CameraModel
 from server import omissions as o
-from server.maths.rigid import inverse_rigid
-from server.opencl.engine import Engine
+from server.effect_functions import (
+    add_objects,
+    bounce_real,
+    composite,
+    cover,
+    direct_real,
+    direct_virtual,
+    light_objects,
+    light_samples,
+    look_around,
+    match_average,
+    prepare_rays,
+    rasterize,
+    refine_real,
+    refine_virtual,
+    reflect,
+    shade_virtual,
+    shadow_map,
+    shadow_real,
+)
 from server.plan import Effect, Omission
 from server.scene_facts import SceneFacts
-from server.stages import adaptive
-from server.stages import composite as composite_stage
-from server.stages import differential_rendering as differential
-from server.stages import shadow_map as shadow_maps
-from server.stages.differential_rendering import RealShadow
-from server.stages.image_space_rendering import Looks, RealLooks
-from server.stages.image_space_rendering import look_around as look_around_stage
-from server.stages.indirect import Indirect
-from server.stages.measure import Measurement
-from server.stages.object_glow import Glow, place_points
-from server.stages.radiance_transfer import Directions, Transfer
-from server.stages.rasterize import Placed, VirtualSurface, nearest_depths
-from server.stages.rasterize import rasterize as rasterize_stage
-from server.stages.raycast import Surface
-from server.stages.reflect import reflect_surroundings
-from server.stages.sample_grid import SampleGrid
-from server.stages.sampling import PRESETS, Sampling
-from server.stages.shadow_map import DirectSamples, ShadowMaps
-from server.stages.tone_mapping import Averages
-from server.stages.traced_scene import Changed, DeviceLight, TracedScene, trace_scene
-from server.stages.volume import Volume
-
-
-@dataclass(frozen=True)
-class View:
-    """What one frame's effects share: the device, the camera and where it is."""
-
-    engine: Engine
-    camera: CameraModel
-    volume_from_camera: NDArray[np.float64]
-    reach_m: float
-    """Length of visibility rays."""
-    sampling: Sampling = PRESETS["reg4"]
-    smooth_edges: bool = True
-    """Whether virtual things cover parts of pixels."""
-
-
-def rasterize(view: View, objects: Sequence[Placed]) -> VirtualSurface:
-    """Draw the virtual objects into their geometry buffer."""
-    return rasterize_stage(view.engine, view.camera, inverse_rigid(view.volume_from_camera), objects)
-
-
-def cover(view: View, objects: Sequence[Placed]) -> cl_array.Array:
-    """How much of each pixel the virtual objects cover."""
-    return nearest_depths(view.engine, view.camera, inverse_rigid(view.volume_from_camera), objects)
-
-
-def look_around(view: View, objects: Sequence[Placed], real_looks: RealLooks) -> Looks:
-    """Depth pictures that visibility is looked up in, of real surface and of each object."""
-    return look_around_stage(view.engine, real_looks, objects)
-
-
-def prepare_rays(
-    view: View,
-    objects: Sequence[Placed],
-    volume: Volume,
-    rays: Directions,
-    light: DeviceLight,
-    looks: Looks | None = None,
-) -> TracedScene:
-    """Bring together what rays are traced through: the volume, the objects' distance grids, the light beyond."""
-    return replace(trace_scene(view.engine, volume, light, rays, view.reach_m, objects), looks=looks)
-
-
-def shadow_map(view: View, objects: Sequence[Placed], volume: Volume, light: DeviceLight) -> ShadowMaps:
-    """Pictures of what stands in the light's sharp parts."""
-    return shadow_maps.draw_shadow_maps(view.engine, volume, light, objects, view.reach_m)
-
-
-def light_objects(view: View, scene: TracedScene, maps: ShadowMaps | None = None) -> Glow:
-    """What virtual objects send to real surface and to one another."""
-    placed = place_points(view.engine, scene.objects)
-    glow = differential.light_points(view.engine, scene, placed)
-    if maps is not None:
-        shadow_maps.light_glow(view.engine, placed, glow, maps)
-    return glow
-
-
-def light_samples(view: View, surface: Surface, transfer: Transfer, maps: ShadowMaps) -> DirectSamples:
-    """What the light's sharp parts bring to the samples of real surface, with objects and without."""
-    samples = SampleGrid(transfer.stride, transfer.openness)
-    parts = shadow_maps.trace_real(view.engine, view.camera, surface, samples, maps)
-    return shadow_maps.light_samples(view.engine, view.camera, surface, parts, maps)
-
-
-def shadow_real(
-    view: View,
-    surface: Surface,
-    transfer: Transfer,
-    scene: TracedScene,
-    indirect: Indirect | None,
-    glow: Glow | None = None,
-    maps: ShadowMaps | None = None,
-    samples: DirectSamples | None = None,
-) -> RealShadow:
-    """What virtual things take from real ones, less what they send them."""
-    lit = replace(scene, glow=glow)
-    shadow = differential.shadow_real(view.engine, view.camera, surface, transfer, lit, indirect)
-    if maps is None or samples is None:
-        return shadow
-    return replace(shadow, whole=shadow_maps.with_direct(view.engine, shadow, samples, maps))
-
-
-def bounce_real(
-    view: View,
-    surface: Surface,
-    transfer: Transfer,
-    scene: TracedScene,
-    ratio: RealShadow,
-    glow: Glow | None = None,
-    maps: ShadowMaps | None = None,
-    samples: DirectSamples | None = None,
-) -> RealShadow:
-    """`ratio` with what real things then send one another less or more."""
-    engine, camera, lit = view.engine, view.camera, replace(scene, glow=glow)
-    camera_from_volume = inverse_rigid(view.volume_from_camera)
-    if maps is None or samples is None or not isinstance(ratio.whole, RealShadow):
-        return differential.bounce_real(engine, camera, camera_from_volume, surface, transfer, lit, ratio)
-    whole = differential.bounce_real(engine, camera, camera_from_volume, surface, transfer, lit, ratio.whole)
-    return shadow_maps.without_direct(engine, whole, ratio, samples, maps)
-
-
-def add_objects(
-    view: View,
-    surface: Surface,
-    scene: TracedScene,
-    glow: Glow | None = None,
-    ratio: RealShadow | None = None,
-    bounced: RealShadow | None = None,
-) -> TracedScene:
-    """The scene as virtual objects have changed it: what they send, and what real surface sends besides them."""
-    settled = bounced or ratio
-    if settled is None:
-        return replace(scene, glow=glow)
-    change = settled.whole or settled
-    changed = Changed(view.camera, inverse_rigid(view.volume_from_camera), surface.positions, change)
-    return replace(scene, glow=glow, changed=changed)
-
-
-def shade_virtual(view: View, virtual: VirtualSurface, changed_scene: TracedScene) -> SampleGrid:
-    """What real and virtual things take from virtual ones, less what they send them."""
-    return differential.shadow_virtual(view.engine, view.camera, virtual, changed_scene)
-
-
-def reflect(view: View, virtual: VirtualSurface, changed_scene: TracedScene) -> cl_array.Array:
-    """What glossy virtual things reflect; traced in both families."""
-    return reflect_surroundings(view.engine, view.camera, view.volume_from_camera, virtual, changed_scene.by_rays())
-
-
-def refine_virtual(view: View, virtual: VirtualSurface, changed_scene: TracedScene) -> cl_array.Array:
-    """Shadows on virtual things at every pixel near their edges."""
-    return adaptive.refine_virtual(view.engine, view.camera, virtual, changed_scene.by_rays())
-
-
-def refine_real(
-    view: View,
-    surface: Surface,
-    scene: TracedScene,
-    ratio: RealShadow,
-    bounced: RealShadow | None = None,
-    glow: Glow | None = None,
-    virtual: VirtualSurface | None = None,
-) -> cl_array.Array:
-    """Shadows on real things at every pixel of their rims."""
-    lit, eye = replace(scene.by_rays(), glow=glow), view.volume_from_camera[:3, 3]
-    return adaptive.refine_real(view.engine, view.camera, surface, lit, bounced or ratio, virtual, eye)
-
-
-def direct_virtual(view: View, virtual: VirtualSurface, maps: ShadowMaps) -> cl_array.Array:
-    """What the light's sharp parts bring to virtual surface."""
-    return shadow_maps.light_virtual(view.engine, view.camera, virtual, maps)
-
-
-def direct_real(
-    view: View,
-    surface: Surface,
-    ratio: RealShadow,
-    maps: ShadowMaps,
-    bounced: RealShadow | None = None,
-    refined_ratio: cl_array.Array | None = None,
-) -> cl_array.Array:
-    """What virtual things take from real ones of the whole light, its sharp parts at every pixel."""
-    engine, camera, upsampling, ratio = view.engine, view.camera, view.sampling.upsampling, bounced or ratio
-    parts = shadow_maps.trace_real(engine, camera, surface, ratio, maps)
-    return shadow_maps.light_real(engine, camera, surface, ratio, parts, maps, refined_ratio, upsampling)
-
-
-def match_average(averages: Averages) -> float:
-    """How much brighter than the light's own scale virtual things are (7.1, H)."""
-    return averages.gain
-
-
-def composite(
-    view: View,
-    shown: NDArray[np.uint8],
-    measurement: Measurement,
-    surface: Surface,
-    volume: Volume,
-    light: DeviceLight,
-    virtual: VirtualSurface | None = None,
-    occluded: SampleGrid | None = None,
-    ratio: SampleGrid | None = None,
-    bounced: SampleGrid | None = None,
-    refined_occluded: cl_array.Array | None = None,
-    refined_ratio: cl_array.Array | None = None,
-    coverage: cl_array.Array | None = None,
-    reflected: cl_array.Array | None = None,
-    gain: float = 1.0,
-    lit_virtual: cl_array.Array | None = None,
-    whole_ratio: cl_array.Array | None = None,
-) -> NDArray[np.uint8]:
-    """The finished picture; with nothing virtual it is the camera's, byte for byte."""
-    if lit_virtual is None and virtual is not None and light.discs:
-        lit_virtual = view.engine.workspace.constant("unlit", np.zeros(surface.positions.shape, cl_types.float4))
-    return composite_stage.composite(
-        view.engine,
-        view.camera,
-        view.volume_from_camera,
-        shown,
-        measurement.radiance,
-        surface,
-        volume.voxel_m,
-        light,
-        virtual,
-        occluded,
-        bounced or ratio,
-        refined_occluded,
-        refined_ratio,
-        view.sampling.upsampling,
-        coverage,
-        reflected,
-        gain,
-        lit_virtual,
-        whole_ratio,
-    )
 
 
 def _shades_virtual(facts: SceneFacts) -> Omission | None:

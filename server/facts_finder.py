@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from server.effects import View
+from server.effect_functions import View
 from server.geometry import GeometryFrame
 from server.maths.direct_lights import split_light
 from server.maths.rigid import inverse_rigid

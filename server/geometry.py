@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,6 +42,8 @@ class GeometryFrame:
     """Where it is lost, the pose and the surfaces are the last good frame's."""
     notes: tuple[str, ...]
     """What was wrong with this frame, one line each."""
+    is_held: bool = False
+    """Whether pose and surfaces are those of the frame before, since nothing has changed."""
 
 
 class Geometry:
@@ -62,14 +65,21 @@ class Geometry:
         frames = self.volume.frames if self.volume else 0
         return math.exp(self._exposure_logarithms / frames) if frames else 1.0
 
-    def update(self, frame: RgbdFrame) -> GeometryFrame:
-        """Measure, locate, fuse, predict, merge. Raises ValueError, one line, for a frame that is refused."""
+    def update(self, frame: RgbdFrame, holds: Callable[[RgbdFrame], bool] = lambda _frame: False) -> GeometryFrame:
+        """Measure, locate, fuse, predict, merge. Raises ValueError, one line, for a frame that is refused.
+
+        holds: whether a frame's geometry is that of the frame before; asked of every frame.
+        """
         engine, camera, stage = self._engine, self._camera, self._engine.profile.stage
         self._check_size(frame)
         volume = self._scene(frame, self._tracking.first_guess(frame))
 
         with stage("input"):  # 5.1.1
             measurement = measure(engine, camera, frame)
+            is_held = holds(frame)
+        if is_held and self._last is not None:
+            with stage("reconstruct"):
+                return self._held(self._last, frame, measurement, volume)
         with stage("reconstruct"):  # 4.2.1
             located = self._tracking.locate(frame, measurement, volume)
             volume_from_camera = volume.volume_from_world() @ located.world_from_camera
@@ -81,9 +91,7 @@ class Geometry:
                 lost = replace(self._last, measurement=measurement, exposure=exposure, scene_radiance=scene)
                 return replace(lost, tracking=located.tracking, notes=notes)
             if located.fuse:
-                volume.allocate(camera, volume_from_camera, measurement.depth_m)
-                integrate(engine, volume, camera, volume_from_camera, Measurement(scene, measurement.depth_m))
-                self._exposure_logarithms += math.log(exposure)
+                self._fuse(volume, volume_from_camera, Measurement(scene, measurement.depth_m), exposure)
         with stage("surface"):  # 4.2.1
             model = raycast(engine, camera, volume_from_camera, volume)
             if located.fuse:
@@ -105,6 +113,20 @@ class Geometry:
         self._last = result if located.fuse else None
         return result
 
+    def _held(self, last: GeometryFrame, frame: RgbdFrame, measurement: Measurement, volume: Volume) -> GeometryFrame:
+        """Only fused: when something happens, the volume is to be what it would have become."""
+        scene = scene_radiance(self._engine, measurement.radiance, last.exposure)
+        self._fuse(volume, last.volume_from_camera, Measurement(scene, measurement.depth_m), last.exposure)
+        notes = self._notes(frame, volume)
+        return replace(last, measurement=measurement, scene_radiance=scene, notes=notes, is_held=True)
+
+    def _fuse(
+        self, volume: Volume, volume_from_camera: NDArray[np.float64], measured: Measurement, exposure: float
+    ) -> None:
+        volume.allocate(self._camera, volume_from_camera, measured.depth_m)
+        integrate(self._engine, volume, self._camera, volume_from_camera, measured)
+        self._exposure_logarithms += math.log(exposure)
+
     def _check_size(self, frame: RgbdFrame) -> None:
         color, depth = self._camera, self._camera.depth_lens
         if frame.color.shape != (color.height, color.width, 3) or frame.depth.shape != (depth.height, depth.width):
@@ -122,9 +144,14 @@ class Geometry:
 
     def _notes(self, frame: RgbdFrame, volume: Volume) -> tuple[str, ...]:
         notes = []
-        depth_m = frame.depth * self._camera.depth_scale_m
-        if not ((frame.depth > 0) & (frame.depth != 65535) & (depth_m <= GREATEST_DEPTH_M)).any():
+        if not any(self._is_usable(depth).any() for depth in (frame.depth[::16, ::16], frame.depth)):  # mostly a few do
             notes.append("the depth picture has no usable value: is the sensor covered?")
         if volume.is_full:
             notes.append("the volume's memory is full, new surface is not fused: give a larger --voxel")
         return tuple(notes)
+
+    def _is_usable(self, depth: NDArray[np.uint16]) -> NDArray[np.bool_]:
+        usable: NDArray[np.bool_] = (
+            (depth > 0) & (depth != 65535) & (depth * self._camera.depth_scale_m <= GREATEST_DEPTH_M)
+        )
+        return usable

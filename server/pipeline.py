@@ -79,6 +79,7 @@ class Pipeline:
         self._rest = self._make_rest()
         self._objects = SessionObjects(self._engine)
         self._webxr_from_world = np.eye(3)
+        self._mean_sent = np.zeros(3)
         self.device_name = device.name
         self.kernel_ms: dict[str, float] = {}
 
@@ -174,9 +175,11 @@ class Pipeline:
         rest = self._rest
         if rest is not None:
             rest.place(placed)
-        if rest is None or rest.omission is None or not geometry.is_held:
-            return self._sample_anew(geometry, volume), {}
-        left_out = dict.fromkeys(HELD_STAGES, rest.omission)
+        if rest is None or rest.omission is None:
+            echo = rest.echo if rest is not None and placed else None
+            return self._sample_anew(geometry, volume), {"light_of_still_frames": echo} if echo else {}
+        stages = ("estimate_light", *(SURFACE_STAGES if geometry.is_held else ()))
+        left_out = dict.fromkeys(stages, rest.omission)
         kept = rest.held.sampled.get(rest.turn) if placed else Sampled(None, None)
         if kept is None:
             kept = self._sample_anew(geometry, volume)
@@ -191,8 +194,10 @@ class Pipeline:
         transfer = self._sampler.transfer(volume, surface, pose, up, reach_m)
         if self._settings.indirect == "none":
             return Sampled(transfer, None)
-        rays = self._sampler.rays
-        return Sampled(transfer, observe_indirect(engine, camera, volume, surface, transfer, rays, reach_m))
+        sent = observe_indirect(engine, camera, volume, surface, transfer, self._sampler.rays, reach_m)
+        if sent.mean.any():  # where next to nothing is hidden, noise decides whether anything is met
+            self._mean_sent = sent.mean
+        return Sampled(transfer, replace(sent, mean=self._mean_sent))
 
     def _light_message(
         self, frame: RgbdFrame, geometry: GeometryFrame, estimate: LightEstimate, volume: Volume
@@ -260,6 +265,12 @@ class Pipeline:
         bricks = replace(bricks, colors=np.float32(self._geometry.usual_exposure) * bricks.colors)
         return scene_mesh(bricks, volume.voxel_m, volume.origin_world, self._webxr_from_world, progress)
 
+    @property
+    def device_bytes(self) -> int:
+        """Device memory of this session: its arrays and its volume; what sessions share is not counted."""
+        volume = self._geometry.volume
+        return self._engine.workspace.bytes_held + (volume.device_bytes if volume else 0)
+
     def close(self) -> None:
         """Give the device's memory back."""
         self._objects.clear()
@@ -273,8 +284,8 @@ class Pipeline:
         """None where everything is to be simulated."""
         if self._settings.plan == "everything":
             return None
-        given = self._asked.poses != "track"
-        return Rest(self._engine, self._camera, poses_are_given=given, period=self._sampler.period)
+        engine, camera, poses = self._engine, self._camera, self._asked.poses
+        return Rest(engine, camera, poses=poses, period=self._sampler.period)
 
     def _wake(self) -> None:
         """Something that pictures do not show is new."""
@@ -301,5 +312,5 @@ def _notes(estimate: LightEstimate) -> tuple[str, ...]:
     return ("no usable surface has been seen yet, the light is unknown",) if estimate.std is None else ()
 
 
-HELD_STAGES = ("locate", "integrate", "raycast", "merge_depth", "estimate_light")
-"""Of the spine, what is not done where nothing has changed."""
+SURFACE_STAGES = ("locate", "raycast", "merge_depth")
+"""Of the geometry, what is not done where nothing has changed."""

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from client.laptop.objects import ObjectFile
 from client.laptop.run import place_objects
-from protocol.messages import Wishes
 from server.evaluation.environment import direction_error_deg, environment_difference, irradiance_error
 from server.evaluation.flip import flip_map
 from server.evaluation.ssim import ssim_map

@@ -20,7 +20,7 @@ import pyopencl as cl
 import trimesh
 
 from client.laptop.source import open_source
-from server import pipeline as spine
+from server import rendering
 from server.pipeline import Pipeline
 from server.plan import Effect
 from server.scene.mesh import Mesh, load_mesh
@@ -133,7 +133,7 @@ def clocked(pipeline: Pipeline, clock: StageClock) -> Iterator[None]:
             else:
                 yield
 
-    with patch.object(profile, "stage", timed_stage), patch.object(spine, "execute", clock.execute):
+    with patch.object(profile, "stage", timed_stage), patch.object(rendering, "execute", clock.execute):
         yield
 
 

@@ -8,13 +8,19 @@ import numpy as np
 import pytest
 
 from client.laptop.gallery.play import play, wishes_of
-from client.laptop.gallery.scenes import GALLERY
+from client.laptop.gallery.scenes import CHANGE_FRAME, GALLERY
 from client.laptop.gallery.source import GallerySource
+from client.laptop.gallery.things import Thing
+from protocol.frames import RgbdFrame
 from protocol.messages import LeftOut, Plan
 from server import facts_finder
 from server.opencl.device import Device
+from server.pipeline import Pipeline
+from server.rest import NOISY
+from server.scene.mesh import load_mesh
+from server.scene.placement import Placement
 from server.stages.reach import NOWHERE
-from tests.bench.plan import holds, is_as_known, stated_bound
+from tests.bench.plan import greatest, holds, is_as_known, stated_bound
 
 QUICK = (
     "elsewhere",
@@ -25,17 +31,34 @@ QUICK = (
     "black-room",
     "soot",
     "comes-in",
+    "still",
     "still-and-empty",
 )
 
 
-def differences(device: Device, name: str, frames: int = 12) -> list[tuple[float, int, bool]]:
+class Cut(GallerySource):
+    """Some frames of a scene."""
+
+    def __init__(self, name: str, *parts: range) -> None:
+        super().__init__(name)
+        self.indices = [index for part in parts for index in part]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, index: int) -> RgbdFrame:
+        return super().__getitem__(self.indices[index])
+
+
+def differences(
+    device: Device, name: str, frames: int = 14, source: GallerySource | None = None
+) -> list[tuple[float, int, bool]]:
     """Of each frame: what is stated, what is found, and whether the plan is the known one."""
-    source = GallerySource(name)
+    source = source or GallerySource(name)
     planned, full = (play(device, source, wishes_of(source, plan=plan)) for plan in ("needed", "everything"))
     found = []
     for index, (_, a), (_, b) in zip(range(frames), planned, full, strict=False):
-        most = int(np.abs(a.color.astype(int) - b.color).max())
+        most = greatest(a.plan, np.abs(a.color.astype(int) - b.color))
         found.append((stated_bound(a.plan, b.plan), most, is_as_known(source, index, a.plan)))
     planned.close()
     full.close()
@@ -48,6 +71,51 @@ def test_scenes_run_what_they_call_for_and_no_more_is_seen(device: Device, name:
         assert is_known
         assert bound <= 1.0
         assert holds(bound, most)
+
+
+def test_a_noisy_view_rests_until_something_happens(device: Device) -> None:
+    """Everything is left out until a hand is there, and in that very frame nothing."""
+    before, hand = range(20), range(CHANGE_FRAME + 2, CHANGE_FRAME + 4)
+    source = Cut("hand-enters-while-still", before, hand)
+    rests = []
+    for _, result in play(device, source, wishes_of(source)):
+        rests.append(any(left.effect == "estimate_light" for left in result.plan.left_out))
+    assert not any(rests[:NOISY])
+    assert rests[NOISY:] == [True] * 4 + [False] * 2
+
+
+def test_what_noise_changes_is_bounded(device: Device) -> None:
+    """While it settles, and at rest."""
+    for bound, most, is_known in differences(device, "still-noisy", frames=NOISY + 6):
+        assert is_known
+        assert holds(bound, most)
+
+
+def test_what_is_placed_and_moved_before_a_resting_view_is_drawn(device: Device) -> None:
+    """As it would be with everything simulated; a byte may differ by the rounding of sums."""
+    source, pipelines = GallerySource("still-and-empty"), []
+    ball = load_mesh(Thing(0.2, (0.0, 0.0, 0.0)).glb(), "glb")
+    for plan in ("needed", "everything"):
+        pipeline = Pipeline(device, source.camera, wishes_of(source, plan=plan))
+        results = []
+        for index in range(28):
+            if index == 10:
+                pipeline.place_object("ball", ball, Placement(position_m=(0.0, 0.0, 0.0)))
+            if index in (23, 24):
+                pipeline.move_object("ball", Placement(position_m=(0.04 * (index - 22), 0.0, 0.1)))
+            if index == 26:
+                pipeline.remove_object("ball")
+            results.append(pipeline.process(source[index]))
+        pipelines.append(results)
+        pipeline.close()
+    run = [len(result.plan.run) for result in pipelines[0]]
+    assert all(count > 1 for count in run[10:22])
+    assert run[22] == run[25 + 1] == 1
+    assert all(count > 1 for count in run[23:26])
+    for needed, everything in zip(*pipelines, strict=True):
+        assert np.abs(needed.color.astype(int) - everything.color).max() <= 1
+    estimated = [not any(left.effect == "estimate_light" for left in r.plan.left_out) for r in pipelines[0]]
+    assert [i for i, was in enumerate(estimated) if was] == [*range(8), *range(10, 18), 26, 27]
 
 
 def test_a_bound_that_is_wrong_is_seen(device: Device) -> None:

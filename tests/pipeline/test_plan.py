@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from server.effects import EFFECTS
-from server.pipeline import _GIVEN
 from server.plan import ALLOWANCE, Effect, Omission, PlanError, execute, make_plan
+from server.rendering import GIVEN as EFFECTS_GIVEN
 from server.scene_facts import Brightness, SceneFacts
 from server.stages.reach import NOWHERE
 from server.stages.tone_mapping import Averages
@@ -272,10 +272,10 @@ OF_REAL = ("shadow_real", "bounce_real", "direct_real", "refine_real")
     ],
 )
 def test_effects_of_a_scene(facts: SceneFacts, run: set[str], reasons: dict[str, str]) -> None:
-    order, plan = make_plan(EFFECTS, "picture", _GIVEN, facts)
+    order, plan = make_plan(EFFECTS, "picture", EFFECTS_GIVEN, facts)
     assert set(plan.run) == run
     assert plan.run[-1] == "composite"
-    made = set(_GIVEN)
+    made = set(EFFECTS_GIVEN)
     for effect in order:  # everything an effect reads is there before it
         assert set(effect.reads) - effect.optional <= made
         made.add(effect.writes)

@@ -40,7 +40,7 @@ def play(device: Device, source: GallerySource, wishes: Wishes) -> Iterator[tupl
             pipeline.place_object(f"object-{number}", mesh, Placement(position_m=thing.place(0)))
         for index in range(len(source)):
             for number, thing in enumerate(source.scene.things):
-                if index and any(thing.step_m):
+                if index and thing.place(index) != thing.place(index - 1):
                     pipeline.move_object(f"object-{number}", Placement(position_m=thing.place(index)))
             yield pipeline, pipeline.process(source[index])
     finally:

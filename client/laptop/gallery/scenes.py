@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,13 @@ Floats = NDArray[np.float64]
 Effects = frozenset[str]
 
 COEFFICIENTS = 16
-FRAMES, STILL_FRAMES, STILL_FROM = 6, 18, 9
+FRAMES = 6
+STILL_FRAMES = 46
+"""Of a camera that stands still: under two seconds."""
+CHANGE_FRAME = 36
+"""In which something happens before it."""
+SETTLED, HELD = 8, 4
+"""Frames after which a still view without noise rests, and then until a round of direction sets is held."""
 GRAY: Rgb = (0.5, 0.5, 0.5)
 
 
@@ -31,13 +37,19 @@ class Part:
     albedo: Rgb
     step_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """From frame to frame; of balls."""
+    stays: int = 0
+    """Frames before it begins to move."""
+
+    def steps(self, index: int) -> int:
+        """That it has moved until a frame."""
+        return max(index - self.stays, 0) if any(self.step_m) else 0
 
     def at(self, index: int) -> Solid:
         """Where it is in a frame."""
-        if not any(self.step_m):
+        if not self.steps(index):
             return self.solid
         assert isinstance(self.solid, Sphere)
-        return Sphere(self.solid.center + index * np.array(self.step_m), self.solid.radius)
+        return Sphere(self.solid.center + self.steps(index) * np.array(self.step_m), self.solid.radius)
 
 
 @dataclass(frozen=True)
@@ -57,10 +69,20 @@ class GalleryScene:
     """Of the camera to the right, from frame to frame."""
     frames: int = FRAMES
     noise_codes: float = 0.0
-    """Deviation of the picture."""
+    """Deviation of the picture's."""
+    depth_noise: float = 0.0
+    """Deviation of depth over that of a structured-light sensor (Nguyen et al. 2012)."""
     is_light_given: bool = True
-    rests_from: int | None = None
-    """The first frame that is known to tell the light nothing new; None: there is none."""
+    lit_later: tuple[int, Floats] | None = None
+    """From which frame on it is lit by another light, and that: [16, 3]."""
+    rests: range = range(0)
+    """Frames that are known to tell the spine nothing new."""
+    holds: range = range(0)
+    """Of these, those in which effects have nothing new to draw either."""
+    hangs: Effects = frozenset()
+    """Effects that it hangs on the noise whether a frame calls for."""
+    settles: range = range(0)
+    """Frames in which it hangs on the noise whether it rests."""
     wishes: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -84,6 +106,17 @@ _ROOM = Part(Shell(np.array([-1.5, 0, -1.5]), np.array([1.5, 2.2, 2.0]), (Openin
 _SOFT = sky(0.7)
 _SUN = sky(0.25) + sun(0.9, 0.7, 0.3, 0.7)
 _BALL = Thing(0.24, (0.0, 0.0, 0.0))
+_BOX = Thing(0.2, (0.0, 0.0, 0.0), is_box=True)
+_HAND = Part(Sphere(np.array([0.9, 0.3, 0.1]), 0.12), (0.68, 0.44, 0.34), (-0.12, 0.0, 0.0))
+SETTLED_NOISY = 36
+_NOISE: dict[str, Any] = {
+    "walk_m": 0.0,
+    "frames": STILL_FRAMES,
+    "noise_codes": 2.5,
+    "depth_noise": 1.0,
+    "settles": range(SETTLED, SETTLED_NOISY),
+    "hangs": frozenset({"bounce_real"}),
+}
 
 _DRAWN = {"rasterize", "cover", "composite"}
 _SHADED = _DRAWN | {"prepare_rays", "add_objects", "shade_virtual"}
@@ -194,7 +227,8 @@ GALLERY: dict[str, GalleryScene] = {
         (_BALL,),
         walk_m=0.0,
         frames=STILL_FRAMES,
-        rests_from=STILL_FROM,
+        rests=range(SETTLED, STILL_FRAMES),
+        holds=range(SETTLED + HELD, STILL_FRAMES),
     ),
     "still-and-empty": GalleryScene(
         "nothing virtual, before a camera that stands still",
@@ -203,11 +237,62 @@ GALLERY: dict[str, GalleryScene] = {
         _always({"composite"}),
         walk_m=0.0,
         frames=STILL_FRAMES,
-        rests_from=STILL_FROM,
+        rests=range(SETTLED, STILL_FRAMES),
+    ),
+    "still-noisy": GalleryScene(
+        "a matt box on a floor, before a camera that stands still and has a sensor's noise",
+        _FLOOR,
+        _SOFT,
+        _always(_STANDS, {"bounce_real"}),
+        (_BOX,),
+        **_NOISE,
+        rests=range(SETTLED_NOISY, STILL_FRAMES),
+        holds=range(SETTLED_NOISY, STILL_FRAMES),
+    ),
+    "still-tracked": GalleryScene(
+        "nothing virtual, before a camera that stands still, with noise, and nobody tells where it is",
+        _FLOOR,
+        _SOFT,
+        _always({"composite"}),
+        **_NOISE,
+        rests=range(SETTLED_NOISY, STILL_FRAMES),
+        wishes={"poses": "track"},
+    ),
+    "moved-while-still": GalleryScene(
+        "the same box, which is moved after a while",
+        _FLOOR,
+        _SOFT,
+        _always(_STANDS, {"bounce_real"}),
+        (replace(_BOX, step_m=(0.01, 0.0, 0.005), stays=CHANGE_FRAME),),
+        **_NOISE,
+        rests=range(SETTLED_NOISY, STILL_FRAMES),
+        holds=range(SETTLED_NOISY, CHANGE_FRAME + 1),
+    ),
+    "lamp-switches-while-still": GalleryScene(
+        "the same box in a light that is to be found, of which a part goes out",
+        _FLOOR,
+        _SUN,
+        _always(_STANDS, {"match_average", "bounce_real"}),
+        (_BOX,),
+        **_NOISE,
+        is_light_given=False,
+        lit_later=(CHANGE_FRAME, sky(0.25) + sun(0.9, 0.7, 0.3, 0.63)),
+        rests=range(SETTLED_NOISY, CHANGE_FRAME),
+        holds=range(SETTLED_NOISY, CHANGE_FRAME),
+    ),
+    "hand-enters-while-still": GalleryScene(
+        "the same box, above which a real ball moves in after a while",
+        (*_FLOOR, replace(_HAND, stays=CHANGE_FRAME - 1)),
+        _SOFT,
+        _always(_STANDS, {"bounce_real"}),
+        (_BOX,),
+        **_NOISE,
+        rests=range(SETTLED_NOISY, CHANGE_FRAME),
+        holds=range(SETTLED_NOISY, CHANGE_FRAME),
     ),
     "hand": GalleryScene(
         "a real ball moves in above a virtual one, which shall be as bright beside the picture",
-        (*_FLOOR, Part(Sphere(np.array([0.9, 0.3, 0.1]), 0.12), (0.68, 0.44, 0.34), (-0.12, 0.0, 0.0))),
+        (*_FLOOR, _HAND),
         _SOFT,
         _always(_STANDS, {"match_average", "bounce_real"}),
         (_BALL,),

@@ -24,6 +24,8 @@ class Thing:
     """World, of its bottom's middle, in frame 0."""
     step_m: Place = (0.0, 0.0, 0.0)
     """From frame to frame."""
+    stays: int = 0
+    """Frames before it begins to move."""
     is_box: bool = False
     color: Rgb = CLAY
     """sRGB."""
@@ -32,7 +34,8 @@ class Thing:
 
     def place(self, index: int) -> Place:
         """Where it stands in a frame."""
-        x, y, z = (a + index * b for a, b in zip(self.place_m, self.step_m, strict=True))
+        moved = max(index - self.stays, 0)
+        x, y, z = (a + moved * b for a, b in zip(self.place_m, self.step_m, strict=True))
         return x, y, z
 
     def glb(self) -> bytes:

@@ -1,0 +1,214 @@
+"""The last part of a frame (thesis 7.1-7.2): the effects it calls for, planned and run, or held where nothing moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import wraps
+from typing import Any
+
+import numpy as np
+from msgspec import structs
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel, RgbdFrame
+from protocol.messages import LeftOut, Plan
+from server.effect_functions import View, composite
+from server.effects import EFFECTS
+from server.facts_finder import FactsFinder
+from server.geometry import GeometryFrame
+from server.held import Finished, Held, Sampled
+from server.maths.direct_lights import split_light
+from server.opencl.engine import Engine
+from server.plan import Effect, Omission, execute, make_plan
+from server.rest import Rest
+from server.settings import Settings
+from server.stages.composite import shown_picture
+from server.stages.continuation import PlaneArrays
+from server.stages.radiance_transfer import TURNS
+from server.stages.rasterize import Placed
+from server.stages.sampling import TransferSampler
+from server.stages.tone_mapping import AverageMemory, Averages, measure_averages
+from server.stages.traced_scene import DeviceLight, take_discs, upload_light
+from server.stages.volume import Volume
+
+Picture = NDArray[np.uint8]
+
+GIVEN = frozenset(
+    {
+        "view",
+        "objects",
+        "volume",
+        "rays",
+        "real_looks",
+        "shown",
+        "measurement",
+        "surface",
+        "transfer",
+        "indirect",
+        "light",
+        "averages",
+    }
+)
+"""What effects read that is none's."""
+SEEN = frozenset({"view", "shown", "measurement", "surface", "volume"})
+"""What the picture is put together from that is this frame's own, whatever is held."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """What the spine made of a frame."""
+
+    frame: RgbdFrame
+    geometry: GeometryFrame
+    volume: Volume
+    objects: list[Placed]
+    sampler: TransferSampler
+    sampled: Sampled
+    """Its own, or a held one. Not read where nothing virtual is there."""
+    sh: NDArray[np.float64]
+    """[bands^2, 3] the light, in the first picture's units."""
+    planes: PlaneArrays
+    is_light_given: bool
+
+
+class Rendering:
+    """One session's."""
+
+    def __init__(self, engine: Engine, camera: CameraModel, settings: Settings) -> None:
+        self._engine = engine
+        self._camera = camera
+        self._everything = settings.plan == "everything"
+        self._average_memory = AverageMemory()
+        self._facts = FactsFinder(everything=self._everything)
+
+    def draw(
+        self, made: Made, settings: Settings, left_out: Mapping[str, Omission], rest: Rest | None
+    ) -> tuple[Picture, Plan]:
+        """The picture, and the plan that says what was left out, `left_out` of the spine with it.
+
+        rest: where a view that stands still holds what was made of it; None: everything is to be made.
+        """
+        shown = shown_picture(self._engine, self._camera, made.frame.color, made.geometry.measurement.radiance)
+        is_held = rest is not None and rest.omission is not None
+        if rest is not None and rest.omission is not None and rest.turn in rest.held.finished:
+            return self._finish(made, settings, shown, rest.held.finished[rest.turn], left_out, rest.omission)
+        given = self._given(made, settings, shown)
+        facts = self._facts.find(
+            given["view"],
+            made.geometry,
+            made.volume,
+            made.sampler.rays,
+            given["transfer"],
+            given["indirect"],
+            made.objects,
+            given["light"],
+            made.sh,
+            shown,
+            given["averages"],
+        )
+        order, plan = make_plan(EFFECTS, "picture", GIVEN, facts, everything=self._everything, stages=left_out)
+        parts: dict[str, Any] = {}
+        picture: Picture = execute([*order[:-1], _noting(order[-1], parts)], given, "picture")
+        if rest is not None and is_held and made.sampler.period <= TURNS:
+            rest.held.keep_finished(rest.turn, {k: v for k, v in parts.items() if k not in SEEN}, plan)
+        elif rest is not None and not is_held:
+            old = _picture_of_old(rest.held, parts) if made.objects and rest.is_checkpoint else None
+            rest.learn(made.sh, made.planes, old)
+        return picture, plan
+
+    def _given(self, made: Made, settings: Settings, shown: Picture) -> dict[str, Any]:
+        """The resources that effects begin with."""
+        engine, geometry, rays = self._engine, made.geometry, made.sampler.rays
+        transfer, indirect = made.sampled.transfer, made.sampled.indirect
+        light = upload_light(engine, made.sh, rays, made.planes, indirect, geometry.exposure)
+        averages = None
+        if made.objects:
+            averages = self._averages(made, settings, light)  # 7.1, H
+            light = take_discs(engine, light, split_light(made.sh), rays, geometry.exposure)  # 7.2.3
+        return {
+            "view": self._view(made, settings),
+            "objects": made.objects,
+            "volume": made.volume,
+            "rays": rays,
+            "real_looks": made.sampler.looks,
+            "shown": shown,
+            "measurement": geometry.measurement,
+            "surface": geometry.surface,
+            "transfer": transfer,
+            "indirect": indirect,
+            "light": light,
+            "averages": averages,
+        }
+
+    def _view(self, made: Made, settings: Settings) -> View:
+        is_smooth, pose = settings.edges == "smooth", made.geometry.volume_from_camera
+        return View(self._engine, self._camera, pose, settings.reach_m, made.sampler.sampling, is_smooth)
+
+    def _averages(self, made: Made, settings: Settings, light: DeviceLight) -> Averages | None:
+        """What pictures and their shading are on average, if virtual things are to match them."""
+        asked, transfer, indirect = settings.tone_mapping, made.sampled.transfer, made.sampled.indirect
+        if transfer is None or asked == "light" or (asked == "auto" and made.is_light_given):
+            return None
+        found = measure_averages(
+            self._engine,
+            self._camera,
+            made.geometry.measurement.radiance,
+            made.geometry.surface,
+            transfer,
+            made.volume,
+            made.sampler.rays,
+            light,
+            indirect,
+            settings.reach_m,
+        )
+        return self._average_memory.update(found, made.geometry.exposure)
+
+    def _finish(
+        self,
+        made: Made,
+        settings: Settings,
+        shown: Picture,
+        finished: Finished,
+        left_out: Mapping[str, Omission],
+        why: Omission,
+    ) -> tuple[Picture, Plan]:
+        """The picture with what has been made of a frame that was sampled alike."""
+        given = {
+            **finished.parts,
+            "view": self._view(made, settings),
+            "shown": shown,
+            "measurement": made.geometry.measurement,
+            "surface": made.geometry.surface,
+            "volume": made.volume,
+        }
+        picture: Picture = execute([PUT_TOGETHER], given, "picture")
+        effects = (name for name in finished.plan.run if name != PUT_TOGETHER.name)
+        held = tuple(_left_out(name, why) for name in (*left_out, *effects))
+        others = (left for left in finished.plan.left_out if left.effect not in left_out)
+        return picture, structs.replace(finished.plan, run=(PUT_TOGETHER.name,), left_out=(*held, *others))
+
+
+def _picture_of_old(held: Held, parts: Mapping[str, Any]) -> Picture:
+    """What is virtual in this frame, put into what the camera saw when the view began to stand still."""
+    shown, measurement = held.keep_old(parts["shown"], parts["measurement"])
+    return composite(**{**parts, "shown": shown, "measurement": measurement})
+
+
+PUT_TOGETHER: Effect[Any] = next(effect for effect in EFFECTS if effect.writes == "picture")
+
+
+def _left_out(name: str, why: Omission) -> LeftOut:
+    return LeftOut(effect=name, reason=why.reason, error_bound=why.error_bound)
+
+
+def _noting(effect: Effect[Any], parts: dict[str, Any]) -> Effect[Any]:
+    """The same effect, which leaves in `parts` what it reads."""
+    run: Callable[..., Any] = effect.run
+
+    @wraps(run)
+    def noted(**reads: Any) -> Any:
+        parts.update(reads)
+        return run(**reads)
+
+    return Effect(noted, effect.writes)

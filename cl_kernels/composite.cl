@@ -1,6 +1,7 @@
 // Compositing (thesis 7.2.1, R3): real hides virtual and virtual hides real; linear inside, sRGB at the end.
 // Provides mark_touched, composite.
 #include "camera.clh"
+#include "lanes.clh"
 #include "sampled_value.clh"
 
 #ifndef SUBPIXELS
@@ -92,6 +93,35 @@ static int covered_near(global const float4 *positions, const int x, const int y
 }
 #endif
 
+// Whether anything virtual may change the LANES pixels of a row from x on; see composite.
+static inline int may_change(const int x, const int y, const int width, const int cols, const int stride, global const uchar *touched,
+                             global const float4 *direct_ratio, global const float4 *virtual_positions, global const uint *nearest) {
+    int any_change = 0;
+    for (int lane = 0; lane < LANES; lane++) {
+#if defined(HAS_SHADOWS) && defined(HAS_DIRECT)
+        any_change |= direct_ratio[y * width + x + lane].w > 0.0f;
+#elif defined(HAS_SHADOWS)
+        any_change |= touched[(cell_of(y, stride) + 1) * (cols + 1) + cell_of(x + lane, stride) + 1] != 0;
+#endif
+#if defined(HAS_OBJECTS) && SUBPIXELS == 0
+        any_change |= virtual_positions[y * width + x + lane].w > 0.0f;
+#endif
+    }
+#ifdef HAS_OBJECTS
+    for (int row = SUBPIXELS * y; row < SUBPIXELS * (y + 1); row++)
+        for (int i = 0; i < SUBPIXELS * LANES; i++) any_change |= nearest[SUBPIXELS * (row * width + x) + i] != 0;
+#endif
+    return any_change;
+}
+
+static inline void copy_codes(global const uchar *shown, global uchar *picture, const int pixel) {
+#if LANES == 8
+    for (int i = 0; i < 3; i++) vstore8(vload8(i, shown + 3 * pixel), i, picture + 3 * pixel);
+#else
+    for (int i = 0; i < 3 * LANES; i++) picture[3 * pixel + i] = shown[3 * pixel + i];
+#endif
+}
+
 // shown [h][w][3]: the camera picture as sRGB codes; radiance [h][w] linear. positions, normals: the real geometry buffer.
 // virtual_positions, virtual_normals, virtual_colors [h][w] (w = 1 where covered): the virtual one, or none without HAS_OBJECTS;
 // nearest: see share_covered, where SUBPIXELS is not 0; else pixels are covered as their middles are.
@@ -102,7 +132,7 @@ static int covered_near(global const float4 *positions, const int x, const int y
 // HAS_DIRECT: `light` and occluded are of the rest of the light; direct_virtual [h][w]: what its discs bring to virtual surface;
 // direct_ratio [h][w] (w = 1 where it counts): ratio of all of it, which then stands for `ratio`.
 // BICUBIC: samples are mixed across edges. codes [65536]: sRGB code of linear radiance i / 65535.
-// -> picture [h][w][3] sRGB. A pixel that nothing virtual touches is the camera's, byte for byte.
+// One item LANES pixels of a row -> picture [h][w][3] sRGB. A pixel that nothing virtual touches is the camera's, byte for byte.
 kernel void composite(const int width, const int height, global const uchar *shown, global const float4 *radiance,
                       global const float4 *positions, global const float4 *normals, const float16 camera_from_volume,
                       const float tolerance_m,
@@ -114,47 +144,53 @@ kernel void composite(const int width, const int height, global const uchar *sho
                       global const uchar *touched, const int has_refined_occluded, global const float4 *refined_occluded,
                       const int has_refined_ratio, global const float4 *refined_ratio,
                       global const float4 *direct_virtual, global const float4 *direct_ratio, global const uchar *codes, global uchar *picture) {
-    const int x = get_global_id(0);
+    const int first = get_global_id(0) * LANES;
     const int y = get_global_id(1);
-    if (x >= width || y >= height) return;
-    const int pixel = y * width + x;
-    const float4 real = positions[pixel];
-    float4 color = radiance[pixel];  // of the real surface; w: whether anything virtual has to do with it
-    color.w = 0.0f;
+    if (first >= width || y >= height) return;
+    if (first + LANES <= width && !may_change(first, y, width, cols, stride, touched, direct_ratio, virtual_positions, nearest)) {
+        copy_codes(shown, picture, y * width + first);
+        return;
+    }
+    for (int x = first; x < min(first + LANES, width); x++) {
+        const int pixel = y * width + x;
+        const float4 real = positions[pixel];
+        float4 color = radiance[pixel];  // of the real surface; w: whether anything virtual has to do with it
+        color.w = 0.0f;
 #ifdef HAS_SHADOWS
 #ifdef HAS_DIRECT
-    if (direct_ratio[pixel].w > 0.0f && radiance[pixel].w >= 0.0f) {
-        const float4 factor = direct_ratio[pixel];
+        if (direct_ratio[pixel].w > 0.0f && radiance[pixel].w >= 0.0f) {
+            const float4 factor = direct_ratio[pixel];
 #else
-    const Grid grid = {cols, rows, stride, width};
-    const int cell = (cell_of(y, stride) + 1) * (cols + 1) + cell_of(x, stride) + 1;
-    if (touched[cell] && real.w > 0.0f && radiance[pixel].w >= 0.0f) {
-        const float4 factor = value_at(grid, ratio, refined_ratio, has_refined_ratio, positions, normals, x, y, height, tolerance_m);
+        const Grid grid = {cols, rows, stride, width};
+        const int cell = (cell_of(y, stride) + 1) * (cols + 1) + cell_of(x, stride) + 1;
+        if (touched[cell] && real.w > 0.0f && radiance[pixel].w >= 0.0f) {
+            const float4 factor = value_at(grid, ratio, refined_ratio, has_refined_ratio, positions, normals, x, y, height, tolerance_m);
 #endif
-        const float3 change = fabs(factor.xyz - 1.0f);
-        if (factor.w > 0.0f && fmax(fmax(change.x, change.y), change.z) > UNTOUCHED) color = (float4)(color.xyz * factor.xyz, 1.0f);
-    }
+            const float3 change = fabs(factor.xyz - 1.0f);
+            if (factor.w > 0.0f && fmax(fmax(change.x, change.y), change.z) > UNTOUCHED) color = (float4)(color.xyz * factor.xyz, 1.0f);
+        }
 #endif
 #ifdef HAS_OBJECTS
-    const Virtual things = {virtual_positions, virtual_normals, virtual_colors, {object_cols, object_rows, object_stride, width},
-                            occluded, refined_occluded, has_refined_occluded, reflected, direct_virtual};
-    const float real_z = real.w > 0.0f ? transform_point(camera_from_volume, real.xyz).z : 0.0f;
+        const Virtual things = {virtual_positions, virtual_normals, virtual_colors, {object_cols, object_rows, object_stride, width},
+                                occluded, refined_occluded, has_refined_occluded, reflected, direct_virtual};
+        const float real_z = real.w > 0.0f ? transform_point(camera_from_volume, real.xyz).z : 0.0f;
 #if SUBPIXELS > 0
-    const float share = share_covered(nearest, x, y, width, real_z, tolerance_m);
-    const int source = share > 0.0f ? covered_near(virtual_positions, x, y, width, height) : -1;
+        const float share = share_covered(nearest, x, y, width, real_z, tolerance_m);
+        const int source = share > 0.0f ? covered_near(virtual_positions, x, y, width, height) : -1;
 #else
-    const float ahead = real_z - transform_point(camera_from_volume, virtual_positions[pixel].xyz).z;
-    const float share = virtual_positions[pixel].w > 0.0f && (real.w <= 0.0f || ahead > -tolerance_m) ? 1.0f : 0.0f;
-    const int source = share > 0.0f ? pixel : -1;
+        const float ahead = real_z - transform_point(camera_from_volume, virtual_positions[pixel].xyz).z;
+        const float share = virtual_positions[pixel].w > 0.0f && (real.w <= 0.0f || ahead > -tolerance_m) ? 1.0f : 0.0f;
+        const int source = share > 0.0f ? pixel : -1;
 #endif
-    if (source >= 0) {
-        const float3 own = virtual_gain * virtual_color(things, light, source % width, source / width, height, tolerance_m);
-        const float part = radiance[pixel].w < 0.0f ? 1.0f : share;  // outside the camera's picture there is nothing to mix with
-        color = (float4)(color.xyz + part * (own - color.xyz), 1.0f);
+        if (source >= 0) {
+            const float3 own = virtual_gain * virtual_color(things, light, source % width, source / width, height, tolerance_m);
+            const float part = radiance[pixel].w < 0.0f ? 1.0f : share;  // outside the camera's picture there is nothing to mix with
+            color = (float4)(color.xyz + part * (own - color.xyz), 1.0f);
+        }
+#endif
+        if (color.w > 0.0f)
+            write_color(picture, pixel, color.xyz, codes);
+        else
+            for (int i = 0; i < 3; i++) picture[3 * pixel + i] = shown[3 * pixel + i];
     }
-#endif
-    if (color.w > 0.0f)
-        write_color(picture, pixel, color.xyz, codes);
-    else
-        for (int i = 0; i < 3; i++) picture[3 * pixel + i] = shown[3 * pixel + i];
 }

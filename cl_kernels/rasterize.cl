@@ -46,11 +46,18 @@ static void write_piece(const int8 piece, const float4 depths, const int slot, c
     count_tiles(piece, size, tile_counts);
 }
 
-// Ready for a new picture: nothing counted, nothing near.
-kernel void clear_picture(const int count, const int pixels, global int *counts, global uint *nearest) {
+// Ready for a new picture: nothing counted, nothing near in the tiles of `region` (x0 y0 x1 y1, half-open).
+// One item a row of pixels of a tile.
+kernel void clear_picture(const int2 size, const int4 region, const int count, global int *counts,
+                          global uint *nearest) {
     const int index = get_global_id(0);
     if (index < count) counts[index] = 0;
-    if (index < pixels) nearest[index] = 0;
+    const int columns = region.z - region.x;
+    if (columns <= 0 || index >= columns * (region.w - region.y) * TILE) return;
+    const int x = TILE * (region.x + index % columns), y = TILE * region.y + index / columns;
+    if (y >= size.y) return;
+    if (x + TILE <= size.x) vstore8((uint8)(0), 0, nearest + y * size.x + x);
+    else for (int i = x; i < size.x; i++) nearest[y * size.x + i] = 0;
 }
 
 // Every vertex of the objects in view on the screen.
@@ -235,22 +242,25 @@ kernel void fill_tiles(const int pieces, const int2 size, const global int8 *cor
 
 static inline int2 pixel_of(const int bit) { return (int2)(bit % TILE, bit / TILE); }
 
-// One work-group a tile. Of its entries, up to 64 at a time: where there are few, each pixel looks through those that
-// cover it; where there are many, they are mostly small, and each entry goes over the pixels it covers: first the
-// nearest depth of each pixel is found, then the lowest triangle that has it.
+// One work-group a tile of `region`. Of its entries, up to 64 at a time: where there are few, each pixel looks through
+// those that cover it; where there are many, they are mostly small, and each entry goes over the pixels it covers:
+// first the nearest depth of each pixel is found, then the lowest triangle that has it.
 // -> visible: the triangle of each pixel, the lower number where two are equally near; NOBODY where a fragment is
 // nearer or nothing is there. nearest: of fragments and pieces.
 kernel __attribute__((reqd_work_group_size(TILE * TILE, 1, 1)))
-void raster_tiles(const int2 size, const global int8 *corners, const global float4 *inverse_depths,
-                  const global int *starts, const global int *entries, global uint *nearest, global int *visible) {
+void raster_tiles(const int2 size, const int4 region, const global int8 *corners,
+                  const global float4 *inverse_depths, const global int *starts,
+                  const global int *entries, global uint *nearest, global int *visible) {
     local ulong masks[TILE * TILE];
     local long8 edges[TILE * TILE];
     local float4 depths[TILE * TILE];
     local int numbers[TILE * TILE];
     local uint best[TILE * TILE];
     local int winners[TILE * TILE];
-    const int tile = get_group_id(0), item = get_local_id(0);
-    const int2 origin = TILE * (int2)(tile % tile_columns(size), tile / tile_columns(size));
+    const int item = get_local_id(0), columns = region.z - region.x;
+    const int2 place = region.xy + (int2)(get_group_id(0) % columns, get_group_id(0) / columns);
+    const int tile = place.y * tile_columns(size) + place.x;
+    const int2 origin = TILE * place;
     const int2 pixel = origin + pixel_of(item);
     const bool inside = pixel.x < size.x && pixel.y < size.y;
     const int index = pixel.y * size.x + pixel.x;
@@ -333,17 +343,21 @@ static int object_of(const int triangle, const int count, const global int8 *obj
 // and metalness (B), -1 for none. `material_of` [t] a triangle's, in its mesh.
 // The ray of pixel (u, v) is model_from_pixel's column 3 + t * its columns 0 to 2 times (u, v, 1), with t the depth;
 // its last row is not part of that: it takes a model point to its depth.
-kernel void shade_surface(const int2 size, const global int *visible, const int object_count,
-                          const global int8 *objects, const global float16 *matrices, const global float *vertices,
-                          const global int *triangles, const global float4 *attributes, const global int *material_of,
+// Goes over the pixels `around` (x0 y0 x1 y1, half-open); `visible` is known in the tiles of `region`.
+kernel void shade_surface(const int2 size, const int4 around, const int4 region, const global int *visible,
+                          const int object_count, const global int8 *objects, const global float16 *matrices,
+                          const global float *vertices, const global int *triangles,
+                          const global float4 *attributes, const global int *material_of,
                           const global float4 *materials, const global int4 *texture_table, const global int4 *levels,
                           const global uchar4 *texels, const global float *values, global int *object_index,
                           global float4 *position, global float4 *normal, global float4 *base_color,
                           global float4 *surface) {
-    const int2 pixel = (int2)(get_global_id(0), get_global_id(1));
-    if (pixel.x >= size.x || pixel.y >= size.y) return;
+    const int2 pixel = around.xy + (int2)(get_global_id(0), get_global_id(1));
+    if (pixel.x >= around.z || pixel.y >= around.w) return;
     const int index = pixel.y * size.x + pixel.x;
-    if (visible[index] == NOBODY) {
+    const int2 tile = pixel / TILE;
+    const bool drawn = tile.x >= region.x && tile.y >= region.y && tile.x < region.z && tile.y < region.w;
+    if (!drawn || visible[index] == NOBODY) {
         object_index[index] = -1;
         position[index] = normal[index] = base_color[index] = surface[index] = (float4)(0.0f);
         return;

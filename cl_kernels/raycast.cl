@@ -6,6 +6,25 @@
 
 #define TILE 8
 
+// First and last of four layers of cells that hold one of `cells`: layer i of those shifted by i steps.
+static inline float2 layers(const ulong cells, const ulong first_layer, const int step) {
+    int low = 3, high = 0;
+    for (int i = 0; i < 4; i++) {
+        if (!(cells & (first_layer << (i * step)))) continue;
+        low = min(low, i);
+        high = i;
+    }
+    return (float2)(low, high + 1);
+}
+
+// The box around the solid cells of a brick, volume metres.
+static inline void solid_box(const ulong cells, const int3 brick, const float voxel_m, float3 *low_m, float3 *size_m) {
+    const float2 x = layers(cells, 0x1111111111111111UL, 1), y = layers(cells, 0x000f000f000f000fUL, 4), z = layers(cells, 0xffffUL, 16);
+    const float cell_m = 2.0f * voxel_m;
+    *low_m = convert_float3(brick) * (BRICK * voxel_m) + cell_m * (float3)(x.s0, y.s0, z.s0);
+    *size_m = cell_m * (float3)(x.s1 - x.s0, y.s1 - y.s0, z.s1 - z.s0);
+}
+
 // Between which depths each tile of TILE x TILE pixels can see a solid voxel: what lies outside a ray need not look at.
 // One item a brick of allocated [count]; nearest, farthest [tile row][tile column]: bits of float metres, which order as
 // they do; start as +infinity and 0.
@@ -16,14 +35,15 @@ kernel void bound_rays(const int count, const int width, const int height, const
     if (item >= count) return;
     const int index = allocated[item];
     if (solid[index] == 0) return;
-    const float side = BRICK * voxel_m;
-    const float3 low = convert_float3((int3)(index % bricks.x, (index / bricks.x) % bricks.y, index / (bricks.x * bricks.y))) * side;
-    const float3 center = transform_point(camera_from_volume, low + 0.5f * side);
-    if (!may_be_seen(intrinsics, width, height, center, 0.8661f * side)) return;  // half a brick's diagonal
+    const int3 brick = (int3)(index % bricks.x, (index / bricks.x) % bricks.y, index / (bricks.x * bricks.y));
+    float3 low, size_m;
+    solid_box(solid[index], brick, voxel_m, &low, &size_m);
+    const float3 center = transform_point(camera_from_volume, low + 0.5f * size_m);
+    if (!may_be_seen(intrinsics, width, height, center, 0.5001f * length(size_m))) return;
     float2 least = (float2)(1e9f), most = (float2)(-1e9f);
     float near = 1e9f, far = 0.0f;
     for (int corner = 0; corner < 8; corner++) {
-        const float3 p = low + side * (float3)(corner & 1, (corner >> 1) & 1, corner >> 2);
+        const float3 p = low + size_m * (float3)(corner & 1, (corner >> 1) & 1, corner >> 2);
         const float3 in_camera = transform_point(camera_from_volume, p);
         near = fmin(near, in_camera.z);
         far = fmax(far, in_camera.z);

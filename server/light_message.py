@@ -44,10 +44,10 @@ def light_message(
         dominant_lights=tuple(
             DirectedLight(
                 direction=_rgb(light.direction),
-                irradiance=_rgb(light.irradiance),
+                irradiance=_rgb(exposure * light.irradiance),
                 spread_deg=math.degrees(light.spread_rad),
             )
-            for light in dominant_lights(sh)
+            for light in dominant_lights(estimate.sh)  # as split_light asks: found once
         ),
         lamps=tuple(_lamp(lamp, exposure) for lamp in lamps),
         exposure=exposure,

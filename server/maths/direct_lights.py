@@ -9,7 +9,7 @@ exactly. How small a lobe is, its finest band says: exp(-l (l + 1) spread^2 / 2)
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from math import log, sqrt
 
 import numpy as np
@@ -97,9 +97,15 @@ def _half_angle(lobe: DominantLight, bands: int) -> float:
     return HALF_ANGLE * max(lobe.spread_rad, sqrt(-log(SHARPEST) / (bands * (bands - 1) / 2)))
 
 
+@cache
+def _basis(bands: int) -> Floats:
+    """[_DIRECTIONS, bands^2]."""
+    return sh_basis(spherical_fibonacci(_DIRECTIONS), bands)
+
+
 def _most_of(light: Floats, out: Floats, bands: int) -> float:
     """How much of `out` can be taken from `light`, at most 1, and the rest arrives from nowhere too far below zero."""
-    basis = sh_basis(spherical_fibonacci(_DIRECTIONS), bands)
+    basis = _basis(bands)
     arriving, taken = basis @ light, basis @ out
     allowed = np.maximum(LEAST_REST * arriving.mean(axis=0), -arriving.min(axis=0))
     return float(np.clip(np.min((arriving + allowed)[taken > 0] / taken[taken > 0], initial=1.0), 0.0, 1.0))

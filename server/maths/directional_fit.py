@@ -49,20 +49,20 @@ class DirectionalFit:
 
     def linearised(self, parameters: Floats) -> tuple[Floats, Floats]:
         """[rows] model less target, and its derivatives [rows, parameters]."""
-        lights = parameters[1:].reshape(-1, 4)
-        vectors, flatness = lights[:, :3], lights[:, 3]
-        length = np.maximum(np.sqrt(np.sum(vectors**2, axis=1)), _LEAST_LENGTH)[:, None]
-        unit = vectors / length
+        flatness, length, unit = _taken_apart(parameters)
         values, slopes = sh_with_slope(unit, self.bands)
-        band = band_of(self.bands**2)
-        fading = pi * np.exp(-np.outer(flatness, band * (band + 1)))
+        band, energy = _band_and_energy(self.bands)
+        fading = pi * np.exp(-flatness * energy)
+        faded = fading * values
         # s Y(d) = s^(1-l) P(v): its gradient by v is that of P less what P grows along v by itself.
-        turning = fading[..., None] * (slopes + (1 - band)[:, None] * values[..., None] * unit[:, None])
-        spreading = -length * fading * values * (0 if self.sharp else band * (band + 1))
-        derivatives = np.concatenate([turning, spreading[..., None]], axis=2)  # [lights, bands^2, 4]
-        jacobian = self.root @ np.swapaxes(derivatives, 0, 1).reshape(len(band), -1)
-        model = parameters[0] * self.root[:, 0] + self.root @ np.sum(length * fading * values, axis=0)
-        return model - self.target, np.column_stack([self.root[:, 0], jacobian])
+        derivatives = np.empty((*values.shape, 4))  # [lights, bands^2, 4]
+        derivatives[..., :3] = fading[..., None] * slopes + ((1 - band) * faded)[..., None] * unit[:, None]
+        derivatives[..., 3] = 0.0 if self.sharp else -length * faded * energy
+        jacobian = np.empty((len(self.root), len(parameters)))
+        jacobian[:, 0] = self.root[:, 0]
+        jacobian[:, 1:] = self.root @ derivatives.transpose(1, 0, 2).reshape(len(band), -1)
+        model = self.root @ np.sum(length * faded, axis=0)
+        return parameters[0] * self.root[:, 0] + model - self.target, jacobian
 
     def misfit(self, parameters: Floats) -> float:
         """Squared error."""
@@ -70,11 +70,9 @@ class DirectionalFit:
 
     def unit_lights(self, parameters: Floats) -> Floats:
         """[rows, 1 + lights]: the sky and the lights of `parameters`, each of strength 1."""
-        columns = [self.root[:, 0]]
-        for light in parameters[1:].reshape(-1, 4):
-            direction = light[:3] / max(float(np.linalg.norm(light[:3])), _LEAST_LENGTH)
-            columns.append(self.root @ directional_sh(direction, np.sqrt(2 * light[3]), self.bands))
-        return np.stack(columns, axis=1)
+        flatness, _, unit = _taken_apart(parameters)
+        lights = pi * np.exp(-flatness * _band_and_energy(self.bands)[1]) * sh_with_slope(unit, self.bands)[0]
+        return np.column_stack([self.root[:, 0], self.root @ lights.T])
 
     def with_next(self, found: Floats) -> Floats:
         """`found` and the light that lessens its misfit most: all candidates are tried at once."""
@@ -102,10 +100,13 @@ class DirectionalFit:
                 break
             normal, slope = jacobian.T @ jacobian, jacobian.T @ residual
             free = ~((here <= low) & (slope > 0) | (here >= high) & (slope < 0))
-            damped = normal + np.diag(damping * np.diag(normal) + 1e-12 * normal.max())
+            normal.flat[:: len(here) + 1] += damping * normal.diagonal() + 1e-12 * normal.max()
             tried = here.copy()
-            tried[free] -= np.linalg.solve(damped[np.ix_(free, free)], slope[free])
-            tried = np.clip(tried, low, high)
+            if free.all():
+                tried -= np.linalg.solve(normal, slope)
+            else:
+                tried[free] -= np.linalg.solve(normal[np.ix_(free, free)], slope[free])
+            tried = np.minimum(np.maximum(tried, low), high)
             tried_residual, tried_jacobian = self.linearised(tried)
             misfit = float(tried_residual @ tried_residual)
             if misfit >= cost:
@@ -117,6 +118,21 @@ class DirectionalFit:
             if gain <= _LEAST_STEP_GAIN * cost:
                 break
         return here
+
+
+def _taken_apart(parameters: Floats) -> tuple[Floats, Floats, Floats]:
+    """Of the lights: half the squared spread [k, 1], strength [k, 1], direction [k, 3]."""
+    lights = parameters[1:].reshape(-1, 4)
+    vectors = lights[:, :3]
+    length = np.maximum(np.sqrt(np.sum(vectors * vectors, axis=1, keepdims=True)), _LEAST_LENGTH)
+    return lights[:, 3:], length, vectors / length
+
+
+@cache
+def _band_and_energy(bands: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """[bands^2] l and l (l + 1)."""
+    band = band_of(bands * bands)
+    return band, band * (band + 1)
 
 
 def _limits(count: int) -> tuple[Floats, Floats]:

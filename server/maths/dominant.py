@@ -9,6 +9,7 @@ A spread of 0 is a light from one direction; the others are round Gaussians on t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from math import pi
 
 import numpy as np
@@ -23,6 +24,7 @@ LEAST_SHARE = 0.1
 LEAST_GAIN = 0.02
 """Of the energy that an even sky leaves: what a further light must explain."""
 _SLOANS_UNIT = 16 * pi / 17
+_REMEMBERED = 32
 
 Floats = NDArray[np.float64]
 
@@ -75,19 +77,34 @@ def dominant_lights(
     Colours are fitted to the found directions by the same error.
     """
     light = luminance_sh(coefficients)
-    root = _root(np.eye(len(light)) if precision is None else precision)
-    fit = DirectionalFit(root, root @ light, round(len(light) ** 0.5), sharp)
-    found = fit.sky()
-    energy = left = fit.misfit(found)
+    key = light.tobytes(), None if precision is None else np.asarray(precision, np.float64).tobytes(), sharp
+    fit = _fit_of(*key)
+    found, left = _found(*key, 0)
+    energy = left
     if energy <= 1e-12 * float(np.sum(fit.target**2)):
         return ()
-    for _ in range(min(most, len(light) // 4)):
-        tried = fit.refined(fit.with_next(found))
-        misfit = fit.misfit(tried)
+    for count in range(min(most, len(light) // 4)):
+        tried, misfit = _found(*key, count + 1)
         if left - misfit < least_gain * energy:
             break
         found, left = tried, misfit
-    return _colored(fit, found, root @ coefficients)
+    return _colored(fit, found, fit.root @ coefficients)
+
+
+def _fit_of(light: bytes, precision: bytes | None, sharp: bool) -> DirectionalFit:
+    """light: luminance [n]; precision: [n, n], None for the radiance's error."""
+    values = np.frombuffer(light, np.float64)
+    count = len(values)
+    root = np.eye(count) if precision is None else _root(np.frombuffer(precision, np.float64).reshape(count, count))
+    return DirectionalFit(root, root @ values, round(count**0.5), sharp)
+
+
+@lru_cache(_REMEMBERED)
+def _found(light: bytes, precision: bytes | None, sharp: bool, count: int) -> tuple[Floats, float]:
+    """The parameters of a sky and `count` lights, and their misfit. A frame asks for the same light more than once."""
+    fit = _fit_of(light, precision, sharp)
+    found = fit.refined(fit.with_next(_found(light, precision, sharp, count - 1)[0])) if count else fit.sky()
+    return found, fit.misfit(found)
 
 
 def _colored(fit: DirectionalFit, found: Floats, targets: Floats) -> tuple[DominantLight, ...]:
@@ -97,10 +114,12 @@ def _colored(fit: DirectionalFit, found: Floats, targets: Floats) -> tuple[Domin
         return ()
     unit = lights[:, :3] / np.linalg.norm(lights[:, :3], axis=1, keepdims=True)
     atoms = fit.unit_lights(found)
-    colors = np.stack([_nonnegative(atoms, targets[:, c]) for c in range(3)], axis=1)[1:]
+    colors = np.linalg.lstsq(atoms, targets, rcond=None)[0]
+    for channel in np.flatnonzero(colors.min(axis=0) < 0):
+        colors[:, channel] = _nonnegative(atoms, targets[:, channel])
     colored = [
         DominantLight(direction, color, float(np.sqrt(2 * flatness)))
-        for direction, color, flatness in zip(unit, colors, lights[:, 3], strict=True)
+        for direction, color, flatness in zip(unit, colors[1:], lights[:, 3], strict=True)
     ]
     strongest = max(light.intensity for light in colored)
     kept = (light for light in colored if light.intensity > 0 and light.intensity >= LEAST_SHARE * strongest)

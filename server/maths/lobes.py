@@ -30,6 +30,7 @@ RIDGE = 1e-3
 """Of the mean diagonal: the least prior that keeps what no surface sees finite."""
 _LOBES_PER_WIDTH = 1.5  # centres for every square width of the sphere
 _FEWEST_LOBES = 24
+_LEAST_KNOWN = 1e-12  # of the best known: rounding
 
 
 @cache
@@ -52,6 +53,13 @@ def lobe_family(width_deg: float) -> Floats:
     apart = np.arccos(np.clip(cell_directions() @ spherical_fibonacci(count).T, -1, 1))
     lobes = np.exp(-0.5 * (apart / width) ** 2)
     return np.asarray(lobes / lobes.sum(axis=0))
+
+
+@cache
+def _lobes_from_cells(width_deg: float) -> Floats:
+    """[lobes, CELLS]: least squares."""
+    lobes = lobe_family(width_deg)
+    return np.asarray(np.linalg.pinv(lobes, rcond=float(np.finfo(np.float64).eps) * max(lobes.shape)))
 
 
 @dataclass(frozen=True)
@@ -96,18 +104,26 @@ def fit_lobes(equations: CellEquations) -> LobeFit:
     return chosen
 
 
-def fit_width(equations: CellEquations, width_deg: float, near: Floats | None = None, pull: float = 0.0) -> LobeFit:
-    """The best light of one family; drawn to radiances `near` [CELLS] by `pull` times the ridge, if they are given."""
+def fit_width(
+    equations: CellEquations,
+    width_deg: float,
+    near: Floats | None = None,
+    pull: float = 0.0,
+    guess: Bools | None = None,
+) -> LobeFit:
+    """The best light of one family; drawn to radiances `near` [CELLS] by `pull` times the ridge, if they are given.
+
+    guess: which lobes [lobes] may be lit. It saves time and changes nothing.
+    """
     lobes = lobe_family(width_deg)
     matrix = lobes.T @ equations.matrix @ lobes
     count = len(matrix)
     ridge = RIDGE * max(float(np.trace(matrix)) / count, 1e-300)
     vector = lobes.T @ equations.vector
     if near is not None:
-        weights = np.linalg.lstsq(lobes, near, rcond=None)[0]
-        vector = vector + ridge * pull * weights
+        vector = vector + ridge * pull * (_lobes_from_cells(width_deg) @ near)
     regular = matrix + ridge * (1.0 + pull) * np.eye(count)
-    amounts, _ = solve_nonnegative(regular, vector)
+    amounts, _ = solve_nonnegative(regular, vector, guess)
     cells = lobes @ amounts
     return LobeFit(width_deg, cells, equations.misfit(cells), amounts)
 
@@ -121,5 +137,6 @@ def spread_of(equations: CellEquations, fit: LobeFit, noise: float) -> Floats:
     lobes = lobe_family(fit.width_deg)
     prior = noise / max(float((fit.amounts**2).mean()), 1e-300)
     information = lobes.T @ equations.matrix @ lobes + prior * np.eye(lobes.shape[1])
-    root = np.linalg.inv(np.linalg.cholesky(information + 1e-12 * np.trace(information) * np.eye(len(information))))
-    return np.asarray(lobes @ root.T * np.sqrt(noise))
+    known, ways = np.linalg.eigh(information)
+    known = np.maximum(known, _LEAST_KNOWN * known.max())  # sums of float32 may say less than nothing of some
+    return np.asarray(lobes @ (ways * np.sqrt(noise / known)))

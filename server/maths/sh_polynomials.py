@@ -19,18 +19,12 @@ def sh_with_slope(points: Floats, bands: int) -> tuple[Floats, Floats]:
     On unit points the polynomials are `sh_basis`; elsewhere they are r^l times it.
     """
     polynomials = _polynomials(bands)
-    powers = np.ones((3, bands, len(points)))
+    powers = np.ones((bands, 3, len(points)))
     for degree in range(1, bands):
-        powers[:, degree] = powers[:, degree - 1] * points.T
-    x, y, z = (powers[axis, polynomials.degrees[axis]] for axis in range(3))  # [monomials, k] each
-    # The derivative of p^0 is 0 p^-1: the factor 0 makes up for the wrong power.
-    dx, dy, dz = (
-        polynomials.degrees[axis][:, None] * powers[axis, np.maximum(polynomials.degrees[axis] - 1, 0)]
-        for axis in range(3)
-    )
-    monomials = np.stack([x * y * z, dx * y * z, x * dy * z, x * y * dz])
-    values = polynomials.factors @ monomials  # [4, bands^2, k]
-    return values[0].T, np.moveaxis(values[1:], 0, -1).swapaxes(0, 1)
+        powers[degree] = powers[degree - 1] * points.T
+    x, y, z = (powers[polynomials.degrees[axis], axis] for axis in range(3))  # [monomials, k] each
+    values = (polynomials.factors @ (x * y * z)).reshape(4, bands * bands, len(points))
+    return values[0].T, values[1:].transpose(2, 1, 0)
 
 
 @dataclass(frozen=True)
@@ -40,7 +34,7 @@ class _Polynomials:
     degrees: NDArray[np.int64]
     """[3, monomials] powers of x, y, z."""
     factors: Floats
-    """[bands^2, monomials]."""
+    """[4 bands^2, monomials]: of the polynomials, of their derivatives by x, by y, by z."""
 
 
 @cache
@@ -55,4 +49,15 @@ def _polynomials(bands: int) -> _Polynomials:
         mine = degrees.sum(axis=0) == l
         solved = np.linalg.lstsq(monomials[mine].T, basis[:, band == l], rcond=None)[0]
         factors[np.ix_(band == l, mine)] = solved.T
-    return _Polynomials(degrees, factors)
+    return _Polynomials(degrees, np.concatenate([factors, *(_derived(degrees, factors, axis) for axis in range(3))]))
+
+
+def _derived(degrees: NDArray[np.int64], factors: Floats, axis: int) -> Floats:
+    """The factors of the derivatives along one axis, by the same monomials."""
+    number = {tuple(powers): k for k, powers in enumerate(degrees.T.tolist())}
+    derived = np.zeros_like(factors)
+    for k, powers in enumerate(degrees.T.tolist()):
+        if powers[axis]:
+            lower = [power - (i == axis) for i, power in enumerate(powers)]
+            derived[:, number[tuple(lower)]] += powers[axis] * factors[:, k]
+    return derived

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections import deque
+from typing import Any, cast
 
 import numpy as np
 import pyopencl as cl
@@ -16,6 +17,7 @@ class Workspace:
     def __init__(self, queue: cl.CommandQueue) -> None:
         self._queue = queue
         self._arrays: dict[str, cl_array.Array] = {}
+        self._copying: deque[tuple[cl.Event, NDArray[Any]]] = deque()
 
     def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> cl_array.Array:
         """The array called `name`; contents are kept while shape and dtype stay, undefined after they change."""
@@ -29,9 +31,13 @@ class Workspace:
         return self._arrays.get(name)
 
     def upload(self, name: str, values: NDArray[Any]) -> cl_array.Array:
-        """Copy `values` into the array called `name`."""
+        """Copy `values` into the array called `name`, once what is queued has run; they may change right away."""
         array = self.array(name, values.shape, values.dtype)
-        array.set(np.ascontiguousarray(values))
+        if array.nbytes:  # to wait for the copy would be to wait for all that is queued before it
+            memory, copied = cast(Any, array.data), np.array(values, order="C")
+            self._copying.append((cl.enqueue_copy(self._queue, memory, copied, is_blocking=False), copied))
+        while self._copying and self._copying[0][0].command_execution_status == cl.command_execution_status.COMPLETE:
+            self._copying.popleft()
         return array
 
     def constant(self, name: str, values: NDArray[Any]) -> cl_array.Array:
@@ -48,6 +54,7 @@ class Workspace:
 
     def release(self) -> None:
         """Give all device memory back."""
+        self._copying.clear()
         for array in self._arrays.values():
             if isinstance(array.base_data, cl.MemoryObject):
                 array.base_data.release()

@@ -74,7 +74,8 @@ def _channels(channels: list[CellEquations], light: LobeFit) -> tuple[Floats, Fl
     for channel in channels:
         along = max(float(light.cells @ channel.matrix @ light.cells), 1e-300)
         tint = max(float(light.cells @ channel.vector) / along, 0.0)
-        radiances.append(fit_width(channel, light.width_deg, near=tint * light.cells, pull=COLOR_PULL).cells)
+        near, lit = tint * light.cells, light.amounts > 0
+        radiances.append(fit_width(channel, light.width_deg, near=near, pull=COLOR_PULL, guess=lit).cells)
         tints.append(tint)
     return np.stack(radiances, axis=1), np.array(tints)
 

@@ -89,13 +89,14 @@ def composite(
         "SUBPIXELS": 0 if coverage is None else SUBPIXELS,
         "HAS_GLOSS": reflected is not None,
         "HAS_DIRECT": bool(light.discs),
+        "LANES": engine.lanes,
     }
     kernel = engine.kernel("composite.cl", "composite", BANDS=bands, **defines)
     unused = space.array("unused", (1,), cl_types.float4)
-    touched = mark_touched(engine, ratio, bands) if ratio else unused
+    touched = mark_touched(engine, ratio, bands) if ratio and not light.discs else unused
     engine.launch(
         kernel,
-        (camera.width, camera.height),
+        (-(-camera.width // engine.lanes), camera.height),
         camera.width,
         camera.height,
         space.upload("shown", shown),
@@ -128,7 +129,7 @@ def mark_touched(engine: Engine, ratio: SampleGrid, bands: int) -> cl_array.Arra
     """[rows + 1, cols + 1] uint8: which cells of the grid have a sample near that is not 1."""
     touched = engine.workspace.array("touched", (ratio.rows + 1, ratio.cols + 1), np.uint8)
     engine.launch(
-        engine.kernel("composite.cl", "mark_touched", BANDS=bands),
+        engine.kernel("composite.cl", "mark_touched", BANDS=bands, LANES=engine.lanes),
         (ratio.cols + 1, ratio.rows + 1),
         ratio.cols,
         ratio.rows,

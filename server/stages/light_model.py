@@ -198,7 +198,7 @@ def with_colors(
     tint = np.maximum(amounts @ vectors / max(float(amounts @ matrix @ amounts), 1e-300), 0.0)
     ridge = RIDGE * max(float(np.trace(matrix)) / len(matrix), 1e-300)
     regular, near = matrix + ridge * (1.0 + pull) * np.eye(len(matrix)), ridge * pull * amounts
-    colors = [solve_nonnegative(regular, vectors[:, c] + tint[c] * near)[0] for c in range(3)]
+    colors = [solve_nonnegative(regular, vectors[:, c] + tint[c] * near, amounts > 0)[0] for c in range(3)]
     return Solution(amounts, np.stack(colors, axis=1), mean_albedo)
 
 

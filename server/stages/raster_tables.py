@@ -14,6 +14,7 @@ from protocol.frames import CameraModel
 from server.opencl.engine import Engine, int2
 from server.scene.arena import Arena, gather
 from server.scene.virtual_object import VirtualObject
+from server.stages.painted import box_around
 from server.stages.pinhole import Pinhole
 from server.stages.pixel_boxes import PixelBox
 
@@ -36,6 +37,13 @@ class Picture:
     count: int
     vertices: int
     triangles: int
+    region: PixelBox
+    """Tiles that the objects can cover: x0, y0, x1, y1, half-open; EMPTY where there are none."""
+
+    @property
+    def all_tiles(self) -> PixelBox:
+        """As `region`, of the whole picture."""
+        return 0, 0, -(-self.camera.width // TILE), -(-self.camera.height // TILE)
 
     @property
     def size(self) -> np.generic:
@@ -54,8 +62,10 @@ def tabulate(
     camera_from_volume: Matrix,
     objects: Sequence[tuple[VirtualObject, Matrix]],
     boxes: tuple[PixelBox | None, ...],
+    name: str,
 ) -> Picture:
-    """The tables of `objects`, each with its `volume_from_model`; those without a box are not drawn."""
+    """The tables of `objects`, each with its `volume_from_model`; those without a box are not drawn. name: of the
+    workspace's arrays."""
     things = [thing for thing, _ in objects]
     volume_from_model = np.array([matrix for _, matrix in objects], np.float64).reshape(-1, 4, 4)
     arena, space = gather(engine, things), engine.workspace
@@ -70,13 +80,19 @@ def tabulate(
     return Picture(
         camera,
         arena,
-        space.upload("raster_objects", rows.view(cl_types.int8)[:, 0]),
-        space.upload("raster_matrices", _matrices(camera, camera_from_volume, volume_from_model)),
-        space.upload("raster_vertex_chunks", _chunks(sizes[:, 0])),
-        space.upload("raster_triangle_chunks", _chunks(sizes[:, 1])),
+        space.upload(f"{name}_objects", rows.view(cl_types.int8)[:, 0]),
+        space.upload(f"{name}_matrices", _matrices(camera, camera_from_volume, volume_from_model)),
+        space.upload(f"{name}_vertex_chunks", _chunks(sizes[:, 0])),
+        space.upload(f"{name}_triangle_chunks", _chunks(sizes[:, 1])),
         len(things),
-        *(int(total) for total in sizes.sum(axis=0)),
+        int(sizes[:, 0].sum()),
+        int(sizes[:, 1].sum()),
+        _tiles_of(box_around(boxes)),
     )
+
+
+def _tiles_of(box: PixelBox) -> PixelBox:
+    return box[0] // TILE, box[1] // TILE, -(-box[2] // TILE), -(-box[3] // TILE)
 
 
 def _matrices(

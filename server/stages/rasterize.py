@@ -17,8 +17,9 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.opencl.engine import Engine, int2
+from server.opencl.engine import Engine, int2, int4
 from server.scene.virtual_object import VirtualObject
+from server.stages.painted import is_empty, repainted
 from server.stages.pinhole import Pinhole, finer
 from server.stages.pixel_boxes import NEAR_M, PixelBox, pixel_boxes
 from server.stages.raster_tables import CHUNK, TILE, Picture, tabulate
@@ -98,8 +99,8 @@ def rasterize(
     arrays of one view from those of another. Waits for the device once.
     """
     boxes = boxes_in_view(camera, camera_from_volume, objects)
-    picture = tabulate(engine, camera, camera_from_volume, objects, boxes)
-    visible = _raster(engine, picture, _make_lists(engine, picture, "raster"), "raster")
+    picture = tabulate(engine, camera, camera_from_volume, objects, boxes, "raster")
+    _, visible = _draw(engine, picture, "raster")
     object_index, position, normal, base_color, material = _shade(engine, picture, visible, name)
     return VirtualSurface(position, normal, base_color, object_index, boxes, material)
 
@@ -120,10 +121,7 @@ def drawn_depths(
     The array is valid until the next call with that `name`.
     """
     boxes = boxes_in_view(camera, camera_from_volume, objects)
-    picture = tabulate(engine, camera, camera_from_volume, objects, boxes)
-    lists = _make_lists(engine, picture, name)
-    _raster(engine, picture, lists, name)
-    return lists.nearest
+    return _draw(engine, tabulate(engine, camera, camera_from_volume, objects, boxes, name), name)[0]
 
 
 def boxes_in_view(
@@ -143,13 +141,23 @@ def _power_of_two(count: int) -> int:
     return 1 << max(count - 1, 0).bit_length()
 
 
-def _make_lists(engine: Engine, picture: Picture, name: str) -> _Lists:
-    """Project, clip and sort; what is too small is made larger, so nothing is lost. name: of the arrays."""
+def _draw(engine: Engine, picture: Picture, name: str) -> tuple[cl_array.Array, cl_array.Array]:
+    """[h, w] bits of the nearest 1 / depth; [h, w] the triangle that has it, in the tiles of `picture.region` only.
+
+    name: of the arrays.
+    """
+    nearest = engine.workspace.array(f"{name}_nearest", (picture.camera.height, picture.camera.width), np.uint32)
+    with repainted(engine, f"{name}_nearest", nearest, picture.region, picture.all_tiles) as tiles:
+        lists = _make_lists(engine, picture, name, nearest, tiles)
+        return nearest, _raster(engine, picture, lists, name)
+
+
+def _make_lists(engine: Engine, picture: Picture, name: str, nearest: cl_array.Array, cleared: PixelBox) -> _Lists:
+    """Project, clip and sort; what is too small is made larger, so nothing is lost. cleared: tiles of `nearest`."""
     space, tiles, shape = engine.workspace, picture.tiles, (picture.camera.height, picture.camera.width)
     projected = _project(engine, picture)
     starts = space.array(f"{name}_starts", (tiles + 3,), np.int32)
     counts = space.array(f"{name}_counts", (2 + tiles,), np.int32)
-    nearest = space.array(f"{name}_nearest", shape, np.uint32)
     pixels = shape[0] * shape[1]
     fragment_room = min(_FRAGMENTS_PER_TRIANGLE * picture.triangles, _FRAGMENTS_PER_PIXEL * pixels)
     fragments = space.array(f"{name}_fragments", (_power_of_two(max(fragment_room, 1)),), cl_types.int4)
@@ -158,6 +166,7 @@ def _make_lists(engine: Engine, picture: Picture, name: str) -> _Lists:
         room = _power_of_two(pieces)
         corners = space.array(f"{name}_corners", (room,), cl_types.int8)
         inverse_depths = space.array(f"{name}_inverse_depths", (room,), cl_types.float4)
+        _clear(engine, picture, counts, nearest, cleared)
         _setup(engine, picture, projected, counts, corners, inverse_depths, nearest, fragments)
         scan = _kernel(engine, "scan_tiles")
         engine.launch(scan, (_SCAN_ITEMS,), tiles, _MOST_ENTRIES // tiles, counts, starts, local=(_SCAN_ITEMS,))
@@ -185,6 +194,12 @@ def _project(engine: Engine, picture: Picture) -> cl_array.Array:
     return projected
 
 
+def _clear(engine: Engine, picture: Picture, counts: cl_array.Array, nearest: cl_array.Array, tiles: PixelBox) -> None:
+    rows = 0 if is_empty(tiles) else (tiles[2] - tiles[0]) * (tiles[3] - tiles[1]) * TILE
+    kernel = _kernel(engine, "clear_picture")
+    engine.launch(kernel, (max(counts.size, rows),), picture.size, int4(*tiles), counts.size, counts, nearest)
+
+
 def _setup(
     engine: Engine,
     picture: Picture,
@@ -196,8 +211,6 @@ def _setup(
     fragments: cl_array.Array,
 ) -> None:
     """Fill the lists of pieces and fragments, as far as there is room, and count them."""
-    most = max(counts.size, nearest.size)
-    engine.launch(_kernel(engine, "clear_picture"), (most,), counts.size, nearest.size, counts, nearest)
     engine.launch(
         _kernel(engine, "setup_triangles"),
         (len(picture.triangle_chunks) * CHUNK if picture.triangles else 0,),
@@ -220,12 +233,14 @@ def _setup(
 
 
 def _raster(engine: Engine, picture: Picture, lists: _Lists, name: str) -> cl_array.Array:
-    """Number of the triangle that each pixel shows, [h, w] int32, 2^31 - 1 where there is none."""
+    """Number of the triangle that each pixel shows, [h, w] int32, 2^31 - 1 where there is none; in `region` only."""
+    x0, y0, x1, y1 = picture.region
     visible = engine.workspace.array(f"{name}_visible", lists.nearest.shape, np.int32)
     engine.launch(
         _kernel(engine, "raster_tiles"),
-        (picture.tiles * TILE * TILE,),
+        ((x1 - x0) * (y1 - y0) * TILE * TILE,),
         picture.size,
+        int4(*picture.region),
         lists.corners,
         lists.inverse_depths,
         lists.starts,
@@ -259,24 +274,29 @@ def _shade(engine: Engine, picture: Picture, visible: cl_array.Array, name: str)
     object_index = space.array(f"{name}_object_index", visible.shape, np.int32)
     parts = ("position", "normal", "base_color", "material")
     fields = [space.array(f"{name}_{part}", visible.shape, cl_types.float4) for part in parts]
-    engine.launch(
-        _kernel(engine, "shade_surface"),
-        (picture.camera.width, picture.camera.height),
-        picture.size,
-        visible,
-        picture.count,
-        picture.objects,
-        picture.matrices,
-        arena.vertices,
-        arena.triangles,
-        arena.attributes,
-        arena.material_of,
-        arena.materials,
-        arena.textures,
-        arena.levels,
-        arena.texels,
-        arena.channel_values,
-        object_index,
-        *fields,
-    )
+    with repainted(engine, f"{name}_object_index", object_index, picture.region, picture.all_tiles) as tiles:
+        x0, y0 = TILE * tiles[0], TILE * tiles[1]
+        x1, y1 = min(TILE * tiles[2], picture.camera.width), min(TILE * tiles[3], picture.camera.height)
+        engine.launch(
+            _kernel(engine, "shade_surface"),
+            (x1 - x0, y1 - y0),
+            picture.size,
+            int4(x0, y0, x1, y1),
+            int4(*picture.region),
+            visible,
+            picture.count,
+            picture.objects,
+            picture.matrices,
+            arena.vertices,
+            arena.triangles,
+            arena.attributes,
+            arena.material_of,
+            arena.materials,
+            arena.textures,
+            arena.levels,
+            arena.texels,
+            arena.channel_values,
+            object_index,
+            *fields,
+        )
     return [object_index, *fields]

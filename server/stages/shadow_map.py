@@ -10,7 +10,7 @@ without: what real things hide already, virtual ones do not darken again.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pyopencl as cl
@@ -22,12 +22,13 @@ from protocol.frames import CameraModel
 from server.maths.direct_lights import DirectLight
 from server.maths.disc_places import disc_places, ray_places, search_places
 from server.maths.dominant import MOST_LIGHTS
-from server.opencl.engine import Engine, KernelArgument, float4
+from server.opencl.engine import Engine, KernelArgument, float4, int4
 from server.opencl.program import Define
 from server.stages.auxiliary_views import view_axes
 from server.stages.composite import mark_touched
 from server.stages.differential_rendering import MOST_POINTS, VIRTUAL_STRIDE, RealShadow, ball_around
 from server.stages.object_glow import Glow, PlacedPoints
+from server.stages.painted import box_around, repainted
 from server.stages.pinhole import Pinhole
 from server.stages.rasterize import Placed, VirtualSurface, drawn_depths
 from server.stages.raycast import Surface
@@ -61,6 +62,8 @@ class ShadowMaps:
     """Middle and radius of the ball around all objects, volume metres."""
     objects: cl_array.Array
     """[MOST_LIGHTS, texels of the pyramid] float2: covered part, mean depth in metres from the ball's middle."""
+    traced: list[tuple[Surface, SampleGrid]] = field(default_factory=list)
+    """What trace_real found last, and of what: more than one effect asks for the same."""
 
     @property
     def least(self) -> Floats:
@@ -109,17 +112,19 @@ def light_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, 
     shape = (camera.height // VIRTUAL_STRIDE, camera.width // VIRTUAL_STRIDE)
     parts = SampleGrid(VIRTUAL_STRIDE, space.array("direct_virtual_parts", shape, cl_types.float4))
     _trace_discs(engine, camera, virtual.position, virtual.normal, parts, maps, is_virtual=True)
-    engine.launch(
-        _kernel(engine, "light_virtual"),
-        size,
-        *size,
-        virtual.position,
-        virtual.normal,
-        *_grid(parts),
-        maps.volume.voxel_m,
-        *maps.arguments(engine),
-        direct,
-    )
+    with repainted(engine, "direct_virtual", direct, box_around(virtual.boxes), (0, 0, *size)) as (x0, y0, x1, y1):
+        engine.launch(
+            _kernel(engine, "light_virtual"),
+            (-(-(x1 - x0) // engine.lanes), y1 - y0),
+            camera.width,
+            int4(x0, y0, x1, y1),
+            virtual.position,
+            virtual.normal,
+            *_grid(parts),
+            maps.volume.voxel_m,
+            *maps.arguments(engine),
+            direct,
+        )
     return direct
 
 
@@ -127,8 +132,12 @@ def trace_real(
     engine: Engine, camera: CameraModel, surface: Surface, ratio: SampleGrid, maps: ShadowMaps
 ) -> SampleGrid:
     """What real things leave of the discs at the samples of `ratio`: float4, a disc each, w = 1 valid."""
-    parts = replace(ratio, values=engine.workspace.array("direct_parts", ratio.values.shape, cl_types.float4))
+    for traced, parts in maps.traced:
+        if traced is surface and (parts.stride, parts.values.shape) == (ratio.stride, ratio.values.shape):
+            return parts
+    parts = SampleGrid(ratio.stride, engine.workspace.array("direct_parts", ratio.values.shape, cl_types.float4))
     _trace_discs(engine, camera, surface.positions, surface.normals, parts, maps, is_virtual=False)
+    maps.traced[:] = [(surface, parts)]  # there is one array
     return parts
 
 
@@ -150,7 +159,7 @@ def light_real(
     mixed = space.array("direct_ratio", (camera.height, camera.width), cl_types.float4)
     engine.launch(
         _kernel(engine, "light_real", BICUBIC=upsampling == "bicubic"),
-        size,
+        (-(-camera.width // engine.lanes), camera.height),
         *size,
         surface.positions,
         surface.normals,
@@ -173,7 +182,7 @@ def light_glow(engine: Engine, placed: PlacedPoints, glow: Glow, maps: ShadowMap
     count = min(placed.count, MOST_POINTS)
     engine.launch(
         _kernel(engine, "light_glow"),
-        (count,),
+        (-(-count // engine.lanes),),
         count,
         placed.points,
         placed.normals,
@@ -181,6 +190,7 @@ def light_glow(engine: Engine, placed: PlacedPoints, glow: Glow, maps: ShadowMap
         *maps.arguments(engine),
         *maps.trace_arguments(engine),
         glow.radiances,
+        local=(max(64 // engine.lanes, 1),),
     )
 
 
@@ -192,7 +202,7 @@ def light_samples(
     without, lit = (space.array(f"direct_samples_{name}", shape, cl_types.float4) for name in ("without", "with"))
     engine.launch(
         _kernel(engine, "light_samples"),
-        (parts.cols, parts.rows),
+        (-(-parts.cols // engine.lanes), parts.rows),
         parts.cols,
         parts.rows,
         parts.stride,
@@ -233,13 +243,19 @@ def _draw_objects(engine: Engine, axes: Floats, ball: Floats, objects: Sequence[
     texels, distance_m = (4 * MAP_SIDE**2 - _COARSEST_SIDE**2) // 3, DISTANCE * float(ball[3])
     maps = engine.workspace.array("object_maps", (MOST_LIGHTS, texels), cl_types.float2)
     middle, focal_px = (MAP_SIDE - 1) / 2, DISTANCE * MAP_SIDE / 2
-    camera = Pinhole(MAP_SIDE, MAP_SIDE, focal_px, focal_px, middle, middle)
-    for light, rotation in enumerate(axes):
+    camera = Pinhole(MAP_SIDE, MOST_LIGHTS * MAP_SIDE, focal_px, focal_px, middle, middle)
+    drawn: list[Placed] = []
+    for light, rotation in enumerate(
+        axes
+    ):  # one picture, a light's below the other's: each sees the objects for itself
         camera_from_volume = np.eye(4)
         camera_from_volume[:3, :3] = rotation
         camera_from_volume[:3, 3] = -rotation @ ball[:3] + [0.0, 0.0, distance_m]
-        nearest = drawn_depths(engine, camera, camera_from_volume, objects, "shadow_map")
-        engine.launch(_kernel(engine, "begin_map"), (MAP_SIDE, MAP_SIDE), light, distance_m, nearest, maps)
+        camera_from_volume[1] += light * MAP_SIDE / focal_px * camera_from_volume[2]
+        drawn += [(thing, camera_from_volume @ volume_from_model) for thing, volume_from_model in objects]
+    nearest = drawn_depths(engine, camera, np.eye(4), drawn, "shadow_map")
+    size = (MAP_SIDE, len(axes) * MAP_SIDE)
+    engine.launch(_kernel(engine, "begin_maps"), size, len(axes), distance_m, nearest, maps)
     for level in range(1, (MAP_SIDE // _COARSEST_SIDE).bit_length()):
         side = MAP_SIDE >> level
         engine.launch(_kernel(engine, "halve_maps"), (side, side, len(axes)), len(axes), level, maps)

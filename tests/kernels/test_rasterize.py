@@ -13,11 +13,12 @@ import trimesh
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.scene.mesh import Mesh
 from server.scene.virtual_object import VirtualObject
 from server.stages import rasterize as rasterize_module
-from server.stages.rasterize import NEAR_M, VirtualSurface, rasterize
+from server.stages.rasterize import NEAR_M, VirtualSurface, nearest_depths, rasterize
 from tests.data import data_folder
 from tests.meshes import mesh_file, mesh_of, pose, public_mesh, shape_of, soup_of
 from tests.reference import rasterize as twin
@@ -438,6 +439,30 @@ def test_two_views_by_name(engine: Engine) -> None:
     rasterize(engine, CAMERA, EYE, [(thing, pose((0.5, 0, 4.0)))], name="other")
     np.testing.assert_array_equal(download(engine, first).position, expected.position)
     np.testing.assert_array_equal(download(engine, first).index, expected.index)
+
+
+def test_nothing_is_left_where_an_object_was(device: Device, engine: Engine) -> None:
+    """Only what objects cover, and did the last time, is gone over: as if drawn for the first time all the same."""
+    thing = VirtualObject.upload(engine, shape_of(trimesh.creation.icosphere()), cells=8)
+    places: list[list[tuple[float, float, float]]] = [
+        [(0.0, 0.0, 6.0)],
+        [(-2.0, 1.0, 5.0), (2.5, -1.0, 7.0)],
+        [(0.0, 0.0, -3.0)],  # behind
+        [(1.5, 1.2, 6.0)],
+        [],
+        [(0.0, 0.0, 1.2)],  # all of the picture
+        [(0.5, 0.0, 9.0)],
+    ]
+    for points in places:
+        objects = [(thing, pose(point)) for point in points]
+        fresh = Engine(device)
+        first = download(fresh, rasterize(fresh, CAMERA, EYE, objects))
+        found = download(engine, rasterize(engine, CAMERA, EYE, objects))
+        for field in ("index", "position", "normal", "color"):
+            np.testing.assert_array_equal(getattr(found, field), getattr(first, field))
+        fine = [e.download(nearest_depths(e, CAMERA, EYE, objects)) for e in (engine, fresh)]
+        np.testing.assert_array_equal(*fine)
+        fresh.close()
 
 
 def test_order_of_triangles_does_not_matter(engine: Engine) -> None:

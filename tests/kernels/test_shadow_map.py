@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from server.effects import View, add_objects
+from server.effect_functions import View, add_objects
 from server.maths.direct_lights import DirectLight, SplitLight, split_light
 from server.maths.directional_fit import directional_sh
 from server.maths.disc_places import disc_places, ray_places, search_places
@@ -103,7 +103,7 @@ class Lit:
         covered[0, 0] = 0
         position, normal = (space.upload(n, float4(a, covered)) for n, a in (("v_p", points), ("v_n", normals)))
         unused = space.array("unused", (1,), np.float32)
-        surface = VirtualSurface(position, normal, unused, unused, ())
+        surface = VirtualSurface(position, normal, unused, unused, ((0, 0, *covered.shape[::-1]),))
         return download4(self.engine, light_virtual(self.engine, camera_of(points), surface, self.maps)).astype(float)
 
 
@@ -395,6 +395,35 @@ def test_pixels_of_real_surface_hold_the_whole_ratio(engine: Engine) -> None:
     assert found[42:, :, 3].all()
     assert 0.05 < (found[:20, :, 3] > 0).mean() < 0.9
     assert not found[found[..., 3] == 0].any()
+
+
+def test_one_lane_and_eight_light_a_rough_floor_alike(device: Device) -> None:
+    """Of a width that eight do not divide, with holes, under two discs: as on a GPU, to rounding."""
+    rng, height, width, stride = np.random.default_rng(3), 40, 45, 4
+    x, z = np.meshgrid(np.linspace(0.1, 0.8, width), np.linspace(0.1, 0.8, height))
+    points = np.stack([x, FLOOR_Y + rng.uniform(-0.01, 0.01, x.shape), z], -1).astype(np.float32).astype(float)
+    normals = np.asarray(UP, float) + rng.uniform(-0.2, 0.2, points.shape)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    known = rng.random(x.shape) > 0.1
+    samples = (height // stride, width // stride)
+    ratio, rest = rng.uniform(0.5, 1.0, (*samples, 3)), rng.uniform(0.1, 0.5, (*samples, 3))
+    found = []
+    for kind in (Narrow, Wide):
+        engine = kind(device)
+        scene, space, camera = lit(engine, disc(8.0), disc(20.0, BEHIND)), engine.workspace, camera_of(points)
+        surface = upload_surface(engine, points, normals, known)
+        shadow = RealShadow(stride, space.upload("m_ratio", float4(ratio)), space.upload("m_rest", float4(rest)))
+        parts = trace_real(engine, camera, surface, shadow, scene.maps)
+        assert trace_real(engine, camera, surface, shadow, scene.maps) is parts  # once a frame
+        mixed = light_real(engine, camera, surface, shadow, parts, scene.maps)
+        brought = light_samples(engine, camera, surface, parts, scene.maps)
+        found.append([download4(engine, a) for a in (mixed, brought.without, brought.with_objects)])
+        engine.close()
+    for narrow, wide in zip(*found, strict=True):
+        apart = np.abs(narrow - wide).max(axis=-1)
+        assert (apart < 1e-5).mean() > 0.995  # a look that falls on a texel's border may fall on either side
+        assert apart.max() < 0.1
+    assert (found[1][0][..., 3] > 0).mean() > 0.8
 
 
 def test_points_on_objects_send_what_the_disc_brings_them(engine: Engine) -> None:

@@ -103,3 +103,14 @@ def test_drawn_to_a_light_it_follows_where_the_samples_are_silent() -> None:
     near = lobe_family(35.0) @ np.full(lobe_family(35.0).shape[1], 2.0)
     drawn = fit_width(nothing, 35.0, near=near, pull=1e6)
     np.testing.assert_allclose(drawn.cells, near, rtol=0.05)
+
+
+def test_a_spread_of_sums_that_rounding_made_indefinite_is_finite() -> None:
+    """A still view without noise: of what samples do not tell, float32 sums may say a little less than nothing."""
+    whole = equations(balls(12), sun(35.0))
+    fit = fit_width(whole, 35.0)
+    cut = whole.matrix - 1e-9 * np.trace(whole.matrix) * np.eye(CELLS)
+    lobes = lobe_family(35.0)
+    assert np.linalg.eigvalsh(lobes.T @ cut @ lobes).min() < 0
+    spread = spread_of(CellEquations(cut, whole.vector, whole.energy), fit, noise=1e-16)
+    assert np.isfinite(spread).all()

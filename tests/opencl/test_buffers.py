@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,22 @@ def test_upload_copies_into_the_same_memory(workspace: Workspace) -> None:
     again = workspace.upload("a", np.asfortranarray(10 * np.arange(6, dtype=np.int32).reshape(2, 3)))
     assert again is first
     np.testing.assert_array_equal(first.get(), [[0, 10, 20], [30, 40, 50]])
+
+
+def test_upload_waits_for_nothing_and_values_may_change(engine: Engine) -> None:
+    gate = cl.UserEvent(engine.device.context)
+    cl.enqueue_barrier(engine.queue, wait_for=[gate])
+    opener = threading.Timer(10.0, gate.set_status, [cl.command_execution_status.COMPLETE])  # if it waits after all
+    opener.start()
+    values = np.arange(1000, dtype=np.int32)
+    array = engine.workspace.upload("a", values)
+    values[:] = -1
+    waited = gate.command_execution_status == cl.command_execution_status.COMPLETE
+    opener.cancel()
+    if not waited:
+        gate.set_status(cl.command_execution_status.COMPLETE)
+    np.testing.assert_array_equal(engine.download(array), np.arange(1000))
+    assert not waited
 
 
 def test_constant_copies_once(workspace: Workspace) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from client.laptop.source import open_source
 from client.laptop.synthetic.lights import disc_light
 from protocol.frames import CameraModel
-from server import pipeline as spine
+from server import rendering
 from server.maths.rigid import inverse_rigid
 from server.opencl.device import Device
 from server.opencl.engine import Engine
@@ -219,9 +219,9 @@ def pictures(device: Device, source: str, preset: str, indirect: str, traced: bo
         replace(e, omitted=lambda _: Omission("traced for comparison", 0.0))
         if traced and e.name == "look_around"
         else e
-        for e in spine.EFFECTS
+        for e in rendering.EFFECTS
     )
-    with patch.object(spine, "EFFECTS", effects):
+    with patch.object(rendering, "EFFECTS", effects):
         result = pipeline.process(opened[0])
     pipeline.close()
     return result.color.astype(float), result.plan.run

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Preset, Wishes
-from server import pipeline as spine
+from server import rendering
 from server.maths.direct_lights import SplitLight, split_light
 from server.maths.directional_fit import directional_sh
 from server.opencl.device import Device
@@ -121,7 +121,7 @@ def test_small_light_throws_its_shadow(device: Device, preset: Preset) -> None:
 
 def test_shadow_is_sharper_than_the_harmonics_can_show(device: Device) -> None:
     light = light_of(9.0)
-    with patch.object(spine, "split_light", lambda sh: SplitLight(sh, ())):
+    with patch.object(rendering, "split_light", lambda sh: SplitLight(sh, ())):
         blurred = shown(device, light)
     assert "shadow_map" not in blurred.plan.run
     expected, is_floor = exact_ratio(9.0)
@@ -137,7 +137,7 @@ def test_soft_light_is_drawn_as_before(device: Device, indirect: bool) -> None:
     left_out = {item.effect: item for item in result.plan.left_out}
     assert left_out["shadow_map"].reason == "the light is soft"
     assert left_out["shadow_map"].error_bound == 0.0
-    with patch.object(spine, "split_light", lambda sh: SplitLight(sh, ())):
+    with patch.object(rendering, "split_light", lambda sh: SplitLight(sh, ())):
         np.testing.assert_array_equal(result.color, shown(device, light, indirect=indirect).color)
     assert (result.color != GREY).any()
 
@@ -165,7 +165,7 @@ def test_surfaces_that_send_light_see_both_parts(device: Device) -> None:
     umbra = is_floor & (expected < expected[is_floor].min() + 0.02)
     assert both[umbra].mean() > direct[umbra].mean()
     assert np.abs(both - direct)[is_floor].mean() < 0.05
-    with patch("server.effects.shadow_maps.light_glow"):
+    with patch("server.effect_functions.shadow_maps.light_glow"):
         dim = ratio_of(shown(device, light, indirect=True))
     assert (both >= dim).all()
     assert (both > dim).any()

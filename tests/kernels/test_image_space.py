@@ -205,7 +205,7 @@ def test_views_are_drawn_in_turn(engine: Engine) -> None:
     ("bricks", "frames", "expected"),
     [
         # of 12, those of 100 or 101 bricks: 12, 7, 2, none
-        ((100, 101, 120, 120, 120, 120, 122, 200), (99,) * 8, [12, 2, 5, 5, 4, 2, 2, 5]),
+        ((100, 101, 120, 120, 120, 120, 123, 200), (99,) * 8, [12, 2, 5, 5, 4, 2, 2, 5]),
         # of one frame at 2; then of 2 and 3 at 4 to 6 ...; none of 16 or more
         ((100,) * 8, (1, 2, 3, 4, 30, 31, 32, 90), [12, 5, 5, 5, 5, 5, 4, 2]),
     ],

@@ -48,7 +48,7 @@ lock: .venv/installed-test
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra test \
 		--constraint requirements.lock pyproject.toml -o requirements-test.lock
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra test --extra mesh \
-		--extra model --extra bench --constraint requirements-test.lock --constraint requirements.lock \
+		--extra model --extra bench --extra sweep --constraint requirements-test.lock --constraint requirements.lock \
 		pyproject.toml -o requirements-bench.lock
 
 .venv/bin/python:

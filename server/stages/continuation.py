@@ -54,7 +54,6 @@ LEAST_FRAMES = 2
 """Frames before extents are tried: one picture can be explained in too many ways."""
 MOST_ROWS = 700
 """Pools that extents are judged by."""
-_STEPS = np.array(STEPS_M)
 _BEHIND_M = 0.05  # a camera that measures so much farther looked through
 
 
@@ -235,7 +234,7 @@ class _Trial:
         self._least_gain = least_gain
         self._judged = judged
         self._open = judged.transfer.sum(axis=1)
-        self._needed: list[list[NDArray[np.uint8]]] = []
+        self._needed: list[NDArray[np.uint8]] = []
         self._hidden: list[NDArray[np.bool_]] = []
         self.misfit = np.inf
 
@@ -252,8 +251,7 @@ class _Trial:
         """Make the next plane's table."""
         number = len(self._needed)
         plane = self._planes[number]
-        beyond = plane.beyond(self._judged.positions, spokes().reshape(-1, 3), LEAST_M)
-        self._needed.append([np.searchsorted(_STEPS, side).astype(np.uint8) for side in beyond])
+        self._needed.append(plane.steps_needed(self._judged.positions, spokes().reshape(-1, 3), LEAST_M))
         self._hidden.append(self._hidden_by(number, plane.steps))
         if not self.unprepared:
             self.misfit = self._misfit_of(np.logical_or.reduce(self._hidden))

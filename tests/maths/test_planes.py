@@ -101,3 +101,20 @@ def test_scattered_points_are_of_no_plane() -> None:
     normals = rng.normal(size=(40, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     assert find_planes(rng.uniform(0, 50, (40, 3)), normals, []) == []
+
+
+def test_steps_needed_are_those_of_how_far_beyond() -> None:
+    """But for rays within float32 of a step's end or of a cell's border."""
+    rng = np.random.default_rng(5)
+    for plane in find_planes(*corner(), []):
+        plane.empty |= rng.random(plane.empty.shape) < 0.2
+        origins = np.array([0.5, 0.5, 1.5]) + 0.4 * rng.normal(size=(300, 3))
+        directions = rng.normal(size=(400, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        directions[:2] = plane.across, -plane.along  # along it: they never meet it
+        exact = np.searchsorted(np.array(STEPS_M), np.stack(plane.beyond(origins, directions, 0.03)))
+        found = plane.steps_needed(origins, directions, 0.03)
+        assert found.shape == (4, 300, 400)
+        assert (found[..., :2] == len(STEPS_M)).all()
+        assert (exact < len(STEPS_M)).mean() > 0.1
+        assert (found != exact).mean() < 1e-3

@@ -34,8 +34,9 @@ _SET_STEP = 8  # samples so far apart along an axis have the same directions
 LEAST_TURN = float(np.cos(np.deg2rad(3.0)))
 """The view from the dominant light is drawn anew once the light has turned by 3 degrees."""
 GROWTH = 0.03
-"""A view is out of date once the volume has so many more bricks than it was drawn of, as a share: whoever enters a
-room sees much of it for the first time within a second, and light would come through it."""
+"""A view is out of date once the volume has so many more bricks than it was drawn of, as a share.
+
+Whoever enters a room sees much of it for the first time within a second, and light would come through it."""
 YOUNG_FRAMES = 16
 """Likewise a view of a volume of fewer frames, once there are twice as many: surface of a few noisy frames has holes."""
 MOST_PER_FRAME = 96

@@ -38,7 +38,7 @@ GROWTH = 0.03
 
 Whoever enters a room sees much of it for the first time within a second, and light would come through it."""
 YOUNG_FRAMES = 16
-"""Likewise a view of a volume of fewer frames, once there are twice as many: surface of a few noisy frames has holes."""
+"""Likewise a view of a volume of fewer frames, once there are twice as many: a few noisy frames leave holes."""
 MOST_PER_FRAME = 96
 """Views that a frame draws at the most, where many are out of date."""
 

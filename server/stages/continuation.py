@@ -251,7 +251,7 @@ class _Trial:
         """Make the next plane's table."""
         number = len(self._needed)
         plane = self._planes[number]
-        self._needed.append(plane.steps_needed(self._judged.positions, spokes().reshape(-1, 3), LEAST_M))
+        self._needed.append(plane.steps_needed(self._judged.positions, spokes().swapaxes(0, 1).reshape(-1, 3), LEAST_M))
         self._hidden.append(self._hidden_by(number, plane.steps))
         if not self.unprepared:
             self.misfit = self._misfit_of(np.logical_or.reduce(self._hidden))
@@ -267,17 +267,16 @@ class _Trial:
         for k, hidden in enumerate(self._hidden):
             if k != plane:
                 others |= hidden
+        by_other_sides = self._hidden_by(plane, patch.steps, besides=side)
         for step in self._candidates(int(patch.steps[side]), MOST_GROWTH * patch.longest_m):
-            steps = patch.steps.copy()
-            steps[side] = step
-            hidden = self._hidden_by(plane, steps)
+            hidden = by_other_sides & (self._needed[plane][side] <= step)
             if not ((hidden ^ self._hidden[plane]) & ~others).any():
                 continue
             tried += 1
             misfit = self._misfit_of(others | hidden)
             allowed = 1 - self._least_gain if step > patch.steps[side] else 1 + 0.2 * self._least_gain
             if misfit < allowed * self.misfit:
-                patch.steps, self._hidden[plane], self.misfit = steps, hidden, misfit
+                patch.steps[side], self._hidden[plane], self.misfit = step, hidden, misfit
         return max(tried, 1)
 
     def _candidates(self, now: int, most_m: float) -> Iterator[int]:
@@ -285,17 +284,18 @@ class _Trial:
         everything = range(len(STEPS_M)) if now == 0 else (now - 2, now - 1, now + 1, now + 2)
         return (step for step in everything if step != now and 0 <= step < len(STEPS_M) and STEPS_M[step] <= most_m)
 
-    def _hidden_by(self, plane: int, steps: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """[n, CELLS * SPOKES]."""
-        hidden = self._needed[plane][0] <= steps[0]
-        for side in range(1, SIDES):
-            hidden &= self._needed[plane][side] <= steps[side]
-        return np.asarray(hidden)
+    def _hidden_by(self, plane: int, steps: NDArray[np.int64], besides: int | None = None) -> NDArray[np.bool_]:
+        """[n, SPOKES * CELLS]; `besides`: a side that is taken to go on without end."""
+        hidden = np.ones(self._needed[plane].shape[1:], np.bool_)
+        for side in range(SIDES):
+            if side != besides:
+                hidden &= self._needed[plane][side] <= steps[side]
+        return hidden
 
     def _misfit_of(self, hidden: NDArray[np.bool_]) -> float:
-        """What the best light of the judged lobes leaves where directions [n, CELLS * SPOKES] are hidden."""
-        judged, codes = self._judged, hidden.view(np.uint8)
-        met = codes[:, 0::4] + codes[:, 1::4] + codes[:, 2::4] + codes[:, 3::4]
+        """What the best light of the judged lobes leaves where directions [n, SPOKES * CELLS] are hidden."""
+        judged, codes = self._judged, hidden.view(np.uint8).reshape(len(hidden), SPOKES, -1)
+        met = codes.sum(axis=1, dtype=np.uint8)
         open_cells = judged.transfer * (1.0 - met / SPOKES)
         target = judged.target - judged.beyond * (self._open - open_cells.sum(axis=1))
         columns = open_cells @ judged.lobes

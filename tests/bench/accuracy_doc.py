@@ -6,5 +6,9 @@ from tests.bench.accuracy import OUT
 from tests.bench.finished import ROOT
 from tests.bench.page import write_page
 
+SHOWN = ("table ", "fig. ", "living room", "stage: ", "lit-room: ")
+"""How names begin of rows that stand on the page without a goal; the others, hundreds, are in the JSON beside it."""
+
 if __name__ == "__main__":
-    write_page(ROOT / "docs" / "benchmarks" / "accuracy.md", OUT / "result.json")
+    page = ROOT / "docs" / "benchmarks" / "accuracy.md"
+    write_page(page, OUT / "result.json", lambda name: name.startswith(SHOWN))

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 START, END = "<!-- figures -->\n", "<!-- end of figures -->\n"
 
 
-def write_page(page: Path, result: Path) -> None:
-    """Write the figures of a suite's result.json into `page`, and a copy of it beside the page."""
+def write_page(page: Path, result: Path, shown: Callable[[str], bool] = lambda _name: True) -> None:
+    """Write the figures of a suite's result.json into `page`, and a copy of it beside the page.
+
+    shown: of rows without a goal, by their names, those that are not left to the copy.
+    """
     before, _, rest = page.read_text().partition(START)
     after = rest.partition(END)[2]
-    page.write_text(before + START + figures(json.loads(result.read_text())) + END + after)
+    found = json.loads(result.read_text())
+    found["rows"] = [row for row in found["rows"] if row["goal"] or shown(row["name"])]
+    page.write_text(before + START + figures(found) + END + after)
     shutil.copy(result, page.with_suffix(".json"))
 
 

@@ -29,6 +29,7 @@ bench: .venv/installed-bench
 	$(BIN)/probeless bench geometry
 	$(BIN)/probeless bench light
 	$(BIN)/probeless bench rendering
+	$(BIN)/probeless bench accuracy
 	$(BIN)/probeless bench plan
 	$(BIN)/probeless bench stability
 	$(BIN)/probeless bench service

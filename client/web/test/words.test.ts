@@ -23,7 +23,7 @@ test("bounds", () => {
 });
 
 test("operating points", () => {
-  const point = { settings: "--preset reg8 --rays 49", reason: "asked for" };
+  const point = { settings: "--preset reg8 --rays 49", reason: "asked for", expected_ms: null, light_error_deg: null };
   assert.equal(describePoint(point), "--preset reg8 --rays 49 (asked for)");
   assert.equal(
     describePoint({ ...point, expected_ms: 131.5, light_error_deg: 3.25 }),

@@ -84,25 +84,10 @@ class PlanePatch:
         at = self.coordinates(points)
         self.seen = np.stack([np.minimum(self.seen[0], at.min(axis=0)), np.maximum(self.seen[1], at.max(axis=0))])
 
-    def beyond(self, origins: Floats, directions: Floats, least_m: float) -> list[Floats]:
-        """For each side [n, m] how far beyond it rays from `origins` [n, 3] along `directions` [m, 3] meet the plane,
-        metres; inf where they do not, or where a camera looked through."""
-        sinking = directions @ self.normal
-        with np.errstate(divide="ignore"):
-            t = (self.offset_m - origins @ self.normal)[:, None] / np.where(np.abs(sinking) < 1e-5, np.inf, sinking)
-        x = (origins @ self.across - self.corner[0])[:, None] + t * (directions @ self.across)
-        y = (origins @ self.along - self.corner[1])[:, None] + t * (directions @ self.along)
-        rows, cols = self.empty.shape
-        col = np.clip(np.nan_to_num(x / CELL_M), 0, cols - 1).astype(np.int64)
-        row = np.clip(np.nan_to_num(y / CELL_M), 0, rows - 1).astype(np.int64)
-        (low_x, low_y), (high_x, high_y) = self.seen
-        misses = (t < least_m) | self.empty[row, col]
-        over = (low_x - x, x - high_x, low_y - y, y - high_y)
-        return [np.where(misses, np.inf, np.maximum(side, 0.0)) for side in over]
-
     def steps_needed(self, origins: Floats, directions: Floats, least_m: float) -> NDArray[np.uint8]:
-        """[SIDES, n, m] the least index into STEPS_M by which each side must go on to meet those rays of `beyond`;
-        len(STEPS_M) where none does. To float32."""
+        """[SIDES, n, m] the least index into STEPS_M by which each side must go on for rays from `origins` [n, 3] along
+        `directions` [m, 3] to meet the plane, farther than `least_m`; len(STEPS_M) where that is not enough, where they
+        miss it, or where a camera looked through. To float32."""
         sinking = directions @ self.normal
         steep = np.abs(sinking) >= 1e-5
         per_metre = np.where(steep, 1 / np.where(steep, sinking, 1.0), 0.0).astype(np.float32)

@@ -14,10 +14,10 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.opencl.engine import Engine, KernelArgument, float4
+from server.opencl.engine import Engine, float4
 from server.stages.indirect import Indirect, no_hits
 from server.stages.object_glow import Glow, PlacedPoints, place_points
-from server.stages.radiance_transfer import Transfer, own_sets
+from server.stages.radiance_transfer import Transfer, sample_arguments
 from server.stages.rasterize import Placed, VirtualSurface
 from server.stages.raycast import Surface
 from server.stages.sample_grid import SampleGrid
@@ -61,7 +61,7 @@ def shadow_real(
     engine.launch(
         engine.kernel("differential_rendering.cl", "shadow_real", **_sample_defines(engine, transfer, scene)),
         (transfer.cols, transfer.rows),
-        *_sample_arguments(engine, camera, surface, transfer),
+        *sample_arguments(engine, camera, surface, transfer),
         transfer.coefficients,
         indirect.hits if indirect else no_hits(engine, transfer),
         scene.light.coefficients,
@@ -88,7 +88,7 @@ def bounce_real(
     engine.launch(
         engine.kernel("differential_rendering.cl", "bounce_real", **_sample_defines(engine, transfer, scene)),
         (transfer.cols, transfer.rows),
-        *_sample_arguments(engine, camera, surface, transfer),
+        *sample_arguments(engine, camera, surface, transfer),
         scene.light.coefficients,
         *shadowed.arguments(engine),
         BOUNCE_EVERY,
@@ -100,23 +100,6 @@ def bounce_real(
 
 def _sample_defines(engine: Engine, transfer: Transfer, scene: TracedScene) -> dict[str, int]:
     return scene.defines(engine) | {"MASK_WORDS": transfer.free_mask.shape[2], "INTERLEAVE": transfer.interleave}
-
-
-def _sample_arguments(
-    engine: Engine, camera: CameraModel, surface: Surface, transfer: Transfer
-) -> tuple[KernelArgument, ...]:
-    """SAMPLE_PARAMETERS of differential_rendering.cl."""
-    return (
-        transfer.cols,
-        transfer.rows,
-        transfer.stride,
-        camera.width,
-        surface.positions,
-        surface.normals,
-        transfer.openness,
-        transfer.free_mask,
-        transfer.sets if transfer.sets is not None else own_sets(engine, transfer.rows, transfer.cols),
-    )
 
 
 _CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.maths.sh import GOLDEN_TURN, sh_basis, spherical_fibonacci
-from server.opencl.engine import Engine
+from server.opencl.engine import Engine, KernelArgument
 from server.stages.raycast import Surface
 from server.stages.visibility_cache import VisibilityCaches, no_caches
 from server.stages.visibility_state import VisibilityState
@@ -192,6 +192,23 @@ def first_set(turn: int) -> int:
 def own_sets(engine: Engine, rows: int, cols: int, turn: int = 0) -> cl_array.Array:
     """[rows, cols, 1] uint8: the set of each sample where nothing is taken from other frames (direction_sets.clh)."""
     return engine.workspace.constant(f"own_sets_{turn % TURNS}_{rows}x{cols}", _sets_of(rows, cols, turn % TURNS))
+
+
+def sample_arguments(
+    engine: Engine, camera: CameraModel, surface: Surface, transfer: Transfer
+) -> tuple[KernelArgument, ...]:
+    """SAMPLE_PARAMETERS of real_shading.clh: the samples of real surface, and which of their directions are free."""
+    return (
+        transfer.cols,
+        transfer.rows,
+        transfer.stride,
+        camera.width,
+        surface.positions,
+        surface.normals,
+        transfer.openness,
+        transfer.free_mask,
+        transfer.sets if transfer.sets is not None else own_sets(engine, transfer.rows, transfer.cols),
+    )
 
 
 @cache

@@ -18,7 +18,7 @@ from protocol.frames import CameraModel
 from server.opencl.engine import Engine, float4
 from server.stages.differential_rendering import ball_around
 from server.stages.indirect import Indirect, no_hits
-from server.stages.radiance_transfer import Directions, Transfer, own_sets
+from server.stages.radiance_transfer import Directions, Transfer, sample_arguments
 from server.stages.rasterize import Placed
 from server.stages.raycast import Surface
 from server.stages.sampling import Upsampling
@@ -139,15 +139,7 @@ def _bound_samples(
     engine.launch(
         engine.kernel("reach.cl", "bound_samples", **_defines(engine, light, transfer)),
         (cols, rows),
-        transfer.cols,
-        transfer.rows,
-        transfer.stride,
-        camera.width,
-        surface.positions,
-        surface.normals,
-        transfer.openness,
-        transfer.free_mask,
-        transfer.sets if transfer.sets is not None else own_sets(engine, transfer.rows, transfer.cols),
+        *sample_arguments(engine, camera, surface, transfer),
         transfer.coefficients,
         indirect.hits if indirect else no_hits(engine, transfer),
         light.coefficients,

@@ -19,7 +19,7 @@ from protocol.frames import CameraModel
 from server.opencl.engine import Engine
 from server.stages.indirect import Indirect, no_hits
 from server.stages.light_estimation import ASSUMED_ALBEDO, FORGETTING
-from server.stages.radiance_transfer import Directions, Transfer, own_sets
+from server.stages.radiance_transfer import Directions, Transfer, sample_arguments
 from server.stages.raycast import Surface
 from server.stages.traced_scene import DeviceLight, light_arguments
 from server.stages.volume import Volume
@@ -88,15 +88,7 @@ def measure_averages(
     engine.launch(
         engine.kernel("tone_mapping.cl", "shade_pairs", **defines),
         (cols, rows),
-        transfer.cols,
-        transfer.rows,
-        transfer.stride,
-        camera.width,
-        surface.positions,
-        surface.normals,
-        transfer.openness,
-        transfer.free_mask,
-        transfer.sets if transfer.sets is not None else own_sets(engine, transfer.rows, transfer.cols),
+        *sample_arguments(engine, camera, surface, transfer),
         radiance,
         transfer.coefficients,
         indirect.hits if indirect else no_hits(engine, transfer),

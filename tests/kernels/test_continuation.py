@@ -35,6 +35,7 @@ from server.stages.lobe_estimator import LobeEstimator
 from tests.analytic import Floats
 from tests.data import data_folder
 from tests.maths.test_planes import FLOOR, WALL, corner
+from tests.reference.planes import beyond
 
 CAMERA = CameraModel(width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
 
@@ -73,7 +74,7 @@ def test_hidden_cells_match_twin(engine: Engine) -> None:
     directions = spokes().reshape(-1, 3)
     hidden = np.zeros((grid.count, CELLS * 4), np.bool_)
     for plane in planes:
-        needed = plane.beyond(positions[1], directions, LEAST_M)
+        needed = beyond(plane, positions[1], directions, LEAST_M)
         reach = np.array(STEPS_M)[plane.steps]
         hidden |= np.logical_and.reduce([side <= most for side, most in zip(needed, reach, strict=True)])
     expected = raw[1] * (1 - hidden.reshape(grid.count, CELLS, 4).mean(axis=2))
@@ -104,7 +105,7 @@ def shaded_corner(extent_m: float, noise: float = 0.02) -> tuple[Floats, Floats,
     continuation = Continuation()
     continuation.planes = find_planes(points, normals, [])
     wall = next(plane for plane in continuation.planes if plane.normal @ WALL > 0.9)
-    needed = np.stack(wall.beyond(points, spokes().reshape(-1, 3), LEAST_M)).max(axis=0)
+    needed = np.stack(beyond(wall, points, spokes().reshape(-1, 3), LEAST_M)).max(axis=0)
     shown = transfer * (1 - (needed <= extent_m).reshape(len(points), CELLS, 4).mean(axis=2))
     towards = np.stack([[1.0, -0.3, 0.5], [-1.0, -0.5, 0.4], [0, -1, 0.2]])
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)

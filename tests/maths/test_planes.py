@@ -7,6 +7,7 @@ import pytest
 
 from server.maths.planes import CELL_M, STEPS_M, PlanePatch, find_planes
 from tests.analytic import Floats
+from tests.reference.planes import beyond
 
 WALL, FLOOR = np.array([0.0, 0.0, -1.0]), np.array([0.0, -1.0, 0.0])
 
@@ -65,27 +66,27 @@ def test_how_far_beyond_each_side_a_ray_meets_the_plane() -> None:
     targets = np.array([[1.4, 0.5, 2.0], [-0.3, 0.5, 2.0], [0.5, -0.7, 2.0], [0.5, 0.5, 2.0], [1.25, -0.35, 2.0]])
     origin = np.array([[0.5, 0.5, 0.5]])
     directions = targets - origin
-    beyond = np.stack(wall.beyond(origin, directions / np.linalg.norm(directions, axis=1, keepdims=True), 0.03))[:, 0]
-    assert sorted(beyond[:, 0])[-1] == pytest.approx(0.4, abs=0.02)
-    assert (np.sort(beyond, axis=0)[:-1, :3] == 0).all()
-    assert beyond[:, 1].max() == pytest.approx(0.3, abs=0.02)
-    assert beyond[:, 2].max() == pytest.approx(0.7, abs=0.02)
-    assert (beyond[:, 3] == 0).all()
-    assert np.sort(beyond[:, 4])[-2:] == pytest.approx([0.25, 0.35], abs=0.02)
+    far = np.stack(beyond(wall, origin, directions / np.linalg.norm(directions, axis=1, keepdims=True), 0.03))[:, 0]
+    assert sorted(far[:, 0])[-1] == pytest.approx(0.4, abs=0.02)
+    assert (np.sort(far, axis=0)[:-1, :3] == 0).all()
+    assert far[:, 1].max() == pytest.approx(0.3, abs=0.02)
+    assert far[:, 2].max() == pytest.approx(0.7, abs=0.02)
+    assert (far[:, 3] == 0).all()
+    assert np.sort(far[:, 4])[-2:] == pytest.approx([0.25, 0.35], abs=0.02)
 
 
 def test_rays_that_miss_or_go_where_a_camera_looked_through() -> None:
     wall = plane_with(find_planes(*corner(), []), WALL)
     origin = np.array([[0.5, 0.5, 0.5]])
     ahead, back, beside = np.array([[0.0, 0, 1]]), np.array([[0.0, 0, -1]]), np.array([[1.0, 0, 0]])
-    assert np.isfinite(wall.beyond(origin, ahead, 0.03)[0]).all()
-    assert np.isinf(wall.beyond(origin, back, 0.03)[0]).all()
-    assert np.isinf(wall.beyond(origin, beside, 0.03)[0]).all()
-    assert np.isinf(wall.beyond(np.array([[0.5, 0.5, 1.98]]), ahead, 0.03)[0]).all()  # it does not hide from itself
+    assert np.isfinite(beyond(wall, origin, ahead, 0.03)[0]).all()
+    assert np.isinf(beyond(wall, origin, back, 0.03)[0]).all()
+    assert np.isinf(beyond(wall, origin, beside, 0.03)[0]).all()
+    assert np.isinf(beyond(wall, np.array([[0.5, 0.5, 1.98]]), ahead, 0.03)[0]).all()  # it does not hide from itself
     centers = wall.cell_centers()
     looked = np.linalg.norm(centers[..., :2] - 0.5, axis=-1) < 2 * CELL_M
     wall.empty |= looked
-    assert np.isinf(wall.beyond(origin, ahead, 0.03)[0]).all()
+    assert np.isinf(beyond(wall, origin, ahead, 0.03)[0]).all()
 
 
 def test_the_box_is_what_was_seen_and_what_it_is_taken_to_go_on() -> None:
@@ -112,7 +113,7 @@ def test_steps_needed_are_those_of_how_far_beyond() -> None:
         directions = rng.normal(size=(400, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         directions[:2] = plane.across, -plane.along  # along it: they never meet it
-        exact = np.searchsorted(np.array(STEPS_M), np.stack(plane.beyond(origins, directions, 0.03)))
+        exact = np.searchsorted(np.array(STEPS_M), np.stack(beyond(plane, origins, directions, 0.03)))
         found = plane.steps_needed(origins, directions, 0.03)
         assert found.shape == (4, 300, 400)
         assert (found[..., :2] == len(STEPS_M)).all()

@@ -36,13 +36,13 @@ static inline float clamped_mean(const float x, const float reach) {
 // -> of every pool, of white surface: pools [CELLS]: the share of its cosine-weighted sky that is each cell and is free (what
 // is sampled is how much of a cell is hidden; an open surface has no sampling error); seen: its mean radiance, what surfaces
 // send it, the share of its sky that is surface no picture shows, and the share of the samples used; place: where its middle
-// lies, its normal, and the sum of its cells.
+// lies, its normal, and the sum of its cells. The first pool's are at `first_pool` of pools and of place, not of seen.
 kernel void pool_cells(const int pool_cols, const int pool_rows, const int cols, const int rows, const int step,
                        const int stride, const int width, global const float4 *positions, global const float4 *normals,
                        global const uint *free_mask, global const uchar *sets, global const float4 *observed,
                        global const float4 *hits, const int count, global const float4 *directions,
                        global const uchar *cell_of, global const float4 *centers, const float half_cell,
-                       const float4 unseen, const float voxel_m, const int slot, global float *pools, global float8 *seen,
+                       const float4 unseen, const float voxel_m, const int first_pool, global float *pools, global float8 *seen,
                        global float8 *place) {
     const int pool_col = get_global_id(0);
     const int pool_row = get_global_id(1);
@@ -51,10 +51,10 @@ kernel void pool_cells(const int pool_cols, const int pool_rows, const int cols,
     const int pool = pool_row * pool_cols + pool_col;
     const int middle = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
     const float4 color = observed[row * cols + col];
-    global float *own = pools + (slot * pool_rows * pool_cols + pool) * CELLS;
+    global float *own = pools + (first_pool + pool) * CELLS;
     for (int k = 0; k < CELLS; k++) own[k] = 0.0f;
     seen[pool] = (float8)(0.0f);
-    place[slot * pool_rows * pool_cols + pool] = (float8)(0.0f);
+    place[first_pool + pool] = (float8)(0.0f);
     if (color.w <= 0.0f) return;
 
     const int2 first = (int2)(max(col - step / 2, 0), max(row - step / 2, 0));
@@ -107,7 +107,7 @@ kernel void pool_cells(const int pool_cols, const int pool_rows, const int cols,
     const float known = hit.w > 0.0f ? fmin(hit.w / fmax(all_sky - open_sky, 1e-6f), 1.0f) : 0.0f;
     const float3 sent = hidden * (known * hit.xyz / fmax(hit.w, 1e-6f) + (1.0f - known) * unseen.xyz);
     seen[pool] = (float8)(sum.xyz / sum.w, sent, hidden * (1.0f - known), sum.w / (4.0f * step * step));
-    place[slot * pool_rows * pool_cols + pool] = (float8)(positions[middle].xyz, 1.0f, normal, free_sky);
+    place[first_pool + pool] = (float8)(positions[middle].xyz, 1.0f, normal, free_sky);
 }
 
 // One item a pool. places [count]; planes ... cell_m: see continued.clh; directions [CELLS][SPOKES]: each cell's, unit

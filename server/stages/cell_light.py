@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from server.maths.lobes import CellEquations, LobeFit, cells_to_sh, fit_lobes, fit_width, spread_of
 from server.maths.surfaces import Albedos
-from server.stages.cell_transfer import PoolWindow
+from server.stages.cell_transfer import PoolGrid, PoolWindow
 from server.stages.light_estimation import ASSUMED_ALBEDO, LightEstimate
 from server.stages.light_model import ALBEDO_SPREAD, COLOR_PULL, Rows, Solution
 
@@ -28,18 +28,19 @@ def solve_cells(
     weights: Floats,
     solution: Solution,
     slot: int,
+    grid: PoolGrid,
     bands: int,
     *,
     albedo_known: bool,
 ) -> tuple[LobeFit, LightEstimate]:
     """The light in cells, of the width that the pictures call for, and what is known of it.
 
-    slot: of the newest frame, whose residuals tell how alike neighbours err. `albedo_known`: the mean albedo is what is
+    slot, grid: of the newest frame, whose residuals tell how alike neighbours err. `albedo_known`: the mean albedo is what is
     assumed.
     """
     to_sh, mean_albedo = cells_to_sh(bands), solution.mean_albedo
-    count = window.slots * window.grid.count
-    place = rows.slots * window.grid.count + rows.places
+    count = window.slots * window.capacity
+    place = rows.slots * window.capacity + rows.places
     targets, scaled = np.zeros((count, 4)), np.zeros(count)
     lightness = albedos.lightness
     targets[place, 0] = rows.luminance / lightness - mean_albedo * rows.sent_luminance
@@ -49,10 +50,10 @@ def solve_cells(
     light = fit_lobes(luminance)
     radiances, tints = _channels(channels, light)
     is_new = rows.slots == slot
-    expected = np.zeros(window.grid.count)
+    expected = np.zeros(grid.count)
     shading = rows.columns[is_new] @ solution.amounts
     expected[rows.places[is_new]] = np.sqrt(scaled[place[is_new]]) * (targets[place[is_new], 0] - shading)
-    alike = _dependence(expected.reshape(window.grid.rows, -1))
+    alike = _dependence(expected.reshape(grid.rows, -1))
     noise = alike * luminance.misfit(light.cells) / max(float((rows.weights).sum()), 1e-300)
     root = to_sh @ spread_of(luminance, light, noise)
     std = MODEL_DOUBT * np.sqrt((root**2).sum(axis=1))[:, None] * tints

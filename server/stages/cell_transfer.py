@@ -91,22 +91,24 @@ def cells_of(directions_bytes: bytes, count: int) -> NDArray[np.uint8]:
 
 
 class PoolWindow:
-    """Transfer of the pools of the last frames, on the device, a slot a frame."""
+    """Transfer of the pools of the last frames, on the device, a slot a frame. Frames may be of several cameras."""
 
-    def __init__(self, engine: Engine, grid: PoolGrid, slots: int) -> None:
+    def __init__(self, engine: Engine, capacity: int, slots: int) -> None:
+        """`capacity`: pools that a frame may have."""
         self._engine = engine
-        self.grid = grid
+        self.capacity = capacity
         self.slots = slots
-        shape = (slots, grid.count, CELLS)
+        shape = (slots, capacity, CELLS)
         self.raw: cl_array.Array = engine.workspace.array("pools_raw", shape, np.float32)
         """[slots, n, CELLS] transfer of white surface to each cell, as the volume has it."""
         self.values: cl_array.Array = engine.workspace.array("pools", shape, np.float32)
         """The same with planes continued (continuation.py)."""
-        self._places = engine.workspace.array("pools_places", (slots, grid.count, 8), np.float32)
+        self._places = engine.workspace.array("pools_places", (slots, capacity, 8), np.float32)
 
     def pool(
         self,
         slot: int,
+        grid: PoolGrid,
         surface: Surface,
         camera: CameraModel,
         transfer: Transfer,
@@ -115,11 +117,13 @@ class PoolWindow:
         indirect: Indirect,
         voxel_m: float,
     ) -> Pools:
-        """Pool a frame's usable samples into `slot`.
+        """Pool a frame's usable samples into `slot`. Raises ValueError where the grid is finer than the window's capacity.
 
         observed: [rows, cols] float4 of the samples, w = 1 usable.
         """
-        engine, grid, space = self._engine, self.grid, self._engine.workspace
+        engine, space = self._engine, self._engine.workspace
+        if grid.count > self.capacity:
+            raise ValueError(f"a frame of {grid.count} pools does not fit a window for {self.capacity}")
         sets = own_sets(engine, transfer.rows, transfer.cols) if transfer.sets is None else transfer.sets
         centers = np.pad(cell_directions(), ((0, 0), (0, 1))).astype(np.float32)
         seen = space.array("pools_seen", (grid.count, 8), np.float32)
@@ -146,13 +150,13 @@ class PoolWindow:
             _HALF_CELL,
             float4(*indirect.mean, 0),
             voxel_m,
-            slot,
+            slot * self.capacity,
             self.raw,
             seen,
             self._places,
         )
         rows = engine.download(seen).astype(np.float64)
-        place = engine.download(self._places[slot]).astype(np.float64)
+        place = engine.download(self._places[slot])[: grid.count].astype(np.float64)
         return Pools(
             grid=grid,
             seen=rows[:, :3],
@@ -173,9 +177,9 @@ class PoolWindow:
         for slot in slots:
             engine.launch(
                 self._kernel("hide_cells"),
-                (self.grid.count,),
-                self.grid.count,
-                slot * self.grid.count,
+                (self.capacity,),
+                self.capacity,
+                slot * self.capacity,
                 self._places,
                 *arguments,
                 engine.workspace.constant("cell_spokes", directions),
@@ -184,18 +188,21 @@ class PoolWindow:
             )
 
     def shading(self, slot: int, lobes: Floats) -> NDArray[np.float32]:
-        """[n, lobes] what each pool of a slot, if white, would show under each of `lobes` [CELLS, lobes]."""
+        """[capacity, lobes] what each pool of a slot, if white, would show under each of `lobes` [CELLS, lobes].
+
+        Rows past the frame's pools say nothing.
+        """
         engine, count = self._engine, lobes.shape[1]
         groups = -(-count // 8)
         padded = np.zeros((CELLS, 8 * groups), np.float32)
         padded[:, :count] = lobes
-        shading = engine.workspace.array("pools_shading", (self.grid.count, 8 * groups), np.float32)
+        shading = engine.workspace.array("pools_shading", (self.capacity, 8 * groups), np.float32)
         engine.launch(
             self._kernel("project_pools"),
-            (groups, self.grid.count),
-            self.grid.count,
+            (groups, self.capacity),
+            self.capacity,
             groups,
-            slot * self.grid.count,
+            slot * self.capacity,
             self.values,
             engine.workspace.upload("pool_lobes", padded),
             shading,
@@ -212,7 +219,7 @@ class PoolWindow:
         engine, space, columns = self._engine, self._engine.workspace, targets.shape[1]
         padded = np.zeros((len(targets), 8), np.float32)
         padded[:, :columns] = targets
-        count, blocks = self.slots * self.grid.count, _BLOCKS * (_BLOCKS + 1) // 2
+        count, blocks = self.slots * self.capacity, _BLOCKS * (_BLOCKS + 1) // 2
         chunk = -(-count // _CHUNKS)
         chunks = -(-count // chunk)
         partial = space.array("cell_sums", (_CHUNKS, blocks, 8, 8), np.float32)

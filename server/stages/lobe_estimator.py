@@ -129,9 +129,10 @@ class LobeEstimator:
 
         observed: [rows, cols] float4 of the samples, w = 1 usable; depth_m: [h, w] as measured.
         """
-        window = self._window_for(pool_grid(transfer))
+        grid = pool_grid(transfer)
+        window = self._window_for(grid)
         slot = self._kept.free_slot()
-        pools = window.pool(slot, surface, camera, transfer, rays, observed, indirect, voxel_m)
+        pools = window.pool(slot, grid, surface, camera, transfer, rays, observed, indirect, voxel_m)
         if pools.weights.sum() < LEAST_WEIGHT or not (pools.seen > 0).any():
             return self._estimate
         window.hide([slot], self.continuation.arrays() if self.continuation else NO_PLANES)
@@ -144,7 +145,7 @@ class LobeEstimator:
                 self._understand(anew=self.continuation.explained < UNDERSTOOD * before)
                 window.hide(self._kept.frames, self.continuation.arrays())
                 for held, frame in self._kept.frames.items():
-                    frame.columns = window.shading(held, self._lobes_and_all())
+                    frame.columns = self._columns(held, frame.pools)
                 estimate = self._refresh(slot, ROUNDS)
             self._understand(anew=was_searching and not self.continuation.is_searching)
         self._estimate = self._averaged(estimate)
@@ -162,9 +163,7 @@ class LobeEstimator:
 
     def fold(self, slot: int, pools: Pools, shot: Shot) -> LightEstimate:
         """The light with `pools`, whose transfer lies in `slot` of the window, not averaged."""
-        assert self._window is not None
-        columns = self._window.shading(slot, self._lobes_and_all())
-        newest = Frame(pools, columns)
+        newest = Frame(pools, self._columns(slot, pools))
         self._kept.add(slot, newest, shot)
         with self._engine.profile.host():
             self._steady = min(self._steady + 1, self._forget(slot, newest))
@@ -205,9 +204,10 @@ class LobeEstimator:
             return self._family
         return lobe_family(min(JUDGED_WIDTH_DEG, self.light.width_deg if self.light else JUDGED_WIDTH_DEG))
 
-    def _lobes_and_all(self) -> Floats:
-        """[CELLS, lobes + 1] the widest family, and a sky of radiance 1 all over."""
-        return np.column_stack([self._family, np.ones(CELLS)])
+    def _columns(self, slot: int, pools: Pools) -> Columns:
+        """[n, lobes + 1] shading of each pool, if white, under the widest family and a sky of radiance 1 all over."""
+        assert self._window is not None
+        return self._window.shading(slot, np.column_stack([self._family, np.ones(CELLS)]))[: pools.grid.count]
 
     def _refresh(self, slot: int, rounds: int) -> LightEstimate:
         """Light and albedos from the window, whose newest frame lies in `slot`."""
@@ -227,15 +227,16 @@ class LobeEstimator:
             weights,
             self._solution,
             slot,
+            self._kept.frames[slot].pools.grid,
             self._bands,
             albedo_known=not self._model.albedos,
         )
         return estimate
 
     def _window_for(self, grid: PoolGrid) -> PoolWindow:
-        """The window, empty where pictures are cut otherwise than before."""
-        if self._window is None or self._window.grid != grid:
-            self._window = PoolWindow(self._engine, grid, SLOTS)
+        """The window, empty where pictures are cut into more parts than any before."""
+        if self._window is None or self._window.capacity < grid.count:
+            self._window = PoolWindow(self._engine, grid.count, SLOTS)
             self._kept = FrameWindow()
         return self._window
 

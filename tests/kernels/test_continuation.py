@@ -63,7 +63,7 @@ def test_hidden_cells_match_twin(engine: Engine) -> None:
         plane.empty |= rng.random(plane.empty.shape) < 0.2
     continuation._boxes = [plane.box for plane in planes]
     grid = PoolGrid(2, 3, 7)
-    window = PoolWindow(engine, grid, 2)
+    window = PoolWindow(engine, grid.count, 2)
     positions = rng.random((2, grid.count, 3)) * [1, 0.9, 0.9] + [0, 0, 1]
     raw = rng.random((2, grid.count, CELLS)).astype(np.float32)
     places = np.zeros((2, grid.count, 8), np.float32)

@@ -212,9 +212,9 @@ def test_a_wall_sends_its_colour_to_the_floor(
     share = download4(engine, hits)[..., 3].mean() / cosines
     assert share == pytest.approx(shape, rel=0.06)
     grid = pool_grid(transfer)
-    window = PoolWindow(engine, grid, 1)
+    window = PoolWindow(engine, grid.count, 1)
     observed = engine.workspace.upload("test_observed", float4(np.full((size, size, 3), 0.5)))
-    pools = window.pool(0, surface, camera, transfer, rays, observed, Indirect(hits, np.zeros(3)), VOXEL_M)
+    pools = window.pool(0, grid, surface, camera, transfer, rays, observed, Indirect(hits, np.zeros(3)), VOXEL_M)
     sent = np.average(pools.sent, axis=0, weights=pools.weights)
     np.testing.assert_allclose(sent, shape * np.array(WALL), rtol=0.1)
     assert np.average(pools.unseen, weights=pools.weights) < (0.01 if every == 1 else 0.06)  # of all that is hidden
@@ -230,7 +230,7 @@ def test_what_has_no_colour_is_not_seen(device: Device, kind: type[Engine]) -> N
     camera = camera_of(size, size)
     transfer = transfer_radiance(engine, camera, volume, surface, 1, rays, ROOM_M)
     grid = pool_grid(transfer)
-    window = PoolWindow(engine, grid, 1)
+    window = PoolWindow(engine, grid.count, 1)
     observed = engine.workspace.upload("test_observed", float4(np.full((size, size, 3), 0.5)))
     x = np.indices(shape_of(volume))[2] * VOXEL_M
     sent, unseen = [], []
@@ -238,7 +238,9 @@ def test_what_has_no_colour_is_not_seen(device: Device, kind: type[Engine]) -> N
         paint(engine, volume, np.full((*x.shape, 3), WALL), has_color)
         hits = gather_hits(engine, camera, volume, surface, transfer, rays, ROOM_M, 1)
         np.testing.assert_allclose(mean_sent(engine, hits), WALL, atol=ROUNDING)
-        pools = window.pool(0, surface, camera, transfer, rays, observed, Indirect(hits, np.full(3, 9.0)), VOXEL_M)
+        pools = window.pool(
+            0, grid, surface, camera, transfer, rays, observed, Indirect(hits, np.full(3, 9.0)), VOXEL_M
+        )
         sent.append(np.average(pools.sent, axis=0, weights=pools.weights))
         unseen.append(np.average(pools.unseen, weights=pools.weights))
     hidden = wall_seen_from(0.21, SIDE_M, SIDE_M - 0.1)

@@ -1,5 +1,5 @@
 // Which cells of the sphere light each part of the picture, and the normal equations of the cells' radiances.
-// Provides pool_cells, hide_cells, accumulate_cells, project_pools.
+// Provides pool_cells, hide_cells, accumulate_cells, project_pools, take_pools.
 #ifndef CELLS
 #error CELLS must be defined: a multiple of 8
 #endif
@@ -174,4 +174,12 @@ kernel void project_pools(const int count, const int groups, const int first, gl
     float8 sum = (float8)(0.0f);
     for (int k = 0; k < CELLS; k++) sum += row[k] * vload8(k * groups + group, lobes);
     vstore8(sum, pool * groups + group, shading);
+}
+
+// Some pools, one after the other: chosen [count], pools [..][CELLS] -> taken [count][CELLS]. One item a cell of a pool.
+kernel void take_pools(const int count, global const int *chosen, global const float *pools, global float *taken) {
+    const int cell = get_global_id(0);
+    const int number = get_global_id(1);
+    if (cell >= CELLS || number >= count) return;
+    taken[number * CELLS + cell] = pools[chosen[number] * CELLS + cell];
 }

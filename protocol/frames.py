@@ -22,6 +22,8 @@ Matrix4 = Annotated[tuple[float, ...], msgspec.Meta(min_length=16, max_length=16
 
 GREATEST_BASELINE_M = 2.0
 """Between the lenses of one camera; more is taken for a translation in millimetres."""
+GREATEST_SHIFT_M = 1000.0
+"""Between the worlds of two clients in one room."""
 _NEAR_ROTATION = 1e-3
 
 
@@ -40,7 +42,7 @@ class DepthCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     def __post_init__(self) -> None:
         _check_lens("camera.depth", self)
-        _check_rigid("camera.depth.color_from_depth", self.color_from_depth)
+        check_rigid("camera.depth.color_from_depth", self.color_from_depth, GREATEST_BASELINE_M)
 
 
 class CameraModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -98,7 +100,8 @@ def _check_lens(owner: str, lens: CameraModel | DepthCamera) -> None:
         raise ValueError(f"{owner}.cx, {owner}.cy and {owner}.distortion must be finite")
 
 
-def _check_rigid(owner: str, row_major: tuple[float, ...]) -> None:
+def check_rigid(owner: str, row_major: tuple[float, ...], greatest_shift_m: float = GREATEST_SHIFT_M) -> None:
+    """Raises ValueError, one line, where 16 row-major numbers are no rigid transform in metres."""
     if len(row_major) != 16 or not np.isfinite(row_major).all():
         raise ValueError(f"{owner} must be 16 finite numbers")
     matrix = np.array(row_major, np.float64).reshape(4, 4)
@@ -108,7 +111,7 @@ def _check_rigid(owner: str, row_major: tuple[float, ...]) -> None:
     is_near = np.abs(rotation).max() < 2 and np.abs(rotation @ rotation.T - np.eye(3)).max() < _NEAR_ROTATION
     if not is_near or np.linalg.det(rotation) < 0:
         raise ValueError(f"{owner}'s upper left 3x3 is not a rotation")
-    if np.abs(offset).max() > GREATEST_BASELINE_M:
+    if np.abs(offset).max() > greatest_shift_m:
         raise ValueError(f"{owner} moves by {np.abs(offset).max():g} m: is it in millimetres?")
 
 

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-from protocol.frames import CameraModel, ColorEncoding
+from protocol.frames import CameraModel, ColorEncoding, check_rigid
 from protocol.limits import (
     MAX_IMAGE_PIXELS,
     MAX_IMAGE_SIDE_PX,
@@ -38,6 +38,7 @@ RgbOrNull = tuple[float | None, float | None, float | None]
 Preset = Literal["rm", "reg4", "reg8", "art1", "art4", "art8", "gr15", "gr15fast", "auto"]
 Robustness = Literal["openness", "normals", "normals_printed", "memory", "outliers"]
 Poses = Literal["given", "track", "refine"]
+Dictionary = Literal["4x4_50", "5x5_100", "6x6_250", "7x7_1000", "apriltag_36h11"]
 Tracking = Literal["given", "tracked", "lost"]
 MeshFormat = Literal["ply", "glb"]
 
@@ -171,12 +172,35 @@ class Message(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag
 # ---- client to server --------------------------------------------------------------------------------------------
 
 
-class Hello(Message, frozen=True, kw_only=True, tag="hello"):
+class Marker(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A square fiducial marker that all clients of a room may see."""
+
+    id: Annotated[int, Meta(ge=0, le=999)]
+    side_m: Annotated[float, Meta(gt=0.005, le=5)]
+    """Of the black square."""
+    dictionary: Dictionary = "4x4_50"
+
+
+class Hello(Message, frozen=True, kw_only=True, omit_defaults=True, tag="hello"):
     """First message of a client that captures."""
 
     client: Name
     camera: CameraModel
     wishes: Wishes = Wishes()
+    room: Name | None = None
+    """Clients of one room share volume, light and objects; None: a room of its own."""
+    room_from_world: Matrix4 | None = None
+    """Where this client's world lies in the room's, which is that of the client that came first; rigid.
+
+    None: not known, to be found by `marker`, else by what the room has seen."""
+    marker: Marker | None = None
+    """By which the client's world is laid on the room's, once both have seen it."""
+
+    def __post_init__(self) -> None:
+        if self.room_from_world is not None:
+            check_rigid("hello.room_from_world", self.room_from_world)
+        if self.room is None and (self.room_from_world is not None or self.marker is not None):
+            raise ValueError("hello.room_from_world and hello.marker are of a room: name it in hello.room")
 
 
 class Watch(Message, frozen=True, kw_only=True, tag="watch"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -12,15 +11,16 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Tracking, Wishes
+from server.alignment import Alignment, Markers
 from server.opencl.engine import Engine
-from server.settings import bounds_seen, default_voxel_m
+from server.reconstruction import Reconstruction
 from server.stages.exposure import ExposureTracking, scene_radiance
 from server.stages.integrate import integrate
 from server.stages.measure import GREATEST_DEPTH_M, Measurement, measure
 from server.stages.merge import merge_depth
 from server.stages.raycast import Surface, raycast
 from server.stages.volume import Volume
-from server.tracking import CameraTracking
+from server.tracking import CameraTracking, Located
 
 
 @dataclass(frozen=True)
@@ -49,21 +49,28 @@ class GeometryFrame:
 class Geometry:
     """One camera's way into its volume. Owned by one thread."""
 
-    def __init__(self, engine: Engine, camera: CameraModel, wishes: Wishes) -> None:
+    def __init__(
+        self,
+        engine: Engine,
+        camera: CameraModel,
+        wishes: Wishes,
+        reconstruction: Reconstruction | None = None,
+        alignment: Alignment | None = None,
+    ) -> None:
+        """`reconstruction`: what others scan too; None: one of its own. `alignment`: with theirs."""
         self._engine = engine
         self._camera = camera
         self._wishes = wishes
-        self._tracking = CameraTracking(engine, camera, wishes.poses)
+        self._reconstruction = reconstruction or Reconstruction(engine)
+        self._alignment = alignment or Alignment(engine, camera, self._reconstruction, Markers())
+        self._tracking = CameraTracking(engine, camera, wishes.poses, self._reconstruction)
         self._exposure = ExposureTracking(engine, camera, "constant" if wishes.as_thesis else wishes.exposure)
         self._last: GeometryFrame | None = None
-        self._exposure_logarithms = 0.0  # sum over fused frames
-        self.volume: Volume | None = None
 
     @property
-    def usual_exposure(self) -> float:
-        """Geometric mean over the frames that were fused: under it the volume's colours look as in most pictures."""
-        frames = self.volume.frames if self.volume else 0
-        return math.exp(self._exposure_logarithms / frames) if frames else 1.0
+    def volume(self) -> Volume | None:
+        """None before the first frame."""
+        return self._reconstruction.volume
 
     def update(self, frame: RgbdFrame, holds: Callable[[RgbdFrame], bool] = lambda _frame: False) -> GeometryFrame:
         """Measure, locate, fuse, predict, merge. Raises ValueError, one line, for a frame that is refused.
@@ -72,16 +79,22 @@ class Geometry:
         """
         engine, camera, stage = self._engine, self._camera, self._engine.profile.stage
         self._check_size(frame)
-        volume = self._scene(frame, self._tracking.first_guess(frame))
+        guess = self._tracking.first_guess(self._alignment.in_room(frame))
+        volume = self._reconstruction.volume_for(self._wishes, camera, frame, guess)
 
         with stage("input"):  # 5.1.1
             measurement = measure(engine, camera, frame)
+            not_aligned = self._alignment.settle(frame, measurement)
+            frame = self._alignment.in_room(frame)
             is_held = holds(frame)
         if is_held and self._last is not None:
             with stage("reconstruct"):
                 return self._held(self._last, frame, measurement, volume)
         with stage("reconstruct"):  # 4.2.1
-            located = self._tracking.locate(frame, measurement, volume)
+            if not_aligned is None:
+                located = self._tracking.locate(frame, measurement, volume)
+            else:
+                located = Located(self._tracking.first_guess(frame), "lost", (not_aligned,))
             volume_from_camera = volume.volume_from_world() @ located.world_from_camera
             place = volume_from_camera if located.fuse else None
             exposure, doubts = self._exposure.update(frame, measurement, volume, place)  # B3
@@ -125,7 +138,7 @@ class Geometry:
     ) -> None:
         volume.allocate(self._camera, volume_from_camera, measured.depth_m)
         integrate(self._engine, volume, self._camera, volume_from_camera, measured)
-        self._exposure_logarithms += math.log(exposure)
+        self._reconstruction.count_exposure(exposure)
 
     def _check_size(self, frame: RgbdFrame) -> None:
         color, depth = self._camera, self._camera.depth_lens
@@ -134,13 +147,6 @@ class Geometry:
                 f"colour is {frame.color.shape[1]}x{frame.color.shape[0]}, depth {frame.depth.shape[1]}x"
                 f"{frame.depth.shape[0]}; the camera has {color.width}x{color.height} and {depth.width}x{depth.height}"
             )
-
-    def _scene(self, frame: RgbdFrame, world_from_camera: NDArray[np.float64]) -> Volume:
-        """The volume; made when the first frame says where the scene is."""
-        if self.volume is None:
-            bounds = self._wishes.volume_m or bounds_seen(self._camera, frame, world_from_camera)
-            self.volume = Volume(self._engine, bounds, self._wishes.voxel_m or default_voxel_m(bounds))
-        return self.volume
 
     def _notes(self, frame: RgbdFrame, volume: Volume) -> tuple[str, ...]:
         notes = []

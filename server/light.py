@@ -26,11 +26,10 @@ from server.stages.volume import Volume
 
 
 class RoomLight:
-    """One session's light."""
+    """One room's light, by the frames of all its cameras."""
 
-    def __init__(self, engine: Engine, camera: CameraModel, settings: Settings) -> None:
+    def __init__(self, engine: Engine, settings: Settings) -> None:
         self._engine = engine
-        self._camera = camera
         self._settings = settings
         self._model = _model_of(settings)
         is_plain = not self._model.albedos and settings.indirect == "none" and self._model.normals == "none"
@@ -70,6 +69,7 @@ class RoomLight:
 
     def update(
         self,
+        camera: CameraModel,
         radiance: cl_array.Array,
         depth_m: cl_array.Array,
         geometry: GeometryFrame,
@@ -82,7 +82,7 @@ class RoomLight:
 
         indirect: what surfaces send, None to leave it out.
         """
-        engine, camera, surface = self._engine, self._camera, geometry.surface
+        engine, surface = self._engine, geometry.surface
         if self._harmonics and self._given:
             return self._given
         if self._harmonics:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from protocol.messages import DirectedLight, Lamp, Light
 from server.maths.dominant import dominant_lights
 from server.maths.emitters import Emitter
-from server.maths.sh import dominant_direction, dominant_intensity, webxr_floats
+from server.maths.sh import dominant_direction, dominant_intensity, rotate_sh, webxr_floats
 from server.stages.light_estimation import LightEstimate
 
 _WIRE_COEFFICIENTS = 16
@@ -54,6 +55,27 @@ def light_message(
         condition=estimate.condition if math.isfinite(estimate.condition) else None,
         valid=estimate.valid,
     )
+
+
+def seen_from(
+    client_from_room: NDArray[np.float64], estimate: LightEstimate, lamps: tuple[Emitter, ...]
+) -> tuple[LightEstimate, tuple[Emitter, ...]]:
+    """The light of a room in the world of one client; client_from_room: [4, 4] rigid.
+
+    Deviations turn as those of coefficients that err apart from one another.
+    """
+    turn = client_from_room[:3, :3]
+    bands = rotate_sh(np.eye(len(estimate.sh)), turn)
+    std = None if estimate.std is None else np.sqrt(bands**2 @ estimate.std**2)
+    moved = tuple(
+        replace(
+            lamp,
+            position=turn @ lamp.position + client_from_room[:3, 3],
+            position_covariance=turn @ lamp.position_covariance @ turn.T,
+        )
+        for lamp in lamps
+    )
+    return replace(estimate, sh=bands @ estimate.sh, std=std), moved
 
 
 def _lamp(lamp: Emitter, exposure: float) -> Lamp:

@@ -12,12 +12,12 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
-from protocol.messages import LeftOut, Light, OperatingPoint, Plan, Preset, Timings, Tracking, Wishes
+from protocol.messages import Hello, LeftOut, Light, OperatingPoint, Plan, Preset, Timings, Tracking, Wishes
+from server.alignment import Alignment
 from server.effects import EFFECTS
 from server.geometry import Geometry, GeometryFrame
 from server.held import Sampled
-from server.light import RoomLight
-from server.light_message import light_message
+from server.light_message import light_message, seen_from
 from server.maths.sh import webxr_from_world
 from server.meshing.scene_mesh import SceneMesh, scene_mesh
 from server.meshing.surface import MeshingError
@@ -28,15 +28,14 @@ from server.plan import Omission
 from server.point_control import control_for
 from server.rendering import Made, Rendering
 from server.rest import Rest
+from server.room import Room
 from server.scene.mesh import Mesh
-from server.scene.placement import Placement
-from server.session_objects import SessionObjects
+from server.scene.placement import Placement, check_size
 from server.settings import Settings, read_wishes
 from server.stages.composite import shown_picture
 from server.stages.denoise import denoise_radiance
 from server.stages.exposure import scene_radiance
 from server.stages.indirect import observe_indirect
-from server.stages.lamp_finder import LampFinder
 from server.stages.light_estimation import LightEstimate
 from server.stages.near_light import remove_lamps
 from server.stages.rasterize import Placed
@@ -61,24 +60,41 @@ class FrameResult:
 
 
 class Pipeline:
-    """One session's spine and its state. Owned by one thread."""
+    """One client's spine and its state. Owned by one thread; what it shares with others is its room's."""
 
-    def __init__(self, device: Device, camera: CameraModel, wishes: Wishes) -> None:
+    def __init__(
+        self,
+        device: Device,
+        camera: CameraModel,
+        wishes: Wishes,
+        room: Room | None = None,
+        asked: Hello | None = None,
+    ) -> None:
+        """`room`: None for one of its own. `asked`: what the client says of its world's place in the room."""
         self._device = device
+        self._room = room or Room(device, wishes)
+        self._owns_room = room is None
+        self._differences = self._room.differences(wishes)
+        wishes = self._room.wishes_of(wishes)
         self._asked = wishes
         self._control = control_for(device, wishes)  # U1
         self._wishes = self._control.chosen.point.wishes(wishes) if self._control else wishes
         self._settings: Settings = read_wishes(self._wishes)
         self._camera = camera
-        self._engine = Engine(device)
-        self._geometry = Geometry(self._engine, camera, wishes)
+        self._engine = Engine(device, beside=self._room.engine)
+        reconstruction = self._room.reconstruction
+        self._alignment = Alignment(self._engine, camera, reconstruction, self._room.markers, asked)
+        self._geometry = Geometry(self._engine, camera, wishes, reconstruction, self._alignment)
         self._sampler = self._make_sampler()
-        self._room_light = RoomLight(self._engine, camera, self._settings)
-        self._lamps = LampFinder(self._engine, camera, self._settings.lamps)
+        self._room_light = self._room.light
+        self._lamps = self._room.lamps
         self._rendering = Rendering(self._engine, camera, self._settings)
         self._rest = self._make_rest()
-        self._objects = SessionObjects(self._engine)
-        self._webxr_from_world = np.eye(3)
+        self._objects = self._room.objects
+        self._waiting: list[tuple[str, Mesh, Placement]] = []
+        """Objects of a client that does not know yet where it is."""
+        self._changes = 0
+        self._webxr_from_client: NDArray[np.float64] | None = None
         self._mean_sent = np.zeros(3)
         self.device_name = device.name
         self.kernel_ms: dict[str, float] = {}
@@ -86,8 +102,18 @@ class Pipeline:
     def process(self, frame: RgbdFrame) -> FrameResult:
         """Fuse one frame, estimate the light, render what is virtual.
 
-        Raises ValueError with one line for a frame that is refused; the session's state is then as it was.
+        Raises ValueError with one line for a frame that is refused; the session's state is then as it was. Waits while
+        another client's frame is in the room.
         """
+        with self._room.lock:
+            if self._changes != self._room.changes:
+                self._wake()
+            result = self._process(frame)
+            self._room.changes += 1
+            self._changes = self._room.changes
+            return result
+
+    def _process(self, frame: RgbdFrame) -> FrameResult:
         started = time.perf_counter()
         engine, settings, stage = self._engine, self._settings, self._engine.profile.stage
         engine.profile.forget()
@@ -95,7 +121,7 @@ class Pipeline:
         volume, objects = self._scene(geometry), self._objects
         if geometry.tracking == "lost":
             return self._lost(frame, geometry, volume, started)
-        measurement, surface = geometry.measurement, geometry.surface
+        measurement, surface, notes = geometry.measurement, geometry.surface, self._place_waiting()
 
         placed = objects.placed(volume.volume_from_world())
         with stage("radiance_transfer"):  # 5.1.2, eq. 5.2
@@ -106,6 +132,7 @@ class Pipeline:
                 smooth = self._smooth(geometry)
                 distant = remove_lamps(engine, smooth, surface, volume, self._lamps.lamps)  # B4
                 estimate = self._room_light.update(
+                    self._camera,
                     distant,
                     measurement.depth_m,
                     geometry,
@@ -120,7 +147,7 @@ class Pipeline:
             picture, plan = self._rendering.draw(made, settings, left_out, self._rest)
         if not self._room_light.is_given:  # B4, for the frames to come
             with stage("light_estimation"):
-                self._lamps.work(geometry.scene_radiance, surface, volume)
+                self._lamps.work(self._camera, geometry.scene_radiance, surface, volume)
 
         engine.queue.finish()
         rows, self.kernel_ms = engine.profile.collect()
@@ -130,11 +157,11 @@ class Pipeline:
         return FrameResult(
             color=picture,
             light=self._light_message(frame, geometry, estimate, volume),
-            world_from_camera=geometry.world_from_camera,
+            world_from_camera=self._alignment.in_client(geometry.world_from_camera),
             tracking=geometry.tracking,
             timings=timings,
             plan=structs.replace(plan, left_out=left_out_too, point=point),
-            notes=(*geometry.notes, *_notes(estimate)),
+            notes=(*geometry.notes, *notes, *self._differences, *_notes(estimate)),
         )
 
     def _lost(self, frame: RgbdFrame, geometry: GeometryFrame, volume: Volume, started: float) -> FrameResult:
@@ -149,11 +176,11 @@ class Pipeline:
         return FrameResult(
             color=picture,
             light=self._light_message(frame, geometry, estimate, volume),
-            world_from_camera=geometry.world_from_camera,
+            world_from_camera=self._alignment.in_client(geometry.world_from_camera),
             tracking="lost",
             timings=Timings(**rows, total=(time.perf_counter() - started) * 1e3),
             plan=Plan(run=(), left_out=left_out),
-            notes=(*geometry.notes, *_notes(estimate)),
+            notes=(*geometry.notes, *self._differences, *_notes(estimate)),
         )
 
     def _smooth(self, geometry: GeometryFrame) -> cl_array.Array:
@@ -203,22 +230,44 @@ class Pipeline:
         self, frame: RgbdFrame, geometry: GeometryFrame, estimate: LightEstimate, volume: Volume
     ) -> Light:
         lamps, exposure = self._lamps.lamps_at(volume.origin_world), geometry.exposure
-        return light_message(frame.index, frame.timestamp_s, estimate, self._webxr_from_world, lamps, exposure)
+        assert self._webxr_from_client is not None
+        if not self._alignment.is_identity:
+            estimate, lamps = seen_from(self._alignment.client_from_room, estimate, lamps)
+        return light_message(frame.index, frame.timestamp_s, estimate, self._webxr_from_client, lamps, exposure)
 
     def place_object(self, object_id: str, mesh: Mesh, placement: Placement) -> tuple[str, ...]:
-        """Put a mesh into the scene, in the place of one with the same id; returns notes. Raises ValueError."""
-        self._objects.place(object_id, mesh, placement)
-        self._wake()
+        """Put a mesh into the room, in the place of one with the same id; returns notes. Raises ValueError."""
+        with self._room.lock:
+            if self._alignment.is_settled or not self._objects.has_begun:
+                self._objects.place(object_id, mesh, self._alignment.placed(placement))
+                self._room.changes += 1
+            else:
+                check_size(mesh, placement)
+                self._waiting = [*(w for w in self._waiting if w[0] != object_id), (object_id, mesh, placement)]
         return mesh.notes
 
     def move_object(self, object_id: str, placement: Placement) -> None:
         """Give an object another place. Raises KeyError if there is none of that id."""
-        self._objects.move(object_id, placement)
+        with self._room.lock:
+            self._objects.move(object_id, self._alignment.placed(placement))
 
     def remove_object(self, object_id: str) -> None:
         """Take an object away. Raises KeyError if there is none of that id."""
-        self._objects.remove(object_id)
-        self._wake()
+        with self._room.lock:
+            self._objects.remove(object_id)
+            self._room.changes += 1
+
+    def _place_waiting(self) -> tuple[str, ...]:
+        """Place what has waited until this client was aligned; what was wrong with it, one line each."""
+        problems = []
+        for object_id, mesh, placement in self._waiting:
+            try:
+                self._objects.place(object_id, mesh, self._alignment.placed(placement))
+                self._wake()
+            except ValueError as error:
+                problems.append(f"object {object_id!r}: {error}")
+        self._waiting = []
+        return tuple(problems)
 
     def set_quality(
         self, preset: Preset, budget_ms: float | None = None, max_light_error_deg: float | None = None
@@ -258,23 +307,26 @@ class Pipeline:
 
     def scene_mesh(self, progress: Callable[[int, int], None] = lambda _done, _total: None) -> SceneMesh:
         """The surface fused so far as triangles. Raises MeshingError, one line, where there is none."""
-        volume = self._geometry.volume
-        if volume is None:
-            raise MeshingError("there is no surface to mesh: no frame has been fused yet")
-        bricks = volume.download_bricks()
-        bricks = replace(bricks, colors=np.float32(self._geometry.usual_exposure) * bricks.colors)
-        return scene_mesh(bricks, volume.voxel_m, volume.origin_world, self._webxr_from_world, progress)
+        with self._room.lock:
+            volume, exposure = self._geometry.volume, self._room.reconstruction.usual_exposure
+            if volume is None or self._webxr_from_client is None:
+                raise MeshingError("there is no surface to mesh: no frame has been fused yet")
+            bricks = volume.download_bricks()
+        bricks = replace(bricks, colors=np.float32(exposure) * bricks.colors)
+        upright = self._webxr_from_client @ self._alignment.client_from_room[:3, :3]
+        return scene_mesh(bricks, volume.voxel_m, volume.origin_world, upright, progress)
 
     @property
     def device_bytes(self) -> int:
-        """Device memory of this session: its arrays and its volume; what sessions share is not counted."""
-        volume = self._geometry.volume
-        return self._engine.workspace.bytes_held + (volume.device_bytes if volume else 0)
+        """Device memory of this session and its room: arrays and volume; what all sessions share is not counted."""
+        return self._engine.workspace.bytes_held + self._room.device_bytes
 
     def close(self) -> None:
-        """Give the device's memory back."""
-        self._objects.clear()
-        self._engine.close()
+        """Give the device's memory back, and the room's where it is this session's alone."""
+        with self._room.lock:
+            self._engine.close()
+        if self._owns_room:
+            self._room.close()
 
     def _make_sampler(self) -> TransferSampler:
         settings = self._settings
@@ -296,15 +348,17 @@ class Pipeline:
         """The volume; the first frame says what is up for the objects."""
         volume = self._geometry.volume
         assert volume is not None
+        camera_up, forward = -geometry.world_from_camera[:3, 1], geometry.world_from_camera[:3, 2]
         if not self._objects.has_begun:
-            camera_up, forward = -geometry.world_from_camera[:3, 1], geometry.world_from_camera[:3, 2]
             up = np.array(self._wishes.up or camera_up, np.float64)
             up /= np.linalg.norm(up)
-            self._webxr_from_world = webxr_from_world(up, forward)
-            given = static_estimate(self._wishes, self._settings.bands, self._webxr_from_world)  # S2
+            given = static_estimate(self._wishes, self._settings.bands, webxr_from_world(up, forward))  # S2
             if given:
                 self._room_light.give(given)
             self._objects.begin(up)
+        if self._webxr_from_client is None or not self._alignment.is_settled:
+            turn = self._alignment.client_from_room[:3, :3]
+            self._webxr_from_client = webxr_from_world(turn @ self._objects.up, turn @ forward)
         return volume
 
 

@@ -12,6 +12,7 @@ from protocol.messages import Poses, Tracking
 from server.maths.registration import angle_between, distance_between
 from server.maths.rigid import inverse_rigid, repaired_pose
 from server.opencl.engine import Engine
+from server.reconstruction import Reconstruction
 from server.stages.denoise import bilateral_depth
 from server.stages.measure import Measurement
 from server.stages.raycast import Surface
@@ -91,7 +92,10 @@ class CameraTracking:
     the volume; where the two do not fit, the client's.
     """
 
-    def __init__(self, engine: Engine, camera: CameraModel, mode: Poses) -> None:
+    def __init__(
+        self, engine: Engine, camera: CameraModel, mode: Poses, reconstruction: Reconstruction | None = None
+    ) -> None:
+        """`reconstruction`: what others scan too, whose views this one helps to remember and is found again by."""
         self._engine = engine
         self._camera = camera
         self._mode = mode
@@ -102,7 +106,8 @@ class CameraTracking:
         self._fit = 0.0
         self._place: _Place | None = None
         self._pyramid: Pyramid = ()
-        self._keyframes = Keyframes()
+        self._keyframes = reconstruction.keyframes if reconstruction else Keyframes()
+        self._is_remembered = mode == "track" or (reconstruction is not None and reconstruction.is_shared)
 
     def first_guess(self, frame: RgbdFrame) -> Floats:
         """world_from_camera before anything is measured. Raises ValueError, one line, for a pose that is none."""
@@ -117,23 +122,24 @@ class CameraTracking:
     def locate(self, frame: RgbdFrame, measurement: Measurement, volume: Volume) -> Located:
         """Pose of a frame that was measured. Raises ValueError as `first_guess` does."""
         guess = self.first_guess(frame)
-        if self._mode == "given":
-            return Located(guess, "given")
         engine, camera = self._engine, self._camera
+        if self._mode == "given":
+            if self._is_remembered and self._keyframes.is_new(volume.volume_from_world() @ guess):
+                self._pyramid = depth_pyramid(engine, camera, bilateral_depth(engine, measurement.depth_m))
+            return Located(guess, "given")
         self._pyramid = depth_pyramid(engine, camera, bilateral_depth(engine, measurement.depth_m))
         if self._pose is None or self._view is None:
-            return self._start(guess, volume)
+            return self._join(frame, guess, volume) if self._is_known(volume) else self._start(guess, volume)
         return self._follow(frame, guess, volume) if self._mode == "track" else self._refine(guess, volume)
 
     def remember(self, frame: RgbdFrame, located: Located, model: Surface, volume_from_camera: Floats) -> None:
         """What the volume shows from where the frame was located: the next one is compared with it."""
-        if self._mode == "given":
-            return
-        if self._needs_view(volume_from_camera):
-            self._view = view_model(self._engine, self._camera, volume_from_camera, model)
-        self._pose, self._given = located.world_from_camera, frame.world_from_camera
-        self._is_lost = False
-        if self._mode == "track" and self._keyframes.is_new(volume_from_camera):
+        if self._mode != "given":
+            if self._needs_view(volume_from_camera):
+                self._view = view_model(self._engine, self._camera, volume_from_camera, model)
+            self._pose, self._given = located.world_from_camera, frame.world_from_camera
+            self._is_lost = False
+        if self._is_remembered and self._keyframes.is_new(volume_from_camera):
             self._keyframes.add(thumbnail(frame, self._engine.download(self._pyramid[0])), volume_from_camera)
 
     def _needs_view(self, volume_from_camera: Floats) -> bool:
@@ -152,6 +158,18 @@ class CameraTracking:
         if self._starting_share(guess, volume) < _LEAST_START:
             return Located(guess, "lost", (_LOST + "there is too little depth inside the volume to begin with",))
         return Located(guess, "tracked")
+
+    def _is_known(self, volume: Volume) -> bool:
+        """Whether a world is there already, which this camera has to find its place in."""
+        return self._mode == "track" and volume.frames > 0
+
+    def _join(self, frame: RgbdFrame, guess: Floats, volume: Volume) -> Located:
+        seen = thumbnail(frame, self._engine.download(self._pyramid[0]))
+        places = [volume.volume_from_world() @ guess, *self._keyframes.most_similar(seen, count=2)]
+        found = relocalize(self._engine, self._camera, volume, self._pyramid, places)
+        if found is None:
+            return Located(guess, "lost", (_LOST + "it does not show what the room has seen",))
+        return self._tracked(found, volume, "left as it was")
 
     def _follow(self, frame: RgbdFrame, last: Floats, volume: Volume) -> Located:
         found = self._register(last, volume)

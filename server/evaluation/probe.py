@@ -10,11 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import pi, sqrt
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from protocol.messages import Dictionary, Marker
+from server.markers import find_marker
 from server.maths.bayes import NormalEquations, Posterior, solve_with_evidence
 from server.maths.sh import lambert_transfer, sh_basis
 from server.stages.light_estimation import prior_precision
@@ -59,30 +60,20 @@ def find_sphere(
     marker_side_m: float,
     center_in_marker_m: Floats,
     radius_m: float,
-    dictionary: int = cv2.aruco.DICT_4X4_50,
+    dictionary: Dictionary = "4x4_50",
 ) -> Sphere:
     """The sphere beside an ArUco marker. Raises ProbeError where the marker is not seen.
 
     gray: [h, w]. center_in_marker_m: [3] in the marker's axes: x right and y up on the sheet, z out of it, origin in
     its middle. The marker's side is that of the black square.
     """
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(dictionary), _sharp_corners())
-    corners, ids, _ = detector.detectMarkers(gray)
-    found = [] if ids is None else [c for c, i in zip(corners, ids.ravel(), strict=True) if i == marker_id]
-    if len(found) != 1:
-        raise ProbeError(f"marker {marker_id} is seen {len(found)} times, must be once")
-    half = marker_side_m / 2
-    square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
-    lens = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    distortion = np.array(camera.distortion, np.float64)
-    solved, turn, shift = cv2.solvePnP(
-        square, found[0].reshape(4, 2).astype(np.float64), lens, distortion, flags=cv2.SOLVEPNP_IPPE_SQUARE
-    )
-    if not solved:
-        raise ProbeError(f"the pose of marker {marker_id} is not found")
-    camera_from_marker = np.asarray(cv2.Rodrigues(turn)[0], np.float64)
-    center = camera_from_marker @ np.asarray(center_in_marker_m, np.float64) + np.asarray(shift, np.float64).ravel()
-    return Sphere(center, radius_m)
+    marker = Marker(id=marker_id, side_m=marker_side_m, dictionary=dictionary)
+    try:
+        camera_from_marker = find_marker(gray, camera, marker)
+    except ValueError as error:
+        raise ProbeError(str(error)) from error
+    center = camera_from_marker @ np.append(np.asarray(center_in_marker_m, np.float64), 1.0)
+    return Sphere(center[:3], radius_m)
 
 
 def sphere_pixels(camera: CameraModel, sphere: Sphere, least_facing: float = LEAST_FACING) -> SpherePixels:
@@ -175,9 +166,3 @@ def _distance(views: Floats, sphere: Sphere) -> tuple[Floats, Floats]:
     along = views @ sphere.center_m
     under_root = along**2 - (sphere.center_m @ sphere.center_m - sphere.radius_m**2)
     return along - np.sqrt(np.maximum(under_root, 0.0)), under_root
-
-
-def _sharp_corners() -> cv2.aruco.DetectorParameters:
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    return parameters

@@ -1,4 +1,4 @@
-"""What a stage launches kernels with: one session's queue, kernels, memory and times."""
+"""What a stage launches kernels with: a queue, kernels, memory and times."""
 
 from __future__ import annotations
 
@@ -19,15 +19,17 @@ KernelArgument = cl_array.Array | np.generic | int | float | None
 
 
 class Engine:
-    """One command queue with everything that belongs to it. Owned by one thread."""
+    """One command queue with everything that belongs to it. Owned by one thread at a time."""
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: Device, beside: Engine | None = None) -> None:
+        """`beside`: another engine, whose queue, kernels and times this one shares; its memory is its own. What either
+        does, it does after all that both were asked for before."""
         self.device = device
-        self.queue = cl.CommandQueue(device.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+        self.queue: cl.CommandQueue = beside.queue if beside else _make_queue(device)
         self.workspace = Workspace(self.queue)
-        self.profile = Profile()
-        self._kernels: dict[tuple[object, ...], cl.Kernel] = {}
-        self._typed: dict[int, cl.Kernel] = {}
+        self.profile: Profile = beside.profile if beside else Profile()
+        self._kernels: dict[tuple[object, ...], cl.Kernel] = beside._kernels if beside else {}
+        self._typed: dict[int, cl.Kernel] = beside._typed if beside else {}
 
     @property
     def lanes(self) -> int:
@@ -72,6 +74,10 @@ class Engine:
         """Wait for the device and give its memory back."""
         self.queue.finish()
         self.workspace.release()
+
+
+def _make_queue(device: Device) -> cl.CommandQueue:
+    return cl.CommandQueue(device.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
 
 
 def _type_of(value: KernelArgument) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +24,14 @@ _LEAST_HORIZONTAL = 1e-3
 class Placement:
     """`position_m`: world point on which the bottom centre of the model's box stands; None: the vertices are world
     coordinates already, and scale and yaw are not used. `yaw_deg` turns counter-clockwise seen from above.
+    `room_from_client`: rigid [4, 4] from the world that this is said in to that of the room; None: they are one.
     Raises ValueError for numbers that are not finite and for a scale that is not positive.
     """
 
     position_m: tuple[float, float, float] | None = None
     scale: float = 1.0
     yaw_deg: float = 0.0
+    room_from_client: Matrix | None = None
 
     def __post_init__(self) -> None:
         if not all(map(math.isfinite, (*(self.position_m or ()), self.scale, self.yaw_deg))):
@@ -48,6 +50,9 @@ def world_from_model(mesh: Mesh, placement: Placement, up: NDArray[np.float64]) 
     as check_size() does.
     """
     check_size(mesh, placement)
+    if placement.room_from_client is not None:
+        here = replace(placement, room_from_client=None)
+        return placement.room_from_client @ world_from_model(mesh, here, placement.room_from_client[:3, :3].T @ up)
     if placement.position_m is None:
         return np.eye(4)
     linear = placement.scale * _yaw(up, placement.yaw_deg) @ _upright(up) @ _y_up(mesh.up_axis)

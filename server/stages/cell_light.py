@@ -35,8 +35,8 @@ def solve_cells(
 ) -> tuple[LobeFit, LightEstimate]:
     """The light in cells, of the width that the pictures call for, and what is known of it.
 
-    slot, grid: of the newest frame, whose residuals tell how alike neighbours err. `albedo_known`: the mean albedo is what is
-    assumed.
+    slot, grid: of the newest frame, whose residuals tell how alike neighbours err. `albedo_known`: the mean albedo is
+    what is assumed.
     """
     to_sh, mean_albedo = cells_to_sh(bands), solution.mean_albedo
     count = window.slots * window.capacity

@@ -117,7 +117,7 @@ class PoolWindow:
         indirect: Indirect,
         voxel_m: float,
     ) -> Pools:
-        """Pool a frame's usable samples into `slot`. Raises ValueError where the grid is finer than the window's capacity.
+        """Pool a frame's usable samples into `slot`. Raises ValueError where the grid exceeds the capacity.
 
         observed: [rows, cols] float4 of the samples, w = 1 usable.
         """
@@ -209,6 +209,15 @@ class PoolWindow:
             local=(1, 64),
         )
         result: NDArray[np.float32] = engine.download(shading)[:, :count]
+        return result
+
+    def raw_of(self, slots: NDArray[np.int64], places: NDArray[np.int64]) -> NDArray[np.float32]:
+        """[n, CELLS] `raw` of the pools at `places` [n] of `slots` [n]."""
+        engine, count = self._engine, len(slots)
+        taken = engine.workspace.array("pools_taken", (count, CELLS), np.float32)
+        chosen = engine.workspace.upload("pools_chosen", (slots * self.capacity + places).astype(np.int32))
+        engine.launch(self._kernel("take_pools"), (CELLS, count), count, chosen, self.raw, taken)
+        result: NDArray[np.float32] = engine.download(taken)
         return result
 
     def equations(self, targets: Floats, weights: Floats) -> list[CellEquations]:

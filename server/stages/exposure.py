@@ -136,7 +136,7 @@ def scene_radiance(
 
 
 class ExposureTracking:
-    """Exposures of one camera's frames, one after the other; the first one's is 1."""
+    """Exposures of one camera's frames, one after the other; that of the first one in the volume is 1."""
 
     def __init__(self, engine: Engine, camera: CameraModel, mode: Literal["auto", "constant"]) -> None:
         self._engine = engine
@@ -163,12 +163,9 @@ class ExposureTracking:
         if given is not None and self._given_of_first is not None:
             self._exposure = given / self._given_of_first
             return self._exposure, notes
-        if self._exposure is None:
-            exposure = 1.0
-        elif volume_from_camera is None or volume.frames == 0:
-            exposure = self._exposure
-        else:
-            exposure = self._estimated(self._exposure, measurement, volume, volume_from_camera)
+        exposure = 1.0 if self._exposure is None else self._exposure
+        if volume_from_camera is not None and volume.frames > 0:
+            exposure = self._estimated(exposure, measurement, volume, volume_from_camera)
         if given is not None:
             self._given_of_first = given / exposure
         self._exposure = exposure

@@ -39,12 +39,11 @@ CHANGED = 0.25
 
 
 class LampFinder:
-    """Lamps of one session."""
+    """Lamps of one room."""
 
-    def __init__(self, engine: Engine, camera: CameraModel, wanted: Literal["auto", "on", "off"]) -> None:
+    def __init__(self, engine: Engine, wanted: Literal["auto", "on", "off"]) -> None:
         """`wanted`: `auto` looks for lamps where the light from outside does not explain what is seen."""
         self._engine = engine
-        self._camera = camera
         self._wanted = wanted
         if wanted != "off":
             Emitters.compiled(engine)  # now, not in the middle of a later frame
@@ -60,7 +59,7 @@ class LampFinder:
         self._wait_frames = FIRST_VIEWS * FRAMES_A_VIEW
         self._frames = 0
 
-    def work(self, radiance: cl_array.Array, surface: Surface, volume: Volume) -> None:
+    def work(self, camera: CameraModel, radiance: cl_array.Array, surface: Surface, volume: Volume) -> None:
         """One frame's part of it; `lamps` are then as the last complete search has them, in volume space.
 
         radiance: [h, w] float4 as in Measurement, with the lamps' light.
@@ -68,7 +67,7 @@ class LampFinder:
         if self._wanted == "off":
             return
         if self._frames % max(FRAMES_A_VIEW, self._wait_frames // VIEWS) == 0:
-            self._see(radiance, surface, volume)
+            self._see(camera, radiance, surface, volume)
         self._frames += 1
         if self._search is None and self._frames >= self._wait_frames:
             samples = _together(self._views)
@@ -103,8 +102,8 @@ class LampFinder:
         self._found, self.lamps = found, found.emitters
         self._search, self._frames = None, 0
 
-    def _see(self, radiance: cl_array.Array, surface: Surface, volume: Volume) -> None:
-        seen = see_samples(self._engine, self._camera, radiance, surface, volume)
+    def _see(self, camera: CameraModel, radiance: cl_array.Array, surface: Surface, volume: Volume) -> None:
+        seen = see_samples(self._engine, camera, radiance, surface, volume)
         view = seen.thinned(VIEW_SAMPLES, self._random)
         if len(view) and self._contradicts(view, volume):
             self.forget()

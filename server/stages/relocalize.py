@@ -75,7 +75,7 @@ class Keyframes:
 
     def is_new(self, volume_from_camera: NDArray[np.float64]) -> bool:
         """Whether a view is far enough from all others to be worth keeping."""
-        return not any(_is_near(kept.volume_from_camera, volume_from_camera) for kept in self._kept)
+        return not any(is_near(kept.volume_from_camera, volume_from_camera) for kept in self._kept)
 
     def add(self, seen: Thumbnail, volume_from_camera: NDArray[np.float64]) -> None:
         """Keep a view; past the greatest count, one of the two nearest to each other goes."""
@@ -106,16 +106,16 @@ def relocalize(
     What is found is verified against the surface as seen from there.
     """
     for pose in poses[:_CANDIDATES]:
-        found = _fit(engine, camera, volume, pyramid, pose)
-        if found is None or not _is_near(found.volume_from_camera, pose, _REACH_M, _REACH_RAD):
+        found = fit_near(engine, camera, volume, pyramid, pose)
+        if found is None or not is_near(found.volume_from_camera, pose, _REACH_M, _REACH_RAD):
             continue
-        verified = _fit(engine, camera, volume, pyramid, found.volume_from_camera)
-        if verified is not None and _is_certain(verified):
+        verified = fit_near(engine, camera, volume, pyramid, found.volume_from_camera)
+        if verified is not None and is_certain(verified):
             return verified
     return None
 
 
-def _fit(
+def fit_near(
     engine: Engine,
     camera: CameraModel,
     volume: Volume,
@@ -128,12 +128,12 @@ def _fit(
     return register(engine, camera, view, pyramid, pose, 0.25 * volume.voxel_m)
 
 
-def _is_certain(found: Registration) -> bool:
+def is_certain(found: Registration) -> bool:
     fits = found.share > _LEAST_SHARE and found.overlap > _LEAST_OVERLAP and found.deviation_m < _GREATEST_DEVIATION_M
     return fits and not len(found.free)
 
 
-def _is_near(
+def is_near(
     a: NDArray[np.float64],
     b: NDArray[np.float64],
     distance_m: float = NEW_DISTANCE_M,

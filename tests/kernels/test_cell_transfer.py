@@ -290,6 +290,14 @@ def test_shading_under_lobes_matches_numpy(engine: Engine, lobes: int, slot: int
     np.testing.assert_allclose(shading, values[slot] @ light, rtol=1e-4)
 
 
+def test_pools_are_taken_from_any_slot(engine: Engine) -> None:
+    window = PoolWindow(engine, 77, 3)
+    raw = np.random.default_rng(4).random((3, 77, CELLS)).astype(np.float32)
+    window.raw.set(raw)
+    slots, places = np.array([2, 0, 1, 2, 2]), np.array([76, 0, 5, 0, 76])
+    np.testing.assert_array_equal(window.raw_of(slots, places), raw[slots, places])
+
+
 def test_cells_are_the_nearest() -> None:
     rays = direction_sets(81, 2)
     cells = cells_of(rays.directions.tobytes(), rays.count)

@@ -78,12 +78,12 @@ def test_search_waits_for_views_forgets_and_can_be_off(engine: Engine, monkeypat
     monkeypatch.setattr(lamp_finder, "see_samples", see)
     monkeypatch.setattr(lamp_finder, "search_lamps", search)
     monkeypatch.setattr(LampFinder, "_contradicts", lambda *_: contradicting)
-    finder = LampFinder(engine, CAMERA, "auto")
+    finder = LampFinder(engine, "auto")
 
     def frames_until(lamps: int) -> int:
         count = 0
         while len(finder.lamps) != lamps:
-            finder.work(None, None, None)
+            finder.work(CAMERA, None, None, None)
             count += 1
         return count
 
@@ -94,7 +94,7 @@ def test_search_waits_for_views_forgets_and_can_be_off(engine: Engine, monkeypat
     assert frames_until(0) == 1  # the next view is one search later
     contradicting = False
     assert frames_until(1) > FIRST_VIEWS
-    finder = LampFinder(engine, CAMERA, "off")
+    finder = LampFinder(engine, "off")
     seen = len(views)
-    finder.work(None, None, None)
+    finder.work(CAMERA, None, None, None)
     assert len(views) == seen

@@ -115,12 +115,30 @@ export interface Wishes {
   lossless?: boolean;
 }
 
+/** A square fiducial marker that all clients of a room may see. */
+export interface Marker {
+  id: number;
+  /** Of the black square. */
+  side_m: number;
+  dictionary?: "4x4_50" | "5x5_100" | "6x6_250" | "7x7_1000" | "apriltag_36h11";
+}
+
 /** First message of a client that captures. */
 export interface Hello {
   type: "hello";
   client: string;
   camera: CameraModel;
   wishes?: Wishes;
+  /** Clients of one room share volume, light and objects; null: a room of its own. */
+  room?: string | null;
+  /**
+   * Where this client's world lies in the room's, which is that of the client that came first; rigid.
+   *
+   * null: not known, to be found by `marker`, else by what the room has seen.
+   */
+  room_from_world?: Array<number> | null;
+  /** By which the client's world is laid on the room's, once both have seen it. */
+  marker?: Marker | null;
 }
 
 /** First message of a client that only looks: it receives what the capturing session produces. */

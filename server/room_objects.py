@@ -1,4 +1,4 @@
-"""The virtual objects of one session: those that are asked for before the first frame wait for it to say what is up."""
+"""The virtual objects of one room: those that are asked for before the first frame wait for it to say what is up."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from server.scene.placement import Placement, check_size
 from server.stages.rasterize import Placed
 
 
-class SessionObjects:
+class RoomObjects:
     """Placed, moved and removed by their ids, at any time."""
 
     def __init__(self, engine: Engine) -> None:

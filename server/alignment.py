@@ -26,14 +26,14 @@ from server.stages.volume import Volume
 
 Floats = NDArray[np.float64]
 
-LEAST_OVERLAP = 0.05
+LEAST_OVERLAP = 0.15
 """Share of the picture that must show what the room has seen for the two to be compared."""
-LEAST_SHARE = 0.4
-"""Of what is compared: less is a contradiction. As tracking has it."""
+LEAST_SHARE, GREATEST_DEVIATION_M = 0.4, 0.015
+"""Of what is compared, what must fit, and how well: else it is a contradiction. As tracking has it."""
 REACH_M, REACH_RAD = 0.3, np.radians(15.0)
 """By so much depth may correct what the client or a marker says."""
 CERTAIN_FRAMES = 5
-"""Corrections that are averaged, of frames one after the other, while the client is in view of what is known."""
+"""Corrections that are averaged, of frames that fix all motions."""
 
 
 class Markers:
@@ -70,7 +70,10 @@ class Alignment:
         self._marker = asked.marker if asked else None
         given = asked.room_from_world if asked else None
         self._given = None if given is None else np.array(given, np.float64).reshape(4, 4)
+        self._is_first = False
+        """Whether its world is the room's."""
         self._corrections = 0
+        self._sightings = 0
         self.room_from_client: Floats = np.eye(4) if self._given is None else self._given
         self._is_alone = asked is None or asked.room is None
         self.is_settled = self._is_alone
@@ -117,31 +120,33 @@ class Alignment:
         if self._is_alone or frame.world_from_camera is None:
             return None
         volume = self._reconstruction.volume
-        if volume is None or volume.frames == 0:  # the first client's world is the room's
-            self.is_settled = True
-        elif self._corrections < CERTAIN_FRAMES:
+        if volume is None or volume.frames == 0:
+            self._is_first = self.is_settled = True
+        elif not self._is_first and self._corrections < CERTAIN_FRAMES:
             problem = self._fit(frame, measurement, volume)
             if problem is not None and not self.is_settled:
                 return f"not aligned with the room, nothing is fused: {problem}"
             self.is_settled = True
         if self._marker is not None and self._markers.place_of(self._marker) is None:
-            self._note_marker(frame, self._marker)
+            self._note_marker(frame, measurement, self._marker)
         return None
 
     def _fit(self, frame: RgbdFrame, measurement: Measurement, volume: Volume) -> str | None:
+        """Learn from a frame; why it does not belong into the room, if so."""
         assert frame.world_from_camera is not None
         engine, camera, to_volume = self._engine, self._camera, volume.volume_from_world()
-        pyramid = depth_pyramid(engine, camera, bilateral_depth(engine, measurement.depth_m))
         try:
-            is_said = self._corrections > 0 or self._guess(frame)
+            is_said = self._corrections > 0 or self._is_said(frame, measurement)
         except ValueError as error:
             return str(error)
+        pyramid = depth_pyramid(engine, camera, bilateral_depth(engine, measurement.depth_m))
         pose = to_volume @ self.room_from_client @ frame.world_from_camera
         if is_said:
             found = fit_near(engine, camera, volume, pyramid, pose)
             if found is None or found.overlap < LEAST_OVERLAP:
                 return None  # it looks elsewhere: nothing contradicts what it says
-            if found.share < LEAST_SHARE or not is_near(found.volume_from_camera, pose, REACH_M, REACH_RAD):
+            fits = found.share > LEAST_SHARE and found.deviation_m < GREATEST_DEVIATION_M
+            if not fits or not is_near(found.volume_from_camera, pose, REACH_M, REACH_RAD):
                 return "its depth does not fit what the room has seen where it says that it is"
         else:
             seen = thumbnail(frame, engine.download(pyramid[0]))
@@ -149,45 +154,42 @@ class Alignment:
             found = relocalize(engine, camera, volume, pyramid, places)
             if found is None:
                 return "it does not show what the room has seen: say where its world lies, or show a common marker"
-        self._correct(inverse_rigid(to_volume) @ found.volume_from_camera, frame.world_from_camera, is_certain(found))
+        if is_certain(found):
+            self._corrections += 1
+            room_from_camera = inverse_rigid(to_volume) @ found.volume_from_camera
+            self._average(room_from_camera @ inverse_rigid(frame.world_from_camera), self._corrections)
         return None
 
-    def _guess(self, frame: RgbdFrame) -> bool:
+    def _is_said(self, frame: RgbdFrame, measurement: Measurement) -> bool:
         """Whether it is said where the client's world lies. Raises ValueError where its marker is not there."""
-        if self._marker is None:
+        place = self._markers.place_of(self._marker) if self._marker else None
+        if self._marker is None or (place is None and self._given is not None):
             return self._given is not None
-        place = self._markers.place_of(self._marker)
-        if place is None and self._given is not None:
-            return True
         if place is None:
             raise ValueError(f"nobody in the room has seen marker {self._marker.id}")
-        self.room_from_client = place @ inverse_rigid(self._world_from_marker(frame, self._marker))
+        said = place @ inverse_rigid(self._world_from_marker(frame, measurement, self._marker))
+        self._sightings += 1
+        self._average(said, self._sightings)
         return True
 
-    def _correct(self, room_from_camera: Floats, client_from_camera: Floats, certain: bool) -> None:
-        """The mean of what frames say; one that does not fix all motions is taken as long as there is no better."""
-        said = room_from_camera @ inverse_rigid(client_from_camera)
-        if not certain:
-            if self._corrections == 0:
-                self.room_from_client = said
-            return
-        self._corrections += 1
-        share = 1.0 / self._corrections
-        mixed = (1 - share) * self.room_from_client + share * said
+    def _average(self, said: Floats, count: int) -> None:
+        """The mean of what `count` frames say of room_from_client, of which `said` is the newest."""
+        mixed = self.room_from_client + (said - self.room_from_client) / count
         u, _, vt = np.linalg.svd(mixed[:3, :3])
         mixed[:3, :3] = u @ vt
         self.room_from_client = mixed
 
-    def _note_marker(self, frame: RgbdFrame, marker: Marker) -> None:
+    def _note_marker(self, frame: RgbdFrame, measurement: Measurement, marker: Marker) -> None:
         try:
-            self._markers.note(marker, self.room_from_client @ self._world_from_marker(frame, marker))
+            self._markers.note(marker, self.room_from_client @ self._world_from_marker(frame, measurement, marker))
         except ValueError:
             return  # not in this picture
 
-    def _world_from_marker(self, frame: RgbdFrame, marker: Marker) -> Floats:
+    def _world_from_marker(self, frame: RgbdFrame, measurement: Measurement, marker: Marker) -> Floats:
         """In the client's world. Raises ValueError, one line, where the picture does not show it."""
         assert frame.world_from_camera is not None
-        return np.asarray(frame.world_from_camera @ find_marker(_gray(frame), self._camera, marker))
+        depth_m = self._engine.download(measurement.depth_m)
+        return np.asarray(frame.world_from_camera @ find_marker(_gray(frame), self._camera, marker, depth_m))
 
 
 def _gray(frame: RgbdFrame) -> NDArray[np.uint8]:

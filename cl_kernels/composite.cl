@@ -1,8 +1,9 @@
 // Compositing (thesis 7.2.1, R3): real hides virtual and virtual hides real; linear inside, sRGB at the end.
-// Provides mark_touched, composite.
+// Provides composite.
 #include "camera.clh"
 #include "lanes.clh"
 #include "sampled_value.clh"
+#include "upsample_row.clh"
 
 #ifndef SUBPIXELS
 #define SUBPIXELS 0
@@ -18,22 +19,6 @@ static inline void write_color(global uchar *picture, const int pixel, const flo
     picture[3 * pixel] = codes[(int)level.x];
     picture[3 * pixel + 1] = codes[(int)level.y];
     picture[3 * pixel + 2] = codes[(int)level.z];
-}
-
-// ratio [rows][cols] (w = 1 valid) -> touched [rows + 1][cols + 1]: whether the 6 x 6 samples around a cell hold one that is
-// valid and not 1. Most of a picture is not touched, and need not be upsampled.
-kernel void mark_touched(const int cols, const int rows, global const float4 *ratio, global uchar *touched) {
-    const int cell_col = (int)get_global_id(0) - 1;
-    const int cell_row = (int)get_global_id(1) - 1;
-    if (cell_col >= cols || cell_row >= rows) return;
-    int any = 0;
-    for (int row = max(cell_row - 2, 0); row <= min(cell_row + 3, rows - 1); row++) {
-        for (int col = max(cell_col - 2, 0); col <= min(cell_col + 3, cols - 1); col++) {
-            const float4 v = ratio[row * cols + col];
-            any |= v.w > 0.0f && (v.x != 1.0f || v.y != 1.0f || v.z != 1.0f);
-        }
-    }
-    touched[(cell_row + 1) * (cols + 1) + cell_col + 1] = (uchar)any;
 }
 
 // The virtual geometry buffer and what occluders take from it.
@@ -114,6 +99,40 @@ static inline int may_change(const int x, const int y, const int width, const in
     return any_change;
 }
 
+#if defined(HAS_SHADOWS) && !defined(HAS_DIRECT)
+// By what virtual things multiply real surface at LANES pixels of a row from x on -> factors [LANES], w = 0 where they do not.
+static void factors_of(const Grid grid, global const float4 *ratio, const int has_refined, global const float4 *refined,
+                       global const uchar *touched, global const float4 *positions, global const float4 *normals, const int x,
+                       const int y, const int height, const float tolerance_m, float4 *factors) {
+    global const uchar *cells = touched + (cell_of(y, grid.stride) + 1) * (grid.cols + 1) + 1;
+    int counts[LANES], any_counts = 0;
+    for (int lane = 0; lane < LANES; lane++) {
+        const int pixel = y * grid.width + x + lane;
+        factors[lane] = (float4)(0.0f);
+        counts[lane] = x + lane < grid.width && cells[cell_of(x + lane, grid.stride)] && positions[pixel].w > 0.0f;
+#ifndef BICUBIC
+        any_counts |= counts[lane];
+        if (!has_refined || !counts[lane] || refined[pixel].w <= 0.0f) continue;
+#else
+        if (!counts[lane]) continue;
+#endif
+        counts[lane] = 0;
+        factors[lane] = value_at(grid, ratio, refined, has_refined, positions, normals, x + lane, y, height, tolerance_m);
+    }
+    if (!any_counts) return;
+    float a[LANES], b[LANES], c[LANES];
+    int known[LANES];
+    intn found;
+    const Vectors mean = upsample_row(grid, ratio, positions, normals, row_from(grid, positions, normals, x, y), tolerance_m, &found);
+    STORE_LANES(mean.x, a);
+    STORE_LANES(mean.y, b);
+    STORE_LANES(mean.z, c);
+    STORE_LANES(found, known);
+    for (int lane = 0; lane < LANES; lane++)
+        if (counts[lane] && known[lane]) factors[lane] = (float4)(a[lane], b[lane], c[lane], 1.0f);
+}
+#endif
+
 static inline void copy_codes(global const uchar *shown, global uchar *picture, const int pixel) {
 #if LANES == 8
     for (int i = 0; i < 3; i++) vstore8(vload8(i, shown + 3 * pixel), i, picture + 3 * pixel);
@@ -127,7 +146,7 @@ static inline void copy_codes(global const uchar *shown, global uchar *picture, 
 // nearest: see share_covered, where SUBPIXELS is not 0; else pixels are covered as their middles are.
 // reflected [h][w]: see reflect.cl, or none without HAS_GLOSS. virtual_gain: picture radiance over the light's, on virtual surface.
 // occluded [object_rows][object_cols]: radiance that occluders take from virtual samples (w = 1 valid);
-// ratio [rows][cols]: shaded with over without virtual objects on real samples (w = 1 valid), touched: see mark_touched; or
+// ratio [rows][cols]: shaded with over without virtual objects on real samples (w = 1 valid), touched: see reached.cl; or
 // none without HAS_SHADOWS. refined_occluded, refined_ratio [h][w]: the same at pixels that have w = 1, or none where has_... is 0.
 // HAS_DIRECT: `light` and occluded are of the rest of the light; direct_virtual [h][w]: what its discs bring to virtual surface;
 // direct_ratio [h][w] (w = 1 where it counts): ratio of all of it, which then stands for `ratio`.
@@ -151,6 +170,11 @@ kernel void composite(const int width, const int height, global const uchar *sho
         copy_codes(shown, picture, y * width + first);
         return;
     }
+#if defined(HAS_SHADOWS) && !defined(HAS_DIRECT)
+    const Grid grid = {cols, rows, stride, width};
+    float4 factors[LANES];
+    factors_of(grid, ratio, has_refined_ratio, refined_ratio, touched, positions, normals, first, y, height, tolerance_m, factors);
+#endif
     for (int x = first; x < min(first + LANES, width); x++) {
         const int pixel = y * width + x;
         const float4 real = positions[pixel];
@@ -158,16 +182,13 @@ kernel void composite(const int width, const int height, global const uchar *sho
         color.w = 0.0f;
 #ifdef HAS_SHADOWS
 #ifdef HAS_DIRECT
-        if (direct_ratio[pixel].w > 0.0f && radiance[pixel].w >= 0.0f) {
-            const float4 factor = direct_ratio[pixel];
+        const float4 factor = direct_ratio[pixel];
 #else
-        const Grid grid = {cols, rows, stride, width};
-        const int cell = (cell_of(y, stride) + 1) * (cols + 1) + cell_of(x, stride) + 1;
-        if (touched[cell] && real.w > 0.0f && radiance[pixel].w >= 0.0f) {
-            const float4 factor = value_at(grid, ratio, refined_ratio, has_refined_ratio, positions, normals, x, y, height, tolerance_m);
+        const float4 factor = factors[x - first];
 #endif
+        if (factor.w > 0.0f && radiance[pixel].w >= 0.0f) {
             const float3 change = fabs(factor.xyz - 1.0f);
-            if (factor.w > 0.0f && fmax(fmax(change.x, change.y), change.z) > UNTOUCHED) color = (float4)(color.xyz * factor.xyz, 1.0f);
+            if (fmax(fmax(change.x, change.y), change.z) > UNTOUCHED) color = (float4)(color.xyz * factor.xyz, 1.0f);
         }
 #endif
 #ifdef HAS_OBJECTS

@@ -42,9 +42,12 @@ kernel void shadow_real(SAMPLE_PARAMETERS, global const float *transfer, global 
 
 // What a sample of real surface gains from other real surface whose own shading virtual objects changed (eq. 7.6: R'_ID - R_ID),
 // added to the ratio. It follows every `every`-th of its hidden directions, beginning with another one than its neighbours do.
-// ratio, shaded [rows][cols]: of shadow_real; changed: that ratio. -> bounced [rows][cols] (rgb, w = 1), w = 0 as in ratio.
+// ratio, shaded [rows][cols]: of shadow_real; changed: that ratio. returned: the most that what a hidden direction brings can change
+// by; a sample that this can change by no more than `spare` of `least` [rows][cols], which is no more than `shaded`, follows none.
+// -> bounced [rows][cols] (rgb, w = 1), w = 0 as in ratio.
 kernel void bounce_real(SAMPLE_PARAMETERS, global const float4 *light, SCENE_PARAMETERS, const int every,
-                        global const float4 *shaded, global float4 *bounced) {
+                        global const float4 *shaded, const float returned, const float spare, global const float4 *least,
+                        global float4 *bounced) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= cols || row >= rows) return;
@@ -52,6 +55,13 @@ kernel void bounce_real(SAMPLE_PARAMETERS, global const float4 *light, SCENE_PAR
     const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
     const float4 normal = normals[pixel], before = changed_ratio[sample];
     if (before.w <= 0.0f) {
+        bounced[sample] = before;
+        return;
+    }
+    const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
+    const float3 counts = fmax(least[sample].xyz, floor);
+    const float part_hidden = clamp(1.0f - openness[sample], 0.0f, 1.0f);
+    if (part_hidden == 0.0f || part_hidden * returned <= spare * fmin(fmin(counts.x, counts.y), counts.z)) {
         bounced[sample] = before;
         return;
     }
@@ -78,8 +88,7 @@ kernel void bounce_real(SAMPLE_PARAMETERS, global const float4 *light, SCENE_PAR
         }
         waiting = 0;
     }
-    const float3 gained = clamp(1.0f - openness[sample], 0.0f, 1.0f) * sum.xyz / fmax(sum.w, 1e-6f);
-    const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
+    const float3 gained = part_hidden * sum.xyz / fmax(sum.w, 1e-6f);
     const float3 without = fmax(shaded[sample].xyz, floor);
     bounced[sample] = (float4)(fmax(before.xyz * without + gained, floor) / without, 1.0f);
 }

@@ -178,13 +178,44 @@ kernel void merge_depth(const int width, const int height, const int pitch, glob
     vstore8(as_float8(result), 0, merged + at);
 }
 
-// D'' (eq. 4.4), a joint bilateral median over 5 x 5 pixels: merged, shade -> aligned. Unknown stays unknown.
+// Whether a depth in the rows within `radius` pixels of eight pixels, and up to four beside them, is not the volume's.
+static inline int any_others(global const float *depths, global const float *predicted, const int pitch, const int at,
+                             const int radius) {
+    int16 others = 0;
+    for (int dy = -radius; dy <= radius; dy++) {
+        const float16 depth = vload16(0, depths + at + dy * pitch - 4);
+        others |= (depth != 0.0f) & (depth != vload16(0, predicted + at + dy * pitch - 4));
+    }
+    return any(others);
+}
+
+// -1 where a depth within `radius` pixels of one of eight is not the volume's.
+static int8 has_others(global const float *depths, global const float *predicted, const int pitch, const int at, const int radius) {
+    int8 others = 0;
+    for (int dy = -radius; dy <= radius; dy++) {
+        for (int dx = -radius; dx <= radius; dx++) {
+            const int there = at + dy * pitch + dx;
+            const float8 depth = vload8(0, depths + there);
+            others |= (depth != 0.0f) & (depth != vload8(0, predicted + there));
+        }
+    }
+    return others;
+}
+
+// D'' (eq. 4.4), a joint bilateral median over 5 x 5 pixels: merged, shade -> aligned. Unknown stays unknown. Where all of the
+// window is the volume's there is no sensor's noise to take away, and it is kept.
 kernel void align_depth(const int width, const int height, const int pitch, global const float *merged,
-                        global const float *shade, const float lambda_intensity, global float *aligned) {
+                        global const float *predicted, global const float *shade, const float lambda_intensity,
+                        global float *aligned) {
     const int x = 8 * get_global_id(0);
     const int y = get_global_id(1);
     if (x >= width || y >= height) return;
     const int at = plane_index(pitch, x, y);
+    if (!any_others(merged, predicted, pitch, at, 2)) {
+        vstore8(vload8(0, merged + at), 0, aligned + at);
+        return;
+    }
+    const int8 wanted = has_others(merged, predicted, pitch, at, 2);
     const float8 here = vload8(0, shade + at);
     int8 values[25], pad = FIRST_PAD;
 #pragma unroll
@@ -194,19 +225,25 @@ kernel void align_depth(const int width, const int height, const int pitch, glob
         const int8 member = is_similar(vload8(0, shade + there), here, lambda_intensity) & (key != 0);
         values[i] = pad_unless(member, key, &pad);
     }
-    const int8 known = as_int8(vload8(0, merged + at)) != 0;
-    vstore8(as_float8(known & middle_of(values, 25)), 0, aligned + at);
+    const int8 own = as_int8(vload8(0, merged + at));
+    vstore8(as_float8(select(own, (own != 0) & middle_of(values, 25), wanted)), 0, aligned + at);
 }
 
 // D''' (eq. 4.5), a median over 3 x 3 pixels: aligned -> smoothed. Unknown stays unknown. Where at least two neighbours are
 // on the pixel's own surface the median is theirs alone: of all it would round corners and take away what is a pixel wide.
+// What is the volume's all around is kept, as by D''.
 kernel void smooth_depth(const int width, const int height, const int pitch, global const float *aligned,
-                         global float *smoothed) {
+                         global const float *predicted, global float *smoothed) {
     const int x = 8 * get_global_id(0);
     const int y = get_global_id(1);
     if (x >= width || y >= height) return;
     const int at = plane_index(pitch, x, y);
     const float8 here = vload8(0, aligned + at);
+    if (!any_others(aligned, predicted, pitch, at, 1)) {
+        vstore8(here, 0, smoothed + at);
+        return;
+    }
+    const int8 wanted = has_others(aligned, predicted, pitch, at, 1);
     const float8 near = SAME_SURFACE_M(here);
     int8 values[9], own[9], pad = FIRST_PAD, count = 0;
 #pragma unroll
@@ -218,5 +255,5 @@ kernel void smooth_depth(const int width, const int height, const int pitch, glo
     }
 #pragma unroll
     for (int i = 0; i < 9; i++) values[i] = pad_unless((values[i] != 0) & (own[i] | (count < 3)), values[i], &pad);
-    vstore8(as_float8((here > 0.0f) & middle_of(values, 9)), 0, smoothed + at);
+    vstore8(as_float8(select(as_int8(here), (here > 0.0f) & middle_of(values, 9), wanted)), 0, smoothed + at);
 }

@@ -25,6 +25,7 @@
 // -> transfer [rows][cols][COEFFICIENTS], openness [rows][cols]: free share of the cosine-weighted sky (-1 where there is no
 // surface), flatness [rows][cols]: share of the window on the sample's own surface, free_mask [rows][cols][MASK_WORDS]: bit j =
 // direction j lies above the surface and is free, sets [rows][cols][INTERLEAVE]: direction j is that of set sets[j % INTERLEAVE].
+// With IS_CHOSEN only the samples `chosen` [chosen_count] are done, one item each; what is kept of the others stays as it was.
 kernel void transfer_radiance(const int cols, const int rows, const int stride, const int width, const int height, const int radius,
                               global const float4 *positions, global const float4 *normals, global const uchar *labels,
                               const int4 bricks, global const int *slots, global const uchar *gaps,
@@ -34,11 +35,22 @@ kernel void transfer_radiance(const int cols, const int rows, const int stride, 
                               global const float16 *cameras, global float4 *points, global float4 *cached_normals,
                               global ushort *traced, global uint *blocked, global const uint *state,
                               global float *transfer, global float *openness, global float *flatness,
-                              global uint *free_mask, global uchar *sets) {
+                              global uint *free_mask, global uchar *sets
+#ifdef IS_CHOSEN
+                              , const int chosen_count, global const int *chosen
+#endif
+) {
+#ifdef IS_CHOSEN
+    if (get_global_id(0) >= chosen_count) return;
+    const int sample = chosen[get_global_id(0)];
+    const int col = sample % cols;
+    const int row = sample / cols;
+#else
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= cols || row >= rows) return;
     const int sample = row * cols + col;
+#endif
     const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
     const float4 position = positions[pixel];
     const int valid = position.w > 0.0f && normals[pixel].w > 0.0f;

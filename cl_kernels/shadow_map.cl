@@ -175,7 +175,7 @@ kernel void light_virtual(const int width, const int4 around, global const float
     store_vectors(with, 0.0f, pixel, last, direct);
 }
 
-// Of LANES pixels, those in whose cells something is touched (see mark_touched).
+// Of LANES pixels, those in whose cells something is touched (see reached.cl).
 static inline intn touched_lanes(global const uchar *touched, const int cols, const int stride, const int x, const int y, const int width) {
     global const uchar *row = touched + (cell_of(y, stride) + 1) * (cols + 1) + 1;
     int bits[LANES];
@@ -184,7 +184,7 @@ static inline intn touched_lanes(global const uchar *touched, const int cols, co
 }
 
 // positions, normals [h][w]: real surface; parts [rows][cols]: of trace_discs; ratio, rest [rows][cols], refined [h][w]: R' / R and R
-// of the rest of the light, see composite.cl; touched: of mark_touched for `ratio`; least: see direct_mix.clh. One item LANES pixels
+// of the rest of the light, see composite.cl; touched: of reached.cl for `ratio`; least: see direct_mix.clh. One item LANES pixels
 // -> mixed [h][w]: R' / R of all of the light (rgb), w = 1 where it may be other than 1, else all 0.
 kernel void light_real(const int width, const int height, global const float4 *positions, global const float4 *normals,
                        const int cols, const int rows, const int stride, global const float4 *parts, const float tolerance_m,

@@ -29,6 +29,8 @@ PURPOSES = {
     "shade_virtual": "shadows virtual things by real ones and by one another",
     "refine_virtual": "sharpens shadows on virtual things near their edges",
     "refine_real": "sharpens the rims of shadows on real things",
+    "shadow_everywhere": "shadows real things where that is hardly seen, too",
+    "find_reach": "finds the parts of the picture in which virtual things change real ones",
     "direct_virtual": "lights virtual things by the light's sharp parts",
     "direct_real": "throws the sharp shadows of virtual things on real ones",
     "match_average": "makes virtual things as bright beside the picture as real ones",

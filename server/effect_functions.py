@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.maths.rigid import inverse_rigid
+from server.omissions import spared, spared_bounces
 from server.opencl.engine import Engine
 from server.stages import adaptive
 from server.stages import composite as composite_stage
@@ -27,6 +28,7 @@ from server.stages.radiance_transfer import Directions, Transfer
 from server.stages.rasterize import Placed, VirtualSurface, nearest_depths
 from server.stages.rasterize import rasterize as rasterize_stage
 from server.stages.raycast import Surface
+from server.stages.reached import mark_reached
 from server.stages.reflect import reflect_surroundings
 from server.stages.sample_grid import SampleGrid
 from server.stages.sampling import PRESETS, Sampling
@@ -122,17 +124,24 @@ def bounce_real(
     transfer: Transfer,
     scene: TracedScene,
     ratio: RealShadow,
+    returned: float,
     glow: Glow | None = None,
     maps: ShadowMaps | None = None,
     samples: DirectSamples | None = None,
+    everywhere: bool = False,
 ) -> RealShadow:
     """`ratio` with what real things then send one another less or more."""
-    engine, camera, lit = view.engine, view.camera, replace(scene, glow=glow)
-    camera_from_volume = inverse_rigid(view.volume_from_camera)
+    engine, lit = view.engine, replace(scene, glow=glow)
+    camera_from_volume, spare = inverse_rigid(view.volume_from_camera), 0.0 if everywhere else spared_bounces()
+
+    def bounced(shadow: RealShadow) -> RealShadow:
+        return differential.bounce_real(
+            engine, view.camera, camera_from_volume, surface, transfer, lit, shadow, returned, spare, ratio
+        )
+
     if maps is None or samples is None or not isinstance(ratio.whole, RealShadow):
-        return differential.bounce_real(engine, camera, camera_from_volume, surface, transfer, lit, ratio)
-    whole = differential.bounce_real(engine, camera, camera_from_volume, surface, transfer, lit, ratio.whole)
-    return shadow_maps.without_direct(engine, whole, ratio, samples, maps)
+        return bounced(ratio)
+    return shadow_maps.without_direct(engine, bounced(ratio.whole), ratio, samples, maps)
 
 
 def add_objects(
@@ -181,6 +190,26 @@ def refine_real(
     return adaptive.refine_real(view.engine, view.camera, surface, lit, bounced or ratio, virtual, eye)
 
 
+def shadow_everywhere() -> bool:
+    """Shadow real things where that is hardly seen, too."""
+    return True
+
+
+def find_reach(
+    view: View,
+    surface: Surface,
+    volume: Volume,
+    ratio: RealShadow,
+    bounced: RealShadow | None = None,
+    refined_ratio: cl_array.Array | None = None,
+    everywhere: bool = False,
+) -> cl_array.Array:
+    """Cells of the picture in which virtual things are seen to change real ones, or `everywhere` in which they do."""
+    spare = 0.0 if everywhere else spared()
+    upsampling, settled = view.sampling.upsampling, bounced or ratio
+    return mark_reached(view.engine, view.camera, surface, settled, refined_ratio, volume.voxel_m, spare, upsampling)
+
+
 def direct_virtual(view: View, virtual: VirtualSurface, maps: ShadowMaps) -> cl_array.Array:
     """What the light's sharp parts bring to virtual surface."""
     return shadow_maps.light_virtual(view.engine, view.camera, virtual, maps)
@@ -193,11 +222,12 @@ def direct_real(
     maps: ShadowMaps,
     bounced: RealShadow | None = None,
     refined_ratio: cl_array.Array | None = None,
+    reached: cl_array.Array | None = None,
 ) -> cl_array.Array:
     """What virtual things take from real ones of the whole light, its sharp parts at every pixel."""
     engine, camera, upsampling, ratio = view.engine, view.camera, view.sampling.upsampling, bounced or ratio
     parts = shadow_maps.trace_real(engine, camera, surface, ratio, maps)
-    return shadow_maps.light_real(engine, camera, surface, ratio, parts, maps, refined_ratio, upsampling)
+    return shadow_maps.light_real(engine, camera, surface, ratio, parts, maps, refined_ratio, upsampling, reached)
 
 
 def match_average(averages: Averages) -> float:
@@ -223,6 +253,7 @@ def composite(
     gain: float = 1.0,
     lit_virtual: cl_array.Array | None = None,
     whole_ratio: cl_array.Array | None = None,
+    reached: cl_array.Array | None = None,
 ) -> NDArray[np.uint8]:
     """The finished picture; with nothing virtual it is the camera's, byte for byte."""
     if lit_virtual is None and virtual is not None and light.discs:
@@ -247,4 +278,5 @@ def composite(
         gain,
         lit_virtual,
         whole_ratio,
+        reached,
     )

@@ -6,6 +6,8 @@ few milliseconds; else light, albedos and the room beyond the pictures are found
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pyopencl.array as cl_array
 
@@ -18,11 +20,29 @@ from server.opencl.engine import Engine
 from server.settings import Settings
 from server.stages.continuation import LEAST_GAIN_KNOWN, NO_PLANES, Continuation, PlaneArrays
 from server.stages.indirect import Indirect, no_hits
-from server.stages.light_estimation import LEAST_OPENNESS, LightEstimate, LightEstimator, gather_samples, sum_tiles
+from server.stages.light_estimation import (
+    LEAST_OPENNESS,
+    Evidence,
+    LightEstimate,
+    LightEstimator,
+    gather_samples,
+    sum_tiles,
+)
 from server.stages.light_model import LightModel
-from server.stages.lobe_estimator import LobeEstimator
+from server.stages.lobe_estimator import KnownLight, LobeEstimator
 from server.stages.radiance_transfer import Directions, Transfer
 from server.stages.volume import Volume
+
+
+@dataclass(frozen=True)
+class KnownRoomLight:
+    """What is known of a room's light, to go on with later."""
+
+    given: LightEstimate | None
+    evidence: Evidence | None
+    lobes: KnownLight
+    remembered: LightEstimate | None
+    """What was told last, where frames do not say it any more when it is taken up again."""
 
 
 class RoomLight:
@@ -38,11 +58,18 @@ class RoomLight:
         self._least_openness = LEAST_OPENNESS if "openness" in settings.robustness else 0.0
         self._lobes = LobeEstimator(engine, settings.bands, self._model, Continuation())
         self._given: LightEstimate | None = None
+        self._remembered: LightEstimate | None = None
+        """Of earlier frames that are not there any more: it holds until new ones say better."""
 
     @property
     def is_given(self) -> bool:
         """Whether the light is known beforehand."""
         return self._given is not None
+
+    @property
+    def reads_pictures(self) -> bool:
+        """Whether `update` learns anything: of a light that is given, harmonics have nothing to learn."""
+        return not (self._harmonics and self._given)
 
     def give(self, light: LightEstimate) -> None:
         """Take this light (S2); what is then found is what of the room hides it."""
@@ -56,7 +83,25 @@ class RoomLight:
         """The light as it stands."""
         if self._given:
             return self._given
-        return self._colored(self._harmonics.estimate() if self._harmonics else self._lobes.estimate())
+        if self._harmonics:
+            return self._colored(self._harmonics.estimate())
+        return self._colored(self._remembered or self._lobes.estimate())
+
+    def known(self) -> KnownRoomLight:
+        """All but the frames that it is estimated from."""
+        evidence = self._harmonics.evidence() if self._harmonics else None
+        estimate = self._remembered or self._lobes.estimate()
+        told = estimate if estimate.std is not None else None
+        return KnownRoomLight(self._given, evidence, self._lobes.known(), told)
+
+    def resume(self, known: KnownRoomLight) -> None:
+        """Go on with what was known of this room, by the same settings. The first frames are too few to judge by."""
+        if known.given:
+            self.give(known.given)
+        if self._harmonics and known.evidence:
+            self._harmonics.resume(known.evidence)
+        self._lobes.resume(known.lobes)
+        self._remembered = known.remembered
 
     def _colored(self, estimate: LightEstimate) -> LightEstimate:
         return estimate.whitened() if self._settings.light_color == "white" else estimate
@@ -89,6 +134,7 @@ class RoomLight:
             tiles = sum_tiles(engine, camera, radiance, surface, transfer, volume.voxel_m, self._least_openness)
             with engine.profile.host():
                 return self._colored(self._harmonics.update(tiles))
+        steady, before = self._lobes.steady, self._lobes.estimate()
         observed = gather_samples(engine, camera, radiance, surface, transfer, self._least_openness)
         estimate = self._lobes.update(
             surface,
@@ -101,7 +147,18 @@ class RoomLight:
             Shot(geometry.volume_from_camera, geometry.exposure),
             depth_m,
         )
-        return self._given or self._colored(estimate)
+        if self._remembered and estimate is not before:
+            has_changed = self._lobes.steady < steady
+            if has_changed or _doubt(estimate) <= _doubt(self._remembered):
+                self._remembered = None
+        return self._given or self._colored(self._remembered or estimate)
+
+
+def _doubt(estimate: LightEstimate) -> float:
+    """Of the light's direction: one standard deviation, over the even light."""
+    if estimate.std is None:
+        return float("inf")
+    return float(np.linalg.norm(estimate.std[1:4] @ LUMINANCE) / max(float(estimate.sh[0] @ LUMINANCE), 1e-12))
 
 
 def _model_of(settings: Settings) -> LightModel:

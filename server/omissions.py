@@ -36,6 +36,14 @@ def codes_of_share(share: float) -> float:
     return SHOWN - codes(1.0 - share) if share < 1.0 else SHOWN
 
 
+ELSEWHERE = 0.5
+"""Display units that a pixel may change by where virtual things are taken not to change it."""
+
+
+ELSEWHERE_BOUNCED = 0.25
+"""Share of that which may be of light that bounces off real surface."""
+
+
 def share_of_codes(bound: float) -> float:
     """The greatest share whose codes_of_share is no more than `bound` (0 to 255, where f is not straight)."""
     return float(1.0 - ((1.0 - bound / SHOWN + 0.055) / 1.055) ** 2.4)
@@ -129,13 +137,31 @@ def out_of_reach(facts: SceneFacts) -> Omission | None:
     return _if_bounded("virtual things hardly change the light of real surface in view", _codes_of_ratio(facts, share))
 
 
+def hardly_changed(_facts: SceneFacts) -> Omission:
+    """A pixel of real surface is multiplied by R'/R; where it is no farther from 1 than `spared` lets it (reached.cl),
+    it is left as it is. Samples where bounced light can change R'/R by no more than `spared_bounces` (bounce_real) are
+    without: what virtual surface gets off them changes by as much. Both together are ELSEWHERE of the brightest."""
+    return Omission("virtual things hardly change the rest of the picture", ELSEWHERE)
+
+
+def spared() -> float:
+    """Of R'/R of a pixel."""
+    return (1.0 - ELSEWHERE_BOUNCED) * share_of_codes(ELSEWHERE)
+
+
+def spared_bounces() -> float:
+    """Of R'/R of a sample."""
+    return ELSEWHERE_BOUNCED * share_of_codes(ELSEWHERE)
+
+
 def dark_things(facts: SceneFacts) -> Omission | None:
     """What objects send: on real surface a share of R, as above; virtual surface gets no more than gain times it."""
     if math.isinf(facts.reach.sent) and facts.brightness.object_sent > 0:
         return None
     share = facts.reach.sent * (1.0 + facts.reach.bounced) if facts.brightness.object_sent > 0 else 0.0
     on_virtual = codes(facts.gain * facts.brightness.object_sent) if facts.objects_in_view else 0.0
-    return _if_bounded("what virtual things send is hardly seen", max(_codes_of_ratio(facts, share), on_virtual))
+    bound = max(_codes_of_ratio(facts, share), on_virtual)
+    return _if_bounded("what virtual things send is hardly seen", bound, ALLOWANCE - ELSEWHERE)
 
 
 def nothing_bounces(facts: SceneFacts) -> Omission | None:
@@ -146,7 +172,8 @@ def nothing_bounces(facts: SceneFacts) -> Omission | None:
         return None
     change = min(reach.change, 1.0 + reach.sent)
     share = reach.bounced * change if reach.bounced > 0 else 0.0
-    return _if_bounded("light that bounces off real surface hardly changes", _codes_of_ratio(facts, share))
+    bound = _codes_of_ratio(facts, share)
+    return _if_bounded("light that bounces off real surface hardly changes", bound, ALLOWANCE - ELSEWHERE)
 
 
 def no_rims(facts: SceneFacts) -> Omission | None:
@@ -164,6 +191,6 @@ def _codes_of_ratio(facts: SceneFacts, share: float) -> float:
     return min(codes_of_share(share), max(on_real, on_virtual))
 
 
-def _if_bounded(reason: str, bound: float) -> Omission | None:
-    """What is more than may change at all is no reason."""
-    return Omission(reason, bound) if bound <= ALLOWANCE else None
+def _if_bounded(reason: str, bound: float, at_most: float = ALLOWANCE) -> Omission | None:
+    """What is more than may change at all is no reason; ALLOWANCE - ELSEWHERE leaves hardly_changed its part."""
+    return Omission(reason, bound) if bound <= at_most else None

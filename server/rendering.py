@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import LeftOut, Plan
-from server.effect_functions import View, composite
+from server.effect_functions import View, composite, shadow_everywhere
 from server.effects import EFFECTS
 from server.facts_finder import FactsFinder
 from server.geometry import GeometryFrame
@@ -48,6 +48,7 @@ GIVEN = frozenset(
         "indirect",
         "light",
         "averages",
+        "returned",
     }
 )
 """What effects read that is none's."""
@@ -107,9 +108,12 @@ class Rendering:
             shown,
             given["averages"],
         )
+        given["returned"] = facts.returned
         order, plan = make_plan(EFFECTS, "picture", GIVEN, facts, everything=self._everything, stages=left_out)
         parts: dict[str, Any] = {}
         picture: Picture = execute([*order[:-1], _noting(order[-1], parts)], given, "picture")
+        if "reached" in parts:
+            plan = _with_share(plan, float(self._engine.download(parts["reached"]).mean()), bool(given["light"].discs))
         if rest is not None and is_held and made.sampler.period <= TURNS:
             rest.held.keep_finished(rest.turn, {k: v for k, v in parts.items() if k not in SEEN}, plan)
         elif rest is not None and not is_held:
@@ -196,6 +200,17 @@ def _picture_of_old(held: Held, parts: Mapping[str, Any]) -> Picture:
 
 
 PUT_TOGETHER: Effect[Any] = next(effect for effect in EFFECTS if effect.writes == "picture")
+
+
+def _with_share(plan: Plan, share: float, has_sharp_shadows: bool) -> Plan:
+    """The plan as it turned out: how much of the picture is not left as it is. share: of its cells."""
+    aside = ", sharp shadows aside" if has_sharp_shadows else ""
+    reason = f"virtual things change {100 * share:.0f} % of the picture{aside}, and hardly the rest"
+    said = (
+        structs.replace(left, reason=reason) if left.effect == shadow_everywhere.__name__ else left
+        for left in plan.left_out
+    )
+    return structs.replace(plan, left_out=tuple(said))
 
 
 def _left_out(name: str, why: Omission) -> LeftOut:

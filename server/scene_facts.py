@@ -63,6 +63,12 @@ class SceneFacts:
     """Of objects on real surface in view."""
 
     @property
+    def returned(self) -> float:
+        """The most radiance by which what real surface sends can change: all of it can be hidden."""
+        change = min(self.reach.change, 1.0 + self.reach.sent)
+        return change * self.brightness.real_sent if self.brightness.real_sent > 0 else 0.0
+
+    @property
     def gain(self) -> float:
         """By which virtual surface is brighter than the light makes it."""
         return self.averages.gain if self.averages else 1.0

@@ -15,6 +15,7 @@ from server.opencl.engine import Engine, KernelArgument, float16
 from server.stages.measure import linear_values
 from server.stages.rasterize import SUBPIXELS, VirtualSurface
 from server.stages.raycast import Surface
+from server.stages.reached import mark_reached
 from server.stages.sample_grid import SampleGrid
 from server.stages.sampling import Upsampling
 from server.stages.traced_scene import DeviceLight
@@ -67,6 +68,7 @@ def composite(
     gain: float = 1.0,
     direct_virtual: cl_array.Array | None = None,
     direct_ratio: cl_array.Array | None = None,
+    reached: cl_array.Array | None = None,
 ) -> NDArray[np.uint8]:
     """Picture [h, w, 3] sRGB of the camera picture `shown` with what is virtual; unchanged where nothing virtual is.
 
@@ -74,6 +76,7 @@ def composite(
     of nearest_depths, for smooth edges; without it a pixel is covered as its middle is. `reflected`: of reflect.py.
     `gain`: by which virtual surface is brighter than `light` makes it (tone_mapping.py). `direct_virtual`:
     what the light's discs bring besides; `direct_ratio`: stands for `ratio` and `refined_ratio` then (shadow_map.py).
+    `reached`: of reached.py, the cells in which `ratio` counts, None: wherever it is not 1.
 
     `tolerance_m`: how far behind a real surface a virtual one still shows, for objects that stand on it.
     """
@@ -93,7 +96,8 @@ def composite(
     }
     kernel = engine.kernel("composite.cl", "composite", BANDS=bands, **defines)
     unused = space.array("unused", (1,), cl_types.float4)
-    touched = mark_touched(engine, ratio, bands) if ratio and not light.discs else unused
+    if reached is None:
+        reached = mark_reached(engine, camera, surface, ratio) if ratio and not light.discs else unused
     engine.launch(
         kernel,
         (-(-camera.width // engine.lanes), camera.height),
@@ -112,7 +116,7 @@ def composite(
         gain,
         *_grid(occluded, unused),
         *_grid(ratio, unused),
-        touched,
+        reached,
         refined_occluded is not None,
         unused if refined_occluded is None else refined_occluded,
         refined_ratio is not None,
@@ -123,20 +127,6 @@ def composite(
         picture,
     )
     return engine.download(picture)
-
-
-def mark_touched(engine: Engine, ratio: SampleGrid, bands: int) -> cl_array.Array:
-    """[rows + 1, cols + 1] uint8: which cells of the grid have a sample near that is not 1."""
-    touched = engine.workspace.array("touched", (ratio.rows + 1, ratio.cols + 1), np.uint8)
-    engine.launch(
-        engine.kernel("composite.cl", "mark_touched", BANDS=bands, LANES=engine.lanes),
-        (ratio.cols + 1, ratio.rows + 1),
-        ratio.cols,
-        ratio.rows,
-        ratio.values,
-        touched,
-    )
-    return touched
 
 
 def _grid(grid: SampleGrid | None, unused: cl_array.Array) -> tuple[KernelArgument, ...]:

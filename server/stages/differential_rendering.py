@@ -5,6 +5,7 @@ Kernel: differential_rendering.cl.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -81,8 +82,15 @@ def bounce_real(
     transfer: Transfer,
     scene: TracedScene,
     shadow: RealShadow,
+    returned: float = math.inf,
+    spare: float = 0.0,
+    least: RealShadow | None = None,
 ) -> RealShadow:
-    """`shadow` with what real surfaces then send one another less or more (eq. 7.6: R'_ID - R_ID)."""
+    """`shadow` with what real surfaces then send one another less or more (eq. 7.6: R'_ID - R_ID).
+
+    returned: the most radiance by which what any real surface sends can change. Where that is no more than the share
+    `spare` of R, that of `least` or else of `shadow`, nothing is followed.
+    """
     bounced = engine.workspace.array("shadow_bounced", (transfer.rows, transfer.cols), cl_types.float4)
     shadowed = replace(scene, changed=Changed(camera, camera_from_volume, surface.positions, shadow))
     engine.launch(
@@ -93,6 +101,9 @@ def bounce_real(
         *shadowed.arguments(engine),
         BOUNCE_EVERY,
         shadow.shaded,
+        returned,
+        spare,
+        (least or shadow).shaded,
         bounced,
     )
     return replace(shadow, values=bounced)

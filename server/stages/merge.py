@@ -9,6 +9,8 @@ thesis leaves open:
 - Where the volume knows nothing, the sensor is taken. A hole that too few neighbours support (LEAST_SUPPORT in
   merge.cl) keeps the volume's surface; without one it stays a hole.
 - The median of an even count is the lower one. D'' and D''' fill no holes.
+- D'' and D''' take noise of the sensor away. Where all that their window knows is the volume's there is none, and the
+  volume's depth is kept: no filter runs where measured and fused depth agree.
 - Where the final depth agrees with the volume, the volume's own surface is taken, unfiltered: the medians would put
   voxel-exact surface back by up to the slope of their windows, and never by more than lambda_D.
 """
@@ -101,9 +103,9 @@ def merge_depth(
     launch(
         "merge.cl", "merge_depth", groups, sensed, trusted, shade, volume.voxel_m, LAMBDA_INTENSITY, merged
     )  # eq. 4.3
-    launch("merge.cl", "align_depth", groups, merged, shade, LAMBDA_INTENSITY, aligned)  # eq. 4.4
+    launch("merge.cl", "align_depth", groups, merged, predicted, shade, LAMBDA_INTENSITY, aligned)  # eq. 4.4
     if smooth:
-        launch("merge.cl", "smooth_depth", groups, aligned, smoothed)  # eq. 4.5
+        launch("merge.cl", "smooth_depth", groups, aligned, predicted, smoothed)  # eq. 4.5
     else:
         smoothed = aligned
 

@@ -118,11 +118,13 @@ def transfer_radiance(
     caches: VisibilityCaches | None = None,
     state: VisibilityState | None = None,
     turn: int = 0,
+    chosen: NDArray[np.int32] | None = None,
 ) -> Transfer:
     """Transfer of the real world alone at every `stride`-th pixel; visibility rays of at most `reach_m`.
 
     `caches`: what earlier frames know, needed where `rays` are interleaved; this frame's visibility is added to it.
     `state`: voxels that are known to be open, where no ray is traced. `turn`: of the direction sets, modulo TURNS.
+    `chosen` [k]: the only samples that are traced, row * cols + col; what the arrays hold of the others stays.
     """
     cols, rows = camera.width // stride, camera.height // stride
     space = engine.workspace
@@ -132,9 +134,13 @@ def transfer_radiance(
     defines = {"BANDS": result.bands, "MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": rays.interleave}
     if state is not None:
         defines["HAS_STATE"] = 1
+    only: tuple[KernelArgument, ...] = ()
+    if chosen is not None:
+        defines["IS_CHOSEN"] = 1
+        only = len(chosen), space.upload(f"chosen_{rows}x{cols}", np.resize(chosen, rows * cols))
     engine.launch(
         engine.kernel("radiance_transfer.cl", "transfer_radiance", **defines),
-        (cols, rows),
+        (cols, rows) if chosen is None else (len(chosen),),
         cols,
         rows,
         stride,
@@ -157,6 +163,7 @@ def transfer_radiance(
         result.flatness,
         result.free_mask,
         sets,
+        *only,
     )
     return result
 

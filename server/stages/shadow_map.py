@@ -25,13 +25,13 @@ from server.maths.dominant import MOST_LIGHTS
 from server.opencl.engine import Engine, KernelArgument, float4, int4
 from server.opencl.program import Define
 from server.stages.auxiliary_views import view_axes
-from server.stages.composite import mark_touched
 from server.stages.differential_rendering import MOST_POINTS, VIRTUAL_STRIDE, RealShadow, ball_around
 from server.stages.object_glow import Glow, PlacedPoints
 from server.stages.painted import box_around, repainted
 from server.stages.pinhole import Pinhole
 from server.stages.rasterize import Placed, VirtualSurface, drawn_depths
 from server.stages.raycast import Surface
+from server.stages.reached import mark_reached
 from server.stages.sample_grid import SampleGrid
 from server.stages.sampling import Upsampling
 from server.stages.traced_scene import DeviceLight
@@ -150,10 +150,12 @@ def light_real(
     maps: ShadowMaps,
     refined: cl_array.Array | None = None,
     upsampling: Upsampling = "bilateral",
+    reached: cl_array.Array | None = None,
 ) -> cl_array.Array:
     """[h, w] float4: R' / R of real surface under the whole light, w = 1 where it may be other than 1.
 
-    ratio: of the rest of the light; parts: of trace_real; refined: what stands for `ratio` where w = 1.
+    ratio: of the rest of the light; parts: of trace_real; refined: what stands for `ratio` where w = 1; reached: of
+    reached.py, the cells in which `ratio` counts, None: wherever it is not 1.
     """
     size, space = (camera.width, camera.height), engine.workspace
     mixed = space.array("direct_ratio", (camera.height, camera.width), cl_types.float4)
@@ -169,7 +171,7 @@ def light_real(
         refined is not None,
         ratio.values if refined is None else refined,
         ratio.shaded,
-        mark_touched(engine, ratio, maps.light.bands),
+        mark_reached(engine, camera, surface, ratio) if reached is None else reached,
         float4(*maps.least, 0.0),
         *maps.arguments(engine),
         mixed,

@@ -7,6 +7,7 @@ simulated that can be. Time is processor time over all cores, which other load d
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -118,11 +119,20 @@ def played(device: Device, source: GallerySource, plan: str) -> list[Played]:
 def is_as_known(source: GallerySource, index: int, plan: Plan) -> bool:
     """Whether a frame ran what its scene calls for, and the spine rested where it could; where it hangs on noise when a
     view has settled, it may."""
-    scene, rests = source.scene, any(left.effect == "estimate_light" for left in plan.left_out)
+    scene = source.scene
+    if changed_share(plan) > scene.changes:
+        return False
+    rests = any(left.effect == "estimate_light" for left in plan.left_out)
     run, called = frozenset(plan.run) - scene.hangs, scene.calls_for(index) - scene.hangs
     if index in scene.settles:
         return run in (HELD, called)
     return run == (HELD if index in scene.holds else called) and rests == (index in scene.rests)
+
+
+def changed_share(plan: Plan) -> float:
+    """Of the picture, as the plan says it; 0 where it does not."""
+    said = (re.search(r"change (\d+) % of the picture", left.reason) for left in plan.left_out)
+    return max((int(found[1]) / 100 for found in said if found), default=0.0)
 
 
 def stated_bound(plan: Plan, reference: Plan) -> float:

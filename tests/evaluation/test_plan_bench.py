@@ -6,6 +6,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from client.laptop.gallery.play import play, wishes_of
 from client.laptop.gallery.scenes import CHANGE_FRAME, GALLERY
@@ -13,18 +14,21 @@ from client.laptop.gallery.source import GallerySource
 from client.laptop.gallery.things import Thing
 from protocol.frames import RgbdFrame
 from protocol.messages import LeftOut, Plan
-from server import facts_finder
+from server import effect_functions, facts_finder
+from server.omissions import ELSEWHERE, spared
 from server.opencl.device import Device
 from server.pipeline import Pipeline
 from server.rest import NOISY
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from server.stages.reach import NOWHERE
-from tests.bench.plan import greatest, holds, is_as_known, stated_bound
+from tests.bench.plan import changed_share, greatest, holds, is_as_known, stated_bound
 
 QUICK = (
     "elsewhere",
     "shadow-falls-in",
+    "far-away",
+    "long-shadow",
     "floating",
     "soft-sky",
     "dark-floor",
@@ -124,6 +128,29 @@ def test_a_bound_that_is_wrong_is_seen(device: Device) -> None:
         found = differences(device, "soft-sky", frames=1)
     assert not holds(*found[0][:2])
     assert not found[0][2]
+
+
+def test_parts_of_the_picture_that_are_too_small_are_seen(device: Device) -> None:
+    """Where ten times as much is spared as is said, it shows beside a shadow."""
+    with patch.object(effect_functions, "spared", lambda: 10 * spared()):
+        found = differences(device, "soft-sky", frames=1)
+    assert found[0][0] == ELSEWHERE
+    assert not holds(*found[0][:2])
+
+
+def test_the_plan_says_how_much_of_the_picture_changes() -> None:
+    plans = [
+        Plan(run=(), left_out=(LeftOut(effect="a", reason=reason, error_bound=0.5),))
+        for reason in ("virtual things change 12 % of the picture, and hardly the rest", "the light is soft")
+    ]
+    assert [changed_share(plan) for plan in plans] == [0.12, 0.0]
+    far = GallerySource("far-away")
+    known = tuple(far.scene.calls_for(0))
+    assert is_as_known(far, 0, Plan(run=known, left_out=plans[0].left_out))
+    much = structs.replace(
+        plans[0].left_out[0], reason="virtual things change 50 % of the picture, and hardly the rest"
+    )
+    assert not is_as_known(far, 0, Plan(run=known, left_out=(much,)))
 
 
 def test_bounds_are_those_of_what_the_other_ran() -> None:

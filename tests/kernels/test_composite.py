@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
 from server.scene.virtual_object import VirtualObject
-from server.stages.composite import composite, mark_touched, shown_picture, srgb_codes
+from server.stages.composite import composite, shown_picture, srgb_codes
 from server.stages.measure import linear_values
 from server.stages.radiance_transfer import direction_sets
 from server.stages.rasterize import VirtualSurface, nearest_depths, rasterize
@@ -250,18 +250,6 @@ def test_the_largest_camera_has_smooth_edges_too(engine: Engine) -> None:
     fine = engine.download(nearest_depths(engine, camera, np.eye(4), [(thing, pose((0.0, 0.0, 1.0)))]))
     assert fine.shape == (2400, 3840)
     assert (fine > 0).sum() / 4 == pytest.approx((0.05 / 0.975 * 1500) ** 2, rel=0.01)
-
-
-@pytest.mark.parametrize("shape", [(11, 15), (1, 1), (5, 40)])
-def test_touched_cells_are_the_twins(engine: Engine, shape: tuple[int, int]) -> None:
-    random = np.random.default_rng(3)
-    values = np.ones((*shape, 4))
-    values[..., 1] = random.choice([1.0, 0.9], shape, p=[0.97, 0.03])
-    values[..., 3] = random.random(shape) < 0.9
-    grid = upload_samples(engine, "ratio", Samples(4, values))
-    assert grid is not None
-    touched = engine.download(mark_touched(engine, grid, 4))
-    np.testing.assert_array_equal(touched, twin.mark_touched(values.astype(np.float32)))
 
 
 # ---- known pictures ----------------------------------------------------------------------------------------------

@@ -338,6 +338,21 @@ def test_depth_edges_move_to_the_edges_of_the_picture(engine: Engine, shift_px: 
     assert wrong.sum() <= 4  # corners
 
 
+def test_what_is_the_volumes_all_around_is_not_filtered(engine: Engine) -> None:
+    """An edge of depth beside one of the picture: it stays where the volume has it, but near what the sensor says."""
+    depth = np.roll(BEFORE_WALL, (1, 1), axis=(0, 1))
+    merged = merge(engine, depth, *surface_from(depth), radiance=BRIGHT_HAND)
+    assert (merged.labels == LABEL_STATIC).all()
+    np.testing.assert_allclose(merged.depth_m, depth, atol=1e-5)
+    row, col = np.argwhere(np.diff(depth, axis=1))[5]
+    known = depth.copy()
+    known[row, col + 1] = 0
+    some = merge(engine, depth, *surface_from(known), radiance=BRIGHT_HAND)
+    changed = np.argwhere(np.abs(some.depth_m - depth) > 1e-3)
+    assert len(changed) > 0
+    assert (np.abs(changed - [row, col + 1]) <= 3).all()
+
+
 def test_speckles_are_removed(engine: Engine) -> None:
     rng = np.random.default_rng(5)
     speckled = rng.random(FLAT.shape) < 0.03

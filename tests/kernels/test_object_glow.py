@@ -323,7 +323,9 @@ CORNER = SCENES["floor under a wall"]  # y = 0.1 and z = 0.2
 FLOOR_RATIO = np.array([0.5, 0.8, 1.4])
 
 
-def bounced_wall(engine: Engine, stride: int, color: ArrayLike = WHITE) -> tuple[Floats, Floats, Floats]:
+def bounced_wall(
+    engine: Engine, stride: int, color: ArrayLike = WHITE, spare: float = 0.0
+) -> tuple[Floats, Floats, Floats]:
     """Ratios [rows, cols, 4] of a corner where the floor's alone was FLOOR_RATIO, the samples' points and normals."""
     view = look_at((0.48, 0.5, 0.9), (0.48, 0.2, 0.2))
     volume, rays = fill_volume(engine, CORNER, VOXEL_M), direction_sets(81, 4)
@@ -341,7 +343,8 @@ def bounced_wall(engine: Engine, stride: int, color: ArrayLike = WHITE) -> tuple
     shadow = RealShadow(stride, engine.workspace.upload("test_ratio", float4(ratio, valid)), shaded)
     light = upload_light(engine, lights.uniform(), rays, indirect=Indirect(shaded, np.ones(3)))
     traced = trace_scene(engine, volume, light, rays, ROOM_M, [])
-    bounced = bounce_real(engine, CAMERA, inverse_rigid(view), surface, transfer, traced, shadow)
+    returned = float(np.abs(FLOOR_RATIO - 1).max())
+    bounced = bounce_real(engine, CAMERA, inverse_rigid(view), surface, transfer, traced, shadow, returned, spare)
     return download4(engine, bounced.values).astype(float), points, normals[..., :3]
 
 
@@ -387,6 +390,21 @@ def test_a_dark_floor_has_nothing_to_lose(engine: Engine) -> None:
     ratio, points, normals = bounced_wall(engine, 4, (0.0, 0.0, 0.0))
     is_wall = (points[..., 3] > 0) & (normals[..., 2] > 0.9)
     np.testing.assert_array_equal(ratio[is_wall][:, :3], 1.0)
+
+
+def test_what_may_be_spared_follows_nothing_and_changes_no_more(engine: Engine) -> None:
+    """Far up the wall little of the floor is seen; below it is most of what there is."""
+    spare = 0.1
+    every, points, normals = (a.copy() for a in bounced_wall(engine, 4))
+    some, _, _ = bounced_wall(engine, 4, spare=spare)
+    is_wall = (points[..., 3] > 0) & (normals[..., 2] > 0.9)
+    followed = (some[is_wall] == every[is_wall])[:, :3].all(axis=1)
+    left = (some[is_wall] == 1)[:, :3].all(axis=1)
+    assert (followed | left).all()
+    assert followed.sum() > 10
+    assert (left & ~followed).sum() > 10
+    assert np.abs(some - every)[is_wall].max() <= spare
+    np.testing.assert_array_equal(every[~is_wall][:, 3], some[~is_wall][:, 3])
 
 
 def test_of_very_many_things_the_first_are_lit_one_by_one(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -362,3 +362,26 @@ def test_same_bits_twice(engine: Engine) -> None:
     first, second = (trace(engine, volume, *points) for _ in range(2))
     np.testing.assert_array_equal(first.transfer, second.transfer)
     np.testing.assert_array_equal(first.free, second.free)
+
+
+def test_chosen_samples_are_those_of_the_whole_picture(engine: Engine) -> None:
+    """And of the others what was there stays."""
+    volume = fill_volume(engine, SCENES["ball above a floor"], VOXEL_M)
+    z, x = np.mgrid[0.2:0.8:48j, 0.2:0.8:64j]
+    surface = upload_surface(engine, np.stack([x, 0 * x + 0.1, z], -1), np.tile([0.0, 1.0, 0.0], (48, 64, 1)), x > 0.25)
+    rays, camera = direction_sets(81, 4), camera_of(64, 48)
+
+    def found(chosen: NDArray[np.int32] | None) -> list[NDArray[Any]]:
+        result = transfer_radiance(engine, camera, volume, surface, 4, rays, ROOM_M, chosen=chosen)
+        return [engine.download(a) for a in (result.openness, result.flatness, result.free_mask, result.coefficients)]
+
+    whole = found(None)
+    assert np.ptp(whole[0]) > 1.1
+    chosen = np.array([3, 0, 100, 77, 191], np.int32)
+    engine.workspace.find("openness_12x16").fill(-7.0)  # type: ignore[union-attr]
+    some = found(chosen)
+    np.testing.assert_array_equal(some[0].flat[chosen], whole[0].flat[chosen])
+    assert (np.delete(some[0], chosen) == -7.0).all()
+    for one, other in zip(some[1:], whole[1:], strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert (found(np.zeros(0, np.int32))[0].flat[chosen] == whole[0].flat[chosen]).all()

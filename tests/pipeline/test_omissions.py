@@ -14,6 +14,7 @@ from server.maths.sh import lambert_transfer, sh_basis, spherical_fibonacci
 from server.plan import ALLOWANCE
 from server.scene_facts import Brightness, SceneFacts, most_radiance, most_shading
 from server.stages.composite import srgb_codes
+from server.stages.measure import linear_values
 from server.stages.reach import NOWHERE, UNKNOWN, Reach
 from server.stages.tone_mapping import Averages
 
@@ -95,11 +96,34 @@ def test_bounced_light_is_bounded_by_what_it_bounces_off() -> None:
     open_floor = o.nothing_bounces(replace(FACTS, reach=Reach(math.inf, 0.5, 0.002)))
     assert open_floor is not None
     assert open_floor.error_bound == pytest.approx(o.codes_of_share(0.003))
+    much = o.codes_of_share(0.006)
+    assert ALLOWANCE - o.ELSEWHERE < much < ALLOWANCE
+    assert (
+        o.nothing_bounces(replace(FACTS, reach=Reach(math.inf, 0.5, 0.004))) is None
+    )  # parts of the picture come first
 
 
 def test_rims_are_only_where_the_ratio_varies() -> None:
     assert o.no_rims(replace(FACTS, reach=Reach(0.05, 0.0, 0.2))) is not None
     assert o.no_rims(replace(FACTS, reach=Reach(0.07, 0.0, 0.2))) is None
+
+
+def test_what_is_spared_elsewhere_is_shared_out() -> None:
+    """Among what is left as it is, and light that bounces off it; no byte of a picture shows less than half a code."""
+    both = o.spared() + o.spared_bounces()
+    assert o.codes_of_share(both) == pytest.approx(o.ELSEWHERE)
+    assert o.hardly_changed(FACTS).error_bound == o.ELSEWHERE
+    codes = np.arange(256)
+    radiance = linear_values("srgb8").astype(float)
+    for share in (1 - 0.99 * both, 1 + 0.99 * both):
+        assert (srgb_codes(share * radiance) == codes).all()
+
+
+def test_no_more_returns_than_real_surface_sends_and_can_lose_or_gain() -> None:
+    assert replace(FACTS, reach=Reach(0.1, 0.05, 0.2)).returned == pytest.approx(0.1 * LIT.real_sent)
+    assert replace(FACTS, reach=Reach(math.inf, 0.5, 0.2)).returned == pytest.approx(1.5 * LIT.real_sent)
+    assert FACTS.returned == math.inf
+    assert replace(FACTS, brightness=DARK).returned == 0.0
 
 
 def test_black_things_send_nothing() -> None:

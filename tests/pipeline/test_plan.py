@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from server.effects import EFFECTS
+from server.omissions import ELSEWHERE
 from server.plan import ALLOWANCE, Effect, Omission, PlanError, execute, make_plan
 from server.rendering import GIVEN as EFFECTS_GIVEN
 from server.scene_facts import Brightness, SceneFacts
@@ -202,7 +203,8 @@ ASKED = {
 SOFT = dict.fromkeys(("direct_virtual", "direct_real", "shadow_map", "light_samples"), "soft")
 TRACED = {"look_around": "traces rays"}
 LIT = ("shade_virtual", "reflect", "match_average", "direct_virtual", "refine_virtual")
-OF_REAL = ("shadow_real", "bounce_real", "direct_real", "refine_real")
+OF_REAL = ("shadow_real", "bounce_real", "direct_real", "refine_real", "find_reach")
+SPARED = {"shadow_everywhere": "hardly change the rest"}
 
 
 @pytest.mark.parametrize(
@@ -215,8 +217,13 @@ OF_REAL = ("shadow_real", "bounce_real", "direct_real", "refine_real")
         ),
         (
             SceneFacts(objects=2, objects_in_view=0, has_light=True),
-            {"prepare_rays", "shadow_real", "composite"},  # what is out of view may still cast a shadow into it
-            {**ASKED, **SOFT, **TRACED, "light_samples": "no indirect"}
+            {
+                "prepare_rays",
+                "shadow_real",
+                "find_reach",
+                "composite",
+            },  # what is out of view may still cast a shadow into it
+            {**ASKED, **SOFT, **TRACED, **SPARED, "light_samples": "no indirect"}
             | dict.fromkeys(("rasterize", "cover", *LIT), "in view"),
         ),
         (
@@ -231,13 +238,13 @@ OF_REAL = ("shadow_real", "bounce_real", "direct_real", "refine_real")
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=True),
-            SHADED | {"shadow_real"},
-            {**SOFT, **ASKED, **TRACED, "reflect": "glossy", "match_average": "own scale"},
+            SHADED | {"shadow_real", "find_reach"},
+            {**SOFT, **ASKED, **SPARED, **TRACED, "reflect": "glossy", "match_average": "own scale"},
         ),
         (
             SceneFacts(objects=1, objects_in_view=1, has_light=True, averages=Averages(0.0, 1.0, 9)),
-            SHADED | {"shadow_real"},
-            {**SOFT, **ASKED, **TRACED, "reflect": "glossy", "match_average": "empty or black"},
+            SHADED | {"shadow_real", "find_reach"},
+            {**SOFT, **ASKED, **SPARED, **TRACED, "reflect": "glossy", "match_average": "empty or black"},
         ),
         (
             SceneFacts(
@@ -266,8 +273,8 @@ OF_REAL = ("shadow_real", "bounce_real", "direct_real", "refine_real")
                 sharp_lights=1,
                 averages=KNOWN,
             ),
-            {effect.name for effect in EFFECTS},
-            {},
+            {effect.name for effect in EFFECTS} - SPARED.keys(),
+            SPARED,
         ),
     ],
 )
@@ -282,4 +289,13 @@ def test_effects_of_a_scene(facts: SceneFacts, run: set[str], reasons: dict[str,
     assert {item.effect: item.reason for item in plan.left_out}.keys() == reasons.keys()
     for item in plan.left_out:
         assert reasons[item.effect] in item.reason
-        assert item.error_bound == (255.0 if any(w in item.reason for w in ("asked", "no light", "black")) else 0.0)
+        is_asked = any(w in item.reason for w in ("asked", "no light", "black"))
+        assert item.error_bound == (255.0 if is_asked else ELSEWHERE if item.effect in SPARED else 0.0)
+
+
+def test_what_rest_may_change_leaves_nothing_to_spare() -> None:
+    facts = SceneFacts(objects=1, objects_in_view=1, has_light=True)
+    for bound, everywhere in ((1.0, True), (1.0 - ELSEWHERE, False)):
+        stages = {"estimate_light": Omission("nothing has changed", bound)}
+        _, plan = make_plan(EFFECTS, "picture", EFFECTS_GIVEN, facts, stages=stages)
+        assert ("shadow_everywhere" in plan.run) == everywhere

@@ -38,18 +38,9 @@ def srgb_codes(linear: Floats) -> NDArray[np.uint8]:
     return np.floor(255 * encoded + 0.5).astype(np.uint8)
 
 
-def mark_touched(ratio: Floats) -> NDArray[np.bool_]:
-    """[rows + 1, cols + 1] whether the 6 x 6 samples around a cell, which begins at sample (row - 1, col - 1), hold one
-    that is valid and not 1. ratio [rows, cols, 4].
-    """
-    rows, cols = ratio.shape[:2]
-    changed = (ratio[..., 3] > 0) & (ratio[..., :3] != 1).any(-1)
-    return np.array(
-        [
-            [changed[max(r - 3, 0) : r + 3, max(c - 3, 0) : c + 3].any() for c in range(cols + 1)]
-            for r in range(rows + 1)
-        ]
-    )
+def cells_of(count: int, stride: int) -> NDArray[np.int_]:
+    """[count] the sample before each of a row of pixels; -1 before the first's."""
+    return (np.arange(count) - stride // 2) // stride
 
 
 def upsample(samples: Samples, surface: Buffer, x: int, y: int, tolerance_m: float) -> Floats:

@@ -101,19 +101,25 @@ def merge(sensor_m: Floats, volume_m: Floats, agrees: Bools, trusted: Bools, sha
     return np.where(sensor_m > 0, np.where(agrees, volume_m, sensor_m), filled)
 
 
-def align(merged_m: Floats, shade: Floats) -> Floats:
-    """D'' (eq. 4.4): joint bilateral median; unknown stays unknown."""
+def has_others(depth_m: Floats, volume_m: Floats, offsets: Offsets) -> Bools:
+    """[h, w] whether any depth of the window is known and not the volume's."""
+    return around((depth_m > 0) & (depth_m != volume_m), offsets).any(axis=0)
+
+
+def align(merged_m: Floats, volume_m: Floats, shade: Floats) -> Floats:
+    """D'' (eq. 4.4): joint bilateral median; unknown stays unknown, and a window of the volume's depths what it is."""
     depths = around(merged_m, ALIGN_OFFSETS)
     aligned = lower_median(depths, similar(shade, ALIGN_OFFSETS) & (depths > 0))
-    return np.where(merged_m > 0, aligned, 0)
+    return np.where((merged_m > 0) & has_others(merged_m, volume_m, ALIGN_OFFSETS), aligned, merged_m)
 
 
-def smooth(aligned_m: Floats) -> Floats:
-    """D''' (eq. 4.5): median, of the pixel's own surface if it has two neighbours; unknown stays unknown."""
+def smooth(aligned_m: Floats, volume_m: Floats) -> Floats:
+    """D''' (eq. 4.5): median, of the pixel's own surface if it has two neighbours; else as align."""
     depths = around(aligned_m, SMOOTH_OFFSETS)
     known = depths > 0
     own = known & (np.abs(depths - aligned_m) < same_surface_m(aligned_m))
-    return np.where(aligned_m > 0, lower_median(depths, np.where(own.sum(axis=0) >= 3, own, known)), 0)
+    median = lower_median(depths, np.where(own.sum(axis=0) >= 3, own, known))
+    return np.where((aligned_m > 0) & has_others(aligned_m, volume_m, SMOOTH_OFFSETS), median, aligned_m)
 
 
 def label(depth_m: Floats, sensor_m: Floats, volume_m: Floats, agrees: Bools, voxel_m: float) -> NDArray[np.int64]:
@@ -172,7 +178,8 @@ def merge_depth(
     volume_m = np.where(positions[..., 3] > 0, (positions[..., :3] - origin) @ rotation[:, 2], 0)
     shade, agrees = intensity(radiance), agreement(depth_m, volume_m, voxel_m) & still
     depth_m = unmixed(depth_m)
-    filtered = smooth(align(merge(depth_m, volume_m, agrees, trusted, shade, voxel_m), shade))
+    merged_m = merge(depth_m, volume_m, agrees, trusted, shade, voxel_m)
+    filtered = smooth(align(merged_m, volume_m, shade), volume_m)
     labels = label(filtered, depth_m, volume_m, agrees, voxel_m)
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u, float)], axis=-1)

@@ -79,6 +79,8 @@ class GalleryScene:
     """Frames that are known to tell the spine nothing new."""
     holds: range = range(0)
     """Of these, those in which effects have nothing new to draw either."""
+    changes: float = 1.0
+    """Greatest share of the picture that its things are seen to change of real ones, sharp shadows aside."""
     hangs: Effects = frozenset()
     """Effects that it hangs on the noise whether a frame calls for."""
     settles: range = range(0)
@@ -101,6 +103,8 @@ def sun(x: float, y: float, z: float, brightness: float, color: Rgb = (1.0, 0.95
 
 _FLOOR = (Part(box((0, -0.05, 0), (3.0, 0.1, 3.0)), (0.8, 0.8, 0.8)),)
 _DARK_FLOOR = (Part(box((0, -0.05, 0), (3.0, 0.1, 3.0)), (0.08, 0.08, 0.08)),)
+_HALL = (Part(box((0, -0.05, 0), (6.0, 0.1, 6.0)), (0.8, 0.8, 0.8)),)
+_FROM_AFAR: dict[str, Any] = {"eye": (0.0, 1.6, 2.6), "target": (0.0, 0.0, 0.2)}
 _WALL = Part(box((0, 0.6, -0.65), (3.0, 1.4, 0.1)), GRAY)
 _ROOM = Part(Shell(np.array([-1.5, 0, -1.5]), np.array([1.5, 2.2, 2.0]), (Opening(3, (-1.0, -1.0), (1.0, 1.0)),)), GRAY)
 _SOFT = sky(0.7)
@@ -115,12 +119,12 @@ _NOISE: dict[str, Any] = {
     "noise_codes": 2.5,
     "depth_noise": 1.0,
     "settles": range(SETTLED, SETTLED_NOISY),
-    "hangs": frozenset({"bounce_real"}),
+    "hangs": frozenset({"bounce_real", "shadow_everywhere"}),
 }
 
 _DRAWN = {"rasterize", "cover", "composite"}
 _SHADED = _DRAWN | {"prepare_rays", "add_objects", "shade_virtual"}
-_STANDS = _SHADED | {"light_objects", "shadow_real"}
+_STANDS = _SHADED | {"light_objects", "shadow_real", "find_reach"}
 _MAPPED = {"shadow_map", "light_samples", "direct_real"}
 
 
@@ -142,7 +146,7 @@ GALLERY: dict[str, GalleryScene] = {
         "a ball beside the picture, whose shadow the sun throws into it",
         _FLOOR,
         _SUN,
-        _always({"composite", "prepare_rays", "light_objects", "shadow_real", "bounce_real"}, _MAPPED),
+        _always({"composite", "prepare_rays", "light_objects", "shadow_real", "find_reach", "bounce_real"}, _MAPPED),
         (Thing(0.3, (1.15, 0.35, 0.2)),),
     ),
     "floating": GalleryScene(
@@ -186,6 +190,24 @@ GALLERY: dict[str, GalleryScene] = {
         _always(_STANDS, _MAPPED, {"direct_virtual", "bounce_real"}),
         (_BALL,),
     ),
+    "far-away": GalleryScene(
+        "a small matt box on the floor of a hall, seen from afar",
+        _HALL,
+        _SOFT,
+        _always(_STANDS, {"bounce_real"}),
+        (replace(_BOX, size_m=0.1),),
+        **_FROM_AFAR,
+        changes=0.2,
+    ),
+    "long-shadow": GalleryScene(
+        "a small matt ball in the air of a hall, whose shadow falls far away in a low sun",
+        _HALL,
+        sky(0.25) + sun(0.93, 0.35, 0.1, 0.7),
+        _always(_STANDS, _MAPPED, {"direct_virtual", "bounce_real"}),
+        (Thing(0.16, (0.5, 0.2, 0.0)),),
+        **_FROM_AFAR,
+        changes=0.35,
+    ),
     "two-suns": GalleryScene(
         "a matt ball on a floor in two lights",
         _FLOOR,
@@ -223,7 +245,12 @@ GALLERY: dict[str, GalleryScene] = {
         "a matt ball on a floor in the sun, before a camera that stands still",
         _FLOOR,
         _SUN,
-        _always(_STANDS, _MAPPED, {"direct_virtual", "bounce_real"}),
+        lambda index: frozenset(
+            _STANDS
+            | _MAPPED
+            | {"direct_virtual", "bounce_real"}
+            | ({"shadow_everywhere"} if index >= SETTLED else set())
+        ),
         (_BALL,),
         walk_m=0.0,
         frames=STILL_FRAMES,

@@ -131,9 +131,10 @@ kernel void hide_cells(const int count, const int first, global const float8 *pl
 
 // One item a block of 8 x 8 sums over the pools of one chunk, of the blocks on and above the diagonal. A row is the pool's
 // cells and then its target.
-// pools [count][CELLS], targets [count], weights [count] -> partial [chunk][block][8][8]: sum w row^T row, blocks row by row.
-kernel void accumulate_cells(const int count, const int chunk_size, global const float *pools, global const float8 *targets,
-                             global const float *weights, global float *partial) {
+// numbers [count]: which of pools [..][CELLS], targets [count], weights [count] -> partial [chunk][block][8][8]: sum w row^T
+// row, blocks row by row.
+kernel void accumulate_cells(const int count, const int chunk_size, global const int *numbers, global const float *pools,
+                             global const float8 *targets, global const float *weights, global float *partial) {
     const int block = get_global_id(0);
     const int chunk = get_global_id(1);
     if (block >= BLOCKS * (BLOCKS + 1) / 2 || chunk * chunk_size >= count) return;
@@ -145,10 +146,8 @@ kernel void accumulate_cells(const int count, const int chunk_size, global const
     for (int i = 0; i < 8; i++) sums[i] = (float8)(0.0f);
     const int end = min((chunk + 1) * chunk_size, count);
     for (int pool = chunk * chunk_size; pool < end; pool++) {
-        const float weight = weights[pool];
-        if (weight <= 0.0f) continue;
-        global const float *row = pools + pool * CELLS;
-        const float8 a = weight * (high < BLOCKS - 1 ? vload8(high, row) : targets[pool]);
+        global const float *row = pools + numbers[pool] * CELLS;
+        const float8 a = weights[pool] * (high < BLOCKS - 1 ? vload8(high, row) : targets[pool]);
         const float8 b = low < BLOCKS - 1 ? vload8(low, row) : targets[pool];
         sums[0] += a.s0 * b;
         sums[1] += a.s1 * b;

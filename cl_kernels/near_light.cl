@@ -1,6 +1,7 @@
 // Lights inside the room: what samples see of the sky and of points in space, and the picture without the lamps' light.
-// Provides pool_sky, see_emitters, remove_lamps.
+// Provides find_samples, pool_sky, see_emitters, remove_lamps.
 #include "direction_sets.clh"
+#include "smooth_normal.clh"
 #include "visibility.clh"
 
 #define LABEL_STATIC 1
@@ -25,6 +26,25 @@ static int usable_pixel(const int width, const int height, global const float4 *
     }
     *color = sum.xyz / 9.0f;
     return usable;
+}
+
+// Which samples pool_sky can use, if they see enough of the sky. One item a sample; radius: see smooth_normal.clh.
+// -> openness [rows][cols]: -1, usable [rows][cols]: 1 where it is.
+kernel void find_samples(const int cols, const int rows, const int stride, const int width, const int height, const int radius,
+                         global const float4 *positions, global const float4 *normals, global const uchar *labels,
+                         global const float4 *radiance, const float least_flatness, const float voxel_m,
+                         global float *openness, global uchar *usable) {
+    const int col = get_global_id(0);
+    const int row = get_global_id(1);
+    if (col >= cols || row >= rows) return;
+    const int x = stride / 2 + col * stride, y = stride / 2 + row * stride;
+    const int pixel = y * width + x;
+    float3 color;
+    const int found = positions[pixel].w > 0.0f && normals[pixel].w > 0.0f &&
+                      usable_pixel(width, height, radiance, labels, x, y, &color) &&
+                      smooth_normal(width, height, positions, normals, x, y, radius, voxel_m).w >= least_flatness;
+    usable[row * cols + col] = found;
+    openness[row * cols + col] = -1.0f;
 }
 
 // One item a pool of 4 x 4 samples, which traced 16 direction sets: an even lattice together. Members lie on the surface

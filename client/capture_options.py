@@ -90,6 +90,33 @@ Mesh = Annotated[bool, typer.Option("--mesh", help="write mesh.ply and mesh.glb"
 BudgetMs = Annotated[float | None, typer.Option(metavar="N", help="choose the operating point for this time")]
 MaxLightError = Annotated[float | None, typer.Option(metavar="DEG", help="choose it for this light error")]
 DeviceOption = Annotated[str | None, typer.Option(metavar="NAME", help="part of an OpenCL device's name")]
+RoomName = Annotated[
+    str | None, typer.Option("--room", metavar="NAME", help="share volume, light and objects with others")
+]
+RoomFromWorld = Annotated[
+    str | None,
+    typer.Option(
+        metavar="same|16 NUMBERS|FILE", help="where this source's world lies in the room's, row-major; default: found"
+    ),
+]
+MarkerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--marker", metavar="ID,SIDE_M[,DICTIONARY]", help="ArUco or AprilTag that all clients of the room see"
+    ),
+]
+Token = Annotated[
+    str | None, typer.Option(metavar="TOKEN", envvar="PROBELESS_TOKEN", help="of the server, if its URL has none")
+]
+ServeToken = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TOKEN|none", envvar="PROBELESS_TOKEN", help="asked of clients; default: a new one; none: nothing"
+    ),
+]
+AllowOrigin = Annotated[
+    list[str] | None, typer.Option(metavar="ORIGIN", help="https://host of pages elsewhere that may use it; repeatable")
+]
 
 
 @dataclass(frozen=True)

@@ -114,11 +114,19 @@ def explain(
 @capturing
 def stream(
     options: CaptureOptions,
-    server: Annotated[str, typer.Option(metavar="URL", help="for example http://localhost:8080")],
+    server: Annotated[
+        str, typer.Option(metavar="URL", help="as the server prints it: http://localhost:8080/?token=...")
+    ],
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for what is written")] = None,
     record: Annotated[Path | None, typer.Option(metavar="FILE", help="keep what is sent as a recording")] = None,
     lossless: Annotated[bool, typer.Option("--lossless", help="raw colour, and every frame is waited for")] = False,
     mesh: o.Mesh = False,
+    room: o.RoomName = None,
+    room_from_world: o.RoomFromWorld = None,
+    marker: o.MarkerOption = None,
+    token: o.Token = None,
+    tls_fingerprint: Annotated[str | None, typer.Option(metavar="SHA256", help="of the server's certificate")] = None,
+    tls_ca: Annotated[Path | None, typer.Option(metavar="FILE", help="who vouches for its certificate, PEM")] = None,
     device: o.DeviceOption = None,
 ) -> None:
     """The laptop client: sends a source to a server and shows what comes back."""
@@ -127,9 +135,13 @@ def stream(
     if mesh and out is None:
         raise OptionError("--mesh writes files: say where with --out")
     capture = prepare(options, lossless=lossless)
+    from client.client import Access
     from client.laptop.stream import stream as send
+    from client.room_options import room_place
 
-    others = {"frames": capture.frames, "mesh": mesh}
+    place = room_place(room, room_from_world, marker)
+    access = Access(token, tls_fingerprint, tls_ca)
+    others = {"frames": capture.frames, "mesh": mesh, "room": place, "access": access}
     done = send(capture.source, server, capture.objects, capture.wishes, out, lossless, record, **others)
     written = f", written to {out}" if out is not None else ""
     speed = done.answered / done.seconds if done.seconds > 0 else 0.0
@@ -144,17 +156,40 @@ def serve(
     host: Annotated[str, typer.Option(help="address to listen on; 0.0.0.0 for all")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: a free one")] = 8080,
     device: o.DeviceOption = None,
-    token: Annotated[str | None, typer.Option(help="not built yet")] = None,
-    tls: Annotated[str | None, typer.Option(metavar="CERT,KEY", help="not built yet")] = None,
+    token: o.ServeToken = None,
+    insecure: Annotated[bool, typer.Option("--insecure", help="with --token none: really for everybody")] = False,
+    allow_origin: o.AllowOrigin = None,
+    tls: Annotated[bool, typer.Option("--tls", help="https and wss, with a certificate made once and kept")] = False,
+    tls_cert: Annotated[Path | None, typer.Option(metavar="FILE", help="a certificate of yours, PEM")] = None,
+    tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="its key, PEM")] = None,
+    volume_memory: Annotated[int | None, typer.Option(metavar="MIB", help="of one volume; default 512")] = None,
+    sessions: Annotated[int | None, typer.Option(min=1, help="that capture at once; default 16")] = None,
+    sessions_per_address: Annotated[int | None, typer.Option(min=1, help="of one client; default 8")] = None,
+    log: Annotated[str, typer.Option(metavar="text|json", help="how events are written to standard error")] = "text",
 ) -> int:
-    """The server."""
-    if token is not None:
-        raise OptionError("--token is not built yet; listen on 127.0.0.1 or put an authenticating proxy in front")
-    if tls is not None:
-        raise OptionError("--tls is not built yet; put a TLS proxy in front")
+    """The server. It asks for a token, which the URL that it prints brings along."""
+    from client.serving import ServeOptions, certificate_of, door_of, leave_soon, limits_of, log_format_of
+    from server.events import log_events
     from server.serve import serve as serve_forever
 
-    return serve_forever(host, port, device)
+    options = ServeOptions(
+        host=host,
+        token=token,
+        insecure=insecure,
+        allow_origin=tuple(allow_origin or ()),
+        tls=tls,
+        tls_cert=tls_cert,
+        tls_key=tls_key,
+        volume_memory=volume_memory,
+        sessions=sessions,
+        sessions_per_address=sessions_per_address,
+    )
+    limits, door, log_format = limits_of(options), door_of(options), log_format_of(log)
+    certificate = certificate_of(options)
+    log_events(log_format)
+    status = serve_forever(host, port, device, limits=limits, door=door, certificate=certificate)
+    leave_soon(status)
+    return status
 
 
 @app.command()

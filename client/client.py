@@ -8,17 +8,15 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import count
-from urllib.parse import urlsplit
 
 from websockets.asyncio.client import ClientConnection
-from websockets.asyncio.client import connect as open_socket
-from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidURI
-from websockets.typing import Subprotocol
+from websockets.exceptions import ConnectionClosed
 
+from client.access import Access, stream_url, without_query
+from client.opening import ClientError, open_client_socket
 from protocol.codec import ProtocolError, decode_server, encode
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import encode_color, encode_depth
-from protocol.limits import MAX_MESSAGE_BYTES, SUBPROTOCOL
 from protocol.messages import (
     Acknowledged,
     Bye,
@@ -29,6 +27,7 @@ from protocol.messages import (
     Frame,
     Hello,
     Light,
+    Marker,
     MeshFormat,
     MeshPart,
     MoveObject,
@@ -44,13 +43,15 @@ from protocol.messages import (
     Wishes,
 )
 
-STREAM_PATH = "/v1/stream"
-OPEN_PATIENCE_S = 10.0
+__all__ = ["Access", "Answer", "ClientError", "RoomPlace", "StreamClient", "frame_message", "stream_url"]
+
+KEEP_S = 30.0
+"""For which the server keeps a session whose connection is lost, and a client tries to come back."""
+RETRY_S = (0.05, 0.1, 0.2, 0.4, 0.8)
+"""Between tries; the last again and again."""
+GONE, TRY_LATER = 4410, 1013
+RESTART, KEEPALIVE = 1012, 1011
 UNREAD_ANSWERS = 16
-
-
-class ClientError(Exception):
-    """The server is absent, refuses, or has gone; one line that says which and what to do."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,11 @@ class _MeshInbox:
     files: dict[MeshFormat, bytearray] = field(default_factory=dict)
     sizes: dict[MeshFormat, int] = field(default_factory=dict)
 
+    def begin_anew(self) -> None:
+        """The files are sent again."""
+        self.files.clear()
+        self.sizes.clear()
+
     def add(self, part: MeshPart) -> None:
         """Append a part. Raises ProtocolError for one that does not follow on."""
         data = self.files.setdefault(part.format, bytearray())
@@ -82,23 +88,41 @@ class _MeshInbox:
 
 
 Tap = Callable[[ClientMessage | ServerMessage], None]
+Request = PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh
+
+
+@dataclass(frozen=True)
+class RoomPlace:
+    """The room that a client joins, and what it says of its world's place there (see `Hello`)."""
+
+    name: str
+    room_from_world: tuple[float, ...] | None = None
+    marker: Marker | None = None
 
 
 class StreamClient:
-    """One connection. Made by `connect`; then `hello` or `watch`; then read `answers` while sending.
+    """One session. Made by `connect`; then `hello` or `watch`; then read `answers` while sending.
 
-    A task of its own reads the socket. Frames are to be sent by one task at a time.
+    A task of its own reads the socket. Frames are to be sent by one task at a time. A capturing client whose connection
+    is lost comes back by itself and goes on: what it asked for is done once, and frames that were on the way are told
+    as dropped, or in a lossless session sent again.
     """
 
-    def __init__(self, socket: ClientConnection, url: str, tap: Tap | None) -> None:
+    def __init__(self, socket: ClientConnection, server_url: str, access: Access, tap: Tap | None) -> None:
         self._socket = socket
-        self._url = url
+        self._server_url = server_url
+        self._access = access
+        self._url = without_query(server_url)
         self._tap = tap
+        self._hello: Hello | None = None
+        self._is_connected = True
+        self.reconnected = 0
+        """Times that a lost connection was restored."""
         self._requests = count()
-        self._camera: CameraModel | None = None
-        self._lossless = False
         self._max_inflight = 1
-        self._unanswered: set[int] = set()
+        self._unanswered: dict[int, Frame | None] = {}
+        """By number; what was sent only where the session is lossless."""
+        self._unacknowledged: dict[int, Request] = {}
         self._unread: deque[Answer | Dropped | Error] = deque()
         self._acknowledged: dict[int, Acknowledged] = {}
         self._mesh: _MeshInbox | None = None
@@ -112,23 +136,42 @@ class StreamClient:
         self._listening = asyncio.create_task(self._listen())
 
     @classmethod
-    async def connect(cls, server_url: str, tap: Tap | None = None) -> StreamClient:
-        """Open the socket of a server given as `http://host:port`, `ws://...` or `host:port`.
+    async def connect(cls, server_url: str, tap: Tap | None = None, access: Access | None = None) -> StreamClient:
+        """Open the socket of a server given as `http(s)://host:port[/?token=...]`, `ws(s)://...` or `host:port`.
 
         `tap` is called with every message sent and received. Raises ClientError.
         """
-        return cls(await _open(server_url), server_url, tap)
+        socket = await open_client_socket(server_url, access or Access())
+        return cls(socket, server_url, access or Access(), tap)
 
-    async def hello(self, camera: CameraModel, wishes: Wishes | None = None, client: str = "probeless") -> Welcome:
-        """Begin to capture; returns when the server has prepared the session. Raises ClientError if it refuses."""
-        wishes = wishes or Wishes()
-        self._camera, self._lossless = camera, wishes.lossless
-        await self._send(Hello(client=client, camera=camera, wishes=wishes))
+    async def hello(
+        self,
+        camera: CameraModel,
+        wishes: Wishes | None = None,
+        client: str = "probeless",
+        room: RoomPlace | None = None,
+        keep_s: float = KEEP_S,
+    ) -> Welcome:
+        """Begin to capture; returns when the server has prepared the session. Raises ClientError if it refuses.
+
+        `room`: to share with others. `keep_s`: for how long a lost connection may be restored.
+        """
+        place = room or RoomPlace("")
+        self._hello = Hello(
+            client=client,
+            camera=camera,
+            wishes=wishes or Wishes(),
+            room=place.name or None,
+            room_from_world=place.room_from_world,
+            marker=place.marker,
+            keep_s=keep_s,
+        )
+        await self._send(self._hello)
         return await self._wait_for_welcome()
 
-    async def watch(self, session: str | None = None) -> Welcome:
+    async def watch(self, session: str | None = None, room: str | None = None) -> Welcome:
         """Begin to watch a session, or the one that streams now or next. Raises ClientError if it is refused."""
-        await self._send(Watch(session=session))
+        await self._send(Watch(session=session, room=room))
         return await self._wait_for_welcome()
 
     @property
@@ -149,11 +192,13 @@ class StreamClient:
 
         A session that wishes `lossless` sends raw colour, any other JPEG; depth is always bit-exact.
         """
-        if self._camera is None:
+        if self._hello is None:
             raise ClientError("a frame can only be sent after hello")
         await self.wait_for_room()
-        self._unanswered.add(frame.index)
-        message = await asyncio.to_thread(frame_message, frame, self._camera, self._lossless)
+        await self._wait_until(lambda: self._is_connected)
+        lossless = self._hello.wishes.lossless
+        message = await asyncio.to_thread(frame_message, frame, self._hello.camera, lossless)
+        self._unanswered[frame.index] = message if lossless else None
         await self._send(message)
 
     async def place_object(
@@ -243,19 +288,29 @@ class StreamClient:
         await self._listening
 
     async def _send(self, message: ClientMessage) -> None:
-        """Encode and send. Raises ClientError."""
+        """Encode and send; while the connection is lost, once it is restored. Raises ClientError."""
         try:
             data = encode(message)
-            await self._socket.send(data)
         except ProtocolError as error:
             raise ClientError(str(error)) from error
+        await self._wait_until(lambda: self._is_connected)
+        socket = self._socket
+        try:
+            await socket.send(data)
         except ConnectionClosed as error:
-            await self._listening  # what the server said last is still to be read
-            raise self._failure or ClientError(f"the connection to {self._url} is closed") from error
+            if not await self._is_sent_again(socket):
+                raise self._failure or ClientError(f"the connection to {self._url} is closed") from error
         if self._tap is not None:
             self._tap(message)
 
-    async def _ask(self, message: PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh) -> Acknowledged:
+    async def _is_sent_again(self, socket: ClientConnection) -> bool:
+        """After a socket broke: whether another one took its place, by which all that matters is sent once more."""
+        async with self._changed:
+            await self._changed.wait_for(lambda: self._ended or (self._is_connected and self._socket is not socket))
+        return not self._ended
+
+    async def _ask(self, message: Request) -> Acknowledged:
+        self._unacknowledged[message.request] = message
         await self._send(message)
         await self._wait_until(lambda: message.request in self._acknowledged)
         return self._acknowledged.pop(message.request)
@@ -276,19 +331,92 @@ class StreamClient:
             self._changed.notify_all()
 
     async def _listen(self) -> None:
-        """Take messages until the connection ends, and keep how it ended."""
+        """Take messages until the session ends, and keep how it ended."""
         try:
-            async for data in self._socket:
-                await self._take(decode_server(data.encode() if isinstance(data, str) else data))
-                await self._note_change()
-        except ConnectionClosed as error:
-            self._failure = None if self._leaving else self._explain(error)
+            while True:
+                try:
+                    async for data in self._socket:
+                        await self._take(decode_server(data.encode() if isinstance(data, str) else data))
+                        await self._note_change()
+                    break
+                except ConnectionClosed as error:
+                    if self._leaving:
+                        break
+                    if not self._is_lost(error):
+                        self._failure = self._explain(error)
+                        break
+                    await self._restore(self._explain(error))
+        except ClientError as error:
+            self._failure = error
         except ProtocolError as error:
             self._failure = ClientError(f"the server at {self._url} sent what is no message: {error}")
             await self._socket.close(1007)
         finally:
             self._ended = True
             await self._note_change()
+
+    def _is_lost(self, error: ConnectionClosed) -> bool:
+        """Whether a session that is kept lost its connection."""
+        if self._hello is None or self._welcome is None or self._welcome.key is None:
+            return False
+        if error.rcvd is None or (error.rcvd.code == KEEPALIVE and "keepalive" in error.rcvd.reason):
+            return True
+        return error.rcvd.code == RESTART and self._hello.room is not None
+
+    async def _restore(self, lost: ClientError) -> None:
+        """Come back by another connection. Raises ClientError where the server does not want that, or is not there."""
+        assert self._hello is not None
+        assert self._welcome is not None
+        self._is_connected = False
+        until_s = asyncio.get_running_loop().time() + self._hello.keep_s
+        hello = Hello(client=self._hello.client, camera=self._hello.camera, resume=self._welcome.key)
+        for tries in count():
+            if self._leaving or asyncio.get_running_loop().time() > until_s:
+                raise ClientError(f"{lost}, and could not be restored")
+            try:
+                socket = await open_client_socket(self._server_url, self._access)
+                welcome = await self._greeted(socket, hello)
+            except ConnectionClosed as refused:
+                code = None if refused.rcvd is None else refused.rcvd.code
+                if code == GONE and self._hello.room is not None:
+                    hello = self._hello  # the room outlives its sessions
+                elif code is not None and code not in (TRY_LATER, RESTART):
+                    raise self._explain(refused) from refused
+            except (ClientError, TimeoutError):
+                pass  # not there yet
+            else:
+                await self._go_on(socket, welcome)
+                return
+            await asyncio.sleep(RETRY_S[min(tries, len(RETRY_S) - 1)])
+
+    async def _greeted(self, socket: ClientConnection, hello: Hello) -> Welcome:
+        """The answer to `hello`. Raises ConnectionClosed, TimeoutError, ProtocolError."""
+        async with asyncio.timeout(KEEP_S):
+            await socket.send(encode(hello))
+            while True:
+                data = await socket.recv()
+                match decode_server(data.encode() if isinstance(data, str) else data):
+                    case Welcome() as welcome:
+                        return welcome
+                    case Error() as error:
+                        self._reason_given = error.reason
+
+    async def _go_on(self, socket: ClientConnection, welcome: Welcome) -> None:
+        """Take the new connection, and send what has no answer yet again."""
+        self._socket, self._welcome, self._reason_given = socket, welcome, None
+        if self._mesh is not None:
+            self._mesh.begin_anew()
+        for request in self._unacknowledged.values():
+            await socket.send(encode(request))
+        for number, frame in list(self._unanswered.items()):
+            if frame is None:
+                del self._unanswered[number]
+                self._unread.append(Dropped(frame=number, reason="lost with the connection, which was restored"))
+            else:
+                await socket.send(encode(frame))
+        self.reconnected += 1
+        self._is_connected = True
+        await self._note_change()
 
     def _explain(self, error: ConnectionClosed) -> ClientError:
         reason = self._reason_given or (error.rcvd.reason if error.rcvd is not None else "")
@@ -307,13 +435,14 @@ class StreamClient:
                 self._light = message
             case Composite() if self._light is not None:
                 await self._deliver(Answer(self._light, message))
-                self._unanswered.discard(message.frame)
+                self._unanswered.pop(message.frame, None)
             case Dropped():
                 await self._deliver(message)
-                self._unanswered.discard(message.frame)
+                self._unanswered.pop(message.frame, None)
             case MeshPart() if self._mesh is not None:
                 self._mesh.add(message)
-            case Acknowledged():
+            case Acknowledged() if message.request in self._unacknowledged:
+                del self._unacknowledged[message.request]
                 self._acknowledged[message.request] = message
             case Error(fatal=False):
                 await self._deliver(message)
@@ -325,14 +454,6 @@ class StreamClient:
         async with self._changed:
             await self._changed.wait_for(lambda: len(self._unread) < UNREAD_ANSWERS or self._leaving)
             self._unread.append(answer)
-
-
-def stream_url(server_url: str) -> str:
-    """The socket's URL of a server given as `http(s)://host:port`, `ws(s)://host:port[/v1/stream]` or `host:port`."""
-    parts = urlsplit(server_url if "://" in server_url else f"ws://{server_url}")
-    scheme = {"http": "ws", "https": "wss"}.get(parts.scheme, parts.scheme)
-    path = parts.path if parts.path.strip("/") else STREAM_PATH
-    return f"{scheme}://{parts.netloc}{path}"
 
 
 def frame_message(frame: RgbdFrame, camera: CameraModel, lossless: bool) -> Frame:
@@ -347,27 +468,3 @@ def frame_message(frame: RgbdFrame, camera: CameraModel, lossless: bool) -> Fram
         depth=encode_depth(frame.depth),
         exposure=frame.exposure,
     )
-
-
-async def _open(server_url: str) -> ClientConnection:
-    """An open socket that speaks this version. Raises ClientError."""
-    try:
-        socket = await open_socket(
-            stream_url(server_url),
-            subprotocols=[Subprotocol(SUBPROTOCOL)],
-            compression=None,
-            max_size=MAX_MESSAGE_BYTES,
-            open_timeout=OPEN_PATIENCE_S,
-            proxy=None,
-        )
-    except (InvalidURI, ValueError) as error:
-        raise ClientError(f"{server_url} is no server address: give http://HOST:PORT") from error
-    except InvalidHandshake as error:
-        raise ClientError(f"what answers at {server_url} is no probeless server ({error})") from error
-    except (OSError, TimeoutError) as error:
-        why = str(error) or "no answer"
-        raise ClientError(f"no server at {server_url} ({why}): start one with: probeless serve") from error
-    if socket.subprotocol != SUBPROTOCOL:
-        await socket.close()
-        raise ClientError(f"what answers at {server_url} does not speak {SUBPROTOCOL}: use the same version on both")
-    return socket

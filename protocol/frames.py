@@ -130,3 +130,15 @@ class RgbdFrame:
     """[4, 4] rigid, metres, OpenCV camera axes (x right, y down, z forward); None where the source has no pose."""
     exposure: float | None = None
     """Exposure time times gain of the colour picture, any unit that stays the same; None where it is not known."""
+    has_depth: bool = True
+    """False: `depth` is empty for want of a sensor; what the room has scanned takes its place."""
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """Where somebody without a camera looks from."""
+
+    index: int
+    timestamp_s: float
+    world_from_camera: NDArray[np.float64]
+    """[4, 4] as in RgbdFrame."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 import cv2
@@ -42,10 +43,16 @@ def encode_color(
     return ColorImage(width=width, height=height, data=data, codec=codec, encoding=encoding)
 
 
-def decode_color(image: ColorImage, camera: CameraModel, encoding: ColorEncoding | None = None) -> Color:
+def decode_color(
+    image: ColorImage,
+    camera: CameraModel,
+    encoding: ColorEncoding | None = None,
+    decompress: Callable[[bytes], NDArray[np.uint8]] | None = None,
+) -> Color:
     """Payload -> [h, w, 3] RGB, uint8 (`srgb8`) or uint16 (`linear16`), of exactly the camera's size.
 
-    `encoding` is what the reader expects: None means the camera's own; a composite is always `srgb8`.
+    `encoding` is what the reader expects: None means the camera's own; a composite is always `srgb8`. `decompress`
+    decodes a JPEG or PNG whose header has been checked (default: `decode_picture`).
     Raises ProtocolError, before anything is allocated, for a picture that is not what it declares.
     """
     expected = encoding or camera.color_encoding
@@ -55,7 +62,18 @@ def decode_color(image: ColorImage, camera: CameraModel, encoding: ColorEncoding
     _require_size("color", image, camera)
     if image.codec == "raw":
         return _raw("color", image, _COLOR_DTYPE[image.encoding], 3).reshape(image.height, image.width, 3)
-    return _decompress_color(image)
+    return _decompress_color(image, decompress or decode_picture)
+
+
+def decode_picture(data: bytes) -> NDArray[np.uint8]:
+    """A JPEG or PNG -> [h, w, 3] RGB. Raises ProtocolError. Its header must have been checked."""
+    try:
+        rgb = cv2.imdecode(np.frombuffer(data, np.uint8), _READ_RGB)
+    except cv2.error as error:
+        raise ProtocolError(f"color.data cannot be decoded: {error}") from error
+    if rgb is None:
+        raise ProtocolError("color.data cannot be decoded")
+    return rgb.astype(np.uint8, copy=False)
 
 
 def encode_depth(depth: NDArray[np.uint16], codec: DepthCodec = DEFAULT_DEPTH_CODEC) -> DepthImage:
@@ -113,16 +131,13 @@ def _compress_color(rgb: Color, codec: ColorCodec, encoding: ColorEncoding, qual
     return data
 
 
-def _decompress_color(image: ColorImage) -> NDArray[np.uint8]:
+def _decompress_color(image: ColorImage, decompress: Callable[[bytes], NDArray[np.uint8]]) -> NDArray[np.uint8]:
     """Decode a JPEG or PNG whose own header has been compared with what the payload declares."""
     size = (jpeg_size if image.codec == "jpeg" else png_size)(image.data)
     if size != (image.width, image.height):
         found = f"color.data is a picture of {size[0]}x{size[1]}"
         raise ProtocolError(f"{found}, color declares {image.width}x{image.height}")
-    try:
-        rgb = cv2.imdecode(np.frombuffer(image.data, np.uint8), _READ_RGB)
-    except cv2.error as error:
-        raise ProtocolError(f"color.data cannot be decoded as {image.codec}: {error}") from error
-    if rgb is None or rgb.shape != (image.height, image.width, 3):
+    rgb = decompress(image.data)
+    if rgb.shape != (image.height, image.width, 3):
         raise ProtocolError(f"color.data cannot be decoded as {image.codec}")
-    return rgb.astype(np.uint8, copy=False)
+    return rgb

@@ -195,6 +195,10 @@ class Hello(Message, frozen=True, kw_only=True, omit_defaults=True, tag="hello")
     None: not known, to be found by `marker`, else by what the room has seen."""
     marker: Marker | None = None
     """By which the client's world is laid on the room's, once both have seen it."""
+    keep_s: Annotated[float, Meta(ge=0, le=300)] = 0.0
+    """How long the session waits for this client when its connection is lost without a bye; 0: it ends with it."""
+    resume: Name | None = None
+    """`welcome.key` of a session that waits: it goes on as it was, and nothing else of this message counts."""
 
     def __post_init__(self) -> None:
         if self.room_from_world is not None:
@@ -203,11 +207,13 @@ class Hello(Message, frozen=True, kw_only=True, omit_defaults=True, tag="hello")
             raise ValueError("hello.room_from_world and hello.marker are of a room: name it in hello.room")
 
 
-class Watch(Message, frozen=True, kw_only=True, tag="watch"):
+class Watch(Message, frozen=True, kw_only=True, omit_defaults=True, tag="watch"):
     """First message of a client that only looks: it receives what the capturing session produces."""
 
     session: Name | None = None
     """None: the session that is streaming, now or next."""
+    room: Name | None = None
+    """Of `session: None`: only those of this room."""
 
 
 class Frame(Message, frozen=True, kw_only=True, omit_defaults=True, tag="frame"):
@@ -216,8 +222,10 @@ class Frame(Message, frozen=True, kw_only=True, omit_defaults=True, tag="frame")
     frame: Index
     timestamp_s: float
     world_from_camera: Matrix4 | None
-    color: ColorImage
-    depth: DepthImage
+    color: ColorImage | None = None
+    """None, with a pose and no depth: of somebody who only looks at a room that others scan."""
+    depth: DepthImage | None = None
+    """None: of a camera without a depth sensor, in a room that others scan."""
     exposure: float | None = None
     """Exposure time times gain of the colour picture, in any unit that stays the same for the session; None: unknown.
 
@@ -226,6 +234,8 @@ class Frame(Message, frozen=True, kw_only=True, omit_defaults=True, tag="frame")
 
     def __post_init__(self) -> None:
         _require_finite("frame", timestamp_s=self.timestamp_s, world_from_camera=self.world_from_camera)
+        if self.color is None and (self.depth is not None or self.world_from_camera is None):
+            raise ValueError("frame.color may be left out only where there is a pose and no depth")
 
 
 class PlaceObject(Message, frozen=True, kw_only=True, tag="place_object"):
@@ -291,7 +301,7 @@ class Bye(Message, frozen=True, kw_only=True, tag="bye"):
 # ---- server to client --------------------------------------------------------------------------------------------
 
 
-class Welcome(Message, frozen=True, kw_only=True, tag="welcome"):
+class Welcome(Message, frozen=True, kw_only=True, omit_defaults=True, tag="welcome"):
     """Answer to hello and watch."""
 
     session: Name
@@ -299,6 +309,12 @@ class Welcome(Message, frozen=True, kw_only=True, tag="welcome"):
     device: str
     max_inflight: int
     """Frames the client may have unanswered."""
+    key: str | None = None
+    """By which the session is resumed (`hello.resume`), where the client asked for it to be kept. A secret."""
+    resumed: bool = False
+    """Frames that were sent before are not answered any more, unless the session is lossless; requests are, if they
+    are sent again."""
+    room: Name | None = None
 
 
 class LeftOut(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -46,6 +46,14 @@ class Markers:
         """room_from_marker [4, 4]; None where nobody that is aligned has seen it."""
         return self._places.get((marker.dictionary, marker.id))
 
+    def places(self) -> dict[tuple[str, int], Floats]:
+        """room_from_marker [4, 4] of all, by dictionary and number."""
+        return dict(self._places)
+
+    def resume(self, places: dict[tuple[str, int], Floats]) -> None:
+        """These hold from the beginning."""
+        self._places = dict(places)
+
     def note(self, marker: Marker, room_from_marker: Floats) -> None:
         """What the first client sees holds."""
         self._places.setdefault((marker.dictionary, marker.id), room_from_marker)
@@ -120,6 +128,8 @@ class Alignment:
         if self._is_alone or frame.world_from_camera is None:
             return None
         volume = self._reconstruction.volume
+        if not frame.has_depth:
+            return self._settle_without_depth(frame, measurement)
         if volume is None or volume.frames == 0:
             self._is_first = self.is_settled = True
         elif not self._is_first and self._corrections < CERTAIN_FRAMES:
@@ -130,6 +140,17 @@ class Alignment:
         if self._marker is not None and self._markers.place_of(self._marker) is None:
             self._note_marker(frame, measurement, self._marker)
         return None
+
+    def _settle_without_depth(self, frame: RgbdFrame, measurement: Measurement) -> str | None:
+        """Nothing can be compared: what is said has to do."""
+        try:
+            self.is_settled = self._is_said(frame, measurement) or self.is_settled
+        except ValueError as error:
+            if not self.is_settled:
+                return f"not aligned with the room: {error}"
+        if self.is_settled:
+            return None
+        return "not aligned with the room: without depth, say where its world lies, or show a common marker"
 
     def _fit(self, frame: RgbdFrame, measurement: Measurement, volume: Volume) -> str | None:
         """Learn from a frame; why it does not belong into the room, if so."""

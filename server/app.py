@@ -6,20 +6,25 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
-from fastapi import FastAPI, WebSocket
+from fastapi import FastAPI, Request, WebSocket
 from fastapi.responses import JSONResponse, PlainTextResponse, Response
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST
 
-from server.connection import POLICY, Connection
+from server.connection import POLICY, Connection, Refusal
+from server.door import WHERE_IT_IS, Door
 from server.service import Service
 
 STREAM_PATH = "/v1/stream"
 PAGE_FOLDER = Path(__file__).resolve().parents[1] / "client" / "web" / "dist"
 
 
-def create_app(service: Service, page_folder: Path = PAGE_FOLDER) -> FastAPI:
-    """The ASGI application around `service`, which it starts and stops; `page_folder` holds index.html."""
+def create_app(service: Service, page_folder: Path = PAGE_FOLDER, door: Door | None = None) -> FastAPI:
+    """The ASGI application around `service`, which it starts and stops; `page_folder` holds index.html.
+
+    `door`: who may come in; None: everybody.
+    """
+    door = door or Door()
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -28,18 +33,26 @@ def create_app(service: Service, page_folder: Path = PAGE_FOLDER) -> FastAPI:
         service.stop()
 
     app = FastAPI(lifespan=lifespan, openapi_url=None)
-    _add_stream(app, service)
+    _add_stream(app, service, door)
     _add_health(app, service)
+    _add_metrics(app, service, door)
     _add_page(app, page_folder)
     return app
 
 
-def _add_stream(app: FastAPI, service: Service) -> None:
+def _add_stream(app: FastAPI, service: Service, door: Door) -> None:
     @app.websocket(STREAM_PATH)
     async def stream(websocket: WebSocket) -> None:
-        connection = Connection(websocket)
-        if await connection.accept():
-            await service.serve(connection)
+        connection = Connection(websocket, service.limits, service.note_refusal)
+        if not await connection.accept():
+            return
+        try:
+            with service.guests.connected(connection.address):
+                if (refusal := door.refusal(websocket)) is not None:
+                    raise refusal
+                await service.serve(connection)
+        except Refusal as refused:
+            await connection.refuse(refused)
 
     @app.websocket("/{path:path}")
     async def elsewhere(websocket: WebSocket) -> None:
@@ -52,12 +65,20 @@ def _add_health(app: FastAPI, service: Service) -> None:
     @app.get("/healthz")
     async def healthz() -> JSONResponse:
         state = {"ready": service.ready, "device": service.device_name, "sessions": service.sessions}
+        if service.departure.has_begun:
+            state["draining"] = True
         if service.failure is not None:
             state["failure"] = service.failure
+        if service.failed_check is not None:
+            state["failed_check"] = service.failed_check
         return JSONResponse(state, status_code=200 if service.ready else 503)
 
+
+def _add_metrics(app: FastAPI, service: Service, door: Door) -> None:
     @app.get("/metrics")
-    async def metrics() -> Response:
+    async def metrics(request: Request) -> Response:
+        if not door.shows_metrics_to(request):
+            return PlainTextResponse(f"The token is missing or wrong: {WHERE_IT_IS}.\n", status_code=401)
         return Response(service.metrics.render(), media_type=CONTENT_TYPE_LATEST)
 
 

@@ -13,8 +13,10 @@ from server.connection import POLICY, BadMessage, Connection, Refusal
 class Watcher:
     """One watching client's slot: per kind of news only the latest is kept until it is taken."""
 
-    def __init__(self, session: str | None) -> None:
+    def __init__(self, session: str | None, room: str | None = None) -> None:
+        """`room`: of any session, only those in it."""
         self.follows_any = session is None
+        self.room = room
         self.session = session
         self._news: dict[str, tuple[bytes, ...]] = {}
         self._ended = False
@@ -52,6 +54,7 @@ class Broadcast:
 
     def __init__(self) -> None:
         self._welcomes: dict[str, bytes] = {}
+        self._rooms: dict[str, str | None] = {}
         self._watchers: list[Watcher] = []
         self._watched: frozenset[str | None] = frozenset()
 
@@ -59,11 +62,11 @@ class Broadcast:
         """Whether pictures of this session have a taker; may be called by any thread."""
         return session in self._watched
 
-    def open_session(self, name: str, welcome: bytes) -> None:
+    def open_session(self, name: str, welcome: bytes, room: str | None = None) -> None:
         """From now on the session can be watched; `welcome` greets its watchers."""
-        self._welcomes[name] = welcome
+        self._welcomes[name], self._rooms[name] = welcome, room
         for watcher in self._watchers:
-            if watcher.session is None:
+            if watcher.session is None and watcher.room in (None, room):
                 watcher.attach(name, welcome)
         self._note_watched()
 
@@ -71,22 +74,23 @@ class Broadcast:
         """The session is over: watchers that follow any session go to the newest one left, the others end."""
         if self._welcomes.pop(name, None) is None:
             return
+        del self._rooms[name]
         for watcher in self._watchers:
             if watcher.session == name:
                 self._move_on(watcher)
         self._note_watched()
 
     @contextlib.contextmanager
-    def watcher(self, session: str | None, waiting: bytes) -> Iterator[Watcher]:
-        """A watcher of the named session, or of the newest; `waiting` greets it where there is none yet.
+    def watcher(self, session: str | None, waiting: bytes, room: str | None = None) -> Iterator[Watcher]:
+        """A watcher of the named session, or of the newest (in `room`); `waiting` greets it where there is none yet.
 
         Raises Refusal for the name of no session.
         """
         if session is not None and session not in self._welcomes:
             there = ", ".join(self._welcomes) or "none"
             raise Refusal(POLICY, f"there is no session {session!r} to watch; sessions now: {there}")
-        watcher = Watcher(session)
-        name = session or self._newest()
+        watcher = Watcher(session, room)
+        name = session or self._newest(room)
         watcher.attach(name, self._welcomes[name] if name else waiting)
         self._watchers.append(watcher)
         self._note_watched()
@@ -102,11 +106,11 @@ class Broadcast:
             if watcher.session == session:
                 watcher.post("pictures", messages)
 
-    def _newest(self) -> str | None:
-        return next(reversed(self._welcomes), None)
+    def _newest(self, room: str | None) -> str | None:
+        return next((name for name in reversed(self._welcomes) if room in (None, self._rooms[name])), None)
 
     def _move_on(self, watcher: Watcher) -> None:
-        heir = self._newest()
+        heir = self._newest(watcher.room)
         if not watcher.follows_any:
             watcher.end()
         elif heir is None:

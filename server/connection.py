@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Callable
 
 import msgspec
 from fastapi import WebSocket, WebSocketDisconnect
 
 from protocol.codec import ProtocolError, decode_client, encode, one_line
 from protocol.limits import PROTOCOL_VERSION, SUBPROTOCOL, SUBPROTOCOL_PREFIX
-from protocol.messages import Acknowledged, ClientMessage, Dropped, Error, Index, ServerMessage
+from protocol.messages import Acknowledged, Bye, ClientMessage, Dropped, Error, Index, ServerMessage
+from server.limits import DEFAULT_LIMITS, Limits
+from server.pace import Pace
 
 NORMAL, PROTOCOL, UNSUPPORTED, INVALID, POLICY, INTERNAL, TRY_LATER = 1000, 1002, 1003, 1007, 1008, 1011, 1013
+RESTART, GOING_AWAY, NO_CODE, LOST = 1012, 1001, 1005, 1006
+UNAUTHORIZED, FORBIDDEN, GONE = 4401, 4403, 4410
 
 MAX_CLOSE_REASON_BYTES = 123
 SEND_PATIENCE_S = 30.0
@@ -45,9 +50,21 @@ class BadMessage(Exception):
 class Connection:
     """A WebSocket of this protocol, used on the event loop only."""
 
-    def __init__(self, websocket: WebSocket) -> None:
+    def __init__(
+        self,
+        websocket: WebSocket,
+        limits: Limits = DEFAULT_LIMITS,
+        on_refusal: Callable[[Refusal], None] = lambda _refusal: None,
+    ) -> None:
+        """`on_refusal` is called when the client is refused, before it is told."""
+        self.address = "" if websocket.client is None else websocket.client.host
         self._websocket = websocket
+        self._on_refusal = on_refusal
+        self._pace = Pace(limits)
+        self._told_of_pace = False
         self._closed = False
+        self.is_lost = False
+        """Whether the client went without closing its socket."""
 
     async def accept(self) -> bool:
         """Shake hands. A client of another version is told which one is spoken here, and False is returned."""
@@ -65,14 +82,28 @@ class Connection:
         event = await self._websocket.receive()
         if event["type"] == "websocket.disconnect":
             self._closed = True
+            self.is_lost = event.get("code", LOST) not in (NORMAL, GOING_AWAY, NO_CODE)
             return None
         data = event.get("bytes")
         if data is None:
             raise Refusal(UNSUPPORTED, "a text message was received; every message is binary MessagePack")
+        await self._keep_pace(len(data))
         try:
             return decode_client(data)
         except ProtocolError as error:
             raise _judge(data, str(error)) from error
+
+    async def _keep_pace(self, size_bytes: int) -> None:
+        """Wait, or raise Refusal, where the client sends more than it may."""
+        if self._pace.is_flooded_by_one_more():
+            raise Refusal(POLICY, self._pace.flooded)
+        pause_s = self._pace.pause_s(size_bytes)
+        if pause_s <= 0:
+            return
+        if not self._told_of_pace:
+            self._told_of_pace = True
+            await self.send_message(Error(reason=self._pace.slowed, fatal=False))
+        await asyncio.sleep(pause_s)
 
     async def send(self, data: bytes) -> None:
         """Send encoded messages, waiting for a client that reads slowly. Raises ClientGone."""
@@ -91,10 +122,18 @@ class Connection:
 
     async def refuse(self, refusal: Refusal) -> None:
         """Tell the client why in an error message and in the close frame, and close."""
+        self._on_refusal(refusal)
         with contextlib.suppress(ClientGone, TimeoutError):
             async with asyncio.timeout(CLOSE_PATIENCE_S):
                 await self.send_message(Error(reason=refusal.reason, fatal=True))
         await self.close(refusal.code, refusal.reason)
+
+    async def dismiss(self, code: int, reason: str) -> None:
+        """Say bye to a client that did nothing wrong, and close."""
+        with contextlib.suppress(ClientGone, TimeoutError):
+            async with asyncio.timeout(CLOSE_PATIENCE_S):
+                await self.send_message(Bye(reason=reason))
+        await self.close(code, reason)
 
     async def close(self, code: int = NORMAL, reason: str = "") -> None:
         """Close once; a client that has left already is fine."""

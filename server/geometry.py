@@ -103,7 +103,7 @@ class Geometry:
             if self._last is not None and not located.fuse:
                 lost = replace(self._last, measurement=measurement, exposure=exposure, scene_radiance=scene)
                 return replace(lost, tracking=located.tracking, notes=notes)
-            if located.fuse:
+            if located.fuse and frame.has_depth:
                 self._fuse(volume, volume_from_camera, Measurement(scene, measurement.depth_m), exposure)
         with stage("surface"):  # 4.2.1
             model = raycast(engine, camera, volume_from_camera, volume)
@@ -150,7 +150,9 @@ class Geometry:
 
     def _notes(self, frame: RgbdFrame, volume: Volume) -> tuple[str, ...]:
         notes = []
-        if not any(self._is_usable(depth).any() for depth in (frame.depth[::16, ::16], frame.depth)):  # mostly a few do
+        if frame.has_depth and not any(
+            self._is_usable(depth).any() for depth in (frame.depth[::16, ::16], frame.depth)
+        ):  # mostly a few do
             notes.append("the depth picture has no usable value: is the sensor covered?")
         if volume.is_full:
             notes.append("the volume's memory is full, new surface is not fused: give a larger --voxel")

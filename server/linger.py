@@ -26,6 +26,11 @@ class LingeringWebSocket(WebSocketsSansIOProtocol):
         else:
             self._await_silence()
 
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Say that it was lost: uvicorn's own code is that of a close frame without one. The first word counts."""
+        self.queue.put_nowait({"type": "websocket.disconnect", "code": 1006})
+        super().connection_lost(exc)
+
     def handle_parser_exception(self) -> None:
         """Send the close frame, tell the app, and close when the client is silent or `close_timeout` is over."""
         assert self.conn.close_sent is not None

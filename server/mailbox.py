@@ -39,7 +39,7 @@ class Letter:
         """Bytes of the pictures or the mesh that it carries."""
         match self.message:
             case Frame(color=color, depth=depth):
-                return len(color.data) + len(depth.data)
+                return sum(len(picture.data) for picture in (color, depth) if picture is not None)
             case PlaceObject(data=data):
                 return len(data)
         return 0

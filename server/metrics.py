@@ -19,13 +19,27 @@ class Metrics:
         self.decode_ms = self._histogram("decode_ms", "Milliseconds to decode a frame's colour and depth")
         self.encode_ms = self._histogram("encode_ms", "Milliseconds to encode a composite")
         self.queue_age_ms = self._histogram("queue_age_ms", "Milliseconds a frame waited before its worker took it")
+        self.turn_ms = self._histogram("turn_ms", "Milliseconds a frame waited for its turn on the device")
         self.processed = Counter("probeless_frames_processed", "Frames composited", registry=self._registry)
         self.dropped = Counter("probeless_frames_dropped", "Frames dropped", ("reason",), registry=self._registry)
         self.sessions = Gauge("probeless_sessions", "Capturing sessions", registry=self._registry)
         self.watchers = Gauge("probeless_watchers", "Watching clients", registry=self._registry)
+        self.refused = Counter("probeless_refused", "Connections refused", ("code",), registry=self._registry)
+        self.device_memory = Gauge(
+            "probeless_device_memory_bytes", "Device memory held by sessions and objects", registry=self._registry
+        )
+        self.ready = Gauge("probeless_ready", "1 once clients are welcome, 0 before and after", registry=self._registry)
+        self.parser_deaths = Counter(
+            "probeless_parser_deaths",
+            "Processes that died reading a stranger's bytes",
+            ("kind",),
+            registry=self._registry,
+        )
+        for kind in ("mesh", "picture"):
+            self.parser_deaths.labels(kind)
         for stage in STAGES:
             self.stage_ms.labels(stage)
-        for reason in ("replaced", "refused", "unreadable"):
+        for reason in ("replaced", "refused", "unreadable", "invalid"):
             self.dropped.labels(reason)
 
     def _histogram(self, name: str, help_text: str, labels: tuple[str, ...] = ()) -> Histogram:

@@ -11,13 +11,14 @@ import pyopencl.array as cl_array
 from msgspec import structs
 from numpy.typing import NDArray
 
-from protocol.frames import CameraModel, RgbdFrame
+from protocol.frames import CameraModel, RgbdFrame, Viewpoint
 from protocol.messages import Hello, LeftOut, Light, OperatingPoint, Plan, Preset, Timings, Tracking, Wishes
 from server.alignment import Alignment
 from server.effects import EFFECTS
 from server.geometry import Geometry, GeometryFrame
 from server.held import Sampled
 from server.light_message import light_message, seen_from
+from server.maths.rigid import repaired_pose
 from server.maths.sh import webxr_from_world
 from server.meshing.scene_mesh import SceneMesh, scene_mesh
 from server.meshing.surface import MeshingError
@@ -32,14 +33,16 @@ from server.room import Room
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement, check_size
 from server.settings import Settings, read_wishes
-from server.stages.composite import shown_picture
+from server.stages.composite import shown_picture, srgb_codes
 from server.stages.denoise import denoise_radiance
 from server.stages.exposure import scene_radiance
 from server.stages.indirect import observe_indirect
 from server.stages.light_estimation import LightEstimate
 from server.stages.near_light import remove_lamps
 from server.stages.rasterize import Placed
+from server.stages.raycast import raycast
 from server.stages.sampling import TransferSampler
+from server.stages.view_colors import view_colors
 from server.stages.volume import Volume
 from server.static_light import static_estimate
 
@@ -99,8 +102,8 @@ class Pipeline:
         self.device_name = device.name
         self.kernel_ms: dict[str, float] = {}
 
-    def process(self, frame: RgbdFrame) -> FrameResult:
-        """Fuse one frame, estimate the light, render what is virtual.
+    def process(self, frame: RgbdFrame | Viewpoint) -> FrameResult:
+        """Fuse one frame, estimate the light, render what is virtual. A viewpoint shows what others have scanned.
 
         Raises ValueError with one line for a frame that is refused; the session's state is then as it was. Waits while
         another client's frame is in the room.
@@ -108,10 +111,28 @@ class Pipeline:
         with self._room.lock:
             if self._changes != self._room.changes:
                 self._wake()
-            result = self._process(frame)
+            result = self._process(self._imagined(frame) if isinstance(frame, Viewpoint) else frame)
             self._room.changes += 1
             self._changes = self._room.changes
             return result
+
+    def _imagined(self, seen_from: Viewpoint) -> RgbdFrame:
+        """What a camera there would see of what has been scanned, without depth. Raises ValueError."""
+        volume, engine, camera = self._room.reconstruction.volume, self._engine, self._camera
+        if volume is None:
+            raise ValueError("nobody has scanned this room yet: there is nothing to look at")
+        pose = repaired_pose(seen_from.world_from_camera)
+        place = volume.volume_from_world() @ self._alignment.room_from_client @ pose
+        volume.bring_back(camera, place)
+        shown = engine.download(
+            view_colors(engine, camera, raycast(engine, camera, place, volume, "looked_at"), volume)
+        )
+        linear = np.stack([shown[channel] for channel in "xyz"], axis=-1).astype(np.float64)
+        is_linear = camera.color_encoding == "linear16"
+        color = np.rint(65535 * linear.clip(0, 1)).astype(np.uint16) if is_linear else srgb_codes(linear)
+        lens = camera.depth_lens
+        depth = np.zeros((lens.height, lens.width), np.uint16)
+        return RgbdFrame(seen_from.index, seen_from.timestamp_s, color, depth, pose, has_depth=False)
 
     def _process(self, frame: RgbdFrame) -> FrameResult:
         started = time.perf_counter()
@@ -128,6 +149,11 @@ class Pipeline:
             sampled, left_out = self._sample(geometry, volume, placed)
         with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
             estimate = self._room_light.estimate()
+            if settings.plan != "everything" and not self._room_light.reads_pictures:
+                stages = ("estimate_light", *(("denoise",) if settings.denoise != "none" else ()))
+                left_out = dict.fromkeys(stages, NOTHING_TO_LEARN) | left_out
+            if not frame.has_depth:
+                left_out = {"estimate_light": ONLY_LOOKS} | left_out
             if "estimate_light" not in left_out and sampled.transfer is not None:
                 smooth = self._smooth(geometry)
                 distant = remove_lamps(engine, smooth, surface, volume, self._lamps.lamps)  # B4
@@ -145,7 +171,7 @@ class Pipeline:
             planes, is_given = self._room_light.planes, self._room_light.is_given
             made = Made(frame, geometry, volume, placed, self._sampler, sampled, estimate.sh, planes, is_given)
             picture, plan = self._rendering.draw(made, settings, left_out, self._rest)
-        if not self._room_light.is_given:  # B4, for the frames to come
+        if not self._room_light.is_given and frame.has_depth:  # B4, for the frames to come
             with stage("light_estimation"):
                 self._lamps.work(self._camera, geometry.scene_radiance, surface, volume)
 
@@ -280,8 +306,12 @@ class Pipeline:
             self._wishes, preset=preset, budget_ms=budget_ms, max_light_error_deg=max_light_error_deg
         )
         control = control_for(self._device, asked)
-        self._sample_at(control.chosen.point if control else Point(preset=preset, rays=self._asked.rays))
-        self._control = control
+        as_asked = (
+            Point.of(self._asked) if preset == self._asked.preset else Point(preset=preset, rays=self._asked.rays)
+        )
+        with self._room.lock:
+            self._sample_at(control.chosen.point if control else as_asked)
+            self._control = control
 
     def _next_point(self, timings: Timings, *, is_held: bool) -> OperatingPoint:
         """What this frame's point was; the next frame's is settled by what this one took, unless little had to be made:
@@ -365,6 +395,10 @@ class Pipeline:
 def _notes(estimate: LightEstimate) -> tuple[str, ...]:
     return ("no usable surface has been seen yet, the light is unknown",) if estimate.std is None else ()
 
+
+NOTHING_TO_LEARN = Omission("the light is given, and nothing else is learnt from the picture", 0.0)
+
+ONLY_LOOKS = Omission("a client without depth adds nothing to the room's light", 0.0)
 
 SURFACE_STAGES = ("locate", "raycast", "merge_depth")
 """Of the geometry, what is not done where nothing has changed."""

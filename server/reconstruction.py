@@ -23,7 +23,8 @@ class Reconstruction:
 
     def __init__(self, engine: Engine, *, is_shared: bool = False) -> None:
         self._engine = engine
-        self._exposure_logarithms = 0.0
+        self.exposure_logarithms = 0.0
+        """Their sum over the frames that were fused."""
         self.is_shared = is_shared
         """Whether several cameras scan it."""
         self.volume: Volume | None = None
@@ -38,6 +39,8 @@ class Reconstruction:
         Raises ValueError, one line, where it says nothing.
         """
         if self.volume is None:
+            if not frame.has_depth:
+                raise ValueError("nobody has scanned this room yet, and this client has no depth to do so")
             seen = wishes.volume_m or bounds_seen(camera, frame, world_from_camera)
             voxel_m = wishes.voxel_m or default_voxel_m(seen)
             bounds = seen if wishes.volume_m else _widened(seen, MARGIN_M if self.is_shared else 0.0)
@@ -46,13 +49,13 @@ class Reconstruction:
 
     def count_exposure(self, exposure: float) -> None:
         """Note the exposure of a frame that was fused, relative to the first's."""
-        self._exposure_logarithms += math.log(exposure)
+        self.exposure_logarithms += math.log(exposure)
 
     @property
     def usual_exposure(self) -> float:
         """Geometric mean over the frames that were fused: under it the volume's colours look as in most pictures."""
         frames = self.volume.frames if self.volume else 0
-        return math.exp(self._exposure_logarithms / frames) if frames else 1.0
+        return math.exp(self.exposure_logarithms / frames) if frames else 1.0
 
 
 def _widened(bounds: Bounds, margin_m: float) -> Bounds:

@@ -11,6 +11,7 @@ from server.alignment import Markers
 from server.light import RoomLight
 from server.opencl.device import Device
 from server.opencl.engine import Engine
+from server.operating_points import Point
 from server.reconstruction import Reconstruction
 from server.room_objects import RoomObjects
 from server.settings import read_wishes
@@ -38,7 +39,8 @@ class Room:
 
     def __init__(self, device: Device, wishes: Wishes, name: str | None = None) -> None:
         """`wishes`: of the client that opens it. `name`: None for the room of one session alone."""
-        settings = read_wishes(wishes)
+        # Where transfer is sampled is for each client to choose, or to have chosen.
+        settings = read_wishes(Point().wishes(wishes) if wishes.preset == "auto" else wishes)
         self.name = name
         self.lock = threading.Lock()
         self.engine = Engine(device)
@@ -50,6 +52,11 @@ class Room:
         self.changes = 0
         """Counts what a client that was here before cannot see in its own pictures: others' frames, objects."""
         self._wishes = wishes
+
+    @property
+    def wishes(self) -> Wishes:
+        """Those of the client that opened it."""
+        return self._wishes
 
     def wishes_of(self, wishes: Wishes) -> Wishes:
         """A client's wishes, with those of the room where these are one for all."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,16 @@ from server.scene.mesh import Mesh
 from server.scene.objects import SceneObjects, check_room
 from server.scene.placement import Placement, check_size
 from server.stages.rasterize import Placed
+
+
+@dataclass(frozen=True)
+class KeptObject:
+    """What an object is made of anew."""
+
+    object_id: str
+    mesh: Mesh
+    place: NDArray[np.float64] | Placement
+    """world_from_model [4, 4]; where it is not known yet what is up, what was asked for."""
 
 
 class RoomObjects:
@@ -37,6 +49,22 @@ class RoomObjects:
         for object_id, mesh, placement in self._waiting:
             self._objects.place(object_id, mesh, placement)
         self._waiting.clear()
+
+    def kept(self) -> list[KeptObject]:
+        """All objects, those that wait too, in the order in which they came."""
+        standing = self._objects.entries() if self._objects else {}
+        return [
+            *(KeptObject(name, entry.mesh, entry.world_from_model) for name, entry in standing.items()),
+            *(KeptObject(name, mesh, placement) for name, mesh, placement in self._waiting),
+        ]
+
+    def put_back(self, kept: KeptObject) -> None:
+        """Make one of the `kept` anew, after `begin` where it stood. Raises ValueError, one line."""
+        if isinstance(kept.place, Placement):
+            self.place(kept.object_id, kept.mesh, kept.place)
+        else:
+            assert self._objects is not None
+            self._objects.put(kept.object_id, kept.mesh, kept.place)
 
     def place(self, object_id: str, mesh: Mesh, placement: Placement) -> None:
         """Put a mesh into the scene, in the place of one with the same id. Raises ValueError."""

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
+import os
+import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable
-from types import TracebackType
+from collections.abc import Callable, Iterator
+from types import FrameType, TracebackType
 from typing import TYPE_CHECKING
 
 import uvicorn
 
 from protocol.limits import MAX_MESSAGE_BYTES
+from protocol.local_keys import LocalKey, key_left
 from server.app import create_app
+from server.door import Door, is_loopback, new_token
+from server.limits import DEFAULT_LIMITS, Limits
 from server.linger import LingeringWebSocket
-from server.service import DEFAULT_MAX_SESSIONS, Service
+from server.service import Service
+from server.tls import Certificate
 
 if TYPE_CHECKING:
     from server.opencl.device import Device
@@ -24,7 +31,11 @@ if TYPE_CHECKING:
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8080
 STOP_PATIENCE_S = 10
+"""From the signal to the end of the process."""
+DRAIN_PATIENCE_S = 7
+"""Of it, for sessions to end and rooms to be saved."""
 EVERYWHERE = ("0.0.0.0", "::", "")
+OPEN_DOOR = Door()
 
 log = logging.getLogger(__name__)
 
@@ -38,24 +49,29 @@ def serve(
     port: int = DEFAULT_PORT,
     device_name: str | None = None,
     *,
-    max_sessions: int = DEFAULT_MAX_SESSIONS,
+    limits: Limits = DEFAULT_LIMITS,
+    door: Door | None = None,
+    certificate: Certificate | None = None,
     say: Callable[[str], None] | None = None,
 ) -> int:
     """Serve until interrupted; the exit status. `say` is given each line for the user (default: standard output).
 
+    `door` None: a new token is asked for. `certificate` None: no TLS.
     A port in use, a missing device or kernels that do not build end in one line on standard error and status 1.
     """
     say = say or _print_line
     try:
         listener = listen(host, port)
         with listener:
-            return serve_on(listener, open_service(device_name, max_sessions=max_sessions), say)
+            return serve_on(
+                listener, open_service(device_name, limits=limits), say, door or Door(new_token()), certificate
+            )
     except ServeError as error:
         sys.stderr.write(f"probeless: {error}\n")
         return 1
 
 
-def open_service(device_name: str | None = None, *, max_sessions: int = DEFAULT_MAX_SESSIONS) -> Service:
+def open_service(device_name: str | None = None, *, limits: Limits = DEFAULT_LIMITS) -> Service:
     """The real service on the device whose name contains `device_name`. Raises ServeError."""
     from server.opencl.device import DeviceError, open_device
 
@@ -63,7 +79,8 @@ def open_service(device_name: str | None = None, *, max_sessions: int = DEFAULT_
         device = open_device(device_name)
     except DeviceError as error:
         raise ServeError(str(error)) from error
-    return Service(device, warm_up=_warm_up, max_sessions=max_sessions)
+    device.volume_bytes = limits.volume_bytes
+    return Service(device, warm_up=_warm_up, limits=limits)
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -80,45 +97,115 @@ def listen(host: str, port: int) -> socket.socket:
         raise ServeError(f"cannot listen on {host} port {port} ({why}): choose another --host or --port") from error
 
 
-def url_of(listener: socket.socket) -> str:
-    """The address a browser on this machine opens."""
+def url_of(listener: socket.socket, certificate: Certificate | None = None, everywhere: str = "localhost") -> str:
+    """The address a browser on this machine opens; of a server on all addresses, with `everywhere` as its host."""
     host, port = listener.getsockname()[:2]
     if host in EVERYWHERE:
-        host = "localhost"
-    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+        host = everywhere
+    scheme = "http" if certificate is None else "https"
+    return f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"
 
 
-def serve_on(listener: socket.socket, service: Service, say: Callable[[str], None]) -> int:
+def serve_on(
+    listener: socket.socket,
+    service: Service,
+    say: Callable[[str], None],
+    door: Door = OPEN_DOOR,
+    certificate: Certificate | None = None,
+) -> int:
     """Serve a service until interrupted; the exit status. Raises ServeError if its warm-up fails."""
-    server = _server(service)
-    url = url_of(listener)
+    server = _server(service, door, certificate)
+    with _key_left(listener, door, certificate) as is_left:
 
-    def on_prepared() -> None:
-        if service.failure is None:
-            say(f"ready: open {url} or run: probeless stream SOURCE --server {url}")
-        else:
-            server.should_exit = True
+        def on_prepared() -> None:
+            if service.failure is None:
+                for line in _ways_in(listener, door, certificate, is_left):
+                    say(line)
+            else:
+                server.should_exit = True
 
-    service.on_prepared = on_prepared
-    say(f"probeless serves at {url} on {service.device_name}; preparing its kernels")
-    try:
-        server.run(sockets=[listener])
-    except KeyboardInterrupt:  # uvicorn raises it again after it has shut down in order
-        say("stopped")
+        service.on_prepared = on_prepared
+        say(f"probeless serves at {url_of(listener, certificate)} on {service.device_name}; preparing its kernels")
+        try:
+            with _ended_like_interrupted():
+                server.run(sockets=[listener])
+        except KeyboardInterrupt:  # uvicorn raises it again after it has shut down in order
+            say("stopped")
     if service.failure is not None:
         raise ServeError(service.failure)
     return 0
 
 
+@contextlib.contextmanager
+def _ended_like_interrupted() -> Iterator[None]:
+    """SIGTERM, which uvicorn too raises again when it has shut down, is KeyboardInterrupt and not the end at once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(_signal: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _ways_in(listener: socket.socket, door: Door, certificate: Certificate | None, is_left: bool) -> list[str]:
+    """What the user opens and runs, here and on other machines."""
+    host, url = listener.getsockname()[0], url_of(listener, certificate)
+    pin = "" if certificate is None else f" --tls-fingerprint {certificate.fingerprint}"
+    everywhere = host in EVERYWHERE
+    own = url if is_left and (everywhere or is_loopback(host)) else f"{url}{door.query}{pin}"
+    lines = [f"ready: open {url}{door.query} or run: probeless stream SOURCE --server {own}"]
+    if everywhere:
+        there = url_of(listener, certificate, socket.gethostname()) + door.query
+        lines.append(f"on other machines: open {there} or run: probeless stream SOURCE --server {there}{pin}")
+    if certificate is not None:
+        lines.append(f"SHA-256 of its certificate: {certificate.fingerprint}")
+    return lines
+
+
+@contextlib.contextmanager
+def _key_left(listener: socket.socket, door: Door, certificate: Certificate | None) -> Iterator[bool]:
+    """While it lasts, programs of this user on this machine find the token; whether they do."""
+    if door.token is None and certificate is None:
+        yield True  # there is nothing to find
+        return
+    fingerprint = None if certificate is None else certificate.fingerprint
+    key = LocalKey(token=door.token, fingerprint=fingerprint, pid=os.getpid())
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(key_left(listener.getsockname()[1], key))
+        except OSError as error:
+            log.warning("programs of this machine must be given the token too, it cannot be kept for them: %s", error)
+            yield False
+        else:
+            yield True
+
+
 class BackgroundServer:
     """A server in a thread of this process; also a context manager that stops it."""
 
-    def __init__(self, service: Service, host: str = DEFAULT_HOST, port: int = 0) -> None:
+    def __init__(
+        self,
+        service: Service,
+        host: str = DEFAULT_HOST,
+        port: int = 0,
+        door: Door = OPEN_DOOR,
+        certificate: Certificate | None = None,
+    ) -> None:
         """Start and wait until it accepts connections. Raises ServeError."""
         self._listener = listen(host, port)
-        self.url = url_of(self._listener)
+        self.url = url_of(self._listener, certificate)
+        self.way_in = f"{self.url}{door.query}"
+        """What a browser opens."""
         self.service = service
-        self._server = _server(service)
+        self._server = _server(service, door, certificate)
+        self._key = _key_left(self._listener, door, certificate)
+        self._key.__enter__()
         self._thread = threading.Thread(target=self._run, name="probeless-server", daemon=True)
         self._thread.start()
         self._server.accepting.wait()
@@ -130,6 +217,7 @@ class BackgroundServer:
             self._server.run(sockets=[self._listener])
         finally:
             self._listener.close()
+            self._key.__exit__(None, None, None)
             self._server.accepting.set()
 
     def stop(self) -> None:
@@ -144,35 +232,50 @@ class BackgroundServer:
         self.stop()
 
 
-def start_in_background(service: Service, host: str = DEFAULT_HOST, port: int = 0) -> BackgroundServer:
+def start_in_background(
+    service: Service,
+    host: str = DEFAULT_HOST,
+    port: int = 0,
+    door: Door = OPEN_DOOR,
+    certificate: Certificate | None = None,
+) -> BackgroundServer:
     """Serve `service` from a thread; `.url` says where (port 0: a free one), `.stop()` ends it. Raises ServeError."""
-    return BackgroundServer(service, host, port)
+    return BackgroundServer(service, host, port, door, certificate)
 
 
 class _Server(uvicorn.Server):
-    """A uvicorn server that says when it accepts connections."""
+    """A uvicorn server that says when it accepts connections, and leaves in order."""
 
-    def __init__(self, config: uvicorn.Config) -> None:
+    def __init__(self, config: uvicorn.Config, service: Service) -> None:
         super().__init__(config)
         self.accepting = threading.Event()
+        self._service = service
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Let the service take its leave while whoever comes is still told, then close."""
+        await self._service.departure.drain(DRAIN_PATIENCE_S)
+        await super().shutdown(sockets)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
         self.accepting.set()
 
 
-def _server(service: Service) -> _Server:
+def _server(service: Service, door: Door, certificate: Certificate | None) -> _Server:
     config = uvicorn.Config(
-        create_app(service),
+        create_app(service, door=door),
+        ssl_certfile=None if certificate is None else certificate.certificate,
+        ssl_keyfile=None if certificate is None else certificate.key,
         log_level="warning",
         access_log=False,
         ws=LingeringWebSocket,
         ws_per_message_deflate=False,  # costs 10 ms a message and gains nothing on compressed pictures
         ws_max_size=MAX_MESSAGE_BYTES,
         ws_max_queue=2,
-        timeout_graceful_shutdown=STOP_PATIENCE_S,
+        log_config=None,
+        timeout_graceful_shutdown=STOP_PATIENCE_S - DRAIN_PATIENCE_S,
     )
-    return _Server(config)
+    return _Server(config, service)
 
 
 def _warm_up(device: Device) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import secrets
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from importlib.metadata import version
 from itertools import count
 from typing import TYPE_CHECKING
@@ -15,25 +17,31 @@ from protocol.codec import encode, one_line
 from protocol.frames import CameraModel
 from protocol.messages import Bye, Hello, Watch, Welcome, Wishes
 from server.broadcast import Broadcast, serve_watcher
-from server.connection import INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
+from server.connection import GONE, INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
+from server.departure import Departure
+from server.events import about
+from server.guests import Guests
+from server.limits import DEFAULT_LIMITS, Limits
 from server.metrics import Metrics
-from server.scene.mesh import Mesh, load_mesh
+from server.parsing.parsers import Parsers
+from server.rooms import RoomFactory, Rooms
+from server.scene.mesh import Mesh
+from server.scheduler import Scheduler
 from server.session import MAX_INFLIGHT, CaptureSession, LoopOutlet
 from server.worker import Workshop
 
 if TYPE_CHECKING:
     from server.opencl.device import Device
     from server.pipeline import Pipeline
+    from server.room import Room
 
-DEFAULT_MAX_SESSIONS = 16
-MAX_WATCHERS = 64
 SERVER_NAME = f"probeless {version('probeless')}"
 NO_SESSION = "waiting"
 """The session in the welcome of a watcher for which there is no capturing session yet."""
 
 log = logging.getLogger(__name__)
 
-PipelineFactory = Callable[["Device", CameraModel, Wishes], "Pipeline"]
+PipelineFactory = Callable[["Device", CameraModel, Wishes, "Room | None", Hello], "Pipeline"]
 MeshLoader = Callable[[bytes, str], Mesh]
 WarmUp = Callable[["Device"], object]
 
@@ -46,41 +54,73 @@ class Service:
         device: Device,
         *,
         pipeline_factory: PipelineFactory | None = None,
-        mesh_loader: MeshLoader = load_mesh,
+        room_factory: RoomFactory | None = None,
+        mesh_loader: MeshLoader | None = None,
+        parsers: Parsers | None = None,
         warm_up: WarmUp | None = None,
-        max_sessions: int = DEFAULT_MAX_SESSIONS,
+        max_sessions: int | None = None,
+        limits: Limits = DEFAULT_LIMITS,
+        at_once: int = 1,
     ) -> None:
-        """`pipeline_factory` (default: the real pipeline) and `mesh_loader` are called in workers' threads.
+        """`pipeline_factory`, `room_factory` (default: the real ones) and `mesh_loader` (default: the parsers') are
+        called in workers' threads. `parsers` read what strangers send, in processes of their own. `at_once`: frames
+        that the device works on side by side.
 
         `warm_up` is called once before the first session, in a thread too; None: there is nothing to wait for.
+        `max_sessions` takes the place of the limits' own.
         """
         self.device_name = device.name
         self.metrics = Metrics()
         self.failure: str | None = None
         """One line, where the warm-up failed: the service will never be ready."""
+        self.failed_check: str | None = None
+        """Its name, where it failed since an answer was wrong."""
+        self.departure = Departure()
         self.on_prepared: Callable[[], None] = lambda: None
         """Called on the event loop when the warm-up has ended, well or not."""
         self._device = device
         self._warm_up = warm_up
-        self._max_sessions = max_sessions
+        self.limits = limits if max_sessions is None else replace(limits, sessions=max_sessions)
+        self.guests = Guests(self.limits)
         self._broadcast = Broadcast()
         self._session_numbers = count(1)
         self._sessions = 0
         self._watchers = 0
         self._prepared = asyncio.Event()
-        self._threads = ThreadPoolExecutor(max_sessions + 1, thread_name_prefix="probeless-session")
-        factory = pipeline_factory or _real_pipeline()
+        self._threads = ThreadPoolExecutor(self.limits.sessions + 1, thread_name_prefix="probeless-session")
+        self._parsers = parsers or Parsers()
+        self._parsers.on_death = self._note_parser_death
+        self.metrics.ready.set_function(lambda: float(self.ready))
+        self.metrics.device_memory.set_function(lambda: float(device.memory.bytes_held))
+        self._kept: dict[str, CaptureSession] = {}
+        """Sessions that outlive their connection, by their keys."""
+        self.departure.on_begin.append(self._give_up_waiting)
+        self._scheduler = Scheduler(at_once)
+        self._factory = pipeline_factory or _real_pipeline()
+        self.rooms = Rooms(room_factory or _real_room(device))
         self._workshop = Workshop(
-            build_pipeline=lambda hello: factory(device, hello.camera, hello.wishes),
-            load_mesh=mesh_loader,
+            opened_pipeline=self._opened_pipeline,
+            scheduler=self._scheduler,
+            wanted_period_s=self.limits.wanted_period_s,
+            load_mesh=mesh_loader or self._parsers.load_mesh,
+            decode_color=self._parsers.decode_color,
             metrics=self.metrics,
         )
         self._preparing: asyncio.Task[None] | None = None
 
+    @contextlib.contextmanager
+    def _opened_pipeline(self, hello: Hello) -> Iterator[Pipeline]:
+        """Worker's thread: a client's pipeline, in its room if it names one."""
+        with contextlib.ExitStack() as stack:
+            room = None if hello.room is None else stack.enter_context(self.rooms.entered(hello.room, hello.wishes))
+            pipeline = self._factory(self._device, hello.camera, hello.wishes, room, hello)
+            stack.callback(pipeline.close)
+            yield pipeline
+
     @property
     def ready(self) -> bool:
-        """The kernels are warm and clients are welcome."""
-        return self._prepared.is_set() and self.failure is None
+        """The kernels are warm, a test frame came out right, and clients are welcome."""
+        return self._prepared.is_set() and self.failure is None and not self.departure.has_begun
 
     @property
     def sessions(self) -> int:
@@ -96,21 +136,36 @@ class Service:
         if self._preparing is not None:
             self._preparing.cancel()
         self._threads.shutdown(wait=False, cancel_futures=True)
+        self._parsers.stop()
 
     async def _prepare(self) -> None:
         if self._warm_up is not None:
             try:
+                self._parsers.start()
                 await asyncio.get_running_loop().run_in_executor(self._threads, self._warm_up, self._device)
             except Exception as error:  # told to whoever asks: `failure`, /healthz, every client
                 log.exception("the warm-up failed")
                 self.failure = one_line(f"the warm-up on {self.device_name} failed: {error}")
+                self.failed_check = getattr(error, "check", None)
+            else:
+                log.info("ready", extra={"device": self.device_name})
         self._prepared.set()
         self.on_prepared()
+
+    def _note_parser_death(self, kind: str) -> None:
+        self.metrics.parser_deaths.labels(kind).inc()
+        log.warning("a parser died", extra={"kind": kind})
+
+    def note_refusal(self, refusal: Refusal) -> None:
+        """Count and log a client that is sent away."""
+        self.metrics.refused.labels(str(refusal.code)).inc()
+        log.info("client refused", extra={"code": refusal.code, "reason": refusal.reason})
 
     async def serve(self, connection: Connection) -> None:
         """One client, from its first message to its end."""
         try:
-            await self._serve_first_message(connection)
+            with self.departure.present(connection):
+                await self._serve_first_message(connection)
         except Refusal as refusal:
             await connection.refuse(refusal)
         except ClientGone:
@@ -121,11 +176,17 @@ class Service:
 
     async def _serve_first_message(self, connection: Connection) -> None:
         try:
-            first = await connection.receive()
+            async with asyncio.timeout(self.limits.first_message_s):
+                first = await connection.receive()
         except BadMessage as bad:
             raise Refusal(POLICY, "the first message must be hello or watch") from bad
+        except TimeoutError as late:
+            raise Refusal(POLICY, f"neither hello nor watch came within {self.limits.first_message_s:g} s") from late
         match first:
+            case Hello(resume=str(key)):
+                await self._resume(connection, key)
             case Hello():
+                self._admit()
                 await self._capture(connection, first)
             case Watch():
                 await self._watch(connection, first)
@@ -135,11 +196,49 @@ class Service:
                 raise Refusal(POLICY, f"the first message must be hello or watch, not {type(first).__name__.lower()}")
 
     async def _capture(self, connection: Connection, hello: Hello) -> None:
-        with self._counted_session() as name:
+        with self.guests.capturing(connection.address), self._counted_session() as name:
             await self._until_ready()
-            outlet = LoopOutlet(name, SERVER_NAME, connection, self._broadcast)
-            log.info("%s: %s captures %dx%d", name, hello.client, hello.camera.width, hello.camera.height)
-            await CaptureSession(connection, hello, self._workshop, outlet).run(self._threads)
+            key = secrets.token_urlsafe(24) if hello.keep_s > 0 else None
+            welcome = Welcome(
+                session=name, server=SERVER_NAME, device="", max_inflight=MAX_INFLIGHT, key=key, room=hello.room
+            )
+            outlet = LoopOutlet(welcome, connection, self._broadcast, is_kept=key is not None)
+            size = f"{hello.camera.width}x{hello.camera.height}"
+            with about(session=name, address=connection.address):
+                log.info("session opened", extra={"client": hello.client, "picture": size})
+                session = CaptureSession(connection, hello, self._workshop, outlet)
+                with self._resumable(key, session):
+                    await session.run(self._threads)
+                log.info("session closed")
+
+    @contextlib.contextmanager
+    def _resumable(self, key: str | None, session: CaptureSession) -> Iterator[None]:
+        if key is not None:
+            self._kept[key] = session
+        try:
+            yield
+        finally:
+            self._kept.pop(key or "", None)
+
+    def _give_up_waiting(self) -> None:
+        for session in tuple(self._kept.values()):
+            session.give_up()
+
+    async def _resume(self, connection: Connection, key: str) -> None:
+        session = self._kept.get(key)
+        if session is None:
+            raise Refusal(GONE, "there is no session of that key: it ended, or the server was started anew")
+        await session.resume(connection)
+
+    def _admit(self) -> None:
+        """Raises Refusal where the device has no time for one more."""
+        period_s, busy = self._scheduler.period_s(newcomers=1), self._scheduler.busy
+        if busy and period_s > self.limits.longest_period_s:
+            raise Refusal(
+                TRY_LATER,
+                f"the server is full: {busy} sessions share its device, and with one more each would get a frame every "
+                f"{period_s:.1f} s, more than {self.limits.longest_period_s:g} s: try again later",
+            )
 
     async def _until_ready(self) -> None:
         await self._prepared.wait()
@@ -148,8 +247,8 @@ class Service:
 
     @contextlib.contextmanager
     def _counted_session(self) -> Iterator[str]:
-        if self._sessions >= self._max_sessions:
-            raise Refusal(TRY_LATER, f"all {self._max_sessions} sessions of this server are taken: try again later")
+        if self._sessions >= self.limits.sessions:
+            raise Refusal(TRY_LATER, f"all {self.limits.sessions} sessions of this server are taken: try again later")
         self._sessions += 1
         self.metrics.sessions.set(self._sessions)
         try:
@@ -160,13 +259,13 @@ class Service:
 
     async def _watch(self, connection: Connection, watch: Watch) -> None:
         waiting = Welcome(session=NO_SESSION, server=SERVER_NAME, device=self.device_name, max_inflight=MAX_INFLIGHT)
-        with self._counted_watcher(), self._broadcast.watcher(watch.session, encode(waiting)) as watcher:
+        with self._counted_watcher(), self._broadcast.watcher(watch.session, encode(waiting), watch.room) as watcher:
             await serve_watcher(connection, watcher)
 
     @contextlib.contextmanager
     def _counted_watcher(self) -> Iterator[None]:
-        if self._watchers >= MAX_WATCHERS:
-            raise Refusal(TRY_LATER, f"{MAX_WATCHERS} clients watch this server already: try again later")
+        if self._watchers >= self.limits.watchers:
+            raise Refusal(TRY_LATER, f"{self.limits.watchers} clients watch this server already: try again later")
         self._watchers += 1
         self.metrics.watchers.set(self._watchers)
         try:
@@ -174,6 +273,15 @@ class Service:
         finally:
             self._watchers -= 1
             self.metrics.watchers.set(self._watchers)
+
+
+def _real_room(device: Device) -> RoomFactory:
+    def open_room(wishes: Wishes, name: str) -> Room:
+        from server.room import Room  # loads OpenCL, as below
+
+        return Room(device, wishes, name)
+
+    return open_room
 
 
 def _real_pipeline() -> PipelineFactory:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from concurrent.futures import CancelledError, Executor, Future
+
+from msgspec import structs
 
 from protocol.codec import encode
 from protocol.messages import Bye, ClientMessage, Dropped, Error, Frame, Hello, Watch, Welcome
@@ -20,60 +23,86 @@ log = logging.getLogger(__name__)
 
 
 class LoopOutlet:
-    """A worker's way out: hands its bytes to the event loop and waits until the socket has taken them."""
+    """A worker's way out: hands its bytes to the event loop and waits until the socket has taken them.
 
-    def __init__(self, session: str, server_name: str, connection: Connection, broadcast: Broadcast) -> None:
-        self._session = session
-        self._server_name = server_name
-        self._connection = connection
+    While the client's connection is lost, what is sent is lost too; the session says what has to be sent again.
+    """
+
+    def __init__(self, welcome: Welcome, connection: Connection, broadcast: Broadcast, *, is_kept: bool) -> None:
+        """`welcome`: but for the device. `is_kept`: a lost connection does not end the session."""
+        self._welcome = welcome
+        self._connection: Connection | None = connection
         self._broadcast = broadcast
+        self._is_kept = is_kept
         self._loop = asyncio.get_running_loop()
         self._sending: Future[None] | None = None
         self._closed = False
 
+    @property
+    def session(self) -> str:
+        """Its name."""
+        return self._welcome.session
+
     def greet(self, device_name: str) -> None:
         """Worker's thread: welcome the client and let others watch it. Raises ClientGone."""
-        welcome = encode(
-            Welcome(session=self._session, server=self._server_name, device=device_name, max_inflight=MAX_INFLIGHT)
-        )
-        self._loop.call_soon_threadsafe(self._open_to_watchers, welcome)
-        self.send(welcome)
+        self._welcome = structs.replace(self._welcome, device=device_name)
+        shown = structs.replace(self._welcome, key=None)  # the key is nobody else's business
+        self._loop.call_soon_threadsafe(self._open_to_watchers, encode(shown))
+        self.send(encode(self._welcome))
 
     def _open_to_watchers(self, welcome: bytes) -> None:
         if not self._closed:
-            self._broadcast.open_session(self._session, welcome)
+            self._broadcast.open_session(self.session, welcome, self._welcome.room)
 
     def send(self, data: bytes) -> None:
-        """Worker's thread: send to the capturing client. Raises ClientGone."""
+        """Worker's thread: send to the capturing client. Raises ClientGone where that ends the session."""
         if self._closed:
             raise ClientGone
-        self._sending = asyncio.run_coroutine_threadsafe(self._connection.send(data), self._loop)
+        connection = self._connection
+        if connection is None:
+            return
+        self._sending = asyncio.run_coroutine_threadsafe(connection.send(data), self._loop)
         try:
             self._sending.result()
-        except CancelledError as error:
-            raise ClientGone from error
+        except (CancelledError, ClientGone) as error:
+            if self._closed or not self._is_kept:
+                raise ClientGone from error
 
     def is_watched(self) -> bool:
         """Worker's thread: whether somebody watches this session."""
-        return self._broadcast.is_watched(self._session)
+        return self._broadcast.is_watched(self.session)
 
     def publish(self, messages: tuple[bytes, ...]) -> None:
         """Worker's thread: give the watchers their copy, without waiting."""
-        self._loop.call_soon_threadsafe(self._broadcast.publish, self._session, messages)
+        self._loop.call_soon_threadsafe(self._broadcast.publish, self.session, messages)
+
+    def detach(self) -> None:
+        """Event loop's thread: the connection is lost, and a worker that is sending is let go."""
+        self._connection = None
+        self._let_go()
+
+    async def attach(self, connection: Connection) -> None:
+        """Event loop's thread: the client is back. Raises ClientGone if it is not."""
+        await connection.send(encode(structs.replace(self._welcome, resumed=True)))
+        self._connection = connection
 
     def close(self) -> None:
         """Event loop's thread: nothing more can be sent, and a worker that is sending is let go."""
         self._closed = True
-        self._broadcast.close_session(self._session)
+        self._broadcast.close_session(self.session)
+        self._let_go()
+
+    def _let_go(self) -> None:
         if self._sending is not None:
             self._sending.cancel()
 
 
 class CaptureSession:
-    """From a client's hello to its end, whoever ends it."""
+    """From a client's hello to its end, whoever ends it; its connection may be lost in between."""
 
     def __init__(self, connection: Connection, hello: Hello, workshop: Workshop, outlet: LoopOutlet) -> None:
         self._connection = connection
+        self._keep_s = hello.keep_s
         self._metrics = workshop.metrics
         self._outlet = outlet
         self._loop = asyncio.get_running_loop()
@@ -81,6 +110,10 @@ class CaptureSession:
         self._told_of_window = False
         self._mailbox = Mailbox(None if hello.wishes.lossless else MAX_INFLIGHT, self._wake_reader)
         self._worker = Worker(workshop, hello, self._mailbox, outlet)
+        self._returned: asyncio.Future[Connection] | None = None
+        """While the connection is lost: the one by which the client comes back."""
+        self._done_with: dict[Connection, asyncio.Event] = {}
+        """Connections that resumed this session, and whether it has no more use for them."""
 
     async def run(self, threads: Executor) -> None:
         """Serve the client until it leaves, must leave, or the worker fails. Returns when the worker has ended."""
@@ -88,6 +121,11 @@ class CaptureSession:
         read = asyncio.create_task(self._read())
         try:
             await asyncio.wait((work, read), return_when=asyncio.FIRST_COMPLETED)
+            while not work.done() and self._is_lost(read):
+                if not await self._wait_for_return(work):
+                    break
+                read = asyncio.create_task(self._read())
+                await asyncio.wait((work, read), return_when=asyncio.FIRST_COMPLETED)
             ended, other = (work, read) if work.done() else (read, work)
             await self._end(ended)
         finally:
@@ -95,7 +133,56 @@ class CaptureSession:
             self._outlet.close()
             read.cancel()
             await asyncio.wait((work, read))
+            for done in self._done_with.values():
+                done.set()
         _report(other)
+
+    async def resume(self, connection: Connection) -> None:
+        """Go on with a client that is back by another connection. Returns when that is not needed any more.
+
+        Where the old connection has not been found lost yet, it is now.
+        """
+        self._done_with[connection] = asyncio.Event()
+        if self._returned is None or self._returned.done():
+            self._connection.is_lost = True
+            await self._connection.close(POLICY, "the client has resumed its session by another connection")
+            while self._returned is None or self._returned.done():
+                await asyncio.sleep(0.01)
+        self._returned.set_result(connection)
+        await self._done_with[connection].wait()
+
+    def give_up(self) -> None:
+        """Wait no more for a client that is away, now or later."""
+        self._keep_s = 0.0
+        if self._returned is not None:
+            self._returned.cancel()
+
+    def _is_lost(self, read: asyncio.Task[None]) -> bool:
+        """Whether the reader has ended by a connection that broke, which this session outlives."""
+        if self._keep_s <= 0 or read.cancelled():
+            return False
+        error = read.exception()
+        return isinstance(error, ClientGone) or (error is None and self._connection.is_lost)
+
+    async def _wait_for_return(self, work: asyncio.Future[None]) -> bool:
+        """Whether the client is back."""
+        log.info("connection lost, session kept", extra={"seconds": self._keep_s})
+        self._outlet.detach()
+        if self._connection in self._done_with:
+            self._done_with[self._connection].set()
+        self._returned = self._loop.create_future()
+        await asyncio.wait((work, self._returned), timeout=self._keep_s, return_when=asyncio.FIRST_COMPLETED)
+        if not self._returned.done() or self._returned.cancelled():
+            log.info("the client has not come back")
+            self._returned.cancel()
+            return False
+        self._connection = self._returned.result()
+        if work.done():
+            return False
+        with contextlib.suppress(ClientGone):  # lost again: the reader says so
+            await self._outlet.attach(self._connection)
+        log.info("session resumed")
+        return True
 
     def _wake_reader(self) -> None:
         self._loop.call_soon_threadsafe(self._room.set)
@@ -115,11 +202,14 @@ class CaptureSession:
 
     async def _read(self) -> None:
         """Post what the client sends until it leaves; stops reading while too much is unread."""
+        connection = self._connection
         while True:
             try:
-                message = await self._connection.receive()
+                message = await connection.receive()
             except BadMessage as bad:
-                await self._connection.send_message(bad.answer)
+                if isinstance(bad.answer, Dropped):
+                    self._metrics.dropped.labels("invalid").inc()
+                await connection.send_message(bad.answer)
                 continue
             if message is None or isinstance(message, Bye):
                 return

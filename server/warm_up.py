@@ -1,4 +1,4 @@
-"""Before the first session: every kernel is compiled, by small frames through the spine."""
+"""Before the first session: every kernel is compiled, by small frames through the spine, and their answers checked."""
 
 from __future__ import annotations
 
@@ -7,37 +7,33 @@ from dataclasses import replace
 import numpy as np
 from msgspec import structs
 
-from protocol.frames import CameraModel, RgbdFrame
+from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
 from server.maths.directional_fit import directional_sh
 from server.opencl.device import Device
 from server.pipeline import Pipeline
-from server.scene.mesh import Mesh
 from server.scene.placement import Placement
+from server.self_check import CAMERA, check_answers, triangle
 
 _LAMP = np.outer(directional_sh(np.array([0.0, -1.0, 0.0]), 0.2, 4), np.ones(3))
 SHARP_LIGHT = tuple((float(r), float(g), float(b)) for r, g, b in _LAMP)
 
 
 def warm_up(device: Device) -> None:
-    """One object under a light that is found, and under a sharp one that is given, in both families of presets."""
+    """One object under a light that is found, and under a sharp one that is given, in both families of presets.
+
+    Raises CheckFailed where the device then computes what is wrong.
+    """
     wishes = Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.02)
     _run(device, wishes)
     _run(device, structs.replace(wishes, preset="art4"))
     _run(device, structs.replace(wishes, preset="gr15fast", light=SHARP_LIGHT))
+    check_answers(device)
 
 
 def _run(device: Device, wishes: Wishes) -> None:
-    camera = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
-    pipeline = Pipeline(device, camera, wishes)
-    triangle = Mesh(
-        vertices=np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], np.float32),
-        triangles=np.array([[0, 1, 2]], np.int32),
-        vertex_colors=np.full((3, 3), 0.5, np.float32),
-        normals=np.tile(np.array([[0, 0, 1]], np.float32), (3, 1)),
-        up_axis="y",
-    )
-    pipeline.place_object("warm-up", triangle, Placement(position_m=(0.0, 0.0, 0.8)))
+    pipeline = Pipeline(device, CAMERA, wishes)
+    pipeline.place_object("warm-up", triangle(), Placement(position_m=(0.0, 0.0, 0.8)))
     frame = RgbdFrame(
         index=0,
         timestamp_s=0.0,

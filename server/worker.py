@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from protocol.codec import ProtocolError, encode, one_line
-from protocol.frames import RgbdFrame
-from protocol.images import decode_color, decode_depth, encode_color
+from protocol.frames import CameraModel, RgbdFrame, Viewpoint
+from protocol.images import Color, decode_color, decode_depth, encode_color
 from protocol.messages import (
     Acknowledged,
+    ColorImage,
     Composite,
     Dropped,
     Frame,
     Hello,
     MoveObject,
     PlaceObject,
+    Plan,
     Quality,
     RemoveObject,
     RequestMesh,
@@ -31,13 +36,19 @@ from server.mailbox import Letter, Mailbox
 from server.mesh_message import mesh_parts
 from server.meshing.files import mesh_files
 from server.metrics import Metrics
+from server.pressure import Pressure
+from server.pressure import Quality as Asked
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
+from server.scheduler import Scheduler
 
 if TYPE_CHECKING:
     from server.pipeline import FrameResult, Pipeline
 
 JPEG_QUALITY = 90
+KEPT_ACKNOWLEDGEMENTS = 256
+KEPT_ANSWERS = 4
+"""More than a client may have unanswered (session.MAX_INFLIGHT)."""
 
 SceneControl = PlaceObject | MoveObject | RemoveObject | Quality
 
@@ -62,9 +73,14 @@ class Outlet(Protocol):
 class Workshop:
     """What every worker of a service shares."""
 
-    build_pipeline: Callable[[Hello], Pipeline]
+    opened_pipeline: Callable[[Hello], AbstractContextManager[Pipeline]]
+    """The pipeline of a client, as long as it is there. Raises ValueError for wishes that cannot be met."""
     load_mesh: Callable[[bytes, str], Mesh]
     metrics: Metrics
+    scheduler: Scheduler
+    wanted_period_s: float = 0.25
+    """Between two frames of sessions that share the device: when it is longer, they sample more cheaply."""
+    decode_color: Callable[[ColorImage, CameraModel], Color] = decode_color
 
 
 class Worker:
@@ -75,6 +91,12 @@ class Worker:
         self._hello = hello
         self._mailbox = mailbox
         self._outlet = outlet
+        self._share = workshop.scheduler.join(hello.room)
+        self._pressure = Pressure(hello.wishes, workshop.wanted_period_s)
+        self._acknowledged: OrderedDict[int, bytes] = OrderedDict()
+        """Requests that were done: a client that lost its connection may send them again."""
+        self._answers: deque[tuple[int, tuple[bytes, bytes]]] = deque(maxlen=KEPT_ANSWERS)
+        """Of lossless sessions: their last frames, by number."""
 
     def run(self) -> None:
         """Build the pipeline, welcome the client, and work until the mailbox closes.
@@ -82,15 +104,16 @@ class Worker:
         Raises Refusal if the client's wishes cannot be met, ClientGone if it left, anything else for a fault of ours.
         """
         try:
-            pipeline = self._workshop.build_pipeline(self._hello)
-        except ValueError as error:
-            raise Refusal(POLICY, str(error)) from error
-        try:
-            self._outlet.greet(pipeline.device_name)
-            while (letter := self._mailbox.take()) is not None:
-                self._handle(pipeline, letter)
+            with contextlib.ExitStack() as stack:
+                try:
+                    pipeline = stack.enter_context(self._workshop.opened_pipeline(self._hello))
+                except ValueError as error:
+                    raise Refusal(POLICY, str(error)) from error
+                self._outlet.greet(pipeline.device_name)
+                while (letter := self._mailbox.take()) is not None:
+                    self._handle(pipeline, letter)
         finally:
-            pipeline.close()
+            self._workshop.scheduler.leave(self._share)
 
     def _handle(self, pipeline: Pipeline, letter: Letter) -> None:
         if isinstance(letter.message, Frame):
@@ -99,20 +122,45 @@ class Worker:
         elif isinstance(letter.message, RequestMesh):
             self._send_mesh(pipeline, letter.message.request)
         else:
-            self._outlet.send(encode(apply_control(pipeline, letter.message, self._workshop.load_mesh)))
+            self._answer_control(pipeline, letter.message)
+
+    def _answer_control(self, pipeline: Pipeline, message: SceneControl) -> None:
+        """Do it once, however often it is sent."""
+        done = self._acknowledged.get(message.request)
+        if done is None:
+            acknowledged = apply_control(pipeline, message, self._workshop.load_mesh)
+            if isinstance(message, Quality) and acknowledged.error is None:
+                self._pressure.ask(Asked(message.preset, message.budget_ms, message.max_light_error_deg))
+            done = self._acknowledged[message.request] = encode(acknowledged)
+            if len(self._acknowledged) > KEPT_ACKNOWLEDGEMENTS:
+                self._acknowledged.popitem(last=False)
+        self._outlet.send(done)
 
     def _answer_frame(self, pipeline: Pipeline, frame: Frame) -> None:
+        known = next((answer for number, answer in self._answers if number == frame.frame), None)
+        if known is not None:
+            return self._send_answer(known)
         try:
             rgbd = self._decode(frame)
         except ProtocolError as error:
             return self._drop(frame, "unreadable", error)
         try:
-            result = pipeline.process(rgbd)
+            with self._workshop.scheduler.turn(self._share) as waited_s:
+                result = pipeline.process(rgbd)
+                self._follow_pressure(pipeline)
         except ValueError as error:
             return self._drop(frame, "refused", error)
+        self._workshop.metrics.turn_ms.observe(waited_s * 1e3)
         self._workshop.metrics.observe_stages(result.timings)
         self._workshop.metrics.processed.inc()
         return self._deliver(frame, result)
+
+    def _follow_pressure(self, pipeline: Pipeline) -> None:
+        """Sample more cheaply where too many share the device, and as asked for again when they are fewer."""
+        scheduler, pressure = self._workshop.scheduler, self._pressure
+        if pressure.observe(scheduler.busy, scheduler.period_s):
+            with contextlib.suppress(ValueError):  # what cannot be chosen on this device is not: it stays as it is
+                pipeline.set_quality(*pressure.quality)
 
     def _send_mesh(self, pipeline: Pipeline, request: int) -> None:
         try:
@@ -123,17 +171,22 @@ class Worker:
             self._outlet.send(encode(part))
         return self._outlet.send(encode(Acknowledged(request=request)))
 
-    def _decode(self, frame: Frame) -> RgbdFrame:
+    def _decode(self, frame: Frame) -> RgbdFrame | Viewpoint:
         start_s = time.perf_counter()
-        camera = self._hello.camera
-        pose = frame.world_from_camera
+        camera, lens = self._hello.camera, self._hello.camera.depth_lens
+        pose = None if frame.world_from_camera is None else np.array(frame.world_from_camera, np.float64).reshape(4, 4)
+        if frame.color is None:
+            assert pose is not None  # of a frame that decodes
+            return Viewpoint(frame.frame, frame.timestamp_s, pose)
+        no_depth = np.zeros((lens.height, lens.width), np.uint16)
         rgbd = RgbdFrame(
             index=frame.frame,
             timestamp_s=frame.timestamp_s,
-            color=decode_color(frame.color, camera),
-            depth=decode_depth(frame.depth, camera),
-            world_from_camera=None if pose is None else np.array(pose, np.float64).reshape(4, 4),
+            color=self._workshop.decode_color(frame.color, camera),
+            depth=no_depth if frame.depth is None else decode_depth(frame.depth, camera),
+            world_from_camera=pose,
             exposure=frame.exposure,
+            has_depth=frame.depth is not None,
         )
         self._workshop.metrics.decode_ms.observe((time.perf_counter() - start_s) * 1e3)
         return rgbd
@@ -147,12 +200,27 @@ class Worker:
         lossless = self._hello.wishes.lossless
         light = encode(result.light)
         composite = self._encode(frame, result, lossless)
-        self._outlet.send(light)
-        self._mailbox.note_answered()
-        self._outlet.send(composite)
+        if lossless:
+            self._answers.append((frame.frame, (light, composite)))
+        self._send_answer((light, composite))
         if self._outlet.is_watched():
             shown = self._encode(frame, result, False) if lossless else composite
             self._outlet.publish((light, shown))
+
+    def _send_answer(self, answer: tuple[bytes, bytes]) -> None:
+        light, composite = answer
+        self._outlet.send(light)
+        self._mailbox.note_answered()
+        self._outlet.send(composite)
+
+    def _plan(self, plan: Plan) -> Plan:
+        """What a frame ran, and why it was sampled so."""
+        if self._pressure.steps == 0 or plan.point is None:
+            return plan
+        reason = (
+            f"{self._workshop.scheduler.busy} sessions share the device: {self._pressure.steps} below what was asked"
+        )
+        return structs.replace(plan, point=structs.replace(plan.point, reason=reason))
 
     def _encode(self, frame: Frame, result: FrameResult, lossless: bool) -> bytes:
         start_s = time.perf_counter()
@@ -164,7 +232,7 @@ class Worker:
                 world_from_camera=_row_major(result.world_from_camera),
                 tracking=result.tracking,
                 timings=result.timings,
-                plan=result.plan,
+                plan=self._plan(result.plan),
                 notes=result.notes,
             )
         )

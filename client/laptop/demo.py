@@ -15,6 +15,7 @@ from client.laptop.vase import vase_glb
 from client.laptop.volume import default_volume, default_voxel
 from client.progress import say
 from protocol.messages import Wishes
+from server.door import Door, new_token
 from server.serve import open_service, start_in_background
 
 SOURCE = "synthetic:table?light=7&frames="
@@ -37,15 +38,16 @@ def run_demo(out: Path, device_name: str | None, keep: bool, port: int = 0) -> N
 
     Raises ServeError, ClientError or UserError, each with one line.
     """
-    with _prepared(FRAMES) as demo, start_in_background(open_service(device_name), port=port) as server:
-        say(f"watch it at {server.url}")
-        done = _stream(demo, server.url, out)
+    service, door = open_service(device_name), Door(new_token())
+    with _prepared(FRAMES) as demo, start_in_background(service, port=port, door=door) as server:
+        say(f"watch it at {server.way_in}")
+        done = _stream(demo, server.way_in, out)
         say(f"{done.answered} frames in {done.seconds:.1f} s, pictures in {out / 'frames'}")
         if keep:
-            say(f"still streaming to {server.url}; end with Ctrl-C")
+            say(f"still streaming to {server.way_in}; end with Ctrl-C")
             with _prepared(FRAMES_TO_WATCH) as endless:
                 while True:
-                    _stream(endless, server.url, None)
+                    _stream(endless, server.way_in, None)
 
 
 def _stream(demo: Demo, url: str, out: Path | None) -> StreamSummary:

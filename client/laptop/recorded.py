@@ -45,6 +45,8 @@ class RecordedSource:
         where = f"{self.path}: frame {index}"
         try:
             message = _read(self.path, *self.places[index])
+            if message.color is None or message.depth is None:
+                raise ProtocolError("the frame has no colour or no depth: it can only be sent to a room")
             color = decode_color(message.color, self.camera)
             depth = decode_depth(message.depth, self.camera)
         except (ProtocolError, OSError) as error:

@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from client.client import Answer, ClientError, StreamClient
+from client.client import Access, Answer, ClientError, RoomPlace, StreamClient
 from client.laptop.errors import OutputError, SourceError
 from client.laptop.objects import ObjectFile, pack_mesh
 from client.laptop.output import FrameOutput, OutputWriter
@@ -54,6 +54,8 @@ def stream(
     *,
     frames: range | None = None,
     mesh: bool = False,
+    room: RoomPlace | None = None,
+    access: Access | None = None,
     console: Console | None = None,
 ) -> StreamSummary:
     """Send `frames` of the source (default: all) to the server and write its answers into `out`, where one is given.
@@ -61,11 +63,13 @@ def stream(
     `realtime` keeps the source's frame rate and skips frames while the server is busy; without it every frame is sent
     as soon as there is room. `lossless` sends raw colour and waits for each answer, so that every frame is answered
     with the very pixels of the server's picture. `mesh` asks for the scene's mesh after the last answer and writes it
-    into `out`. `record` gets every message sent and received.
+    into `out`. `record` gets every message sent and received. `room`: to share with others. `access`: what lets the
+    client in, if not the URL.
     Raises ClientError, UserError, each with one clear line. Progress goes to `console` (default: standard error).
     """
     wishes = msgspec.structs.replace(wishes or Wishes(), lossless=lossless)
-    job = _Job(source, frames or range(len(source)), server_url, objects, wishes, realtime and not lossless, mesh)
+    others = (realtime and not lossless, mesh, room, access)
+    job = _Job(source, frames or range(len(source)), server_url, objects, wishes, *others)
     console = console or Console(stderr=True)
     with _recorder(record) as tap, contextlib.ExitStack() as stack:
         writer = stack.enter_context(OutputWriter(out)) if out is not None else None
@@ -84,6 +88,8 @@ class _Job:
     wishes: Wishes
     realtime: bool
     mesh: bool
+    room: RoomPlace | None
+    access: Access | None
 
 
 class _Stream:
@@ -99,9 +105,10 @@ class _Stream:
 
     async def run(self, tap: Callable[[ClientMessage | ServerMessage], None] | None) -> StreamSummary:
         meshes = [pack_mesh(item.path) for item in self._job.objects]  # a bad file is told before anything is sent
-        client = await StreamClient.connect(self._job.server_url, tap)
+        client = await StreamClient.connect(self._job.server_url, tap, self._job.access)
         try:
-            self._note_welcome(await client.hello(self._job.source.camera, self._job.wishes, "probeless stream"))
+            job = self._job
+            self._note_welcome(await client.hello(job.source.camera, job.wishes, "probeless stream", job.room))
             await self._place_objects(client, meshes)
             await self._exchange(client)
         finally:
@@ -114,7 +121,7 @@ class _Stream:
 
     async def _place_objects(self, client: StreamClient, meshes: list[tuple[str, bytes]]) -> None:
         for number, (item, (format_, data)) in enumerate(zip(self._job.objects, meshes, strict=True)):
-            name = f"object-{number}"
+            name = f"object-{number}" if self._job.room is None else f"{self._summary.session}-object-{number}"
             done = await client.place_object(name, format_, data, item.position_m, item.scale, item.yaw_deg)
             if done.error is not None:
                 raise ClientError(f"{item.path}: {done.error}")

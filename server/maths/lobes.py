@@ -8,7 +8,7 @@ pictures: a narrower one must leave clearly less.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
@@ -85,6 +85,15 @@ class CellEquations:
     """[CELLS] sum w m y."""
     energy: float
     """Sum w y^2."""
+    projected: dict[float, Floats] = field(default_factory=dict, repr=False, compare=False)
+    """`under` so far; equations of one matrix may share it."""
+
+    def under(self, width_deg: float) -> Floats:
+        """[lobes, lobes] `matrix` of the amounts of one family. Multiplied as float32, as what is summed was."""
+        if width_deg not in self.projected:
+            lobes = lobe_family(width_deg).astype(np.float32)
+            self.projected[width_deg] = (lobes.T @ (self.matrix.astype(np.float32) @ lobes)).astype(np.float64)
+        return self.projected[width_deg]
 
     def misfit(self, cells: Floats) -> float:
         """What radiances [CELLS] leave of the energy."""
@@ -92,13 +101,23 @@ class CellEquations:
         return max(float(left), 1e-12 * self.energy)
 
 
-def fit_lobes(equations: CellEquations) -> LobeFit:
-    """The simplest light that explains the sums: see the module."""
-    chosen = fit_width(equations, WIDTHS_DEG[0])
+def fit_lobes(equations: CellEquations, lit: dict[float, Bools] | None = None) -> LobeFit:
+    """The simplest light that explains the sums: see the module.
+
+    lit: of each width a guess of which lobes [lobes] are lit, as of a similar light; renewed. It only saves time.
+    """
+    lit = {} if lit is None else lit
+
+    def fitted(width: float) -> LobeFit:
+        fit = fit_width(equations, width, guess=lit.get(width))
+        lit[width] = fit.amounts > 0
+        return fit
+
+    chosen = fitted(WIDTHS_DEG[0])
     allowed = 1.0
     for width in WIDTHS_DEG[1:]:
         allowed *= LEAST_GAIN
-        narrower = fit_width(equations, width)
+        narrower = fitted(width)
         if narrower.misfit < allowed * chosen.misfit:
             chosen, allowed = narrower, 1.0
     return chosen
@@ -116,7 +135,7 @@ def fit_width(
     guess: which lobes [lobes] may be lit. It saves time and changes nothing.
     """
     lobes = lobe_family(width_deg)
-    matrix = lobes.T @ equations.matrix @ lobes
+    matrix = equations.under(width_deg)
     count = len(matrix)
     ridge = RIDGE * max(float(np.trace(matrix)) / count, 1e-300)
     vector = lobes.T @ equations.vector
@@ -136,7 +155,7 @@ def spread_of(equations: CellEquations, fit: LobeFit, noise: float) -> Floats:
     """
     lobes = lobe_family(fit.width_deg)
     prior = noise / max(float((fit.amounts**2).mean()), 1e-300)
-    information = lobes.T @ equations.matrix @ lobes + prior * np.eye(lobes.shape[1])
+    information = equations.under(fit.width_deg) + prior * np.eye(lobes.shape[1])
     known, ways = np.linalg.eigh(information)
     known = np.maximum(known, _LEAST_KNOWN * known.max())  # sums of float32 may say less than nothing of some
     return np.asarray(lobes @ (ways * np.sqrt(noise / known)))

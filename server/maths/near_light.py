@@ -32,8 +32,10 @@ from server.maths.robust_squares import (
 from server.maths.sh import LUMINANCE
 
 Result = TypeVar("Result")
-Steps = Generator[None, None, Result]
-"""Work in steps of some tens of milliseconds, between which other work may be done."""
+Steps = Generator[int, None, Result]
+"""Work in pieces, between which other work may be done; each yield says what the next takes: STEP, LONG_STEP."""
+STEP, LONG_STEP = 1, 4
+"""About five milliseconds of processor time, and twenty."""
 
 LEAST_MISFIT = 0.02
 """Median error of the light from outside, in proportion, below which it explains all there is."""
@@ -44,7 +46,7 @@ LEAST_GAIN = 0.6
 LEAST_SHARE = 0.03
 """Of all light that the samples receive: what is less is not told from errors."""
 MOST_EMITTERS = 2
-_AT_ONCE = 512  # candidates a step
+_AT_ONCE = 256  # candidates a step
 _STARTS = 3
 _COARSE = 2  # steps by whose end the best start is known
 _APART_M = 0.4
@@ -103,14 +105,14 @@ def find_emitters(
     nothing = search.result([], [])
     if search.places() < LEAST_PLACES or nothing.misfit < least_misfit:
         return nothing
-    yield
+    yield STEP
     found: list[Floats] = []
     strengths: list[float] = []
     while len(found) < most:
         columns = search.columns(found)
         position = yield from search.best_place(columns, candidates)
         gain = search.gain(columns, position) if position is not None else 0.0
-        yield
+        yield STEP
         if position is None or gain < LEAST_GAIN:
             break
         found.append(position)
@@ -149,7 +151,7 @@ class _Search:
         base = fit(columns, self.values, start=self.base)
         strengths = np.zeros(len(candidates))
         for first in range(0, len(candidates), _AT_ONCE):
-            yield
+            yield LONG_STEP
             some = slice(first, first + _AT_ONCE)
             seen = self._seen(candidates[some])
             enough = (seen > 0).mean(axis=1) > _LEAST_SEEN
@@ -157,6 +159,7 @@ class _Search:
         scale = base.predicted + float(base.predicted.mean()) + 1e-12
         best, place = np.inf, None
         for start in _starts(candidates, strengths):
+            yield LONG_STEP
             tried = yield from self._moved(columns, candidates[start], _STEPS_M[:_COARSE], base)
             found = fit(self._and(columns, tried), self.values, None, self._blocks, base)
             error = float(np.sum(np.abs(self.values - found.predicted) / scale))
@@ -171,7 +174,7 @@ class _Search:
         position = yield from self._moved(columns, start, steps_m, self.base)
         for _ in range(_POLISH):
             position = position + self._newton_step(columns, position)
-            yield
+            yield STEP
         return position
 
     def _moved(self, columns: Floats, start: Floats, steps_m: tuple[float, ...], base: Fit) -> Steps[Floats]:
@@ -187,7 +190,7 @@ class _Search:
                 around = position + step * _STENCIL
                 seen = centered(self._seen(around).T, whole.weights, self._blocks).T
                 moved = int(gains(both[:, :count], both[:, count], without, seen).argmax())
-                yield
+                yield STEP
                 if moved == _MIDDLE:
                     break
                 position = around[moved]

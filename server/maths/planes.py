@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 CELL_M = 0.05
 """Side of a cell of a plane's map."""
@@ -17,7 +18,6 @@ STEPS_M = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0)
 """How far a plane may go on beyond each of its four sides."""
 _GRID_M = 0.05  # all of them are multiples
 _ROUNDING = np.float32(1e-4)
-_BLOCK = 48  # origins whose rays stay in the processor's cache
 _STEP_OF = np.searchsorted(np.array(STEPS_M) + 1e-6, _GRID_M * np.arange(round(STEPS_M[-1] / _GRID_M) + 2)).astype(
     np.uint8
 )
@@ -84,40 +84,42 @@ class PlanePatch:
         at = self.coordinates(points)
         self.seen = np.stack([np.minimum(self.seen[0], at.min(axis=0)), np.maximum(self.seen[1], at.max(axis=0))])
 
-    def steps_needed(self, origins: Floats, directions: Floats, least_m: float) -> NDArray[np.uint8]:
-        """[SIDES, n, m] the least index into STEPS_M by which each side must go on for rays from `origins` [n, 3] along
-        `directions` [m, 3] to meet the plane, farther than `least_m`; len(STEPS_M) where that is not enough, where they
-        miss it, or where a camera looked through. To float32."""
+    def steps_needed(
+        self, origins: Floats, directions: Floats, of_origins: Indices, of_directions: Indices, least_m: float
+    ) -> NDArray[np.uint8]:
+        """[SIDES, k] the least index into STEPS_M by which each side must go on for rays to meet the plane, farther off
+        than `least_m`; len(STEPS_M) where that is not enough, they miss it, or a camera looked through.
+
+        Rays: from those of `origins` [n, 3] along those of `directions` [m, 3] that `of_origins`, `of_directions` [k]
+        name. To float32.
+        """
         sinking = directions @ self.normal
         steep = np.abs(sinking) >= 1e-5
         per_metre = np.where(steep, 1 / np.where(steep, sinking, 1.0), 0.0).astype(np.float32)
         heights = (self.offset_m - origins @ self.normal).astype(np.float32)
-        starts = [(origins @ a - c).astype(np.float32) for a, c in zip(self._axes, self.corner, strict=True)]
-        slopes = [(directions @ axis).astype(np.float32) for axis in self._axes]
+        t = heights[of_origins] * per_metre[of_directions]
+        ahead = np.flatnonzero(t >= np.float32(least_m))
+        t, starts, slopes = t[ahead], of_origins[ahead], of_directions[ahead]
+        x, y = (
+            (origins @ axis - corner).astype(np.float32)[starts] + t * (directions @ axis).astype(np.float32)[slopes]
+            for axis, corner in zip((self.across, self.along), self.corner, strict=True)
+        )
         (low_x, low_y), (high_x, high_y) = self.seen.astype(np.float32)
-        needed = np.empty((SIDES, len(origins), len(directions)), np.uint8)
-        for first in range(0, len(origins), _BLOCK):
-            block = slice(first, first + _BLOCK)
-            t = heights[block, None] * per_metre
-            x, y = (start[block, None] + t * slope for start, slope in zip(starts, slopes, strict=True))
-            misses = (t < least_m) | self._is_empty_at(x, y)
-            for side, over in enumerate((low_x - x, x - high_x, low_y - y, y - high_y)):
-                steps = np.ceil(over * np.float32(1 / _GRID_M) - _ROUNDING)
-                found = _STEP_OF[np.clip(steps, 0, len(_STEP_OF) - 1).astype(np.uint8)]
-                found[misses] = len(STEPS_M)
-                needed[side, block] = found
+        never = np.uint8(len(STEPS_M))
+        least = never * self._is_empty_at(x, y).view(np.uint8)
+        needed = np.full((SIDES, len(of_origins)), never)
+        for side, over in enumerate((low_x - x, x - high_x, low_y - y, y - high_y)):
+            steps = np.ceil(over * np.float32(1 / _GRID_M) - _ROUNDING)
+            found = _STEP_OF.take(np.clip(steps, 0, len(_STEP_OF) - 1).astype(np.uint8))
+            needed[side, ahead] = np.maximum(found, least)
         return needed
-
-    @property
-    def _axes(self) -> tuple[Floats, Floats]:
-        return self.across, self.along
 
     def _is_empty_at(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Of coordinates relative to `corner`; beyond the map, its nearest cell."""
         rows, cols = self.empty.shape
         col = np.clip(x * np.float32(1 / CELL_M), 0, cols - 1).astype(np.int32)
         row = np.clip(y * np.float32(1 / CELL_M), 0, rows - 1).astype(np.int32)
-        return np.asarray(self.empty.ravel()[row * np.int32(cols) + col])
+        return np.asarray(self.empty.ravel().take(row * np.int32(cols) + col))
 
 
 def find_planes(points: Floats, normals: Floats, known: list[PlanePatch]) -> list[PlanePatch]:

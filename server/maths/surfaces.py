@@ -31,7 +31,7 @@ MOST_MATERIALS = 3
 _LEAST_SHARE = 0.005  # of all weight, for a colour of its own
 _ALIKE = 20.0  # pools that say what one says: neighbours err alike
 _BINS = 96
-_EM_STEPS = 20
+_EM_STEPS, _SETTLED = 20, 1e-4
 _DARKEST = 1e-4
 
 
@@ -57,6 +57,15 @@ class Surfaces:
 
     def __init__(self) -> None:
         self._colors = np.empty((0, 2))
+
+    @property
+    def colors(self) -> Floats:
+        """[n, 2] their middles: logarithms of red and blue over green."""
+        return self._colors
+
+    @colors.setter
+    def colors(self, colors: Floats) -> None:
+        self._colors = colors
 
     def albedos(
         self, seen: Floats, shading: Floats, weights: Floats, *, materials: bool = True, one_color: bool = False
@@ -90,13 +99,13 @@ class Surfaces:
         """[n] cluster of each of `colors` [n, 2]; renews the centres."""
         centers = self._colors if len(self._colors) else np.average(colors, axis=0, weights=weights)[None]
         for _ in range(3):
-            centers = _with_far_ones(colors, weights, centers)
-            member = _nearest(colors, centers)
+            centers, apart = _with_far_ones(colors, weights, centers)
+            member = apart.argmin(axis=0)
             sums = np.bincount(member, weights, len(centers))
             moved = np.stack([np.bincount(member, weights * c, len(centers)) for c in colors.T], axis=1)
             centers = np.where(sums[:, None] > 0, moved / np.maximum(sums, 1e-300)[:, None], centers)
         self._colors = centers
-        return _nearest(colors, centers)
+        return np.asarray(_apart(colors, centers).argmin(axis=0))
 
 
 def light_of_surfaces(color: Floats, tint: Floats, member: Indices) -> Floats:
@@ -112,23 +121,25 @@ def light_of_surfaces(color: Floats, tint: Floats, member: Indices) -> Floats:
     return np.asarray(tint / tint[1] / np.exp(share * shown.mean(axis=0)))
 
 
-def _nearest(colors: Floats, centers: Floats) -> Indices:
-    return np.asarray(((colors[:, None] - centers) ** 2).sum(axis=2).argmin(axis=1))
+def _apart(colors: Floats, centers: Floats) -> Floats:
+    """[k, n] squared distances of `colors` [n, 2] from `centers` [k, 2]."""
+    x, y = colors.T
+    return np.stack([(x - u) ** 2 + (y - v) ** 2 for u, v in centers])
 
 
-def _with_far_ones(colors: Floats, weights: Floats, centers: Floats) -> Floats:
-    """`centers` and, where enough colours are far from all of them, the densest of those in turn."""
-    least = _LEAST_SHARE * weights.sum()
+def _with_far_ones(colors: Floats, weights: Floats, centers: Floats) -> tuple[Floats, Floats]:
+    """`centers` and, where enough colours are far from all of them, the densest of those in turn; `_apart` of all."""
+    least, apart = _LEAST_SHARE * weights.sum(), _apart(colors, centers)
     while True:
-        far = ((colors[:, None] - centers) ** 2).sum(axis=2).min(axis=1) > COLOR_RADIUS**2
+        far = apart.min(axis=0) > COLOR_RADIUS**2
         if weights[far].sum() < least:
-            return centers
+            return centers, apart
         some = np.flatnonzero(far)[:: max(1, int(far.sum()) // 64)]
-        near = ((colors[some][:, None] - colors[far]) ** 2).sum(axis=2) < COLOR_RADIUS**2
-        mass = near @ weights[far]
+        mass = (_apart(colors[far], colors[some]) < COLOR_RADIUS**2) @ weights[far]
         if mass.max() < least:
-            return centers
-        centers = np.vstack([centers, colors[some[int(mass.argmax())]]])
+            return centers, apart
+        densest = colors[some[int(mass.argmax())]][None]
+        centers, apart = np.vstack([centers, densest]), np.vstack([apart, _apart(colors, densest)])
 
 
 def lightness_levels(values: Floats, weights: Floats, most: int) -> Floats:
@@ -145,8 +156,8 @@ def levels_of_each(groups: Sequence[tuple[Floats, Floats]], most: int) -> list[F
     at, mass = (np.stack(arrays) for arrays in zip(*(_histogram(*groups[i]) for i in several), strict=True))
     independent = np.array([max(len(groups[i][0]) / _ALIKE, 2.0) for i in several])
     best_score = np.full(len(several), -np.inf)
-    for k in range(1, most + 1):
-        means, likelihood = _mixtures(at, mass, k)
+    fits = _mixtures(at, mass, most)
+    for k, (means, likelihood) in enumerate(fits, 1):
         scores = independent * likelihood - k * np.log(independent)
         for row, i in enumerate(several):
             if k > 1 and np.diff(np.sort(means[row])).min() < LEAST_GAP:
@@ -162,22 +173,38 @@ def _histogram(values: Floats, weights: Floats) -> tuple[Floats, Floats]:
     return 0.5 * (edges[1:] + edges[:-1]), counts / counts.sum()
 
 
-def _mixtures(at: Floats, mass: Floats, k: int) -> tuple[Floats, Floats]:
-    """Means [g, k] of `k` normal distributions of one spread, by EM, of each group [g, bins], and the mean log
-    likelihoods [g]."""
-    places = (np.arange(k) + 0.5) / k
-    means = np.stack([np.interp(places, np.cumsum(m), a) for a, m in zip(at, mass, strict=True)])
+def _mixtures(at: Floats, mass: Floats, most: int) -> list[tuple[Floats, Floats]]:
+    """Of 1 to `most` normal distributions of one spread, by EM: their means [g, k] in each group [g, bins], and the
+    mean log likelihoods [g]. All at once: the numbers are few, the operations are what takes time."""
+    groups, bins = at.shape
     middle = (mass * at).sum(axis=1)
-    spread = np.maximum(np.sqrt((mass * (at - middle[:, None]) ** 2).sum(axis=1)) / k, LEAST_SPREAD)
-    shares = np.full((len(at), k), 1 / k)
+    spread = np.sqrt((mass * (at - middle[:, None]) ** 2).sum(axis=1))
+    counts = np.arange(1, most + 1)
+    there = np.arange(most) < counts[:, None]  # [fits, k]
+    places = (np.arange(most) + 0.5) / counts[:, None]
+    means = np.stack([np.interp(places, np.cumsum(m), a) for a, m in zip(at, mass, strict=True)], axis=1)
+    at, mass = (np.broadcast_to(a, (most, groups, bins)).reshape(-1, bins) for a in (at, mass))
+    means = means.reshape(-1, most)
+    shares = np.repeat(there / counts[:, None], groups, axis=0)
+    there = np.repeat(there, groups, axis=0)
+    spread = np.maximum(spread / counts[:, None], LEAST_SPREAD).ravel()
+    powers = np.stack([np.ones_like(at), at, at * at], axis=2)
     density = np.empty(at.shape)
     for _ in range(_EM_STEPS):
-        off = at[..., None] - means[:, None]
-        parts = shares[:, None] * np.exp(-0.5 * (off / spread[:, None, None]) ** 2) / spread[:, None, None]
-        density = parts.sum(axis=2) + 1e-300
-        parts *= (mass / density)[..., None]
-        shares = parts.sum(axis=1) + 1e-12
-        means = (parts * at[..., None]).sum(axis=1) / shares
-        variance = (parts * (at[..., None] - means[:, None]) ** 2).sum(axis=(1, 2))
-        spread = np.maximum(np.sqrt(variance), LEAST_SPREAD)
-    return means, (mass * np.log(density)).sum(axis=1)
+        off = (at[:, None] - means[..., None]) / spread[:, None, None]
+        parts = np.exp(-0.5 * off * off)
+        parts *= (shares / spread[:, None])[..., None]
+        density = parts.sum(axis=1) + 1e-300
+        parts *= (mass / density)[:, None]
+        moments = parts @ powers
+        shares = np.where(there, moments[..., 0] + 1e-12, 0.0)
+        moved = moments[..., 1] / np.maximum(shares, 1e-12)
+        variance = (moments[..., 2] - moved * (2 * moments[..., 1] - moved * moments[..., 0])).sum(axis=1)
+        narrowed = np.maximum(np.sqrt(np.maximum(variance, 0.0)), LEAST_SPREAD)
+        settled = max(float(np.abs(moved - means)[there].max()), float(np.abs(narrowed - spread).max())) < _SETTLED
+        means, spread = moved, narrowed
+        if settled:
+            break
+    likelihood = (mass * np.log(density)).sum(axis=1).reshape(most, groups)
+    by_fit = means.reshape(most, groups, most)
+    return [(by_fit[k, :, : k + 1], likelihood[k]) for k in range(most)]

@@ -50,7 +50,7 @@ class Workspace:
     @property
     def bytes_held(self) -> int:
         """Device memory of all arrays."""
-        return sum(array.nbytes for array in self._arrays.values())
+        return sum(array.nbytes for array in tuple(self._arrays.values()))  # asked for by other threads too
 
     def release(self) -> None:
         """Give all device memory back."""

@@ -7,10 +7,12 @@ from threading import Lock
 
 import pyopencl as cl
 
+from server.opencl.device_memory import DeviceMemory
 from server.opencl.pocl_cpu import name_unknown_cpu
 from server.opencl.program import KernelBuildError, ProgramCache
 
 _INSTALL = "install a vendor driver, or PoCL for the processor: pip install 'pyopencl[pocl]'"
+VOLUME_BYTES = 512 << 20
 _named: set[int] = set()
 _naming = Lock()
 
@@ -41,6 +43,9 @@ class Device:
         self.is_gpu = bool(cl_device.type & cl.device_type.GPU)
         self.context = cl.Context([cl_device])
         self.programs = ProgramCache(self.context)
+        self.memory = DeviceMemory()
+        self.volume_bytes = VOLUME_BYTES
+        """Of its memory, what one volume may take; beyond, parts of it go to the host."""
 
 
 def _all_devices() -> list[cl.Device]:

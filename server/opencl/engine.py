@@ -27,6 +27,7 @@ class Engine:
         self.device = device
         self.queue: cl.CommandQueue = beside.queue if beside else _make_queue(device)
         self.workspace = Workspace(self.queue)
+        device.memory.add(self.workspace)
         self.profile: Profile = beside.profile if beside else Profile()
         self._kernels: dict[tuple[object, ...], cl.Kernel] = beside._kernels if beside else {}
         self._typed: dict[int, cl.Kernel] = beside._typed if beside else {}

@@ -28,6 +28,9 @@ class Profile:
         outer, self.row = self.row, row
         try:
             yield
+        except Exception as error:
+            error.add_note(f"in stage {row}")
+            raise
         finally:
             self.row = outer
 

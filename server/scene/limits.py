@@ -14,6 +14,8 @@ MAX_KEPT_PIXELS = 8192 * 8192
 
 MAX_SCENE_TRIANGLES = 8_000_000
 """Of all objects of a session together, each as often as it is placed."""
+MAX_SCENE_TEXTURE_PIXELS = 4 * MAX_KEPT_PIXELS
+"""Likewise."""
 MAX_OBJECTS = 4096
 
 

@@ -13,7 +13,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from server.opencl.engine import Engine
-from server.scene.limits import MAX_OBJECTS, MAX_SCENE_TRIANGLES, MeshError
+from server.scene.limits import MAX_OBJECTS, MAX_SCENE_TEXTURE_PIXELS, MAX_SCENE_TRIANGLES, MeshError
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement, world_from_model
 from server.scene.virtual_object import VirtualObject
@@ -25,10 +25,13 @@ FINE_GRIDS = 64
 
 
 @dataclass(frozen=True)
-class _Entry:
+class SceneObject:
+    """One that stands in the scene."""
+
     mesh: Mesh
     digest: bytes
     world_from_model: NDArray[np.float64]
+    """[4, 4]."""
 
 
 class SceneObjects:
@@ -37,7 +40,7 @@ class SceneObjects:
     def __init__(self, engine: Engine, up: NDArray[np.float64]) -> None:
         self._engine = engine
         self.up = up
-        self._entries: dict[str, _Entry] = {}
+        self._entries: dict[str, SceneObject] = {}
         self._things: dict[bytes, VirtualObject] = {}
         self._uses: Counter[bytes] = Counter()
 
@@ -46,9 +49,12 @@ class SceneObjects:
 
         Raises ValueError, one line, where it cannot stand there or the scene is full; the scene is then as it was.
         """
+        self.put(object_id, mesh, world_from_model(mesh, placement, self.up))
+
+    def put(self, object_id: str, mesh: Mesh, matrix: NDArray[np.float64]) -> None:
+        """The same where world_from_model `matrix` [4, 4] is known. Raises MeshError where the scene is full."""
         others = (entry.mesh for name, entry in self._entries.items() if name != object_id)
         check_room(others, mesh)
-        matrix = world_from_model(mesh, placement, self.up)
         digest = mesh_digest(mesh)
         if digest not in self._things:
             cells = CELLS if len(self._things) < FINE_GRIDS else FEWER_CELLS
@@ -59,13 +65,13 @@ class SceneObjects:
         self._uses[digest] += 1
         if object_id in self._entries:
             self.remove(object_id)
-        self._entries[object_id] = _Entry(mesh, digest, matrix)
+        self._entries[object_id] = SceneObject(mesh, digest, matrix)
 
     def move(self, object_id: str, placement: Placement) -> None:
         """Give an object another place. Raises KeyError if there is none of that id, ValueError as place() does."""
         entry = self._entries[object_id]
         placed = world_from_model(entry.mesh, placement, self.up)
-        self._entries[object_id] = _Entry(entry.mesh, entry.digest, placed)
+        self._entries[object_id] = SceneObject(entry.mesh, entry.digest, placed)
 
     def remove(self, object_id: str) -> None:
         """Take an object away. Raises KeyError if there is none of that id."""
@@ -74,6 +80,10 @@ class SceneObjects:
         if self._uses[digest] == 0:
             del self._uses[digest]
             self._things.pop(digest).release()
+
+    def entries(self) -> dict[str, SceneObject]:
+        """All of them, in the order in which they came."""
+        return dict(self._entries)
 
     def clear(self) -> None:
         """Take all objects away."""
@@ -88,14 +98,27 @@ class SceneObjects:
 
 def check_room(others: Iterable[Mesh], mesh: Mesh) -> None:
     """Raises MeshError, one line, if `mesh` is too much beside `others`, the meshes of a scene's other objects."""
-    counts = [len(other.triangles) for other in others]
+    meshes = tuple(others)
+    counts = [len(other.triangles) for other in meshes]
     if len(counts) >= MAX_OBJECTS:
         raise MeshError(f"the scene has {len(counts)} objects, more are not shown: remove some")
+    pixels = sum(texture_pixels(other) for other in (*meshes, mesh))
+    if pixels > MAX_SCENE_TEXTURE_PIXELS:
+        raise MeshError(
+            f"with this object the scene would have {pixels >> 20} MiPixel of textures, "
+            f"more than {MAX_SCENE_TEXTURE_PIXELS >> 20}: remove objects or give them smaller pictures"
+        )
     if sum(counts) + len(mesh.triangles) > MAX_SCENE_TRIANGLES:
         raise MeshError(
             f"with this object the scene would have {sum(counts) + len(mesh.triangles)} triangles, "
             f"more than {MAX_SCENE_TRIANGLES}: remove objects or simplify them"
         )
+
+
+def texture_pixels(mesh: Mesh) -> int:
+    """Of all pictures of a mesh, each once."""
+    textures = {t for m in mesh.materials for t in (m.color_texture, m.surface_texture) if t is not None}
+    return sum(t.image.shape[0] * t.image.shape[1] for t in textures)
 
 
 def mesh_digest(mesh: Mesh) -> bytes:

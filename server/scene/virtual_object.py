@@ -50,7 +50,7 @@ class VirtualObject:
             for array in (mesh.vertices, mesh.triangles, _attributes(mesh), mesh.material_of, texels)
         )
         grid = voxelize(engine, vertices, triangles, mesh.bounds, cells)
-        return cls(
+        thing = cls(
             vertices,
             triangles,
             attributes,
@@ -61,6 +61,8 @@ class VirtualObject:
             grid,
             deal_points(engine, mesh, grid),
         )
+        engine.device.memory.add(thing)
+        return thing
 
     @property
     def bytes_held(self) -> int:

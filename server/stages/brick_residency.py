@@ -42,6 +42,10 @@ class Residency:
         self.slots_device = engine.workspace.upload("brick_slots", self._table.slots)
         self.resident_device = upload_list(engine, "resident_bricks", self._table.resident())
         self.resident_count = 0
+        self.changes = 0
+        """Counts what changes bricks' voxels."""
+        self._changed = np.zeros(self._table.slots.size, np.int64)
+        self._wanted = np.empty(0, np.int32)
 
     @property
     def device_bytes(self) -> int:
@@ -51,6 +55,7 @@ class Residency:
     def begin_frame(self, wanted: Indices) -> None:
         """Note which bricks the newest picture wants."""
         self._frame += 1
+        self._wanted = wanted
         self._table.touch(wanted, self._frame)
         if self._frame % _SETTLING_FRAMES == 0:
             self._give_back_idle()
@@ -79,6 +84,48 @@ class Residency:
         self._restore(self.store.indices())
         self._claim(np.flatnonzero(self._table.slots.ravel() == NO_SLOT).astype(np.int32))
 
+    def note_picture(self, camera: CameraModel, volume_from_camera: NDArray[np.float64]) -> None:
+        """A picture was integrated: bricks in view, and near what it measured, may have changed."""
+        resident = self._table.resident()
+        self._note_change(resident[self._in_view(camera, volume_from_camera, resident)])
+        self._changed[self._wanted] = self.changes
+
+    def note_all(self) -> None:
+        """Any brick with a slot may have changed."""
+        self._note_change(self._table.resident())
+
+    def held(self) -> Indices:
+        """All bricks that hold voxels, released ones too, in order."""
+        return np.sort(np.concatenate([self._table.resident(), self.store.indices()]))
+
+    def changed_since(self, change: int) -> Indices:
+        """Those of the bricks held that may have changed after `changes` was that; -1: all."""
+        held = self.held()
+        return held[self._changed[held] > change]
+
+    def copies(self, bricks: Indices) -> Iterator[tuple[Indices, NDArray[Any], NDArray[np.uint32]]]:
+        """Of bricks that are held, in batches and in an order of its own: places, voxels [k, 512] float2, colours."""
+        slots = self._table.slots_of(bricks)
+        resident = bricks[slots > AWAY_SLOT]
+        for batch, voxels, colors in self.pool.download(self._table.slots_of(resident)):
+            yield resident[batch], voxels, colors
+        yield from self.store.batches(bricks[slots == AWAY_SLOT])
+
+    def fill(self, bricks: Indices, voxels: NDArray[Any], colors: NDArray[np.uint32]) -> None:
+        """Take in bricks of which nothing is held: voxels [n, 512] float2, colours [n, 512]. They count as unchanged.
+
+        Earlier ones make room for them; the host takes what the device has no room for, whatever its budget.
+        """
+        for start in range(0, len(bricks), max(self.limit, 1)):
+            some = slice(start, start + max(self.limit, 1))
+            self.store.put(bricks[some], voxels[some], colors[some])
+            self._table.leave(bricks[some], AWAY_SLOT)
+            self._grow(self.resident_count + len(bricks[some]))
+            short = len(bricks[some]) - self._free_slots()
+            if short > 0:
+                self._release(self._table.resident()[:short])
+            self._restore(bricks[some])
+
     def everything(self) -> Iterator[tuple[Indices, NDArray[Any], NDArray[np.uint32]]]:
         """In batches: coordinates [k, 3], voxels [k, 512] float2 and colours [k, 512] of bricks, released ones too."""
         resident = self._table.resident()
@@ -86,6 +133,10 @@ class Residency:
             yield self._table.coordinates(resident[batch]), voxels, colors
         for chosen, voxels, colors in self.store.batches():
             yield self._table.coordinates(chosen), voxels, colors
+
+    def _note_change(self, bricks: Indices) -> None:
+        self.changes += 1
+        self._changed[bricks] = self.changes
 
     def _free_slots(self) -> int:
         return self.pool.capacity - self.resident_count
@@ -116,6 +167,7 @@ class Residency:
 
     def _claim(self, bricks: Indices) -> None:
         self.pool.clear(self._table.take(bricks))
+        self._note_change(bricks)
         self._place(bricks)
 
     def _restore(self, bricks: Indices) -> None:

@@ -44,9 +44,11 @@ class BrickStore:
             self._bricks[index] = (voxel.copy(), color.copy())
         self._indices = None
 
-    def batches(self) -> Iterator[tuple[NDArray[np.int32], NDArray[Any], NDArray[np.uint32]]]:
-        """All bricks, some at a time: places, voxels [k, 512] float2, colours [k, 512]."""
-        indices = self.indices()
+    def batches(
+        self, indices: NDArray[np.int32] | None = None
+    ) -> Iterator[tuple[NDArray[np.int32], NDArray[Any], NDArray[np.uint32]]]:
+        """All bricks, or those asked for, some at a time: places, voxels [k, 512] float2, colours [k, 512]."""
+        indices = self.indices() if indices is None else indices
         for start in range(0, len(indices), _BATCH):
             chosen = indices[start : start + _BATCH]
             yield chosen, *_stacked([self._bricks[index] for index in chosen.tolist()])

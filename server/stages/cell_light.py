@@ -12,6 +12,7 @@ from server.stages.light_estimation import ASSUMED_ALBEDO, LightEstimate
 from server.stages.light_model import ALBEDO_SPREAD, COLOR_PULL, Rows, Solution
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 MODEL_DOUBT = 1.6
 """Of the standard deviation over what the residuals tell of it, as in light_estimation.py; albedos err too."""
@@ -30,13 +31,14 @@ def solve_cells(
     slot: int,
     grid: PoolGrid,
     bands: int,
+    lit: dict[float, Bools],
     *,
     albedo_known: bool,
 ) -> tuple[LobeFit, LightEstimate]:
     """The light in cells, of the width that the pictures call for, and what is known of it.
 
     slot, grid: of the newest frame, whose residuals tell how alike neighbours err. `albedo_known`: the mean albedo is
-    what is assumed.
+    what is assumed. lit: as fit_lobes has it, of the last frame.
     """
     to_sh, mean_albedo = cells_to_sh(bands), solution.mean_albedo
     count = window.slots * window.capacity
@@ -47,7 +49,7 @@ def solve_cells(
     targets[place, 1:] = rows.seen / (lightness[:, None] * albedos.color) - mean_albedo * rows.sent
     scaled[place] = weights * lightness**2
     luminance, *channels = window.equations(targets, scaled)
-    light = fit_lobes(luminance)
+    light = fit_lobes(luminance, lit)
     radiances, tints = _channels(channels, light)
     is_new = rows.slots == slot
     expected = np.zeros(grid.count)

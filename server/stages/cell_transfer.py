@@ -226,27 +226,32 @@ class PoolWindow:
         Summed on the device, in fixed order.
         """
         engine, space, columns = self._engine, self._engine.workspace, targets.shape[1]
-        padded = np.zeros((len(targets), 8), np.float32)
-        padded[:, :columns] = targets
-        count, blocks = self.slots * self.capacity, _BLOCKS * (_BLOCKS + 1) // 2
-        chunk = -(-count // _CHUNKS)
+        used = np.flatnonzero(weights > 0)
+        room, blocks = self.slots * self.capacity, _BLOCKS * (_BLOCKS + 1) // 2
+        count, chunk = len(used), max(1, -(-len(used) // _CHUNKS))
         chunks = -(-count // chunk)
+        padded, numbers = np.zeros((room, 8), np.float32), np.zeros(room, np.int32)
+        padded[:count, :columns], numbers[:count] = targets[used], used
+        used_weights = np.zeros(room, np.float32)
+        used_weights[:count] = weights[used]
         partial = space.array("cell_sums", (_CHUNKS, blocks, 8, 8), np.float32)
         engine.launch(
             self._kernel("accumulate_cells"),
             (blocks, chunks),
             count,
             chunk,
+            space.upload("pool_numbers", numbers),
             self.values,
             space.upload("pool_targets", padded),
-            space.upload("pool_weights", weights.astype(np.float32)),
+            space.upload("pool_weights", used_weights),
             partial,
             local=(16, 1),
         )
         full = _from_blocks(engine.download(partial)[:chunks].sum(axis=0, dtype=np.float64))
         energies = weights @ targets**2
         matrix, vectors = full[:CELLS, :CELLS], full[:CELLS, CELLS:]
-        return [CellEquations(matrix, vectors[:, k], float(energies[k])) for k in range(columns)]
+        shared: dict[float, Floats] = {}
+        return [CellEquations(matrix, vectors[:, k], float(energies[k]), shared) for k in range(columns)]
 
     def _kernel(self, name: str, **defines: int) -> cl.Kernel:
         shape = {"MASK_WORDS": 1, "INTERLEAVE": 1} | defines

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from copy import deepcopy
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import pyopencl.cltypes as cl_types
@@ -23,6 +25,7 @@ from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine, KernelArgument
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 PlaneArrays = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8]]
 """Planes [n, 4, 4], their shapes [n, 4] and all maps, as hide_cells of cell_transfer.cl takes them."""
 NO_PLANES: PlaneArrays = (np.zeros((0, 4, 4), np.float32), np.zeros((0, 4), np.int32), np.zeros(1, np.uint8))
@@ -54,6 +57,7 @@ LEAST_FRAMES = 2
 """Frames before extents are tried: one picture can be explained in too many ways."""
 MOST_ROWS = 700
 """Pools that extents are judged by."""
+_NEAREST_M = 0.1  # of what a camera sees
 _BEHIND_M = 0.05  # a camera that measures so much farther looked through
 
 
@@ -75,6 +79,20 @@ class Judged:
     """[n]."""
 
 
+@dataclass(frozen=True)
+class KnownPlanes:
+    """What a continuation knows, to go on with later."""
+
+    planes: list[PlanePatch]
+    boxes: list[Floats]
+    """[4] each, of those believed."""
+    frames: int
+    turn: int
+    passes: int
+    was_settled: bool
+    explained: float
+
+
 class Continuation:
     """The planes of one session's room."""
 
@@ -82,13 +100,24 @@ class Continuation:
         self._least_gain = least_gain
         self.planes: list[PlanePatch] = []
         self._looked: list[PlanePatch] = []
-        self._views: deque[tuple[Floats, Floats]] = deque(maxlen=VIEWS)
+        self._views: deque[tuple[CameraModel, Floats, Singles]] = deque(maxlen=VIEWS)
         self._frames = 0
         self._turn, self._passes, self._was_settled = 0, 0, False
         self._trial: _Trial | None = None
         self._tries, self._share = 0, 0
         self._boxes: list[Floats] = []
         self.explained = 1.0
+
+    def known(self) -> KnownPlanes:
+        """A copy of all but earlier views and a trial under way."""
+        planes, boxes = deepcopy(self.planes), list(self._boxes)
+        return KnownPlanes(planes, boxes, self._frames, self._turn, self._passes, self._was_settled, self.explained)
+
+    def resume(self, known: KnownPlanes) -> None:
+        """Go on with what another one knew; takes it over."""
+        self.planes, self._looked, self._boxes = known.planes, list(known.planes), known.boxes
+        self._frames, self._turn, self._passes = known.frames, known.turn, known.passes
+        self._was_settled, self.explained = known.was_settled, known.explained
 
     @property
     def is_searching(self) -> bool:
@@ -100,13 +129,13 @@ class Continuation:
         """Whether extents are believed."""
         return self._passes >= SETTLED_PASSES
 
-    def look(self, camera: CameraModel, volume_from_camera: Floats, depth_m: Floats) -> None:
+    def look(self, camera: CameraModel, volume_from_camera: Floats, depth_m: Singles) -> None:
         """Note where a camera looked through the planes' continuations. depth_m: [h, w], 0 = none."""
-        self._views.append((inverse_rigid(volume_from_camera), depth_m))
+        self._views.append((camera, inverse_rigid(volume_from_camera), depth_m))
         for plane in self.planes:
             is_new = not any(plane is known for known in self._looked)
-            for camera_from_volume, depth in list(self._views) if is_new else [self._views[-1]]:
-                plane.empty |= _looked_through(plane, camera, camera_from_volume, depth)
+            for view in list(self._views) if is_new else [self._views[-1]]:
+                plane.empty |= _looked_through(plane, *view)
         self._looked = list(self.planes)
 
     def find(self, positions: Floats, normals: Floats) -> None:
@@ -141,7 +170,7 @@ class Continuation:
         if self._turn != 0 or self._passes < SETTLED_PASSES:
             return False
         self._was_settled = True
-        self.explained = trial.misfit / trial.misfit_of_none()
+        self.explained = trial.misfit / trial.misfit_of_none
         believed = self.planes if self.explained < BELIEVED else []
         before, self._boxes = self._boxes, [plane.box for plane in believed]
         return len(before) != len(self._boxes) or not np.array_equal(before, self._boxes)
@@ -201,20 +230,30 @@ def plane_arguments(engine: Engine, name: str, planes: PlaneArrays) -> tuple[Ker
 
 
 def _looked_through(
-    plane: PlanePatch, camera: CameraModel, camera_from_volume: Floats, depth_m: Floats
+    plane: PlanePatch, camera: CameraModel, camera_from_volume: Floats, depth_m: Singles
 ) -> NDArray[np.bool_]:
-    """[rows, cols] cells of a plane's map behind which the camera measured something."""
-    at = plane.cell_centers() @ camera_from_volume[:3, :3].T + camera_from_volume[:3, 3]
-    z = at[..., 2]
-    safe = np.maximum(z, 1e-3)
-    u = np.rint(at[..., 0] / safe * camera.fx + camera.cx)
-    v = np.rint(at[..., 1] / safe * camera.fy + camera.cy)
-    inside = (z > 0.1) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-    measured = np.zeros(z.shape)
-    measured[inside] = depth_m[v[inside].astype(np.int64), u[inside].astype(np.int64)]
-    return np.asarray(inside & (measured > z + _BEHIND_M))
+    """[rows, cols] cells of a plane's map behind which the camera measured something, but those that are empty anyhow.
+    To float32."""
+    rows, cols = plane.empty.shape
+    turn = camera_from_volume[:3, :3]
+    corner = plane.offset_m * plane.normal + (plane.corner + CELL_M / 2) @ np.stack([plane.across, plane.along])
+    first = turn @ corner + camera_from_volume[:3, 3]
+    by_col = (np.arange(cols)[:, None] * CELL_M * (turn @ plane.across)).astype(np.float32)
+    by_row = (first + np.arange(rows)[:, None] * CELL_M * (turn @ plane.along)).astype(np.float32)
+    z = by_row[:, None, 2] + by_col[:, 2]
+    per_metre = 1 / np.maximum(z, np.float32(_NEAREST_M))
+    u = np.rint((by_row[:, None, 0] + by_col[:, 0]) * per_metre * np.float32(camera.fx) + np.float32(camera.cx))
+    v = np.rint((by_row[:, None, 1] + by_col[:, 1]) * per_metre * np.float32(camera.fy) + np.float32(camera.cy))
+    inside = (z > _NEAREST_M) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+    cells = np.flatnonzero(inside & ~plane.empty)
+    pixels = v.ravel()[cells].astype(np.int64) * camera.width + u.ravel()[cells].astype(np.int64)
+    behind = cells[depth_m.ravel()[pixels] > z.ravel()[cells] + np.float32(_BEHIND_M)]
+    through = np.zeros((rows, cols), np.bool_)
+    through.flat[behind] = True
+    return through
 
 
+@cache
 def spokes() -> Floats:
     """[CELLS, SPOKES, 3] unit directions, four about the middle of each cell."""
     middle = cell_directions()
@@ -226,22 +265,59 @@ def spokes() -> Floats:
     return np.asarray(around / np.linalg.norm(around, axis=2, keepdims=True))
 
 
+@dataclass(frozen=True)
+class _Judgement:
+    """What pools say of some extents, and what makes the next judgement quick. Float32."""
+
+    met: NDArray[np.uint8]
+    """[pairs] spokes that planes hide."""
+    cells: Singles
+    """[n, CELLS] transfer that is left."""
+    open: Singles
+    """[n] its sum."""
+    columns: Singles
+    """[n, k] shading of white surface under each lobe."""
+    lit: NDArray[np.bool_]
+    """[k] lobes of the best light."""
+    misfit: float
+    """What that light leaves."""
+
+
 class _Trial:
-    """Extents and how well the light they leave explains some pools."""
+    """Extents and how well the light they leave explains some pools.
+
+    A pair is a pool and a cell that sends it light; of all others nothing can be hidden.
+    """
 
     def __init__(self, planes: list[PlanePatch], judged: Judged, least_gain: float) -> None:
         self._planes = planes
         self._least_gain = least_gain
         self._judged = judged
-        self._open = judged.transfer.sum(axis=1)
+        self._pools, self._cells = np.nonzero(judged.transfer > 0)
+        self._spoke_share = (judged.transfer[self._pools, self._cells] / SPOKES).astype(np.float32)
+        self._lobes = judged.lobes.astype(np.float32)
+        self._roots = np.sqrt(judged.weights)
         self._needed: list[NDArray[np.uint8]] = []
         self._hidden: list[NDArray[np.bool_]] = []
-        self.misfit = np.inf
+        cells = judged.transfer.astype(np.float32)
+        none_met, lit = np.zeros(len(self._pools), np.uint8), np.zeros(self._lobes.shape[1], np.bool_)
+        self._of_none = self._judgement(none_met, cells, cells.sum(axis=1), cells @ self._lobes, lit)
+        self._now = self._of_none
 
     @property
     def unprepared(self) -> int:
         """Planes without a table of what they would hide; what is tried needs all."""
         return len(self._planes) - len(self._needed)
+
+    @property
+    def misfit(self) -> float:
+        """Of the extents as they are."""
+        return self._now.misfit
+
+    @property
+    def misfit_of_none(self) -> float:
+        """The same where no plane goes on."""
+        return self._of_none.misfit
 
     def is_of(self, planes: list[PlanePatch]) -> bool:
         """Whether these are the planes, and they are as they were."""
@@ -250,15 +326,15 @@ class _Trial:
     def prepare(self) -> None:
         """Make the next plane's table."""
         number = len(self._needed)
-        plane = self._planes[number]
-        self._needed.append(plane.steps_needed(self._judged.positions, spokes().swapaxes(0, 1).reshape(-1, 3), LEAST_M))
+        plane, origins = self._planes[number], self._judged.positions
+        each = [
+            plane.steps_needed(origins, directions, self._pools, self._cells, LEAST_M)
+            for directions in spokes().swapaxes(0, 1)
+        ]
+        self._needed.append(np.stack(each, axis=1))
         self._hidden.append(self._hidden_by(number, plane.steps))
         if not self.unprepared:
-            self.misfit = self._misfit_of(np.logical_or.reduce(self._hidden))
-
-    def misfit_of_none(self) -> float:
-        """The same where no plane goes on."""
-        return self._misfit_of(np.zeros_like(self._hidden[0]))
+            self._now = self._judge(np.logical_or.reduce(self._hidden))
 
     def settle(self, plane: int, side: int) -> int:
         """Give one side of a plane the best of the extents near its own; how many were tried."""
@@ -273,10 +349,10 @@ class _Trial:
             if not ((hidden ^ self._hidden[plane]) & ~others).any():
                 continue
             tried += 1
-            misfit = self._misfit_of(others | hidden)
+            judged = self._judge(others | hidden)
             allowed = 1 - self._least_gain if step > patch.steps[side] else 1 + 0.2 * self._least_gain
-            if misfit < allowed * self.misfit:
-                patch.steps[side], self._hidden[plane], self.misfit = step, hidden, misfit
+            if judged.misfit < allowed * self.misfit:
+                patch.steps[side], self._hidden[plane], self._now = step, hidden, judged
         return max(tried, 1)
 
     def _candidates(self, now: int, most_m: float) -> Iterator[int]:
@@ -285,24 +361,37 @@ class _Trial:
         return (step for step in everything if step != now and 0 <= step < len(STEPS_M) and STEPS_M[step] <= most_m)
 
     def _hidden_by(self, plane: int, steps: NDArray[np.int64], besides: int | None = None) -> NDArray[np.bool_]:
-        """[n, SPOKES * CELLS]; `besides`: a side that is taken to go on without end."""
+        """[SPOKES, pairs]; `besides`: a side that is taken to go on without end."""
         hidden = np.ones(self._needed[plane].shape[1:], np.bool_)
         for side in range(SIDES):
             if side != besides:
                 hidden &= self._needed[plane][side] <= steps[side]
         return hidden
 
-    def _misfit_of(self, hidden: NDArray[np.bool_]) -> float:
-        """What the best light of the judged lobes leaves where directions [n, SPOKES * CELLS] are hidden."""
-        judged, codes = self._judged, hidden.view(np.uint8).reshape(len(hidden), SPOKES, -1)
-        met = codes.sum(axis=1, dtype=np.uint8)
-        open_cells = judged.transfer * (1.0 - met / SPOKES)
-        target = judged.target - judged.beyond * (self._open - open_cells.sum(axis=1))
-        columns = open_cells @ judged.lobes
-        weighted = judged.weights[:, None] * columns
-        matrix, vector = weighted.T @ columns, weighted.T @ target
+    def _judge(self, hidden: NDArray[np.bool_]) -> _Judgement:
+        """Of extents that hide [SPOKES, pairs]: what differs from the present ones is made anew."""
+        now, met = self._now, hidden.sum(axis=0, dtype=np.uint8)
+        changed = np.flatnonzero(met != now.met)
+        pools = self._pools[changed]
+        rows = pools[np.flatnonzero(np.diff(pools, prepend=-1))]
+        cells, left, columns = now.cells.copy(), now.open.copy(), now.columns.copy()
+        cells[pools, self._cells[changed]] = self._spoke_share[changed] * (SPOKES - met[changed])
+        left[rows] = cells[rows].sum(axis=1)
+        columns[rows] = cells[rows] @ self._lobes
+        return self._judgement(met, cells, left, columns, now.lit)
+
+    def _judgement(
+        self, met: NDArray[np.uint8], cells: Singles, left: Singles, columns: Singles, lit: NDArray[np.bool_]
+    ) -> _Judgement:
+        """`lit`: guess of the lobes of the best light."""
+        judged = self._judged
+        hidden = self._of_none.open - left if met.any() else 0.0
+        target = (self._roots * (judged.target - judged.beyond * hidden)).astype(np.float32)
+        weighted = self._roots.astype(np.float32)[:, None] * columns
+        matrix, vector = (weighted.T @ weighted).astype(np.float64), (weighted.T @ target).astype(np.float64)
         ridge = RIDGE * max(float(np.trace(matrix)) / len(matrix), 1e-300)
-        amounts, _ = solve_nonnegative(matrix + ridge * np.eye(len(matrix)), vector)
-        energy = max(float(judged.weights @ target**2), 1e-300)
-        left = energy + amounts @ (matrix @ amounts - 2 * vector)
-        return max(float(left), 1e-12 * energy)
+        matrix.flat[:: len(matrix) + 1] += ridge
+        amounts, lit = solve_nonnegative(matrix, vector, lit)
+        rest = (target - weighted @ amounts.astype(np.float32)).astype(np.float64)
+        energy = max(float(target @ target), 1e-300)
+        return _Judgement(met, cells, left, columns, lit, max(float(rest @ rest), 1e-12 * energy))

@@ -51,11 +51,12 @@ class Contradiction:
 class FrameWindow:
     """The frames of one session's estimate, by slot."""
 
-    def __init__(self) -> None:
+    def __init__(self, count: int = 0) -> None:
+        """`count`: frames before."""
         self._entries: dict[int, _Entry] = {}
         self._recent: list[int] = []
         self._kept: list[int] = []
-        self._count = 0
+        self._count = count
 
     @property
     def frames(self) -> dict[int, Frame]:

@@ -50,4 +50,5 @@ def integrate(
         local=(items,),
     )
     volume.count_frame()
+    volume.note_picture(camera, volume_from_camera)
     volume.summarize(all=False)

@@ -22,7 +22,7 @@ from server.maths.sh import LUMINANCE
 from server.opencl.engine import Engine
 from server.stages.light_estimation import ASSUMED_ALBEDO
 from server.stages.near_light import Emitters, outside_light, search_lamps
-from server.stages.near_samples import PooledSamples, see_samples
+from server.stages.near_samples import PooledSamples, see_some
 from server.stages.raycast import Surface
 from server.stages.volume import Volume
 
@@ -33,7 +33,8 @@ FIRST_VIEWS = 3
 """With which the first search begins."""
 MOST_WAITING_FRAMES = 192
 """Between searches that find the same again: the time doubles up to that, and views are the further apart."""
-STEPS_A_FRAME = 3
+STEPS_A_FRAME = 6
+"""Of a search; none where a new view is taken, so that no frame is a slow one."""
 CHANGED = 0.25
 """Misfit of a new view under what was found: beyond this, and three times what the search left, the light changed."""
 
@@ -56,8 +57,19 @@ class LampFinder:
         self._views: deque[PooledSamples] = deque(maxlen=VIEWS)
         self._found: Found | None = None
         self._search: Steps[Found] | None = None
+        self._next_takes = 0
         self._wait_frames = FIRST_VIEWS * FRAMES_A_VIEW
         self._frames = 0
+
+    @property
+    def found(self) -> Found | None:
+        """By the last complete search; None before, and where the light has changed since."""
+        return self._found
+
+    def resume(self, found: Found | None) -> None:
+        """Begin with what was `found` in this room before."""
+        self.forget()
+        self._found, self.lamps = found, found.emitters if found else ()
 
     def work(self, camera: CameraModel, radiance: cl_array.Array, surface: Surface, volume: Volume) -> None:
         """One frame's part of it; `lamps` are then as the last complete search has them, in volume space.
@@ -66,16 +78,20 @@ class LampFinder:
         """
         if self._wanted == "off":
             return
+        left = STEPS_A_FRAME
         if self._frames % max(FRAMES_A_VIEW, self._wait_frames // VIEWS) == 0:
             self._see(camera, radiance, surface, volume)
+            left = 0
         self._frames += 1
         if self._search is None and self._frames >= self._wait_frames:
             samples = _together(self._views)
             least = LEAST_MISFIT if self._wanted == "auto" else 0.0
             if len(samples):
                 self._search = search_lamps(self._engine, volume, samples, least_misfit=least)
-        for _ in range(STEPS_A_FRAME):
-            self._step()
+                self._next_takes = 0
+        while self._search is not None and self._next_takes <= left:
+            left -= self._next_takes
+            self._step(self._search)
 
     def lamps_at(self, origin_world: NDArray[np.float64]) -> tuple[Emitter, ...]:
         """The lamps in the world; the volume's origin lies at `origin_world` [3], metres."""
@@ -86,12 +102,10 @@ class LampFinder:
         reason = "virtual objects are not yet lit by lamps in the room"
         return (LeftOut(effect="lamplight", reason=reason, error_bound=None),) if self.lamps else ()
 
-    def _step(self) -> None:
-        if self._search is None:
-            return
+    def _step(self, search: Steps[Found]) -> None:
         try:
             with self._engine.profile.host():  # its kernels count twice, they are a third of it
-                next(self._search)
+                self._next_takes = next(search)
         except StopIteration as end:
             self._take(end.value)
 
@@ -103,8 +117,7 @@ class LampFinder:
         self._search, self._frames = None, 0
 
     def _see(self, camera: CameraModel, radiance: cl_array.Array, surface: Surface, volume: Volume) -> None:
-        seen = see_samples(self._engine, camera, radiance, surface, volume)
-        view = seen.thinned(VIEW_SAMPLES, self._random)
+        view = see_some(self._engine, camera, radiance, surface, volume, VIEW_SAMPLES, self._random)
         if len(view) and self._contradicts(view, volume):
             self.forget()
         self._views.append(view)

@@ -76,6 +76,15 @@ class LightEstimate:
 
 
 @dataclass(frozen=True)
+class Evidence:
+    """What an estimator knows, to go on with later."""
+
+    equations: NormalEquations | None
+    weight: float
+    dependence: float
+
+
+@dataclass(frozen=True)
 class TileSums:
     """Normal equations of every tile of one frame, float64."""
 
@@ -246,6 +255,14 @@ class LightEstimator:
                 ridge = self._dependence * luminance.ratio * np.diag(self._precision)
                 self._dependence = sample_dependence(tiles, luminance.mean[:, 0], ridge)
         return self.estimate()
+
+    def evidence(self) -> Evidence:
+        """All that it knows."""
+        return Evidence(self._evidence, self._weight, self._dependence)
+
+    def resume(self, known: Evidence) -> None:
+        """Go on with the `evidence` of one for as many bands."""
+        self._evidence, self._weight, self._dependence = known.equations, known.weight, known.dependence
 
     def estimate(self) -> LightEstimate:
         """The light as it stands."""

@@ -7,6 +7,7 @@ mean, which only indirect light tells, times what tells surfaces apart.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from server.stages.cell_transfer import Pools
 from server.stages.light_estimation import ASSUMED_ALBEDO
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 Columns = NDArray[np.float32]
 
 COLOR_PULL = 25.0
@@ -88,15 +90,41 @@ class Rows:
     weights: Floats
     """[n]."""
 
-    @property
+    @cached_property
     def luminance(self) -> Floats:
         """[n] of what was seen."""
         return np.asarray(self.seen @ LUMINANCE)
 
-    @property
+    @cached_property
     def sent_luminance(self) -> Floats:
         """[n] of what surfaces send."""
         return np.asarray(self.sent @ LUMINANCE)
+
+    def under(self, amounts: Floats) -> Floats:
+        """[n, ...] what of lobes `amounts` [lobes, ...] white surface would show. To float32."""
+        return (self.columns @ amounts.astype(np.float32)).astype(np.float64)
+
+    def shading(self, solution: Solution) -> Floats:
+        """[n, 3] what white surface would show of all light, if others have the mean albedo."""
+        return self.under(solution.colors) + solution.mean_albedo * self.sent
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Weighted sums over pools, summed as float32. Columns: shading under each lobe, then what surfaces send."""
+
+    matrix: Floats
+    """[lobes + 1, lobes + 1] of the columns' products."""
+    vector: Floats
+    """[lobes + 1] of the columns times luminance over albedo."""
+    energy: float
+    """Of that squared."""
+    seen: Floats
+    """[lobes, 3] of the lobes times colour over albedo."""
+    sent: Floats
+    """[lobes, 3] of the lobes times what surfaces send."""
+    count: int
+    """Pools."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +162,7 @@ def weights_of(rows: Rows, solution: Solution | None, albedos: Albedos | None, *
     weights = rows.weights / (1.0 + (doubt / (NOISE * np.maximum(luminance, 0.05 * mean))) ** 2)
     if solution is None or albedos is None:
         return np.asarray(weights)
-    explained = rows.columns @ solution.amounts + solution.mean_albedo * rows.sent_luminance
+    explained = rows.under(solution.amounts) + solution.mean_albedo * rows.sent_luminance
     expected = np.maximum(albedos.lightness * explained, 0.05 * mean)
     weights = weights * (mean / expected) ** BRIGHTER_COUNTS
     if outliers:
@@ -150,19 +178,34 @@ def system_of(rows: Rows, albedos: Albedos, weights: Floats) -> tuple[Floats, Fl
     return columns, rows.luminance / albedos.lightness, weights * albedos.lightness**2
 
 
-def solve_amounts(
-    columns: Floats, target: Floats, weights: Floats, near: Floats | None = None, hold: float = 0.0
-) -> Floats:
-    """[lobes + 1] >= 0: amounts, and the mean albedo, drawn to ASSUMED_ALBEDO.
+def sums_of(rows: Rows, albedos: Albedos, weights: Floats) -> Sums:
+    """The sums that light is solved from, if surfaces have `albedos`; weights: [n] of residuals in radiance."""
+    lightness, lobes = albedos.lightness, rows.columns.shape[1]
+    roots = np.sqrt(weights) * lightness
+    columns = np.empty((len(roots), lobes + 1), np.float32)
+    np.multiply(rows.columns, roots.astype(np.float32)[:, None], out=columns[:, :lobes])
+    columns[:, lobes] = roots * rows.sent_luminance
+    targets = np.empty((len(roots), 7), np.float32)
+    targets[:, 0] = roots * rows.luminance / lightness
+    targets[:, 1:4] = rows.seen * (roots / lightness)[:, None] / albedos.color
+    targets[:, 4:] = rows.sent * roots[:, None]
+    matrix, vectors = ((columns.T @ other).astype(np.float64) for other in (columns, targets))
+    energy = float(np.square(targets[:, 0], dtype=np.float64).sum())
+    return Sums(matrix, vectors[:, 0], energy, vectors[:lobes, 1:4], vectors[:lobes, 4:], len(roots))
 
-    Drawn to the shape of `near` [lobes] as well, `hold` times as much as pools say of a lobe on average.
+
+def solve_amounts(
+    sums: Sums, near: Floats | None = None, hold: float = 0.0, lit: Bools | None = None
+) -> tuple[Floats, Bools]:
+    """[lobes + 1] >= 0: amounts, and the mean albedo, drawn to ASSUMED_ALBEDO; and which of them may be positive.
+
+    Drawn to the shape of `near` [lobes] as well, `hold` times as much as pools say of a lobe on average. lit: guess of
+    what may be positive. It saves time and changes nothing.
     """
-    weighted = weights[:, None] * columns
-    matrix, vector = weighted.T @ columns, weighted.T @ target
-    lobes = len(matrix) - 1
+    matrix, vector, lobes = sums.matrix, sums.vector.copy(), len(sums.matrix) - 1
     pull = np.full(lobes + 1, RIDGE * max(float(np.trace(matrix[:lobes, :lobes])) / lobes, 1e-300))
-    independent = max(len(target) / ALIKE, 1.0)
-    noise = max(float(weights @ target**2) * NOISE**2 / independent, 1e-300)
+    independent = max(sums.count / ALIKE, 1.0)
+    noise = max(sums.energy * NOISE**2 / independent, 1e-300)
     if near is not None:
         held = hold / RIDGE * pull[:lobes]
         brightness = float(near @ vector[:lobes]) / max(float(near @ matrix[:lobes, :lobes] @ near), 1e-300)
@@ -170,34 +213,23 @@ def solve_amounts(
         vector[:lobes] += held * brightness * near
     pull[-1] = noise / ALBEDO_SPREAD**2
     vector[-1] += pull[-1] * ASSUMED_ALBEDO
-    amounts, _ = solve_nonnegative(matrix + np.diag(pull), vector)
+    amounts, lit = solve_nonnegative(matrix + np.diag(pull), vector, lit)
     amounts[-1] = np.clip(amounts[-1], *ALBEDO_RANGE)
-    return amounts
+    return amounts, lit
 
 
-def with_colors(
-    rows: Rows,
-    albedos: Albedos,
-    weights: Floats,
-    amounts: Floats,
-    mean_albedo: float,
-    pull: float | None,
-) -> Solution:
+def with_colors(sums: Sums, amounts: Floats, mean_albedo: float, pull: float | None) -> Solution:
     """The solution with its colours, each channel drawn to a multiple of the luminance by `pull` times the ridge.
 
     None: each is one, as while surfaces of many colours are looked for, which else would pass for coloured light.
     """
-    scaled = weights * albedos.lightness**2
-    weighted = scaled[:, None] * rows.columns
-    target = rows.seen / (albedos.lightness[:, None] * albedos.color) - mean_albedo * rows.sent
-    vectors = weighted.T @ target
-    if pull is None:
-        along = max(float(scaled @ (rows.columns @ amounts) ** 2), 1e-300)
-        return Solution(amounts, amounts[:, None] * np.maximum(amounts @ vectors / along, 0.0), mean_albedo)
-    matrix = weighted.T @ rows.columns
+    lobes = len(amounts)
+    matrix, vectors = sums.matrix[:lobes, :lobes], sums.seen - mean_albedo * sums.sent
     tint = np.maximum(amounts @ vectors / max(float(amounts @ matrix @ amounts), 1e-300), 0.0)
-    ridge = RIDGE * max(float(np.trace(matrix)) / len(matrix), 1e-300)
-    regular, near = matrix + ridge * (1.0 + pull) * np.eye(len(matrix)), ridge * pull * amounts
+    if pull is None:
+        return Solution(amounts, amounts[:, None] * tint, mean_albedo)
+    ridge = RIDGE * max(float(np.trace(matrix)) / lobes, 1e-300)
+    regular, near = matrix + ridge * (1.0 + pull) * np.eye(lobes), ridge * pull * amounts
     colors = [solve_nonnegative(regular, vectors[:, c] + tint[c] * near, amounts > 0)[0] for c in range(3)]
     return Solution(amounts, np.stack(colors, axis=1), mean_albedo)
 
@@ -208,12 +240,10 @@ def is_of_one_color(rows: Rows) -> bool:
     If it does, there is no telling it from surfaces of many colours, and colourless rooms under coloured lights are
     the simpler world.
     """
-    albedos, weights = one_albedo(len(rows.seen)), weights_of(rows, None, None, outliers=False)
-    amounts = solve_amounts(*system_of(rows, albedos, weights))
-    mean_albedo = float(amounts[-1])
-    colors = with_colors(rows, albedos, weights, amounts[:-1], mean_albedo, pull=0.0).colors
-    shading = rows.columns @ colors + mean_albedo * rows.sent
-    reflected = np.log(np.maximum(rows.seen, _DARK) / np.maximum(shading, _DARK))
+    sums = sums_of(rows, one_albedo(len(rows.seen)), weights_of(rows, None, None, outliers=False))
+    amounts, _ = solve_amounts(sums)
+    solution = with_colors(sums, amounts[:-1], float(amounts[-1]), pull=0.0)
+    reflected = np.log(np.maximum(rows.seen, _DARK) / np.maximum(rows.shading(solution), _DARK))
     ratios = reflected[:, [0, 2]] - reflected[:, 1:2]
     apart = np.linalg.norm(ratios - np.median(ratios, axis=0), axis=1)
     return bool(np.sqrt(np.mean(np.minimum(apart, 3 * np.median(apart)) ** 2)) < ONE_COLOR)

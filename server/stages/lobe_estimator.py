@@ -8,7 +8,7 @@ shadows are neutral. Frames count until surface that they share with the newest 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -27,7 +27,7 @@ from server.maths.surfaces import Albedos, Surfaces, one_albedo
 from server.opencl.engine import Engine
 from server.stages.cell_light import solve_cells
 from server.stages.cell_transfer import PoolGrid, Pools, PoolWindow, pool_grid
-from server.stages.continuation import MOST_ROWS, NO_PLANES, Continuation, Judged
+from server.stages.continuation import MOST_ROWS, NO_PLANES, Continuation, Judged, KnownPlanes
 from server.stages.frame_window import SLOTS, FrameWindow
 from server.stages.indirect import Indirect
 from server.stages.light_estimation import ASSUMED_ALBEDO, LightEstimate
@@ -42,6 +42,7 @@ from server.stages.light_model import (
     misfit_of,
     rows_of,
     solve_amounts,
+    sums_of,
     system_of,
     weights_of,
     with_colors,
@@ -74,9 +75,27 @@ LEAST_WEIGHT = 8.0
 """Pools without which a frame says nothing."""
 ROUNDS, FIRST_ROUNDS, COLOR_ROUNDS = 4, 16, 4
 """Of light and albedos in turn: in a frame, in the first and after a change, and how many of those by colour alone."""
+STEADY_ROUNDS = 2
+"""In a frame of a light that has been steady for `YOUNG` frames: what is left to do, the next frames do."""
 JUDGED_WIDTH_DEG = 25.0
 """Of the lobes that extents are judged with: a light of wide lobes alone would have planes make its edges."""
 _LEAST_MISFIT = 1e-4  # of the frame's energy: below it a ratio of misfits says nothing
+
+
+@dataclass(frozen=True)
+class KnownLight:
+    """What an estimator knows but for the frames it knows it from, to go on with later."""
+
+    estimate: LightEstimate
+    light: LobeFit | None
+    solution: Solution | None
+    mean: Floats | None
+    """[lobes]."""
+    surface_colors: Floats
+    one_color: bool
+    steady: int
+    frames: int
+    planes: KnownPlanes | None
 
 
 class LobeEstimator:
@@ -105,6 +124,7 @@ class LobeEstimator:
         self._steady = 0
         self._mean: Floats | None = None
         self._last: tuple[Rows, Albedos, Floats] | None = None
+        self._lit: dict[float, NDArray[np.bool_]] = {}
         self.light: LobeFit | None = None
         self.materials = 0
         self._estimate = LightEstimate(np.zeros((bands * bands, 3)), None, float("inf"), valid=False)
@@ -112,6 +132,36 @@ class LobeEstimator:
     def estimate(self) -> LightEstimate:
         """The light as it stands."""
         return self._estimate
+
+    @property
+    def steady(self) -> int:
+        """Frames that the mean goes back; fewer than before where the light has changed."""
+        return self._steady
+
+    def known(self) -> KnownLight:
+        """All but the frames of the window."""
+        return KnownLight(
+            self._estimate,
+            self.light,
+            self._solution,
+            self._mean,
+            self._surfaces.colors,
+            self._one_color,
+            self._steady,
+            self._kept.count,
+            self.continuation.known() if self.continuation else None,
+        )
+
+    def resume(self, known: KnownLight) -> None:
+        """Go on with what another one knew, of as many bands; nothing of it where its lobes were others."""
+        lobes = self._family.shape[1]
+        if known.solution is not None and len(known.solution.amounts) != lobes:
+            return
+        self._estimate, self.light, self._solution, self._mean = known.estimate, known.light, known.solution, known.mean
+        self._surfaces.colors, self._one_color, self._steady = known.surface_colors, known.one_color, known.steady
+        self._kept = FrameWindow(known.frames)
+        if self.continuation and known.planes:
+            self.continuation.resume(known.planes)
 
     def update(
         self,
@@ -167,7 +217,8 @@ class LobeEstimator:
         self._kept.add(slot, newest, shot)
         with self._engine.profile.host():
             self._steady = min(self._steady + 1, self._forget(slot, newest))
-        return self._refresh(slot, FIRST_ROUNDS if self._steady == 1 else ROUNDS)
+        rounds = FIRST_ROUNDS if self._steady == 1 else ROUNDS if self._steady < YOUNG else STEADY_ROUNDS
+        return self._refresh(slot, rounds)
 
     def _look_around(self, continuation: Continuation, camera: CameraModel, pose: Floats, depth_m: Columns) -> None:
         """Find planes in what is seen, and what of them cannot be."""
@@ -176,7 +227,7 @@ class LobeEstimator:
         normals = [frame.pools.normals[own] for frame, own in zip(self._kept.frames.values(), used, strict=True)]
         with self._engine.profile.host():
             continuation.find(np.concatenate(positions), np.concatenate(normals))
-            continuation.look(camera, pose, depth_m.astype(np.float64))
+            continuation.look(camera, pose, depth_m)
 
     def _judged(self) -> Judged:
         """Some pools of the window, as the albedos found last have them."""
@@ -184,18 +235,21 @@ class LobeEstimator:
         assert self._last is not None
         rows, albedos, weights = self._last
         some = np.arange(0, len(rows.seen), max(1, -(-len(rows.seen) // MOST_ROWS)))
-        raw = self._engine.download(self._window.raw)[rows.slots[some], rows.places[some]].astype(np.float64)
+        slots, places = rows.slots[some], rows.places[some]
         mean_albedo = self._solution.mean_albedo if self._solution else ASSUMED_ALBEDO
         _, target, scaled = system_of(rows, albedos, weights)
-        frames = self._kept.frames
-        pools = [(frames[slot].pools, place) for slot, place in zip(rows.slots[some], rows.places[some], strict=True)]
-        sent = np.array([frame.sent[place] @ LUMINANCE for frame, place in pools])
+        positions, sent, beyond = np.empty((len(some), 3)), np.empty(len(some)), np.empty(len(some))
+        for slot, frame in self._kept.frames.items():
+            own, pools = slots == slot, frame.pools
+            positions[own] = pools.positions[places[own]]
+            sent[own] = pools.sent[places[own]] @ LUMINANCE
+            beyond[own] = pools.beyond @ LUMINANCE
         return Judged(
-            positions=np.array([frame.positions[place] for frame, place in pools]),
-            transfer=raw,
+            positions=positions,
+            transfer=self._window.raw_of(slots, places).astype(np.float64),
             lobes=self._judged_lobes(),
             target=target[some] - mean_albedo * sent,
-            beyond=mean_albedo * np.array([frame.beyond @ LUMINANCE for frame, _ in pools]),
+            beyond=mean_albedo * beyond,
             weights=scaled[some],
         )
 
@@ -229,6 +283,7 @@ class LobeEstimator:
             slot,
             self._kept.frames[slot].pools.grid,
             self._bands,
+            self._lit,
             albedo_known=not self._model.albedos,
         )
         return estimate
@@ -237,7 +292,7 @@ class LobeEstimator:
         """The window, empty where pictures are cut into more parts than any before."""
         if self._window is None or self._window.capacity < grid.count:
             self._window = PoolWindow(self._engine, grid.count, SLOTS)
-            self._kept = FrameWindow()
+            self._kept = FrameWindow(self._kept.count)
         return self._window
 
     def _forget(self, slot: int, newest: Frame) -> int:
@@ -258,7 +313,7 @@ class LobeEstimator:
         rows = rows_of({0: newest}, self._model.normals)
         albedos, weights = self._albedos(rows, solution, materials=True), weights_of(rows, None, None, outliers=False)
         columns, target, scaled = system_of(rows, albedos, weights)
-        own = misfit_of(columns, target, scaled, solve_amounts(columns, target, scaled))
+        own = misfit_of(columns, target, scaled, solve_amounts(sums_of(rows, albedos, weights))[0])
         known = np.append(solution.amounts, solution.mean_albedo)
         energy = float(scaled @ target**2)
         return misfit_of(columns, target, scaled, known) > CHANGE * (own + _LEAST_MISFIT * energy)
@@ -268,6 +323,7 @@ class LobeEstimator:
         if not self._model.albedos:
             rounds = min(rounds, 2)
         solution, first = self._solution, rounds == FIRST_ROUNDS
+        lit = None if solution is None else np.append(solution.amounts > 0, True)
         hold = HOLD * min((self._steady - 1) / LONG, 1.0)
         albedos, weights = one_albedo(len(rows.seen)), weights_of(rows, None, None, outliers=False)
         self._one_color = not self._model.albedos or is_of_one_color(rows)
@@ -276,9 +332,9 @@ class LobeEstimator:
             if solution is not None:
                 albedos = self._albedos(rows, solution, materials=not first or number > COLOR_ROUNDS)
                 weights = weights_of(rows, solution, albedos, outliers=self._model.outliers)
-            columns, target, scaled = system_of(rows, albedos, weights)
-            amounts = solve_amounts(columns, target, scaled, self._mean, hold)
-            solution = with_colors(rows, albedos, weights, amounts[:-1], float(amounts[-1]), pull)
+            sums = sums_of(rows, albedos, weights)
+            amounts, lit = solve_amounts(sums, self._mean, hold, lit)
+            solution = with_colors(sums, amounts[:-1], float(amounts[-1]), pull)
         self._solution = solution
         assert solution is not None
         shape = solution.amounts / max(float(solution.amounts.sum()), 1e-300)
@@ -289,5 +345,5 @@ class LobeEstimator:
         if not self._model.albedos:
             return one_albedo(len(rows.seen))
         materials = materials and (self.continuation is None or not self.continuation.is_searching)
-        shading = rows.columns @ solution.colors + solution.mean_albedo * rows.sent
+        shading = rows.shading(solution)
         return self._surfaces.albedos(rows.seen, shading, rows.weights, materials=materials, one_color=self._one_color)

@@ -12,7 +12,7 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from server.maths.emitters import Emitter, Scene
-from server.maths.near_light import LEAST_MISFIT, Found, Steps, find_emitters
+from server.maths.near_light import LEAST_MISFIT, LONG_STEP, STEP, Found, Steps, find_emitters
 from server.opencl.engine import Engine
 from server.stages.light_estimation import ASSUMED_ALBEDO
 from server.stages.near_samples import PooledSamples
@@ -81,12 +81,13 @@ def search_lamps(
 ) -> Steps[Found]:
     """Lamps in the volume, in volume space, and the light from outside (`outside_light`) beside them.
 
-    About a second of processor time, in steps.
+    About a second of processor time, in pieces.
     """
+    yield LONG_STEP
     emitters = Emitters(engine, volume, samples)
     outside = outside_light(volume, samples, emitters)
     scene = Scene(samples.positions, samples.normals, samples.colors / albedo, outside)
-    yield
+    yield STEP
     return (yield from find_emitters(scene, emitters.shares, _grid(_size_m(volume)), least_misfit=least_misfit))
 
 

@@ -19,7 +19,16 @@ from server.maths.sh import spherical_fibonacci
 from server.opencl.engine import Engine
 from server.settings import WHOLE_ROOM_M
 from server.stages.light_estimation import LEAST_FLATNESS, LEAST_OPENNESS
-from server.stages.radiance_transfer import SETS_A_FRAME, Directions, Transfer, direction_sets, transfer_radiance
+from server.stages.radiance_transfer import (
+    SETS_A_FRAME,
+    Directions,
+    Transfer,
+    direction_sets,
+    own_sets,
+    room_for_transfer,
+    transfer_radiance,
+    window_px,
+)
 from server.stages.raycast import Surface
 from server.stages.volume import Volume
 
@@ -28,6 +37,7 @@ LOBES = 96
 LEAST_SHARE = 0.5
 """Of a pool's samples: fewer have too few directions between them."""
 _POOL = 4
+_SPARE = 1.25  # pools that are traced for one that is asked for: some turn out to see too little of the sky
 _RAYS, _BANDS = 81, 4
 _SPACING = 1 / 160
 """Of samples, in picture widths: pools of twice the size smear the light of a lamp half a metre away, which then is
@@ -151,9 +161,66 @@ def see_samples(
 ) -> PooledSamples:
     """Pooled samples of a frame with rays of their own, whatever the session's are: whole, and as long as the room."""
     rays = direction_sets(_RAYS, _BANDS)
-    stride = max(1, round(camera.width * _SPACING))
-    transfer = transfer_radiance(engine, camera, volume, surface, stride, rays, WHOLE_ROOM_M)
+    transfer = transfer_radiance(engine, camera, volume, surface, _stride(camera), rays, WHOLE_ROOM_M)
     return pool_samples(engine, camera, radiance, surface, transfer, rays, volume.voxel_m)
+
+
+def see_some(
+    engine: Engine,
+    camera: CameraModel,
+    radiance: cl_array.Array,
+    surface: Surface,
+    volume: Volume,
+    most: int,
+    random: np.random.Generator,
+) -> PooledSamples:
+    """At most `most` of `see_samples`, picked at random; of the others no ray is traced."""
+    usable = _usable(engine, camera, radiance, surface, volume.voxel_m)
+    rows, cols = (size // _POOL for size in usable.shape)
+    members = usable[: rows * _POOL, : cols * _POOL].reshape(rows, _POOL, cols, _POOL)
+    pools = np.flatnonzero(members.sum(axis=(1, 3)) >= LEAST_SHARE * _POOL**2)
+    picked = np.zeros((rows, cols), np.bool_)
+    picked.flat[random.permutation(pools)[: round(_SPARE * most)]] = True
+    wanted = np.zeros_like(usable)
+    wanted[: rows * _POOL, : cols * _POOL] = (members & picked[:, None, :, None]).reshape(rows * _POOL, cols * _POOL)
+    chosen = np.flatnonzero(wanted).astype(np.int32)
+    rays = direction_sets(_RAYS, _BANDS)
+    transfer = transfer_radiance(engine, camera, volume, surface, _stride(camera), rays, WHOLE_ROOM_M, chosen=chosen)
+    return pool_samples(engine, camera, radiance, surface, transfer, rays, volume.voxel_m).thinned(most, random)
+
+
+def _stride(camera: CameraModel) -> int:
+    return max(1, round(camera.width * _SPACING))
+
+
+def _usable(
+    engine: Engine, camera: CameraModel, radiance: cl_array.Array, surface: Surface, voxel_m: float
+) -> NDArray[np.bool_]:
+    """[rows, cols] samples that can be pooled if they see enough of the sky; they see none yet."""
+    stride = _stride(camera)
+    rows, cols = camera.height // stride, camera.width // stride
+    rays, space = direction_sets(_RAYS, _BANDS), engine.workspace
+    room = room_for_transfer(engine, rows, cols, stride, rays, own_sets(engine, rows, cols))
+    usable = space.array("near_usable", (rows, cols), np.uint8)
+    engine.launch(
+        engine.kernel("near_light.cl", "find_samples", LOBES=LOBES, LANES=engine.lanes),
+        (cols, rows),
+        cols,
+        rows,
+        stride,
+        camera.width,
+        camera.height,
+        window_px(camera),
+        surface.positions,
+        surface.normals,
+        surface.labels,
+        radiance,
+        LEAST_FLATNESS,
+        voxel_m,
+        room.openness,
+        usable,
+    )
+    return np.asarray(engine.download(usable) != 0)
 
 
 def _vectors(engine: Engine, array: cl_array.Array) -> NDArray[np.float64]:

@@ -39,7 +39,9 @@ class Thumbnail:
 
 
 @dataclass(frozen=True)
-class _Keyframe:
+class Keyframe:
+    """A view that is remembered."""
+
     thumbnail: Thumbnail
     volume_from_camera: NDArray[np.float64]
 
@@ -68,10 +70,14 @@ class Keyframes:
     """Views of a volume that a lost camera is looked for in."""
 
     def __init__(self) -> None:
-        self._kept: list[_Keyframe] = []
+        self._kept: list[Keyframe] = []
 
     def __len__(self) -> int:
         return len(self._kept)
+
+    def kept(self) -> list[Keyframe]:
+        """All of them, in the order in which they came."""
+        return list(self._kept)
 
     def is_new(self, volume_from_camera: NDArray[np.float64]) -> bool:
         """Whether a view is far enough from all others to be worth keeping."""
@@ -79,7 +85,7 @@ class Keyframes:
 
     def add(self, seen: Thumbnail, volume_from_camera: NDArray[np.float64]) -> None:
         """Keep a view; past the greatest count, one of the two nearest to each other goes."""
-        self._kept.append(_Keyframe(seen, volume_from_camera))
+        self._kept.append(Keyframe(seen, volume_from_camera))
         if len(self._kept) > GREATEST_COUNT:
             del self._kept[self._most_crowded()]
 

@@ -7,7 +7,8 @@ bit for bit when one looks at them again. While away they still stop rays, as ce
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -38,7 +39,8 @@ class VolumeSizeError(ValueError):
 class Volume:
     """TSDF of one session. World axes; volume space has its origin at the volume's lower corner.
 
-    `budget_bytes` is device memory of the pool, `host_budget_bytes` (default four times that) of released bricks.
+    `budget_bytes` is device memory of the pool (default: what the device gives a volume), `host_budget_bytes` (default
+    four times that) of released bricks.
     """
 
     def __init__(
@@ -46,9 +48,10 @@ class Volume:
         engine: Engine,
         bounds_m: tuple[float, float, float, float, float, float],
         voxel_m: float,
-        budget_bytes: int = 512 << 20,
+        budget_bytes: int | None = None,
         host_budget_bytes: int | None = None,
     ) -> None:
+        self.bounds_m = bounds_m
         self.origin_world = np.array(bounds_m[:3], np.float64)
         self.voxel_m = float(voxel_m)
         self.bricks = _brick_counts(np.array(bounds_m[3:]) - self.origin_world, self.voxel_m)
@@ -57,6 +60,7 @@ class Volume:
         self.is_full = False
         self._engine = engine
         self._tables = RayTables(engine, self.bricks)
+        budget_bytes = engine.device.volume_bytes if budget_bytes is None else budget_bytes
         host_bytes = 4 * budget_bytes if host_budget_bytes is None else host_budget_bytes
         self._residency = Residency(engine, self._tables, self.voxel_m, budget_bytes, host_bytes)
         self._tables.update()
@@ -120,6 +124,34 @@ class Volume:
         """Say that one more picture was integrated."""
         self.frames += 1
 
+    def note_picture(self, camera: CameraModel, volume_from_camera: NDArray[np.float64]) -> None:
+        """Say where a picture was taken whose integration may have changed bricks."""
+        self._residency.note_picture(camera, volume_from_camera)
+
+    @property
+    def changes(self) -> int:
+        """Grows whenever voxels change."""
+        return self._residency.changes
+
+    def places(self) -> Indices:
+        """[n] all bricks that hold voxels, released ones too: their places in the grid, x fastest, in order."""
+        return self._residency.held()
+
+    def changed_since(self, change: int) -> Indices:
+        """[n] those of `places` whose voxels may have changed after `changes` was `change`; -1: all."""
+        return self._residency.changed_since(change)
+
+    def copies(self, places: Indices) -> Iterator[tuple[Indices, NDArray[Any], NDArray[np.uint32]]]:
+        """The bricks at `places`, bit for bit, some at a time: places [k], voxels [k, 512] float2, colours [k, 512]."""
+        return self._residency.copies(places)
+
+    def fill(self, batches: Iterable[tuple[Indices, NDArray[Any], NDArray[np.uint32]]], frames: int) -> None:
+        """Make an empty volume one of which these are the `copies`, after `frames` pictures."""
+        for places, voxels, colors in batches:
+            self._residency.fill(places, voxels, colors)
+        self.frames = frames
+        self._tables.update()
+
     def volume_from_world(self) -> NDArray[np.float64]:
         """4x4 that moves world coordinates to the volume's origin."""
         return translation(-self.origin_world)
@@ -161,6 +193,7 @@ class Volume:
         """After integration: how far rays may jump. `all`: look for solid voxels first; else integration did so."""
         if all:
             pool = self._residency.pool
+            self._residency.note_all()
             self._tables.find_solid(self.allocated_device, self.allocated_bricks, self.slots_device, pool)
         self._tables.update()
 

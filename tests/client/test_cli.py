@@ -59,8 +59,12 @@ def assert_one_line(done: subprocess.CompletedProcess[str], status: int, words: 
         (["stream", TABLE], "--server"),
         (["stream", TABLE, "--server", "localhost:1", "--device", "x"], "probeless serve --device"),
         (["stream", TABLE, "--server", "http://127.0.0.1:9", "--mesh"], "say where with --out"),
-        (["serve", "--token", "x"], "not built yet"),
-        (["serve", "--tls", "x"], "not built yet"),
+        (["serve", "--token", "a b"], "without spaces"),
+        (["serve", "--token", "none", "--host", "0.0.0.0"], "--insecure"),
+        (["serve", "--insecure"], "goes with --token none"),
+        (["serve", "--tls-cert", "x"], "go together"),
+        (["serve", "--allow-origin", "x"], "expected https://HOST"),
+        (["serve", "--volume-memory", "1"], "expected MiB"),
         (["serve", "--port", "70000"], "--port"),
         (["bench", "nothing"], "nothing"),
     ],
@@ -81,6 +85,7 @@ def test_wrong_use_ends_with_2(words: list[str], error: str, tmp_path: Path) -> 
         (["run", TABLE, "--out", "{tmp}", "--device", "no such device"], "no OpenCL device is called"),
         (["run", TABLE, "--out", "/proc/probeless"], "cannot be written"),
         (["serve", "--device", "no such device", "--port", "0"], "no OpenCL device is called"),
+        (["serve", "--tls-cert", "{tmp}/none.pem", "--tls-key", "{tmp}/none.pem"], "none.pem"),
     ],
 )
 def test_what_cannot_be_done_ends_with_1(words: list[str], error: str, tmp_path: Path) -> None:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+from scipy.spatial.transform import Rotation
 
 from client.laptop.source import open_source
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import CameraModel
 from protocol.messages import Wishes
 from server.evaluation.environment import direction_error_deg
-from server.maths.lobes import CELLS, cell_directions, lobe_family
-from server.maths.planes import STEPS_M, PlanePatch, find_planes
+from server.maths.lobes import CELLS, RIDGE, cell_directions, lobe_family
+from server.maths.planes import SIDES, STEPS_M, PlanePatch, find_planes
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import Pipeline
@@ -35,7 +39,7 @@ from server.stages.lobe_estimator import LobeEstimator
 from tests.analytic import Floats
 from tests.data import data_folder
 from tests.maths.test_planes import FLOOR, WALL, corner
-from tests.reference.planes import beyond
+from tests.reference.planes import beyond, looked_through
 
 CAMERA = CameraModel(width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
 
@@ -126,6 +130,44 @@ def test_a_wall_goes_on_as_far_as_the_shading_says() -> None:
     assert continuation.arrays()[0].shape[0] == len(continuation.planes)
 
 
+def test_what_extents_leave_is_that_of_the_best_light() -> None:
+    """However many steps led to them: against all pools at once, in float64, by another solver."""
+    points, normals, judged = shaded_corner(1.0)
+    rng = np.random.default_rng(6)
+    judged = replace(judged, beyond=0.1 * rng.random(len(points)))
+    planes = looking(points, normals).planes
+    trial = _Trial(planes, judged, 0.01)
+    while trial.unprepared:
+        trial.prepare()
+    for turn in range(2 * SIDES * len(planes)):
+        trial.settle(*divmod(turn % (SIDES * len(planes)), SIDES))
+    assert sum(plane.steps.sum() for plane in planes) > 3
+    directions = spokes().reshape(-1, 3)
+    hidden = np.zeros((len(points), len(directions)), np.bool_)
+    for plane in planes:
+        needed = beyond(plane, points, directions, LEAST_M)
+        reach = np.array(STEPS_M)[plane.steps]
+        hidden |= np.logical_and.reduce([side <= most for side, most in zip(needed, reach, strict=True)])
+    expected = misfit_of(judged, hidden)
+    assert trial.misfit == pytest.approx(expected, rel=2e-3)  # of a direction at an edge float32 decides otherwise
+    assert trial.misfit_of_none == pytest.approx(misfit_of(judged, np.zeros_like(hidden)), rel=1e-4)
+    assert trial.misfit < 0.8 * trial.misfit_of_none
+
+
+def misfit_of(judged: Judged, hidden: NDArray[np.bool_]) -> float:
+    """What non-negative least squares of the lobes leaves; hidden: [n, CELLS * SPOKES]."""
+    left = judged.transfer * (1 - hidden.reshape(len(hidden), CELLS, -1).mean(axis=2))
+    root = np.sqrt(judged.weights)
+    target = judged.target - judged.beyond * (judged.transfer - left).sum(axis=1)
+    columns = root[:, None] * (left @ judged.lobes)
+    ridge = np.sqrt(RIDGE * np.trace(columns.T @ columns) / columns.shape[1])
+    amounts, _ = nnls(
+        np.concatenate([columns, ridge * np.eye(columns.shape[1])]),
+        np.concatenate([root * target, np.zeros(columns.shape[1])]),
+    )
+    return float(np.sum((root * target - columns @ amounts) ** 2))
+
+
 def test_nothing_is_believed_that_explains_little() -> None:
     """Open surroundings: extents that noise alone suggests are not taken."""
     points, normals, judged = shaded_corner(-1.0)
@@ -185,6 +227,30 @@ def test_a_camera_that_looks_through_empties_the_plane() -> None:
     assert wall.empty[seen].all()
     assert not wall.empty[~seen & ((np.abs(at[..., 0]) > 1.4) | (np.abs(at[..., 1]) > 1.1))].any()
     assert floor.empty.any()
+
+
+def test_what_cameras_looked_through_is_what_the_twin_says() -> None:
+    """Of a plane that was known all the time, and of a new one with which earlier views are compared."""
+    rng = np.random.default_rng(8)
+    poses, small = [np.eye(4), np.eye(4)], CameraModel(width=40, height=50, fx=30.0, fy=35.0, cx=20.0, cy=24.0)
+    poses[1][:3, :3] = Rotation.from_rotvec([0.3, -0.5, 0.1]).as_matrix()
+    poses[1][:3, 3] = 0.4, -0.2, 0.5
+    cameras = [CAMERA, small]
+    depths = [np.where(rng.random((c.height, c.width)) < 0.1, 0, rng.uniform(0.5, 4.0, (c.height, c.width)))
+              for c in cameras]  # fmt: skip
+    continuation = Continuation()
+    planes = find_planes(*corner(), [])
+    continuation.planes = planes[:1]
+    for camera, pose, depth in zip(cameras, poses, depths, strict=True):
+        continuation.look(camera, pose, depth.astype(np.float32))
+    continuation.planes = planes
+    continuation.look(CAMERA, np.eye(4), np.zeros((48, 64), np.float32))
+    for plane in planes:
+        expected = np.zeros_like(plane.empty)
+        for camera, pose, depth in zip(cameras, poses, depths, strict=True):
+            expected |= looked_through(plane, camera, np.linalg.inv(pose), depth, 0.1, 0.05)
+        assert 0.02 < expected.mean() < 0.9
+        assert (plane.empty != expected).mean() < 1e-3  # float32 rounds to another pixel at its edge
 
 
 @pytest.mark.data

@@ -330,15 +330,17 @@ def test_a_light_that_moves_slowly_does_not_lag(engine: Engine, model: LightMode
     assert max(errors) < (2.0 if noise < 0.1 else 6.0)
 
 
-def test_pictures_cut_otherwise_begin_anew(engine: Engine) -> None:
-    """As after a change of preset: nothing is taken from a window of other pools."""
-    run, view, light = Run(engine, 4), View.of(), sun()
+def test_pictures_cut_into_more_pools_begin_anew(engine: Engine) -> None:
+    """As after a change of preset: nothing is taken from a window that is too small. Fewer fit into it."""
+    run, view, few, light = Run(engine, 4), View.of(), PoolGrid(4, 20, 25), sun()
+    small = run._window_for(few)
     run.add(view, view.under(light))
-    window = run._window_for(GRID)
-    assert run._window_for(PoolGrid(4, 40, 50)) is not window
+    window = run._window
+    assert window is not small
+    assert run._window_for(few) is window
+    assert run._kept.frames
+    assert run._window_for(PoolGrid(2, GRID.rows + 1, GRID.cols)) is not window
     assert not run._kept.frames
-    again = run.add(view, view.under(sun((-0.8, -0.3, -0.1))))
-    assert error_deg(again.sh, sun((-0.8, -0.3, -0.1))) < 1.0
 
 
 def test_a_frame_that_sees_nothing_leaves_the_estimate(engine: Engine) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -12,8 +14,17 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.stages.light_estimation import LEAST_FLATNESS, LEAST_OPENNESS
 from server.stages.near_light import CLEARANCE_M, Emitters, remove_lamps, surround_patches
-from server.stages.near_samples import LEAST_SHARE, LOBES, PooledSamples, lobe_radiance, pool_samples
+from server.stages.near_samples import (
+    LEAST_SHARE,
+    LOBES,
+    PooledSamples,
+    lobe_radiance,
+    pool_samples,
+    see_samples,
+    see_some,
+)
 from server.stages.radiance_transfer import direction_sets
+from server.stages.raycast import LABEL_DYNAMIC
 from tests.kernels.test_light_estimation import random_frame
 from tests.lights import random_directions
 from tests.reference import near_light as twin
@@ -184,3 +195,27 @@ def test_camera_smaller_than_a_pool(engine: Engine) -> None:
     camera, radiance, surface, transfer = frame.upload(engine)
     assert isinstance(camera, CameraModel)
     assert len(pool_samples(engine, camera, radiance, surface, transfer, direction_sets(81, 4), VOXEL_M)) == 0
+
+
+def test_some_samples_are_among_all(engine: Engine) -> None:
+    """Under a ball on a floor of which a part is not static and a part is clipped."""
+    volume = fill_volume(engine, SCENES["ball above a floor"], VOXEL_M)
+    z, x = np.mgrid[0.15:0.85:48j, 0.15:0.85:64j]
+    surface = upload_surface(engine, np.stack([x, 0 * x + 0.1, z], -1), np.tile([0.0, 1.0, 0.0], (48, 64, 1)), x > 0.2)
+    labels = np.where(z < 0.3, LABEL_DYNAMIC, engine.download(surface.labels)).astype(np.uint8)
+    surface = replace(surface, labels=engine.workspace.upload("other_labels", labels))
+    seen = np.random.default_rng(4).uniform(0, 0.6, (48, 64, 3))
+    radiance = engine.workspace.upload("radiance", float4(seen, (x < 0.7).astype(float)))
+    camera = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
+    whole = see_samples(engine, camera, radiance, surface, volume)
+    some = see_some(engine, camera, radiance, surface, volume, 20, np.random.default_rng(1))
+    assert len(whole) > 50
+    assert len(some) == 20
+    numbers = [int(np.flatnonzero((whole.positions == position).all(axis=1))[0]) for position in some.positions]
+    assert len(set(numbers)) == 20
+    for name in ("normals", "colors", "sky"):
+        np.testing.assert_array_equal(getattr(some, name), getattr(whole, name)[numbers])
+    again = see_some(engine, camera, radiance, surface, volume, 1000, np.random.default_rng(2))
+    np.testing.assert_array_equal(again.sky, whole.sky)
+    empty = replace(surface, labels=engine.workspace.upload("no_labels", np.zeros_like(labels)))
+    assert len(see_some(engine, camera, radiance, empty, volume, 20, np.random.default_rng(1))) == 0

@@ -84,6 +84,20 @@ def test_the_widest_family_that_explains_is_taken() -> None:
     assert fit.misfit < LEAST_GAIN**steps * fit_width(narrow, WIDTHS_DEG[0]).misfit
 
 
+@pytest.mark.parametrize("width_deg", [35.0, 10.0])
+def test_guesses_of_what_is_lit_change_nothing(width_deg: float) -> None:
+    """None, wrong ones, and those of the same light."""
+    sums = equations(balls(1500), sun(width_deg) + sun(width_deg, (-0.9, 0.1, 0.2)), noise=0.02)
+    plain = fit_lobes(sums)
+    lit = {width: np.arange(lobe_family(width).shape[1]) % 2 == 0 for width in WIDTHS_DEG[1:]}
+    for _ in range(2):
+        guessed = fit_lobes(sums, lit)
+        assert guessed.width_deg == plain.width_deg
+        np.testing.assert_allclose(guessed.amounts, plain.amounts, rtol=1e-6, atol=1e-9 * plain.amounts.max())
+    assert set(lit) == set(WIDTHS_DEG)
+    np.testing.assert_array_equal(lit[plain.width_deg], plain.amounts > 0)
+
+
 def test_what_no_sample_sees_stays_finite_and_uncertain() -> None:
     """Only surface facing up: the light from below is open, and its spread says so."""
     normals = np.tile([0.0, 0.0, 1.0], (200, 1)) + 0.1 * np.random.default_rng(3).normal(size=(200, 3))

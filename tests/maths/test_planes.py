@@ -114,8 +114,8 @@ def test_steps_needed_are_those_of_how_far_beyond() -> None:
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         directions[:2] = plane.across, -plane.along  # along it: they never meet it
         exact = np.searchsorted(np.array(STEPS_M), np.stack(beyond(plane, origins, directions, 0.03)))
-        found = plane.steps_needed(origins, directions, 0.03)
-        assert found.shape == (4, 300, 400)
+        of_origins, of_directions = (index.ravel() for index in np.mgrid[:300, :400])
+        found = plane.steps_needed(origins, directions, of_origins, of_directions, 0.03).reshape(4, 300, 400)
         assert (found[..., :2] == len(STEPS_M)).all()
         assert (exact < len(STEPS_M)).mean() > 0.1
         assert (found != exact).mean() < 1e-3

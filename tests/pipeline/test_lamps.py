@@ -12,7 +12,7 @@ from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import CameraModel
 from protocol.messages import Wishes
 from server.maths.emitters import Emitter
-from server.maths.near_light import Found, Steps
+from server.maths.near_light import LONG_STEP, STEP, Found, Steps
 from server.maths.sh import LUMINANCE
 from server.opencl.device import Device
 from server.opencl.engine import Engine
@@ -21,8 +21,8 @@ from server.stages import lamp_finder
 from server.stages.lamp_finder import FIRST_VIEWS, FRAMES_A_VIEW, STEPS_A_FRAME, LampFinder
 from server.stages.near_samples import LOBES, PooledSamples
 
-FRAMES = range(0, 120, 2)
-"""Three views, a search of 25 frames, and ten more for the sky to follow."""
+FRAMES = range(0, 128, 2)
+"""Three views, a search of 29 frames, and ten more for the sky to follow."""
 CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
 
 
@@ -67,15 +67,17 @@ def test_search_waits_for_views_forgets_and_can_be_off(engine: Engine, monkeypat
     lamp = Emitter(np.zeros(3), np.ones(3), np.eye(3), np.ones(3), 0.9, 0.5)
 
     def search(*_: object, **__: object) -> Steps[Found]:
-        for _step in range(7):
-            yield
+        yield LONG_STEP
+        for _step in range(6):
+            yield STEP
+        yield LONG_STEP
         return Found((lamp,), np.zeros(1), 0.01)
 
     def see(*_: object) -> PooledSamples:
         views.append(finder)
         return PooledSamples(*(np.zeros((5, 3)) for _ in range(3)), np.zeros((5, LOBES)))
 
-    monkeypatch.setattr(lamp_finder, "see_samples", see)
+    monkeypatch.setattr(lamp_finder, "see_some", see)
     monkeypatch.setattr(lamp_finder, "search_lamps", search)
     monkeypatch.setattr(LampFinder, "_contradicts", lambda *_: contradicting)
     finder = LampFinder(engine, "auto")
@@ -87,7 +89,10 @@ def test_search_waits_for_views_forgets_and_can_be_off(engine: Engine, monkeypat
             count += 1
         return count
 
-    assert frames_until(1) == FIRST_VIEWS * FRAMES_A_VIEW + 7 // STEPS_A_FRAME
+    assert LONG_STEP < STEPS_A_FRAME < 2 * LONG_STEP
+    assert STEPS_A_FRAME == 6 * STEP
+    searching = 3  # of frames: one or two with a long piece and short ones, and a view between
+    assert frames_until(1) == FIRST_VIEWS * FRAMES_A_VIEW + searching
     assert len(views) == FIRST_VIEWS + 1
     assert finder.left_out()[0].effect == "lamplight"
     contradicting = True

@@ -295,6 +295,12 @@ def test_a_dense_volume_needs_its_memory(engine: Engine) -> None:
         volume.allocate_everywhere()
 
 
+def test_a_volume_has_what_its_device_gives_one(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine.device, "volume_bytes", 120 * BRICK_BYTES)
+    with pytest.raises(VolumeSizeError, match="more than the budget's 120"):
+        Volume(engine, ROOM_BOUNDS, VOXEL_M).allocate_everywhere()
+
+
 # ---- a room ------------------------------------------------------------------------------------------------------
 
 

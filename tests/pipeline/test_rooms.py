@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 import trimesh
 from msgspec import structs
 
-from protocol.frames import RgbdFrame
+from protocol.frames import RgbdFrame, Viewpoint
 from protocol.messages import Hello, Light, Marker
 from server.maths.registration import angle_between, distance_between
 from server.maths.rigid import inverse_rigid
@@ -235,6 +236,51 @@ def test_a_marker_that_nobody_has_seen_is_said(device: Device, room: Room) -> No
     assert any("nobody in the room has seen marker 7" in note for note in result.notes)
 
 
+def test_somebody_who_only_looks_sees_the_room_from_where_he_stands(device: Device, room: Room) -> None:
+    scan(join(device, room), range(0, 30, 2))
+    looker = join(device, room, room_from_world=said(inverse_rigid(ELSEWHERE)))
+    looker.place_object("cube", CUBE, Placement(position_m=tuple((ELSEWHERE @ [-0.9, 0.6, 1.0, 1.0])[:3].tolist())))
+    assert room.reconstruction.volume is not None
+    fused = room.reconstruction.volume.frames
+    seen = looker.process(Viewpoint(0, 0.0, ELSEWHERE @ view_at(13)))
+    true = frame_at(view_at(13)).color.astype(int)
+    near = np.abs(seen.color.astype(int) - true).max(axis=-1)
+    assert seen.tracking == "given"
+    assert np.median(near) < 12
+    assert (near > 60).mean() < 0.2  # the cube, and edges
+    assert "rasterize" in seen.plan.run
+    assert {left.effect for left in seen.plan.left_out} >= {"estimate_light"}
+    assert room.reconstruction.volume.frames == fused
+    np.testing.assert_allclose(seen.world_from_camera, ELSEWHERE @ view_at(13), atol=1e-9)
+
+
+def test_a_camera_without_depth_gets_light_and_objects_and_changes_nothing(device: Device, room: Room) -> None:
+    scan(join(device, room), range(12))
+    plain = join(device, room, room_from_world=said(inverse_rigid(ELSEWHERE)))
+    assert room.reconstruction.volume is not None
+    before = room.reconstruction.volume.download_bricks()
+    frame = frame_at(view_at(8), 8, given=ELSEWHERE @ view_at(8))
+    frame = replace(frame, depth=np.zeros_like(frame.depth), has_depth=False)
+    plain.place_object("cube", CUBE, Placement(position_m=tuple((ELSEWHERE @ [-0.9, 0.6, 1.0, 1.0])[:3].tolist())))
+    result = plain.process(frame)
+    assert result.tracking == "given"
+    assert result.notes == ()
+    assert (np.abs(result.color.astype(int) - frame.color).max(axis=-1) > 12).mean() > 0.005
+    np.testing.assert_array_equal(room.reconstruction.volume.download_bricks().tsdf, before.tsdf)
+
+
+def test_without_depth_a_client_must_say_where_it_is(device: Device, room: Room) -> None:
+    frame = replace(frame_at(view_at(8), 8, given=view_at(8)), has_depth=False)
+    with pytest.raises(ValueError, match="nobody has scanned this room yet"):
+        join(device, room).process(frame)
+    with pytest.raises(ValueError, match="nobody has scanned this room yet"):
+        join(device, room).process(Viewpoint(0, 0.0, view_at(0)))
+    scan(join(device, room), range(2))
+    result = join(device, room).process(frame)
+    assert result.tracking == "lost"
+    assert result.notes[0].startswith("not aligned with the room: without depth, say where")
+
+
 def test_objects_of_one_client_are_seen_by_the_others_in_their_place(device: Device, room: Room) -> None:
     first = join(device, room)
     second = join(device, room, room_from_world=said(inverse_rigid(ELSEWHERE)))
@@ -304,3 +350,10 @@ def test_clients_of_threads_of_their_own_do_not_disturb_one_another(device: Devi
     assert [results[number].tracking for number in range(3)] == ["given"] * 3
     assert room.reconstruction.volume is not None
     assert room.reconstruction.volume.frames == 18
+
+
+def test_a_room_of_a_client_whose_preset_is_chosen_for_it_opens(device: Device) -> None:
+    """Where transfer is sampled is each client's own, and not known yet when the room is opened."""
+    room = Room(device, structs.replace(wishes("given"), preset="auto", budget_ms=100.0), "study")
+    assert scan(join(device, room), range(1)).tracking == "given"
+    room.close()

@@ -94,6 +94,16 @@ def test_room_for_exactly_so_many(monkeypatch: pytest.MonkeyPatch) -> None:
         check_room([box(), box()], box())
 
 
+def test_room_for_so_many_texture_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    texture = Texture(np.zeros((4, 6, 3), np.uint8))
+    textured = replace(box(), materials=(Material(color_texture=texture, surface_texture=texture), Material()))
+    monkeypatch.setattr(scene_objects, "MAX_SCENE_TEXTURE_PIXELS", 48)
+    check_room([textured], textured)
+    check_room([textured, textured], box())
+    with pytest.raises(MeshError, match="of textures, more than 0: remove objects or give them smaller pictures"):
+        check_room([textured, textured], textured)
+
+
 def test_digest_tells_apart_what_looks_different() -> None:
     image = np.zeros((4, 4, 3), np.uint8)
     plain = box()

@@ -20,6 +20,7 @@ from protocol.messages import (
     Lamp,
     LeftOut,
     Light,
+    Marker,
     MeshPart,
     MoveObject,
     OperatingPoint,
@@ -74,7 +75,17 @@ CLIENT: dict[str, ClientMessage] = {
         ),
     ),
     "hello_two_lenses": Hello(client="rig", camera=TWO_LENSES),
+    "hello_room": Hello(
+        client="tablet",
+        camera=TWO_LENSES,
+        room="kitchen",
+        room_from_world=IDENTITY,
+        marker=Marker(id=7, side_m=0.125, dictionary="apriltag_36h11"),
+        keep_s=30.0,
+    ),
+    "hello_resume": Hello(client="tablet", camera=TWO_LENSES, resume="k3y"),
     "watch": Watch(),
+    "watch_room": Watch(room="kitchen"),
     "watch_named": Watch(session="küche"),
     "frame": Frame(frame=7, timestamp_s=0.25, world_from_camera=IDENTITY, color=COLOR, depth=DEPTH),
     "frame_with_exposure": Frame(
@@ -91,6 +102,15 @@ CLIENT: dict[str, ClientMessage] = {
 
 SERVER: dict[str, ServerMessage] = {
     "welcome": Welcome(session="kitchen", server="probeless 0.1.0", device="PoCL CPU", max_inflight=2),
+    "welcome_back": Welcome(
+        session="session-1",
+        server="probeless 0.1.0",
+        device="PoCL CPU",
+        max_inflight=2,
+        key="k3y",
+        resumed=True,
+        room="a",
+    ),
     "composite": Composite(
         frame=7,
         timestamp_s=0.25,

@@ -131,7 +131,7 @@ def test_a_wrong_field_is_named(path: str, value: object, named: str) -> None:
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize("field", ["type", "frame", "timestamp_s", "world_from_camera", "color", "depth"])
+@pytest.mark.parametrize("field", ["type", "frame", "timestamp_s", "world_from_camera"])
 def test_a_missing_field_is_named(field: str) -> None:
     fields = _frame_fields()
     del fields[field]
@@ -217,3 +217,14 @@ def test_the_error_is_a_value_error_that_fits_an_error_message() -> None:
     assert issubclass(ProtocolError, ValueError)
     assert one_line("a\n\t b\x00c") == "a b c"
     assert len(one_line("x" * 10_000)) == MAX_REASON_CHARS
+
+
+def test_colour_is_missing_only_where_somebody_looks_from_a_pose() -> None:
+    fields = _frame_fields()
+    del fields["depth"]
+    assert decode_client(msgpack.packb(fields)).depth is None
+    del fields["color"]
+    assert decode_client(msgpack.packb(fields)).color is None
+    for wrong in ({"depth": _frame_fields()["depth"]}, {"world_from_camera": None}):
+        with pytest.raises(ProtocolError, match=r"frame\.color may be left out only"):
+            decode_client(msgpack.packb(fields | wrong))

@@ -1,9 +1,12 @@
-"""Float64 twin of how far planes must go on to be met (server/maths/planes.py)."""
+"""Float64 twins of how far planes must go on to be met (server/maths/planes.py), and of what a camera looked through
+(server/stages/continuation.py)."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from protocol.frames import CameraModel
 from server.maths.planes import CELL_M, PlanePatch
 from tests.analytic import Floats
 
@@ -23,3 +26,20 @@ def beyond(plane: PlanePatch, origins: Floats, directions: Floats, least_m: floa
     misses = (t < least_m) | plane.empty[row, col]
     over = (low_x - x, x - high_x, low_y - y, y - high_y)
     return [np.where(misses, np.inf, np.maximum(side, 0.0)) for side in over]
+
+
+def looked_through(
+    plane: PlanePatch, camera: CameraModel, camera_from_volume: Floats, depth_m: Floats, least_m: float, apart_m: float
+) -> NDArray[np.bool_]:
+    """[rows, cols] cells of the plane's map, farther than `least_m`, in whose pixel something was measured more than
+    `apart_m` behind them. depth_m: [h, w], 0 = none."""
+    at = plane.cell_centers() @ camera_from_volume[:3, :3].T + camera_from_volume[:3, 3]
+    through = np.zeros(at.shape[:2], np.bool_)
+    for cell in np.ndindex(*through.shape):
+        x, y, z = at[cell]
+        if z <= least_m:
+            continue
+        u, v = round(x / z * camera.fx + camera.cx), round(y / z * camera.fy + camera.cy)
+        if 0 <= u < camera.width and 0 <= v < camera.height:
+            through[cell] = depth_m[v, u] > z + apart_m
+    return through

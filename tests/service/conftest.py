@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
@@ -12,6 +13,12 @@ from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
 from tests.service.wire import Wire
 
 StartServer = Callable[..., BackgroundServer]
+
+
+@pytest.fixture(autouse=True)
+def keys_are_left_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tokens are not left where the user's programs look for them."""
+    monkeypatch.setenv("PROBELESS_KEYS", str(tmp_path / "keys"))
 
 
 @pytest.fixture
@@ -26,8 +33,9 @@ def start_server(lab: Lab) -> Iterator[StartServer]:
     servers: list[BackgroundServer] = []
 
     def start(**options: object) -> BackgroundServer:
+        at_the_door = {name: options.pop(name) for name in ("door", "certificate") if name in options}
         service = Service(FAKE_DEVICE, **{"pipeline_factory": lab.build, "mesh_loader": fake_mesh} | options)
-        servers.append(start_in_background(service))
+        servers.append(start_in_background(service, **at_the_door))
         return servers[-1]
 
     yield start

@@ -52,7 +52,7 @@ class Lab:
     closed: threading.Event = field(default_factory=threading.Event)
     threads: set = field(default_factory=set)
 
-    def build(self, _device: object, _camera: CameraModel, wishes: Wishes) -> FakePipeline:
+    def build(self, _device: object, _camera: CameraModel, wishes: Wishes, *_room: object) -> FakePipeline:
         """The `pipeline_factory` of a service under test."""
         self.threads.add(threading.current_thread().name)
         if wishes.preset == "auto":
@@ -177,7 +177,7 @@ def terrain(side: int) -> SceneMesh:
     )
 
 
-FAKE_DEVICE = SimpleNamespace(name="a fake device")
+FAKE_DEVICE = SimpleNamespace(name="a fake device", memory=SimpleNamespace(bytes_held=4096))
 
 
 def fake_mesh(data: bytes, format_: str) -> tuple[str, bytes]:

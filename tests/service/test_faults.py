@@ -13,6 +13,7 @@ from protocol.images import encode_color
 from protocol.limits import MAX_MESSAGE_BYTES
 from protocol.messages import Acknowledged, Composite, Dropped, Error, Hello, Quality
 from tests.service.fakes import CAMERA, EXPLODE_MM, PATIENCE_S, frame_message, rgbd_frame
+from tests.service.test_http import rows
 
 
 def serves_frames(wire, index: int) -> bool:
@@ -105,7 +106,9 @@ def test_garbage_in_a_session_ends_only_that_session(dial) -> None:
         (msgpack.packb({"type": "remove_object", "request": 7, "object": "x" * 65}), Acknowledged, "$.object"),
     ],
 )
-def test_wrong_field_of_a_known_frame_or_request_is_answered_and_the_session_lives(dial, data, answer, field) -> None:
+def test_wrong_field_of_a_known_frame_or_request_is_answered_and_the_session_lives(
+    server, dial, data, answer, field
+) -> None:
     wire = dial()
     wire.greet()
     wire.socket.send(data)
@@ -113,6 +116,7 @@ def test_wrong_field_of_a_known_frame_or_request_is_answered_and_the_session_liv
     assert isinstance(message, answer)
     text = message.reason if answer is Dropped else message.error
     assert field in text
+    assert rows(server)["probeless_frames_dropped_total", "invalid"] == (answer is Dropped)
     assert (message.frame if answer is Dropped else message.request) == 7
     assert serves_frames(wire, 8)
 

@@ -10,6 +10,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from protocol.messages import Composite, Error, Hello, Timings
 from server.app import create_app
+from server.self_check import CheckFailed
 from server.serve import start_in_background
 from server.service import Service
 from tests.service.fakes import CAMERA, FAKE_DEVICE, PATIENCE_S, REFUSE_MM, fake_mesh, frame_message
@@ -73,13 +74,28 @@ def test_failed_warm_up_is_told_to_everybody(lab) -> None:
         assert messages == [Error(reason=reason, fatal=True)]
 
 
+def test_a_wrong_answer_of_the_device_is_named(lab) -> None:
+    def fail(_: object) -> None:
+        raise CheckFailed("light", "its direction is 41.0 degrees off, at most 10")
+
+    prepared = threading.Event()
+    service = Service(FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh, warm_up=fail)
+    service.on_prepared = prepared.set
+    with start_in_background(service) as server:
+        assert prepared.wait(PATIENCE_S)
+        state = get(server, "/healthz").json()
+        assert (state["ready"], state["failed_check"]) == (False, "light")
+        assert "check 'light': its direction is 41.0 degrees off" in state["failure"]
+        assert rows(server)["probeless_ready",] == 0
+
+
 def test_metrics_have_every_row_before_the_first_frame(server) -> None:
     found = rows(server)
     for stage in Timings.__struct_fields__:
         assert found["probeless_stage_ms_count", stage] == 0
     for name in ("decode_ms_count", "encode_ms_count", "queue_age_ms_count", "frames_processed_total", "sessions"):
         assert found[f"probeless_{name}",] == 0
-    for reason in ("replaced", "refused", "unreadable"):
+    for reason in ("replaced", "refused", "unreadable", "invalid"):
         assert found["probeless_frames_dropped_total", reason] == 0
 
 

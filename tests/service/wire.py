@@ -23,13 +23,19 @@ class Wire:
         subprotocols: tuple[str, ...] = (SUBPROTOCOL,),
         receive_buffer_bytes: int | None = None,
         path: str = "/v1/stream",
+        called: str | None = None,
+        **headers: str,
     ) -> None:
-        """`receive_buffer_bytes`: as little as the kernel allows, for a client that reads slowly."""
+        """`receive_buffer_bytes`: as little as the kernel allows, for a client that reads slowly.
+
+        `called`: a URL by which the client believes to know the server at `url`.
+        """
         self.socket = connect(
-            url.replace("http", "ws") + path,
+            (called or url).replace("http", "ws") + path,
             sock=_tcp(url, receive_buffer_bytes),
             max_queue=1 if receive_buffer_bytes else None,
             subprotocols=subprotocols or None,
+            additional_headers=headers,
             compression=None,
             max_size=None,
             proxy=None,

@@ -13,7 +13,8 @@ const FIRST_PAUSE_MS = 500;
 const LONGEST_PAUSE_MS = 15_000;
 /** A connection that lasted this long was a good one: the pauses start from the shortest again. */
 const GOOD_AFTER_MS = 10_000;
-const WRONG_VERSION = 1002;
+/** Wrong version, no token or a wrong one, a page of elsewhere: trying again would change nothing. */
+const REFUSED: readonly number[] = [1002, 4401, 4403];
 
 /** Pause before attempt number `attempt` (1, 2, ...): doubling, with up to a quarter less so that pages spread out. */
 export function pause_ms(attempt: number, random: () => number = Math.random): number {
@@ -21,9 +22,15 @@ export function pause_ms(attempt: number, random: () => number = Math.random): n
   return full * (1 - random() / 4);
 }
 
-/** `ws(s)` URL of the stream on the host the page came from. */
+/** `ws(s)` URL of the stream on the host the page came from, with the token that the page was opened with. */
 export function streamUrl(page: URL): string {
-  return `${page.protocol === "https:" ? "wss" : "ws"}://${page.host}/v1/stream`;
+  return `${page.protocol === "https:" ? "wss" : "ws"}://${page.host}/v1/stream${tokenQuery(page)}`;
+}
+
+/** `?token=...` as the page's own URL has it, or nothing. */
+export function tokenQuery(page: URL): string {
+  const token = page.searchParams.get("token");
+  return token === null ? "" : `?token=${encodeURIComponent(token)}`;
 }
 
 export class Connection {
@@ -54,6 +61,11 @@ export class Connection {
     socket.onclose = (event) => this.closed(event);
   }
 
+  /** Try no more by itself. */
+  stop(): void {
+    clearTimeout(this.timer);
+  }
+
   private receive(socket: WebSocket, data: unknown): void {
     let message: ServerMessage;
     try {
@@ -71,7 +83,7 @@ export class Connection {
   private closed(event: CloseEvent): void {
     this.socket = null;
     const reason = event.reason || (event.code === 1006 ? "the server does not answer" : "the server closed the connection");
-    if (event.code === WRONG_VERSION) {
+    if (REFUSED.includes(event.code)) {
       this.onState({ kind: "refused", reason });
       return;
     }

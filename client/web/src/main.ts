@@ -1,6 +1,6 @@
 // The page: watches a session and shows what it produces.
 
-import { Connection, type ConnectionState, streamUrl } from "./connection";
+import { Connection, type ConnectionState, streamUrl, tokenQuery } from "./connection";
 import { byId, make, setText } from "./dom";
 import { showLight } from "./light";
 import { addNote, clearNotes, showNotes } from "./notes";
@@ -136,7 +136,7 @@ function showHint(words: readonly string[]): void {
 
 function start(): void {
   const page = new URL(location.href);
-  showHint(["probeless", "stream", "synthetic:table", "--server", page.origin]);
+  showHint(["probeless", "stream", "synthetic:table", "--server", page.origin + tokenQuery(page).replace("?", "/?")]);
   const live = new Connection(
     streamUrl(page),
     page.searchParams.get("session"),

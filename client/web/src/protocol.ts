@@ -139,6 +139,10 @@ export interface Hello {
   room_from_world?: Array<number> | null;
   /** By which the client's world is laid on the room's, once both have seen it. */
   marker?: Marker | null;
+  /** How long the session waits for this client when its connection is lost without a bye; 0: it ends with it. */
+  keep_s?: number;
+  /** `welcome.key` of a session that waits: it goes on as it was, and nothing else of this message counts. */
+  resume?: string | null;
 }
 
 /** First message of a client that only looks: it receives what the capturing session produces. */
@@ -146,6 +150,8 @@ export interface Watch {
   type: "watch";
   /** null: the session that is streaming, now or next. */
   session?: string | null;
+  /** Of `session: null`: only those of this room. */
+  room?: string | null;
 }
 
 /** Colour: `jpeg` and `png` are sRGB 8-bit; `raw` is interleaved RGB, little endian, in `encoding`. */
@@ -175,8 +181,10 @@ export interface Frame {
   frame: number;
   timestamp_s: number;
   world_from_camera: Array<number> | null;
-  color: ColorImage;
-  depth: DepthImage;
+  /** null, with a pose and no depth: of somebody who only looks at a room that others scan. */
+  color?: ColorImage | null;
+  /** null: of a camera without a depth sensor, in a room that others scan. */
+  depth?: DepthImage | null;
   /**
    * Exposure time times gain of the colour picture, in any unit that stays the same for the session; null: unknown.
    *
@@ -244,6 +252,14 @@ export interface Welcome {
   device: string;
   /** Frames the client may have unanswered. */
   max_inflight: number;
+  /** By which the session is resumed (`hello.resume`), where the client asked for it to be kept. A secret. */
+  key: string | null;
+  /**
+   * Frames that were sent before are not answered any more, unless the session is lossless; requests are, if they
+   * are sent again.
+   */
+  resumed: boolean;
+  room: string | null;
 }
 
 /** Milliseconds under the thesis's row names (table 6.2): device plus host time; total is wall time. */

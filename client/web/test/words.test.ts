@@ -62,4 +62,6 @@ test("pauses grow to a limit and differ between pages", () => {
 test("the stream is on the host the page came from", () => {
   assert.equal(streamUrl(new URL("http://tablet.local:8000/?session=a")), "ws://tablet.local:8000/v1/stream");
   assert.equal(streamUrl(new URL("https://example.org/")), "wss://example.org/v1/stream");
+  const withToken = new URL("http://tablet.local:8000/?token=a%2Bb%26c&session=a");
+  assert.equal(streamUrl(withToken), "ws://tablet.local:8000/v1/stream?token=a%2Bb%26c");
 });

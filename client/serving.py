@@ -1,0 +1,113 @@
+"""What the options of `probeless serve` amount to: who may come in, by what certificate, and how much of it."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import cast, get_args
+from urllib.parse import urlsplit
+
+from client.laptop.errors import OptionError, RunError
+from server.door import MAX_TOKEN_CHARS, Door, is_loopback, is_token, new_token
+from server.events import LogFormat
+from server.limits import DEFAULT_LIMITS, MIB, Limits
+from server.tls import Certificate, CertificateError, given_certificate, own_certificate
+
+NO_TOKEN = "none"
+LEAVING_PATIENCE_S = 3.0
+LEAST_VOLUME_MIB, MOST_VOLUME_MIB = 16, 1 << 20
+
+
+@dataclass(frozen=True)
+class ServeOptions:
+    """As the user gave them."""
+
+    host: str
+    token: str | None = None
+    insecure: bool = False
+    allow_origin: tuple[str, ...] = ()
+    tls: bool = False
+    tls_cert: Path | None = None
+    tls_key: Path | None = None
+    volume_memory: int | None = None
+    """MiB."""
+    sessions: int | None = None
+    sessions_per_address: int | None = None
+
+
+def door_of(options: ServeOptions) -> Door:
+    """Raises OptionError."""
+    origins = frozenset(_origin(text) for text in options.allow_origin)
+    if options.token == NO_TOKEN:
+        if not (options.insecure or is_loopback(options.host)):
+            raise OptionError(
+                f"--token none lets in everybody who reaches {options.host}: leave it out, or add --insecure if that "
+                "is meant, say behind a proxy that asks who comes"
+            )
+        return Door(None, origins)
+    if options.insecure:
+        raise OptionError("--insecure goes with --token none: leave it out")
+    if options.token is not None and not is_token(options.token):
+        raise OptionError(f"--token: expected up to {MAX_TOKEN_CHARS} ASCII characters without spaces, or none")
+    return Door(options.token or new_token(), origins)
+
+
+def certificate_of(options: ServeOptions) -> Certificate | None:
+    """None: no TLS. Raises OptionError, RunError."""
+    if (options.tls_cert is None) != (options.tls_key is None):
+        raise OptionError(
+            "--tls-cert and --tls-key go together: give both, or --tls alone for a certificate of its own"
+        )
+    try:
+        if options.tls_cert is not None and options.tls_key is not None:
+            return given_certificate(options.tls_cert, options.tls_key)
+        return own_certificate() if options.tls else None
+    except CertificateError as error:
+        raise RunError(str(error)) from error
+
+
+def limits_of(options: ServeOptions) -> Limits:
+    """Raises OptionError."""
+    limits = DEFAULT_LIMITS
+    if options.volume_memory is not None:
+        if not LEAST_VOLUME_MIB <= options.volume_memory <= MOST_VOLUME_MIB:
+            raise OptionError(
+                f"--volume-memory {options.volume_memory}: expected MiB, {LEAST_VOLUME_MIB} to {MOST_VOLUME_MIB}"
+            )
+        limits = replace(limits, volume_bytes=options.volume_memory * MIB)
+    sessions = limits.sessions if options.sessions is None else options.sessions
+    per_address = min(sessions, limits.sessions_per_address)
+    if options.sessions_per_address is not None:
+        per_address = options.sessions_per_address
+    return replace(limits, sessions=sessions, sessions_per_address=per_address)
+
+
+def log_format_of(text: str) -> LogFormat:
+    """Raises OptionError."""
+    if text not in get_args(LogFormat):
+        raise OptionError(f"--log {text}: expected text or json")
+    return cast(LogFormat, text)
+
+
+def leave_soon(status: int) -> None:
+    """End this process shortly with `status`, even where a device never comes back to the thread that waits for it."""
+
+    def leave() -> None:
+        sys.stderr.write("probeless: a session is stuck on the device and was given up\n")
+        sys.stderr.flush()
+        os._exit(status)
+
+    timer = threading.Timer(LEAVING_PATIENCE_S, leave)
+    timer.daemon = True
+    timer.start()
+
+
+def _origin(text: str) -> str:
+    """As a browser writes it. Raises OptionError."""
+    parts = urlsplit(text.lower().rstrip("/"))
+    if parts.scheme not in ("http", "https") or not parts.netloc or parts.path or parts.query:
+        raise OptionError(f"--allow-origin {text}: expected https://HOST or https://HOST:PORT, as a browser shows it")
+    return f"{parts.scheme}://{parts.netloc}"

@@ -1,0 +1,59 @@
+"""How many connections and sessions each client address has, so that one client cannot take them all."""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+from collections import Counter
+from collections.abc import Iterator
+
+from server.connection import TRY_LATER, Refusal
+from server.limits import Limits
+
+
+class Guests:
+    """For the event loop's thread."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._connections: Counter[str] = Counter()
+        self._sessions: Counter[str] = Counter()
+
+    @contextlib.contextmanager
+    def connected(self, address: str) -> Iterator[None]:
+        """While it lasts the address has one more connection. Raises Refusal."""
+        with _counted(self._connections, address, self._limits.connections_per_address, "connections"):
+            yield
+
+    @contextlib.contextmanager
+    def capturing(self, address: str) -> Iterator[None]:
+        """While it lasts the address has one more session. Raises Refusal."""
+        with _counted(self._sessions, address, self._limits.sessions_per_address, "sessions"):
+            yield
+
+
+@contextlib.contextmanager
+def _counted(counts: Counter[str], address: str, most: int, what: str) -> Iterator[None]:
+    who = network_of(address)
+    if counts[who] >= most:
+        raise Refusal(TRY_LATER, f"your address {who} has {most} {what} already, which is the most: end one of them")
+    counts[who] += 1
+    try:
+        yield
+    finally:
+        counts[who] -= 1
+        if not counts[who]:
+            del counts[who]
+
+
+def network_of(address: str) -> str:
+    """Who an address stands for: itself, or in IPv6 its network, since one client has 2^64 of them."""
+    try:
+        found = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    if isinstance(found, ipaddress.IPv4Address):
+        return str(found)
+    if found.ipv4_mapped is not None:
+        return str(found.ipv4_mapped)
+    return str(ipaddress.ip_network((found, 64), strict=False))

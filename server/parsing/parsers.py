@@ -1,0 +1,95 @@
+"""Reading meshes and pictures in children, with the same results and errors as in this process."""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.codec import ProtocolError
+from protocol.frames import CameraModel
+from protocol.images import Color, decode_color
+from protocol.limits import MAX_IMAGE_PIXELS
+from protocol.messages import ColorImage
+from server.parsing.children import IS_POSSIBLE, ChildDied, Children, Work
+from server.parsing.mesh_bytes import GREATEST_BYTES, mesh_from_bytes
+from server.scene.limits import MeshError
+from server.scene.mesh import Mesh, load_mesh
+
+MESH_WORK = Work("server.parsing.read_mesh:read_mesh", 4096, patience_s=30.0, greatest_answer=GREATEST_BYTES)
+PICTURE_WORK = Work(
+    "server.parsing.read_picture:read_picture",
+    1024,
+    patience_s=5.0,
+    greatest_answer=4096,
+    shared_bytes=3 * MAX_IMAGE_PIXELS,
+)
+_SIZE = struct.Struct("<II")
+MESH_CHILDREN, PICTURE_CHILDREN = 2, 2
+"""So that a file that takes long keeps nobody else waiting."""
+
+
+class Parsers:
+    """Of one service. Methods are for its workers' threads; where the system lacks what it takes, they read here."""
+
+    def __init__(
+        self,
+        mesh_work: Work = MESH_WORK,
+        picture_work: Work = PICTURE_WORK,
+    ) -> None:
+        self.on_death: Callable[[str], None] = lambda _kind: None
+        """Called, by the thread that waits, with `mesh` or `picture` for each child that dies at work."""
+        self.meshes = Children(mesh_work, MESH_CHILDREN, lambda: self.on_death("mesh"))
+        self.pictures = Children(picture_work, PICTURE_CHILDREN, lambda: self.on_death("picture"))
+
+    def start(self) -> None:
+        """One child of each kind begins to load, without being waited for."""
+        if IS_POSSIBLE:
+            self.meshes.start_one()
+            self.pictures.start_one()
+
+    def stop(self) -> None:
+        """End all children."""
+        self.meshes.stop()
+        self.pictures.stop()
+
+    def load_mesh(self, data: bytes, file_format: str) -> Mesh:
+        """As server.scene.mesh.load_mesh. Raises MeshError, also where the file takes too much or kills its reader."""
+        if not IS_POSSIBLE:
+            return load_mesh(data, file_format)
+        try:
+            answer = self.meshes.ask(file_format.encode() + b"\n" + data)
+        except ChildDied as error:
+            raise MeshError(f"the reader of the {file_format} file {error}: simplify the mesh or repair it") from error
+        except ValueError as error:
+            raise MeshError(str(error)) from error
+        assert isinstance(answer, bytearray)
+        return mesh_from_bytes(answer)
+
+    def decode_color(self, image: ColorImage, camera: CameraModel) -> Color:
+        """As protocol.images.decode_color. Raises ProtocolError."""
+        return decode_color(image, camera, decompress=self._decompress if IS_POSSIBLE else None)
+
+    def _decompress(self, data: bytes) -> NDArray[np.uint8]:
+        try:
+            picture = self.pictures.ask(data, _shared_picture)
+        except ChildDied as error:
+            raise ProtocolError(f"color.data: the picture's reader {error}") from error
+        except ValueError as error:
+            raise ProtocolError(str(error)) from error
+        assert isinstance(picture, np.ndarray)
+        return picture
+
+
+def _shared_picture(answer: bytearray, memory: mmap.mmap | None) -> NDArray[np.uint8]:
+    """[h, w, 3], an own copy. Raises ValueError for a size that cannot be."""
+    assert memory is not None
+    if len(answer) != _SIZE.size:
+        raise ValueError("color.data: its reader said no size")
+    height, width = _SIZE.unpack(answer)
+    if 3 * height * width > len(memory):
+        raise ValueError("color.data: its reader said a wrong size")
+    return np.frombuffer(memory, np.uint8, 3 * height * width).reshape(height, width, 3).copy()

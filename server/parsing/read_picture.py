@@ -1,0 +1,24 @@
+"""What a child that reads pictures does."""
+
+from __future__ import annotations
+
+import struct
+
+import cv2
+
+from protocol.images import decode_picture
+from server.parsing.child import shared_memory
+
+SIZE = struct.Struct("<II")
+
+cv2.setNumThreads(1)  # a child may start no threads
+
+
+def read_picture(request: bytes) -> bytes:
+    """A JPEG or PNG -> its height and width; [h, w, 3] RGB is in the shared memory. Raises ValueError."""
+    rgb = decode_picture(request)
+    memory = shared_memory()
+    if rgb.nbytes > len(memory):
+        raise ValueError("color.data is a larger picture than may be")
+    memory[: rgb.nbytes] = rgb.data.cast("B") if rgb.flags.c_contiguous else rgb.tobytes()
+    return SIZE.pack(*rgb.shape[:2])

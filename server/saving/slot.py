@@ -1,0 +1,214 @@
+"""One of the two folders that saves of a room go to in turn: whole in itself, renewed without ever being half new."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+from weakref import ref
+
+import msgspec
+from msgspec import structs
+
+from server.parsing.mesh_bytes import mesh_to_bytes
+from server.saving.brick_files import Batch, merged, write_bricks
+from server.saving.files import DamagedFile, check_file, read_parts, sync_folder, write_parts
+from server.saving.state import (
+    VERSION,
+    FileName,
+    Header,
+    KeptPlace,
+    KeptVolume,
+    RoomState,
+    state_from_bytes,
+    state_to_bytes,
+)
+from server.scene.mesh import Mesh
+from server.scene.placement import Placement
+from server.stages.volume import Volume
+
+if TYPE_CHECKING:
+    from server.room_objects import KeptObject
+    from server.saving.snapshot import Snapshot
+
+SAVE, PART = "save", "save.part"
+"""What a save is read by; it names all other files."""
+SPARE_BRICKS = 1024
+"""Files of bricks become one where they hold twice those that there are, and so many more."""
+
+
+@dataclass(frozen=True)
+class _Bricks:
+    """What files of bricks hold: a volume as it was when its `changes` was `change`."""
+
+    volume: ref[Volume]
+    change: int
+    files: tuple[FileName, ...]
+    count: int
+    """In all files, also those that later ones have anew."""
+
+
+@dataclass
+class _Work:
+    """A save that is being written."""
+
+    header: Header
+    taken: Snapshot
+    new: list[Path] = field(default_factory=list)
+    """Files that are to go where it fails."""
+    bricks: _Bricks | None = None
+    meshes: dict[FileName, Mesh | None] = field(default_factory=dict)
+    size: int = 0
+
+
+class Slot:
+    """Used by one thread at a time."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._bricks: _Bricks | None = None
+        self._meshes: dict[FileName, Mesh | None] = {}
+        """Files known to be whole, by the mesh that they were written of."""
+        self._read: tuple[tuple[FileName, ...], int] = ((), 0)
+
+    def paths(self, files: Iterable[FileName]) -> list[Path]:
+        """Of files in it."""
+        return [self.folder / name for name in files]
+
+    def change_of(self, volume: Volume) -> int:
+        """The volume's `changes` that the files have it at; -1 where they hold another or none."""
+        known = self._bricks
+        return known.change if known and known.volume() is volume else -1
+
+    def note_filled(self, volume: Volume) -> None:
+        """Say that `volume` has been filled from what was read."""
+        files, count = self._read
+        self._bricks = _Bricks(ref(volume), volume.changes, files, count)
+
+    def header(self) -> Header | None:
+        """What the save says first, unchecked; None where there is none. Raises DamagedFile, OSError."""
+        path = self.folder / SAVE
+        if not path.exists():
+            return None
+        try:
+            return msgspec.msgpack.decode(next(read_parts(path), b""), type=Header)
+        except msgspec.MsgspecError as error:
+            raise DamagedFile(f"{path} is no save: {error}") from error
+
+    def read(self) -> RoomState:
+        """The save, after all its files have been compared with their checksums. Raises DamagedFile, OSError."""
+        path = self.folder / SAVE
+        check_file(path)
+        header = self.header()
+        if header is None or header.version != VERSION:
+            raise DamagedFile(f"{path} is of version {header and header.version}, this program reads {VERSION}")
+        try:
+            _, packed = read_parts(path)
+            state = state_from_bytes(packed)
+        except ValueError as error:
+            raise DamagedFile(f"{path} is no save: {error}") from error
+        meshes: dict[FileName, Mesh | None] = dict.fromkeys(kept.mesh for kept in state.objects)
+        files = state.volume.files if state.volume else ()
+        for file in self.paths((*files, *meshes)):
+            check_file(file)
+        self._meshes = meshes
+        self._read = files, state.volume.bricks_in_files if state.volume else 0
+        return state
+
+    def write(self, header: Header, taken: Snapshot) -> int:
+        """Make the save that of `taken`; bytes written. Raises OSError, the save is then as it was, or durable soon.
+
+        Raises DamagedFile where earlier files have changed on the disk: all is then written next time.
+        """
+        self._make_folder()
+        work = _Work(header, taken)
+        try:
+            self._write_files(work)
+            sync_folder(self.folder)
+            os.replace(self.folder / PART, self.folder / SAVE)
+        except (OSError, DamagedFile) as error:
+            if isinstance(error, DamagedFile):
+                self._bricks = None
+            _remove(work.new)
+            raise
+        self._bricks, self._meshes = work.bricks, work.meshes
+        sync_folder(self.folder)
+        self._tidy({*(work.bricks.files if work.bricks else ()), *work.meshes})
+        return work.size
+
+    def _write_files(self, work: _Work) -> None:
+        """All but the last step, which makes it the save."""
+        state = work.taken.state
+        state = structs.replace(state, objects=tuple(self._objects(work)))
+        if state.volume and work.taken.volume:
+            work.bricks = self._written_bricks(work, work.taken.volume, state.volume)
+            files, count = work.bricks.files, work.bricks.count
+            state = structs.replace(state, volume=structs.replace(state.volume, files=files, bricks_in_files=count))
+        work.new.append(self.folder / PART)
+        work.size += write_parts(self.folder / PART, [msgspec.msgpack.encode(work.header), state_to_bytes(state)])
+
+    def _objects(self, work: _Work) -> Iterator[KeptPlace]:
+        """The objects, their meshes written as far as they are not there."""
+        names = {id(mesh): name for name, mesh in self._meshes.items()}
+        for kept in work.taken.objects:
+            name = names.get(id(kept.mesh))
+            if name is None:
+                data = mesh_to_bytes(kept.mesh)
+                name = f"mesh-{hashlib.blake2b(data, digest_size=16).hexdigest()}"
+                if name not in self._meshes:
+                    work.new.append(self.folder / name)
+                    work.size += write_parts(self.folder / name, [data])
+                names[id(kept.mesh)] = name
+            work.meshes[name] = kept.mesh
+            yield _place_of(kept, name)
+
+    def _written_bricks(self, work: _Work, volume: Volume, kept: KeptVolume) -> _Bricks:
+        """The files, with one more of the bricks that have changed; or one of all."""
+        known = self._bricks if self.change_of(volume) >= 0 else None
+        files, count = (known.files, known.count) if known else ((), 0)
+        sequence, bricks = work.header.sequence, work.taken.bricks
+        if bricks:
+            files = (*files, self._write_bricks(work, f"bricks-{sequence}", bricks))
+            count += sum(len(places) for places, _, _ in bricks)
+        if len(files) > 1 and count > 2 * len(kept.places) + SPARE_BRICKS:
+            everything = merged(self.paths(files), kept.places)
+            files, count = (self._write_bricks(work, f"bricks-{sequence}-all", everything),), len(kept.places)
+        return _Bricks(ref(volume), work.taken.change, files, count)
+
+    def _write_bricks(self, work: _Work, name: FileName, bricks: Iterable[Batch]) -> FileName:
+        work.new.append(self.folder / name)
+        work.size += write_bricks(self.folder / name, bricks)
+        return name
+
+    def _make_folder(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if not (self.folder / SAVE).exists():
+            for folder in self.folder.parents[:3]:
+                sync_folder(folder)
+
+    def _tidy(self, kept: set[FileName]) -> None:
+        """Remove what the save does not name: of earlier ones, and of those that were not finished."""
+        _remove([path for path in self.folder.iterdir() if path.name not in kept and path.name != SAVE])
+
+    def set_aside(self) -> Path:
+        """Give the folder another name, for a person to look at; the name. Raises OSError."""
+        room = self.folder.parent
+        number = next(n for n in range(1, 1 << 30) if not (room / f"set-aside-{n}").exists())
+        os.replace(self.folder, room / f"set-aside-{number}")
+        sync_folder(room)
+        self._bricks, self._meshes = None, {}
+        return room / f"set-aside-{number}"
+
+
+def _place_of(kept: KeptObject, mesh: FileName) -> KeptPlace:
+    if isinstance(kept.place, Placement):
+        return KeptPlace(kept.object_id, mesh, asked=kept.place)
+    return KeptPlace(kept.object_id, mesh, world_from_model=kept.place)
+
+
+def _remove(paths: Sequence[Path]) -> None:
+    for path in paths:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,113 @@
+"""What is kept of a room beside its voxels and meshes, as typed structs, and those as bytes."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, get_args, get_origin
+
+import msgspec
+import numpy as np
+import zstandard
+from msgspec import Meta, Struct
+from numpy.typing import NDArray
+
+from protocol.messages import Wishes
+from server.light import KnownRoomLight
+from server.maths.near_light import Found
+from server.scene.placement import Placement
+from server.stages.relocalize import Keyframe
+
+VERSION = 1
+"""Of all that is written. A change of any of these types, or of those that they are made of, is another version."""
+_MOST_BYTES = 1 << 30
+
+FileName = Annotated[str, Meta(pattern="^[a-z0-9-]+$")]
+
+
+class KeptVolume(Struct, frozen=True, forbid_unknown_fields=True):
+    """A volume less its voxels."""
+
+    bounds_m: tuple[float, float, float, float, float, float]
+    voxel_m: float
+    frames: int
+    exposure_logarithms: float
+    places: NDArray[np.int32]
+    """[n] its bricks."""
+    files: tuple[FileName, ...] = ()
+    """Of its voxels; a later one holds what has changed."""
+    bricks_in_files: int = 0
+    """In all of them together."""
+
+
+class KeptMarker(Struct, frozen=True, forbid_unknown_fields=True):
+    """A marker that clients have seen."""
+
+    dictionary: str
+    number: int
+    room_from_marker: NDArray[np.float64]
+
+
+class KeptPlace(Struct, frozen=True, forbid_unknown_fields=True):
+    """An object less its mesh; one of the two is there."""
+
+    object_id: str
+    mesh: FileName
+    world_from_model: NDArray[np.float64] | None = None
+    asked: Placement | None = None
+
+
+class RoomState(Struct, frozen=True, forbid_unknown_fields=True):
+    """One room."""
+
+    wishes: Wishes
+    """Of the client that opened it."""
+    up: NDArray[np.float64] | None
+    volume: KeptVolume | None
+    keyframes: tuple[Keyframe, ...]
+    markers: tuple[KeptMarker, ...]
+    light: KnownRoomLight
+    lamps: Found | None
+    objects: tuple[KeptPlace, ...] = ()
+
+
+class Header(Struct, frozen=True):
+    """What every version begins a save with."""
+
+    version: int
+    name: str
+    sequence: int
+    """Grows from save to save of a room."""
+
+
+def state_to_bytes(state: RoomState) -> bytes:
+    """Packed."""
+    return zstandard.ZstdCompressor(level=1).compress(msgspec.msgpack.encode(state, enc_hook=_array_to_list))
+
+
+def state_from_bytes(data: bytes) -> RoomState:
+    """Raises ValueError, one line, for what is none."""
+    try:
+        if zstandard.frame_content_size(data) > _MOST_BYTES:
+            raise ValueError("it is larger than any room")
+        packed = zstandard.ZstdDecompressor().decompress(data)
+        return msgspec.msgpack.decode(packed, type=RoomState, dec_hook=_array_from_list)
+    except (zstandard.ZstdError, msgspec.MsgspecError) as error:
+        raise ValueError(str(error)) from error
+
+
+def _array_to_list(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return [value.dtype.str, value.shape, np.ascontiguousarray(value).tobytes()]
+    if isinstance(value, np.generic):
+        return value.item()
+    raise NotImplementedError(f"a {type(value).__name__} is not kept")
+
+
+def _array_from_list(asked: Any, value: Any) -> Any:
+    """An own copy. Raises ValueError for another type than `asked`, an NDArray's."""
+    if get_origin(asked) is not np.ndarray:
+        raise NotImplementedError(f"a {asked} is not kept")
+    kind = np.dtype(get_args(get_args(asked)[1])[0])
+    name, shape, data = value
+    if name != kind.str:
+        raise ValueError(f"numbers of type {name} where {kind.str} belong")
+    return np.frombuffer(data, kind).reshape(shape).copy()

@@ -1,0 +1,124 @@
+"""Whether a device computes what it should: small frames whose answers are known, held against stated bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.codec import one_line
+from protocol.frames import CameraModel, RgbdFrame
+from protocol.messages import Wishes
+from server.opencl.device import Device
+from server.pipeline import FrameResult, Pipeline
+from server.scene.mesh import Mesh
+from server.scene.placement import Placement
+
+CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
+VOLUME_M, VOXEL_M = (-1.0, -1.0, 0.0, 1.0, 1.0, 2.0), 0.02
+BALL_M, RADIUS_M, WALL_M = (0.0, 0.0, 1.0), 0.4, 1.6
+ALBEDO, AMBIENT = 0.5, 0.3
+
+TOWARDS_LIGHT = np.array([0.5, -0.5, -0.7]) / np.linalg.norm([0.5, -0.5, -0.7])
+LIGHT_BOUND_DEG = 10.0
+"""Found within 2 degrees, from any side; a wrong normal, ray or solve is tens of degrees off."""
+EVEN_SKY = ((float(np.sqrt(4 * np.pi)),) * 3,)
+"""Radiance 1 from everywhere: under it a surface that nothing hides shows its own colour (the white furnace)."""
+OBJECT_BOUND, LEAST_OBJECT_PIXELS = 6, 8
+
+
+class CheckFailed(Exception):
+    """An answer that is wrong; `check` is the name of what was checked."""
+
+    def __init__(self, check: str, found: str) -> None:
+        super().__init__(one_line(f"check {check!r}: {found}"))
+        self.check = check
+
+
+def check_answers(device: Device) -> None:
+    """Raises CheckFailed for the first answer that is out of its bounds."""
+    plain = Wishes(volume_m=VOLUME_M, voxel_m=VOXEL_M, as_thesis=True, ray_length_m=0.1, bands=2)
+    result = _processed(device, plain, lambda _pipeline: None)
+    check_picture(result)
+    check_light(result)
+    furnace = Wishes(volume_m=VOLUME_M, voxel_m=VOXEL_M, light=EVEN_SKY)
+    check_object(_processed(device, furnace, _place_triangle))
+
+
+def check_picture(result: FrameResult) -> None:
+    """Where nothing is virtual the picture is the camera's, byte for byte."""
+    wrong = int((result.color != frame().color).any(axis=2).sum())
+    if wrong:
+        raise CheckFailed("picture", f"{wrong} pixels of a picture without virtual objects are not the camera's")
+
+
+def check_light(result: FrameResult) -> None:
+    """The light that shaded the ball is found again."""
+    found = np.array(result.light.dominant_direction)
+    if not np.isfinite([value for row in result.light.sh for value in row]).all():
+        raise CheckFailed("light", "the light is not finite")
+    off_deg = float(np.degrees(np.arccos(np.clip(found @ TOWARDS_LIGHT, -1, 1))))
+    if not off_deg <= LIGHT_BOUND_DEG:
+        raise CheckFailed("light", f"its direction is {off_deg:.1f} degrees off, at most {LIGHT_BOUND_DEG:g}")
+
+
+def check_object(result: FrameResult) -> None:
+    """Under an even sky a virtual triangle shows its own colour."""
+    picture, own = frame().color.astype(int), int(_srgb(np.array(ALBEDO)))
+    shown = np.abs(result.color.astype(int) - own).max(axis=2) <= OBJECT_BOUND
+    pixels = int((shown & (np.abs(picture - own).max(axis=2) > OBJECT_BOUND)).sum())
+    if pixels < LEAST_OBJECT_PIXELS:
+        raise CheckFailed("object", f"{pixels} pixels show its colour, at least {LEAST_OBJECT_PIXELS} should")
+
+
+def frame(index: int = 0) -> RgbdFrame:
+    """A matt ball before a matt wall, under an even sky and a distant lamp, without shadows."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    ray = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
+    center = np.array(BALL_M)
+    a, b = (ray * ray).sum(axis=-1), ray @ center
+    q = b * b - a * (center @ center - RADIUS_M**2)
+    depth_m = np.where(q > 0, (b - np.sqrt(np.maximum(q, 0))) / a, WALL_M)
+    outwards = (ray * depth_m[..., None] - center) / RADIUS_M
+    normal = np.where((q > 0)[..., None], outwards, [0.0, 0.0, -1.0])
+    radiance = ALBEDO * (AMBIENT + (1 - AMBIENT) * np.maximum(normal @ TOWARDS_LIGHT, 0))
+    return RgbdFrame(
+        index=index,
+        timestamp_s=index / 30,
+        color=np.repeat(_srgb(radiance)[..., None], 3, axis=-1),
+        depth=np.round(depth_m * 1000).astype(np.uint16),
+        world_from_camera=np.eye(4),
+    )
+
+
+def triangle() -> Mesh:
+    """Of 10 cm, upright."""
+    return Mesh(
+        vertices=np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], np.float32),
+        triangles=np.array([[0, 1, 2]], np.int32),
+        vertex_colors=np.full((3, 3), ALBEDO, np.float32),
+        normals=np.tile(np.array([[0, 0, 1]], np.float32), (3, 1)),
+        up_axis="y",
+    )
+
+
+def _processed(device: Device, wishes: Wishes, prepare: Callable[[Pipeline], object]) -> FrameResult:
+    """The second frame's result: the first one's volume is seen in it."""
+    pipeline = Pipeline(device, CAMERA, wishes)
+    try:
+        prepare(pipeline)
+        pipeline.process(frame())
+        return pipeline.process(frame(1))
+    finally:
+        pipeline.close()
+
+
+def _place_triangle(pipeline: Pipeline) -> None:
+    pipeline.place_object("triangle", triangle(), Placement(position_m=(0.2, 0.1, 0.5)))
+
+
+def _srgb(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """IEC 61966-2-1, 8 bits."""
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.round(255 * encoded).astype(np.uint8)

@@ -1,0 +1,43 @@
+"""What the options of `serve` amount to."""
+
+from __future__ import annotations
+
+import pytest
+
+from client.laptop.errors import OptionError
+from client.serving import ServeOptions, certificate_of, door_of, limits_of
+
+
+def test_a_token_is_made_unless_one_is_given() -> None:
+    made = {door_of(ServeOptions(host="127.0.0.1")).token for _ in range(2)}
+    assert len(made) == 2
+    assert None not in made
+    assert door_of(ServeOptions(host="0.0.0.0", token="x")).token == "x"
+
+
+def test_no_token_must_be_said_twice_where_others_reach_it() -> None:
+    for host in ("127.0.0.1", "localhost", "::1"):
+        assert door_of(ServeOptions(host=host, token="none")).token is None
+    for host in ("0.0.0.0", "::", "192.0.2.1", "room.example"):
+        with pytest.raises(OptionError, match=f"reaches {host}"):
+            door_of(ServeOptions(host=host, token="none"))
+        assert door_of(ServeOptions(host=host, token="none", insecure=True)).token is None
+
+
+def test_origins_are_as_a_browser_writes_them() -> None:
+    door = door_of(ServeOptions(host="127.0.0.1", allow_origin=("https://App.example/", "http://room:8080")))
+    assert door.origins == {"https://app.example", "http://room:8080"}
+    for wrong in ("app.example", "https://", "https://app.example/path", "ws://app.example", "*"):
+        with pytest.raises(OptionError, match="--allow-origin"):
+            door_of(ServeOptions(host="127.0.0.1", allow_origin=(wrong,)))
+
+
+def test_limits() -> None:
+    assert limits_of(ServeOptions(host="h", volume_memory=64)).volume_bytes == 64 << 20
+    assert limits_of(ServeOptions(host="h", sessions=3)).sessions_per_address == 3
+    few = limits_of(ServeOptions(host="h", sessions=40, sessions_per_address=5))
+    assert (few.sessions, few.sessions_per_address) == (40, 5)
+
+
+def test_no_tls_unless_asked_for() -> None:
+    assert certificate_of(ServeOptions(host="h")) is None

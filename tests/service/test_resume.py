@@ -1,0 +1,203 @@
+"""A connection that breaks ends nothing: the session waits, what was asked for is done once, and it goes on."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from client.client import Answer, ClientError, StreamClient
+from protocol.messages import Acknowledged, Composite, Dropped, Hello, MoveObject, PlaceObject, Welcome, Wishes
+from tests.service.fakes import CAMERA, PATIENCE_S, Lab, frame_message, rgbd_frame
+from tests.service.proxy import Proxy, impaired
+from tests.service.wire import Wire
+
+PLACE = PlaceObject(request=3, object="vase", format="ply", data=b"mesh", position_m=(0, 0, 1))
+
+
+def greet(wire: Wire, **said: object) -> Welcome:
+    wire.say(Hello(client="test", camera=CAMERA, **{"keep_s": 20.0} | said))
+    welcome = wire.hear()
+    assert isinstance(welcome, Welcome), welcome
+    return welcome
+
+
+@pytest.fixture
+def proxy(server) -> Iterator[Proxy]:
+    with impaired(server.url) as between:
+        yield between
+
+
+def placed(lab: Lab) -> list[str]:
+    return [entry[1] for entry in lab.log if entry[0] == "place"]
+
+
+def test_a_session_goes_on_by_another_connection(server, proxy: Proxy, lab: Lab) -> None:
+    first = Wire(proxy.url)
+    welcome = greet(first)
+    assert welcome.key
+    assert not welcome.resumed
+    first.say(PLACE)
+    assert isinstance(first.hear(), Acknowledged)
+    first.say(frame_message(0))
+    first.hear_until(Composite)
+    proxy.cut()
+    second = Wire(server.url)
+    again = greet(second, resume=welcome.key)
+    assert again.resumed
+    assert again.session == welcome.session
+    second.say(PLACE, frame_message(1))
+    messages = second.hear_until(Composite)
+    assert [m.request for m in messages if isinstance(m, Acknowledged)] == [3]
+    assert messages[-1].frame == 1
+    assert placed(lab) == ["vase"]  # done once, acknowledged twice
+    assert server.service.sessions == 1
+    second.hang_up()
+
+
+def test_a_request_whose_acknowledgement_was_lost_is_not_done_again(server, proxy: Proxy, lab: Lab) -> None:
+    first = Wire(proxy.url)
+    welcome = greet(first)
+    proxy.flows.clear()
+    proxy.flows.set()
+    first.say(PLACE)
+    first.hear()
+    lab.hold = True
+    first.say(frame_message(0), MoveObject(request=4, object="vase", position_m=(0, 0, 2)))
+    lab.next_entered()
+    proxy.cut()
+    lab.release(5)
+    second = Wire(server.url)
+    greet(second, resume=welcome.key)
+    move = MoveObject(request=4, object="vase", position_m=(0, 0, 2))
+    second.say(move, move)
+    assert [second.hear_until(Acknowledged)[-1].request for _ in range(2)] == [4, 4]
+    assert [entry[0] for entry in lab.log].count("move") == 1
+    second.hang_up()
+
+
+def test_a_client_that_does_not_come_back_is_let_go(server, proxy: Proxy, lab: Lab) -> None:
+    wire = Wire(proxy.url)
+    key = greet(wire, keep_s=0.3).key
+    proxy.cut()
+    assert lab.closed.wait(PATIENCE_S)
+    code, reason, _ = resumed(server.url, key)
+    assert code == 4410
+    assert "no session of that key" in reason
+
+
+def test_a_client_that_says_bye_is_not_waited_for(server, lab: Lab) -> None:
+    wire = Wire(server.url)
+    greet(wire)
+    wire.hang_up()
+    assert lab.closed.wait(PATIENCE_S)
+
+
+def test_a_key_that_is_none_is_refused(server) -> None:
+    code, reason, _ = resumed(server.url, "guessed")
+    assert code == 4410
+    assert "no session of that key" in reason
+
+
+def resumed(url: str, key: str) -> tuple[int, str, list]:
+    wire = Wire(url)
+    wire.say(Hello(client="test", camera=CAMERA, resume=key))
+    return wire.ending()
+
+
+def test_one_that_has_moved_to_another_network_takes_its_session_along(server) -> None:
+    """The old connection is half open: the server has not noticed yet that nobody is there."""
+    old = Wire(server.url)
+    welcome = greet(old)
+    new = Wire(server.url)
+    assert greet(new, resume=welcome.key).resumed
+    code, reason, _ = old.ending()
+    assert "by another connection" in reason
+    assert code == 1008
+    new.say(frame_message(0))
+    new.hear_until(Composite)
+    new.hang_up()
+
+
+def test_watchers_see_no_break(server, proxy: Proxy) -> None:
+    first = Wire(proxy.url)
+    welcome = greet(first)
+    watcher = Wire(server.url)
+    assert watcher.watch().key is None
+    proxy.cut()
+    second = Wire(server.url)
+    greet(second, resume=welcome.key)
+    second.say(frame_message(5))
+    assert watcher.hear_until(Composite)[-1].frame == 5
+    second.hang_up()
+
+
+async def streamed(url: str, proxy: Proxy, frames: int, cuts: set[int], *, lossless: bool) -> tuple[list, int]:
+    client = await StreamClient.connect(url)
+    await client.hello(CAMERA, Wishes(lossless=lossless))
+    taken: list = []
+
+    async def read() -> None:
+        async for answer in client.answers():
+            taken.append(answer)
+
+    reading = asyncio.create_task(read())
+    for index in range(frames):
+        await client.send_frame(rgbd_frame(index))
+        if index in cuts:
+            proxy.cut()
+            done = await client.place_object(f"object-{index}", "ply", b"mesh")
+            assert done.error is None
+    await client.wait_until_answered()
+    await client.close()
+    await reading
+    return taken, client.reconnected
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+def test_the_client_comes_back_by_itself(proxy: Proxy, lab: Lab, lossless: bool) -> None:
+    cuts = {3, 7, 12}
+    taken, reconnected = asyncio.run(streamed(proxy.url, proxy, 20, cuts, lossless=lossless))
+    assert reconnected == 3
+    assert sorted(placed(lab)) == sorted(f"object-{index}" for index in cuts)
+    numbers = [a.composite.frame if isinstance(a, Answer) else a.frame for a in taken]
+    assert sorted(numbers) == list(range(20))  # each frame has one answer, or is told to be lost
+    lost = [a for a in taken if isinstance(a, Dropped)]
+    if lossless:
+        assert not lost
+        processed = [entry[1] for entry in lab.log if entry[0] == "frame"]
+        assert processed == list(range(20))  # and was worked on once
+    else:
+        assert len(lost) <= 6
+        assert {a.reason for a in lost} <= {
+            "lost with the connection, which was restored",
+            "replaced by a newer frame",
+        }
+
+
+def test_a_client_that_cannot_come_back_says_so(proxy: Proxy) -> None:
+    async def stream() -> None:
+        client = await StreamClient.connect(proxy.url)
+        await client.hello(CAMERA, keep_s=0.4)
+        proxy.refuses = True
+        proxy.cut()
+        await client.send_frame(rgbd_frame(0))
+        with contextlib.suppress(asyncio.CancelledError):
+            await client.wait_until_answered()
+
+    with pytest.raises(ClientError, match="the connection was lost, and could not be restored"):
+        asyncio.run(stream())
+
+
+def test_a_server_that_leaves_does_not_wait_for_a_client_that_is_away(server, proxy: Proxy, lab: Lab) -> None:
+    wire = Wire(proxy.url)
+    greet(wire)
+    proxy.cut()
+    time.sleep(0.2)
+    started = time.monotonic()
+    server.stop()
+    assert lab.closed.is_set()
+    assert time.monotonic() - started < 20.0  # that is for how long the session would be kept

@@ -1,0 +1,186 @@
+"""Rooms over the socket: clients that share one, who watches it, how many the device has time for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from client.cli import app
+from client.laptop.errors import OptionError
+from client.room_options import room_place
+from protocol.frames import IDENTITY, RgbdFrame
+from protocol.images import encode_color, encode_depth
+from protocol.messages import Acknowledged, Composite, Error, Frame, Hello, Marker, PlaceObject, Watch, Welcome
+from server.limits import Limits
+from server.opencl.device import Device
+from server.serve import BackgroundServer, start_in_background
+from server.service import Service
+from tests.rooms import CAMERA, frame_at, view_at, wishes
+from tests.service import fakes
+from tests.service.wire import Wire
+
+
+@pytest.fixture
+def real_server(device: Device) -> Iterator[BackgroundServer]:
+    with start_in_background(Service(device)) as server:
+        yield server
+
+
+def enter(url: str, **said: object) -> tuple[Wire, Welcome]:
+    wire = Wire(url)
+    wire.say(Hello(client="test", camera=CAMERA, wishes=wishes("given"), **{"room": "study"} | said))
+    welcome = wire.hear()
+    assert isinstance(welcome, Welcome), welcome
+    return wire, welcome
+
+
+def message_of(frame: RgbdFrame) -> Frame:
+    assert frame.world_from_camera is not None
+    return Frame(
+        frame=frame.index,
+        timestamp_s=frame.timestamp_s,
+        world_from_camera=tuple(frame.world_from_camera.ravel().tolist()),
+        color=encode_color(frame.color, "png"),
+        depth=encode_depth(frame.depth),
+    )
+
+
+def answered(wire: Wire, step: int) -> Composite:
+    wire.say(message_of(frame_at(view_at(step), step, given=view_at(step))))
+    composite = wire.hear_until(Composite)[-1]
+    assert isinstance(composite, Composite)
+    return composite
+
+
+def test_clients_of_a_room_share_it_and_others_do_not(real_server: BackgroundServer) -> None:
+    first, welcome = enter(real_server.url)
+    second, _ = enter(real_server.url, room_from_world=IDENTITY)
+    apart, _ = enter(real_server.url, room="attic")
+    assert welcome.room == "study"
+    assert real_server.service.rooms.count == 2
+    for step in range(4):
+        answered(first, step)
+    mesh = trimesh.creation.box((0.2, 0.2, 0.2)).export(file_type="ply")
+    assert answered(second, 4).tracking == "given"
+    second.say(PlaceObject(request=1, object="cube", format="ply", data=mesh, position_m=(-0.9, 0.6, 1.0)))
+    assert second.hear_until(Acknowledged)[-1].error is None
+    assert "rasterize" in answered(first, 5).plan.run
+    assert "rasterize" not in answered(apart, 5).plan.run
+    for wire in (first, second, apart):
+        wire.hang_up()
+
+
+def test_a_room_closes_behind_the_last(real_server: BackgroundServer) -> None:
+    wires = [enter(real_server.url)[0] for _ in range(2)]
+    answered(wires[0], 0)
+    wires[0].hang_up()
+    assert real_server.service.rooms.count == 1
+    wires[1].hang_up()
+    wait_until(lambda: real_server.service.rooms.count == 0)
+
+
+def wait_until(holds) -> None:
+    import time
+
+    end_s = time.monotonic() + fakes.PATIENCE_S
+    while not holds():
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
+def test_watchers_of_a_room_see_only_that(real_server: BackgroundServer) -> None:
+    watcher = Wire(real_server.url)
+    watcher.say(Watch(room="study"))
+    assert watcher.hear().session == "waiting"
+    apart, _ = enter(real_server.url, room="attic")
+    answered(apart, 0)
+    inside, welcome = enter(real_server.url)
+    answered(inside, 1)
+    heard = watcher.hear_until(Composite)
+    assert [m.session for m in heard if isinstance(m, Welcome)] == [welcome.session]
+    assert heard[-1].frame == 1
+    for wire in (apart, inside, watcher):
+        wire.hang_up()
+
+
+def test_a_client_too_many_is_told_that_the_server_is_full(start_server, lab) -> None:
+    server = start_server(limits=Limits(longest_period_s=0.05))
+    first = Wire(server.url)
+    first.greet()
+    lab.hold = True
+    first.say(fakes.frame_message(0))
+    lab.next_entered()
+    import time
+
+    time.sleep(0.1)  # the frame takes so long
+    lab.release(100)
+    first.hear_until(Composite)
+    second = Wire(server.url)
+    second.say(Hello(client="test", camera=fakes.CAMERA))
+    code, reason, messages = second.ending()
+    assert code == 1013
+    assert reason.startswith("the server is full: 1 sessions share its device")
+    assert any(isinstance(m, Error) and m.fatal for m in messages)
+    first.say(fakes.frame_message(1))
+    first.hear_until(Composite)  # the others are not disturbed
+    first.hang_up()
+
+
+def test_sessions_that_share_a_device_step_down_and_are_told(start_server, lab) -> None:
+    server = start_server(limits=Limits(wanted_period_s=0.0))
+    wires = [Wire(server.url) for _ in range(2)]
+    for wire in wires:
+        wire.greet(preset="rm")
+    for index in range(20):
+        for wire in wires:
+            wire.say(fakes.frame_message(index))
+            composite = wire.hear_until(Composite)[-1]
+    presets = [entry[1] for entry in lab.log if entry[0] == "preset"]
+    assert sorted(set(presets)) == ["art1", "gr15fast", "reg4"]
+    assert composite.plan.point is None or "share the device" in composite.plan.point.reason
+    for wire in wires:
+        wire.hang_up()
+
+
+def test_options_say_the_room_and_the_place_in_it(tmp_path: Path) -> None:
+    assert room_place(None, None, None) is None
+    place = room_place("kitchen", "same", "7,0.12,apriltag_36h11")
+    assert place is not None
+    assert place.room_from_world == IDENTITY
+    assert place.marker == Marker(id=7, side_m=0.12, dictionary="apriltag_36h11")
+    file = tmp_path / "pose.txt"
+    np.savetxt(file, np.eye(4))
+    assert room_place("kitchen", str(file), None).room_from_world == IDENTITY
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ((None, "same", None), "name it with --room"),
+        (("a", "1 2 3", None), "16"),
+        (("a", " ".join(["2"] * 16), None), "last row"),
+        (("a", None, "seven"), "ID,SIDE_M"),
+        (("a", None, "7,0.1,qr"), "ID,SIDE_M"),
+    ],
+)
+def test_options_that_say_nothing_are_refused(said: tuple, words: str) -> None:
+    with pytest.raises(OptionError, match=words):
+        room_place(*said)
+
+
+def test_the_command_streams_into_a_room(real_server: BackgroundServer, tmp_path: Path) -> None:
+    watcher = Wire(real_server.url)
+    watcher.say(Watch(room="study"))
+    watcher.hear()
+    options = ["--frames", "0:2", "--room", "study", "--marker", "7,0.1"]
+    command = ["stream", "synthetic:table", "--server", real_server.url, "--out", str(tmp_path), "--lossless", *options]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    assert len(list((tmp_path / "frames").iterdir())) == 2
+    assert watcher.hear_until(Composite)
+    watcher.hang_up()

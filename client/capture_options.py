@@ -93,6 +93,7 @@ DeviceOption = Annotated[str | None, typer.Option(metavar="NAME", help="part of 
 RoomName = Annotated[
     str | None, typer.Option("--room", metavar="NAME", help="share volume, light and objects with others")
 ]
+RoomKey = Annotated[str | None, typer.Option("--room-key", metavar="KEY", help="who opens the room sets it")]
 RoomFromWorld = Annotated[
     str | None,
     typer.Option(

@@ -122,6 +122,7 @@ def stream(
     lossless: Annotated[bool, typer.Option("--lossless", help="raw colour, and every frame is waited for")] = False,
     mesh: o.Mesh = False,
     room: o.RoomName = None,
+    room_key: o.RoomKey = None,
     room_from_world: o.RoomFromWorld = None,
     marker: o.MarkerOption = None,
     token: o.Token = None,
@@ -139,7 +140,7 @@ def stream(
     from client.laptop.stream import stream as send
     from client.room_options import room_place
 
-    place = room_place(room, room_from_world, marker)
+    place = room_place(room, room_from_world, marker, room_key)
     access = Access(token, tls_fingerprint, tls_ca)
     others = {"frames": capture.frames, "mesh": mesh, "room": place, "access": access}
     done = send(capture.source, server, capture.objects, capture.wishes, out, lossless, record, **others)
@@ -165,10 +166,13 @@ def serve(
     volume_memory: Annotated[int | None, typer.Option(metavar="MIB", help="of one volume; default 512")] = None,
     sessions: Annotated[int | None, typer.Option(min=1, help="that capture at once; default 16")] = None,
     sessions_per_address: Annotated[int | None, typer.Option(min=1, help="of one client; default 8")] = None,
+    data: Annotated[
+        str | None, typer.Option(metavar="DIR|none", help="where rooms are kept; default: the user's data folder")
+    ] = None,
     log: Annotated[str, typer.Option(metavar="text|json", help="how events are written to standard error")] = "text",
 ) -> int:
     """The server. It asks for a token, which the URL that it prints brings along."""
-    from client.serving import ServeOptions, certificate_of, door_of, leave_soon, limits_of, log_format_of
+    from client.serving import ServeOptions, certificate_of, data_folder, door_of, leave_soon, limits_of, log_format_of
     from server.events import log_events
     from server.serve import serve as serve_forever
 
@@ -187,7 +191,8 @@ def serve(
     limits, door, log_format = limits_of(options), door_of(options), log_format_of(log)
     certificate = certificate_of(options)
     log_events(log_format)
-    status = serve_forever(host, port, device, limits=limits, door=door, certificate=certificate)
+    kept_in = data_folder(data)
+    status = serve_forever(host, port, device, limits=limits, door=door, certificate=certificate, data=kept_in)
     leave_soon(status)
     return status
 

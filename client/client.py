@@ -96,6 +96,7 @@ class RoomPlace:
     """The room that a client joins, and what it says of its world's place there (see `Hello`)."""
 
     name: str
+    key: str | None = None
     room_from_world: tuple[float, ...] | None = None
     marker: Marker | None = None
 
@@ -162,6 +163,7 @@ class StreamClient:
             camera=camera,
             wishes=wishes or Wishes(),
             room=place.name or None,
+            room_key=place.key,
             room_from_world=place.room_from_world,
             marker=place.marker,
             keep_s=keep_s,
@@ -169,9 +171,9 @@ class StreamClient:
         await self._send(self._hello)
         return await self._wait_for_welcome()
 
-    async def watch(self, session: str | None = None, room: str | None = None) -> Welcome:
+    async def watch(self, session: str | None = None, room: str | None = None, room_key: str | None = None) -> Welcome:
         """Begin to watch a session, or the one that streams now or next. Raises ClientError if it is refused."""
-        await self._send(Watch(session=session, room=room))
+        await self._send(Watch(session=session, room=room, room_key=room_key))
         return await self._wait_for_welcome()
 
     @property

@@ -15,15 +15,18 @@ from protocol.messages import Dictionary, Marker
 SAME = "same"
 
 
-def room_place(room: str | None, room_from_world: str | None, marker: str | None) -> RoomPlace | None:
+def room_place(
+    room: str | None, room_from_world: str | None, marker: str | None, key: str | None = None
+) -> RoomPlace | None:
     """None where no room is named. Raises OptionError."""
     if room is None:
-        for option, said in (("--room-from-world", room_from_world), ("--marker", marker)):
+        for option, said in (("--room-key", key), ("--room-from-world", room_from_world), ("--marker", marker)):
             if said is not None:
                 raise OptionError(f"{option} is of a room: name it with --room")
         return None
     return RoomPlace(
         room,
+        key,
         None if room_from_world is None else _matrix(room_from_world),
         None if marker is None else _marker(marker),
     )

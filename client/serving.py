@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
+import tempfile
 import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast, get_args
 from urllib.parse import urlsplit
+
+from platformdirs import user_data_path
 
 from client.laptop.errors import OptionError, RunError
 from server.door import MAX_TOKEN_CHARS, Door, is_loopback, is_token, new_token
@@ -17,6 +20,7 @@ from server.limits import DEFAULT_LIMITS, MIB, Limits
 from server.tls import Certificate, CertificateError, given_certificate, own_certificate
 
 NO_TOKEN = "none"
+NO_DATA = "none"
 LEAVING_PATIENCE_S = 3.0
 LEAST_VOLUME_MIB, MOST_VOLUME_MIB = 16, 1 << 20
 
@@ -83,6 +87,22 @@ def limits_of(options: ServeOptions) -> Limits:
     if options.sessions_per_address is not None:
         per_address = options.sessions_per_address
     return replace(limits, sessions=sessions, sessions_per_address=per_address)
+
+
+def data_folder(text: str | None) -> Path | None:
+    """Where rooms are kept; None: nowhere. Raises RunError where nothing can be written there."""
+    if text == NO_DATA:
+        return None
+    folder = user_data_path("probeless") / "rooms" if text is None else Path(text)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise RunError(
+            f"rooms cannot be kept in {folder} ({error.strerror}): name another folder with --data, or --data none"
+        ) from error
+    return folder
 
 
 def log_format_of(text: str) -> LogFormat:

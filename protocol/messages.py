@@ -27,6 +27,7 @@ from protocol.limits import (
 
 Side = Annotated[int, Meta(ge=1, le=MAX_IMAGE_SIDE_PX)]
 Name = Annotated[str, Meta(min_length=1, max_length=MAX_NAME_CHARS)]
+Key = Annotated[str, Meta(min_length=1, max_length=MAX_NAME_CHARS)]
 Reason = Annotated[str, Meta(max_length=MAX_REASON_CHARS)]
 Bytes = Annotated[bytes, Meta(max_length=MAX_MESSAGE_BYTES)]
 Index = Annotated[int, Meta(ge=0, le=2**53)]
@@ -189,6 +190,8 @@ class Hello(Message, frozen=True, kw_only=True, omit_defaults=True, tag="hello")
     wishes: Wishes = Wishes()
     room: Name | None = None
     """Clients of one room share volume, light and objects; None: a room of its own."""
+    room_key: Key | None = None
+    """Of the room: who opens it sets it, the others have to know it."""
     room_from_world: Matrix4 | None = None
     """Where this client's world lies in the room's, which is that of the client that came first; rigid.
 
@@ -203,8 +206,8 @@ class Hello(Message, frozen=True, kw_only=True, omit_defaults=True, tag="hello")
     def __post_init__(self) -> None:
         if self.room_from_world is not None:
             check_rigid("hello.room_from_world", self.room_from_world)
-        if self.room is None and (self.room_from_world is not None or self.marker is not None):
-            raise ValueError("hello.room_from_world and hello.marker are of a room: name it in hello.room")
+        if self.room is None and (self.room_from_world, self.marker, self.room_key) != (None, None, None):
+            raise ValueError("hello.room_key, room_from_world and marker are of a room: name it in hello.room")
 
 
 class Watch(Message, frozen=True, kw_only=True, omit_defaults=True, tag="watch"):
@@ -214,6 +217,8 @@ class Watch(Message, frozen=True, kw_only=True, omit_defaults=True, tag="watch")
     """None: the session that is streaming, now or next."""
     room: Name | None = None
     """Of `session: None`: only those of this room."""
+    room_key: Key | None = None
+    """Without it, nothing is seen of rooms that have one."""
 
 
 class Frame(Message, frozen=True, kw_only=True, omit_defaults=True, tag="frame"):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Iterator
+from hmac import compare_digest
+from typing import NamedTuple
 
 from protocol.messages import Bye
 from server.connection import POLICY, BadMessage, Connection, Refusal
@@ -13,10 +15,11 @@ from server.connection import POLICY, BadMessage, Connection, Refusal
 class Watcher:
     """One watching client's slot: per kind of news only the latest is kept until it is taken."""
 
-    def __init__(self, session: str | None, room: str | None = None) -> None:
-        """`room`: of any session, only those in it."""
+    def __init__(self, session: str | None, room: str | None = None, lock: bytes = b"") -> None:
+        """`room`: of any session, only those in it. `lock`: of the key that the client has (rooms.py)."""
         self.follows_any = session is None
         self.room = room
+        self.lock = lock
         self.session = session
         self._news: dict[str, tuple[bytes, ...]] = {}
         self._ended = False
@@ -49,12 +52,17 @@ class Watcher:
         return messages
 
 
+class _Place(NamedTuple):
+    room: str | None
+    lock: bytes
+
+
 class Broadcast:
     """Which watcher sees which session. Everything but `is_watched` is for the event loop's thread."""
 
     def __init__(self) -> None:
         self._welcomes: dict[str, bytes] = {}
-        self._rooms: dict[str, str | None] = {}
+        self._places: dict[str, _Place] = {}
         self._watchers: list[Watcher] = []
         self._watched: frozenset[str | None] = frozenset()
 
@@ -62,11 +70,11 @@ class Broadcast:
         """Whether pictures of this session have a taker; may be called by any thread."""
         return session in self._watched
 
-    def open_session(self, name: str, welcome: bytes, room: str | None = None) -> None:
-        """From now on the session can be watched; `welcome` greets its watchers."""
-        self._welcomes[name], self._rooms[name] = welcome, room
+    def open_session(self, name: str, welcome: bytes, room: str | None = None, lock: bytes = b"") -> None:
+        """From now on the session can be watched, by those who have the room's key; `welcome` greets them."""
+        self._welcomes[name], self._places[name] = welcome, _Place(room, lock)
         for watcher in self._watchers:
-            if watcher.session is None and watcher.room in (None, room):
+            if watcher.session is None and self._shows(name, watcher):
                 watcher.attach(name, welcome)
         self._note_watched()
 
@@ -74,23 +82,27 @@ class Broadcast:
         """The session is over: watchers that follow any session go to the newest one left, the others end."""
         if self._welcomes.pop(name, None) is None:
             return
-        del self._rooms[name]
+        del self._places[name]
         for watcher in self._watchers:
             if watcher.session == name:
                 self._move_on(watcher)
         self._note_watched()
 
     @contextlib.contextmanager
-    def watcher(self, session: str | None, waiting: bytes, room: str | None = None) -> Iterator[Watcher]:
+    def watcher(
+        self, session: str | None, waiting: bytes, room: str | None = None, lock: bytes = b""
+    ) -> Iterator[Watcher]:
         """A watcher of the named session, or of the newest (in `room`); `waiting` greets it where there is none yet.
 
-        Raises Refusal for the name of no session.
+        Raises Refusal for the name of no session that this client may see.
         """
-        if session is not None and session not in self._welcomes:
-            there = ", ".join(self._welcomes) or "none"
-            raise Refusal(POLICY, f"there is no session {session!r} to watch; sessions now: {there}")
-        watcher = Watcher(session, room)
-        name = session or self._newest(room)
+        watcher = Watcher(session, room, lock)
+        seen = [name for name in self._welcomes if self._shows(name, watcher)]
+        if session is not None and session not in seen:
+            raise Refusal(
+                POLICY, f"there is no session {session!r} to watch; sessions now: {', '.join(seen) or 'none'}"
+            )
+        name = session or self._newest(watcher)
         watcher.attach(name, self._welcomes[name] if name else waiting)
         self._watchers.append(watcher)
         self._note_watched()
@@ -106,11 +118,17 @@ class Broadcast:
             if watcher.session == session:
                 watcher.post("pictures", messages)
 
-    def _newest(self, room: str | None) -> str | None:
-        return next((name for name in reversed(self._welcomes) if room in (None, self._rooms[name])), None)
+    def _newest(self, watcher: Watcher) -> str | None:
+        return next((name for name in reversed(self._welcomes) if self._shows(name, watcher)), None)
+
+    def _shows(self, name: str, watcher: Watcher) -> bool:
+        """Whether a watcher of any session may see this one."""
+        place = self._places[name]
+        has_key = not place.lock or compare_digest(place.lock, watcher.lock)
+        return has_key and watcher.room in (None, place.room)
 
     def _move_on(self, watcher: Watcher) -> None:
-        heir = self._newest(watcher.room)
+        heir = self._newest(watcher)
         if not watcher.follows_any:
             watcher.end()
         elif heir is None:

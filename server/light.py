@@ -33,6 +33,9 @@ from server.stages.lobe_estimator import KnownLight, LobeEstimator
 from server.stages.radiance_transfer import Directions, Transfer
 from server.stages.volume import Volume
 
+AS_SURE = 1.1
+"""New frames tell the light as well as those before a restart did, if they leave no more than so many times the doubt."""
+
 
 @dataclass(frozen=True)
 class KnownRoomLight:
@@ -149,7 +152,7 @@ class RoomLight:
         )
         if self._remembered and estimate is not before:
             has_changed = self._lobes.steady < steady
-            if has_changed or _doubt(estimate) <= _doubt(self._remembered):
+            if has_changed or _doubt(estimate) <= AS_SURE * _doubt(self._remembered):
                 self._remembered = None
         return self._given or self._colored(self._remembered or estimate)
 

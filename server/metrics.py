@@ -20,6 +20,10 @@ class Metrics:
         self.encode_ms = self._histogram("encode_ms", "Milliseconds to encode a composite")
         self.queue_age_ms = self._histogram("queue_age_ms", "Milliseconds a frame waited before its worker took it")
         self.turn_ms = self._histogram("turn_ms", "Milliseconds a frame waited for its turn on the device")
+        self.overhead_ms = self._histogram(
+            "overhead_ms",
+            "Milliseconds a frame took outside of the pipeline, without waiting for its turn or the socket",
+        )
         self.processed = Counter("probeless_frames_processed", "Frames composited", registry=self._registry)
         self.dropped = Counter("probeless_frames_dropped", "Frames dropped", ("reason",), registry=self._registry)
         self.sessions = Gauge("probeless_sessions", "Capturing sessions", registry=self._registry)

@@ -51,6 +51,8 @@ class Room:
         self.markers = Markers()
         self.changes = 0
         """Counts what a client that was here before cannot see in its own pictures: others' frames, objects."""
+        self.key_digest: bytes | None = None
+        """Of the key without which nobody gets in (rooms.py), empty for none; None until somebody has come."""
         self._wishes = wishes
 
     @property

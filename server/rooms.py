@@ -6,6 +6,8 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from hashlib import sha256
+from hmac import compare_digest
 from typing import TYPE_CHECKING
 
 from protocol.messages import Wishes
@@ -14,6 +16,15 @@ if TYPE_CHECKING:
     from server.room import Room
 
 RoomFactory = Callable[[Wishes, str], "Room"]
+
+
+class RoomLocked(ValueError):
+    """One line: the room has another key."""
+
+
+def lock_of(key: str | None) -> bytes:
+    """What is kept of a room's key, and may be seen by whoever reads the disk; empty for a room without."""
+    return b"" if key is None else sha256(key.encode()).digest()
 
 
 class Rooms:
@@ -28,32 +39,50 @@ class Rooms:
         self._lock = threading.Lock()
 
     @contextmanager
-    def entered(self, name: str, wishes: Wishes) -> Iterator[Room]:
-        """The room of that name, as long as the client is in it. Raises ValueError where it cannot be opened."""
+    def entered(self, name: str, wishes: Wishes, key: str | None = None) -> Iterator[Room]:
+        """The room of that name, as long as the client is in it.
+
+        Whoever opens a room sets its `key`, and the others have to know it. Raises RoomLocked, or ValueError where the
+        room cannot be opened.
+        """
+        lock = lock_of(key)
         with self._lock:
             if name not in self._rooms:
                 self._rooms[name] = self._open_room(wishes, name)
-            self._guests[name] += 1
             room = self._rooms[name]
+            self._guests[name] += 1
         try:
+            room.key_digest = lock if room.key_digest is None else room.key_digest
+            if not compare_digest(room.key_digest, lock):
+                raise RoomLocked(f"room {name!r} has a key of its own, and this is not it: ask who opened it")
             yield room
         finally:
+            self._leave(name)
+
+    def visited(self) -> Iterator[Room]:
+        """Each room that somebody is in, kept open while it is looked at."""
+        for name in tuple(self._rooms):
             with self._lock:
-                self._guests[name] -= 1
-                if not self._guests[name]:
-                    del self._guests[name]
-                    self._close(self._rooms.pop(name))
+                if name not in self._rooms:
+                    continue
+                self._guests[name] += 1
+            try:
+                yield self._rooms[name]
+            finally:
+                self._leave(name)
+
+    def _leave(self, name: str) -> None:
+        with self._lock:
+            self._guests[name] -= 1
+            if not self._guests[name]:
+                del self._guests[name]
+                self._close(self._rooms.pop(name))
 
     def _close(self, room: Room) -> None:
         try:
             self._on_closed(room)
         finally:
             room.close()
-
-    def open_rooms(self) -> tuple[Room, ...]:
-        """Those that somebody is in."""
-        with self._lock:
-            return tuple(self._rooms.values())
 
     @property
     def count(self) -> int:

@@ -11,6 +11,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING
 
@@ -52,26 +53,28 @@ def serve(
     limits: Limits = DEFAULT_LIMITS,
     door: Door | None = None,
     certificate: Certificate | None = None,
+    data: Path | None = None,
     say: Callable[[str], None] | None = None,
 ) -> int:
     """Serve until interrupted; the exit status. `say` is given each line for the user (default: standard output).
 
-    `door` None: a new token is asked for. `certificate` None: no TLS.
+    `door` None: a new token is asked for. `certificate` None: no TLS. `data`: folder that rooms are kept in.
     A port in use, a missing device or kernels that do not build end in one line on standard error and status 1.
     """
     say = say or _print_line
     try:
         listener = listen(host, port)
         with listener:
-            return serve_on(
-                listener, open_service(device_name, limits=limits), say, door or Door(new_token()), certificate
-            )
+            service = open_service(device_name, limits=limits, data=data)
+            return serve_on(listener, service, say, door or Door(new_token()), certificate)
     except ServeError as error:
         sys.stderr.write(f"probeless: {error}\n")
         return 1
 
 
-def open_service(device_name: str | None = None, *, limits: Limits = DEFAULT_LIMITS) -> Service:
+def open_service(
+    device_name: str | None = None, *, limits: Limits = DEFAULT_LIMITS, data: Path | None = None
+) -> Service:
     """The real service on the device whose name contains `device_name`. Raises ServeError."""
     from server.opencl.device import DeviceError, open_device
 
@@ -80,7 +83,7 @@ def open_service(device_name: str | None = None, *, limits: Limits = DEFAULT_LIM
     except DeviceError as error:
         raise ServeError(str(error)) from error
     device.volume_bytes = limits.volume_bytes
-    return Service(device, warm_up=_warm_up, limits=limits)
+    return Service(device, warm_up=_warm_up, limits=limits, data=data)
 
 
 def listen(host: str, port: int) -> socket.socket:

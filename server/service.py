@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from importlib.metadata import version
 from itertools import count
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from protocol.codec import encode, one_line
@@ -21,10 +22,11 @@ from server.connection import GONE, INTERNAL, POLICY, TRY_LATER, BadMessage, Cli
 from server.departure import Departure
 from server.events import about
 from server.guests import Guests
+from server.kept_rooms import KeptRooms
 from server.limits import DEFAULT_LIMITS, Limits
 from server.metrics import Metrics
 from server.parsing.parsers import Parsers
-from server.rooms import RoomFactory, Rooms
+from server.rooms import RoomFactory, Rooms, lock_of
 from server.scene.mesh import Mesh
 from server.scheduler import Scheduler
 from server.session import MAX_INFLIGHT, CaptureSession, LoopOutlet
@@ -61,10 +63,11 @@ class Service:
         max_sessions: int | None = None,
         limits: Limits = DEFAULT_LIMITS,
         at_once: int = 1,
+        data: Path | None = None,
     ) -> None:
         """`pipeline_factory`, `room_factory` (default: the real ones) and `mesh_loader` (default: the parsers') are
         called in workers' threads. `parsers` read what strangers send, in processes of their own. `at_once`: frames
-        that the device works on side by side.
+        that the device works on side by side. `data`: folder that rooms are kept in; None: they end with their clients.
 
         `warm_up` is called once before the first session, in a thread too; None: there is nothing to wait for.
         `max_sessions` takes the place of the limits' own.
@@ -97,7 +100,9 @@ class Service:
         self.departure.on_begin.append(self._give_up_waiting)
         self._scheduler = Scheduler(at_once)
         self._factory = pipeline_factory or _real_pipeline()
-        self.rooms = Rooms(room_factory or _real_room(device))
+        self._keeping = KeptRooms(data, device) if data is not None else None
+        open_room = self._keeping.open_room if self._keeping else room_factory or _real_room(device)
+        self.rooms = Rooms(open_room, self._keeping.keep if self._keeping else lambda _room: None)
         self._workshop = Workshop(
             opened_pipeline=self._opened_pipeline,
             scheduler=self._scheduler,
@@ -108,11 +113,18 @@ class Service:
         )
         self._preparing: asyncio.Task[None] | None = None
 
+    async def _stop_keeping(self) -> None:
+        assert self._keeping is not None
+        await asyncio.to_thread(self._keeping.stop)
+
+    def _entered(self, name: str, hello: Hello) -> contextlib.AbstractContextManager[Room]:
+        return self.rooms.entered(name, hello.wishes, hello.room_key)
+
     @contextlib.contextmanager
     def _opened_pipeline(self, hello: Hello) -> Iterator[Pipeline]:
         """Worker's thread: a client's pipeline, in its room if it names one."""
         with contextlib.ExitStack() as stack:
-            room = None if hello.room is None else stack.enter_context(self.rooms.entered(hello.room, hello.wishes))
+            room = None if hello.room is None else stack.enter_context(self._entered(hello.room, hello))
             pipeline = self._factory(self._device, hello.camera, hello.wishes, room, hello)
             stack.callback(pipeline.close)
             yield pipeline
@@ -130,6 +142,9 @@ class Service:
     def start(self) -> None:
         """Begin to warm up, without waiting for it. Needs the running event loop that will serve."""
         self._preparing = asyncio.create_task(self._prepare())
+        if self._keeping is not None:
+            self._keeping.start(self.rooms)
+            self.departure.saving.append(self._stop_keeping)
 
     def stop(self) -> None:
         """Let the threads go; sessions have ended by now."""
@@ -202,7 +217,8 @@ class Service:
             welcome = Welcome(
                 session=name, server=SERVER_NAME, device="", max_inflight=MAX_INFLIGHT, key=key, room=hello.room
             )
-            outlet = LoopOutlet(welcome, connection, self._broadcast, is_kept=key is not None)
+            lock = lock_of(hello.room_key)
+            outlet = LoopOutlet(welcome, connection, self._broadcast, is_kept=key is not None, lock=lock)
             size = f"{hello.camera.width}x{hello.camera.height}"
             with about(session=name, address=connection.address):
                 log.info("session opened", extra={"client": hello.client, "picture": size})
@@ -259,7 +275,10 @@ class Service:
 
     async def _watch(self, connection: Connection, watch: Watch) -> None:
         waiting = Welcome(session=NO_SESSION, server=SERVER_NAME, device=self.device_name, max_inflight=MAX_INFLIGHT)
-        with self._counted_watcher(), self._broadcast.watcher(watch.session, encode(waiting), watch.room) as watcher:
+        with (
+            self._counted_watcher(),
+            self._broadcast.watcher(watch.session, encode(waiting), watch.room, lock_of(watch.room_key)) as watcher,
+        ):
             await serve_watcher(connection, watcher)
 
     @contextlib.contextmanager

@@ -28,8 +28,11 @@ class LoopOutlet:
     While the client's connection is lost, what is sent is lost too; the session says what has to be sent again.
     """
 
-    def __init__(self, welcome: Welcome, connection: Connection, broadcast: Broadcast, *, is_kept: bool) -> None:
-        """`welcome`: but for the device. `is_kept`: a lost connection does not end the session."""
+    def __init__(
+        self, welcome: Welcome, connection: Connection, broadcast: Broadcast, *, is_kept: bool, lock: bytes = b""
+    ) -> None:
+        """`welcome`: but for the device. `is_kept`: a lost connection does not end the session. `lock`: of its room."""
+        self._lock = lock
         self._welcome = welcome
         self._connection: Connection | None = connection
         self._broadcast = broadcast
@@ -37,6 +40,7 @@ class LoopOutlet:
         self._loop = asyncio.get_running_loop()
         self._sending: Future[None] | None = None
         self._closed = False
+        self.waited_s = 0.0
 
     @property
     def session(self) -> str:
@@ -52,7 +56,7 @@ class LoopOutlet:
 
     def _open_to_watchers(self, welcome: bytes) -> None:
         if not self._closed:
-            self._broadcast.open_session(self.session, welcome, self._welcome.room)
+            self._broadcast.open_session(self.session, welcome, self._welcome.room, self._lock)
 
     def send(self, data: bytes) -> None:
         """Worker's thread: send to the capturing client. Raises ClientGone where that ends the session."""
@@ -61,12 +65,19 @@ class LoopOutlet:
         connection = self._connection
         if connection is None:
             return
-        self._sending = asyncio.run_coroutine_threadsafe(connection.send(data), self._loop)
+        self._sending = asyncio.run_coroutine_threadsafe(self._send_timed(connection, data), self._loop)
         try:
             self._sending.result()
         except (CancelledError, ClientGone) as error:
             if self._closed or not self._is_kept:
                 raise ClientGone from error
+
+    async def _send_timed(self, connection: Connection, data: bytes) -> None:
+        began = self._loop.time()
+        try:
+            await connection.send(data)
+        finally:
+            self.waited_s += self._loop.time() - began
 
     def is_watched(self) -> bool:
         """Worker's thread: whether somebody watches this session."""

@@ -31,13 +31,14 @@ from protocol.messages import (
     RemoveObject,
     RequestMesh,
 )
-from server.connection import POLICY, Refusal
+from server.connection import POLICY, UNAUTHORIZED, Refusal
 from server.mailbox import Letter, Mailbox
 from server.mesh_message import mesh_parts
 from server.meshing.files import mesh_files
 from server.metrics import Metrics
 from server.pressure import Pressure
 from server.pressure import Quality as Asked
+from server.rooms import RoomLocked
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.scheduler import Scheduler
@@ -61,6 +62,10 @@ class Outlet(Protocol):
 
     def send(self, data: bytes) -> None:
         """Send to the capturing client, returning when the socket has taken it. Raises ClientGone."""
+
+    @property
+    def waited_s(self) -> float:
+        """For how long, in all, the socket was waited for."""
 
     def is_watched(self) -> bool:
         """Whether anybody wants what `publish` is given."""
@@ -107,6 +112,8 @@ class Worker:
             with contextlib.ExitStack() as stack:
                 try:
                     pipeline = stack.enter_context(self._workshop.opened_pipeline(self._hello))
+                except RoomLocked as error:
+                    raise Refusal(UNAUTHORIZED, str(error)) from error
                 except ValueError as error:
                     raise Refusal(POLICY, str(error)) from error
                 self._outlet.greet(pipeline.device_name)
@@ -140,20 +147,25 @@ class Worker:
         known = next((answer for number, answer in self._answers if number == frame.frame), None)
         if known is not None:
             return self._send_answer(known)
+        began, waited_before_s = time.perf_counter(), self._outlet.waited_s
         try:
             rgbd = self._decode(frame)
         except ProtocolError as error:
             return self._drop(frame, "unreadable", error)
         try:
+            asked = time.perf_counter()
             with self._workshop.scheduler.turn(self._share) as waited_s:
                 result = pipeline.process(rgbd)
                 self._follow_pressure(pipeline)
+            spent_elsewhere_s = time.perf_counter() - asked
         except ValueError as error:
             return self._drop(frame, "refused", error)
         self._workshop.metrics.turn_ms.observe(waited_s * 1e3)
         self._workshop.metrics.observe_stages(result.timings)
         self._workshop.metrics.processed.inc()
-        return self._deliver(frame, result)
+        self._deliver(frame, result)
+        spent_elsewhere_s += self._outlet.waited_s - waited_before_s
+        return self._workshop.metrics.overhead_ms.observe((time.perf_counter() - began - spent_elsewhere_s) * 1e3)
 
     def _follow_pressure(self, pipeline: Pipeline) -> None:
         """Sample more cheaply where too many share the device, and as asked for again when they are fewer."""

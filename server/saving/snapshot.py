@@ -58,6 +58,7 @@ def snapshot_within(room: Room, slot: Slot) -> Snapshot:
         markers=tuple(KeptMarker(*name, place) for name, place in room.markers.places().items()),
         light=room.light.known(),
         lamps=room.lamps.found,
+        key_digest=room.key_digest,
     )
     return Snapshot(state, room.objects.kept(), volume, bricks, volume.changes if volume else 0)
 
@@ -69,6 +70,7 @@ def _kept(volume: Volume, exposure_logarithms: float) -> KeptVolume:
 def rebuilt(name: str, state: RoomState, slot: Slot, device: Device) -> Room:
     """The room of which `state` was read from `slot`. Raises DamagedFile, OSError."""
     room = Room(device, state.wishes, name)
+    room.key_digest = state.key_digest
     try:
         if state.volume:
             _rebuild_volume(room, state.volume, slot)

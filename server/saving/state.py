@@ -67,6 +67,8 @@ class RoomState(Struct, frozen=True, forbid_unknown_fields=True):
     light: KnownRoomLight
     lamps: Found | None
     objects: tuple[KeptPlace, ...] = ()
+    key_digest: bytes | None = None
+    """See Room."""
 
 
 class Header(Struct, frozen=True):

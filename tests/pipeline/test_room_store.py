@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
 
 import cv2
 import numpy as np
@@ -13,6 +16,7 @@ from msgspec import structs
 
 from protocol.frames import RgbdFrame
 from protocol.messages import Light, Marker
+from server.light import KnownRoomLight, RoomLight
 from server.maths.registration import distance_between
 from server.opencl.device import Device
 from server.opencl.engine import Engine
@@ -21,6 +25,11 @@ from server.room import Room
 from server.room_store import RoomStore, folder_name
 from server.saving.brick_files import merged, read_bricks, write_bricks
 from server.scene.placement import Placement
+from server.settings import read_wishes
+from server.stages.integrate import integrate
+from server.stages.light_estimation import LightEstimate
+from server.stages.lobe_estimator import KnownLight
+from server.stages.measure import GREATEST_DEPTH_M, measure
 from server.stages.raycast import raycast
 from server.stages.volume import Volume
 from tests import corners
@@ -191,6 +200,63 @@ def test_a_light_that_has_changed_is_found_in_a_room_that_came_back(
     again.close()
 
 
+class Told:
+    """An estimator that says what it is told to."""
+
+    steady = 5
+
+    def __init__(self, doubts: list[float]) -> None:
+        self._doubts = iter(doubts)
+        self._now = LightEstimate(np.ones((16, 3)), None, np.inf, valid=False)
+
+    def resume(self, known: KnownLight) -> None:
+        pass
+
+    def estimate(self) -> LightEstimate:
+        return self._now
+
+    def update(self, *_given: Any) -> LightEstimate:
+        doubt = next(self._doubts)
+        if doubt > 0:
+            self._now = LightEstimate(np.ones((16, 3)), np.full((16, 3), doubt), 1.0, valid=True)
+        return self._now
+
+
+def test_a_light_is_forgotten_once_new_frames_say_as_much(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("server.light.gather_samples", lambda *_given: None)
+    monkeypatch.setattr("server.light.no_hits", lambda *_given: None)
+    light = RoomLight(engine, read_wishes(corners.WISHES))
+    told = LightEstimate(np.full((16, 3), 2.0), np.full((16, 3), 0.2), 1.0, valid=True)
+    light._lobes = Told([0.0, 0.5, 0.0, 0.13, 0.1, 0.5])  # 0: a frame that says nothing
+    light.resume(replace(light_known(), remembered=told))
+    given: Any = MagicMock()
+    estimates = [light.update(given, given, given, given, given, given, given, None) for _ in range(6)]
+    assert [estimate is told for estimate in estimates] == [True, True, True, True, False, False]
+    assert [light.estimate() is told] == [False]
+
+
+def light_known() -> KnownRoomLight:
+    return KnownRoomLight(None, None, MagicMock(), None)
+
+
+def test_a_change_that_is_beyond_the_greatest_depth_in_the_middle_is_written(engine: Engine) -> None:
+    """Voxels behind the farthest surface that is fused."""
+    camera = structs.replace(CAMERA, depth_scale_m=0.001)
+    depth = np.full((camera.height, camera.width), int(1000 * GREATEST_DEPTH_M) - 1, np.uint16)
+    frame = RgbdFrame(0, 0.0, np.full((*depth.shape, 3), 128, np.uint8), depth, np.eye(4))
+    bounds = (-2.0, -2.0, GREATEST_DEPTH_M - 1.6, 2.0, 2.0, GREATEST_DEPTH_M + 3.2)
+    volume = Volume(engine, bounds, 0.1)
+    for _ in range(2):
+        before, bits = volume.changes, voxels_of(volume)
+        measured = measure(engine, camera, frame)
+        volume.allocate(camera, volume.volume_from_world(), measured.depth_m)
+        integrate(engine, volume, camera, volume.volume_from_world(), measured)
+        after, changed = voxels_of(volume), set(volume.changed_since(before).tolist())
+        differing = {place for place in after if after[place] != bits.get(place)}
+        assert differing
+        assert differing <= changed
+
+
 def test_a_surface_taken_to_go_on_still_does(device: Device, corner: Room, store: RoomStore) -> None:
     store.save(corner)
     again = loaded(store, "corner", device)
@@ -281,13 +347,16 @@ def test_a_save_is_of_one_moment(device: Device, room: Room, store: RoomStore, m
     client = client_of(device, room, wishes("given"))
     scan(client, range(2))
     had = {2: print_of(room)}
-    process, came, stop = client._process, threading.Event(), threading.Event()
+    process, sample, came, stop = client._process, client._sample, threading.Event(), threading.Event()
 
     def noted(frame: RgbdFrame) -> FrameResult:
         result = process(frame)
         had[room.reconstruction.volume.frames] = print_of(room)
-        came.set()
         return result
+
+    def in_the_middle(*given: Any) -> Any:
+        came.set()  # fused, but the light is not estimated yet
+        return sample(*given)
 
     def work() -> None:
         for step in range(2, 1000):
@@ -296,6 +365,7 @@ def test_a_save_is_of_one_moment(device: Device, room: Room, store: RoomStore, m
             scan(client, range(step, step + 1))
 
     monkeypatch.setattr(client, "_process", noted)
+    monkeypatch.setattr(client, "_sample", in_the_middle)
     thread, found = threading.Thread(target=work), []
     thread.start()
     try:

@@ -15,7 +15,7 @@ from client.laptop.errors import OptionError
 from client.room_options import room_place
 from protocol.frames import IDENTITY, RgbdFrame
 from protocol.images import encode_color, encode_depth
-from protocol.messages import Acknowledged, Composite, Error, Frame, Hello, Marker, PlaceObject, Watch, Welcome
+from protocol.messages import Acknowledged, Composite, Error, Frame, Hello, Light, Marker, PlaceObject, Watch, Welcome
 from server.limits import Limits
 from server.opencl.device import Device
 from server.serve import BackgroundServer, start_in_background
@@ -184,3 +184,52 @@ def test_the_command_streams_into_a_room(real_server: BackgroundServer, tmp_path
     assert len(list((tmp_path / "frames").iterdir())) == 2
     assert watcher.hear_until(Composite)
     watcher.hang_up()
+
+
+def test_a_room_with_a_key_is_for_those_who_have_it(real_server: BackgroundServer) -> None:
+    owner, welcome = enter(real_server.url, room_key="k3y")
+    for key in (None, "guess"):
+        wire = Wire(real_server.url)
+        wire.say(Hello(client="test", camera=CAMERA, room="study", room_key=key))
+        code, reason, _ = wire.ending()
+        assert code == 4401
+        assert reason == "room 'study' has a key of its own, and this is not it: ask who opened it"
+    named = Wire(real_server.url)
+    named.say(Watch(session=welcome.session))
+    code, reason, _ = named.ending()
+    assert code == 1008
+    assert reason.endswith("sessions now: none")
+    anybody, insider = Wire(real_server.url), Wire(real_server.url)
+    anybody.say(Watch())
+    assert anybody.hear().session == "waiting"
+    insider.say(Watch(room="study", room_key="k3y"))
+    assert insider.hear().session == welcome.session
+    second, _ = enter(real_server.url, room_key="k3y", room_from_world=IDENTITY)
+    answered(owner, 0)
+    assert insider.hear_until(Composite)[-1].frame == 0
+    for wire in (owner, second, anybody, insider):
+        wire.hang_up()
+
+
+def test_rooms_are_as_they_were_after_a_restart(device: Device, tmp_path: Path) -> None:
+    mesh = trimesh.creation.box((0.2, 0.2, 0.2)).export(file_type="ply")
+    with start_in_background(Service(device, data=tmp_path)) as server:
+        wire, _ = enter(server.url, room_key="k3y")
+        for step in range(12):
+            before = answered(wire, step)
+        wire.say(PlaceObject(request=1, object="cube", format="ply", data=mesh, position_m=(-0.9, 0.6, 1.0)))
+        wire.hear_until(Acknowledged)
+    assert "rasterize" not in before.plan.run
+    with start_in_background(Service(device, data=tmp_path)) as server:
+        refused = Wire(server.url)
+        refused.say(Hello(client="test", camera=CAMERA, wishes=wishes("given"), room="study"))
+        assert refused.ending()[0] == 4401
+        wire, _ = enter(server.url, room_key="k3y")
+        wire.say(message_of(frame_at(view_at(6), 0, given=view_at(6))))
+        heard = wire.hear_until(Composite)
+        after = heard[-1]
+        assert after.tracking == "given"
+        assert "rasterize" in after.plan.run
+        light = next(message for message in heard if isinstance(message, Light))
+        assert light.sh_std[0][0] is not None
+        wire.hang_up()

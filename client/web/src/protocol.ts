@@ -131,6 +131,8 @@ export interface Hello {
   wishes?: Wishes;
   /** Clients of one room share volume, light and objects; null: a room of its own. */
   room?: string | null;
+  /** Of the room: who opens it sets it, the others have to know it. */
+  room_key?: string | null;
   /**
    * Where this client's world lies in the room's, which is that of the client that came first; rigid.
    *
@@ -152,6 +154,8 @@ export interface Watch {
   session?: string | null;
   /** Of `session: null`: only those of this room. */
   room?: string | null;
+  /** Without it, nothing is seen of rooms that have one. */
+  room_key?: string | null;
 }
 
 /** Colour: `jpeg` and `png` are sRGB 8-bit; `raw` is interleaved RGB, little endian, in `encoding`. */

@@ -67,7 +67,7 @@ class Room:
     def differences(self, wishes: Wishes) -> tuple[str, ...]:
         """One line for each wish of a client that the room does not grant."""
         return tuple(
-            f"{name.replace('_', '-')} is as the client that opened room {self.name!r} asked"
+            f"{name.removesuffix('_m').replace('_', '-')} is as the client that opened room {self.name!r} asked"
             for name in SHARED
             if getattr(wishes, name) != getattr(self._wishes, name)
         )

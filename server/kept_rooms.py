@@ -48,7 +48,10 @@ class KeptRooms:
     def keep(self, room: Room) -> None:
         """Save a room that is about to close."""
         assert self._saver is not None
+        assert self._store is not None
+        assert room.name is not None
         self._saver.save(room)
+        self._store.release(room.name)
 
     def stop(self) -> None:
         """Save what is open once more."""

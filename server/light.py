@@ -34,7 +34,7 @@ from server.stages.radiance_transfer import Directions, Transfer
 from server.stages.volume import Volume
 
 AS_SURE = 1.1
-"""New frames tell the light as well as those before a restart did, if they leave no more than so many times the doubt."""
+"""New frames tell the light as well as those before a restart did, if they leave at most so many times the doubt."""
 
 
 @dataclass(frozen=True)

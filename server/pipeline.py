@@ -270,6 +270,7 @@ class Pipeline:
             else:
                 check_size(mesh, placement)
                 self._waiting = [*(w for w in self._waiting if w[0] != object_id), (object_id, mesh, placement)]
+                return (*mesh.notes, "it is placed once this client is aligned with the room")
         return mesh.notes
 
     def move_object(self, object_id: str, placement: Placement) -> None:

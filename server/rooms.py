@@ -36,6 +36,8 @@ class Rooms:
         self._on_closed = on_closed
         self._rooms: dict[str, Room] = {}
         self._guests: Counter[str] = Counter()
+        self._doors: dict[str, threading.Lock] = {}
+        """One a name: held while that room is opened or closed, which takes disk and device; other rooms go on."""
         self._lock = threading.Lock()
 
     @contextmanager
@@ -47,11 +49,12 @@ class Rooms:
         """
         lock = lock_of(key)
         with self._lock:
-            if name not in self._rooms:
-                self._rooms[name] = self._open_room(wishes, name)
-            room = self._rooms[name]
             self._guests[name] += 1
         try:
+            with self._door(name):
+                if name not in self._rooms:
+                    self._rooms[name] = self._open_room(wishes, name)
+                room = self._rooms[name]
             room.key_digest = lock if room.key_digest is None else room.key_digest
             if not compare_digest(room.key_digest, lock):
                 raise RoomLocked(f"room {name!r} has a key of its own, and this is not it: ask who opened it")
@@ -63,20 +66,30 @@ class Rooms:
         """Each room that somebody is in, kept open while it is looked at."""
         for name in tuple(self._rooms):
             with self._lock:
-                if name not in self._rooms:
+                room = self._rooms.get(name)
+                if room is None:
                     continue
                 self._guests[name] += 1
             try:
-                yield self._rooms[name]
+                yield room
             finally:
                 self._leave(name)
 
     def _leave(self, name: str) -> None:
         with self._lock:
             self._guests[name] -= 1
-            if not self._guests[name]:
-                del self._guests[name]
-                self._close(self._rooms.pop(name))
+            if self._guests[name]:
+                return
+        with self._door(name):
+            with self._lock:
+                is_empty = not self._guests[name]  # nobody has come meanwhile
+                room = self._rooms.pop(name, None) if is_empty else None
+            if room is not None:
+                self._close(room)
+
+    def _door(self, name: str) -> threading.Lock:
+        with self._lock:
+            return self._doors.setdefault(name, threading.Lock())
 
     def _close(self, room: Room) -> None:
         try:

@@ -72,7 +72,7 @@ def layout_of(kind: Any) -> Any:
 def _layout(info: Any, within: set[Any]) -> Any:
     cls = getattr(info, "cls", None)
     if isinstance(info, msgspec.inspect.CustomType):
-        return str(cls).rpartition("dtype[")[2]
+        return cls.__name__
     if cls is Wishes:
         return "Wishes"  # may have more of them, with defaults
     if hasattr(info, "fields"):

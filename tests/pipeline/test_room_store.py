@@ -33,7 +33,7 @@ from server.stages.measure import GREATEST_DEPTH_M, measure
 from server.stages.raycast import raycast
 from server.stages.volume import Volume
 from tests import corners
-from tests.analytic import Floats
+from tests.analytic import Floats, look_at
 from tests.corners import FLOOR, WALL, corner_frame
 from tests.kept_rooms import BALL, CUBE, PLACE, client_of, print_of, scan, voxels_of
 from tests.lights import degrees_between, lobe_and_sky
@@ -207,7 +207,7 @@ class Told:
 
     def __init__(self, doubts: list[float]) -> None:
         self._doubts = iter(doubts)
-        self._now = LightEstimate(np.ones((16, 3)), None, np.inf, valid=False)
+        self._now = LightEstimate(np.full((16, 3), 2.0), np.full((16, 3), 0.2), 1.0, valid=True)  # as it was resumed
 
     def resume(self, known: KnownLight) -> None:
         pass
@@ -239,22 +239,23 @@ def light_known() -> KnownRoomLight:
     return KnownRoomLight(None, None, MagicMock(), None)
 
 
-def test_a_change_that_is_beyond_the_greatest_depth_in_the_middle_is_written(engine: Engine) -> None:
-    """Voxels behind the farthest surface that is fused."""
-    camera = structs.replace(CAMERA, depth_scale_m=0.001)
-    depth = np.full((camera.height, camera.width), int(1000 * GREATEST_DEPTH_M) - 1, np.uint16)
-    frame = RgbdFrame(0, 0.0, np.full((*depth.shape, 3), 128, np.uint8), depth, np.eye(4))
-    bounds = (-2.0, -2.0, GREATEST_DEPTH_M - 1.6, 2.0, 2.0, GREATEST_DEPTH_M + 3.2)
-    volume = Volume(engine, bounds, 0.1)
+def test_changes_behind_the_farthest_surface_that_is_fused_are_told(engine: Engine) -> None:
+    """A brick's corner there is not in view as its middle is, but integration reaches it."""
+    depth = np.full((CAMERA.height, CAMERA.width), int(1000 * GREATEST_DEPTH_M) - 1, np.uint16)
+    view = look_at((0, 0, 0), (1, 1, 1))
+    frame = RgbdFrame(0, 0.0, np.full((*depth.shape, 3), 128, np.uint8), depth, view)
+    corner = (GREATEST_DEPTH_M + 0.3) / np.sqrt(3)
+    volume = Volume(engine, (corner - 1.6,) * 3 + (corner + 1.6,) * 3, 0.1)
+    pose = volume.volume_from_world() @ view
     for _ in range(2):
         before, bits = volume.changes, voxels_of(volume)
-        measured = measure(engine, camera, frame)
-        volume.allocate(camera, volume.volume_from_world(), measured.depth_m)
-        integrate(engine, volume, camera, volume.volume_from_world(), measured)
-        after, changed = voxels_of(volume), set(volume.changed_since(before).tolist())
+        measured = measure(engine, CAMERA, frame)
+        volume.allocate(CAMERA, pose, measured.depth_m)
+        integrate(engine, volume, CAMERA, pose, measured)
+        after = voxels_of(volume)
         differing = {place for place in after if after[place] != bits.get(place)}
-        assert differing
-        assert differing <= changed
+        assert 2 + 4 * (2 + 4 * 2) in differing  # that brick, x fastest
+        assert differing <= set(volume.changed_since(before).tolist())
 
 
 def test_a_surface_taken_to_go_on_still_does(device: Device, corner: Room, store: RoomStore) -> None:

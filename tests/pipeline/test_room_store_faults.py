@@ -276,7 +276,7 @@ def test_two_saves_are_kept(device: Device, room: Room, tmp_path: Path) -> None:
     assert found(tmp_path, device) == prints[1]
 
 
-LAYOUT = "27d6396123f372aa"
+LAYOUT = "aebee7bf174ec815"
 
 
 def test_the_version_is_that_of_the_layout() -> None:

@@ -12,7 +12,8 @@
 // Real surface: the ratio R' / R of shading with virtual objects to shading without, at the samples of the transfer.
 // transfer [rows][cols][COEFFICIENTS]; hits [rows][cols]: see indirect.cl; light [COEFFICIENTS] rgb.
 // ball: center and radius of a ball around all objects.
-// -> ratio [rows][cols] (rgb, w = 1), shaded [rows][cols] (rgb of R, w = 1); w = 0 where there is no surface.
+// -> ratio [rows][cols] (rgb, w = 1), shaded [rows][cols] (rgb of R, w = 1); w = 0 where there is no surface. R is whole where nothing
+// is taken too: other parts of the light (shadow_map.cl), bounces and refined pixels (adaptive.cl) are set against it.
 kernel void shadow_real(SAMPLE_PARAMETERS, global const float *transfer, global const float4 *hits, global const float4 *light,
                         SCENE_PARAMETERS, const float4 ball, global float4 *ratio, global float4 *shaded) {
     const int col = get_global_id(0);
@@ -32,9 +33,8 @@ kernel void shadow_real(SAMPLE_PARAMETERS, global const float *transfer, global 
     global const uchar *own = sets + sample * INTERLEAVE;
     float3 without = (float3)(0.0f);
     for (int i = 0; i < COEFFICIENTS; i++) without += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
+    without = shading_without(arrives, position.xyz, normal.xyz, without, openness[sample], hits[sample], own, free);
     const float3 taken = taken_from_real(volume, things, arrives, ball, position.xyz, normal.xyz, 0, 0, 1, own, INTERLEAVE, free);
-    if (any(taken != 0.0f))
-        without = shading_without(arrives, position.xyz, normal.xyz, without, openness[sample], hits[sample], own, free);
     const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
     ratio[sample] = (float4)(fmax(without - taken, floor) / fmax(without, floor), 1.0f);
     shaded[sample] = (float4)(without, 1.0f);

@@ -22,6 +22,7 @@ from server.opencl.engine import Engine
 from server.scene.virtual_object import VirtualObject
 from server.stages.continuation import NO_PLANES, Continuation, PlaneArrays
 from server.stages.differential_rendering import shadow_real, shadow_virtual
+from server.stages.indirect import Indirect
 from server.stages.radiance_transfer import Directions, direction_sets, transfer_radiance
 from server.stages.rasterize import Placed, VirtualSurface
 from server.stages.sample_grid import SampleGrid
@@ -29,6 +30,7 @@ from server.stages.traced_scene import trace_scene, upload_light
 from tests import lights
 from tests.meshes import pose, shape_of
 from tests.reference import differential_rendering as twin
+from tests.reference import planes as planes_twin
 from tests.reference.sh import open_transfer, sh_basis
 from tests.solids import Ball, Box, Scene, ball, box, download4, fill_volume, float4, floor, hit, upload_surface
 from tests.tolerance import relative_tolerance
@@ -272,6 +274,60 @@ def test_no_surface_has_no_ratio(engine: Engine) -> None:
     traced = trace_scene(engine, volume, upload_light(engine, LIGHT, rays), rays, FAR_M, objects)
     ratio = shadow_real(engine, camera, surface, transfer, traced)
     np.testing.assert_array_equal(download4(engine, ratio.values)[..., 3], np.repeat([1, 0], 4)[:, None] * np.ones(8))
+
+
+@pytest.mark.parametrize("solid", [PLATE, box((3, 5, 3), (3.2, 5.2, 3.2))], ids=["plate", "far"])
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_shading_is_the_twins_wherever_objects_are(device: Device, engine: Engine, solid: Box, goes_on: bool) -> None:
+    """R has what hidden directions send at every sample, whether objects take something there or not."""
+    wall = box((-1.0, -1.0, -1.0), (0.3, 2.0, 2.0))
+    points = floor_points(0.32, 0.86, 16)
+    positions, normals = buffer(points, UP, (16, 16), STRIDE)
+    camera, rays, volume = camera_of(positions), direction_sets(81, 4), fill_volume(engine, (*FLOOR, wall), VOXEL_M)
+    surface = upload_surface(engine, positions[..., :3], normals[..., :3], positions[..., 3] > 0)
+    transfer = transfer_radiance(engine, camera, volume, surface, STRIDE, rays, FAR_M)
+    random = np.random.default_rng(4)
+    hits = random.uniform(0.0, 8.0, (16, 16, 4))
+    hits[3] = 0.0  # nothing was met there
+    beyond = PlanePatch(
+        normal=np.array([1.0, 0, 0]),
+        offset_m=0.9,
+        across=np.array([0.0, 0, 1]),
+        along=np.array([0.0, 1, 0]),
+        corner=np.zeros(2),
+        empty=np.zeros((40, 40), np.bool_),
+        seen=np.array([[0.0, 0], [0.8, 0.8]]),
+    )
+    continuation, unseen, gain = Continuation(), np.array([0.4, 0.1, 0.2]), 1.5
+    continuation.planes, continuation._boxes = [beyond], [beyond.box]
+    on_device = engine.workspace.upload("test_hits", float4(hits[..., :3], hits[..., 3]))
+    indirect = Indirect(on_device, unseen)
+    planes = continuation.arrays() if goes_on else NO_PLANES
+    light = upload_light(engine, LIGHT / gain, rays, planes, indirect, gain)
+    traced = trace_scene(engine, volume, light, rays, FAR_M, [placed(engine, solid)])
+    found = download4(engine, shadow_real(engine, camera, surface, transfer, traced, indirect).shaded)
+    bits = np.unpackbits(engine.download(transfer.free_mask).view(np.uint8), axis=-1, bitorder="little")[..., :81]
+    coefficients, openness = (engine.download(a).astype(float) for a in (transfer.coefficients, transfer.openness))
+    expected = np.zeros((16, 16, 3))
+    for row, col in np.ndindex(16, 16):
+        place, own = points.reshape(16, 16, 3)[row, col], rays.directions[twin.direction_set(row, col)].astype(float)
+        sides = planes_twin.beyond(beyond, place[None], own[:, :3], 0.0)
+        expected[row, col] = twin.shading_without(
+            UP,
+            own,
+            np.maximum(sh_basis(own[:, :3], 4) @ LIGHT, 0.0),
+            bits[row, col].astype(bool),
+            goes_on & (np.max(sides, axis=0)[0] == 0),
+            coefficients[row, col],
+            LIGHT,
+            openness[row, col],
+            hits[row, col],
+            gain * unseen,
+            gain,
+        )
+    assert 0.02 < (1 - openness).min() < 0.2 < (1 - openness).max()
+    close = np.abs(found[..., :3] - expected).max(axis=-1) < 20 * relative_tolerance(device) * expected.max()
+    assert close.mean() > 0.98  # a direction that meets the plane's border just so counts or not
 
 
 # ---- shadows on virtual surfaces ---------------------------------------------------------------------------------

@@ -9,17 +9,21 @@ import pytest
 
 from protocol.frames import CameraModel
 from server.maths.direct_lights import DirectLight
+from server.opencl.device import Device
 from server.opencl.engine import Engine
+from server.stages.differential_rendering import shadow_real
 from server.stages.indirect import Indirect
 from server.stages.radiance_transfer import Transfer, direction_sets, own_sets
 from server.stages.reach import MostSent, _bound_pixels, _bound_samples, _greatest
-from server.stages.traced_scene import DeviceLight, upload_light
+from server.stages.traced_scene import DeviceLight, trace_scene, upload_light
 from server.stages.volume import Volume
 from tests import lights
 from tests.analytic import Floats
+from tests.kernels.test_differential_rendering import placed
 from tests.reference import reach as twin
 from tests.reference.sh import open_transfer
-from tests.solids import float4, upload_surface
+from tests.solids import box, download4, float4, upload_surface
+from tests.tolerance import relative_tolerance
 
 STRIDE, ROWS, COLS, RAYS = 2, 12, 16, 81
 WIDTH, HEIGHT = STRIDE * COLS, STRIDE * ROWS
@@ -156,6 +160,22 @@ def test_in_the_dark_nothing_that_is_not_sent_is_taken(engine: Engine) -> None:
     case = Case(engine, light=np.zeros((16, 3)))
     found = engine.download(case.bounds()).view(np.float32)
     assert np.isfinite(found).all()
+
+
+def test_changes_are_measured_against_what_rendering_takes_for_r(device: Device, engine: Engine) -> None:
+    """A bound over R holds for R' / R only if it is the same R, near objects and far from them."""
+    case = Case(engine)
+    bounds = engine.download(case.bounds()).view(np.float32).reshape(ROWS, COLS, 4).copy()
+    solid = box((0.7, 0.2, 0.5), (0.9, 0.4, 0.7))
+    scene = trace_scene(engine, case.volume, case.device_light(), case.rays, 1000.0, [placed(engine, solid)])
+    shadow = shadow_real(engine, case.camera, case.surface, case.device_transfer, scene, case.indirect)
+    shaded, ratio = (download4(engine, a)[..., :3].astype(float) for a in (shadow.shaded, shadow.values))
+    there = bounds[..., 3] > 0
+    touched = (ratio != 1).any(axis=-1)
+    assert 0.1 < touched[there].mean() < 0.9
+    hidden = (1 - case.openness)[..., None]
+    expected = (hidden * MOST.real / shaded.clip(1e-9)).max(axis=-1)
+    np.testing.assert_allclose(bounds[there][:, 2], expected[there], rtol=10 * relative_tolerance(device))
 
 
 def _pixels(case: Case, light: DeviceLight, bounds: cl_array.Array, *, has_bounds: bool) -> Floats:

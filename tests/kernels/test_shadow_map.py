@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
+from server import effect_functions as effects
 from server.effect_functions import View, add_objects
 from server.maths.direct_lights import DirectLight, SplitLight, split_light
 from server.maths.directional_fit import directional_sh
@@ -19,8 +20,9 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.stages.continuation import NO_PLANES, Continuation, PlaneArrays
 from server.stages.differential_rendering import RealShadow
+from server.stages.indirect import observe_indirect
 from server.stages.object_glow import place_points
-from server.stages.radiance_transfer import Directions, direction_sets
+from server.stages.radiance_transfer import Directions, direction_sets, transfer_radiance
 from server.stages.rasterize import VirtualSurface
 from server.stages.sample_grid import SampleGrid
 from server.stages.shadow_map import (
@@ -40,9 +42,11 @@ from server.stages.traced_scene import DeviceLight, take_discs, trace_scene, upl
 from tests import lights
 from tests.kernels import test_reflect
 from tests.kernels.test_differential_rendering import camera_of, placed
+from tests.kernels.test_indirect import WALL as WALL_COLOR
+from tests.kernels.test_indirect import floor_beside_a_wall, wall_seen_from
 from tests.kernels.test_lanes import Narrow, Wide
 from tests.reference import shadow_map as twin
-from tests.solids import Ball, Box, Scene, ball, box, download4, fill_volume, float4, floor, hit, upload_surface
+from tests.solids import SIDE_M, Ball, Box, Scene, ball, box, download4, fill_volume, float4, floor, hit, upload_surface
 from tests.tolerance import relative_tolerance
 
 VOXEL_M, FAR_M = 0.01, 1000.0
@@ -345,6 +349,49 @@ def test_rays_are_as_long_as_they_are_said_to_be(engine: Engine) -> None:
 
 
 # ---- both parts of the light together ----------------------------------------------------------------------------
+
+SKY, BESIDE_M = 0.2, 0.1
+
+
+def test_an_umbra_keeps_what_surfaces_send(engine: Engine) -> None:
+    """Floor beside a wall, under an even sky and a disc that a small bar hides: R' / R is the sky and what the wall
+    sends over that and the disc, in closed form, at samples and at pixels.
+
+    The bar hides 1 / 200 of the sky: most samples have no direction that meets it, and R is the same there.
+    """
+    light, middle = disc(2.0, (0.0, 0.8, 0.6)), np.array([0.48, FLOOR_Y, 0.2 + BESIDE_M])
+    bar = box(middle + 0.3 * light.direction - 0.02, middle + 0.3 * light.direction + 0.02)
+    points = np.tile(middle, (16, 16, 1))
+    points[..., 0] += 0.005 * np.linspace(-1, 1, 256).reshape(16, 16)
+    camera, rays, even = camera_of(points), direction_sets(81, 4), lights.uniform((SKY,) * 3)
+    volume, _ = floor_beside_a_wall(engine)
+    surface = upload_surface(engine, points, np.broadcast_to(UP, points.shape), np.ones((16, 16), bool))
+    transfer = transfer_radiance(engine, camera, volume, surface, 1, rays, FAR_M)
+    indirect = observe_indirect(engine, camera, volume, surface, transfer, rays, FAR_M)
+    rest = upload_light(engine, even, rays, indirect=indirect)
+    split = take_discs(engine, rest, SplitLight(even, (light,)), rays)
+    objects, view = [placed(engine, bar)], View(engine, camera, np.eye(4), FAR_M)
+    maps = draw_shadow_maps(engine, volume, split, objects, FAR_M)
+    scene = trace_scene(engine, volume, split, rays, FAR_M, objects)
+    samples = effects.light_samples(view, surface, transfer, maps)
+    shadow = effects.shadow_real(view, surface, transfer, scene, indirect, None, maps, samples)
+    parts = trace_real(engine, camera, surface, shadow, maps)
+    pixels = download4(engine, light_real(engine, camera, surface, shadow, parts, maps)).astype(float)
+    assert isinstance(shadow.whole, RealShadow)
+    buffers = (shadow.values, shadow.shaded, shadow.whole.values, shadow.whole.shaded)
+    by_rays, shaded, ratio, whole = (download4(engine, a)[..., :3].astype(float) for a in buffers)
+
+    hidden = wall_seen_from(BESIDE_M + VOXEL_M, SIDE_M, SIDE_M - FLOOR_Y)
+    expected = SKY * (1 - hidden) + hidden * np.array(WALL_COLOR)
+    brought = exact(middle[None], light, ())[0]
+    missed = (by_rays == 1).all(axis=-1)
+    assert 0.5 < missed.mean() < 1
+    for at in (missed, ~missed):
+        np.testing.assert_allclose(shaded[at].mean(axis=0), expected, rtol=0.1)
+        np.testing.assert_allclose(whole[at].mean(axis=0), expected + brought, rtol=0.1)
+    for found in (ratio, pixels[..., :3]):
+        np.testing.assert_allclose(found.mean(axis=(0, 1)), expected / (expected + brought), rtol=0.08)
+    assert (pixels[..., 3] == 1).all()
 
 
 def test_mixed_ratios_are_the_twins_and_come_apart_again(device: Device, engine: Engine) -> None:

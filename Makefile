@@ -3,16 +3,19 @@ PYTHON ?= python3
 BIN := .venv/bin
 DATA ?= ../shared/data
 
-.PHONY: help install install-bench demo test lint bench check-races web lock clean
+.PHONY: help install install-bench install-cluster install-oak demo test lint bench check-races web lock clean
 help:
 	@echo "make demo    the main job: server, streaming client, pictures in out/demo"
 	@echo "make test    the tests           make lint   formatting, types"
 	@echo "make bench   the benchmarks      make web    rebuild the page from its sources"
 	@echo "make check-races   the kernels in a simulator that finds data races (downloads it)"
-	@echo "make install the program alone, as .venv/bin/probeless"
+	@echo "make install the program alone, as .venv/bin/probeless; install-cluster: and Ray Serve, for many machines"
+	@echo "make install-oak   that, and what reads an OAK camera"
 
 install: .venv/installed
 install-bench: .venv/installed-bench
+install-cluster: .venv/installed-cluster
+install-oak: .venv/installed-oak
 
 demo: .venv/installed
 	$(BIN)/probeless demo
@@ -51,6 +54,10 @@ lock: .venv/installed-test
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra test --extra mesh \
 		--extra model --extra bench --extra sweep --constraint requirements-test.lock --constraint requirements.lock \
 		pyproject.toml -o requirements-bench.lock
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh --extra cluster \
+		--constraint requirements-bench.lock pyproject.toml -o requirements-cluster.lock
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh --extra oak \
+		--constraint requirements.lock pyproject.toml -o requirements-oak.lock
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
@@ -66,8 +73,16 @@ lock: .venv/installed-test
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-test.lock
 	@touch $@
 
+.venv/installed-oak: requirements-oak.lock .venv/installed
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-oak.lock
+	@touch $@
+
 .venv/installed-bench: requirements-bench.lock .venv/installed-test
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-bench.lock
+	@touch $@
+
+.venv/installed-cluster: requirements-cluster.lock .venv/installed
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-cluster.lock
 	@touch $@
 
 .oclgrind/installed: requirements-races.lock | .venv/bin/python

@@ -13,7 +13,7 @@ import typer
 from client import capture_options as o
 from client.capture_options import CaptureOptions, capturing
 from client.laptop.errors import OptionError
-from client.options import prepare
+from client.options import prepare, refuse_depth_noise
 from client.progress import Stopwatch, note, progress_bar, say, track
 
 USAGE_STATUS, FAILURE_STATUS, INTERRUPTED_STATUS = 2, 1, 130
@@ -86,7 +86,7 @@ def run(
         find_library()  # before the frames, not after them
     watch = Stopwatch()
     with OutputWriter(out) as writer, Run(capture, device, note) as pipeline:
-        for output in track(pipeline.outputs(), len(capture.frames)):
+        for output in track(pipeline.outputs(), capture.total):
             writer.write(output)
             watch.frames += 1
         if mesh:
@@ -120,6 +120,11 @@ def stream(
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for what is written")] = None,
     record: Annotated[Path | None, typer.Option(metavar="FILE", help="keep what is sent as a recording")] = None,
     lossless: Annotated[bool, typer.Option("--lossless", help="raw colour, and every frame is waited for")] = False,
+    adapt: Annotated[bool, typer.Option(help="picture quality, size and rate follow what the link carries")] = True,
+    depth_noise: Annotated[
+        float | None, typer.Option(metavar="M", help="of the sensor at 1 m: depth may be rounded by that times z^2")
+    ] = None,
+    view: Annotated[bool, typer.Option("--view", help="the picture in the terminal, in half blocks")] = False,
     mesh: o.Mesh = False,
     room: o.RoomName = None,
     room_key: o.RoomKey = None,
@@ -135,14 +140,17 @@ def stream(
         raise OptionError("--device: the server has the device; name it there with probeless serve --device")
     if mesh and out is None:
         raise OptionError("--mesh writes files: say where with --out")
+    refuse_depth_noise(depth_noise, lossless)
     capture = prepare(options, lossless=lossless)
     from client.client import Access
+    from client.laptop.stream import Sending
     from client.laptop.stream import stream as send
     from client.room_options import room_place
 
     place = room_place(room, room_from_world, marker, room_key)
     access = Access(token, tls_fingerprint, tls_ca)
     others = {"frames": capture.frames, "mesh": mesh, "room": place, "access": access}
+    others["sending"] = Sending(adapt, depth_noise, view)
     done = send(capture.source, server, capture.objects, capture.wishes, out, lossless, record, **others)
     written = f", written to {out}" if out is not None else ""
     speed = done.answered / done.seconds if done.seconds > 0 else 0.0

@@ -13,10 +13,10 @@ from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed
 
 from client.access import Access, stream_url, without_query
+from client.coding import DEFAULT_CODING, Coding, frame_message
 from client.opening import ClientError, open_client_socket
 from protocol.codec import ProtocolError, decode_server, encode
 from protocol.frames import CameraModel, RgbdFrame
-from protocol.images import encode_color, encode_depth
 from protocol.messages import (
     Acknowledged,
     Bye,
@@ -43,7 +43,7 @@ from protocol.messages import (
     Wishes,
 )
 
-__all__ = ["Access", "Answer", "ClientError", "RoomPlace", "StreamClient", "frame_message", "stream_url"]
+__all__ = ["Access", "Answer", "ClientError", "Coding", "RoomPlace", "StreamClient", "frame_message", "stream_url"]
 
 KEEP_S = 30.0
 """For which the server keeps a session whose connection is lost, and a client tries to come back."""
@@ -123,6 +123,8 @@ class StreamClient:
         self._max_inflight = 1
         self._unanswered: dict[int, Frame | None] = {}
         """By number; what was sent only where the session is lossless."""
+        self._lost: set[int] = set()
+        """Frames that a connection took along; late answers to them are none."""
         self._unacknowledged: dict[int, Request] = {}
         self._unread: deque[Answer | Dropped | Error] = deque()
         self._acknowledged: dict[int, Acknowledged] = {}
@@ -177,6 +179,11 @@ class StreamClient:
         return await self._wait_for_welcome()
 
     @property
+    def unanswered(self) -> int:
+        """Frames that were sent and have no answer yet."""
+        return len(self._unanswered)
+
+    @property
     def has_room(self) -> bool:
         """Another frame may be sent without exceeding the server's window."""
         return len(self._unanswered) < self._max_inflight
@@ -189,18 +196,34 @@ class StreamClient:
         """Wait until no frame is unanswered. Raises ClientError when the server has gone."""
         await self._wait_until(lambda: not self._unanswered)
 
-    async def send_frame(self, frame: RgbdFrame) -> None:
+    async def ping(self) -> float:
+        """Seconds that an empty message takes there and back. Raises ClientError."""
+        try:
+            return await (await self._socket.ping())
+        except ConnectionClosed as error:
+            raise ClientError(f"the connection to {self._url} is closed") from error
+
+    async def send_frame(self, frame: RgbdFrame, coding: Coding = DEFAULT_CODING) -> None:
         """Encode and send one frame, waiting for room in the window first. Raises ClientError.
 
-        A session that wishes `lossless` sends raw colour, any other JPEG; depth is always bit-exact.
+        A session that wishes `lossless` sends raw colour and exact depth, any other JPEG and depth as `coding` says.
         """
+        await self.wait_for_room()
+        await self.send_encoded(await self.encode_frame(frame, coding))
+
+    async def encode_frame(self, frame: RgbdFrame, coding: Coding = DEFAULT_CODING) -> Frame:
+        """A frame as `send_frame` sends it, encoded in a thread of its own. Raises ClientError before `hello`."""
+        if self._hello is None:
+            raise ClientError("a frame can only be sent after hello")
+        return await asyncio.to_thread(frame_message, frame, self._hello.camera, self._hello.wishes.lossless, coding)
+
+    async def send_encoded(self, message: Frame) -> None:
+        """Send what `encode_frame` made, waiting for room in the window first. Raises ClientError."""
         if self._hello is None:
             raise ClientError("a frame can only be sent after hello")
         await self.wait_for_room()
         await self._wait_until(lambda: self._is_connected)
-        lossless = self._hello.wishes.lossless
-        message = await asyncio.to_thread(frame_message, frame, self._hello.camera, lossless)
-        self._unanswered[frame.index] = message if lossless else None
+        self._unanswered[message.frame] = message if self._hello.wishes.lossless else None
         await self._send(message)
 
     async def place_object(
@@ -296,6 +319,8 @@ class StreamClient:
         except ProtocolError as error:
             raise ClientError(str(error)) from error
         await self._wait_until(lambda: self._is_connected)
+        if isinstance(message, Frame) and self._hello is not None:  # from now on it is answered, or told to be lost
+            self._unanswered[message.frame] = message if self._hello.wishes.lossless else None
         socket = self._socket
         try:
             await socket.send(data)
@@ -413,6 +438,7 @@ class StreamClient:
         for number, frame in list(self._unanswered.items()):
             if frame is None:
                 del self._unanswered[number]
+                self._lost.add(number)
                 self._unread.append(Dropped(frame=number, reason="lost with the connection, which was restored"))
             else:
                 await socket.send(encode(frame))
@@ -430,6 +456,8 @@ class StreamClient:
         if self._tap is not None:
             self._tap(message)
         match message:
+            case Composite() | Dropped() if message.frame in self._lost:
+                self._lost.discard(message.frame)  # it was still worked on, but is told to be lost already
             case Welcome():
                 self._welcome = message
                 self._max_inflight = message.max_inflight
@@ -456,17 +484,3 @@ class StreamClient:
         async with self._changed:
             await self._changed.wait_for(lambda: len(self._unread) < UNREAD_ANSWERS or self._leaving)
             self._unread.append(answer)
-
-
-def frame_message(frame: RgbdFrame, camera: CameraModel, lossless: bool) -> Frame:
-    """One frame as it goes over the wire: colour raw where every bit counts or is linear, else JPEG."""
-    codec = "raw" if lossless or camera.color_encoding == "linear16" else "jpeg"
-    pose = frame.world_from_camera
-    return Frame(
-        frame=frame.index,
-        timestamp_s=frame.timestamp_s,
-        world_from_camera=None if pose is None else tuple(pose.ravel().tolist()),
-        color=encode_color(frame.color, codec, camera.color_encoding),
-        depth=encode_depth(frame.depth),
-        exposure=frame.exposure,
-    )

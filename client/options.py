@@ -12,7 +12,7 @@ from client.laptop.datasets.ground_truth import GroundTruthSource
 from client.laptop.errors import OptionError
 from client.laptop.light_file import read_light, read_panorama_light
 from client.laptop.objects import ObjectFile, parse_object
-from client.laptop.source import Source, open_source
+from client.laptop.source import ENDLESS, Source, is_live, open_source
 from client.laptop.volume import Volume, default_volume, default_voxel, with_room_to_move
 from protocol.messages import Wishes
 
@@ -28,6 +28,11 @@ class Capture:
     wishes: Wishes
     objects: tuple[ObjectFile, ...]
 
+    @property
+    def total(self) -> int | None:
+        """Number of frames; None where they end when somebody says so."""
+        return None if self.frames.stop >= ENDLESS else len(self.frames)
+
 
 def prepare(options: CaptureOptions, lossless: bool = False) -> Capture:
     """Open the source and settle every default. Raises OptionError, SourceError, ObjectError."""
@@ -42,7 +47,8 @@ def prepare(options: CaptureOptions, lossless: bool = False) -> Capture:
     frames = parse_frames(options.frames, len(source))
     seen = volume or default_volume(source, frames)
     voxel = options.voxel or default_voxel(seen)
-    volume = volume or (seen if source.has_poses else with_room_to_move(seen))
+    is_seen_whole = source.has_poses and not is_live(source)
+    volume = volume or (seen if is_seen_whole else with_room_to_move(seen))
     settled = {"volume_m": volume, "voxel_m": voxel, "up": up or source.up, "poses": poses, "lossless": lossless}
     return Capture(source, frames, Wishes(**wishes, **settled), objects)
 
@@ -70,6 +76,16 @@ def refuse_unknown(options: CaptureOptions) -> None:
     _choice("--exposure", options.exposure, ("auto", "constant"))
     _choice("--upsampling", options.upsampling, ("bilateral", "bicubic"))
     _choice("--interleave", options.interleave, (1, 2, 4, 8))
+
+
+def refuse_depth_noise(noise_per_m: float | None, lossless: bool) -> None:
+    """Raise OptionError for a noise at 1 m that no sensor has, or beside `--lossless`."""
+    if noise_per_m is None:
+        return
+    if not 0 < noise_per_m <= 0.05:
+        raise OptionError(f"--depth-noise {noise_per_m:g}: expected metres at 1 m, up to 0.05; a Kinect's is 0.0014")
+    if lossless:
+        raise OptionError("--depth-noise rounds depth and --lossless keeps every bit; leave one out")
 
 
 _SAMPLED_BY = ("rays", "stride", "interleave", "upsampling", "visibility_state", "auxiliary_views")

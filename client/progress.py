@@ -22,8 +22,8 @@ class FramesPerSecond(ProgressColumn):
         return Text(f"{task.speed:.1f} frames/s" if task.speed else "- frames/s")
 
 
-def track(items: Iterable[T], total: int) -> Iterator[T]:
-    """The items, with a bar on standard error where that is a terminal."""
+def track(items: Iterable[T], total: int | None) -> Iterator[T]:
+    """The items, with a bar on standard error where that is a terminal. `total`: None where they have no end."""
     columns = (BarColumn(), MofNCompleteColumn(), FramesPerSecond(), TextColumn("left"), TimeRemainingColumn())
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:

@@ -1,10 +1,21 @@
-# probeless on a CPU through PoCL. Build from the project's root: docker build -f docker/cpu.Dockerfile -t probeless:cpu .
-FROM python:3.11-slim-bookworm
-RUN apt-get update && apt-get install --yes --no-install-recommends make && rm -rf /var/lib/apt/lists/*
+# The server on a CPU, through PoCL. From the project's folder: docker build -f docker/cpu.Dockerfile -t probeless:cpu .
+FROM debian:bookworm-slim
 WORKDIR /opt/probeless
-COPY . .
-RUN make install && useradd --create-home probeless
-USER probeless
+COPY docker/install.sh docker/
+RUN sh docker/install.sh system
+COPY requirements.lock ./
+RUN sh docker/install.sh packages requirements.lock
+COPY LICENSE Makefile README.md pyproject.toml requirements.lock ./
+COPY cl_kernels cl_kernels
+COPY client client
+COPY docker docker
+COPY protocol protocol
+COPY server server
+RUN sh docker/install.sh program
+ENV HOME=/data PYTHONUNBUFFERED=1
+VOLUME /data
+USER 10001:10001
 EXPOSE 8080
-HEALTHCHECK CMD [".venv/bin/python", "-c", "import urllib.request as u; u.urlopen('http://127.0.0.1:8080/healthz')"]
-CMD [".venv/bin/probeless", "serve", "--host", "0.0.0.0", "--port", "8080"]
+STOPSIGNAL SIGTERM
+HEALTHCHECK --start-period=3m --interval=10s --timeout=6s --retries=3 CMD ["/opt/probeless/.venv/bin/python", "docker/health.py"]
+ENTRYPOINT ["/usr/bin/tini", "--", "sh", "docker/start.sh"]

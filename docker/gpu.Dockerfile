@@ -1,12 +1,24 @@
-# probeless on an NVIDIA GPU. Needs the NVIDIA container toolkit on the host, which brings libnvidia-opencl but no ICD file.
-FROM python:3.11-slim-bookworm
-RUN apt-get update && apt-get install --yes --no-install-recommends make && rm -rf /var/lib/apt/lists/* \
-    && mkdir -p /etc/OpenCL/vendors && echo libnvidia-opencl.so.1 > /etc/OpenCL/vendors/nvidia.icd
-ENV NVIDIA_DRIVER_CAPABILITIES=compute,utility
+# The server on a GPU, through its vendor's OpenCL; the host needs the NVIDIA container toolkit, or for Intel /dev/dri.
+# From the project's folder: docker build -f docker/gpu.Dockerfile --build-arg VENDOR=nvidia -t probeless:gpu .
+FROM debian:bookworm-slim
+ARG VENDOR=nvidia
 WORKDIR /opt/probeless
-COPY . .
-RUN make install && useradd --create-home probeless
-USER probeless
+COPY docker/install.sh docker/
+RUN sh docker/install.sh system
+RUN sh docker/install.sh driver $VENDOR
+COPY requirements.lock ./
+RUN sh docker/install.sh packages requirements.lock
+COPY LICENSE Makefile README.md pyproject.toml requirements.lock ./
+COPY cl_kernels cl_kernels
+COPY client client
+COPY docker docker
+COPY protocol protocol
+COPY server server
+RUN sh docker/install.sh program
+ENV HOME=/data PYTHONUNBUFFERED=1 NVIDIA_VISIBLE_DEVICES=all NVIDIA_DRIVER_CAPABILITIES=compute,utility
+VOLUME /data
+USER 10001:10001
 EXPOSE 8080
-HEALTHCHECK CMD [".venv/bin/python", "-c", "import urllib.request as u; u.urlopen('http://127.0.0.1:8080/healthz')"]
-CMD [".venv/bin/probeless", "serve", "--host", "0.0.0.0", "--port", "8080"]
+STOPSIGNAL SIGTERM
+HEALTHCHECK --start-period=3m --interval=10s --timeout=6s --retries=3 CMD ["/opt/probeless/.venv/bin/python", "docker/health.py"]
+ENTRYPOINT ["/usr/bin/tini", "--", "sh", "docker/start.sh"]

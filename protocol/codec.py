@@ -10,6 +10,8 @@ from protocol.limits import MAX_MESSAGE_BYTES, MAX_REASON_CHARS
 from protocol.messages import ClientMessage, ServerMessage
 
 T = TypeVar("T")
+_END_CHARS = 120
+"""Of a line that is too long."""
 
 
 class ProtocolError(ValueError):
@@ -20,9 +22,16 @@ class ProtocolError(ValueError):
 
 
 def one_line(text: str) -> str:
-    """`text` as one printable line of at most MAX_REASON_CHARS: it may quote what an attacker sent."""
-    line = " ".join("".join(c if c.isprintable() else " " for c in text[: 4 * MAX_REASON_CHARS]).split())
-    return line if len(line) <= MAX_REASON_CHARS else line[: MAX_REASON_CHARS - 1] + "…"
+    """`text` as one printable line of at most MAX_REASON_CHARS: it may quote what an attacker sent.
+
+    What is too long loses its middle, since a field's name stands at the end.
+    """
+    most = 4 * MAX_REASON_CHARS
+    ends = text if len(text) <= most else text[: most // 2] + text[-most // 2 :]
+    line = " ".join("".join(c if c.isprintable() else " " for c in ends).split())
+    if len(line) <= MAX_REASON_CHARS:
+        return line
+    return line[: MAX_REASON_CHARS - _END_CHARS - 1] + "…" + line[-_END_CHARS:]
 
 
 _encoder = msgspec.msgpack.Encoder()
@@ -53,6 +62,8 @@ def _decode(decoder: msgspec.msgpack.Decoder[T], data: bytes | bytearray | memor
         return decoder.decode(data)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise ProtocolError(f"not a valid message: {error}") from error
+    except RecursionError as error:
+        raise ProtocolError("not a valid message: lists or maps in it are nested too deeply") from error
 
 
 def _require_size(size_bytes: int) -> None:

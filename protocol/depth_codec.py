@@ -60,9 +60,9 @@ def inflate(data: bytes, size_bytes: int) -> bytes:
     return raw
 
 
-def zstd_compress(data: bytes) -> bytes:
+def zstd_compress(data: bytes, level: int = LEVEL) -> bytes:
     """One zstd frame with its content size in the header."""
-    return zstandard.ZstdCompressor(level=LEVEL, write_content_size=True).compress(data)
+    return zstandard.ZstdCompressor(level=level, write_content_size=True).compress(data)
 
 
 def zstd_decompress(data: bytes, size_bytes: int) -> bytes:

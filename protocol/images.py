@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.codec import ProtocolError
-from protocol.depth_codec import deflate, filter_depth, inflate, unfilter_depth, zstd_compress, zstd_decompress
+from protocol.depth_codec import LEVEL, deflate, filter_depth, inflate, unfilter_depth, zstd_compress, zstd_decompress
 from protocol.frames import CameraModel, ColorEncoding, DepthCamera
 from protocol.messages import ColorImage, DepthImage, Payload
 from protocol.picture_headers import jpeg_size, png_size
@@ -51,18 +51,28 @@ def decode_color(
 ) -> Color:
     """Payload -> [h, w, 3] RGB, uint8 (`srgb8`) or uint16 (`linear16`), of exactly the camera's size.
 
-    `encoding` is what the reader expects: None means the camera's own; a composite is always `srgb8`. `decompress`
-    decodes a JPEG or PNG whose header has been checked (default: `decode_picture`).
+    A JPEG of a half or a quarter of the camera's width and height, rounded up, is enlarged to it. `encoding` is what
+    the reader expects: None means the camera's own; a composite is always `srgb8`. `decompress` decodes a JPEG or PNG
+    whose header has been checked (default: `decode_picture`).
     Raises ProtocolError, before anything is allocated, for a picture that is not what it declares.
     """
     expected = encoding or camera.color_encoding
     if image.encoding != expected:
         raise ProtocolError(f"color.encoding is {image.encoding}, this session's is {expected}")
     _require_codec(image.codec, image.encoding)
-    _require_size("color", image, camera)
+    if image.codec != "jpeg" or (image.width, image.height) not in reduced_sizes(camera):
+        _require_size("color", image, camera)
     if image.codec == "raw":
         return _raw("color", image, _COLOR_DTYPE[image.encoding], 3).reshape(image.height, image.width, 3)
-    return _decompress_color(image, decompress or decode_picture)
+    rgb = _decompress_color(image, decompress or decode_picture)
+    if (image.width, image.height) == (camera.width, camera.height):
+        return rgb
+    return cv2.resize(rgb, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR).astype(np.uint8, copy=False)
+
+
+def reduced_sizes(camera: CameraModel) -> tuple[tuple[int, int], ...]:
+    """Width and height of a colour picture sent at a half and at a quarter of the camera's, rounded up."""
+    return tuple((-(-camera.width // divisor), -(-camera.height // divisor)) for divisor in (2, 4))
 
 
 def decode_picture(data: bytes) -> NDArray[np.uint8]:
@@ -76,16 +86,26 @@ def decode_picture(data: bytes) -> NDArray[np.uint8]:
     return rgb.astype(np.uint8, copy=False)
 
 
-def encode_depth(depth: NDArray[np.uint16], codec: DepthCodec = DEFAULT_DEPTH_CODEC) -> DepthImage:
-    """[h, w] uint16, 0 = no measurement -> payload, bit-exact. Raises ValueError for another shape or dtype."""
+def encode_depth(
+    depth: NDArray[np.uint16],
+    codec: DepthCodec = DEFAULT_DEPTH_CODEC,
+    *,
+    level: int = LEVEL,
+    rounded_per_m: float | None = None,
+) -> DepthImage:
+    """[h, w] uint16, 0 = no measurement -> payload, bit-exact. Raises ValueError for another shape or dtype.
+
+    `level` is zstd's: higher takes fewer bytes and more time. `rounded_per_m`: what was done to `depth` before.
+    """
     if depth.ndim != 2 or depth.dtype != np.uint16:
         raise ValueError(f"depth must be [h, w] uint16, is {depth.shape} {depth.dtype}")
     height, width = depth.shape
     if codec == "raw":
         data = depth.astype("<u2").tobytes()
     else:
-        data = (deflate if codec == "zdelta" else zstd_compress)(filter_depth(depth))
-    return DepthImage(width=width, height=height, data=data, codec=codec)
+        planes = filter_depth(depth)
+        data = deflate(planes) if codec == "zdelta" else zstd_compress(planes, level)
+    return DepthImage(width=width, height=height, data=data, codec=codec, rounded_per_m=rounded_per_m)
 
 
 def decode_depth(image: DepthImage, camera: CameraModel) -> NDArray[np.uint16]:

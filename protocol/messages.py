@@ -76,13 +76,15 @@ class ColorImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True)
     encoding: ColorEncoding = "srgb8"
 
 
-class DepthImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class DepthImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
     """uint16 depth, lossless.
 
     `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd.
     """
 
     codec: Literal["raw", "zdelta", "zstd-delta"]
+    rounded_per_m: Annotated[float, Meta(gt=0, le=1)] | None = None
+    """What the sender changed before: each depth z (metres) by at most this times z^2; None: nothing."""
 
 
 BudgetMs = Annotated[float, Meta(gt=0, le=60000)]
@@ -148,6 +150,8 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     common a normal is (`normals_printed`: as eq. 5.7 has them); earlier frames count; what fits badly counts less."""
     plan: Literal["needed", "everything"] = "needed"
     """`everything`: what would hardly be seen is simulated too, to check the bounds of leaving it out."""
+    answer: Literal["picture", "light"] = "picture"
+    """`light`: a frame is answered by its light alone, for clients that draw virtual things themselves."""
     lossless: bool = False
     """Answers carry PNG pictures, and every frame is answered in order instead of latest-wins."""
 

@@ -167,7 +167,7 @@ def _judge(data: bytes, reason: str) -> Refusal | BadMessage:
     """A message that can be answered in kind is only answered; anything else ends the connection."""
     try:
         envelope = msgspec.msgpack.decode(data, type=_Envelope)
-    except (msgspec.MsgspecError, UnicodeDecodeError):
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return Refusal(INVALID, reason)
     if envelope.type == "frame" and envelope.frame is not None:
         return BadMessage(Dropped(frame=envelope.frame, reason=reason))

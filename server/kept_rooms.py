@@ -45,6 +45,11 @@ class KeptRooms:
         except RoomStoreError as error:
             raise ValueError(str(error)) from error
 
+    def keep_now(self, room: Room) -> None:
+        """Save a room that somebody is in, as when what was done in it is about to be acknowledged."""
+        assert self._saver is not None
+        self._saver.save(room)
+
     def keep(self, room: Room) -> None:
         """Save a room that is about to close."""
         assert self._saver is not None

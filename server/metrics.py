@@ -22,7 +22,10 @@ class Metrics:
         self.turn_ms = self._histogram("turn_ms", "Milliseconds a frame waited for its turn on the device")
         self.overhead_ms = self._histogram(
             "overhead_ms",
-            "Milliseconds a frame took outside of the pipeline, without waiting for its turn or the socket",
+            "Milliseconds of a frame outside of the pipeline, waiting for its turn or the socket left out",
+        )
+        self.overhead_cpu_ms = self._histogram(
+            "overhead_cpu_ms", "Milliseconds of the processor that a session's thread took outside of the pipeline"
         )
         self.processed = Counter("probeless_frames_processed", "Frames composited", registry=self._registry)
         self.dropped = Counter("probeless_frames_dropped", "Frames dropped", ("reason",), registry=self._registry)

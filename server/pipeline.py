@@ -276,11 +276,20 @@ class Pipeline:
     def move_object(self, object_id: str, placement: Placement) -> None:
         """Give an object another place. Raises KeyError if there is none of that id."""
         with self._room.lock:
-            self._objects.move(object_id, self._alignment.placed(placement))
+            mesh = next((mesh for name, mesh, _ in self._waiting if name == object_id), None)
+            if mesh is None:
+                self._objects.move(object_id, self._alignment.placed(placement))
+            else:
+                check_size(mesh, placement)
+                self._waiting = [*(w for w in self._waiting if w[0] != object_id), (object_id, mesh, placement)]
 
     def remove_object(self, object_id: str) -> None:
         """Take an object away. Raises KeyError if there is none of that id."""
         with self._room.lock:
+            left = [waiting for waiting in self._waiting if waiting[0] != object_id]
+            if len(left) < len(self._waiting):
+                self._waiting = left
+                return
             self._objects.remove(object_id)
             self._room.changes += 1
 

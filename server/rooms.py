@@ -62,6 +62,10 @@ class Rooms:
         finally:
             self._leave(name)
 
+    def named(self, name: str) -> Room | None:
+        """For somebody who is in it."""
+        return self._rooms.get(name)
+
     def visited(self) -> Iterator[Room]:
         """Each room that somebody is in, kept open while it is looked at."""
         for name in tuple(self._rooms):

@@ -29,7 +29,8 @@ class Share:
     had_s: float = 0.0
     """Device time, virtual where it was away."""
     cost_s: float | None = None
-    """Running mean of its frames; None before the first."""
+    """Running mean of its frames, without the first, in which kernels are loaded; None before there are any."""
+    frames: int = 0
     last_s: float = float("-inf")
     """When it last worked, by the scheduler's clock."""
 
@@ -113,5 +114,9 @@ class Scheduler:
 
     def _charge(self, share: Share, spent_s: float) -> None:
         share.had_s += spent_s
-        share.cost_s = spent_s if share.cost_s is None else share.cost_s + _RATE * (spent_s - share.cost_s)
+        share.frames += 1
+        if share.frames <= 2 or share.cost_s is None:
+            share.cost_s = spent_s  # the second takes the place of the first
+        else:
+            share.cost_s += _RATE * (spent_s - share.cost_s)
         share.last_s = self._clock()

@@ -110,12 +110,19 @@ class Service:
             load_mesh=mesh_loader or self._parsers.load_mesh,
             decode_color=self._parsers.decode_color,
             metrics=self.metrics,
+            keep_room=self._keep_room,
         )
         self._preparing: asyncio.Task[None] | None = None
 
     async def _stop_keeping(self) -> None:
         assert self._keeping is not None
         await asyncio.to_thread(self._keeping.stop)
+
+    def _keep_room(self, name: str) -> None:
+        """Thread of a worker that is in it."""
+        room = self.rooms.named(name)
+        if self._keeping is not None and room is not None:
+            self._keeping.keep_now(room)
 
     def _entered(self, name: str, hello: Hello) -> contextlib.AbstractContextManager[Room]:
         return self.rooms.entered(name, hello.wishes, hello.room_key)

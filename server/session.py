@@ -12,7 +12,7 @@ from msgspec import structs
 from protocol.codec import encode
 from protocol.messages import Bye, ClientMessage, Dropped, Error, Frame, Hello, Watch, Welcome
 from server.broadcast import Broadcast
-from server.connection import INTERNAL, POLICY, BadMessage, ClientGone, Connection, Refusal
+from server.connection import INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
 from server.mailbox import Mailbox
 from server.worker import Worker, Workshop
 
@@ -207,9 +207,9 @@ class CaptureSession:
             log.info("a client left")
         except Refusal as refusal:
             await self._connection.refuse(refusal)
-        except Exception:  # reported to both sides: a fault of this session must not reach another
+        except Exception as error:  # reported to both sides: a fault of this session must not reach another
             log.exception("a session failed")
-            await self._connection.refuse(Refusal(INTERNAL, "the server failed in this session; its log says why"))
+            await self._connection.refuse(_told(error))
 
     async def _read(self) -> None:
         """Post what the client sends until it leaves; stops reading while too much is unread."""
@@ -246,6 +246,17 @@ class CaptureSession:
     async def _say_too_many(self, frames: int) -> None:
         reason = f"{frames} frames were sent ahead: keep at most {MAX_INFLIGHT} unanswered (welcome.max_inflight)"
         await self._connection.send_message(Error(reason=reason, fatal=False))
+
+
+def _told(error: Exception) -> Refusal:
+    """What a client is told of a fault that is not its own."""
+    if type(error).__name__ == "MemoryError":  # OpenCL's or Python's; OpenCL is not loaded where no pipeline needs it
+        return Refusal(
+            TRY_LATER,
+            "the server's device has no memory left for this session: ask for a larger --voxel or a smaller --volume, "
+            "or try again later",
+        )
+    return Refusal(INTERNAL, "the server failed in this session; its log says why")
 
 
 def _report(other: asyncio.Future[None]) -> None:

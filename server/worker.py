@@ -86,6 +86,8 @@ class Workshop:
     wanted_period_s: float = 0.25
     """Between two frames of sessions that share the device: when it is longer, they sample more cheaply."""
     decode_color: Callable[[ColorImage, CameraModel], Color] = decode_color
+    keep_room: Callable[[str], None] = lambda _name: None
+    """Save a room, before its objects' coming or going is acknowledged: a server that is killed loses none."""
 
 
 class Worker:
@@ -100,7 +102,7 @@ class Worker:
         self._pressure = Pressure(hello.wishes, workshop.wanted_period_s)
         self._acknowledged: OrderedDict[int, bytes] = OrderedDict()
         """Requests that were done: a client that lost its connection may send them again."""
-        self._answers: deque[tuple[int, tuple[bytes, bytes]]] = deque(maxlen=KEPT_ANSWERS)
+        self._answers: deque[tuple[int, tuple[bytes, ...]]] = deque(maxlen=KEPT_ANSWERS)
         """Of lossless sessions: their last frames, by number."""
 
     def run(self) -> None:
@@ -136,6 +138,9 @@ class Worker:
         done = self._acknowledged.get(message.request)
         if done is None:
             acknowledged = apply_control(pipeline, message, self._workshop.load_mesh)
+            room = self._hello.room
+            if room is not None and acknowledged.error is None and isinstance(message, PlaceObject | RemoveObject):
+                self._workshop.keep_room(room)
             if isinstance(message, Quality) and acknowledged.error is None:
                 self._pressure.ask(Asked(message.preset, message.budget_ms, message.max_light_error_deg))
             done = self._acknowledged[message.request] = encode(acknowledged)
@@ -147,25 +152,22 @@ class Worker:
         known = next((answer for number, answer in self._answers if number == frame.frame), None)
         if known is not None:
             return self._send_answer(known)
-        began, waited_before_s = time.perf_counter(), self._outlet.waited_s
+        overhead = _Overhead(self._outlet)
         try:
             rgbd = self._decode(frame)
         except ProtocolError as error:
             return self._drop(frame, "unreadable", error)
         try:
-            asked = time.perf_counter()
-            with self._workshop.scheduler.turn(self._share) as waited_s:
+            with overhead.left_out(), self._workshop.scheduler.turn(self._share) as waited_s:
                 result = pipeline.process(rgbd)
                 self._follow_pressure(pipeline)
-            spent_elsewhere_s = time.perf_counter() - asked
         except ValueError as error:
             return self._drop(frame, "refused", error)
         self._workshop.metrics.turn_ms.observe(waited_s * 1e3)
         self._workshop.metrics.observe_stages(result.timings)
         self._workshop.metrics.processed.inc()
         self._deliver(frame, result)
-        spent_elsewhere_s += self._outlet.waited_s - waited_before_s
-        return self._workshop.metrics.overhead_ms.observe((time.perf_counter() - began - spent_elsewhere_s) * 1e3)
+        return overhead.tell(self._workshop.metrics)
 
     def _follow_pressure(self, pipeline: Pipeline) -> None:
         """Sample more cheaply where too many share the device, and as asked for again when they are fewer."""
@@ -209,21 +211,23 @@ class Worker:
         self._outlet.send(encode(Dropped(frame=frame.frame, reason=one_line(str(error)))))
 
     def _deliver(self, frame: Frame, result: FrameResult) -> None:
-        lossless = self._hello.wishes.lossless
+        lossless, with_picture = self._hello.wishes.lossless, self._hello.wishes.answer == "picture"
         light = encode(result.light)
-        composite = self._encode(frame, result, lossless)
+        composite = self._encode(frame, result, lossless) if with_picture else None
+        answer = (light,) if composite is None else (light, composite)
         if lossless:
-            self._answers.append((frame.frame, (light, composite)))
-        self._send_answer((light, composite))
+            self._answers.append((frame.frame, answer))
+        self._send_answer(answer)
         if self._outlet.is_watched():
-            shown = self._encode(frame, result, False) if lossless else composite
+            shown = composite if composite is not None and not lossless else self._encode(frame, result, False)
             self._outlet.publish((light, shown))
 
-    def _send_answer(self, answer: tuple[bytes, bytes]) -> None:
-        light, composite = answer
-        self._outlet.send(light)
+    def _send_answer(self, answer: tuple[bytes, ...]) -> None:
+        *before, last = answer
+        for message in before:
+            self._outlet.send(message)
         self._mailbox.note_answered()
-        self._outlet.send(composite)
+        self._outlet.send(last)
 
     def _plan(self, plan: Plan) -> Plan:
         """What a frame ran, and why it was sampled so."""
@@ -250,6 +254,29 @@ class Worker:
         )
         self._workshop.metrics.encode_ms.observe((time.perf_counter() - start_s) * 1e3)
         return data
+
+
+class _Overhead:
+    """What one frame takes outside of the pipeline: on the clock, without waiting for the socket; of the processor."""
+
+    def __init__(self, outlet: Outlet) -> None:
+        self._outlet = outlet
+        self._wall_s, self._cpu_s = -time.perf_counter() + outlet.waited_s, -time.thread_time()
+
+    @contextlib.contextmanager
+    def left_out(self) -> Iterator[None]:
+        """While it lasts, nothing counts."""
+        wall_s, cpu_s = time.perf_counter(), time.thread_time()
+        try:
+            yield
+        finally:
+            self._wall_s -= time.perf_counter() - wall_s
+            self._cpu_s -= time.thread_time() - cpu_s
+
+    def tell(self, metrics: Metrics) -> None:
+        """The frame is answered."""
+        metrics.overhead_ms.observe((self._wall_s + time.perf_counter() - self._outlet.waited_s) * 1e3)
+        metrics.overhead_cpu_ms.observe((self._cpu_s + time.thread_time()) * 1e3)
 
 
 def _row_major(matrix: NDArray[np.float64]) -> tuple[float, ...]:

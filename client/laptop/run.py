@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from itertools import takewhile
 from types import TracebackType
 from typing import Protocol
 
 from client.laptop.errors import RunError
 from client.laptop.objects import ObjectFile, pack_mesh
 from client.laptop.output import FrameOutput
+from client.laptop.source import is_live
+from client.laptop.stopping import stop_on_interrupt
 from client.options import Capture
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import MeshFormat, Wishes
@@ -42,8 +45,11 @@ class Run:
             raise
 
     def outputs(self) -> Iterator[FrameOutput]:
-        """One output per frame, in order. Raises UserError."""
-        yield from process_frames(self._pipeline, (self._capture.source[i] for i in self._capture.frames))
+        """One output per frame, in order; of a camera until Ctrl-C. Raises UserError."""
+        source = self._capture.source
+        with stop_on_interrupt(is_live(source)) as stopping:
+            positions = takewhile(lambda _: not stopping.is_set(), self._capture.frames)
+            yield from process_frames(self._pipeline, (source[i] for i in positions))
 
     def mesh(self, progress: Callable[[int, int], None]) -> dict[MeshFormat, bytes]:
         """The files of the surface fused so far; `progress` is told parts done and in all. Raises MeshingError."""

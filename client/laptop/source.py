@@ -12,6 +12,9 @@ __all__ = ["Source", "SourceError", "open_source"]
 
 SYNTHETIC_PREFIX = "synthetic:"
 GALLERY_PREFIX = "synthetic:gallery/"
+OAK_PREFIX = "oak?"
+ENDLESS = 2**31
+"""Length of a source that goes on until it is stopped: a camera."""
 
 
 class Source(Protocol):
@@ -34,18 +37,27 @@ class Source(Protocol):
     def up(self) -> tuple[float, float, float] | None:
         """World direction, where the source knows it."""
 
-    def __len__(self) -> int: ...
+    def __len__(self) -> int:
+        """`ENDLESS` of a camera."""
 
-    def __getitem__(self, index: int) -> RgbdFrame: ...
+    def __getitem__(self, index: int) -> RgbdFrame:
+        """The frame of that number; of a camera, its newest, given that number."""
+
+
+def is_live(source: Source) -> bool:
+    """True of a camera: frames come when they come, and go on."""
+    return len(source) == ENDLESS
 
 
 def open_source(spec: str) -> Source:
-    """The source that `spec` names: a folder, `synthetic:NAME[?key=value&...]`, a recording's file, or `oak`.
+    """The source that `spec` names: a folder, `synthetic:NAME[?key=value&...]`, a recording's file, `oak[?vio=off]`.
 
     Raises SourceError.
     """
-    if spec == "oak":
-        return _open_oak()
+    if spec == "oak" or spec.startswith(OAK_PREFIX):
+        from client.laptop.oak import open_oak
+
+        return open_oak(spec.removeprefix("oak").removeprefix("?"))
     if spec.startswith(GALLERY_PREFIX):
         from client.laptop.gallery.source import GallerySource
 
@@ -64,10 +76,3 @@ def open_source(spec: str) -> Source:
 
         return open_recording(path)
     raise SourceError(f"{spec}: no such folder or file; give a data-set folder, a recording, synthetic:table or oak")
-
-
-def _open_oak() -> Source:
-    raise SourceError(
-        "oak: no OAK camera support is installed or no device is connected; stream a data-set folder, a recording or "
-        "synthetic:table instead"
-    )

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
@@ -14,15 +16,23 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from client.adaptive import Adaptive, Measured
 from client.client import Access, Answer, ClientError, RoomPlace, StreamClient
+from client.coding import Coding, picture_bytes
 from client.laptop.errors import OutputError, SourceError
 from client.laptop.objects import ObjectFile, pack_mesh
 from client.laptop.output import FrameOutput, OutputWriter
-from client.laptop.source import Source
+from client.laptop.source import ENDLESS, Source, is_live
+from client.laptop.stopping import stop_on_interrupt
+from client.laptop.stream_figures import STAGES, StreamFigures
+from client.laptop.stream_view import StreamView
 from protocol.frames import CameraModel
 from protocol.images import decode_color
-from protocol.messages import ClientMessage, Dropped, Error, MeshFormat, ServerMessage, Welcome, Wishes
+from protocol.messages import ClientMessage, Composite, Dropped, Error, MeshFormat, ServerMessage, Welcome, Wishes
 from protocol.recording import write_message
+
+LOOK_S = 0.002
+"""Between looks whether a camera's next frame may go."""
 
 
 @dataclass
@@ -40,6 +50,21 @@ class StreamSummary:
     """Sent, and refused or replaced by the server."""
     seconds: float = 0.0
     """From the first frame's sending to the last answer."""
+    reconnected: int = 0
+    latency_ms: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """p50 and p99 of the last frames, by `stream_figures.STAGES`."""
+
+
+@dataclass(frozen=True)
+class Sending:
+    """How frames are sent and shown."""
+
+    adapts: bool = True
+    """Quality, size and rate follow the link; of `realtime` only."""
+    depth_noise_per_m: float | None = None
+    """Depth may be moved by this times z^2 (metres); None: it is sent bit for bit."""
+    view: bool = False
+    """The picture in the terminal."""
 
 
 def stream(
@@ -56,6 +81,7 @@ def stream(
     mesh: bool = False,
     room: RoomPlace | None = None,
     access: Access | None = None,
+    sending: Sending | None = None,
     console: Console | None = None,
 ) -> StreamSummary:
     """Send `frames` of the source (default: all) to the server and write its answers into `out`, where one is given.
@@ -64,17 +90,19 @@ def stream(
     as soon as there is room. `lossless` sends raw colour and waits for each answer, so that every frame is answered
     with the very pixels of the server's picture. `mesh` asks for the scene's mesh after the last answer and writes it
     into `out`. `record` gets every message sent and received. `room`: to share with others. `access`: what lets the
-    client in, if not the URL.
+    client in, if not the URL. `sending`: what may be left out on the way.
     Raises ClientError, UserError, each with one clear line. Progress goes to `console` (default: standard error).
     """
     wishes = msgspec.structs.replace(wishes or Wishes(), lossless=lossless)
-    others = (realtime and not lossless, mesh, room, access)
+    others = (realtime and not lossless, mesh, room, access, sending or Sending())
     job = _Job(source, frames or range(len(source)), server_url, objects, wishes, *others)
     console = console or Console(stderr=True)
     with _recorder(record) as tap, contextlib.ExitStack() as stack:
+        stopping = stack.enter_context(stop_on_interrupt(is_live(source)))
         writer = stack.enter_context(OutputWriter(out)) if out is not None else None
-        progress = stack.enter_context(_progress(console))
-        return asyncio.run(_Stream(job, writer, progress).run(tap))
+        figures, progress = StreamFigures(), _progress(console)
+        view = stack.enter_context(StreamView(console, progress, figures, job.sending.view))
+        return asyncio.run(_Stream(job, writer, progress, stopping, figures, view).run(tap))
 
 
 @dataclass(frozen=True)
@@ -90,16 +118,32 @@ class _Job:
     mesh: bool
     room: RoomPlace | None
     access: Access | None
+    sending: Sending
 
 
 class _Stream:
     """One connection's sending and receiving, side by side on one event loop."""
 
-    def __init__(self, job: _Job, writer: OutputWriter | None, progress: Progress) -> None:
+    def __init__(
+        self,
+        job: _Job,
+        writer: OutputWriter | None,
+        progress: Progress,
+        stopping: threading.Event,
+        figures: StreamFigures,
+        view: StreamView,
+    ) -> None:
         self._job = job
         self._writer = writer
         self._progress = progress
-        self._bar = progress.add_task(job.source.name, total=len(job.frames), note="connecting")
+        self._stopping, self._figures, self._view = stopping, figures, view
+        self._adaptive = _adaptive(job, math.inf)
+        self._fixed = Coding(depth_noise_per_m=job.sending.depth_noise_per_m)
+        self._out: dict[int, tuple[float, int]] = {}
+        """When each frame without an answer was sent, and its bytes."""
+        self._last_sent_s = -math.inf
+        total = None if job.frames.stop >= ENDLESS else len(job.frames)
+        self._bar = progress.add_task(job.source.name, total=total, note="connecting")
         self._summary = StreamSummary()
         self._told: set[str] = set()
 
@@ -110,9 +154,13 @@ class _Stream:
             job = self._job
             self._note_welcome(await client.hello(job.source.camera, job.wishes, "probeless stream", job.room))
             await self._place_objects(client, meshes)
+            if self._adaptive is not None:
+                self._adaptive = _adaptive(job, await client.ping())
             await self._exchange(client)
         finally:
             await client.close("the source has ended")
+        found = {stage: self._figures.percentiles(stage) for stage in STAGES}
+        self._summary.latency_ms = {stage: pair for stage, pair in found.items() if pair is not None}
         return self._summary
 
     def _note_welcome(self, welcome: Welcome) -> None:
@@ -148,7 +196,7 @@ class _Stream:
     async def _send(self, client: StreamClient) -> None:
         """Send all frames and wait for the last answer; also where the source is damaged on the way."""
         try:
-            await self._send_frames(client)
+            await (self._send_live(client) if is_live(self._job.source) else self._send_frames(client))
         except SourceError:
             await client.wait_until_answered()
             raise
@@ -161,14 +209,42 @@ class _Stream:
         for number, position in enumerate(self._job.frames):
             if self._job.realtime:
                 await asyncio.sleep(start_s + number / self._job.source.fps - time.perf_counter())
-                if not client.has_room:
+                if not self._may_send(client):
                     self._summary.skipped += 1
                     self._advance()
                     continue
-            await client.send_frame(await asyncio.to_thread(self._job.source.__getitem__, position))
-            self._summary.sent += 1
-            if self._job.wishes.lossless:
-                await client.wait_until_answered()
+            await self._send_one(client, position)
+
+    def _may_send(self, client: StreamClient) -> bool:
+        """Whether the server and the link are free for a frame: it would grow old waiting for them."""
+        if self._adaptive is None or not client.has_room:
+            return client.has_room
+        return self._adaptive.may_send(time.perf_counter(), self._last_sent_s, client.unanswered)
+
+    async def _send_one(self, client: StreamClient, position: int) -> None:
+        frame = await asyncio.to_thread(self._job.source.__getitem__, position)
+        captured_s = time.perf_counter()
+        coding = self._fixed if self._adaptive is None else self._adaptive.coding
+        message = await client.encode_frame(frame, coding)
+        sent_s = self._last_sent_s = time.perf_counter()
+        size = picture_bytes(message)
+        self._out[frame.index] = sent_s, size
+        self._figures.note_sent(frame.index, captured_s, sent_s, size)
+        await client.send_encoded(message)
+        self._summary.sent += 1
+        if self._job.wishes.lossless:
+            await client.wait_until_answered()
+
+    async def _send_live(self, client: StreamClient) -> None:
+        """Whenever there is room, the newest frame of a camera, until Ctrl-C or the last that was asked for."""
+        for position in self._job.frames:
+            await client.wait_for_room()
+            if self._stopping.is_set():
+                return
+            while not self._may_send(client) and not self._stopping.is_set():
+                await asyncio.sleep(LOOK_S)
+            await self._send_one(client, position)
+            self._summary.skipped = getattr(self._job.source, "missed", 0)
 
     async def _fetch_mesh(self, client: StreamClient) -> None:
         bar = self._progress.add_task("mesh", total=None, note="the server makes it")
@@ -184,25 +260,51 @@ class _Stream:
         async for answer in client.answers():
             match answer:
                 case Answer():
-                    await self._keep(answer)
+                    await self._keep(answer, client.reconnected)
                 case Dropped():
                     self._note_dropped(answer)
                 case Error():
                     self._tell(answer.reason)
 
-    async def _keep(self, answer: Answer) -> None:
-        if self._writer is not None:
+    async def _keep(self, answer: Answer, reconnected: int) -> None:
+        returned_s = time.perf_counter()
+        composite = answer.composite
+        if self._adaptive is not None:
+            self._measure(composite, returned_s, reconnected)
+        picture = None
+        if self._writer is not None or self._view.wants_pictures:
             output = await asyncio.to_thread(frame_output, answer, self._job.source.camera)
-            await asyncio.to_thread(self._writer.write, output)
-        for note in answer.composite.notes:
+            picture = output.color
+            if self._writer is not None:
+                await asyncio.to_thread(self._writer.write, output)
+        coding = self._fixed if self._adaptive is None else self._adaptive.coding
+        shown_s = time.perf_counter()
+        self._view.show(shown_s, answer.light, composite, picture, coding, reconnected)
+        size = len(composite.color.data)
+        self._figures.note_answer(composite.frame, returned_s, shown_s, composite.timings.total / 1e3, size)
+        for note in composite.notes:
             self._tell(note)
         self._summary.answered += 1
         self._advance()
+
+    def _measure(self, composite: Composite, returned_s: float, reconnected: int) -> None:
+        """Tell what the frame's way was like."""
+        assert self._adaptive is not None
+        if reconnected != self._summary.reconnected:
+            self._summary.reconnected = reconnected
+            self._adaptive.note_lost()
+            self._out.clear()
+        sent = self._out.pop(composite.frame, None)
+        if sent is not None:
+            times = (sent[0], returned_s, composite.timings.total / 1e3)
+            self._adaptive.note(Measured(*times, bytes_up=sent[1], bytes_down=len(composite.color.data)))
 
     def _note_dropped(self, dropped: Dropped) -> None:
         if self._job.wishes.lossless:
             raise ClientError(f"frame {dropped.frame}: {dropped.reason}")
         self._summary.dropped += 1
+        self._out.pop(dropped.frame, None)
+        self._figures.forget(dropped.frame)
         self._tell(f"frame {dropped.frame}: {dropped.reason}")
         self._advance()
 
@@ -215,6 +317,13 @@ class _Stream:
         if line not in self._told:
             self._told.add(line)
             self._progress.console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _adaptive(job: _Job, delay_s: float) -> Adaptive | None:
+    """What follows the link, where quality may."""
+    if not job.realtime or not job.sending.adapts:
+        return None
+    return Adaptive(1 / job.source.fps, delay_s, job.sending.depth_noise_per_m)
 
 
 def frame_output(answer: Answer, camera: CameraModel) -> FrameOutput:

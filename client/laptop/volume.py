@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.laptop.errors import SourceError
-from client.laptop.source import Source
+from client.laptop.source import Source, is_live
 from protocol.frames import CameraModel, RgbdFrame
 
 Volume = tuple[float, float, float, float, float, float]
@@ -32,9 +32,10 @@ VOXEL_STEP_M = 0.0005
 def default_volume(source: Source, frames: range) -> Volume:
     """x0, y0, z0, x1, y1, z1 in world metres around what `frames` of `source` see. Raises SourceError.
 
-    Up to 12 frames spread over the range; only the first of a source without poses, whose camera is the world.
+    Up to 12 frames spread over the range; only the first of a source without poses, whose camera is the world, and of
+    a camera, which has no more yet.
     """
-    chosen = _spread(frames) if source.has_poses else [frames[0]]
+    chosen = _spread(frames) if source.has_poses and not is_live(source) else [frames[0]]
     points = np.concatenate([_points_in_world(source[i], source.camera) for i in chosen])
     if not len(points):
         raise SourceError(f"{source.name}: no depth within {TRUSTED_DEPTH_M:g} m; give --volume")

@@ -1,6 +1,6 @@
 // `node build.mjs [FOLDER]` bundles the page into FOLDER (default dist); `--tests` bundles the tests into .test.
 // The same sources and the pinned packages give the same bytes on every machine.
-import { copyFile, mkdir, readdir, rm } from "node:fs/promises";
+import { copyFile, mkdir, readdir, readFile, rm, writeFile } from "node:fs/promises";
 import { join } from "node:path";
 import { build } from "esbuild";
 
@@ -10,9 +10,11 @@ async function buildPage(folder) {
   await rm(folder, { recursive: true, force: true });
   await mkdir(folder, { recursive: true });
   await build({
-    entryPoints: { app: "src/main.ts", style: "src/style.css" },
+    entryPoints: { app: "src/main.ts", worker: "src/worker.ts", style: "src/style.css" },
     outdir: folder,
     bundle: true,
+    splitting: true, // three.js is fetched where it is needed only
+    chunkNames: "[name]-[hash]",
     minify: true,
     format: "esm",
     target: "es2022",
@@ -21,7 +23,8 @@ async function buildPage(folder) {
     logLevel: "warning",
   });
   await copyFile("src/index.html", join(folder, "index.html"));
-  await copyFile("node_modules/@msgpack/msgpack/LICENSE", join(folder, "app.js.LICENSE.txt"));
+  const licences = await Promise.all(["@msgpack/msgpack", "three"].map((name) => readFile(`node_modules/${name}/LICENSE`, "utf8")));
+  await writeFile(join(folder, "LICENSES.txt"), licences.join("\n----\n\n"));
 }
 
 async function buildTests(folder) {

@@ -1,136 +1,61 @@
-"""`probeless bench service`: the whole way, from a client's frame over the socket to the composite that comes back.
+"""`probeless bench service`: what makes it a service a person would run for others.
 
-640x480, 256^3 voxels over 2 m, REG4, one object, JPEG up and down: frames a second, memory over 1 000 frames, and the
-time from `serve` to the first composite with a warm kernel cache. The server is a process of its own, as in the field;
-the client runs here, on the same cores.
+The way of one client; load; faults at random moments; bad bytes; two clients that see a plane each; replay. Servers are
+processes of their own, as in the field; clients run here, on the same cores. A run that was stopped goes on with the
+parts that are missing: finished ones lie in out/bench/service/parts, mutated messages in bytes.jsonl, logs beside them.
 """
 
 from __future__ import annotations
 
-import asyncio
-import re
-import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
-from statistics import median
+import json
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from server.evaluation.report import Report
+from server.opencl.device import open_device
+from tests.bench.finished import ROOT, Finished, Part
+from tests.bench.run import Run
+from tests.bench.service_bytes import decoder_part, socket_part
+from tests.bench.service_faults import FAULTS, fault_part, server_killed_part
+from tests.bench.service_http import http_part
+from tests.bench.service_load import load_part, side_by_side_part
+from tests.bench.service_planes import planes_part
+from tests.bench.service_replay import replay_part
+from tests.bench.service_speed import speed_part
 
-from client.client import Answer, StreamClient
-from client.laptop.source import Source, open_source
-from client.laptop.vase import vase_glb
-from protocol.frames import RgbdFrame
-from protocol.messages import Wishes
-from server.evaluation.report import Report, Row
-
-SOURCES = ("synthetic:room?frames=40", "synthetic:table?frames=40")
-"""A room that fills the picture, and a table whose surroundings have no depth."""
-SIDE_M = 2.0
-VOXEL_M = SIDE_M / 256
-WINDOW = 20
-"""Frames over which one rate is measured; the figure is the median of the windows."""
-SETTLING = 0.2
-"""Share of the frames after which memory must not grow any more."""
+OUT = ROOT / "out" / "bench" / "service"
+PARTS: dict[str, Callable[..., Part]] = {
+    "speed": speed_part,
+    "load": load_part,
+    "side by side": side_by_side_part,
+    "server killed": server_killed_part,
+    **{name: partial(fault_part, name) for name in FAULTS},
+    "mutated messages": decoder_part,
+    "mutated messages over the socket": socket_part,
+    "bad requests": http_part,
+    "two planes": planes_part,
+    "replay": replay_part,
+}
 
 
 def run_suite(quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
     """Measure; `say` gets progress."""
-    frames = 120 if quick else 1000
-    with serving():  # fills the kernel cache
-        pass
-    report = Report("", sizes={"frames": frames})
-    for spec in SOURCES:
-        name = spec.partition("?")[0]
-        source = open_source(spec)
-        shown = [source[i] for i in range(len(source))]
-        started = time.perf_counter()
-        with serving() as (process, url):
-            report.device, times, memory = asyncio.run(stream(url, source, shown, frames, process.pid, say))
-        rates = [WINDOW / (b - a) for a, b in zip(times[::WINDOW], times[WINDOW::WINDOW], strict=False)]
-        settled = memory[int(len(memory) * SETTLING) :]
-        growth = 100 * (max(settled[-3:]) / settled[0] - 1)
-        report.rows += [
-            Row(f"{name}: end to end through the socket", median(rates), "frames/s", ">= 4"),
-            Row(f"{name}: slowest window of {WINDOW} frames", min(rates), "frames/s", ""),
-            Row(f"{name}: first composite after serve, warm cache", times[0] - started, "s", "<= 10"),
-            Row(f"{name}: server memory at the end", memory[-1], "MB", ""),
-            Row(f"{name}: growth of memory over the last {len(settled) * WINDOW} frames", growth, "%", "<= 1"),
-        ]
-    return report.as_dict()
-
-
-@contextmanager
-def serving() -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """`probeless serve` on a free port, stopped at the end."""
-    command = [str(Path(sys.executable).parent / "probeless"), "serve", "--port", "0"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    try:
-        assert process.stdout is not None
-        lines: list[str] = []
-        for line in process.stdout:
-            lines.append(line)
-            found = re.search(r"https?://\S+", line)
-            if found:
-                break
-        else:
-            raise RuntimeError(f"the server ended: {''.join(lines)}")
-        yield process, found.group().rstrip("/")
-    finally:
-        process.terminate()
-        process.communicate(timeout=30)
-
-
-async def stream(
-    url: str, source: Source, shown: list[RgbdFrame], count: int, pid: int, say: Callable[[str], None]
-) -> tuple[str, list[float], list[float]]:
-    """Send frames to and fro as fast as the window allows: device, times of the answers, memory in MB."""
-    client = await StreamClient.connect(url)
-    center = np.mean([looked_at(frame, source.camera.depth_scale_m) for frame in shown], axis=0)
-    low, high = center - SIDE_M / 2, center + SIDE_M / 2
-    wishes = Wishes(volume_m=(*low.tolist(), *high.tolist()), voxel_m=VOXEL_M, up=source.up)
-    welcome = await client.hello(source.camera, wishes)
-    await client.place_object("vase", "glb", vase_glb(), position_m=tuple(center.tolist()))
-    sending = asyncio.create_task(_send(client, shown, count))
-    times: list[float] = []
-    memory: list[float] = []
-    async for answer in client.answers():
-        if not isinstance(answer, Answer):
-            raise RuntimeError(f"frame was not answered: {answer}")
-        times.append(time.perf_counter())
-        if len(times) % WINDOW == 1:
-            memory.append(resident_mb(pid))
-            say(f"{len(times)} of {count} frames, {memory[-1]:.0f} MB")
-        if len(times) == count:
-            break
-    await sending
-    await client.close()
-    return welcome.device, times, memory
-
-
-def looked_at(frame: RgbdFrame, depth_scale_m: float) -> NDArray[np.float64]:
-    """World point on the camera's axis at the median depth."""
-    depth_m = float(np.median(frame.depth[frame.depth > 0])) * depth_scale_m
-    assert frame.world_from_camera is not None
-    return frame.world_from_camera[:3, 3] + depth_m * frame.world_from_camera[:3, 2]
-
-
-async def _send(client: StreamClient, shown: list[RgbdFrame], count: int) -> None:
-    """The frames forwards and backwards, so that the camera never jumps; never more unanswered than the window."""
-    path = [*shown, *shown[-2:0:-1]]
-    for index in range(count):
-        frame = path[index % len(path)]
-        await client.wait_for_room()
-        await client.send_frame(RgbdFrame(index, index / 30, frame.color, frame.depth, frame.world_from_camera))
-
-
-def resident_mb(pid: int) -> float:
-    """Resident memory of a process in MB, from /proc."""
-    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-        if line.startswith("VmRSS"):
-            return int(line.split()[1]) / 1e3
-    raise RuntimeError(f"no process {pid}")
+    run = Run(open_device(None), quick, say)
+    say(f"device: {run.device.name}")
+    OUT.mkdir(parents=True, exist_ok=True)
+    finished = Finished(OUT, run.device.name, quick)
+    report = Report(run.device.name)
+    details: dict[str, Any] = {}
+    for name, measure in PARTS.items():
+        part = finished.part(name, lambda measure=measure: measure(run, OUT), say)  # type: ignore[misc]
+        report.rows += part.rows
+        report.unmeasured += part.unmeasured
+        report.sizes |= part.sizes
+        details[name] = part.details
+    result = report.as_dict()
+    (OUT / "result.json").write_text(json.dumps(result, indent=1, allow_nan=False))
+    (OUT / "details.json").write_text(json.dumps(details, indent=1, allow_nan=False))
+    finished.forget()
+    (OUT / "bytes.jsonl").unlink(missing_ok=True)
+    return result

@@ -92,6 +92,17 @@ def test_the_period_foretells_what_sessions_get() -> None:
     assert device.scheduler.period_s() == 0.0
 
 
+def test_first_frames_in_which_kernels_are_loaded_foretell_nothing() -> None:
+    device = Device({"a": 2.0, "b": 2.0})
+    device.serve(4.0)
+    device.costs |= {"a": 0.1, "b": 0.1}
+    device.serve(0.2)
+    assert device.scheduler.period_s() == pytest.approx(0.2)
+    device.costs |= {"a": 0.2, "b": 0.2}
+    device.serve(0.4)
+    assert device.scheduler.period_s() == pytest.approx(0.24)
+
+
 def run_in_threads(scheduler: Scheduler, shares: list[Share], turns: int) -> tuple[int, int]:
     """The most frames at once, in all and of one room."""
     working: list[Share] = []

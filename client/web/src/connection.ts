@@ -1,24 +1,34 @@
-// The socket to the server: watches, and comes back by itself when it is lost.
+// The socket to the server, which comes back by itself when it is lost. What is said on it is not known here.
 
 import { decodeServer, encode } from "./messages";
-import { type ServerMessage, SUBPROTOCOL } from "./protocol";
+import { type ClientMessage, type ServerMessage, SUBPROTOCOL } from "./protocol";
 
 export type ConnectionState =
   | { kind: "connecting" }
   | { kind: "open" }
-  | { kind: "lost"; reason: string; retryAt_ms: number }
+  | { kind: "lost"; reason: string; wait_ms: number }
   | { kind: "refused"; reason: string };
 
-const FIRST_PAUSE_MS = 500;
-const LONGEST_PAUSE_MS = 15_000;
+/** Between tries: the first pause, and the longest. */
+export interface Pauses {
+  first_ms: number;
+  longest_ms: number;
+}
+
+/** For somebody who watches, and for a session that the server keeps for a while only. */
+export const WATCHING: Pauses = { first_ms: 500, longest_ms: 15_000 };
+export const CAPTURING: Pauses = { first_ms: 100, longest_ms: 2_000 };
+
 /** A connection that lasted this long was a good one: the pauses start from the shortest again. */
 const GOOD_AFTER_MS = 10_000;
 /** Wrong version, no token or a wrong one, a page of elsewhere: trying again would change nothing. */
 const REFUSED: readonly number[] = [1002, 4401, 4403];
+/** What is wished cannot be had; a session that was to be watched may come yet. */
+export const POLICY = 1008;
 
 /** Pause before attempt number `attempt` (1, 2, ...): doubling, with up to a quarter less so that pages spread out. */
-export function pause_ms(attempt: number, random: () => number = Math.random): number {
-  const full = Math.min(LONGEST_PAUSE_MS, FIRST_PAUSE_MS * 2 ** (attempt - 1));
+export function pause_ms(attempt: number, random: () => number = Math.random, pauses: Pauses = WATCHING): number {
+  const full = Math.min(pauses.longest_ms, pauses.first_ms * 2 ** (attempt - 1));
   return full * (1 - random() / 4);
 }
 
@@ -33,37 +43,60 @@ export function tokenQuery(page: URL): string {
   return token === null ? "" : `?token=${encodeURIComponent(token)}`;
 }
 
+export interface Hooks {
+  /** The first message of each connection. */
+  greeting(): ClientMessage;
+  onState(state: ConnectionState): void;
+  onMessage(message: ServerMessage): void;
+  /** Before it is tried again; `code` as of the socket. */
+  onClosed?(code: number): void;
+}
+
 export class Connection {
   private socket: WebSocket | null = null;
   private attempts = 0;
   private opened_ms = 0;
   private timer: ReturnType<typeof setTimeout> | undefined;
+  private hasStopped = false;
 
-  /** `session`: the one to watch; null for whichever is streaming. */
   constructor(
     private readonly url: string,
-    private readonly session: string | null,
-    private readonly onState: (state: ConnectionState) => void,
-    private readonly onMessage: (message: ServerMessage) => void,
+    private readonly hooks: Hooks,
+    private readonly pauses: Pauses = WATCHING,
+    private readonly refused: readonly number[] = REFUSED,
   ) {}
 
   /** Connect now, unless a connection is open or being opened. */
   open(): void {
-    if (this.socket !== null) return;
+    if (this.socket !== null || this.hasStopped) return;
     clearTimeout(this.timer);
-    this.onState({ kind: "connecting" });
+    this.hooks.onState({ kind: "connecting" });
     const socket = new WebSocket(this.url, SUBPROTOCOL);
     this.socket = socket;
     this.opened_ms = performance.now();
     socket.binaryType = "arraybuffer";
-    socket.onopen = () => socket.send(encode({ type: "watch", session: this.session }));
+    socket.onopen = () => socket.send(encode(this.hooks.greeting()));
     socket.onmessage = (event: MessageEvent<unknown>) => this.receive(socket, event.data);
     socket.onclose = (event) => this.closed(event);
   }
 
-  /** Try no more by itself. */
-  stop(): void {
+  /** Send, if there is a connection; whether there was. */
+  send(message: ClientMessage): boolean {
+    if (this.socket?.readyState !== WebSocket.OPEN) return false;
+    this.socket.send(encode(message));
+    return true;
+  }
+
+  /** Leave, and try no more. */
+  stop(reason = ""): void {
+    this.hasStopped = true;
     clearTimeout(this.timer);
+    const { socket } = this;
+    if (socket === null) return;
+    this.send({ type: "bye", reason });
+    socket.onmessage = socket.onclose = null;
+    socket.close(1000, "");
+    this.socket = null;
   }
 
   private receive(socket: WebSocket, data: unknown): void {
@@ -76,20 +109,24 @@ export class Connection {
       console.error("unreadable message", error);
       return;
     }
-    if (message.type === "welcome") this.onState({ kind: "open" });
-    this.onMessage(message);
+    if (message.type === "welcome") this.hooks.onState({ kind: "open" });
+    this.hooks.onMessage(message);
   }
 
   private closed(event: CloseEvent): void {
     this.socket = null;
     const reason = event.reason || (event.code === 1006 ? "the server does not answer" : "the server closed the connection");
-    if (REFUSED.includes(event.code)) {
-      this.onState({ kind: "refused", reason });
+    this.hooks.onClosed?.(event.code);
+    if (this.refused.includes(event.code)) {
+      this.hooks.onState({ kind: "refused", reason });
       return;
     }
     if (performance.now() - this.opened_ms > GOOD_AFTER_MS) this.attempts = 0;
-    const wait_ms = pause_ms(++this.attempts);
+    const wait_ms = pause_ms(++this.attempts, Math.random, this.pauses);
     this.timer = setTimeout(() => this.open(), wait_ms);
-    this.onState({ kind: "lost", reason, retryAt_ms: performance.now() + wait_ms });
+    this.hooks.onState({ kind: "lost", reason, wait_ms });
   }
 }
+
+/** Of a client that captures. */
+export const REFUSED_CAPTURE: readonly number[] = [...REFUSED, POLICY];

@@ -1,101 +1,85 @@
-// The page: watches a session and shows what it produces.
+// The page: watches a session, or captures one of its own, and shows what it produces.
 
-import { Connection, type ConnectionState, streamUrl, tokenQuery } from "./connection";
+import { reasonOf } from "./capture/source";
+import { findSupport } from "./capture/support";
+import { Capturing } from "./capturing";
+import { type ConnectionState, streamUrl, tokenQuery } from "./connection";
 import { byId, make, setText } from "./dom";
-import { showLight } from "./light";
-import { addNote, clearNotes, showNotes } from "./notes";
-import { markPicture, showPicture } from "./picture";
-import { showPlan } from "./plan";
-import type { Composite, Light, ServerMessage } from "./protocol";
-import { FrameRate } from "./rate";
-import { addTimings, clearTimings, showTimings } from "./timings";
+import { type Choice, fill, missing, quality, read } from "./form";
+import { clearLatency, noteShown } from "./latency";
+import { LightMode } from "./light_mode";
+import { ObjectTools } from "./objects/tools";
+import { Panels } from "./panels";
+import { fitPicture, markPicture, showPicture } from "./picture";
+import type { Light, ServerMessage } from "./protocol";
+import { Remote } from "./remote";
+import type { FromWorker } from "./worker_messages";
 
 const QUIET_AFTER_MS = 3000;
 const REFRESH_MS = 250;
-/** The light changes slowly and is dear to draw on a phone. */
-const LIGHT_MS = 100;
 
-const state = byId("state");
-const countdown = byId("state-countdown");
+const page = new URL(location.href);
+const stage = byId("stage");
+const form = byId<HTMLFormElement>("capture-form");
 const retry = byId<HTMLButtonElement>("retry");
 const reload = byId<HTMLButtonElement>("reload");
-const rateText = byId("frame-rate");
+const stopButton = byId<HTMLButtonElement>("stop");
+const fullButton = byId<HTMLButtonElement>("full");
 
-const rate = new FrameRate();
+const panels = new Panels();
+const remote = new Remote(receive, (reason) => fail(`This page cannot work in this browser: ${reason}`));
+let lightMode: LightMode | null = null;
+const tools = new ObjectTools((asked) => (lightMode === null ? remote.request(asked) : null));
+let capturing: Capturing | null = null;
 let connection: ConnectionState = { kind: "connecting" };
-let light: Light | null = null;
-let composite: Composite | null = null;
-let lastPicture_ms = Number.NEGATIVE_INFINITY;
-let drawing = false;
-let lightDue = false;
-let lightShown_ms = Number.NEGATIVE_INFINITY;
+let retryAt_ms = 0;
+let welcomes = 0;
+let told = "";
 
-function receive(message: ServerMessage): void {
-  switch (message.type) {
-    case "welcome":
-      greet(message.session, message.server, message.device);
+function receive(message: FromWorker): void {
+  switch (message.kind) {
+    case "state":
+      connection = message.state;
+      if (connection.kind === "lost") retryAt_ms = performance.now() + connection.wait_ms;
+      refresh();
       return;
-    case "light":
-      light = message;
-      lightDue = true;
+    case "message":
+      receiveServer(message.message);
       return;
-    case "composite":
-      receivePicture(message);
+    case "picture":
+      showPicture(message.composite, message.bitmap);
+      if (message.times !== null) noteShown(message.times, message.composite.timings);
+      if (capturing !== null) tools.show(capturing.seenIn(message.composite.frame));
       return;
-    case "dropped":
-      addNote(`left out: ${message.reason}`, message.frame);
-      break;
-    case "error":
-    case "bye":
-      addNote(`the server says: ${message.reason}`, null);
-      break;
-    case "acknowledged":
-    case "mesh_part":
+    case "say":
+      panels.note(message.text);
       return;
+    case "wanted":
+      return; // the remote's own
     default:
       message satisfies never;
   }
-  showNotes();
 }
 
-function greet(session: string, server: string, device: string): void {
-  setText(byId("session"), session);
-  setText(byId("server"), server);
-  setText(byId("device"), device);
-  rate.clear();
-  clearTimings();
-  clearNotes();
+function receiveServer(message: ServerMessage): void {
+  panels.receive(message);
+  if (message.type === "acknowledged") {
+    const problem = tools.scene.acknowledge(message.request, message.error);
+    if (problem !== null) tools.say(problem);
+  }
+  if (message.type === "welcome" && capturing !== null && ++welcomes > 1 && !message.resumed) tools.scene.placeAgain();
+  if (message.type === "composite") told = "";
+  if (message.type === "light" && lightMode !== null) receiveLight(message);
 }
 
-function receivePicture(message: Composite): void {
-  composite = message;
-  lastPicture_ms = performance.now();
-  rate.add(lastPicture_ms);
-  addTimings(message.timings);
-  for (const note of message.notes) addNote(note, message.frame);
-  showPicture(message).catch((error: unknown) => {
-    addNote(`this picture cannot be shown: ${String(error)}`, message.frame);
-    showNotes();
-  });
-  if (drawing) return;
-  drawing = true;
-  requestAnimationFrame(draw);
-}
-
-function draw(): void {
-  drawing = false;
-  if (composite === null) return;
-  showTimings(composite.timings);
-  showPlan(composite.plan);
-  showNotes();
-  refresh();
-}
-
-function drawLight(now_ms: number): void {
-  if (!lightDue || light === null || composite === null || now_ms - lightShown_ms < LIGHT_MS) return;
-  lightDue = false;
-  lightShown_ms = now_ms;
-  showLight(light, composite.world_from_camera);
+/** In light mode a light is the answer to its frame. */
+function receiveLight(light: Light): void {
+  told = "";
+  lightMode?.setLight(light);
+  const seen = capturing?.seenIn(light.frame) ?? null;
+  panels.noteAnswer(seen?.world_from_camera ?? null);
+  if (seen !== null) fitPicture(seen.camera);
+  tools.show(seen);
 }
 
 /** The connection's state in a word for the eye and a sentence for everybody. */
@@ -108,25 +92,99 @@ function describe(now_ms: number): { kind: string; text: string } {
     case "refused":
       return { kind: "bad", text: `Refused: ${connection.reason}` };
     case "open":
-      if (composite === null) return { kind: "busy", text: "Connected, waiting for a session" };
-      if (now_ms - lastPicture_ms > QUIET_AFTER_MS) return { kind: "busy", text: "Connected, no new pictures" };
-      return { kind: "good", text: "Live" };
+      if (panels.lastAnswer_ms === Number.NEGATIVE_INFINITY) return { kind: "busy", text: capturing ? "Connected, waiting for the first picture" : "Connected, waiting for a session" };
+      if (now_ms - panels.lastAnswer_ms > QUIET_AFTER_MS) return { kind: "busy", text: "Connected, no new pictures" };
+      return { kind: "good", text: capturing ? "Live, captured here" : "Live" };
   }
 }
 
 function refresh(): void {
   const now_ms = performance.now();
-  drawLight(now_ms);
+  panels.refresh(now_ms);
   const { kind, text } = describe(now_ms);
-  setText(state, text);
+  setText(byId("state"), text);
   document.documentElement.dataset["state"] = kind;
   markPicture(kind === "good");
-  const fps = rate.value(now_ms);
-  setText(rateText, fps === null ? "–" : fps.toFixed(1));
+  setText(byId("stage-said"), told !== "" || capturing === null || kind === "good" ? told : text);
   retry.hidden = connection.kind !== "lost";
   reload.hidden = connection.kind !== "refused";
-  const left_s = connection.kind === "lost" ? Math.max(0, Math.ceil((connection.retryAt_ms - now_ms) / 1000)) : null;
-  setText(countdown, left_s === null ? "" : `next try in ${left_s} s`);
+  const left_s = connection.kind === "lost" ? Math.max(0, Math.ceil((retryAt_ms - now_ms) / 1000)) : null;
+  setText(byId("state-countdown"), left_s === null ? "" : `next try in ${left_s} s`);
+}
+
+/** What is said over the picture: what the source told last, else how the connection of a capture is. */
+function say(text: string): void {
+  told = text;
+  refresh();
+}
+
+function fail(text: string): void {
+  setText(byId("capture-said"), text);
+  say(text);
+}
+
+function watch(): void {
+  const { room, key } = read(form);
+  begin();
+  remote.watch(streamUrl(page), { type: "watch", session: page.searchParams.get("session"), room: room || null, room_key: key || null });
+}
+
+/** What was shown belongs to a session that is over. */
+function begin(): void {
+  welcomes = 0;
+  panels.clear();
+  clearLatency();
+  tools.clear();
+}
+
+async function capture(choice: Choice): Promise<void> {
+  await endCapture();
+  begin();
+  try {
+    const local = choice.answer === "light" ? await LightMode.load(() => tools.scene.placed, say) : null;
+    const next = new Capturing(remote, { say: (text, isEnd) => (isEnd ? void leave(text) : say(text)) }, local?.draw ?? null);
+    await next.start(choice, stage, streamUrl(page));
+    capturing = next;
+    lightMode = local;
+  } catch (error) {
+    watch();
+    return fail(reasonOf(error));
+  }
+  stage.classList.toggle("local", lightMode !== null);
+  stopButton.hidden = false;
+  showFull(true);
+  refresh();
+}
+
+/** Back to watching. */
+async function leave(reason: string): Promise<void> {
+  await endCapture();
+  watch();
+  fail(reason);
+}
+
+async function endCapture(): Promise<void> {
+  const ended = capturing;
+  capturing = lightMode = null;
+  stage.classList.remove("local");
+  stopButton.hidden = true;
+  showFull(false);
+  await ended?.stop();
+  remote.stop("");
+}
+
+function showFull(isFull: boolean): void {
+  stage.classList.toggle("full", isFull);
+  fullButton.setAttribute("aria-pressed", String(isFull));
+}
+
+/** The whole screen where the browser gives it, else the whole page. */
+async function toggleFull(): Promise<void> {
+  const isFull = !stage.classList.contains("full");
+  showFull(isFull);
+  if (capturing !== null) return; // augmented reality has the screen already
+  if (isFull) await stage.requestFullscreen?.().catch(() => undefined);
+  else if (document.fullscreenElement !== null) await document.exitFullscreen();
 }
 
 /** The command with which there is something to see; it breaks between words only. */
@@ -134,23 +192,62 @@ function showHint(words: readonly string[]): void {
   byId("hint").append(...words.flatMap((word) => [make("span", "", word), " "]));
 }
 
+async function showSupport(): Promise<void> {
+  const support = await findSupport();
+  for (const [name, lack] of [["xr", support.xr], ["camera", support.camera]] as const) {
+    const words = byId(`lacks-${name}`);
+    words.hidden = lack === null;
+    setText(words, lack ?? "");
+    const input = form.querySelector<HTMLInputElement>(`input[value="${name}"]`)!;
+    input.disabled = lack !== null;
+    if (lack !== null && input.checked) form.querySelector<HTMLInputElement>('input[value="watch"]')!.checked = true;
+  }
+  noteChoice();
+}
+
+function noteChoice(): void {
+  const choice = read(form);
+  form.dataset["source"] = choice.source;
+  form.dataset["preset"] = choice.preset;
+}
+
+function submit(): void {
+  const choice = read(form);
+  const lack = missing(choice);
+  fail(lack ?? "");
+  if (lack !== null) return;
+  if (choice.source === "watch") void endCapture().then(watch);
+  else void capture(choice);
+}
+
 function start(): void {
-  const page = new URL(location.href);
   showHint(["probeless", "stream", "synthetic:table", "--server", page.origin + tokenQuery(page).replace("?", "/?")]);
-  const live = new Connection(
-    streamUrl(page),
-    page.searchParams.get("session"),
-    (next) => {
-      connection = next;
-      refresh();
-    },
-    receive,
-  );
-  retry.addEventListener("click", () => live.open());
+  fill(form, page);
+  noteChoice();
+  void showSupport();
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    submit();
+  });
+  form.addEventListener("change", (event) => {
+    noteChoice();
+    const name = (event.target as HTMLInputElement).name;
+    if (capturing !== null && (name === "preset" || name === "budget")) remote.request({ type: "quality", ...quality(read(form)) } as Parameters<Remote["request"]>[0]);
+  });
+  stopButton.addEventListener("click", () => void leave(""));
+  fullButton.addEventListener("click", () => void toggleFull());
+  document.addEventListener("fullscreenchange", () => {
+    if (document.fullscreenElement === null && capturing === null) showFull(false);
+  });
+  retry.addEventListener("click", () => remote.retry());
   reload.addEventListener("click", () => location.reload());
-  addEventListener("online", () => live.open());
+  addEventListener("online", () => remote.retry());
+  addEventListener("pagehide", () => remote.stop("the page was closed"));
+  addEventListener("pageshow", (event) => {
+    if (event.persisted) location.reload();
+  });
   setInterval(refresh, REFRESH_MS);
-  live.open();
+  watch();
 }
 
 start();

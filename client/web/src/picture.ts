@@ -1,50 +1,28 @@
-// The composited picture: the newest one that can be decoded in time.
+// The composited picture, the newest that was decoded.
 
 import { byId, context2d, setText } from "./dom";
-import type { ColorImage, Composite } from "./protocol";
+import type { Composite } from "./protocol";
 import { TRACKING } from "./words";
 
 const canvas = byId<HTMLCanvasElement>("picture");
+const guide = byId<HTMLCanvasElement>("guide");
 const context = context2d(canvas);
 const frame = byId("picture-frame");
 const caption = byId("picture-caption");
 
-let waiting: Composite | null = null;
-let busy = false;
-
-/** Show a composite; one that arrives while another is being decoded replaces an older one that waits. */
-export async function showPicture(composite: Composite): Promise<void> {
-  waiting = composite;
-  if (busy) return;
-  busy = true;
-  try {
-    while (waiting !== null) {
-      const next: Composite = waiting;
-      waiting = null;
-      draw(next, await decode(next.color));
-    }
-  } finally {
-    busy = false;
+/** Make room for pictures of this size. */
+export function fitPicture({ width, height }: { width: number; height: number }): void {
+  if (canvas.width === width && canvas.height === height) return;
+  for (const each of [canvas, guide]) {
+    each.width = width;
+    each.height = height;
   }
+  frame.style.setProperty("--aspect", `${width} / ${height}`);
 }
 
-/** Say whether what is seen is current. */
-export function markPicture(live: boolean): void {
-  frame.classList.toggle("stale", !live);
-}
-
-async function decode(color: ColorImage): Promise<ImageBitmap> {
-  if (color.codec === "raw") throw new Error("the picture is raw, which this page does not show");
-  const blob = new Blob([new Uint8Array(color.data)], { type: `image/${color.codec}` });
-  return createImageBitmap(blob);
-}
-
-function draw(composite: Composite, bitmap: ImageBitmap): void {
-  if (canvas.width !== bitmap.width || canvas.height !== bitmap.height) {
-    canvas.width = bitmap.width;
-    canvas.height = bitmap.height;
-    frame.style.setProperty("--aspect", `${bitmap.width} / ${bitmap.height}`);
-  }
+/** Show a composite's picture, which is closed. */
+export function showPicture(composite: Composite, bitmap: ImageBitmap): void {
+  fitPicture(bitmap);
   context.drawImage(bitmap, 0, 0);
   bitmap.close();
   frame.classList.add("has-picture");
@@ -52,4 +30,9 @@ function draw(composite: Composite, bitmap: ImageBitmap): void {
   canvas.setAttribute("aria-label", `Camera picture with the virtual objects in it, ${size}, frame ${composite.frame}`);
   setText(caption, `Frame ${composite.frame} · ${size} · ${composite.timestamp_s.toFixed(2)} s · ${TRACKING[composite.tracking]}`);
   caption.classList.toggle("bad", composite.tracking === "lost");
+}
+
+/** Say whether what is seen is current. */
+export function markPicture(live: boolean): void {
+  frame.classList.toggle("stale", !live);
 }

@@ -111,6 +111,8 @@ export interface Wishes {
   robustness?: Array<"memory" | "normals" | "normals_printed" | "openness" | "outliers">;
   /** `everything`: what would hardly be seen is simulated too, to check the bounds of leaving it out. */
   plan?: "everything" | "needed";
+  /** `light`: a frame is answered by its light alone, for clients that draw virtual things themselves. */
+  answer?: "light" | "picture";
   /** Answers carry PNG pictures, and every frame is answered in order instead of latest-wins. */
   lossless?: boolean;
 }
@@ -177,6 +179,8 @@ export interface DepthImage {
   height: number;
   data: Uint8Array;
   codec: "raw" | "zdelta" | "zstd-delta";
+  /** What the sender changed before: each depth z (metres) by at most this times z^2; null: nothing. */
+  rounded_per_m?: number | null;
 }
 
 /** One RGB-D frame; answered by exactly one of composite (with its light before it), dropped or error. */

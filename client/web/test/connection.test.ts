@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { Connection, type ConnectionState } from "../src/connection";
+import { CAPTURING, Connection, type ConnectionState, pause_ms, REFUSED_CAPTURE } from "../src/connection";
 
 class FakeSocket {
   static last: FakeSocket;
@@ -13,12 +13,18 @@ class FakeSocket {
 }
 
 /** The state that a page is in once its socket was closed. */
-function stateAfter(code: number, reason: string): ConnectionState {
+function stateAfter(code: number, reason: string, refused?: readonly number[]): ConnectionState {
   const states: ConnectionState[] = [];
   Object.assign(globalThis, { WebSocket: FakeSocket });
-  const connection = new Connection("ws://host/v1/stream", null, (state) => states.push(state), () => undefined);
+  const hooks = {
+    greeting: () => ({ type: "watch" }) as const,
+    onState: (state: ConnectionState) => states.push(state),
+    onMessage: () => undefined,
+  };
+  const connection = new Connection("ws://host/v1/stream", hooks, CAPTURING, refused);
   connection.open();
-  FakeSocket.last.onclose({ code, reason });
+  const socket = FakeSocket.last;
+  socket.onclose({ code, reason });
   connection.stop();
   const last = states.at(-1);
   assert.ok(last !== undefined);
@@ -34,4 +40,14 @@ test("without its token a page says what to do and does not try again", () => {
 
 test("a server that restarts or is full is tried again", () => {
   for (const code of [1006, 1012, 1013]) assert.equal(stateAfter(code, "later").kind, "lost");
+});
+
+test("a session that is not there yet may come; wishes that cannot be met stay so", () => {
+  assert.equal(stateAfter(1008, "no session").kind, "lost");
+  assert.deepEqual(stateAfter(1008, "no such preset", REFUSED_CAPTURE), { kind: "refused", reason: "no such preset" });
+});
+
+test("a session that is kept for a while is tried for sooner", () => {
+  const pauses = [1, 2, 3, 4, 5, 6, 50].map((attempt) => pause_ms(attempt, () => 0, CAPTURING));
+  assert.deepEqual(pauses, [100, 200, 400, 800, 1600, 2000, 2000]);
 });

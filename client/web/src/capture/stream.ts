@@ -1,0 +1,177 @@
+// One capturing session: hello, frames as the server has room for them, requests until they are answered, and back again
+// after a lost connection (protocol/README.md).
+
+import { CAPTURING, Connection, type ConnectionState, REFUSED_CAPTURE } from "../connection";
+import type { CameraModel, ClientMessage, Composite, Frame, Hello, Light, ServerMessage } from "../protocol";
+import { isSameCamera } from "./axes";
+import { type Captured, now_ms } from "./source";
+
+/** What a person chose: a hello but for the camera. */
+export type Setup = Omit<Hello, "type" | "camera" | "resume">;
+export type Request = Extract<ClientMessage, { request: number }>;
+
+export interface Numbered extends Captured {
+  number: number;
+}
+
+/** When a frame was where, in milliseconds that page and worker count alike. */
+export interface Times {
+  captured_ms: number;
+  sent_ms: number;
+  answered_ms: number;
+}
+
+export interface StreamHooks {
+  /** A frame that is captured now would be sent at once. */
+  onWanted(): void;
+  onState(state: ConnectionState): void;
+  /** `times`: of an answer to a frame. */
+  onMessage(message: ServerMessage, times: Times | null): void;
+  say(text: string): void;
+}
+
+const GONE = 4410;
+const LOST = "the connection was lost while it was on its way";
+
+export class CaptureStream {
+  private connection: Connection | null = null;
+  private camera: CameraModel | null = null;
+  private key: string | null = null;
+  private isWelcome = false;
+  private maxInflight = 1;
+  private wasAsked = false;
+  private isEncoding = false;
+  private readonly unanswered = new Map<number, { captured_ms: number; sent_ms: number }>();
+  private readonly requests = new Map<number, Request>();
+  /** Of the connection: what was begun on another one is not sent on this one. */
+  private epoch = 0;
+
+  /** `encodeFrame`: to what goes over the wire; picture and depth are its to dispose of. */
+  constructor(
+    private readonly url: string,
+    private readonly setup: Setup,
+    private readonly encodeFrame: (frame: Numbered) => Promise<Frame>,
+    private readonly hooks: StreamHooks,
+  ) {}
+
+  /** Begin: the first frame says of which camera the session is. */
+  start(): void {
+    this.askForFrame();
+  }
+
+  /** Send a frame that was asked for. */
+  async offer(frame: Numbered): Promise<void> {
+    this.wasAsked = false;
+    if (this.camera === null || !isSameCamera(this.camera, frame.camera)) {
+      release(frame);
+      return this.openFor(frame.camera);
+    }
+    if (!this.hasRoom()) return release(frame);
+    const { epoch } = this;
+    this.isEncoding = true;
+    try {
+      const message = await this.encodeFrame(frame);
+      if (epoch !== this.epoch) return;
+      this.unanswered.set(frame.number, { captured_ms: frame.captured_ms, sent_ms: now_ms() });
+      this.connection?.send(message);
+    } finally {
+      if (epoch === this.epoch) this.isEncoding = false;
+      this.askForFrame();
+    }
+  }
+
+  /** Have something done once, however often the connection is lost. */
+  request(message: Request): void {
+    this.requests.set(message.request, message);
+    if (this.isWelcome) this.connection?.send(message);
+  }
+
+  /** Try now to come back. */
+  retry(): void {
+    this.connection?.open();
+  }
+
+  stop(reason: string): void {
+    this.connection?.stop(reason);
+    this.connection = null;
+    this.leave();
+  }
+
+  /** A session has one camera: another one, as of a tablet that was turned, is a session of its own. */
+  private openFor(camera: CameraModel): void {
+    if (this.camera !== null) this.hooks.say("the camera’s picture has another shape now: the session begins anew");
+    this.connection?.stop("another camera");
+    this.camera = camera;
+    this.key = null;
+    this.leave();
+    this.connection = new Connection(
+      this.url,
+      {
+        greeting: () => ({ type: "hello", ...this.setup, camera, resume: this.key }),
+        onState: (state) => this.hooks.onState(state),
+        onMessage: (message) => this.receive(message),
+        onClosed: (code) => {
+          if (code === GONE) this.key = null;
+          this.leave();
+        },
+      },
+      CAPTURING,
+      REFUSED_CAPTURE,
+    );
+    this.connection.open();
+  }
+
+  private leave(): void {
+    this.epoch++;
+    this.isWelcome = this.isEncoding = false;
+    for (const number of this.unanswered.keys()) this.hooks.onMessage({ type: "dropped", frame: number, reason: LOST }, null);
+    this.unanswered.clear();
+  }
+
+  private hasRoom(): boolean {
+    return this.isWelcome && !this.isEncoding && this.unanswered.size < this.maxInflight;
+  }
+
+  private askForFrame(): void {
+    if (this.wasAsked || !(this.camera === null || this.hasRoom())) return;
+    this.wasAsked = true;
+    this.hooks.onWanted();
+  }
+
+  private receive(message: ServerMessage): void {
+    const times = this.note(message);
+    this.hooks.onMessage(message, times);
+    this.askForFrame();
+  }
+
+  private note(message: ServerMessage): Times | null {
+    switch (message.type) {
+      case "welcome":
+        this.key = message.key ?? null;
+        this.maxInflight = message.max_inflight;
+        this.isWelcome = true;
+        for (const request of this.requests.values()) this.connection?.send(request);
+        return null;
+      case "acknowledged":
+        this.requests.delete(message.request);
+        return null;
+      case "light":
+        return this.setup.wishes?.answer === "light" ? this.answered(message) : null;
+      case "composite":
+      case "dropped":
+        return this.answered(message);
+      default:
+        return null;
+    }
+  }
+
+  private answered(message: { frame: number } & (Composite | Light | { type: "dropped" })): Times | null {
+    const sent = this.unanswered.get(message.frame);
+    this.unanswered.delete(message.frame);
+    return sent === undefined ? null : { ...sent, answered_ms: now_ms() };
+  }
+}
+
+function release(frame: Captured): void {
+  if ("close" in frame.color) frame.color.close();
+}

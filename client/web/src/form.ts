@@ -1,0 +1,78 @@
+// What a person asks for: from the page's address or the form.
+
+import type { Setup } from "./capture/stream";
+import type { Marker, Wishes } from "./protocol";
+
+export type SourceName = "watch" | "xr" | "camera";
+
+export interface Choice {
+  source: SourceName;
+  room: string;
+  key: string;
+  marker: number | null;
+  side_cm: number;
+  view_deg: number;
+  preset: NonNullable<Wishes["preset"]>;
+  budget_ms: number;
+  /** Who draws the objects: the server into the picture, or this device in the light that the server finds. */
+  answer: "picture" | "light";
+}
+
+const SOURCES: readonly SourceName[] = ["watch", "xr", "camera"];
+/** For which the server keeps the session of a connection that is lost, as client/client.py has it. */
+export const KEEP_S = 30;
+
+/** Fill the form with what the address says: `?room=kitchen&key=...&source=xr`. */
+export function fill(form: HTMLFormElement, page: URL): void {
+  for (const name of ["room", "key", "marker", "side", "view", "preset", "budget", "answer"]) {
+    const value = page.searchParams.get(name);
+    const field = form.elements.namedItem(name);
+    if (value !== null && (field instanceof HTMLInputElement || field instanceof HTMLSelectElement)) field.value = value;
+  }
+  const source = SOURCES.find((name) => name === page.searchParams.get("source"));
+  if (source !== undefined) (form.elements.namedItem("source") as RadioNodeList).value = source;
+}
+
+export function read(form: HTMLFormElement): Choice {
+  const data = new FormData(form);
+  const text = (name: string): string => String(data.get(name) ?? "").trim();
+  return {
+    source: SOURCES.find((name) => name === text("source")) ?? "watch",
+    room: text("room"),
+    key: text("key"),
+    marker: text("marker") === "" ? null : Number(text("marker")),
+    side_cm: Number(text("side")),
+    view_deg: Number(text("view")),
+    preset: text("preset") as Choice["preset"],
+    budget_ms: Number(text("budget")),
+    answer: text("source") === "xr" && text("answer") === "light" ? "light" : "picture",
+  };
+}
+
+/** What is missing before a session can begin, in one sentence; null: nothing. */
+export function missing(choice: Choice): string | null {
+  if (choice.key !== "" && choice.room === "") return "A key is of a room: name the room too.";
+  if (choice.source !== "camera") return null;
+  if (choice.room === "") return "A plain camera sees no depth and does not know where it is: name a room that somebody else scans.";
+  if (choice.marker === null) return "Say which marker both cameras see: only by it is known where a plain camera is in the room.";
+  return null;
+}
+
+/** How the light is sampled. */
+export function quality({ preset, budget_ms }: Choice): Pick<Wishes, "preset" | "budget_ms"> {
+  return preset === "auto" ? { preset, budget_ms } : { preset, budget_ms: null };
+}
+
+/** The hello of a choice, but for the camera. */
+export function setupOf(choice: Choice): Setup {
+  const marker: Marker | null = choice.marker === null ? null : { id: choice.marker, side_m: choice.side_cm / 100 };
+  const up: Pick<Wishes, "up"> = choice.source === "xr" ? { up: [0, 1, 0] } : {};
+  return {
+    client: "probeless page",
+    wishes: { ...quality(choice), ...up, answer: choice.answer },
+    room: choice.room || null,
+    room_key: choice.key || null,
+    marker: choice.room === "" ? null : marker,
+    keep_s: KEEP_S,
+  };
+}

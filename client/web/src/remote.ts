@@ -1,0 +1,69 @@
+// The page's end of the worker.
+
+import type { Captured } from "./capture/source";
+import type { Request, Setup } from "./capture/stream";
+import type { FromWorker, ToWorker } from "./worker_messages";
+import type { Watch } from "./protocol";
+
+/** A request before it has its number. */
+export type Asked = { [K in Request["type"]]: Omit<Extract<Request, { type: K }>, "request"> }[Request["type"]];
+
+export class Remote {
+  private readonly worker = new Worker("worker.js", { type: "module" });
+  private frames = 0;
+  private requests = 0;
+  private isWanted = false;
+
+  constructor(onMessage: (message: FromWorker) => void, onFailure: (reason: string) => void) {
+    this.worker.onmessage = ({ data }: MessageEvent<FromWorker>) => {
+      if (data.kind === "wanted") this.isWanted = true;
+      else onMessage(data);
+    };
+    this.worker.onerror = (event) => onFailure(event.message || "its worker could not be loaded");
+  }
+
+  watch(url: string, watch: Watch): void {
+    this.isWanted = false;
+    this.post({ kind: "watch", url, watch });
+  }
+
+  capture(url: string, setup: Setup): void {
+    this.isWanted = false;
+    this.post({ kind: "capture", url, setup });
+  }
+
+  /** Whether a frame would be sent at once. */
+  get wantsFrame(): boolean {
+    return this.isWanted;
+  }
+
+  /** Hand a frame over, picture and depth with it; its number. */
+  send(captured: Captured): number {
+    this.isWanted = false;
+    const number = this.frames++;
+    const { color, depth } = captured;
+    const transfer: Transferable[] = ["close" in color ? color : color.buffer, ...(depth === null ? [] : [depth.buffer])];
+    this.post({ kind: "frame", frame: { ...captured, number } }, transfer);
+    return number;
+  }
+
+  /** Ask the server for something; the number by which it answers. */
+  request(asked: Asked): number {
+    const request = this.requests++;
+    this.post({ kind: "request", request: { ...asked, request } as Request });
+    return request;
+  }
+
+  retry(): void {
+    this.post({ kind: "retry" });
+  }
+
+  stop(reason: string): void {
+    this.isWanted = false;
+    this.post({ kind: "stop", reason });
+  }
+
+  private post(message: ToWorker, transfer: Transferable[] = []): void {
+    this.worker.postMessage(message, transfer);
+  }
+}

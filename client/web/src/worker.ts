@@ -1,0 +1,93 @@
+// The worker: the socket, and all that is packed and unpacked, away from the page's own thread.
+
+import { encodeFrame } from "./capture/encode";
+import { reasonOf } from "./capture/source";
+import { CaptureStream, type Times } from "./capture/stream";
+import { Connection } from "./connection";
+import type { Composite, ServerMessage } from "./protocol";
+import type { FromWorker, ToWorker } from "./worker_messages";
+
+let watching: Connection | null = null;
+let stream: CaptureStream | null = null;
+
+const post = (message: FromWorker, transfer: Transferable[] = []): void => self.postMessage(message, { transfer });
+const say = (text: string): void => post({ kind: "say", text });
+
+self.onmessage = ({ data }: MessageEvent<ToWorker>): void => {
+  switch (data.kind) {
+    case "watch":
+      stop("");
+      watching = new Connection(data.url, {
+        greeting: () => data.watch,
+        onState: (state) => post({ kind: "state", state }),
+        onMessage: (message) => tell(message, null),
+      });
+      watching.open();
+      return;
+    case "capture":
+      stop("");
+      stream = new CaptureStream(data.url, data.setup, encodeFrame, {
+        onWanted: () => post({ kind: "wanted" }),
+        onState: (state) => post({ kind: "state", state }),
+        onMessage: tell,
+        say,
+      });
+      stream.start();
+      return;
+    case "frame":
+      stream?.offer(data.frame).catch((error: unknown) => say(`a frame cannot be packed: ${reasonOf(error)}`));
+      return;
+    case "request":
+      stream?.request(data.request);
+      return;
+    case "retry":
+      watching?.open();
+      stream?.retry();
+      return;
+    case "stop":
+      stop(data.reason);
+      return;
+    default:
+      data satisfies never;
+  }
+};
+
+function stop(reason: string): void {
+  watching?.stop(reason);
+  stream?.stop(reason);
+  watching = stream = null;
+}
+
+function tell(message: ServerMessage, times: Times | null): void {
+  if (message.type !== "composite") return post({ kind: "message", message });
+  post({ kind: "message", message: withoutBytes(message) });
+  waiting = { composite: message, times };
+  void decodeWaiting();
+}
+
+const withoutBytes = (composite: Composite): Composite => ({ ...composite, color: { ...composite.color, data: new Uint8Array() } });
+
+let waiting: { composite: Composite; times: Times | null } | null = null;
+let isDecoding = false;
+
+/** The newest picture; one that arrives while another is being decoded replaces an older one that waits. */
+async function decodeWaiting(): Promise<void> {
+  if (isDecoding) return;
+  isDecoding = true;
+  while (waiting !== null) {
+    const { composite, times }: NonNullable<typeof waiting> = waiting;
+    waiting = null;
+    try {
+      const bitmap = await decode(composite);
+      post({ kind: "picture", composite: withoutBytes(composite), bitmap, times }, [bitmap]);
+    } catch (error) {
+      say(`picture ${composite.frame} cannot be shown: ${reasonOf(error)}`);
+    }
+  }
+  isDecoding = false;
+}
+
+function decode({ color }: Composite): Promise<ImageBitmap> {
+  if (color.codec === "raw") throw new Error("it is raw, which this page does not show");
+  return createImageBitmap(new Blob([new Uint8Array(color.data)], { type: `image/${color.codec}` }));
+}

@@ -1,0 +1,22 @@
+// What the page and its worker say to each other.
+
+import type { Numbered, Request, Setup, Times } from "./capture/stream";
+import type { ConnectionState } from "./connection";
+import type { Composite, ServerMessage, Watch } from "./protocol";
+
+export type ToWorker =
+  | { kind: "watch"; url: string; watch: Watch }
+  | { kind: "capture"; url: string; setup: Setup }
+  | { kind: "frame"; frame: Numbered }
+  | { kind: "request"; request: Request }
+  | { kind: "retry" }
+  | { kind: "stop"; reason: string };
+
+export type FromWorker =
+  | { kind: "state"; state: ConnectionState }
+  /** Every message of the server's; a composite without the bytes of its picture. */
+  | { kind: "message"; message: ServerMessage }
+  /** A composite's picture, decoded; of those that come too fast, some are left out. */
+  | { kind: "picture"; composite: Composite; bitmap: ImageBitmap; times: Times | null }
+  | { kind: "wanted" }
+  | { kind: "say"; text: string };

@@ -1,0 +1,63 @@
+"""What Ray Serve runs: `import_path: server.cluster.application:build`, its `args` those of ClusterSettings.
+
+Clients' token is PROBELESS_TOKEN, as of `probeless serve`; it must be set, to `none` for everybody.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from fastapi import FastAPI
+from ray import serve
+
+from server.cluster.ingress import Ingress, create_ingress_app
+from server.cluster.keeper import Keeper
+from server.cluster.ray_places import RayPlaces
+from server.cluster.settings import ClusterSettings, read_settings
+from server.door import Door, is_token
+
+TOKEN = "PROBELESS_TOKEN"
+
+
+class IngressReplica:
+    """One replica: its sockets."""
+
+    def __init__(self, settings: ClusterSettings, door: Door, _keeper: object) -> None:
+        """`_keeper`: named here, so that Serve runs one."""
+        self._ingress = Ingress(RayPlaces(settings), door)
+
+    def __serve_build_asgi_app__(self) -> FastAPI:
+        """Called by Serve."""
+        return create_ingress_app(self._ingress)
+
+
+def build(args: dict[str, Any]) -> Any:
+    """The application. Raises ValueError where a setting is wrong."""
+    settings = read_settings(args)
+    keeper = serve.deployment(
+        Keeper, name="keeper", num_replicas=1, ray_actor_options={"num_cpus": 0.1}, graceful_shutdown_timeout_s=5.0
+    )
+    ingress = serve.deployment(
+        serve.ingress()(IngressReplica),
+        name="ingress",
+        max_ongoing_requests=2 * settings.sockets_per_replica,
+        autoscaling_config={
+            "min_replicas": settings.ingress_replicas,
+            "max_replicas": settings.most_ingress_replicas,
+            "target_ongoing_requests": settings.sockets_per_replica,
+        },
+        ray_actor_options={"num_cpus": settings.ingress_cpus},
+        graceful_shutdown_timeout_s=10.0,
+    )
+    return ingress.bind(settings, door_from_environment(), keeper.bind(settings))
+
+
+def door_from_environment() -> Door:
+    """Raises ValueError where no token is set, or one that cannot be one."""
+    token = os.environ.get(TOKEN, "")
+    if token == "none":
+        return Door(None)
+    if not is_token(token):
+        raise ValueError(f"set {TOKEN} to a secret of yours (openssl rand -hex 24), or to none to let everybody in")
+    return Door(token)

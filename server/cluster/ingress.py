@@ -1,0 +1,101 @@
+"""What a replica serves: the socket, relayed to its room's host; the page; health."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from pathlib import Path
+
+from fastapi import FastAPI, WebSocket
+from fastapi.responses import JSONResponse
+from fastapi.staticfiles import StaticFiles
+from websockets.asyncio.client import ClientConnection
+from websockets.exceptions import InvalidHandshake
+
+from protocol.messages import ClientMessage
+from server.app import PAGE_FOLDER, STREAM_PATH
+from server.cluster.places import NoPlace, NotYet, Places
+from server.cluster.relay import open_host, relay
+from server.cluster.routing import Route, route_of
+from server.connection import GONE, POLICY, TRY_LATER, BadMessage, Connection, Refusal
+from server.door import Door
+from server.limits import DEFAULT_LIMITS, Limits
+
+ASK_AGAIN_S = 0.25
+PATIENCE_S = 20.0
+"""For a room to have an address: to be opened, or to move."""
+
+log = logging.getLogger(__name__)
+
+
+class Ingress:
+    """Of one replica: any number of sockets, each of them one client's."""
+
+    def __init__(
+        self, places: Places, door: Door, limits: Limits = DEFAULT_LIMITS, patience_s: float = PATIENCE_S
+    ) -> None:
+        self._places = places
+        self._door = door
+        self._limits = limits
+        self._patience_s = patience_s
+        self.clients = 0
+
+    async def serve(self, websocket: WebSocket) -> None:
+        """One client, from its handshake to its end."""
+        connection = Connection(websocket, self._limits)
+        if not await connection.accept():
+            return
+        self.clients += 1
+        try:
+            if (refusal := self._door.refusal(websocket)) is not None:
+                raise refusal
+            route = route_of(await self._first_message(connection))
+            async with await self._host_of(route) as host:
+                await host.send(route.first)
+                await relay(websocket, host, route.room_id)
+        except Refusal as refused:
+            log.info("client refused", extra={"code": refused.code, "reason": refused.reason})
+            await connection.refuse(refused)
+        finally:
+            self.clients -= 1
+
+    async def _first_message(self, connection: Connection) -> ClientMessage | None:
+        try:
+            async with asyncio.timeout(self._limits.first_message_s):
+                return await connection.receive()
+        except BadMessage as bad:
+            raise Refusal(POLICY, "the first message must be hello or watch") from bad
+        except TimeoutError as late:
+            raise Refusal(POLICY, f"neither hello nor watch came within {self._limits.first_message_s:g} s") from late
+
+    async def _host_of(self, route: Route) -> ClientConnection:
+        """A connection to the room's host, waiting for a room that is opened or moves. Raises Refusal."""
+        try:
+            async with asyncio.timeout(self._patience_s):
+                while True:
+                    try:
+                        return await open_host(await self._places.find(route.room_id, route.may_open))
+                    except (NotYet, OSError, InvalidHandshake) as why:  # TimeoutError is an OSError
+                        log.debug("room %s has no host yet: %s", route.room_id, why)
+                    await asyncio.sleep(ASK_AGAIN_S)
+        except TimeoutError as late:
+            raise Refusal(TRY_LATER, "no machine has a place for this room yet: try again in a minute") from late
+        except NoPlace as none:
+            raise Refusal(TRY_LATER if route.may_open else GONE, str(none)) from none
+
+
+def create_ingress_app(ingress: Ingress, page_folder: Path = PAGE_FOLDER) -> FastAPI:
+    """The ASGI application of one replica."""
+    app = FastAPI(openapi_url=None)
+
+    @app.websocket(STREAM_PATH)
+    async def stream(websocket: WebSocket) -> None:
+        await ingress.serve(websocket)
+
+    @app.get("/healthz")
+    async def healthz() -> JSONResponse:
+        return JSONResponse({"ready": True, "clients": ingress.clients})
+
+    if (page_folder / "index.html").is_file():
+        app.mount("/", StaticFiles(directory=page_folder, html=True))
+    return app

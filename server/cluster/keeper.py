@@ -1,0 +1,75 @@
+"""Looks after the rooms of the cluster, every few seconds: closes those that nobody is in, asks for enough places."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from typing import Any
+
+import ray
+from ray.autoscaler.sdk import request_resources
+from ray.exceptions import RayError
+from ray.util.metrics import Gauge
+
+from server.cluster.capacity import Capacity
+from server.cluster.host import HostStatus
+from server.cluster.ray_places import NAMESPACE, room_names
+from server.cluster.settings import ClusterSettings
+
+EVERY_S = 2.0
+ANSWER_S = 5.0
+log = logging.getLogger(__name__)
+
+
+class Keeper:
+    """A deployment of Serve, one replica: Serve starts it anew where it fails."""
+
+    def __init__(self, settings: ClusterSettings) -> None:
+        self._settings = settings
+        self._capacity = Capacity(settings.policy)
+        self._asked = 0
+        self._rooms = Gauge("probeless_rooms", "Rooms that are open or wait for a place")
+        self._places = Gauge("probeless_places_wanted", "Places for rooms that the cluster is asked for")
+        self._age = Gauge("probeless_queue_age_seconds", "Age of frames when they are taken, mean over the rooms")
+        self._task = asyncio.get_running_loop().create_task(self._run())
+
+    def check_health(self) -> None:
+        """Asked by Serve. Raises what ended the keeper."""
+        if self._task.done():
+            self._task.result()
+
+    async def places(self) -> int:
+        """That were asked for last."""
+        return self._asked
+
+    async def _run(self) -> None:
+        while True:
+            names = await asyncio.to_thread(room_names)
+            found = await asyncio.gather(*(self._look_after(name) for name in names))
+            ages = [status.queue_age_s for status in found if status is not None and status.queue_age_s > 0]
+            await self._ask_for_places(len(names), sum(ages) / len(ages) if ages else 0.0)
+            await asyncio.sleep(EVERY_S)
+
+    async def _look_after(self, name: str) -> HostStatus | None:
+        """Its status; None of a room that waits for a place, moves, or has just been closed."""
+        with contextlib.suppress(RayError, ValueError, TimeoutError):
+            async with asyncio.timeout(ANSWER_S):
+                actor: Any = await asyncio.to_thread(ray.get_actor, name, NAMESPACE)
+                status: HostStatus = await actor.status.remote()
+                if status.clients == 0 and status.idle_s > self._settings.close_after_s:
+                    log.info("%s is closed: nobody is in it", name)
+                    actor.leave.remote()
+                    return None
+                return status
+        return None
+
+    async def _ask_for_places(self, rooms: int, queue_age_s: float) -> None:
+        wanted = self._capacity.wanted(time.monotonic(), rooms, queue_age_s)
+        self._rooms.set(rooms)
+        self._places.set(wanted)
+        self._age.set(queue_age_s)
+        if wanted != self._asked:
+            await asyncio.to_thread(request_resources, bundles=[dict(self._settings.place)] * wanted)
+            self._asked = wanted

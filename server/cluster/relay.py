@@ -1,0 +1,86 @@
+"""Bytes of one client to its room's host and back, endings included."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+
+from fastapi import WebSocket, WebSocketDisconnect
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed
+from websockets.protocol import State
+from websockets.typing import Subprotocol
+
+from protocol.limits import MAX_MESSAGE_BYTES, SUBPROTOCOL
+from server.cluster.places import Address
+from server.cluster.routing import outgoing
+from server.connection import GOING_AWAY, INTERNAL, LOST, NO_CODE, NORMAL, RESTART
+
+STREAM_PATH = "/v1/stream"
+OPEN_PATIENCE_S = 5.0
+PING_S, PING_PATIENCE_S = 5.0, 10.0
+"""A machine that has gone without a word is given up after both."""
+MOVED = "the machine of this room has gone, the room moves to another one: come again"
+
+
+async def open_host(address: Address) -> ClientConnection:
+    """Raises OSError, TimeoutError, websockets' InvalidHandshake."""
+    return await connect(
+        address.url + STREAM_PATH,
+        additional_headers={"Authorization": f"Bearer {address.token}"},
+        subprotocols=[Subprotocol(SUBPROTOCOL)],
+        compression=None,
+        max_size=None,
+        max_queue=2,
+        open_timeout=OPEN_PATIENCE_S,
+        ping_interval=PING_S,
+        ping_timeout=PING_PATIENCE_S,
+        proxy=None,
+    )
+
+
+async def relay(client: WebSocket, host: ClientConnection, room_id: str) -> None:
+    """Until either of them has ended, and then the other one likewise."""
+    up = asyncio.create_task(_client_to_host(client, host))
+    down = asyncio.create_task(_host_to_client(client, host, room_id))
+    try:
+        await asyncio.wait((up, down), return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in (up, down):
+            task.cancel()
+        ended = await asyncio.gather(up, down, return_exceptions=True)
+    if host.state is not State.CLOSED:
+        host.transport.abort()  # without a close frame: to the host its client is lost, not gone
+    for error in ended:
+        if isinstance(error, Exception):
+            raise error
+
+
+async def _client_to_host(client: WebSocket, host: ClientConnection) -> None:
+    while True:
+        event = await client.receive()
+        if event["type"] == "websocket.disconnect":
+            code = event.get("code", LOST)
+            if code in (NORMAL, GOING_AWAY):  # NO_CODE is what uvicorn says of a connection that broke, too
+                await host.close(code)
+            return
+        data = event.get("bytes")
+        if data is not None and len(data) > MAX_MESSAGE_BYTES:
+            data = data[: MAX_MESSAGE_BYTES + 1]  # enough for the host to refuse it
+        with contextlib.suppress(ConnectionClosed):  # the other direction ends it, with the reason
+            await host.send(event["text"] if data is None else data)
+
+
+async def _host_to_client(client: WebSocket, host: ClientConnection, room_id: str) -> None:
+    try:
+        while True:
+            data = await host.recv(decode=False)
+            await client.send_bytes(outgoing(data, room_id))
+    except ConnectionClosed as closed:
+        code, reason = (RESTART, MOVED) if closed.rcvd is None else (closed.rcvd.code, closed.rcvd.reason)
+        if closed.rcvd is not None and code in (NO_CODE, LOST):
+            code = INTERNAL
+        with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # the client was faster
+            await client.close(code, reason)
+    except (RuntimeError, WebSocketDisconnect):
+        pass  # the client has gone, which the other direction hears of too

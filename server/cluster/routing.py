@@ -1,0 +1,81 @@
+"""Which room a client belongs to, read from its first message; and names that carry that on to its next connection.
+
+A room's host is an ordinary service that knows nothing of the others: what it calls a session or a key is made unique
+by the room's id in front, on the way out, and is told apart again on the way in.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import secrets
+from dataclasses import dataclass
+
+import msgspec
+from msgspec import structs
+
+from protocol.codec import decode_server, encode
+from protocol.messages import ClientMessage, Hello, Watch, Welcome
+from server.connection import GONE, POLICY, Refusal
+
+ID_BYTES = 8
+_OWN = re.compile(rf"([0-9a-f]{{{2 * ID_BYTES}}})\.(.+)")
+SMALL_BYTES = 4096
+"""A welcome is smaller."""
+
+
+@dataclass(frozen=True)
+class Route:
+    """Where a client goes, and what it says there first."""
+
+    room_id: str
+    first: bytes
+    may_open: bool
+    """Whether the room is opened where it is not: not for those who come back to a session."""
+
+
+class _Tag(msgspec.Struct):
+    type: str
+
+
+def room_id_of(name: str) -> str:
+    """Of a room with a name: the same for everybody who names it."""
+    return hashlib.blake2b(name.encode("utf-8", "surrogatepass"), digest_size=ID_BYTES).hexdigest()
+
+
+def route_of(first: ClientMessage | None) -> Route:
+    """Raises Refusal for a first message that leads nowhere."""
+    match first:
+        case Hello(resume=str(key)):
+            room_id, own = _split(key, Refusal(GONE, "there is no session of that key: it ended"))
+            return Route(room_id, encode(structs.replace(first, resume=own)), may_open=False)
+        case Hello(room=None):
+            return Route(secrets.token_hex(ID_BYTES), encode(first), may_open=True)
+        case Hello(room=str(name)):
+            return Route(room_id_of(name), encode(first), may_open=True)
+        case Watch(session=str(session)):
+            room_id, own = _split(session, Refusal(GONE, f"there is no session {session[:80]!r}"))
+            return Route(room_id, encode(structs.replace(first, session=own)), may_open=False)
+        case Watch(room=str(name)):
+            return Route(room_id_of(name), encode(first), may_open=True)
+        case Watch():
+            raise Refusal(POLICY, "this server has many rooms: say which one, or which session, you want to watch")
+        case _:
+            raise Refusal(POLICY, "the first message must be hello or watch")
+
+
+def outgoing(data: bytes, room_id: str) -> bytes:
+    """A host's message as clients get it: names in a welcome are made unique, all else stays as it is."""
+    if len(data) > SMALL_BYTES or msgspec.msgpack.decode(data, type=_Tag).type != "welcome":
+        return data
+    welcome = decode_server(data)
+    assert isinstance(welcome, Welcome)
+    key = None if welcome.key is None else f"{room_id}.{welcome.key}"
+    return encode(structs.replace(welcome, session=f"{room_id}.{welcome.session}", key=key))
+
+
+def _split(name: str, refusal: Refusal) -> tuple[str, str]:
+    found = _OWN.fullmatch(name)
+    if found is None:
+        raise refusal
+    return found.group(1), found.group(2)

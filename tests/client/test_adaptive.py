@@ -1,0 +1,163 @@
+"""What the client sends over links that it does not know, simulated: rate, delay and computing, without a clock."""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass, field
+from itertools import pairwise
+from statistics import median
+
+import pytest
+
+from client.adaptive import LADDER, Adaptive, Measured
+
+FPS = 15
+DEPTH_BYTES = 80_000
+COLOR_BYTES = (60_000, 43_000, 33_000, 23_000, 13_000, 9_000, 4_000)
+"""About what the kitchen takes, by rung."""
+ANSWER_BYTES = 40_000
+
+
+@dataclass
+class Link:
+    """A link and a server: each way and the server take one frame at a time, in order."""
+
+    bytes_per_s: float
+    delay_s: float = 0.02
+    computed_s: float = 0.02
+    overhead_s: float = 0.0
+    up_free_s: float = 0.0
+    server_free_s: float = 0.0
+    down_free_s: float = 0.0
+    ages_s: list[float] = field(default_factory=list)
+    """Of each answered frame, from its capture."""
+
+    def send(self, sent_s: float, size: int) -> Measured:
+        arrived_s = max(sent_s, self.up_free_s) + size / self.bytes_per_s
+        self.up_free_s = arrived_s
+        done_s = max(arrived_s + self.delay_s, self.server_free_s) + self.computed_s + self.overhead_s
+        self.server_free_s = done_s
+        self.down_free_s = max(done_s, self.down_free_s) + ANSWER_BYTES / self.bytes_per_s
+        return Measured(sent_s, self.down_free_s + self.delay_s, self.computed_s, size, ANSWER_BYTES)
+
+
+def stream(adaptive: Adaptive, link: Link, seconds: float, start_s: float = 0.0, color: tuple = COLOR_BYTES) -> list:
+    """Send for a time; the frames' records. The camera's newest frame is never older than a frame's time."""
+    now_s, last_s = start_s, -1e9
+    under_way: list[tuple[float, Measured]] = []
+    done = []
+    while now_s < start_s + seconds:
+        now_s += 0.001
+        while under_way and under_way[0][0] <= now_s:
+            _, frame = heapq.heappop(under_way)
+            adaptive.note(frame)
+            done.append(frame)
+            link.ages_s.append(frame.answered_s - frame.sent_s)
+        if adaptive.may_send(now_s, last_s, len(under_way)) and now_s - last_s >= 1 / FPS:
+            assert len(under_way) < 2
+            frame = link.send(now_s, color[adaptive.rung] + DEPTH_BYTES)
+            heapq.heappush(under_way, (frame.answered_s, frame))
+            last_s = now_s
+    return done
+
+
+def test_a_link_that_carries_all_gets_the_best_at_the_full_rate() -> None:
+    adaptive, link = Adaptive(1 / FPS), Link(100e6 / 8)
+    done = stream(adaptive, link, 10)
+    assert adaptive.rung == 0
+    assert len(done) > 0.95 * 10 * FPS
+
+
+def test_a_slow_link_gets_fewer_bytes_and_nothing_waits() -> None:
+    adaptive, link = Adaptive(1 / FPS, delay_s=0.04), Link(12e6 / 8)
+    done = stream(adaptive, link, 30)
+    assert adaptive.rung > 0
+    transfer_s = (done[-1].bytes_up + ANSWER_BYTES) / link.bytes_per_s
+    assert median(link.ages_s[-50:]) < 2 * link.delay_s + link.computed_s + 1.3 * transfer_s
+    assert max(link.ages_s[-50:]) < 0.35
+    full = Link(12e6 / 8)
+    held = stream(_Fixed(), full, 30)
+    assert len(done) > 1.15 * len(held)
+
+
+class _Fixed(Adaptive):
+    """Sends the best whenever the window has room."""
+
+    def __init__(self) -> None:
+        super().__init__(1 / FPS)
+
+    def may_send(self, _now_s: float, _last_sent_s: float, unanswered: int) -> bool:
+        return unanswered < 2
+
+    def note(self, _frame: Measured) -> None: ...
+
+
+def test_pacing_keeps_frames_younger_than_the_window_does() -> None:
+    paced, filled = Link(6e6 / 8), Link(6e6 / 8)
+    adaptive = Adaptive(1 / FPS, delay_s=0.04)
+    stream(adaptive, paced, 30)
+    stream(_Fixed(), filled, 30)
+    assert median(paced.ages_s) < 0.75 * median(filled.ages_s)
+
+
+def test_a_link_that_eases_is_found_out() -> None:
+    adaptive, link = Adaptive(1 / FPS, delay_s=0.04), Link(8e6 / 8)
+    stream(adaptive, link, 20)
+    low = adaptive.rung
+    link.bytes_per_s = 100e6 / 8
+    stream(adaptive, link, 30, start_s=20)
+    assert low >= 2
+    assert adaptive.rung == 0
+
+
+def test_a_rung_that_is_too_heavy_is_tried_ever_more_rarely() -> None:
+    adaptive, link = Adaptive(1 / FPS, delay_s=0.04), Link(14.5e6 / 8)
+    rungs = []
+    for second in range(120):
+        stream(adaptive, link, 1, start_s=second)
+        rungs.append(adaptive.rung)
+    changes = [sum(a != b for a, b in pairwise(part)) for part in (rungs[:60], rungs[60:])]
+    assert changes[1] <= max(changes[0], 8)
+
+
+def test_a_slow_server_is_no_reason_for_worse_pictures() -> None:
+    adaptive, link = Adaptive(1 / FPS, delay_s=0.04), Link(100e6 / 8, computed_s=0.3)
+    done = stream(adaptive, link, 20)
+    assert adaptive.rung == 0
+    assert len(done) > 0.9 * 20 / 0.3
+    assert median(link.ages_s[-20:]) < 0.3 + 0.04 + 0.1 + 0.3 * 0.5
+
+
+def test_frames_do_not_queue_at_a_server_that_takes_longer_than_it_says() -> None:
+    adaptive, link = Adaptive(1 / FPS, delay_s=0.04), Link(100e6 / 8, computed_s=0.3)
+    link.overhead_s = 0.04  # of decoding and the like, not part of what it tells
+    stream(adaptive, link, 30)
+    assert median(link.ages_s[-20:]) < 0.34 + 0.04 + 0.02 + 0.1
+
+
+def test_distance_is_no_reason_for_worse_pictures() -> None:
+    adaptive, link = Adaptive(1 / FPS, delay_s=0.2), Link(100e6 / 8, delay_s=0.1)
+    done = stream(adaptive, link, 10)
+    assert adaptive.rung == 0
+    assert len(done) >= 0.55 * 10 * FPS  # the window holds two
+
+
+def test_throughput_is_told() -> None:
+    adaptive, link = Adaptive(1 / FPS, delay_s=0.04), Link(8e6 / 8)
+    assert adaptive.bytes_per_s is None
+    stream(adaptive, link, 10)
+    assert adaptive.bytes_per_s == pytest.approx(1e6, rel=0.35)
+
+
+def test_after_a_lost_connection_it_begins_a_rung_lower() -> None:
+    adaptive = Adaptive(1 / FPS)
+    adaptive.note_lost()
+    assert adaptive.rung == 1
+    for _ in range(20):
+        adaptive.note_lost()
+    assert adaptive.rung == len(LADDER) - 1
+
+
+def test_the_wish_for_rounded_depth_is_on_every_rung() -> None:
+    assert Adaptive(1 / FPS, depth_noise_per_m=0.003).coding.depth_noise_per_m == 0.003
+    assert all(rung.depth_noise_per_m is None for rung in LADDER)

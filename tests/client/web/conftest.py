@@ -1,0 +1,79 @@
+"""Fixtures: Debian's Chromium, a page in it, and where its pictures are kept."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+
+HERE = Path(__file__).parent
+PICTURES = HERE.parents[2] / "out" / "web"
+EXPECTED = "PROBELESS_EXPECT_CHROMIUM"
+PATIENCE_MS = 30_000
+FLAGS = (
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--use-fake-ui-for-media-stream",
+    "--use-fake-device-for-media-stream",
+)
+
+OpenPage = Callable[..., Page]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """Chromium without a window. With PROBELESS_EXPECT_CHROMIUM set, as in CI, there must be one."""
+    path = shutil.which("chromium")
+    if path is None:
+        assert EXPECTED not in os.environ, "there is no chromium: apt-get install chromium"
+        pytest.skip("there is no chromium: apt-get install chromium")
+    own = ["--no-sandbox"] if os.geteuid() == 0 else []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=[*FLAGS, *own])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def open_page(browser: Browser) -> Iterator[OpenPage]:
+    """Open a URL, with a device of WebXR where `device` says what it shows; faults of the page fail the test."""
+    faults: list[str] = []
+    contexts = []
+
+    def open_(url: str, device: dict | None = None, size: tuple[int, int] = (360, 640)) -> Page:
+        context = browser.new_context(viewport={"width": size[0], "height": size[1]}, has_touch=True)
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(PATIENCE_MS)
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        if device is not None:
+            page.add_init_script(path=HERE / "device.js")
+        page.goto(url)
+        if device is not None:
+            page.evaluate("given => device.load(given)", device)
+        return page
+
+    yield open_
+    for context in contexts:
+        context.close()
+    assert not faults
+
+
+@pytest.fixture
+def keep_picture() -> Callable[[Page, str], None]:
+    """Keep what a page looks like."""
+
+    def keep(page: Page, name: str) -> None:
+        PICTURES.mkdir(parents=True, exist_ok=True)
+        page.screenshot(path=PICTURES / f"{name}.png")
+
+    return keep
+
+
+def wait_for_text(page: Page, selector: str, text: str) -> None:
+    """Until the element says it."""
+    page.locator(selector).filter(has_text=text).first.wait_for(state="attached")

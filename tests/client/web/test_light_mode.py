@@ -1,0 +1,162 @@
+"""Light mode: the server answers with light alone, and three.js draws in the browser what our own renderer would."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+import trimesh
+from msgspec import structs
+from numpy.typing import NDArray
+from playwright.sync_api import Page
+
+from protocol.frames import CameraModel, RgbdFrame
+from protocol.messages import Hello, Light, Welcome, Wishes
+from server.maths.sh import lambert_transfer
+from server.opencl.device import Device
+from server.pipeline import Pipeline
+from server.scene.mesh import load_mesh
+from server.scene.placement import Placement
+from server.serve import BackgroundServer, start_in_background
+from server.service import Service
+from tests.client.web.conftest import OpenPage, wait_for_text
+from tests.client.web.sequence import FLIP, of_device
+from tests.client.web.test_capture import Received, start_capture
+from tests.service import fakes
+from tests.service.fakes import FAKE_DEVICE, FakeResult, fake_mesh
+from tests.service.wire import Wire
+
+CAMERA = CameraModel(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
+TOUCHED = (79.5, 74.5)
+DEPTH_M, RADIUS_M = 0.6, 0.08
+SH = np.zeros((16, 3))
+SH[:9] = np.outer([2.0, 0.5, 0.4, -0.3, 0.15, -0.1, 0.12, 0.2, -0.15], [1.0, 0.9, 0.8])
+TOLERANCE = 0.02
+
+
+class _Lit(fakes.FakePipeline):
+    """A pipeline that finds this light."""
+
+    def process(self, frame: RgbdFrame) -> FakeResult:
+        result = super().process(frame)
+        light = structs.replace(result.light, sh=tuple(map(tuple, SH.tolist())))
+        return dataclasses.replace(result, light=light)
+
+
+@pytest.fixture
+def received() -> Received:
+    return Received()
+
+
+@pytest.fixture
+def server(received: Received) -> Iterator[BackgroundServer]:
+    def build(_device: object, _camera: CameraModel, wishes: Wishes, *_room: object) -> _Lit:
+        received.wishes.append(wishes)
+        return _Lit(received.lab)
+
+    with start_in_background(Service(FAKE_DEVICE, pipeline_factory=build, mesh_loader=fake_mesh)) as server:
+        yield server
+
+
+def plane() -> RgbdFrame:
+    """A wall across the view of a camera that stands in the origin, by WebXR's axes."""
+    depth = np.full((CAMERA.height, CAMERA.width), round(DEPTH_M * 1000), np.uint16)
+    return RgbdFrame(0, 0.0, np.full((*depth.shape, 3), 90, np.uint8), depth, FLIP)
+
+
+def foot() -> NDArray[np.float64]:
+    """Where the ball stands that is placed by a touch."""
+    u, v = TOUCHED
+    return np.array([(u - CAMERA.cx) / CAMERA.fx, (CAMERA.cy - v) / CAMERA.fy, -1.0]) * DEPTH_M
+
+
+def ball_normals() -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """World normals [height, width, 3] of the ball, and where it is seen well within its outline."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (CAMERA.cy - v) / CAMERA.fy, -np.ones(u.shape)], axis=-1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    centre = foot() + np.array([0.0, RADIUS_M, 0.0])
+    along = rays @ centre
+    inside = along**2 - centre @ centre + RADIUS_M**2
+    normals = (rays * (along - np.sqrt(np.maximum(inside, 0)))[..., None] - centre) / RADIUS_M
+    return normals, (inside > 0) & ((-rays * normals).sum(axis=-1) > 0.35)
+
+
+def linear(srgb: NDArray[np.uint8]) -> NDArray[np.float64]:
+    value = srgb / 255.0
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def drawn(page: Page) -> NDArray[np.uint8]:
+    """[height, width, 4] of what was drawn over the room."""
+    text = page.evaluate("() => btoa(device.seen.reduce((text, value) => text + String.fromCharCode(value), ''))")
+    return np.frombuffer(base64.b64decode(text), np.uint8).reshape(CAMERA.height, CAMERA.width, 4)[::-1]
+
+
+def test_three_js_shades_a_white_ball_as_we_do_and_no_picture_is_sent(
+    server: BackgroundServer,
+    received: Received,
+    device: Device,
+    open_page: OpenPage,
+    keep_picture: Callable[[Page, str], None],
+) -> None:
+    page = open_page(server.url, of_device(CAMERA, [plane()], loops=True))
+    page.locator("input[value=xr]").check()
+    page.locator("[name=answer]").select_option("light")
+    start_capture(page)
+    wait_for_text(page, "#state", "Live, captured here")
+    assert received.wishes[0].answer == "light"
+    page.locator("#model").select_option("Ball")
+    page.locator("#place").click()
+    box = page.locator("#picture").bounding_box()
+    scale = min(box["width"] / CAMERA.width, box["height"] / CAMERA.height)
+    u, v = TOUCHED
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.touchscreen.tap(middle[0] + scale * (u - CAMERA.cx), middle[1] + scale * (v - CAMERA.cy))
+    page.wait_for_function("() => device.seen?.some((value, i) => i % 4 === 3 && value > 0)")
+    keep_picture(page, "light_mode")
+    shown = drawn(page)
+    normals, seen = ball_normals()
+    expected = lambert_transfer(normals, 4) @ SH
+    assert seen.sum() > 500
+    assert (shown[seen, 3] == 255).all()
+    assert np.abs(linear(shown[..., :3]) / expected - 1)[seen].max() < TOLERANCE
+    assert (shown[0, :, 3] == 0).all()  # the room is seen beside it
+    assert not any(entry[0] == "place" for entry in received.lab.log)
+
+    ours = our_picture(device)
+    assert np.abs(linear(shown[..., :3]) / linear(ours) - 1)[seen].max() < TOLERANCE
+
+
+def our_picture(device: Device) -> NDArray[np.uint8]:
+    """The same ball by our own renderer, in the same light, with next to nothing of a room around it."""
+    wishes = Wishes(
+        light=tuple(map(tuple, SH.tolist())), tone_mapping="light", edges="hard", up=(0.0, 1.0, 0.0), indirect="none"
+    )
+    pipeline = Pipeline(device, CAMERA, wishes)
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS_M)
+    ball.visual.vertex_colors = [255, 255, 255, 255]
+    _ = ball.vertex_normals  # exported with it
+    data = trimesh.Scene(ball).export(file_type="glb")
+    pipeline.place_object("ball", load_mesh(data, "glb"), Placement(tuple(foot().tolist())))
+    frame = plane()
+    frame.depth[:-20], frame.depth[-20:] = 0, 3000
+    try:
+        return pipeline.process(frame).color
+    finally:
+        pipeline.close()
+
+
+def test_a_session_that_wants_light_alone_gets_no_composites(server: BackgroundServer) -> None:
+    wire = Wire(server.url)
+    wire.say(Hello(client="test", camera=fakes.CAMERA, wishes=Wishes(answer="light")))
+    assert isinstance(wire.hear(), Welcome)
+    for index in range(3):
+        wire.say(fakes.frame_message(index))
+        answer = wire.hear()
+        assert isinstance(answer, Light)
+        assert answer.frame == index
+    wire.hang_up()

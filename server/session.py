@@ -12,7 +12,7 @@ from msgspec import structs
 from protocol.codec import encode
 from protocol.messages import Bye, ClientMessage, Dropped, Error, Frame, Hello, Watch, Welcome
 from server.broadcast import Broadcast
-from server.connection import INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
+from server.connection import GONE, INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
 from server.mailbox import Mailbox
 from server.worker import Worker, Workshop
 
@@ -123,6 +123,7 @@ class CaptureSession:
         self._worker = Worker(workshop, hello, self._mailbox, outlet)
         self._returned: asyncio.Future[Connection] | None = None
         """While the connection is lost: the one by which the client comes back."""
+        self._has_ended = False
         self._done_with: dict[Connection, asyncio.Event] = {}
         """Connections that resumed this session, and whether it has no more use for them."""
 
@@ -140,6 +141,7 @@ class CaptureSession:
             ended, other = (work, read) if work.done() else (read, work)
             await self._end(ended)
         finally:
+            self._has_ended = True
             self._mailbox.close()
             self._outlet.close()
             read.cancel()
@@ -151,14 +153,16 @@ class CaptureSession:
     async def resume(self, connection: Connection) -> None:
         """Go on with a client that is back by another connection. Returns when that is not needed any more.
 
-        Where the old connection has not been found lost yet, it is now.
+        Where the old connection has not been found lost yet, it is now. Raises Refusal where the session is ending.
         """
         self._done_with[connection] = asyncio.Event()
         if self._returned is None or self._returned.done():
             self._connection.is_lost = True
             await self._connection.close(POLICY, "the client has resumed its session by another connection")
-            while self._returned is None or self._returned.done():
+            while not self._has_ended and (self._returned is None or self._returned.done()):
                 await asyncio.sleep(0.01)
+        if self._has_ended or self._returned is None or self._returned.done():
+            raise Refusal(GONE, "the session has just ended")
         self._returned.set_result(connection)
         await self._done_with[connection].wait()
 

@@ -11,7 +11,6 @@ namespaces, limits.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import re
 import shutil
@@ -85,7 +84,6 @@ def use(image: Image, root: Path) -> None:
         say(f"healthy after {time.perf_counter() - began:.1f} s: {health}")
         say(f"runs as {owner(server.pid)}, may write: {writable(as_user, folder)}")
         stream(port)
-        say(f"health says {json.loads(health)['device']}")
     finally:
         server.terminate()
         began = time.perf_counter()

@@ -11,7 +11,7 @@ import pytest
 
 from client.client import Answer, ClientError, StreamClient
 from protocol.messages import Acknowledged, Composite, Dropped, Hello, MoveObject, PlaceObject, Welcome, Wishes
-from tests.service.fakes import CAMERA, PATIENCE_S, Lab, frame_message, rgbd_frame
+from tests.service.fakes import CAMERA, EXPLODE_MM, PATIENCE_S, Lab, frame_message, rgbd_frame
 from tests.service.proxy import Proxy, impaired
 from tests.service.wire import Wire
 
@@ -201,3 +201,17 @@ def test_a_server_that_leaves_does_not_wait_for_a_client_that_is_away(server, pr
     server.stop()
     assert lab.closed.is_set()
     assert time.monotonic() - started < 20.0  # that is for how long the session would be kept
+
+
+def test_a_session_that_is_ending_is_not_resumed(server, lab: Lab) -> None:
+    """The worker fails while the client is on its way back: it is told so, and not left waiting."""
+    old = Wire(server.url)
+    key = greet(old).key
+    lab.hold = True
+    old.say(frame_message(0, EXPLODE_MM))
+    lab.next_entered()
+    new = Wire(server.url)
+    new.say(Hello(client="test", camera=CAMERA, resume=key))
+    lab.release(5)
+    code, _, _ = new.ending()
+    assert code in (1011, 4410)

@@ -8,8 +8,8 @@ from protocol.recording import read_messages
 from tests.service.proxy import impaired
 from tests.service.test_stream import FakeSource, quietly
 
-BYTES_PER_S = 30_000
-"""A frame at full quality takes about 5 kB: five a second, of thirty."""
+BYTES_PER_S = 60_000
+"""A frame at full quality takes about 5 kB: twelve a second, of sixty."""
 
 
 def sent_frames(record: Path) -> list[Frame]:
@@ -17,12 +17,12 @@ def sent_frames(record: Path) -> list[Frame]:
 
 
 def test_a_slow_link_gets_smaller_pictures_and_exact_depth(server, tmp_path: Path) -> None:
-    source = FakeSource(90, fps=30.0)
+    source = FakeSource(180, fps=60.0)
     with impaired(server.url, delay_s=0.01, bytes_per_s=BYTES_PER_S) as link:
         summary = quietly(source, link.url, record=tmp_path / "r")
     frames = sent_frames(tmp_path / "r")
     assert (summary.sent, summary.answered) == (len(frames), len(frames))
-    assert summary.skipped == 90 - len(frames) > 0
+    assert summary.skipped == 180 - len(frames) > 0
     assert len(frames[-1].color.data) < 0.6 * len(frames[0].color.data)
     assert frames[-1].color.width < frames[0].color.width == source.camera.width
     assert all(frame.depth.rounded_per_m is None for frame in frames)

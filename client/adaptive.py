@@ -25,18 +25,17 @@ LADDER = (
     Coding(50, depth_level=9),
     Coding(75, 2, depth_level=9),
     Coding(50, 2, depth_level=9),
-    Coding(50, 4, depth_level=9),
 )
 """From the best to the cheapest. Depth is exact on every rung, or rounded as asked for."""
 SHARE = 0.9
-"""Of the time between frames that transfer may take."""
+"""Of the time between frames that the busier way may take."""
 SMOOTHING = 0.25
 """Weight of the newest measurement."""
 BAD_ANSWERS = 2
 """So many frames in a row that took too long: one rung down."""
 GOOD_ANSWERS, MOST_GOOD_ANSWERS = 8, 128
 """So many in a row with time to spare: one up. Doubled each time that it was wrong."""
-SPARE = 0.55
+SPARE = 0.8
 """A rung up is tried where transfer takes less than this share of what it may."""
 WINDOW = 32
 
@@ -74,6 +73,7 @@ class Adaptive:
         self._patience = GOOD_ANSWERS
         self._climbed = False
         self._told = 0
+        self._stepped_s = -math.inf
 
     @property
     def rung(self) -> int:
@@ -94,8 +94,7 @@ class Adaptive:
     @property
     def busy_s(self) -> float:
         """Of the slowest stage that a frame passes: the next one would wait there. Stages overlap and do not add."""
-        total = max(self._bytes_up + self._bytes_down, 1.0)
-        one_way_s = self._transfer_s * max(self._bytes_up, self._bytes_down) / total
+        one_way_s = self._transfer_s * _greater_share(self._bytes_up, self._bytes_down)
         return max(self._computed_s, one_way_s)
 
     def may_send(self, now_s: float, last_sent_s: float, unanswered: int) -> bool:
@@ -119,29 +118,36 @@ class Adaptive:
         self._transfer_s += weight * (transfer_s - self._transfer_s)
         self._bytes_up += weight * (frame.bytes_up - self._bytes_up)
         self._bytes_down += weight * (frame.bytes_down - self._bytes_down)
-        self._choose(transfer_s)
+        if frame.sent_s >= self._stepped_s:  # those that were under way then tell of the rung before
+            self._choose(transfer_s * _greater_share(frame.bytes_up, frame.bytes_down), frame.answered_s)
 
     def note_lost(self) -> None:
         """The connection was restored: what was measured before says nothing of it, and a rung down is safe."""
         self._ways.clear()
         self._last_answer_s = -math.inf
-        self._step(+1)
+        self._step(+1, -math.inf)
 
-    def _choose(self, transfer_s: float) -> None:
+    def _choose(self, one_way_s: float, now_s: float) -> None:
         most_s = SHARE * max(self._wanted_s, self._computed_s)
-        self._bad = self._bad + 1 if transfer_s > most_s else 0
-        self._good = self._good + 1 if transfer_s < SPARE * most_s else 0
+        self._bad = self._bad + 1 if one_way_s > most_s else 0
+        self._good = self._good + 1 if one_way_s < SPARE * most_s else 0
         if self._bad >= BAD_ANSWERS:
             if self._climbed:
                 self._patience = min(2 * self._patience, MOST_GOOD_ANSWERS)
-            self._step(+1)
+            self._step(+1, now_s)
         elif self._good >= self._patience:
             if self._climbed:  # the last step up has held
                 self._patience = GOOD_ANSWERS
-            self._step(-1)
+            self._step(-1, now_s)
             self._climbed = True
 
-    def _step(self, down: int) -> None:
+    def _step(self, down: int, now_s: float) -> None:
         self._rung = min(max(self._rung + down, 0), len(LADDER) - 1)
         self._bad = self._good = 0
         self._climbed = False
+        self._stepped_s = now_s
+
+
+def _greater_share(up: float, down: float) -> float:
+    """Of both ways' bytes, that of the busier one: the ways carry at the same time."""
+    return max(up, down) / max(up + down, 1.0)

@@ -18,7 +18,7 @@ DENOISE = ("none", "bilateral", "tv_l1")
 ROBUSTNESS = get_args(RobustnessName)
 
 SourceArgument = Annotated[
-    str, typer.Argument(metavar="SOURCE", help="data-set folder, synthetic:NAME, recording or oak")
+    str, typer.Argument(metavar="SOURCE", help="data-set folder, synthetic:NAME, recording or oak[?vio=off]")
 ]
 Frames = Annotated[str | None, typer.Option(metavar="A:B", help="half-open range of positions in the source")]
 PosesOption = Annotated[

@@ -22,6 +22,7 @@ from client.laptop.stream_figures import STAGES, StreamFigures
 from protocol.messages import Composite, Light
 
 PICTURE_COLUMNS = 80
+TABLE_ROWS = 14
 REFRESH_HZ = 4
 LABELS = {
     "encode": "captured to sent",
@@ -65,7 +66,7 @@ class StreamView:
         self._now_s, self._light, self._composite = now_s, light, composite
         self._coding, self._reconnected = coding, reconnected
         if picture is not None and self.wants_pictures:
-            self._picture = half_blocks(picture, min(PICTURE_COLUMNS, self._live.console.width))
+            self._picture = half_blocks(picture, self._columns(picture))
 
     def render(self) -> RenderableType:
         """All of it."""
@@ -85,6 +86,11 @@ class StreamView:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._live.stop()
+
+    def _columns(self, picture: NDArray[np.uint8]) -> int:
+        """As many as leave room for the table below."""
+        rows = max(self._live.console.height - TABLE_ROWS, 4)
+        return max(min(PICTURE_COLUMNS, self._live.console.width, 2 * rows * picture.shape[1] // picture.shape[0]), 8)
 
     def _table(self, light: Light, composite: Composite) -> Table:
         table = Table.grid(padding=(0, 2))
@@ -107,7 +113,7 @@ def light_line(light: Light) -> str:
     """Where the light comes from, in words and numbers."""
     x, y, z = light.dominant_direction
     sure = "" if light.valid else ", not fixed by the pictures so far"
-    lamps = f", {len(light.lamps)} lamps" if light.lamps else ""
+    lamps = f", lamps in the room: {len(light.lamps)}" if light.lamps else ""
     return f"from ({x:+.2f}, {y:+.2f}, {z:+.2f}), intensity {light.dominant_intensity:.2g}{lamps}{sure}"
 
 

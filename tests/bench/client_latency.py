@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from urllib.parse import parse_qs, urlsplit
@@ -12,9 +13,10 @@ import msgspec
 from rich.console import Console
 
 from client.client import Access
-from client.laptop.source import open_source
+from client.laptop.source import Source, open_source
 from client.laptop.stream import Sending, StreamSummary, stream
 from client.laptop.stream_figures import STAGES
+from protocol.frames import RgbdFrame
 from server.evaluation.report import Row
 from tests.bench.client_bandwidth import KITCHEN
 from tests.bench.light_runs import wishes_for
@@ -32,11 +34,28 @@ NAMES = {
 }
 
 
+class ThereAndBack:
+    """A source played forwards and backwards for as long as is wanted: the camera never jumps."""
+
+    def __init__(self, source: Source, count: int) -> None:
+        self._source, self._count = source, count
+        self.name, self.camera, self.fps = source.name, source.camera, source.fps
+        self.has_poses, self.up = source.has_poses, source.up
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: int) -> RgbdFrame:
+        last = len(self._source) - 1
+        place = last - abs(index % (2 * last) - last)
+        return replace(self._source[place], index=index, timestamp_s=index / self.fps)
+
+
 def latency_rows(count: int, say: Callable[[str], None]) -> list[Row]:
     """Of the kitchen at its own rate, `count` frames of it, GR15FAST."""
     rows: list[Row] = []
     with TemporaryDirectory() as folder, serving(Path(folder) / "log") as served:
-        _measure(served.url, min(count, 10), Sending())  # compiles
+        _measure(served.url, min(count, 30), Sending())  # compiles
         say(f"latency on loopback, {count} frames")
         rows += _rows("loopback", _measure(served.url, count, Sending()))
         for name, sending in {"adaptive": Sending(), "fixed": Sending(adapts=False)}.items():
@@ -52,11 +71,10 @@ def _measure(url: str, count: int, sending: Sending) -> StreamSummary:
     wishes = msgspec.structs.replace(wishes_for(source, range(len(source))), preset="gr15fast")
     with TemporaryDirectory() as out:
         return stream(
-            source,
+            ThereAndBack(source, count),
             url,
             wishes=wishes,
             out=Path(out),
-            frames=range(count),
             access=Access(),
             sending=sending,
             console=Console(file=io.StringIO()),

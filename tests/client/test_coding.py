@@ -75,6 +75,9 @@ def test_no_depth_moves_further_than_the_bound(noise_per_m: float, scale_m: floa
     if wide.any():  # where steps are wider than units there are fewer values than before
         assert len(np.unique(rounded[wide])) < 0.5 * wide.sum()
         assert moved_m[wide].max() > 0.5 * noise_per_m
+    if 2 * noise_per_m * 2**2 > 4 * scale_m:
+        metres = rounded[(z > 2) & (z < 4)] * scale_m
+        assert len(np.unique(metres)) < 1.8 * (1 / 2 - 1 / 4) / (2 * noise_per_m)
 
 
 def test_the_wire_says_by_how_much_depth_was_rounded() -> None:

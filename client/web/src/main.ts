@@ -13,7 +13,7 @@ import { Panels } from "./panels";
 import { fitPicture, markPicture, showPicture } from "./picture";
 import type { Light, ServerMessage } from "./protocol";
 import { Remote } from "./remote";
-import type { FromWorker } from "./worker_messages";
+import type { News } from "./worker_messages";
 
 const QUIET_AFTER_MS = 3000;
 const REFRESH_MS = 250;
@@ -36,7 +36,7 @@ let retryAt_ms = 0;
 let welcomes = 0;
 let told = "";
 
-function receive(message: FromWorker): void {
+function receive(message: News): void {
   switch (message.kind) {
     case "state":
       connection = message.state;

@@ -2,7 +2,7 @@
 
 import type { Captured } from "./capture/source";
 import type { Request, Setup } from "./capture/stream";
-import type { FromWorker, ToWorker } from "./worker_messages";
+import type { FromWorker, News, ToWorker } from "./worker_messages";
 import type { Watch } from "./protocol";
 
 /** A request before it has its number. */
@@ -13,23 +13,25 @@ export class Remote {
   private frames = 0;
   private requests = 0;
   private isWanted = false;
+  private run = 0;
 
-  constructor(onMessage: (message: FromWorker) => void, onFailure: (reason: string) => void) {
+  constructor(onNews: (news: News) => void, onFailure: (reason: string) => void) {
     this.worker.onmessage = ({ data }: MessageEvent<FromWorker>) => {
+      if (data.run !== this.run) return;
       if (data.kind === "wanted") this.isWanted = true;
-      else onMessage(data);
+      else onNews(data);
     };
     this.worker.onerror = (event) => onFailure(event.message || "its worker could not be loaded");
   }
 
   watch(url: string, watch: Watch): void {
     this.isWanted = false;
-    this.post({ kind: "watch", url, watch });
+    this.post({ kind: "watch", run: ++this.run, url, watch });
   }
 
   capture(url: string, setup: Setup): void {
     this.isWanted = false;
-    this.post({ kind: "capture", url, setup });
+    this.post({ kind: "capture", run: ++this.run, url, setup });
   }
 
   /** Whether a frame would be sent at once. */
@@ -60,6 +62,7 @@ export class Remote {
 
   stop(reason: string): void {
     this.isWanted = false;
+    this.run++;
     this.post({ kind: "stop", reason });
   }
 

@@ -5,18 +5,24 @@ import { reasonOf } from "./capture/source";
 import { CaptureStream, type Times } from "./capture/stream";
 import { Connection } from "./connection";
 import type { Composite, ServerMessage } from "./protocol";
-import type { FromWorker, ToWorker } from "./worker_messages";
+import type { FromWorker, News, ToWorker } from "./worker_messages";
 
 let watching: Connection | null = null;
 let stream: CaptureStream | null = null;
+/** A picture to be decoded. */
+let waiting: { composite: Composite; times: Times | null } | null = null;
+let isDecoding = false;
 
-const post = (message: FromWorker, transfer: Transferable[] = []): void => self.postMessage(message, { transfer });
+let run = 0;
+
+const post = (news: News, transfer: Transferable[] = []): void =>
+  self.postMessage({ ...news, run } satisfies FromWorker, { transfer });
 const say = (text: string): void => post({ kind: "say", text });
 
 self.onmessage = ({ data }: MessageEvent<ToWorker>): void => {
   switch (data.kind) {
     case "watch":
-      stop("");
+      begin(data.run);
       watching = new Connection(data.url, {
         greeting: () => data.watch,
         onState: (state) => post({ kind: "state", state }),
@@ -25,7 +31,7 @@ self.onmessage = ({ data }: MessageEvent<ToWorker>): void => {
       watching.open();
       return;
     case "capture":
-      stop("");
+      begin(data.run);
       stream = new CaptureStream(data.url, data.setup, encodeFrame, {
         onWanted: () => post({ kind: "wanted" }),
         onState: (state) => post({ kind: "state", state }),
@@ -52,10 +58,15 @@ self.onmessage = ({ data }: MessageEvent<ToWorker>): void => {
   }
 };
 
+function begin(next: number): void {
+  stop("");
+  run = next;
+}
+
 function stop(reason: string): void {
   watching?.stop(reason);
   stream?.stop(reason);
-  watching = stream = null;
+  watching = stream = waiting = null;
 }
 
 function tell(message: ServerMessage, times: Times | null): void {
@@ -67,9 +78,6 @@ function tell(message: ServerMessage, times: Times | null): void {
 
 const withoutBytes = (composite: Composite): Composite => ({ ...composite, color: { ...composite.color, data: new Uint8Array() } });
 
-let waiting: { composite: Composite; times: Times | null } | null = null;
-let isDecoding = false;
-
 /** The newest picture; one that arrives while another is being decoded replaces an older one that waits. */
 async function decodeWaiting(): Promise<void> {
   if (isDecoding) return;
@@ -78,8 +86,9 @@ async function decodeWaiting(): Promise<void> {
     const { composite, times }: NonNullable<typeof waiting> = waiting;
     waiting = null;
     try {
+      const begun = run;
       const bitmap = await decode(composite);
-      post({ kind: "picture", composite: withoutBytes(composite), bitmap, times }, [bitmap]);
+      if (begun === run) post({ kind: "picture", composite: withoutBytes(composite), bitmap, times }, [bitmap]);
     } catch (error) {
       say(`picture ${composite.frame} cannot be shown: ${reasonOf(error)}`);
     }

@@ -5,14 +5,15 @@ import type { ConnectionState } from "./connection";
 import type { Composite, ServerMessage, Watch } from "./protocol";
 
 export type ToWorker =
-  | { kind: "watch"; url: string; watch: Watch }
-  | { kind: "capture"; url: string; setup: Setup }
+  /** `run`: of watching or capturing; what is left of an earlier one is not heard. */
+  | { kind: "watch"; run: number; url: string; watch: Watch }
+  | { kind: "capture"; run: number; url: string; setup: Setup }
   | { kind: "frame"; frame: Numbered }
   | { kind: "request"; request: Request }
   | { kind: "retry" }
   | { kind: "stop"; reason: string };
 
-export type FromWorker =
+export type News =
   | { kind: "state"; state: ConnectionState }
   /** Every message of the server's; a composite without the bytes of its picture. */
   | { kind: "message"; message: ServerMessage }
@@ -20,3 +21,5 @@ export type FromWorker =
   | { kind: "picture"; composite: Composite; bitmap: ImageBitmap; times: Times | null }
   | { kind: "wanted" }
   | { kind: "say"; text: string };
+
+export type FromWorker = News & { run: number };

@@ -5,7 +5,7 @@ import { test } from "node:test";
 import { decode } from "@msgpack/msgpack";
 import { CaptureStream, type Numbered } from "../src/capture/stream";
 import { encode } from "../src/messages";
-import type { CameraModel, ClientMessage, Frame, ServerMessage } from "../src/protocol";
+import type { CameraModel, ClientMessage, Frame, ServerMessage, Wishes } from "../src/protocol";
 
 class FakeSocket {
   static readonly OPEN = 1;
@@ -37,14 +37,14 @@ const welcome = (more: object = {}): object => ({
   type: "welcome", session: "s", server: "p", device: "d", max_inflight: 2, key: "secret", resumed: false, room: null, ...more,
 });
 
-function begin(): { stream: CaptureStream; wanted: () => number; heard: ServerMessage[]; frame: (number: number, camera?: CameraModel) => Numbered } {
+function begin(wishes: Wishes = {}): { stream: CaptureStream; wanted: () => number; heard: ServerMessage[]; frame: (number: number, camera?: CameraModel) => Numbered } {
   FakeSocket.all = [];
   Object.assign(globalThis, { WebSocket: FakeSocket });
   let wanted = 0;
   const heard: ServerMessage[] = [];
   const packed = (frame: Numbered): Promise<Frame> =>
     Promise.resolve({ type: "frame", frame: frame.number, timestamp_s: frame.timestamp_s, world_from_camera: frame.world_from_camera });
-  const stream = new CaptureStream("ws://host/v1/stream", { client: "test", keep_s: 30 }, packed, {
+  const stream = new CaptureStream("ws://host/v1/stream", { client: "test", keep_s: 30, wishes }, packed, {
     onWanted: () => wanted++,
     onState: () => undefined,
     onMessage: (message) => heard.push(message),
@@ -59,8 +59,8 @@ function begin(): { stream: CaptureStream; wanted: () => number; heard: ServerMe
 
 const framesOf = (socket: FakeSocket): number[] => socket.sent.filter((each) => each.type === "frame").map((each) => each.frame);
 
-async function opened(): Promise<ReturnType<typeof begin>> {
-  const session = begin();
+async function opened(wishes?: Wishes): Promise<ReturnType<typeof begin>> {
+  const session = begin(wishes);
   await session.stream.offer(session.frame(0));
   FakeSocket.last.onopen();
   FakeSocket.last.say(welcome());
@@ -83,6 +83,16 @@ test("hello names the camera; no more frames are under way than the server allow
   await stream.offer(frame(4));
   assert.deepEqual(framesOf(socket), [1, 2, 4]);
   stream.stop("");
+});
+
+test("a light is the answer where no picture is wanted, and only there", async () => {
+  for (const answer of ["light", "picture"] as const) {
+    const { stream, wanted, frame } = await opened({ answer });
+    for (const number of [1, 2]) await stream.offer(frame(number));
+    FakeSocket.last.say({ type: "light", frame: 1, sh: [] });
+    assert.equal(wanted(), answer === "light" ? 4 : 3);
+    stream.stop("");
+  }
 });
 
 test("after a lost connection it resumes, sends unanswered requests again and forgets frames", async (context) => {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
@@ -140,8 +141,11 @@ def test_a_lost_connection_is_resumed_and_the_picture_goes_on(
     open_page: OpenPage,
     keep_picture: Callable[[Page, str], None],
 ) -> None:
-    with impaired(server.url) as proxy:
-        page = open_page(proxy.url, of_device(CAMERA, frames_seen(3), loops=True))
+    device = of_device(CAMERA, frames_seen(3), loops=True)
+    with (
+        impaired(server.url) as proxy,
+        closing(open_page(proxy.url, device)) as page,
+    ):  # it would come back to the proxy
         start_capture(page)
         received.wait(3)
         wait_for_text(page, "#state", "Live, captured here")
@@ -156,7 +160,6 @@ def test_a_lost_connection_is_resumed_and_the_picture_goes_on(
         assert len(received.hellos) == 1  # resumed, not begun anew
         page.locator("#stop").click()
         wait_for_text(page, "#state", "waiting for a session")
-        page.close()  # or it comes back to a proxy that is not there
 
 
 def test_a_plain_camera_joins_a_room_by_a_marker_and_sends_no_depth(

@@ -6,6 +6,7 @@ import base64
 import dataclasses
 from collections.abc import Callable, Iterator
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -22,7 +23,7 @@ from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from server.serve import BackgroundServer, start_in_background
 from server.service import Service
-from tests.client.web.conftest import OpenPage, wait_for_text
+from tests.client.web.conftest import PICTURES, OpenPage, wait_for_text
 from tests.client.web.sequence import FLIP, of_device
 from tests.client.web.test_capture import Received, start_capture
 from tests.service import fakes
@@ -119,6 +120,7 @@ def test_three_js_shades_a_white_ball_as_we_do_and_no_picture_is_sent(
     page.wait_for_function("() => device.seen?.some((value, i) => i % 4 === 3 && value > 0)")
     keep_picture(page, "light_mode")
     shown = drawn(page)
+    cv2.imwrite(str(PICTURES / "light_mode_drawn.png"), cv2.cvtColor(shown, cv2.COLOR_RGBA2BGRA))
     normals, seen = ball_normals()
     expected = lambert_transfer(normals, 4) @ SH
     assert seen.sum() > 500

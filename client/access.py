@@ -36,8 +36,6 @@ class Access:
 class Entrance:
     """What a connection is opened with."""
 
-    shown_url: str
-    """The server's, as it may be told to anybody."""
     stream_url: str
     headers: dict[str, str]
     tls: ssl.SSLContext | None
@@ -54,7 +52,7 @@ def entrance(server_url: str, access: Access) -> Entrance:
     elif access.tls_fingerprint is not None or access.tls_ca is not None:
         raise AccessError(f"{without_query(server_url)} is without TLS: give https:// to have its certificate checked")
     headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-    return Entrance(without_query(server_url), stream_url(server_url), headers, tls)
+    return Entrance(stream_url(server_url), headers, tls)
 
 
 def with_scheme(server_url: str) -> str:

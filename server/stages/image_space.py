@@ -25,7 +25,14 @@ from server.opencl.engine import Engine, float16
 from server.stages.auxiliary_views import VIEWS, AuxiliaryViews, ViewsAround, look_into_views
 from server.stages.image_space_rendering import RealLooks
 from server.stages.measure import intrinsics
-from server.stages.radiance_transfer import Directions, Transfer, first_set, own_sets, room_for_transfer, window_px
+from server.stages.radiance_transfer import (
+    Directions,
+    Transfer,
+    first_set,
+    own_sets,
+    room_for_transfer,
+    window_arguments,
+)
 from server.stages.raycast import Surface
 from server.stages.volume import Volume
 
@@ -246,14 +253,7 @@ def smooth_normals(
     engine.launch(
         engine.kernel("image_space.cl", "smooth_normals", **defines),
         (cols, rows),
-        cols,
-        rows,
-        stride,
-        camera.width,
-        camera.height,
-        window_px(camera),
-        surface.positions,
-        surface.normals,
+        *window_arguments(camera, surface, stride),
         voxel_m,
         normals,
     )

@@ -27,7 +27,7 @@ from server.stages.radiance_transfer import (
     own_sets,
     room_for_transfer,
     transfer_radiance,
-    window_px,
+    window_arguments,
 )
 from server.stages.raycast import Surface
 from server.stages.volume import Volume
@@ -205,14 +205,7 @@ def _usable(
     engine.launch(
         engine.kernel("near_light.cl", "find_samples", LOBES=LOBES, LANES=engine.lanes),
         (cols, rows),
-        cols,
-        rows,
-        stride,
-        camera.width,
-        camera.height,
-        window_px(camera),
-        surface.positions,
-        surface.normals,
+        *window_arguments(camera, surface, stride),
         surface.labels,
         radiance,
         LEAST_FLATNESS,

@@ -141,14 +141,7 @@ def transfer_radiance(
     engine.launch(
         engine.kernel("radiance_transfer.cl", "transfer_radiance", **defines),
         (cols, rows) if chosen is None else (len(chosen),),
-        cols,
-        rows,
-        stride,
-        camera.width,
-        camera.height,
-        window_px(camera),
-        surface.positions,
-        surface.normals,
+        *window_arguments(camera, surface, stride),
         surface.labels,
         *volume.arguments(),
         rays.count,
@@ -186,9 +179,11 @@ def room_for_transfer(
     )
 
 
-def window_px(camera: CameraModel) -> int:
-    """Radius of the window that a sample's normal is the mean of (smooth_normal.clh)."""
-    return max(1, round(camera.width * _WINDOW))
+def window_arguments(camera: CameraModel, surface: Surface, stride: int) -> tuple[KernelArgument, ...]:
+    """Where samples lie, and the window that the normal of each is the mean of (smooth_normal.clh)."""
+    cols, rows = camera.width // stride, camera.height // stride
+    window_px = max(1, round(camera.width * _WINDOW))
+    return cols, rows, stride, camera.width, camera.height, window_px, surface.positions, surface.normals
 
 
 def first_set(turn: int) -> int:

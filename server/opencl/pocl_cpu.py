@@ -1,8 +1,9 @@
 """Lets PoCL compile for processors newer than the LLVM it was built with.
 
 PoCL asks LLVM for the host processor's name and hands it to clang. LLVM answers "generic" for an x86 processor it does
-not know (an AMD Zen 5 with the LLVM 14 of PoCL 3.0), clang refuses that name, and no kernel compiles; no option of PoCL
-overrides it. The name is a C string that the device structure points to: it is replaced in place.
+not know (an AMD Zen 5 with the LLVM 14 of PoCL 3.0), clang refuses that name, and no kernel compiles; and it takes a
+Zen 4 for a Zen 3, which has no AVX-512, while PoCL takes the built-in functions that have it. No option of PoCL
+overrides the name. It is a C string that the device structure points to: it is replaced in place.
 
 Which name matters: PoCL's own library of built-in functions comes compiled for `skylake-avx512` or `haswell`, and LLVM
 inlines a function only into code for a processor that has all of its features. Under the plain x86-64 levels each
@@ -19,12 +20,14 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import pyopencl as cl
 
-_UNKNOWN = b"generic\0"
+_UNKNOWN = "generic"
+_WITHOUT_AVX512 = frozenset({"znver1", "znver2", "znver3", "haswell", "broadwell", "skylake", "alderlake"})
 _DEVICE_STRUCT_BYTES = 4096
 _V2 = frozenset({"sse4_1", "sse4_2", "ssse3", "popcnt"})
 _V3 = _V2 | {"avx2", "bmi1", "bmi2", "fma", "f16c", "movbe"}
+_AVX512 = b"skylake-avx512"
 _NAMES = (  # with the features that compilers use unasked; what else the name stands for, programs must ask for
-    (b"skylake-avx512", _V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
+    (_AVX512, _V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
     (b"haswell", _V3),
     (b"x86-64-v2", _V2),
 )
@@ -41,18 +44,36 @@ def processor_name(cpuinfo: str) -> bytes:
 
 
 def name_unknown_cpu(device: cl.Device) -> str | None:
-    """If `device` is PoCL's CPU under the name "generic", give it one clang knows; return the name, else None."""
-    if "pthread" not in device.name or platform.machine() != "x86_64" or not Path("/proc/self/mem").exists():
+    """If `device` is PoCL's CPU under a name that is none or is too little, give it a better one; that name, else None."""
+    known = known_name(device)
+    if known is None or platform.machine() != "x86_64" or not Path("/proc/self/mem").exists():
         return None
-    name = processor_name(Path("/proc/cpuinfo").read_text())
+    better = processor_name(Path("/proc/cpuinfo").read_text())
+    if known == _UNKNOWN or (known in _WITHOUT_AVX512 and better == _AVX512):
+        return better.decode() if rename(device, known, better) else None
+    return None
+
+
+def known_name(device: cl.Device) -> str | None:
+    """The processor's name that PoCL had from LLVM; None where this is another device.
+
+    The version says it behind the triple: `OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-znver3`.
+    """
+    _, found, rest = str(device.version).partition("HSTR: pthread-x86_64-")
+    return rest.split("-gnu-")[-1].strip() if found else None
+
+
+def rename(device: cl.Device, known: str, better: bytes) -> bool:
+    """Write `better`, of at most 23 bytes, over the name `known` that the structure points to; whether it was found."""
+    wanted = known.encode() + b"\0"
     structure = ctypes.string_at(device.int_ptr, _DEVICE_STRUCT_BYTES)
     with Path("/proc/self/mem").open("rb", buffering=0) as memory:
         for offset in range(0, _DEVICE_STRUCT_BYTES, 8):
             address = int.from_bytes(structure[offset : offset + 8], "little")
-            if _reads(memory, address, len(_UNKNOWN)) == _UNKNOWN:
-                ctypes.memmove(address, name + b"\0", len(name) + 1)  # malloc gives 24 bytes or more
-                return name.decode()
-    return None
+            if _reads(memory, address, len(wanted)) == wanted:
+                ctypes.memmove(address, better + b"\0", len(better) + 1)  # malloc gives 24 bytes or more
+                return True
+    return False
 
 
 def _reads(memory: object, address: int, count: int) -> bytes:

@@ -11,6 +11,12 @@ import cl_kernels
 
 KERNEL_FOLDER = Path(cl_kernels.__file__).parent
 _OPTIONS = ("-cl-std=CL1.2", "-Werror", "-cl-fp32-correctly-rounded-divide-sqrt")
+_PROLOGUE = """#ifdef __clang__
+#pragma clang diagnostic ignored "-Wpsabi"
+#endif
+"""
+"""Where a processor has no registers for float16, clang warns that other compilers would pass it otherwise: no call
+leaves a program."""
 
 Define = int | float | str | bool
 
@@ -50,7 +56,7 @@ class ProgramCache:
             return self._programs[key]
 
     def _build(self, file: str, defines: tuple[str, ...]) -> cl.Program:
-        source = f'#line 1 "{file}"\n' + (KERNEL_FOLDER / file).read_text()
+        source = f'{_PROLOGUE}#line 1 "{file}"\n' + (KERNEL_FOLDER / file).read_text()
         options = [*self._options, "-I", str(KERNEL_FOLDER / "include"), *defines]
         try:
             program: cl.Program = cl.Program(self._context, source).build(options)

@@ -26,6 +26,7 @@ class FakeDevice:
     compiler_available: bool = True
     max_compute_units: int = 2
     global_mem_size: int = 1 << 30
+    version: str = "OpenCL 3.0 Fake"
 
     @property
     def int_ptr(self) -> int:

@@ -44,7 +44,7 @@ def processor_name(cpuinfo: str) -> bytes:
 
 
 def name_unknown_cpu(device: cl.Device) -> str | None:
-    """If `device` is PoCL's CPU under a name that is none or is too little, give it a better one; that name, else None."""
+    """If `device` is PoCL's CPU under a name that is none or too little, give it a better one; that one, else None."""
     known = known_name(device)
     if known is None or platform.machine() != "x86_64" or not Path("/proc/self/mem").exists():
         return None

@@ -150,8 +150,9 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     common a normal is (`normals_printed`: as eq. 5.7 has them); earlier frames count; what fits badly counts less."""
     plan: Literal["needed", "everything"] = "needed"
     """`everything`: what would hardly be seen is simulated too, to check the bounds of leaving it out."""
-    answer: Literal["picture", "light"] = "picture"
-    """`light`: a frame is answered by its light alone, for clients that draw virtual things themselves."""
+    answer: Literal["picture", "layer", "light"] = "picture"
+    """`layer`: what is virtual comes apart from the camera's picture, for clients that put it over their newest one;
+    `light`: a frame is answered by its light alone, for clients that draw virtual things themselves."""
     lossless: bool = False
     """Answers carry PNG pictures, and every frame is answered in order instead of latest-wins."""
 
@@ -226,7 +227,7 @@ class Watch(Message, frozen=True, kw_only=True, omit_defaults=True, tag="watch")
 
 
 class Frame(Message, frozen=True, kw_only=True, omit_defaults=True, tag="frame"):
-    """One RGB-D frame; answered by exactly one of composite (with its light before it), dropped or error."""
+    """One RGB-D frame; answered by exactly one of composite or layer (with its light before it), dropped or error."""
 
     frame: Index
     timestamp_s: float
@@ -436,6 +437,41 @@ class Composite(Message, frozen=True, kw_only=True, tag="composite"):
     """What was wrong with this frame's input, one line each."""
 
 
+class LayerPatch(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A part of the camera's picture, and how far away each of its pixels is."""
+
+    x: Annotated[int, Meta(ge=0, lt=MAX_IMAGE_SIDE_PX)]
+    """Column of the camera's picture in which the part begins."""
+    y: Annotated[int, Meta(ge=0, lt=MAX_IMAGE_SIDE_PX)]
+    color: ColorImage
+    """PNG."""
+    depth: DepthImage
+    """Of the same size, along the camera's z; 0: the pixel says nothing."""
+
+
+class Layer(Message, frozen=True, kw_only=True, tag="layer"):
+    """What is virtual in one frame (`wishes.answer`), to be put over a camera picture p, of this frame or a later one.
+
+    All linear: picture = coverage * virtual + (1 - coverage) * ratio * p (thesis 7.2.1).
+    """
+
+    frame: Index
+    timestamp_s: float
+    virtual: LayerPatch | None
+    """Colour of four channels: sRGB, not multiplied by coverage, which is the fourth, 255 for all of a pixel. None: none
+    is seen."""
+    ratio: LayerPatch | None
+    """Colour of three channels: by what real surface is multiplied, times 128. None: real surface stays as it is."""
+    depth_scale_m: Annotated[float, Meta(gt=0, le=1)]
+    """Metres of a unit of depth."""
+    world_from_camera: Matrix4
+    tracking: Tracking
+    timings: Timings
+    plan: Plan
+    notes: tuple[str, ...] = ()
+    """What was wrong with this frame's input, one line each."""
+
+
 class Dropped(Message, frozen=True, kw_only=True, tag="dropped"):
     """This frame was replaced by a newer one before it was read, or refused; nothing else comes for it."""
 
@@ -474,4 +510,4 @@ class Error(Message, frozen=True, kw_only=True, tag="error"):
 
 
 ClientMessage = Hello | Watch | Frame | PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh | Bye
-ServerMessage = Welcome | Composite | Light | Dropped | MeshPart | Acknowledged | Error | Bye
+ServerMessage = Welcome | Composite | Layer | Light | Dropped | MeshPart | Acknowledged | Error | Bye

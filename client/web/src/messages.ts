@@ -14,6 +14,7 @@ const decoder = new Decoder({
 const SERVER_TAGS: ReadonlySet<unknown> = new Set<ServerMessage["type"]>([
   "welcome",
   "composite",
+  "layer",
   "light",
   "dropped",
   "mesh_part",

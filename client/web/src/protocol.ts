@@ -111,8 +111,11 @@ export interface Wishes {
   robustness?: Array<"memory" | "normals" | "normals_printed" | "openness" | "outliers">;
   /** `everything`: what would hardly be seen is simulated too, to check the bounds of leaving it out. */
   plan?: "everything" | "needed";
-  /** `light`: a frame is answered by its light alone, for clients that draw virtual things themselves. */
-  answer?: "light" | "picture";
+  /**
+   * `layer`: what is virtual comes apart from the camera's picture, for clients that put it over their newest one;
+   * `light`: a frame is answered by its light alone, for clients that draw virtual things themselves.
+   */
+  answer?: "layer" | "light" | "picture";
   /** Answers carry PNG pictures, and every frame is answered in order instead of latest-wins. */
   lossless?: boolean;
 }
@@ -183,7 +186,7 @@ export interface DepthImage {
   rounded_per_m?: number | null;
 }
 
-/** One RGB-D frame; answered by exactly one of composite (with its light before it), dropped or error. */
+/** One RGB-D frame; answered by exactly one of composite or layer (with its light before it), dropped or error. */
 export interface Frame {
   type: "frame";
   frame: number;
@@ -322,6 +325,43 @@ export interface Composite {
   notes: Array<string>;
 }
 
+/** A part of the camera's picture, and how far away each of its pixels is. */
+export interface LayerPatch {
+  /** Column of the camera's picture in which the part begins. */
+  x: number;
+  y: number;
+  /** PNG. */
+  color: ColorImage;
+  /** Of the same size, along the camera's z; 0: the pixel says nothing. */
+  depth: DepthImage;
+}
+
+/**
+ * What is virtual in one frame (`wishes.answer`), to be put over a camera picture p, of this frame or a later one.
+ *
+ * All linear: picture = coverage * virtual + (1 - coverage) * ratio * p (thesis 7.2.1).
+ */
+export interface Layer {
+  type: "layer";
+  frame: number;
+  timestamp_s: number;
+  /**
+   * Colour of four channels: sRGB, not multiplied by coverage, which is the fourth, 255 for all of a pixel. null: none
+   * is seen.
+   */
+  virtual: LayerPatch | null;
+  /** Colour of three channels: by what real surface is multiplied, times 128. null: real surface stays as it is. */
+  ratio: LayerPatch | null;
+  /** Metres of a unit of depth. */
+  depth_scale_m: number;
+  world_from_camera: Array<number>;
+  tracking: "given" | "lost" | "tracked";
+  timings: Timings;
+  plan: Plan;
+  /** What was wrong with this frame's input, one line each. */
+  notes: Array<string>;
+}
+
 /** One of the lights that the room's light is made of, besides an even sky. */
 export interface DirectedLight {
   /** World, unit, towards the light. */
@@ -430,6 +470,7 @@ export type ClientMessage =
 export type ServerMessage =
   | Welcome
   | Composite
+  | Layer
   | Light
   | Dropped
   | MeshPart

@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import trimesh
@@ -83,7 +84,8 @@ def load_part(run: Run, out: Path) -> Part:
     part.add(f"{name}: event loop and picture readers, of the processor, a frame", beside_ms, "ms")
     for metric in ("decode_ms", "encode_ms", "turn_ms", "queue_age_ms"):
         part.add(f"{name}: mean {metric}", mean_of(load.before, load.after, metric), "ms")
-    part.add(f"{name}: growth of memory", growth(load.memory_mb), "%", "<= 1")
+    part.add(f"{name}: growth of memory, first half to second", growth(load.memory_mb), "%", "<= 1")
+    part.add(f"{name}: most memory over least", 100 * (max(load.memory_mb) / min(load.memory_mb) - 1), "%")
     part.add(f"{name}: memory of the server and its parsers at the end", load.memory_mb[-1], "MB")
     part.add(f"{name}: requests lost, done twice or not as asked", len(load.wrong), "requests", "<= 0")
     part.add(f"{name}: fewest pictures of a watcher", min(load.watched), "pictures", ">= 1")
@@ -270,8 +272,9 @@ def _memory_mb(pid: int) -> float:
 
 
 def growth(memory_mb: list[float]) -> float:
-    """Percent, from the start to the end."""
-    return 100 * (max(memory_mb[-3:]) / max(memory_mb[:3]) - 1)
+    """Percent, from the median of the first half to that of the second: it goes up and down with the objects."""
+    half = len(memory_mb) // 2
+    return 100 * (median(memory_mb[half:]) / median(memory_mb[:half]) - 1)
 
 
 Samples = Mapping[tuple[str, ...], float]

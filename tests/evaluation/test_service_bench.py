@@ -60,7 +60,7 @@ def test_percentiles_are_of_what_came_between() -> None:
     assert np.isnan(overhead(after, after, "overhead_ms")[1])
 
 
-def test_growth_is_of_the_ends() -> None:
+def test_growth_is_of_the_halves() -> None:
     assert growth([100.0] * 10) == 0
     assert growth([100.0] * 5 + [110.0] * 5) == pytest.approx(10.0)
 

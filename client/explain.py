@@ -35,6 +35,7 @@ PURPOSES = {
     "direct_real": "throws the sharp shadows of virtual things on real ones",
     "match_average": "makes virtual things as bright beside the picture as real ones",
     "composite": "puts the picture together",
+    "compose_layer": "puts together what is virtual, apart from the camera's picture",
 }
 LEAD_FRAMES = 4
 """Before the frame that is explained: so many are processed for there to be a light."""

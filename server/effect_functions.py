@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -17,11 +18,14 @@ from server.opencl.engine import Engine
 from server.stages import adaptive
 from server.stages import composite as composite_stage
 from server.stages import differential_rendering as differential
+from server.stages import layer as layer_stage
 from server.stages import shadow_map as shadow_maps
+from server.stages.composite import Mixture
 from server.stages.differential_rendering import RealShadow
 from server.stages.image_space_rendering import Looks, RealLooks
 from server.stages.image_space_rendering import look_around as look_around_stage
 from server.stages.indirect import Indirect
+from server.stages.layer import Layer
 from server.stages.measure import Measurement
 from server.stages.object_glow import Glow, place_points
 from server.stages.radiance_transfer import Directions, Transfer
@@ -235,9 +239,8 @@ def match_average(averages: Averages) -> float:
     return averages.gain
 
 
-def composite(
+def mixture(
     view: View,
-    shown: NDArray[np.uint8],
     measurement: Measurement,
     surface: Surface,
     volume: Volume,
@@ -254,15 +257,13 @@ def composite(
     lit_virtual: cl_array.Array | None = None,
     whole_ratio: cl_array.Array | None = None,
     reached: cl_array.Array | None = None,
-) -> NDArray[np.uint8]:
-    """The finished picture; with nothing virtual it is the camera's, byte for byte."""
+) -> Mixture:
+    """What is virtual in the picture, and what it changes of the rest. No effect: what the next two read."""
     if lit_virtual is None and virtual is not None and light.discs:
         lit_virtual = view.engine.workspace.constant("unlit", np.zeros(surface.positions.shape, cl_types.float4))
-    return composite_stage.composite(
-        view.engine,
+    return Mixture(
         view.camera,
         view.volume_from_camera,
-        shown,
         measurement.radiance,
         surface,
         volume.voxel_m,
@@ -280,3 +281,13 @@ def composite(
         whole_ratio,
         reached,
     )
+
+
+def composite(view: View, shown: NDArray[np.uint8], **mixed: Any) -> NDArray[np.uint8]:
+    """The finished picture; with nothing virtual it is the camera's, byte for byte."""
+    return composite_stage.composite(view.engine, shown, mixture(view, **mixed))
+
+
+def compose_layer(view: View, **mixed: Any) -> Layer:
+    """What is virtual, apart from the camera's picture."""
+    return layer_stage.compose_layer(view.engine, mixture(view, **mixed))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from server import omissions as o
 from server.effect_functions import (
     add_objects,
     bounce_real,
+    compose_layer,
     composite,
     cover,
     direct_real,
@@ -15,6 +18,7 @@ from server.effect_functions import (
     light_samples,
     look_around,
     match_average,
+    mixture,
     prepare_rays,
     rasterize,
     refine_real,
@@ -27,6 +31,9 @@ from server.effect_functions import (
 )
 from server.plan import Effect, Omission
 from server.scene_facts import SceneFacts
+
+Answer = Literal["picture", "layer", "light"]
+"""What a frame is answered by: `wishes.answer`."""
 
 
 def _shades_virtual(facts: SceneFacts) -> Omission | None:
@@ -68,6 +75,13 @@ EFFECTS: tuple[Effect[SceneFacts], ...] = (
     Effect(direct_virtual, "lit_virtual", lambda f: o.no_object(f) or o.no_light(f) or o.soft(f), _shades_virtual),
     Effect(direct_real, "whole_ratio", lambda f: o.no_object(f) or o.no_light(f) or o.soft(f), o.out_of_reach),
     Effect(match_average, "gain", lambda f: o.no_object(f) or o.no_light(f) or o.not_matched(f), _shades_virtual),
-    Effect(composite, "picture"),
+    Effect(composite, "picture", through=mixture),
+    Effect(compose_layer, "layer", through=mixture),
 )
-"""One writer a resource; `composite` is what a frame wants."""
+"""One writer a resource; what a frame wants is one of the last two."""
+
+
+def effects_of(answer: Answer) -> tuple[Effect[SceneFacts], ...]:
+    """All but the one that another answer than this ends with."""
+    ends = {"picture": "layer", "layer": "picture"}
+    return tuple(effect for effect in EFFECTS if effect.writes != ends.get(answer))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel, RgbdFrame, Viewpoint
 from protocol.messages import Hello, LeftOut, Light, OperatingPoint, Plan, Preset, Timings, Tracking, Wishes
 from server.alignment import Alignment
-from server.effects import EFFECTS
+from server.effects import effects_of
 from server.geometry import Geometry, GeometryFrame
 from server.held import Sampled
 from server.light_message import light_message, seen_from
@@ -27,7 +27,7 @@ from server.opencl.engine import Engine
 from server.operating_points import Point, asked_for
 from server.plan import Omission
 from server.point_control import control_for
-from server.rendering import Made, Rendering
+from server.rendering import Made, Rendering, Wanted
 from server.rest import Rest
 from server.room import Room
 from server.scene.mesh import Mesh
@@ -37,6 +37,7 @@ from server.stages.composite import shown_picture, srgb_codes
 from server.stages.denoise import denoise_radiance
 from server.stages.exposure import scene_radiance
 from server.stages.indirect import observe_indirect
+from server.stages.layer import NOTHING, Layer
 from server.stages.light_estimation import LightEstimate
 from server.stages.near_light import remove_lamps
 from server.stages.rasterize import Placed
@@ -51,8 +52,8 @@ from server.static_light import static_estimate
 class FrameResult:
     """What one frame gave."""
 
-    color: NDArray[np.uint8]
-    """[h, w, 3] composite, sRGB."""
+    color: NDArray[np.uint8] | None
+    """[h, w, 3] composite, sRGB; None: neither the client nor anybody else wants it."""
     light: Light
     world_from_camera: NDArray[np.float64]
     tracking: Tracking
@@ -60,6 +61,8 @@ class FrameResult:
     plan: Plan
     notes: tuple[str, ...]
     """What was wrong with this frame's input, one line each."""
+    layer: Layer | None = None
+    """What is virtual in it; None: the client does not want it apart."""
 
 
 class Pipeline:
@@ -79,6 +82,7 @@ class Pipeline:
         self._owns_room = room is None
         self._differences = self._room.differences(wishes)
         wishes = self._room.wishes_of(wishes)
+        self._answer = wishes.answer
         self._asked = wishes
         self._control = control_for(device, wishes)  # U1
         self._wishes = self._control.chosen.point.wishes(wishes) if self._control else wishes
@@ -102,8 +106,10 @@ class Pipeline:
         self.device_name = device.name
         self.kernel_ms: dict[str, float] = {}
 
-    def process(self, frame: RgbdFrame | Viewpoint) -> FrameResult:
+    def process(self, frame: RgbdFrame | Viewpoint, *, watched: bool = False) -> FrameResult:
         """Fuse one frame, estimate the light, render what is virtual. A viewpoint shows what others have scanned.
+
+        `watched`: somebody wants the picture, whatever the client wished to be answered by.
 
         Raises ValueError with one line for a frame that is refused; the session's state is then as it was. Waits while
         another client's frame is in the room.
@@ -111,7 +117,8 @@ class Pipeline:
         with self._room.lock:
             if self._changes != self._room.changes:
                 self._wake()
-            result = self._process(self._imagined(frame) if isinstance(frame, Viewpoint) else frame)
+            wanted = Wanted(self._answer, watched)
+            result = self._process(self._imagined(frame) if isinstance(frame, Viewpoint) else frame, wanted)
             self._room.changes += 1
             self._changes = self._room.changes
             return result
@@ -134,19 +141,19 @@ class Pipeline:
         depth = np.zeros((lens.height, lens.width), np.uint16)
         return RgbdFrame(seen_from.index, seen_from.timestamp_s, color, depth, pose, has_depth=False)
 
-    def _process(self, frame: RgbdFrame) -> FrameResult:
+    def _process(self, frame: RgbdFrame, wanted: Wanted) -> FrameResult:
         started = time.perf_counter()
         engine, settings, stage = self._engine, self._settings, self._engine.profile.stage
         engine.profile.forget()
         geometry = self._geometry.update(frame, self._holds)  # ch. 4
         volume, objects = self._scene(geometry), self._objects
         if geometry.tracking == "lost":
-            return self._lost(frame, geometry, volume, started)
+            return self._lost(frame, geometry, volume, started, wanted)
         measurement, surface, notes = geometry.measurement, geometry.surface, self._place_waiting()
 
         placed = objects.placed(volume.volume_from_world())
         with stage("radiance_transfer"):  # 5.1.2, eq. 5.2
-            sampled, left_out = self._sample(geometry, volume, placed)
+            sampled, left_out = self._sample(geometry, volume, placed, wanted)
         with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
             estimate = self._room_light.estimate()
             if settings.plan != "everything" and not self._room_light.reads_pictures:
@@ -170,7 +177,7 @@ class Pipeline:
         with stage("rendering"):  # 7.1-7.2, the effects this frame calls for
             planes, is_given = self._room_light.planes, self._room_light.is_given
             made = Made(frame, geometry, volume, placed, self._sampler, sampled, estimate.sh, planes, is_given)
-            picture, plan = self._rendering.draw(made, settings, left_out, self._rest)
+            drawn = self._rendering.draw(made, settings, left_out, self._rest, wanted)
         if not self._room_light.is_given and frame.has_depth:  # B4, for the frames to come
             with stage("light_estimation"):
                 self._lamps.work(self._camera, geometry.scene_radiance, surface, volume)
@@ -179,28 +186,35 @@ class Pipeline:
         rows, self.kernel_ms = engine.profile.collect()
         timings = Timings(**rows, total=(time.perf_counter() - started) * 1e3)
         point = self._next_point(timings, is_held=geometry.is_held)
-        left_out_too = (*plan.left_out, *self._lamps.left_out())
+        left_out_too = (*drawn.plan.left_out, *self._lamps.left_out())
         return FrameResult(
-            color=picture,
+            color=drawn.picture,
+            layer=drawn.layer,
             light=self._light_message(frame, geometry, estimate, volume),
             world_from_camera=self._alignment.in_client(geometry.world_from_camera),
             tracking=geometry.tracking,
             timings=timings,
-            plan=structs.replace(plan, left_out=left_out_too, point=point),
+            plan=structs.replace(drawn.plan, left_out=left_out_too, point=point),
             notes=(*geometry.notes, *notes, *self._differences, *_notes(estimate)),
         )
 
-    def _lost(self, frame: RgbdFrame, geometry: GeometryFrame, volume: Volume, started: float) -> FrameResult:
+    def _lost(
+        self, frame: RgbdFrame, geometry: GeometryFrame, volume: Volume, started: float, wanted: Wanted
+    ) -> FrameResult:
         """The camera's own picture and the last light: where it is not known, nothing can be drawn or learnt."""
         self._wake()
-        with self._engine.profile.stage("rendering"):
-            picture = shown_picture(self._engine, self._camera, frame.color, geometry.measurement.radiance)
-        left_out = tuple(LeftOut(effect=e.name, reason="the camera is lost", error_bound=255.0) for e in EFFECTS)
+        picture = None
+        if wanted.answer == "picture" or wanted.watched:
+            with self._engine.profile.stage("rendering"):
+                picture = shown_picture(self._engine, self._camera, frame.color, geometry.measurement.radiance)
+        effects = effects_of(wanted.answer)
+        left_out = tuple(LeftOut(effect=e.name, reason="the camera is lost", error_bound=255.0) for e in effects)
         estimate = self._room_light.estimate()
         self._engine.queue.finish()
         rows, self.kernel_ms = self._engine.profile.collect()
         return FrameResult(
             color=picture,
+            layer=NOTHING if wanted.answer == "layer" else None,
             light=self._light_message(frame, geometry, estimate, volume),
             world_from_camera=self._alignment.in_client(geometry.world_from_camera),
             tracking="lost",
@@ -222,18 +236,18 @@ class Pipeline:
         return self._rest is not None and self._rest.holds(frame, self._lamps.lamps)
 
     def _sample(
-        self, geometry: GeometryFrame, volume: Volume, placed: list[Placed]
+        self, geometry: GeometryFrame, volume: Volume, placed: list[Placed], wanted: Wanted
     ) -> tuple[Sampled, dict[str, Omission]]:
         """Transfer, and what surfaces send (7.3.3); what of the spine is left out of this frame."""
-        rest = self._rest
+        rest, draws = self._rest, bool(placed) and wanted.last is not None
         if rest is not None:
             rest.place(placed)
         if rest is None or rest.omission is None:
-            echo = rest.echo if rest is not None and placed else None
+            echo = rest.echo if rest is not None and draws else None
             return self._sample_anew(geometry, volume), {"light_of_still_frames": echo} if echo else {}
         stages = ("estimate_light", *(SURFACE_STAGES if geometry.is_held else ()))
         left_out = dict.fromkeys(stages, rest.omission)
-        kept = rest.held.sampled.get(rest.turn) if placed else Sampled(None, None)
+        kept = rest.held.sampled.get(rest.turn) if draws else Sampled(None, None)
         if kept is None:
             kept = self._sample_anew(geometry, volume)
             rest.held.keep_sampled(rest.turn, kept)

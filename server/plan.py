@@ -44,11 +44,14 @@ class Effect(Generic[Facts]):
     """Where it cannot run, or was asked not to: whatever that changes."""
     needless: Callable[[Facts], Omission | None] = _never
     """Where leaving it out changes no more than is said. None where the scene calls for the effect."""
+    through: Callable[..., Any] | None = None
+    """A function that `run` hands its keywords on to: what that reads, the effect reads."""
     reads: tuple[str, ...] = field(init=False)
     optional: frozenset[str] = field(init=False)
 
     def __post_init__(self) -> None:
-        parameters = signature(self.run).parameters
+        functions = (self.run,) if self.through is None else (self.run, self.through)
+        parameters = {p.name: p for f in functions for p in signature(f).parameters.values() if p.kind != p.VAR_KEYWORD}
         object.__setattr__(self, "reads", tuple(parameters))
         optional = (name for name, p in parameters.items() if p.default is not Parameter.empty)
         object.__setattr__(self, "optional", frozenset(optional))

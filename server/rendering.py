@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import LeftOut, Plan
 from server.effect_functions import View, composite, shadow_everywhere
-from server.effects import EFFECTS
+from server.effects import EFFECTS, Answer
 from server.facts_finder import FactsFinder
 from server.geometry import GeometryFrame
 from server.held import Finished, Held, Sampled
@@ -25,6 +25,7 @@ from server.rest import Rest
 from server.settings import Settings
 from server.stages.composite import shown_picture
 from server.stages.continuation import PlaneArrays
+from server.stages.layer import Layer
 from server.stages.radiance_transfer import TURNS
 from server.stages.rasterize import Placed
 from server.stages.sampling import TransferSampler
@@ -73,6 +74,32 @@ class Made:
     is_light_given: bool
 
 
+@dataclass(frozen=True)
+class Wanted:
+    """What is to be drawn of a frame."""
+
+    answer: Answer = "picture"
+    """What its client gets."""
+    watched: bool = False
+    """Whether somebody else is to see the picture."""
+
+    @property
+    def last(self) -> Effect[Any] | None:
+        """The effect that all others are for; None: nothing is drawn."""
+        if self.answer == "light" and not self.watched:
+            return None
+        return LAYER if self.answer == "layer" else PICTURE
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What was wanted, the rest None."""
+
+    picture: Picture | None
+    layer: Layer | None
+    plan: Plan
+
+
 class Rendering:
     """One session's."""
 
@@ -84,16 +111,47 @@ class Rendering:
         self._facts = FactsFinder(everything=self._everything)
 
     def draw(
-        self, made: Made, settings: Settings, left_out: Mapping[str, Omission], rest: Rest | None
-    ) -> tuple[Picture, Plan]:
-        """The picture, and the plan that says what was left out, `left_out` of the spine with it.
+        self,
+        made: Made,
+        settings: Settings,
+        left_out: Mapping[str, Omission],
+        rest: Rest | None,
+        wanted: Wanted,
+    ) -> Drawn:
+        """What is wanted, and the plan that says what was left out, `left_out` of the spine with it.
 
-        rest: where a view that stands still holds what was made of it; None: everything is to be made.
+        rest: where a view that stands still holds what was made of it; None: everything is to be made. What it learns
+        does not depend on who watches.
         """
-        shown = shown_picture(self._engine, self._camera, made.frame.color, made.geometry.measurement.radiance)
         is_held = rest is not None and rest.omission is not None
-        if rest is not None and rest.omission is not None and rest.turn in rest.held.finished:
-            return self._finish(made, settings, shown, rest.held.finished[rest.turn], left_out, rest.omission)
+        old: Picture | None = None
+        if wanted.last is None:
+            drawn = Drawn(None, None, _undrawn(left_out))
+        else:
+            shown = shown_picture(self._engine, self._camera, made.frame.color, made.geometry.measurement.radiance)
+            if rest is not None and rest.omission is not None and rest.turn in rest.held.finished:
+                return self._finish(
+                    made, settings, shown, rest.held.finished[rest.turn], left_out, rest.omission, wanted
+                )
+            result, parts, plan = self._make(made, settings, shown, left_out, wanted.last)
+            if rest is not None and is_held and made.sampler.period <= TURNS:
+                rest.held.keep_finished(rest.turn, {k: v for k, v in parts.items() if k not in SEEN}, plan)
+            drawn = _drawn(result, parts, shown, plan, wanted)
+            if rest is not None and not is_held and wanted.answer != "light" and made.objects and rest.is_checkpoint:
+                old = _picture_of_old(rest.held, parts, shown)
+        if rest is not None and not is_held:
+            rest.learn(made.sh, made.planes, old)
+        return drawn
+
+    def _make(
+        self,
+        made: Made,
+        settings: Settings,
+        shown: Picture,
+        left_out: Mapping[str, Omission],
+        last: Effect[Any],
+    ) -> tuple[Picture | Layer, dict[str, Any], Plan]:
+        """What the last effect makes, what it reads, and the plan that ends with it."""
         given = self._given(made, settings, shown)
         facts = self._facts.find(
             given["view"],
@@ -109,17 +167,12 @@ class Rendering:
             given["averages"],
         )
         given["returned"] = facts.returned
-        order, plan = make_plan(EFFECTS, "picture", GIVEN, facts, everything=self._everything, stages=left_out)
+        order, plan = make_plan(EFFECTS, last.writes, GIVEN, facts, everything=self._everything, stages=left_out)
         parts: dict[str, Any] = {}
-        picture: Picture = execute([*order[:-1], _noting(order[-1], parts)], given, "picture")
+        result: Picture | Layer = execute([*order[:-1], _noting(order[-1], parts)], given, last.writes)
         if "reached" in parts:
             plan = _with_share(plan, float(self._engine.download(parts["reached"]).mean()), bool(given["light"].discs))
-        if rest is not None and is_held and made.sampler.period <= TURNS:
-            rest.held.keep_finished(rest.turn, {k: v for k, v in parts.items() if k not in SEEN}, plan)
-        elif rest is not None and not is_held:
-            old = _picture_of_old(rest.held, parts) if made.objects and rest.is_checkpoint else None
-            rest.learn(made.sh, made.planes, old)
-        return picture, plan
+        return result, parts, plan
 
     def _given(self, made: Made, settings: Settings, shown: Picture) -> dict[str, Any]:
         """The resources that effects begin with."""
@@ -176,9 +229,11 @@ class Rendering:
         finished: Finished,
         left_out: Mapping[str, Omission],
         why: Omission,
-    ) -> tuple[Picture, Plan]:
-        """The picture with what has been made of a frame that was sampled alike."""
-        given = {
+        wanted: Wanted,
+    ) -> Drawn:
+        """What is wanted, of what has been made of a frame that was sampled alike."""
+        assert wanted.last is not None
+        parts = {
             **finished.parts,
             "view": self._view(made, settings),
             "shown": shown,
@@ -186,20 +241,39 @@ class Rendering:
             "surface": made.geometry.surface,
             "volume": made.volume,
         }
-        picture: Picture = execute([PUT_TOGETHER], given, "picture")
-        effects = (name for name in finished.plan.run if name != PUT_TOGETHER.name)
+        result: Picture | Layer = execute([wanted.last], parts, wanted.last.writes)
+        *effects, last = finished.plan.run
         held = tuple(_left_out(name, why) for name in (*left_out, *effects))
         others = (left for left in finished.plan.left_out if left.effect not in left_out)
-        return picture, structs.replace(finished.plan, run=(PUT_TOGETHER.name,), left_out=(*held, *others))
+        plan = structs.replace(finished.plan, run=(last,), left_out=(*held, *others))
+        return _drawn(result, parts, shown, plan, wanted)
 
 
-def _picture_of_old(held: Held, parts: Mapping[str, Any]) -> Picture:
+def _drawn(result: Picture | Layer, parts: Mapping[str, Any], shown: Picture, plan: Plan, wanted: Wanted) -> Drawn:
+    """What the last effect of a plan made of `parts`, and the picture where that is wanted besides."""
+    if not isinstance(result, Layer):
+        return Drawn(result, None, plan)
+    if not wanted.watched:
+        return Drawn(None, result, plan)
+    picture = composite(**{**parts, "shown": shown})
+    return Drawn(picture, result, structs.replace(plan, run=(*plan.run, PICTURE.name)))
+
+
+def _undrawn(left_out: Mapping[str, Omission]) -> Plan:
+    """Of a frame that is answered by its light alone."""
+    omissions = {**left_out, **{effect.name: BY_ITSELF for effect in EFFECTS}}
+    return Plan(run=(), left_out=tuple(_left_out(name, why) for name, why in omissions.items()))
+
+
+def _picture_of_old(held: Held, parts: Mapping[str, Any], shown: Picture) -> Picture:
     """What is virtual in this frame, put into what the camera saw when the view began to stand still."""
-    shown, measurement = held.keep_old(parts["shown"], parts["measurement"])
+    shown, measurement = held.keep_old(shown, parts["measurement"])
     return composite(**{**parts, "shown": shown, "measurement": measurement})
 
 
-PUT_TOGETHER: Effect[Any] = next(effect for effect in EFFECTS if effect.writes == "picture")
+PICTURE: Effect[Any] = next(effect for effect in EFFECTS if effect.writes == "picture")
+LAYER: Effect[Any] = next(effect for effect in EFFECTS if effect.writes == "layer")
+BY_ITSELF = Omission("asked for: the client draws by itself", 0.0)
 
 
 def _with_share(plan: Plan, share: float, has_sharp_shadows: bool) -> Plan:
@@ -226,4 +300,4 @@ def _noting(effect: Effect[Any], parts: dict[str, Any]) -> Effect[Any]:
         parts.update(reads)
         return run(**reads)
 
-    return Effect(noted, effect.writes)
+    return Effect(noted, effect.writes, through=effect.through)

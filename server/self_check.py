@@ -48,6 +48,7 @@ def check_answers(device: Device) -> None:
 
 def check_picture(result: FrameResult) -> None:
     """Where nothing is virtual the picture is the camera's, byte for byte."""
+    assert result.color is not None
     wrong = int((result.color != frame().color).any(axis=2).sum())
     if wrong:
         raise CheckFailed("picture", f"{wrong} pixels of a picture without virtual objects are not the camera's")
@@ -65,6 +66,7 @@ def check_light(result: FrameResult) -> None:
 
 def check_object(result: FrameResult) -> None:
     """Under an even sky a virtual triangle shows its own colour."""
+    assert result.color is not None
     picture, own = frame().color.astype(int), int(_srgb(np.array(ALBEDO)))
     shown = np.abs(result.color.astype(int) - own).max(axis=2) <= OBJECT_BOUND
     pixels = int((shown & (np.abs(picture - own).max(axis=2) > OBJECT_BOUND)).sum())

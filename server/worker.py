@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from msgspec import structs
-from numpy.typing import NDArray
 
 from protocol.codec import ProtocolError, encode, one_line
 from protocol.frames import CameraModel, RgbdFrame, Viewpoint
@@ -24,6 +23,7 @@ from protocol.messages import (
     Dropped,
     Frame,
     Hello,
+    Layer,
     MoveObject,
     PlaceObject,
     Plan,
@@ -32,6 +32,7 @@ from protocol.messages import (
     RequestMesh,
 )
 from server.connection import POLICY, UNAUTHORIZED, Refusal
+from server.layer_message import layer_message, row_major
 from server.mailbox import Letter, Mailbox
 from server.mesh_message import mesh_parts
 from server.meshing.files import mesh_files
@@ -159,7 +160,7 @@ class Worker:
             return self._drop(frame, "unreadable", error)
         try:
             with overhead.left_out(), self._workshop.scheduler.turn(self._share) as waited_s:
-                result = pipeline.process(rgbd)
+                result = pipeline.process(rgbd, watched=self._outlet.is_watched())
                 self._follow_pressure(pipeline)
         except ValueError as error:
             return self._drop(frame, "refused", error)
@@ -211,15 +212,18 @@ class Worker:
         self._outlet.send(encode(Dropped(frame=frame.frame, reason=one_line(str(error)))))
 
     def _deliver(self, frame: Frame, result: FrameResult) -> None:
-        lossless, with_picture = self._hello.wishes.lossless, self._hello.wishes.answer == "picture"
-        light = encode(result.light)
-        composite = self._encode(frame, result, lossless) if with_picture else None
-        answer = (light,) if composite is None else (light, composite)
-        if lossless:
+        wishes, light = self._hello.wishes, encode(result.light)
+        answer: tuple[bytes, ...] = (light,)
+        if wishes.answer == "layer":
+            answer = (light, self._timed(lambda: layer_message(frame, result, self._plan(result.plan))))
+        elif wishes.answer == "picture":
+            answer = (light, self._timed(lambda: self._composite(frame, result, lossless=wishes.lossless)))
+        if wishes.lossless:
             self._answers.append((frame.frame, answer))
         self._send_answer(answer)
-        if self._outlet.is_watched():
-            shown = composite if composite is not None and not lossless else self._encode(frame, result, False)
+        if self._outlet.is_watched() and result.color is not None:
+            is_shown = wishes.answer == "picture" and not wishes.lossless
+            shown = answer[-1] if is_shown else self._timed(lambda: self._composite(frame, result, lossless=False))
             self._outlet.publish((light, shown))
 
     def _send_answer(self, answer: tuple[bytes, ...]) -> None:
@@ -238,22 +242,25 @@ class Worker:
         )
         return structs.replace(plan, point=structs.replace(plan.point, reason=reason))
 
-    def _encode(self, frame: Frame, result: FrameResult, lossless: bool) -> bytes:
+    def _timed(self, make: Callable[[], Composite | Layer]) -> bytes:
+        """An answer, encoded; notes how long that takes."""
         start_s = time.perf_counter()
-        data = encode(
-            Composite(
-                frame=frame.frame,
-                timestamp_s=frame.timestamp_s,
-                color=encode_color(result.color, "png" if lossless else "jpeg", quality=JPEG_QUALITY),
-                world_from_camera=_row_major(result.world_from_camera),
-                tracking=result.tracking,
-                timings=result.timings,
-                plan=self._plan(result.plan),
-                notes=result.notes,
-            )
-        )
+        data = encode(make())
         self._workshop.metrics.encode_ms.observe((time.perf_counter() - start_s) * 1e3)
         return data
+
+    def _composite(self, frame: Frame, result: FrameResult, *, lossless: bool) -> Composite:
+        assert result.color is not None
+        return Composite(
+            frame=frame.frame,
+            timestamp_s=frame.timestamp_s,
+            color=encode_color(result.color, "png" if lossless else "jpeg", quality=JPEG_QUALITY),
+            world_from_camera=row_major(result.world_from_camera),
+            tracking=result.tracking,
+            timings=result.timings,
+            plan=self._plan(result.plan),
+            notes=result.notes,
+        )
 
 
 class _Overhead:
@@ -277,10 +284,6 @@ class _Overhead:
         """The frame is answered."""
         metrics.overhead_ms.observe((self._wall_s + time.perf_counter() - self._outlet.waited_s) * 1e3)
         metrics.overhead_cpu_ms.observe((self._cpu_s + time.thread_time()) * 1e3)
-
-
-def _row_major(matrix: NDArray[np.float64]) -> tuple[float, ...]:
-    return tuple(matrix.ravel().tolist())
 
 
 def apply_control(pipeline: Pipeline, message: SceneControl, load_mesh: Callable[[bytes, str], Mesh]) -> Acknowledged:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -48,84 +49,108 @@ def shown_picture(
     return color.astype(np.uint8, copy=False)
 
 
-def composite(
-    engine: Engine,
-    camera: CameraModel,
-    volume_from_camera: NDArray[np.float64],
-    shown: NDArray[np.uint8],
-    radiance: cl_array.Array,
-    surface: Surface,
-    tolerance_m: float,
-    light: DeviceLight,
-    virtual: VirtualSurface | None = None,
-    occluded: SampleGrid | None = None,
-    ratio: SampleGrid | None = None,
-    refined_occluded: cl_array.Array | None = None,
-    refined_ratio: cl_array.Array | None = None,
-    upsampling: Upsampling = "bilateral",
-    coverage: cl_array.Array | None = None,
-    reflected: cl_array.Array | None = None,
-    gain: float = 1.0,
-    direct_virtual: cl_array.Array | None = None,
-    direct_ratio: cl_array.Array | None = None,
-    reached: cl_array.Array | None = None,
-) -> NDArray[np.uint8]:
-    """Picture [h, w, 3] sRGB of the camera picture `shown` with what is virtual; unchanged where nothing virtual is.
+@dataclass(frozen=True)
+class Mixture:
+    """What is mixed with the camera's picture, and what it is mixed by: arguments of mixture.clh."""
 
-    `refined_occluded`, `refined_ratio` [h, w] float4: what stands for `occluded` and `ratio` where w = 1. `coverage`:
-    of nearest_depths, for smooth edges; without it a pixel is covered as its middle is. `reflected`: of reflect.py.
-    `gain`: by which virtual surface is brighter than `light` makes it (tone_mapping.py). `direct_virtual`:
-    what the light's discs bring besides; `direct_ratio`: stands for `ratio` and `refined_ratio` then (shadow_map.py).
-    `reached`: of reached.py, the cells in which `ratio` counts, None: wherever it is not 1.
+    camera: CameraModel
+    volume_from_camera: NDArray[np.float64]
+    radiance: cl_array.Array
+    """[h, w] float4, the camera's picture, linear; w < 0 outside of it."""
+    surface: Surface
+    tolerance_m: float
+    """How far behind a real surface a virtual one still shows, for objects that stand on it."""
+    light: DeviceLight
+    virtual: VirtualSurface | None = None
+    occluded: SampleGrid | None = None
+    ratio: SampleGrid | None = None
+    refined_occluded: cl_array.Array | None = None
+    """[h, w] float4: what stands for `occluded` where w = 1."""
+    refined_ratio: cl_array.Array | None = None
+    upsampling: Upsampling = "bilateral"
+    coverage: cl_array.Array | None = None
+    """Of nearest_depths, for smooth edges; without it a pixel is covered as its middle is."""
+    reflected: cl_array.Array | None = None
+    """Of reflect.py."""
+    gain: float = 1.0
+    """By which virtual surface is brighter than `light` makes it (tone_mapping.py)."""
+    direct_virtual: cl_array.Array | None = None
+    """What the light's discs bring besides."""
+    direct_ratio: cl_array.Array | None = None
+    """Stands for `ratio` and `refined_ratio` where the light has discs (shadow_map.py)."""
+    reached: cl_array.Array | None = None
+    """Of reached.py, the cells in which `ratio` counts; None: wherever it is not 1."""
 
-    `tolerance_m`: how far behind a real surface a virtual one still shows, for objects that stand on it.
-    """
-    if virtual is None and ratio is None:
-        return shown
-    space = engine.workspace
-    picture = space.array("picture", (camera.height, camera.width, 3), np.uint8)
-    bands = round(light.coefficients.shape[0] ** 0.5)
-    defines = {
-        "HAS_OBJECTS": virtual is not None,
-        "HAS_SHADOWS": ratio is not None,
-        "BICUBIC": upsampling == "bicubic",
-        "SUBPIXELS": 0 if coverage is None else SUBPIXELS,
-        "HAS_GLOSS": reflected is not None,
-        "HAS_DIRECT": bool(light.discs),
-        "LANES": engine.lanes,
-    }
-    kernel = engine.kernel("composite.cl", "composite", BANDS=bands, **defines)
-    unused = space.array("unused", (1,), cl_types.float4)
-    if reached is None:
-        reached = mark_reached(engine, camera, surface, ratio) if ratio and not light.discs else unused
+    @property
+    def is_nothing(self) -> bool:
+        """Whether nothing is virtual."""
+        return self.virtual is None and self.ratio is None
+
+
+def launch_mixture(engine: Engine, file: str, name: str, mixture: Mixture, *others: KernelArgument) -> None:
+    """Enqueue a kernel whose arguments begin with MIXTURE_ARGUMENTS of mixture.clh; `others` are its own."""
+    camera, light, virtual, ratio = mixture.camera, mixture.light, mixture.virtual, mixture.ratio
+    unused = engine.workspace.array("unused", (1,), cl_types.float4)
+
+    def given(array: cl_array.Array | None) -> cl_array.Array:
+        return unused if array is None else array
+
+    reached = mixture.reached
+    if reached is None and ratio is not None and not light.discs:
+        reached = mark_reached(engine, camera, mixture.surface, ratio)
+    kernel = engine.kernel(
+        file,
+        name,
+        BANDS=round(light.coefficients.shape[0] ** 0.5),
+        HAS_OBJECTS=virtual is not None,
+        HAS_SHADOWS=ratio is not None,
+        BICUBIC=mixture.upsampling == "bicubic",
+        SUBPIXELS=0 if mixture.coverage is None else SUBPIXELS,
+        HAS_GLOSS=mixture.reflected is not None,
+        HAS_DIRECT=bool(light.discs),
+        LANES=engine.lanes,
+    )
     engine.launch(
         kernel,
         (-(-camera.width // engine.lanes), camera.height),
         camera.width,
         camera.height,
-        space.upload("shown", shown),
-        radiance,
-        surface.positions,
-        surface.normals,
-        float16(inverse_rigid(volume_from_camera)),
-        tolerance_m,
+        mixture.radiance,
+        mixture.surface.positions,
+        mixture.surface.normals,
+        float16(inverse_rigid(mixture.volume_from_camera)),
+        mixture.tolerance_m,
         *((virtual.position, virtual.normal, virtual.base_color) if virtual else (unused, unused, unused)),
-        unused if coverage is None else coverage,
-        unused if reflected is None else reflected,
+        given(mixture.coverage),
+        given(mixture.reflected),
         light.coefficients,
-        gain,
-        *_grid(occluded, unused),
+        mixture.gain,
+        *_grid(mixture.occluded, unused),
         *_grid(ratio, unused),
-        reached,
-        refined_occluded is not None,
-        unused if refined_occluded is None else refined_occluded,
-        refined_ratio is not None,
-        unused if refined_ratio is None else refined_ratio,
-        unused if direct_virtual is None else direct_virtual,
-        unused if direct_ratio is None else direct_ratio,
-        space.constant("srgb_codes", _shown_codes()),
-        picture,
+        given(reached),
+        mixture.refined_occluded is not None,
+        given(mixture.refined_occluded),
+        mixture.refined_ratio is not None,
+        given(mixture.refined_ratio),
+        given(mixture.direct_virtual),
+        given(mixture.direct_ratio),
+        *others,
     )
+
+
+def srgb_table(engine: Engine) -> cl_array.Array:
+    """[65536] uint8: the sRGB code of linear radiance i / 65535."""
+    return engine.workspace.constant("srgb_codes", _shown_codes())
+
+
+def composite(engine: Engine, shown: NDArray[np.uint8], mixture: Mixture) -> NDArray[np.uint8]:
+    """Picture [h, w, 3] sRGB of the camera picture `shown` with what is virtual; unchanged where nothing virtual is."""
+    if mixture.is_nothing:
+        return shown
+    space, camera = engine.workspace, mixture.camera
+    picture = space.array("picture", (camera.height, camera.width, 3), np.uint8)
+    others = (space.upload("shown", shown), srgb_table(engine), picture)
+    launch_mixture(engine, "composite.cl", "composite", mixture, *others)
     return engine.download(picture)
 
 

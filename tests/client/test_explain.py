@@ -10,7 +10,7 @@ from client.laptop.errors import SourceError
 from client.laptop.gallery.scenes import GALLERY
 from client.laptop.source import open_source
 from protocol.messages import LeftOut, Plan
-from server.effects import EFFECTS
+from server.effects import EFFECTS, effects_of
 
 
 def test_every_effect_has_a_purpose() -> None:
@@ -56,4 +56,4 @@ def test_the_gallery_is_as_large_as_promised() -> None:
     assert len({scene.calls_for(0) for scene in GALLERY.values()}) >= 8  # scenes differ in what they call for
     called_for = set().union(*(scene.calls_for(index) for scene in GALLERY.values() for index in range(scene.frames)))
     presets = {"look_around", "refine_virtual", "refine_real"}
-    assert {effect.name for effect in EFFECTS} - presets <= called_for
+    assert {effect.name for effect in effects_of("picture")} - presets <= called_for

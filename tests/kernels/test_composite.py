@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
 from server.scene.virtual_object import VirtualObject
-from server.stages.composite import composite, shown_picture, srgb_codes
+from server.stages.composite import Mixture, composite, shown_picture, srgb_codes
 from server.stages.measure import linear_values
 from server.stages.radiance_transfer import direction_sets
 from server.stages.rasterize import VirtualSurface, nearest_depths, rasterize
@@ -83,9 +83,8 @@ def upload_samples(engine: Engine, name: str, samples: Samples | None) -> Sample
     )
 
 
-def compose(
+def mixture_of(
     engine: Engine,
-    shown: Codes,
     radiance: Floats,
     real: Buffer,
     virtual: Buffer | None = None,
@@ -96,15 +95,13 @@ def compose(
     refined_ratio: Samples | None = None,
     upsampling: Upsampling = "bilateral",
     inverse_depths: Floats | None = None,
-) -> Codes:
+) -> Mixture:
     surface: Surface = upload_surface(
         engine, real.positions[..., :3], real.normals[..., :3], real.positions[..., 3] > 0
     )
-    return composite(
-        engine,
+    return Mixture(
         CAMERA,
         VOLUME_FROM_CAMERA,
-        shown,
         engine.workspace.upload("radiance", float4(radiance[..., :3], radiance[..., 3])),
         surface,
         TOLERANCE_M,
@@ -117,6 +114,11 @@ def compose(
         upsampling,
         None if inverse_depths is None else engine.workspace.upload("fine", inverse_depths.astype(np.float32)),
     )
+
+
+def compose(engine: Engine, shown: Codes, *others: Any, **named: Any) -> Codes:
+    """The picture of mixture_of."""
+    return composite(engine, shown, mixture_of(engine, *others, **named))
 
 
 def upload_every(engine: Engine, name: str, samples: Samples | None) -> cl_array.Array | None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from server.effects import EFFECTS
+from server.effects import EFFECTS, effects_of
 from server.omissions import ELSEWHERE
 from server.plan import ALLOWANCE, Effect, Omission, PlanError, execute, make_plan
 from server.rendering import GIVEN as EFFECTS_GIVEN
@@ -273,7 +273,7 @@ SPARED = {"shadow_everywhere": "hardly change the rest"}
                 sharp_lights=1,
                 averages=KNOWN,
             ),
-            {effect.name for effect in EFFECTS} - SPARED.keys(),
+            {effect.name for effect in effects_of("picture")} - SPARED.keys(),
             SPARED,
         ),
     ],
@@ -291,6 +291,15 @@ def test_effects_of_a_scene(facts: SceneFacts, run: set[str], reasons: dict[str,
         assert reasons[item.effect] in item.reason
         is_asked = any(w in item.reason for w in ("asked", "no light", "black"))
         assert item.error_bound == (255.0 if is_asked else ELSEWHERE if item.effect in SPARED else 0.0)
+
+
+def test_a_layer_calls_for_what_a_picture_does() -> None:
+    facts = SceneFacts(objects=1, objects_in_view=1, has_light=True)
+    (_, of_picture), (_, of_layer) = (make_plan(EFFECTS, end, EFFECTS_GIVEN, facts) for end in ("picture", "layer"))
+    assert of_picture.run[-1] == "composite"
+    assert of_layer.run[-1] == "compose_layer"
+    assert of_picture.run[:-1] == of_layer.run[:-1]
+    assert of_picture.left_out == of_layer.left_out
 
 
 def test_what_rest_may_change_leaves_nothing_to_spare() -> None:

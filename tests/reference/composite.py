@@ -1,8 +1,9 @@
-"""Float64 twin of cl_kernels/composite.cl and of include/upsample.clh."""
+"""Float64 twin of cl_kernels/composite.cl, layer.cl and of include/upsample.clh."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,8 +83,25 @@ def upsample_bicubic(samples: Samples, x: int, y: int) -> Floats:
     )
 
 
-def composite(
-    shown: NDArray[np.uint8],
+@dataclass(frozen=True)
+class Mixed:
+    """What each pixel shows: real surface times `factor`, which is 1 where it is left as it is, and virtual over it."""
+
+    factor: Floats
+    """[h, w, 3]."""
+    is_touched: NDArray[np.bool_]
+    """[h, w] whether real surface is multiplied."""
+    own: Floats
+    """[h, w, 3] radiance of the virtual surface."""
+    part: Floats
+    """[h, w] of the pixel that it covers."""
+    virtual_z: Floats
+    """[h, w] camera depth of that surface, 0 where none is seen."""
+    real_z: Floats
+    """[h, w] 0 where there is no real surface."""
+
+
+def mix(
     radiance: Floats,
     real: Buffer,
     camera_from_volume: Floats,
@@ -96,12 +114,13 @@ def composite(
     refined_ratio: Samples | None = None,
     bicubic: bool = False,
     inverse_depths: Floats | None = None,
-) -> NDArray[np.uint8]:
-    """The picture [h, w, 3]: the nearer of virtual and real surface, real ones times `ratio`, untouched ones as shown.
+) -> Mixed:
+    """What is mixed at each pixel: the nearer of virtual and real surface, real ones times `ratio`.
 
     radiance [h, w, 4]; light [n, 3]. A virtual surface at most `tolerance_m` behind a real one is in front.
     inverse_depths [f h, f w] of the nearest object at the parts of each pixel, 0 for none; else the middle counts.
     """
+    height, width = radiance.shape[:2]
 
     def value_at(samples: Samples, refined: Samples | None, surface: Buffer, x: int, y: int) -> Floats:
         if refined is not None and refined.values[y, x, 3] > 0:
@@ -117,20 +136,22 @@ def composite(
         if inverse_depths is None:
             is_front = virtual.positions[y, x, 3] > 0 and real_z - depth(virtual.positions[y, x]) > -tolerance_m
             return float(is_front), (x, y)
-        f = inverse_depths.shape[0] // shown.shape[0]
+        f = inverse_depths.shape[0] // height
         parts = inverse_depths[f * y : f * y + f, f * x : f * x + f]
         share = float(((parts > 0) & (real_z + tolerance_m > 1 / np.maximum(parts, 1e-9))).mean())
         steps = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, -1), (-1, 1), (1, 1)]
-        near = [(x + a, y + b) for a, b in steps if 0 <= x + a < shown.shape[1] and 0 <= y + b < shown.shape[0]]
+        near = [(x + a, y + b) for a, b in steps if 0 <= x + a < width and 0 <= y + b < height]
         return share, next(((u, v) for u, v in near if virtual.positions[v, u, 3] > 0), None)
 
-    picture = shown.copy()
-    for y, x in np.ndindex(shown.shape[:2]):
-        here, color, is_changed = real.positions[y, x], radiance[y, x, :3].copy(), False
+    size = (height, width)
+    mixed = Mixed(np.ones((*size, 3)), np.zeros(size, bool), np.zeros((*size, 3)), *(np.zeros(size) for _ in range(3)))
+    for y, x in np.ndindex(*size):
+        here = real.positions[y, x]
+        mixed.real_z[y, x] = depth(here) if here[3] > 0 else 0.0
         if ratio is not None and here[3] > 0 and radiance[y, x, 3] >= 0:
             factor = value_at(ratio, refined_ratio, real, x, y)
             if factor[3] > 0 and np.abs(factor[:3] - 1).max() > UNTOUCHED:
-                color, is_changed = color * factor[:3], True
+                mixed.factor[y, x], mixed.is_touched[y, x] = factor[:3], True
         if virtual is not None and occluded is not None:
             share, source = share_and_source(x, y)
             if share > 0 and source is not None:
@@ -138,8 +159,29 @@ def composite(
                 taken = value_at(occluded, refined_occluded, virtual, u, v)[:3]
                 bands = round(len(light) ** 0.5)
                 shading = np.maximum(open_transfer(virtual.normals[v, u, :3], bands) @ light - taken, 0)
-                part = 1.0 if radiance[y, x, 3] < 0 else share
-                color, is_changed = (1 - part) * color + part * virtual.colors[v, u] * shading, True
-        if is_changed:
-            picture[y, x] = srgb_codes(color)
-    return picture
+                mixed.own[y, x] = virtual.colors[v, u] * shading
+                mixed.part[y, x] = 1.0 if radiance[y, x, 3] < 0 else share
+                mixed.virtual_z[y, x] = depth(virtual.positions[v, u])
+    return mixed
+
+
+def composite(shown: NDArray[np.uint8], radiance: Floats, *others: Any, **named: Any) -> NDArray[np.uint8]:
+    """The picture [h, w, 3] of what `mix` mixes, untouched pixels as shown."""
+    mixed = mix(radiance, *others, **named)
+    color = radiance[..., :3] * mixed.factor
+    color += mixed.part[..., None] * (mixed.own - color)
+    is_changed = mixed.is_touched | (mixed.part > 0)
+    return np.where(is_changed[..., None], srgb_codes(color), shown)
+
+
+def layer(depth_scale_m: float, mixed: Mixed) -> tuple[NDArray[np.uint8], ...]:
+    """Codes of colour and coverage [h, w, 4] and of factors [h, w, 3]; depths [h, w] of virtual and of real surface."""
+
+    def depths(z: Floats) -> NDArray[np.uint16]:
+        return np.where(z > 0, np.clip(np.floor(z / depth_scale_m + 0.5), 1, 65535), 0).astype(np.uint16)
+
+    is_seen = mixed.part > 0
+    colors = np.where(is_seen[..., None], srgb_codes(mixed.own), 0)
+    virtual = np.concatenate([colors, np.floor(255 * mixed.part + 0.5)[..., None]], axis=-1).astype(np.uint8)
+    ratio = np.clip(np.floor(128 * mixed.factor + 0.5), 0, 255).astype(np.uint8)
+    return virtual, ratio, depths(mixed.virtual_z), depths(mixed.real_z)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,6 +14,7 @@ from protocol.images import encode_color, encode_depth
 from protocol.messages import Frame, LeftOut, Light, Plan, Timings, Wishes
 from server.meshing.scene_mesh import SceneMesh
 from server.meshing.surface import MeshingError
+from server.stages.layer import Layer, LayerPart
 
 PATIENCE_S = 20.0
 CAMERA = CameraModel(width=48, height=32, fx=40.0, fy=41.0, cx=23.5, cy=15.5)
@@ -27,13 +28,14 @@ REFUSE_MM, EXPLODE_MM = 111, 222
 class FakeResult:
     """Has the fields of `server.pipeline.FrameResult`."""
 
-    color: np.ndarray
+    color: np.ndarray | None
     light: Light
     world_from_camera: np.ndarray
     tracking: str
     timings: Timings
     plan: Plan
     notes: tuple[str, ...]
+    layer: Layer | None = None
 
 
 @dataclass
@@ -57,7 +59,7 @@ class Lab:
         self.threads.add(threading.current_thread().name)
         if wishes.preset == "auto":
             raise ValueError("preset auto is not for this fake: choose reg4")
-        return FakePipeline(self)
+        return FakePipeline(self, wishes.answer)
 
     def next_entered(self) -> int:
         """Wait until a pipeline begins a frame; its index."""
@@ -73,8 +75,9 @@ class FakePipeline:
 
     device_name = "a fake device"
 
-    def __init__(self, lab: Lab) -> None:
+    def __init__(self, lab: Lab, answer: str = "picture") -> None:
         self.lab = lab
+        self.answer = answer
         self.objects: set[str] = set()
 
     def place_object(self, object_id: str, mesh: object, placement: object) -> tuple[str, ...]:
@@ -100,7 +103,7 @@ class FakePipeline:
             raise MeshingError("there is no surface to mesh: no frame has been fused yet")
         return self.lab.mesh
 
-    def process(self, frame: RgbdFrame) -> FakeResult:
+    def process(self, frame: RgbdFrame, *, watched: bool = False) -> FakeResult:
         self.lab.log.append(("frame", frame.index))
         self.lab.entered.put(frame.index)
         if self.lab.hold and not self.lab.released.acquire(timeout=PATIENCE_S):
@@ -109,7 +112,9 @@ class FakePipeline:
             raise ValueError("no depth in this frame: point the camera at something")
         if frame.depth[0, 0] == EXPLODE_MM:
             raise RuntimeError("secret internals")
-        return fake_result(frame)
+        result = fake_result(frame)
+        color = result.color if watched or self.answer == "picture" else None
+        return replace(result, color=color, layer=fake_layer(frame) if self.answer == "layer" else None)
 
     def close(self) -> None:
         self.lab.closed.set()
@@ -127,6 +132,13 @@ def fake_result(frame: RgbdFrame) -> FakeResult:
         plan=Plan(run=("composite",), left_out=(LeftOut(effect="shadow", reason="no object", error_bound=0.0),)),
         notes=("one note",),
     )
+
+
+def fake_layer(frame: RgbdFrame) -> Layer:
+    """Some virtual pixels, of no two frames the same; no real ones that change."""
+    random = np.random.default_rng(1000 + frame.index)
+    color = random.integers(0, 256, (5, 7, 4), np.uint8)
+    return Layer(virtual=LayerPart(3, 2, color, random.integers(1, 5000, (5, 7), np.uint16)))
 
 
 def fake_light(frame: RgbdFrame) -> Light:

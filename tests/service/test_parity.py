@@ -60,7 +60,8 @@ def run_in_process(device: Device, scene: Scene, folder: Path) -> None:
     pipeline.place_object("object-0", load_mesh(data, format_), placement)
     with OutputWriter(folder) as writer:
         for frame in (scene.source[i] for i in range(FRAMES)):
-            result = vars(pipeline.process(frame))
+            result = {**vars(pipeline.process(frame))}
+            assert result.pop("layer") is None  # not wished for
             writer.write(FrameOutput(frame=frame.index, timestamp_s=frame.timestamp_s, **result))
         writer.write_mesh(mesh_files(pipeline.scene_mesh()))
     pipeline.close()

@@ -61,9 +61,9 @@ class _Recording(FakePipeline):
         super().__init__(received.lab)
         self._received = received
 
-    def process(self, frame: RgbdFrame) -> FakeResult:
+    def process(self, frame: RgbdFrame, **wanted: bool) -> FakeResult:
         self._received.frames.append(frame)
-        return super().process(frame)
+        return super().process(frame, **wanted)
 
 
 @pytest.fixture

@@ -41,8 +41,8 @@ TOLERANCE = 0.02
 class _Lit(fakes.FakePipeline):
     """A pipeline that finds this light."""
 
-    def process(self, frame: RgbdFrame) -> FakeResult:
-        result = super().process(frame)
+    def process(self, frame: RgbdFrame, **wanted: bool) -> FakeResult:
+        result = super().process(frame, **wanted)
         light = structs.replace(result.light, sh=tuple(map(tuple, SH.tolist())))
         return dataclasses.replace(result, light=light)
 

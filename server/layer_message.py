@@ -1,0 +1,64 @@
+"""A frame's layer as it is sent: pictures as PNG, depth without loss (protocol/README.md, "Layers")."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.images import encode_depth
+from protocol.messages import ColorImage, Frame, Layer, LayerPatch, Plan
+
+if TYPE_CHECKING:
+    from server.pipeline import FrameResult
+    from server.stages.layer import LayerPart
+
+Codec = Literal["zdelta", "zstd-delta"]
+
+_FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
+_BGR_FROM = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
+
+
+def layer_message(frame: Frame, result: FrameResult, plan: Plan) -> Layer:
+    """The answer to `frame`. A browser has no Zstandard: who sends depth by it is taken to read it, nobody else."""
+    layer = result.layer
+    assert layer is not None
+    reads_zstd = frame.depth is not None and frame.depth.codec.startswith("zstd")
+    codec: Codec = "zstd-delta" if reads_zstd else "zdelta"
+    return Layer(
+        frame=frame.frame,
+        timestamp_s=frame.timestamp_s,
+        virtual=_patch(layer.virtual, codec),
+        ratio=_patch(layer.ratio, codec),
+        depth_scale_m=layer.depth_scale_m,
+        world_from_camera=row_major(result.world_from_camera),
+        tracking=result.tracking,
+        timings=result.timings,
+        plan=plan,
+        notes=result.notes,
+    )
+
+
+def row_major(matrix: NDArray[np.float64]) -> tuple[float, ...]:
+    """A matrix as messages have it."""
+    return tuple(matrix.ravel().tolist())
+
+
+def _patch(part: LayerPart | None, codec: Codec) -> LayerPatch | None:
+    """A part of a layer; the same bytes for the same part."""
+    if part is None:
+        return None
+    height, width = part.depth.shape
+    color = ColorImage(width=width, height=height, data=_png(part.color), codec="png")
+    return LayerPatch(x=part.x, y=part.y, color=color, depth=encode_depth(part.depth, codec))
+
+
+def _png(color: NDArray[np.uint8]) -> bytes:
+    """[h, w, 3] RGB or [h, w, 4] RGBA."""
+    done, data = cv2.imencode(".png", cv2.cvtColor(color, _BGR_FROM[color.shape[2]]), _FAST)
+    if not done:
+        raise ValueError(f"OpenCV could not encode a layer of {color.shape} as PNG")
+    found: bytes = data.tobytes()
+    return found

@@ -178,9 +178,19 @@ def serve(
         str | None, typer.Option(metavar="DIR|none", help="where rooms are kept; default: the user's data folder")
     ] = None,
     log: Annotated[str, typer.Option(metavar="text|json", help="how events are written to standard error")] = "text",
+    objects: Annotated[Path | None, typer.Option(metavar="DIR", help="models that clients may place, by name")] = None,
 ) -> int:
     """The server. It asks for a token, which the URL that it prints brings along."""
-    from client.serving import ServeOptions, certificate_of, data_folder, door_of, leave_soon, limits_of, log_format_of
+    from client.serving import (
+        ServeOptions,
+        certificate_of,
+        data_folder,
+        door_of,
+        leave_soon,
+        limits_of,
+        log_format_of,
+        objects_folder,
+    )
     from server.events import log_events
     from server.serve import serve as serve_forever
 
@@ -200,7 +210,8 @@ def serve(
     certificate = certificate_of(options)
     log_events(log_format)
     kept_in = data_folder(data)
-    status = serve_forever(host, port, device, limits=limits, door=door, certificate=certificate, data=kept_in)
+    others = {"limits": limits, "door": door, "certificate": certificate, "objects": objects_folder(objects)}
+    status = serve_forever(host, port, device, data=kept_in, **others)
     leave_soon(status)
     return status
 

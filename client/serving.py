@@ -119,6 +119,13 @@ def leave_soon(status: int) -> None:
         sys.stderr.write("probeless: a session is stuck on the device and was given up\n")
         sys.stderr.flush()
         os._exit(status)
+def objects_folder(path: Path | None) -> Path | None:
+    """Where models are that clients may place; None: nowhere. Raises OptionError."""
+    if path is not None and not path.is_dir():
+        raise OptionError(f"--objects {path}: no such folder; give one with .glb, .obj, .ply or .stl files in it")
+    return path
+
+
 
     timer = threading.Timer(LEAVING_PATIENCE_S, leave)
     timer.daemon = True

@@ -1,4 +1,4 @@
-"""The routes: the socket, the page, health and metrics. Plain ASGI; everything it serves hangs on one service."""
+"""The routes: the socket, the page, objects, health and metrics. Plain ASGI; all of it hangs on one service."""
 
 from __future__ import annotations
 
@@ -13,16 +13,23 @@ from prometheus_client import CONTENT_TYPE_LATEST
 
 from server.connection import POLICY, Connection, Refusal
 from server.door import WHERE_IT_IS, Door
+from server.object_library import ObjectLibrary
+from server.object_routes import add_objects
 from server.service import Service
 
 STREAM_PATH = "/v1/stream"
 PAGE_FOLDER = Path(__file__).resolve().parents[1] / "client" / "web" / "dist"
 
 
-def create_app(service: Service, page_folder: Path = PAGE_FOLDER, door: Door | None = None) -> FastAPI:
+def create_app(
+    service: Service,
+    page_folder: Path = PAGE_FOLDER,
+    door: Door | None = None,
+    library: ObjectLibrary | None = None,
+) -> FastAPI:
     """The ASGI application around `service`, which it starts and stops; `page_folder` holds index.html.
 
-    `door`: who may come in; None: everybody.
+    `door`: who may come in; None: everybody. `library`: of objects to place; None: the vase alone.
     """
     door = door or Door()
 
@@ -36,6 +43,7 @@ def create_app(service: Service, page_folder: Path = PAGE_FOLDER, door: Door | N
     _add_stream(app, service, door)
     _add_health(app, service)
     _add_metrics(app, service, door)
+    add_objects(app, library or ObjectLibrary(), door)
     _add_page(app, page_folder)
     return app
 

@@ -10,7 +10,7 @@ import msgspec
 from fastapi import WebSocket, WebSocketDisconnect
 
 from protocol.codec import ProtocolError, decode_client, encode, one_line
-from protocol.limits import PROTOCOL_VERSION, SUBPROTOCOL, SUBPROTOCOL_PREFIX
+from protocol.limits import SUBPROTOCOL, SUBPROTOCOL_PREFIX
 from protocol.messages import Acknowledged, Bye, ClientMessage, Dropped, Error, Index, ServerMessage
 from server.limits import DEFAULT_LIMITS, Limits
 from server.pace import Pace
@@ -152,7 +152,7 @@ def _cut(reason: str) -> str:
 
 def _wrong_version(offered: list[str]) -> str:
     asked = next((name for name in offered if name.startswith(SUBPROTOCOL_PREFIX)), "no protocol version")
-    return one_line(f"this server speaks {SUBPROTOCOL} (version {PROTOCOL_VERSION}), you asked for {asked[:24]}")
+    return one_line(f"this server speaks {SUBPROTOCOL}, you asked for {asked[:24]}: use the same version on both sides")
 
 
 class _Envelope(msgspec.Struct):

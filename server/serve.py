@@ -23,6 +23,7 @@ from server.app import create_app
 from server.door import Door, is_loopback, new_token
 from server.limits import DEFAULT_LIMITS, Limits
 from server.linger import LingeringWebSocket
+from server.object_library import ObjectLibrary
 from server.service import Service
 from server.tls import Certificate
 
@@ -54,11 +55,13 @@ def serve(
     door: Door | None = None,
     certificate: Certificate | None = None,
     data: Path | None = None,
+    objects: Path | None = None,
     say: Callable[[str], None] | None = None,
 ) -> int:
     """Serve until interrupted; the exit status. `say` is given each line for the user (default: standard output).
 
     `door` None: a new token is asked for. `certificate` None: no TLS. `data`: folder that rooms are kept in.
+    `objects`: folder of models that clients may place; None: a vase alone.
     A port in use, a missing device or kernels that do not build end in one line on standard error and status 1.
     """
     say = say or _print_line
@@ -66,7 +69,8 @@ def serve(
         listener = listen(host, port)
         with listener:
             service = open_service(device_name, limits=limits, data=data)
-            return serve_on(listener, service, say, door or Door(new_token()), certificate)
+            library = ObjectLibrary(objects)
+            return serve_on(listener, service, say, door or Door(new_token()), certificate, library)
     except ServeError as error:
         sys.stderr.write(f"probeless: {error}\n")
         return 1
@@ -115,9 +119,10 @@ def serve_on(
     say: Callable[[str], None],
     door: Door = OPEN_DOOR,
     certificate: Certificate | None = None,
+    library: ObjectLibrary | None = None,
 ) -> int:
     """Serve a service until interrupted; the exit status. Raises ServeError if its warm-up fails."""
-    server = _server(service, door, certificate)
+    server = _server(service, door, certificate, library)
     with _key_left(listener, door, certificate) as is_left:
 
         def on_prepared() -> None:
@@ -199,6 +204,7 @@ class BackgroundServer:
         port: int = 0,
         door: Door = OPEN_DOOR,
         certificate: Certificate | None = None,
+        library: ObjectLibrary | None = None,
     ) -> None:
         """Start and wait until it accepts connections. Raises ServeError."""
         self._listener = listen(host, port)
@@ -206,7 +212,7 @@ class BackgroundServer:
         self.way_in = f"{self.url}{door.query}"
         """What a browser opens."""
         self.service = service
-        self._server = _server(service, door, certificate)
+        self._server = _server(service, door, certificate, library)
         self._key = _key_left(self._listener, door, certificate)
         self._key.__enter__()
         self._thread = threading.Thread(target=self._run, name="probeless-server", daemon=True)
@@ -241,9 +247,10 @@ def start_in_background(
     port: int = 0,
     door: Door = OPEN_DOOR,
     certificate: Certificate | None = None,
+    library: ObjectLibrary | None = None,
 ) -> BackgroundServer:
     """Serve `service` from a thread; `.url` says where (port 0: a free one), `.stop()` ends it. Raises ServeError."""
-    return BackgroundServer(service, host, port, door, certificate)
+    return BackgroundServer(service, host, port, door, certificate, library)
 
 
 class _Server(uvicorn.Server):
@@ -264,9 +271,9 @@ class _Server(uvicorn.Server):
         self.accepting.set()
 
 
-def _server(service: Service, door: Door, certificate: Certificate | None) -> _Server:
+def _server(service: Service, door: Door, certificate: Certificate | None, library: ObjectLibrary | None) -> _Server:
     config = uvicorn.Config(
-        create_app(service, door=door),
+        create_app(service, door=door, library=library),
         ssl_certfile=None if certificate is None else certificate.certificate,
         ssl_keyfile=None if certificate is None else certificate.key,
         log_level="warning",

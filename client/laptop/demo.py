@@ -11,11 +11,11 @@ from pathlib import Path
 from client.laptop.objects import ObjectFile
 from client.laptop.source import Source, open_source
 from client.laptop.stream import StreamSummary, stream
-from client.laptop.vase import vase_glb
 from client.laptop.volume import default_volume, default_voxel
 from client.progress import say
 from protocol.messages import Wishes
 from server.door import Door, new_token
+from server.scene.vase import vase_glb
 from server.serve import open_service, start_in_background
 
 SOURCE = "synthetic:table?light=7&frames="

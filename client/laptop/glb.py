@@ -1,4 +1,4 @@
-"""GLB containers: checking one, packing a glTF with its files into one, building one from arrays.
+"""GLB containers: checking one, packing a glTF with its files into one; how they are written is the server's too.
 
 Bytes of images and vertices are carried over as they are; no axis, unit or colour is converted.
 """
@@ -15,13 +15,13 @@ from urllib.parse import unquote
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from client.laptop.errors import ObjectError
+from server.scene.glb import add_array, add_view, append, to_bytes
 
-_JSON, _BIN = 0x4E4F534A, 0x004E4942
-_COMPONENT = {np.dtype(np.float32): 5126, np.dtype(np.uint32): 5125, np.dtype(np.uint8): 5121}
-_SHAPE = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+__all__ = ["add_array", "add_image", "add_view", "check_glb", "gltf_to_glb", "to_bytes"]
+
+_JSON = 0x4E4F534A
 
 
 def check_glb(path: Path, data: bytes) -> dict[str, Any]:
@@ -45,7 +45,7 @@ def gltf_to_glb(path: Path, data: bytes) -> bytes:
     if not document.get("meshes"):
         raise ObjectError(f"{path}: the glTF holds no mesh")
     body = bytearray()
-    offsets = [_append(body, _fetch(path, buffer.get("uri"))) for buffer in document.get("buffers", [])]
+    offsets = [append(body, _fetch(path, buffer.get("uri"))) for buffer in document.get("buffers", [])]
     for view in document.get("bufferViews", []):
         view["byteOffset"] = view.get("byteOffset", 0) + offsets[view.get("buffer", 0)]
         view["buffer"] = 0
@@ -53,44 +53,6 @@ def gltf_to_glb(path: Path, data: bytes) -> bytes:
         if "uri" in image:
             _embed(document, body, image, _fetch(path, image.pop("uri")))
     return to_bytes(document, body)
-
-
-def to_bytes(document: dict[str, Any], body: bytes | bytearray) -> bytes:
-    """The GLB of `document`, whose one buffer is `body`."""
-    if body:
-        document["buffers"] = [{"byteLength": len(body)}]
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    padded = bytes(body) + b"\0" * (-len(body) % 4)
-    chunks = struct.pack("<II", len(text), _JSON) + text
-    if padded:
-        chunks += struct.pack("<II", len(padded), _BIN) + padded
-    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
-
-
-def add_array(document: dict[str, Any], body: bytearray, values: NDArray, bounds: bool = False) -> int:
-    """Append an accessor over `values` [n] or [n, k] (float32, uint32, uint8 meaning 0..1); returns its index."""
-    columns = 1 if values.ndim == 1 else values.shape[1]
-    accessor = {
-        "bufferView": add_view(document, body, np.ascontiguousarray(values).tobytes()),
-        "componentType": _COMPONENT[values.dtype],
-        "count": len(values),
-        "type": _SHAPE[columns],
-    }
-    if values.dtype == np.uint8:
-        accessor["normalized"] = True
-    if bounds:
-        accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
-    document.setdefault("accessors", []).append(accessor)
-    return len(document["accessors"]) - 1
-
-
-def add_view(document: dict[str, Any], body: bytearray, data: bytes) -> int:
-    """Append a buffer view over `data`; returns its index."""
-    offset = _append(body, data)
-    views = document.setdefault("bufferViews", [])
-    views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(data)})
-    return len(views) - 1
 
 
 def add_image(document: dict[str, Any], body: bytearray, data: bytes, name: Path) -> int:
@@ -106,13 +68,6 @@ def add_image(document: dict[str, Any], body: bytearray, data: bytes, name: Path
 def _embed(document: dict[str, Any], body: bytearray, image: dict[str, Any], data: bytes) -> None:
     image["bufferView"] = add_view(document, body, data)
     image["mimeType"] = _mime_type(data) or image.get("mimeType", "image/png")
-
-
-def _append(body: bytearray, data: bytes) -> int:
-    body.extend(b"\0" * (-len(body) % 4))
-    offset = len(body)
-    body.extend(data)
-    return offset
 
 
 def _mime_type(data: bytes) -> str | None:

@@ -20,6 +20,8 @@ from server.cluster.routing import Route, route_of
 from server.connection import GONE, POLICY, TRY_LATER, BadMessage, Connection, Refusal
 from server.door import Door
 from server.limits import DEFAULT_LIMITS, Limits
+from server.object_library import ObjectLibrary
+from server.object_routes import add_objects
 
 ASK_AGAIN_S = 0.25
 PATIENCE_S = 20.0
@@ -35,7 +37,7 @@ class Ingress:
         self, places: Places, door: Door, limits: Limits = DEFAULT_LIMITS, patience_s: float = PATIENCE_S
     ) -> None:
         self._places = places
-        self._door = door
+        self.door = door
         self._limits = limits
         self._patience_s = patience_s
         self.clients = 0
@@ -47,7 +49,7 @@ class Ingress:
             return
         self.clients += 1
         try:
-            if (refusal := self._door.refusal(websocket)) is not None:
+            if (refusal := self.door.refusal(websocket)) is not None:
                 raise refusal
             route = route_of(await self._first_message(connection))
             async with await self._host_of(route) as host:
@@ -96,6 +98,7 @@ def create_ingress_app(ingress: Ingress, page_folder: Path = PAGE_FOLDER) -> Fas
     async def healthz() -> JSONResponse:
         return JSONResponse({"ready": True, "clients": ingress.clients})
 
+    add_objects(app, ObjectLibrary(), ingress.door)
     if (page_folder / "index.html").is_file():
         app.mount("/", StaticFiles(directory=page_folder, html=True))
     return app

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from client.adaptive import LADDER
 from client.coding import Coding, frame_message, picture_bytes
 from client.laptop.source import Source, open_source
-from client.laptop.vase import vase_glb
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import decode_color, decode_depth
 from server.evaluation.environment import direction_error_deg
@@ -23,6 +22,7 @@ from server.opencl.device import Device
 from server.pipeline import Pipeline
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
+from server.scene.vase import vase_glb
 from tests.bench.light_runs import wishes_for
 from tests.bench.service_speed import looked_at
 from tests.data import ROOT

@@ -17,7 +17,6 @@ from websockets.asyncio.client import ClientConnection
 
 from client.client import Access, StreamClient
 from client.laptop.source import open_source
-from client.laptop.vase import vase_glb
 from client.laptop.volume import default_volume
 from client.opening import open_client_socket
 from protocol.codec import decode_server, encode
@@ -36,6 +35,7 @@ from protocol.messages import (
     Wishes,
 )
 from protocol.recording import read_messages, write_message
+from server.scene.vase import vase_glb
 from tests.bench.finished import Part
 from tests.bench.run import Run
 from tests.bench.service_process import serving

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from client.client import Answer, StreamClient
 from client.laptop.source import Source, open_source
-from client.laptop.vase import vase_glb
 from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
+from server.scene.vase import vase_glb
 from tests.bench.finished import Part
 from tests.bench.run import Run
 from tests.bench.service_process import resident_mb, serving

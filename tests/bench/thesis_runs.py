@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from client.laptop.synthetic.export import guest_ply
 from client.laptop.synthetic.source import SyntheticSource, open_synthetic
-from client.laptop.vase import vase_glb
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
@@ -25,6 +24,7 @@ from server.opencl.device import Device
 from server.pipeline import FrameResult, Pipeline
 from server.scene.mesh import Mesh, load_mesh
 from server.scene.placement import Placement
+from server.scene.vase import vase_glb
 from tests.bench.finished import ROOT
 from tests.bench.thesis_numbers import ROWS
 

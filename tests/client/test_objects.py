@@ -14,9 +14,9 @@ import trimesh
 
 from client.laptop.errors import ObjectError
 from client.laptop.objects import pack_mesh, parse_object
-from client.laptop.vase import HEIGHT_M, vase_glb
 from protocol.limits import MAX_MESH_BYTES
 from server.scene.mesh import load_mesh
+from server.scene.vase import HEIGHT_M, vase_glb
 from tests.data import data_folder
 
 OBJ = """mtllib model.mtl

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop import glb
+from server.scene import glb
 
 HEIGHT_M = 0.24
 SEGMENTS = 64
@@ -95,7 +95,8 @@ def _triangles(rings: int) -> NDArray[np.uint32]:
     keep = np.ones((rings - 1, 2), bool)
     keep[0, 0] = keep[-1, 1] = False
     cells = np.stack([lower, upper], axis=2)[np.broadcast_to(keep[:, None], (rings - 1, SEGMENTS, 2))]
-    return cells.ravel().astype(np.uint32)
+    triangles: NDArray[np.uint32] = cells.ravel().astype(np.uint32)
+    return triangles
 
 
 def _colors(height: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -1,0 +1,52 @@
+"""The library of objects over HTTP: `GET /v1/objects` lists it, `GET /v1/objects/{name}` is one of its files."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+from fastapi import FastAPI, Request
+from fastapi.responses import JSONResponse, PlainTextResponse, Response
+
+from server.connection import UNAUTHORIZED
+from server.door import Door
+from server.object_library import NoObject, ObjectLibrary
+
+OBJECTS_PATH = "/v1/objects"
+
+
+def add_objects(app: FastAPI, library: ObjectLibrary, door: Door) -> None:
+    """Whoever may open the stream may have the objects; in threads, since files are read."""
+
+    @app.get(OBJECTS_PATH)
+    def listing(request: Request) -> Response:
+        return _refusal(door, request) or JSONResponse(
+            {"objects": [asdict(offered) for offered in library.listing()]}, headers=_headers(request)
+        )
+
+    @app.get(OBJECTS_PATH + "/{name}")
+    def one(request: Request, name: str) -> Response:
+        if (refusal := _refusal(door, request)) is not None:
+            return refusal
+        try:
+            found = library.read(name)
+        except NoObject as error:
+            return PlainTextResponse(f"{error}\n", status_code=404, headers=_headers(request))
+        headers = _headers(request) | {"etag": found.etag}
+        if found.etag in request.headers.get("if-none-match", ""):
+            return Response(status_code=304, headers=headers)
+        return Response(found.data, media_type=found.media_type, headers=headers)
+
+
+def _refusal(door: Door, request: Request) -> Response | None:
+    refusal = door.refusal(request)
+    if refusal is None:
+        return None
+    status = 401 if refusal.code == UNAUTHORIZED else 403
+    return PlainTextResponse(f"{refusal.reason}\n", status_code=status, headers={"cache-control": "no-store"})
+
+
+def _headers(request: Request) -> dict[str, str]:
+    """Kept by whoever asked, and asked for again each time; for pages of origins that the door has let pass."""
+    headers = {"cache-control": "private, no-cache", "vary": "origin", "x-content-type-options": "nosniff"}
+    origin = request.headers.get("origin")
+    return headers if origin is None else headers | {"access-control-allow-origin": origin}

@@ -3,11 +3,12 @@ PYTHON ?= python3
 BIN := .venv/bin
 DATA ?= ../shared/data
 
-.PHONY: help install install-bench install-cluster install-oak demo test lint bench check-races web lock clean
+.PHONY: help install install-bench install-cluster install-oak demo test lint bench check-races web package lock clean
 help:
 	@echo "make demo    the main job: server, streaming client, pictures in out/demo"
 	@echo "make test    the tests           make lint   formatting, types"
 	@echo "make bench   the benchmarks      make web    rebuild the page from its sources"
+	@echo "make package the npm package of client/web, into out"
 	@echo "make check-races   the kernels in a simulator that finds data races (downloads it)"
 	@echo "make install the program alone, as .venv/bin/probeless; install-cluster: and Ray Serve, for many machines"
 	@echo "make install-oak   that, and what reads an OAK camera"
@@ -45,6 +46,9 @@ check-races: .venv/installed-test .oclgrind/installed
 web: .venv/installed-test
 	$(BIN)/python -m protocol.typescript
 	$(BIN)/python -m client.web.build
+
+package: .venv/installed-test
+	$(BIN)/python -m client.web.build --package out
 
 # The locks hold every package with its hash, for every platform and Python that pyproject.toml allows.
 lock: .venv/installed-test

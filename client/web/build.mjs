@@ -1,4 +1,5 @@
-// `node build.mjs [FOLDER]` bundles the page into FOLDER (default dist); `--tests` bundles the tests into .test.
+// `node build.mjs [FOLDER]` bundles the page into FOLDER (default dist); `--tests` bundles the tests into .test, `--library`
+// what the npm package offers into lib.
 // The same sources and the pinned packages give the same bytes on every machine.
 import { copyFile, mkdir, readdir, readFile, rm, writeFile } from "node:fs/promises";
 import { join } from "node:path";
@@ -23,8 +24,22 @@ async function buildPage(folder) {
     logLevel: "warning",
   });
   await copyFile("src/index.html", join(folder, "index.html"));
-  const licences = await Promise.all(["@msgpack/msgpack", "three"].map((name) => readFile(`node_modules/${name}/LICENSE`, "utf8")));
+  const licences = await Promise.all(["@msgpack/msgpack", "fzstd", "three"].map((name) => readFile(`node_modules/${name}/LICENSE`, "utf8")));
   await writeFile(join(folder, "LICENSES.txt"), licences.join("\n----\n\n"));
+}
+
+async function buildLibrary(folder) {
+  await rm(folder, { recursive: true, force: true });
+  await build({
+    entryPoints: { probeless: "src/library.ts" },
+    outdir: folder,
+    bundle: true,
+    packages: "external",
+    format: "esm",
+    target: "es2022",
+    charset: "utf8",
+    logLevel: "warning",
+  });
 }
 
 async function buildTests(folder) {
@@ -42,4 +57,6 @@ async function buildTests(folder) {
   });
 }
 
-await (argument === "--tests" ? buildTests(".test") : buildPage(argument));
+if (argument === "--tests") await buildTests(".test");
+else if (argument === "--library") await buildLibrary("lib");
+else await buildPage(argument);

@@ -1,5 +1,7 @@
 """Builds the page into client/web/dist with the Node.js that comes from PyPI: `python -m client.web.build`.
 
+`--package FOLDER` packs the client for programs instead, as an npm package.
+
 The built page is part of the repository, so that running probeless needs no Node.js; a test holds it to its sources.
 """
 
@@ -41,16 +43,26 @@ def build(output: Path, folder: Path = FOLDER) -> None:
     npm("run", "build", "--", str(output.resolve()), folder=folder)
 
 
+def pack(output: Path, folder: Path = FOLDER) -> None:
+    """Write the npm package of `folder` into `output`, as NAME-VERSION.tgz."""
+    output.mkdir(parents=True, exist_ok=True)
+    npm("pack", "--pack-destination", str(output.resolve()), folder=folder)
+
+
 def main() -> int:
     """Install and build; on failure say what npm said."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--out", type=Path, default=FOLDER / "dist", help="folder of the built page")
-    output = options.parse_args().out
+    options.add_argument("--package", type=Path, metavar="FOLDER", help="pack the npm package into it instead")
+    given = options.parse_args()
+    output = given.package or given.out
     try:
         install()
-        build(output)
+        (pack if given.package else build)(output)
     except subprocess.CalledProcessError as error:
-        sys.stderr.write(f"the page could not be built:\n{error.stdout}{error.stderr}")
+        sys.stderr.write(
+            f"{'the package' if given.package else 'the page'} could not be built:\n{error.stdout}{error.stderr}"
+        )
         return 1
     sys.stdout.write(f"built {output}\n")
     return 0

@@ -1,11 +1,13 @@
 // A session of this page's own: from the form's button to its end.
 
 import { startCamera } from "./capture/camera_source";
-import { type Captured, reasonOf, type Sink, type Source, SourceError } from "./capture/source";
+import { type Shown, startRecorded } from "./capture/recorded_source";
+import { type Captured, type Packed, reasonOf, type Shot, type Sink, type Source, SourceError } from "./capture/source";
 import { type Draw, startXr } from "./capture/xr_source";
 import { type Choice, setupOf } from "./form";
-import type { Seen } from "./objects/picking";
+import { scaled, type Seen, Y_UP } from "./objects/picking";
 import type { Remote } from "./remote";
+import type { Vector3 } from "./sh";
 
 /** Frames on the way whose depth a finger may still need. */
 const KEPT = 8;
@@ -15,29 +17,55 @@ export interface CapturingHooks {
   say(text: string, isEnd: boolean): void;
 }
 
+/** Who draws on this device, where anybody does. */
+export interface Screen {
+  /** In a WebXR session. */
+  readonly draw: Draw;
+  /** Pictures that the page displays itself. */
+  readonly show?: (shown: Shown) => void;
+}
+
 export class Capturing implements Sink {
   private source: Source | null = null;
-  private readonly seen = new Map<number, Seen>();
+  private up: Vector3 = Y_UP;
+  private readonly seen = new Map<number, Omit<Seen, "world_from_camera"> & Pick<Shot, "world_from_camera">>();
+  private readonly shots = new Map<number, Shot>();
 
   constructor(
     private readonly remote: Remote,
     private readonly hooks: CapturingHooks,
-    private readonly draw: Draw | null,
+    private readonly screen: Screen | null,
   ) {}
 
   /** Begin, to be called by a tap. Throws SourceError. */
   async start(choice: Choice, stage: Element, url: string): Promise<void> {
     try {
-      this.source = choice.source === "xr" ? await startXr(stage, this, this.draw) : await startCamera(choice.view_deg, this);
+      this.source = await this.open(choice, stage);
     } catch (error) {
       throw error instanceof SourceError ? error : new SourceError(`The camera cannot be started (${reasonOf(error)}).`);
     }
-    this.remote.capture(url, setupOf(choice));
+    const setup = setupOf(choice);
+    const wishes = { ...setup.wishes, ...this.source.wishes };
+    const up = wishes.up ?? Y_UP;
+    this.up = scaled(up, 1 / Math.hypot(...up));
+    this.remote.capture(url, { ...setup, wishes });
   }
 
-  /** The frame of a number, as far as its depth is still here. */
-  seenIn(frame: number): Seen | null {
-    return this.seen.get(frame) ?? null;
+  private open({ source, file, loops, view_deg }: Choice, stage: Element): Promise<Source> {
+    if (source === "recorded") return startRecorded(file!, loops, this, this.screen?.show ?? null);
+    return source === "xr" ? startXr(stage, this, this.screen?.draw ?? null) : startCamera(view_deg, this);
+  }
+
+  /** With which lens and from where a frame was taken, as far as it is not long ago. */
+  shotOf(frame: number): Shot | null {
+    return this.shots.get(frame) ?? null;
+  }
+
+  /** The frame of a number, as far as its depth is still here. `answered`: from where the server says that it was taken. */
+  seenIn(frame: number, answered: readonly number[] | null): Seen | null {
+    const seen = this.seen.get(frame);
+    const world_from_camera = seen?.world_from_camera ?? answered;
+    return seen === undefined || world_from_camera === null ? null : { ...seen, world_from_camera };
   }
 
   async stop(): Promise<void> {
@@ -49,14 +77,12 @@ export class Capturing implements Sink {
     return this.remote.wantsFrame;
   }
 
-  take(frame: Captured): void {
-    const { camera, world_from_camera, depth } = frame;
-    const kept = depth === null ? null : depth.slice(); // the frame's own goes to the worker
+  take(frame: Captured | Packed): void {
+    const { camera, world_from_camera, timestamp_s, captured_ms } = frame;
+    const depth = "packed" in frame ? (frame.packed.depth ?? null) : (frame.depth?.slice() ?? null); // the frame's own goes to the worker
     const number = this.remote.send(frame);
-    if (kept === null || world_from_camera === null) return;
-    this.seen.set(number, { camera, world_from_camera, depth: kept });
-    const oldest = this.seen.keys().next().value;
-    if (this.seen.size > KEPT && oldest !== undefined) this.seen.delete(oldest);
+    keep(this.shots, number, { camera, world_from_camera, timestamp_s, captured_ms });
+    if (depth !== null) keep(this.seen, number, { camera, world_from_camera, up: this.up, depth });
   }
 
   say(text: string): void {
@@ -66,4 +92,10 @@ export class Capturing implements Sink {
   ended(reason: string): void {
     this.hooks.say(reason, true);
   }
+}
+
+function keep<T>(kept: Map<number, T>, number: number, value: T): void {
+  kept.set(number, value);
+  const oldest = kept.keys().next().value;
+  if (kept.size > KEPT && oldest !== undefined) kept.delete(oldest);
 }

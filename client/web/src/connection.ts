@@ -6,7 +6,8 @@ import { type ClientMessage, type ServerMessage, SUBPROTOCOL } from "./protocol"
 export type ConnectionState =
   | { kind: "connecting" }
   | { kind: "open" }
-  | { kind: "lost"; reason: string; wait_ms: number }
+  /** `isFull`: the server is there, and has no place now. */
+  | { kind: "lost"; reason: string; wait_ms: number; isFull: boolean }
   | { kind: "refused"; reason: string };
 
 /** Between tries: the first pause, and the longest. */
@@ -21,8 +22,9 @@ export const CAPTURING: Pauses = { first_ms: 100, longest_ms: 2_000 };
 
 /** A connection that lasted this long was a good one: the pauses start from the shortest again. */
 const GOOD_AFTER_MS = 10_000;
+const [LOST, VERSION, TRY_LATER] = [1006, 1002, 1013] as const;
 /** Wrong version, no token or a wrong one, a page of elsewhere: trying again would change nothing. */
-const REFUSED: readonly number[] = [1002, 4401, 4403];
+const REFUSED: readonly number[] = [VERSION, 4401, 4403];
 /** What is wished cannot be had; a session that was to be watched may come yet. */
 export const POLICY = 1008;
 
@@ -115,7 +117,7 @@ export class Connection {
 
   private closed(event: CloseEvent): void {
     this.socket = null;
-    const reason = event.reason || (event.code === 1006 ? "the server does not answer" : "the server closed the connection");
+    const reason = reasonFor(event);
     this.hooks.onClosed?.(event.code);
     if (this.refused.includes(event.code)) {
       this.hooks.onState({ kind: "refused", reason });
@@ -124,8 +126,15 @@ export class Connection {
     if (performance.now() - this.opened_ms > GOOD_AFTER_MS) this.attempts = 0;
     const wait_ms = pause_ms(++this.attempts, Math.random, this.pauses);
     this.timer = setTimeout(() => this.open(), wait_ms);
-    this.hooks.onState({ kind: "lost", reason, wait_ms });
+    this.hooks.onState({ kind: "lost", reason, wait_ms, isFull: event.code === TRY_LATER });
   }
+}
+
+/** What the server said, or what is known without it, and what to do. */
+function reasonFor({ code, reason }: CloseEvent): string {
+  if (code === LOST) return "the server does not answer; see that it runs (probeless serve) and that the network does";
+  if (code === VERSION && reason !== "") return `${reason}; reload this page`;
+  return reason || "the server closed the connection and did not say why";
 }
 
 /** Of a client that captures. */

@@ -31,10 +31,22 @@ export async function encodeDepth(depth: Uint16Array, width: number): Promise<De
 }
 
 export async function decodeDepth(image: DepthImage): Promise<Uint16Array<ArrayBuffer>> {
-  if (image.codec !== "zdelta") throw new Error(`depth codec ${image.codec} is not read here`);
-  const planes = await pipe(new Uint8Array(image.data), new DecompressionStream("deflate-raw"));
-  if (planes.length !== 2 * image.width * image.height) throw new Error("depth is not of the size it declares");
-  return unfilterDepth(planes, image.width);
+  const bytes = await unpacked(image);
+  if (bytes.length !== 2 * image.width * image.height) throw new Error("depth is not of the size it declares");
+  return image.codec === "raw" ? new Uint16Array(bytes.slice().buffer) : unfilterDepth(bytes, image.width);
+}
+
+async function unpacked({ codec, data }: DepthImage): Promise<Uint8Array> {
+  switch (codec) {
+    case "raw":
+      return data;
+    case "zdelta":
+      return pipe(new Uint8Array(data), new DecompressionStream("deflate-raw"));
+    case "zstd-delta": // no browser has Zstandard for pages
+      return (await import("fzstd")).decompress(data);
+    default:
+      throw new Error(`depth codec ${String(codec)} is not read here`);
+  }
 }
 
 async function pipe(

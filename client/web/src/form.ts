@@ -3,7 +3,7 @@
 import type { Setup } from "./capture/stream";
 import type { Marker, Wishes } from "./protocol";
 
-export type SourceName = "watch" | "xr" | "camera";
+export type SourceName = "watch" | "xr" | "camera" | "recorded";
 
 export interface Choice {
   source: SourceName;
@@ -14,17 +14,22 @@ export interface Choice {
   view_deg: number;
   preset: NonNullable<Wishes["preset"]>;
   budget_ms: number;
-  /** Who draws the objects: the server into the picture, or this device in the light that the server finds. */
-  answer: "picture" | "light";
+  /** Who draws the objects: the server into the picture, or to go over the newest one; or this device in the light that the server finds. */
+  answer: NonNullable<Wishes["answer"]>;
+  /** Of a recorded sequence. */
+  file: File | null;
+  loops: boolean;
 }
 
-const SOURCES: readonly SourceName[] = ["watch", "xr", "camera"];
+const SOURCES: readonly SourceName[] = ["watch", "xr", "camera", "recorded"];
+/** Besides pictures: the page itself must see the camera's picture and know where it is. */
+const ANSWERS: Readonly<Record<string, readonly Choice["answer"][]>> = { xr: ["layer", "light"], recorded: ["layer"] };
 /** For which the server keeps the session of a connection that is lost, as client/client.py has it. */
 export const KEEP_S = 30;
 
 /** Fill the form with what the address says: `?room=kitchen&key=...&source=xr`. */
 export function fill(form: HTMLFormElement, page: URL): void {
-  for (const name of ["room", "key", "marker", "side", "view", "preset", "budget", "answer"]) {
+  for (const name of ["room", "key", "marker", "side", "view", "preset", "budget", "answer", "repeat"]) {
     const value = page.searchParams.get(name);
     const field = form.elements.namedItem(name);
     if (value !== null && (field instanceof HTMLInputElement || field instanceof HTMLSelectElement)) field.value = value;
@@ -36,6 +41,7 @@ export function fill(form: HTMLFormElement, page: URL): void {
 export function read(form: HTMLFormElement): Choice {
   const data = new FormData(form);
   const text = (name: string): string => String(data.get(name) ?? "").trim();
+  const file = data.get("recording");
   return {
     source: SOURCES.find((name) => name === text("source")) ?? "watch",
     room: text("room"),
@@ -45,13 +51,16 @@ export function read(form: HTMLFormElement): Choice {
     view_deg: Number(text("view")),
     preset: text("preset") as Choice["preset"],
     budget_ms: Number(text("budget")),
-    answer: text("source") === "xr" && text("answer") === "light" ? "light" : "picture",
+    answer: ANSWERS[text("source")]?.find((each) => each === text("answer")) ?? "picture",
+    file: file instanceof File && file.name !== "" ? file : null,
+    loops: text("repeat") !== "once",
   };
 }
 
 /** What is missing before a session can begin, in one sentence; null: nothing. */
 export function missing(choice: Choice): string | null {
   if (choice.key !== "" && choice.room === "") return "A key is of a room: name the room too.";
+  if (choice.source === "recorded" && choice.file === null) return "Choose the recording: a file that probeless stream SOURCE --record FILE has made.";
   if (choice.source !== "camera") return null;
   if (choice.room === "") return "A plain camera sees no depth and does not know where it is: name a room that somebody else scans.";
   if (choice.marker === null) return "Say which marker both cameras see: only by it is known where a plain camera is in the room.";
@@ -61,6 +70,12 @@ export function missing(choice: Choice): string | null {
 /** How the light is sampled. */
 export function quality({ preset, budget_ms }: Choice): Pick<Wishes, "preset" | "budget_ms"> {
   return preset === "auto" ? { preset, budget_ms } : { preset, budget_ms: null };
+}
+
+/** Let the form say it. */
+export function putQuality(form: HTMLFormElement, { preset, budget_ms }: Choice): void {
+  (form.elements.namedItem("preset") as HTMLSelectElement).value = preset;
+  (form.elements.namedItem("budget") as HTMLInputElement).value = String(budget_ms);
 }
 
 /** The hello of a choice, but for the camera. */

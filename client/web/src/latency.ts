@@ -2,6 +2,7 @@
 
 import { now_ms } from "./capture/source";
 import type { Times } from "./capture/stream";
+import type { Ages } from "./layer_mode";
 import { byId, setText } from "./dom";
 import type { Timings } from "./protocol";
 import { milliseconds } from "./words";
@@ -37,8 +38,23 @@ export function stagesOf(times: Times, timings: Timings, shown_ms: number): Reco
   };
 }
 
+const ages: { layer: number[]; picture: number[] } = { layer: [], picture: [] };
+
+/** How old what is on the screen is, in layer mode; null: in no other mode is it another age than that of an answer. */
+export function showAges(now: Ages | null): void {
+  byId("latency").classList.toggle("layered", now !== null);
+  if (now === null || now.layer_ms === null) return;
+  for (const [name, value, say] of [["layer", now.layer_ms, milliseconds], ["picture", now.picture_frames, String]] as const) {
+    ages[name].push(value);
+    if (ages[name].length > HISTORY) ages[name].shift();
+    setText(byId(`age-${name}`), say(value));
+    setText(byId(`age-${name}-median`), say(median(ages[name])));
+  }
+}
+
 export function clearLatency(): void {
-  for (const stage of STAGES) history[stage].length = 0;
+  for (const values of [...Object.values(history), ...Object.values(ages)]) values.length = 0;
+  showAges(null);
   byId("latency").hidden = true;
 }
 

@@ -5,13 +5,16 @@ import { findSupport } from "./capture/support";
 import { Capturing } from "./capturing";
 import { type ConnectionState, streamUrl, tokenQuery } from "./connection";
 import { byId, make, setText } from "./dom";
-import { type Choice, fill, missing, quality, read } from "./form";
-import { clearLatency, noteShown } from "./latency";
+import { type Choice, fill, missing, read } from "./form";
+import { clearLatency, noteShown, showAges } from "./latency";
+import { LayerMode } from "./layer_mode";
 import { LightMode } from "./light_mode";
+import { closeParts } from "./local/layer_parts";
 import { ObjectTools } from "./objects/tools";
 import { Panels } from "./panels";
-import { fitPicture, markPicture, showPicture } from "./picture";
+import { captionPicture, fitPicture, markPicture, showPicture } from "./picture";
 import type { Light, ServerMessage } from "./protocol";
+import { QualityChanges } from "./quality_changes";
 import { Remote } from "./remote";
 import type { News } from "./worker_messages";
 
@@ -29,12 +32,19 @@ const fullButton = byId<HTMLButtonElement>("full");
 const panels = new Panels();
 const remote = new Remote(receive, (reason) => fail(`This page cannot work in this browser: ${reason}`));
 let lightMode: LightMode | null = null;
+let layerMode: LayerMode | null = null;
 const tools = new ObjectTools((asked) => (lightMode === null ? remote.request(asked) : null));
+const qualityChanges = new QualityChanges(form, (asked) => remote.request(asked), (text) => {
+  setText(byId("capture-said"), text);
+  noteChoice();
+});
 let capturing: Capturing | null = null;
 let connection: ConnectionState = { kind: "connecting" };
 let retryAt_ms = 0;
 let welcomes = 0;
 let told = "";
+/** What a session must be like to be watched, in words. */
+let watched = "";
 
 function receive(message: News): void {
   switch (message.kind) {
@@ -49,7 +59,10 @@ function receive(message: News): void {
     case "picture":
       showPicture(message.composite, message.bitmap);
       if (message.times !== null) noteShown(message.times, message.composite.timings);
-      if (capturing !== null) tools.show(capturing.seenIn(message.composite.frame));
+      if (capturing !== null) tools.show(capturing.seenIn(message.composite.frame, message.composite.world_from_camera));
+      return;
+    case "layer":
+      receiveLayer(message);
       return;
     case "say":
       panels.note(message.text);
@@ -64,22 +77,38 @@ function receive(message: News): void {
 function receiveServer(message: ServerMessage): void {
   panels.receive(message);
   if (message.type === "acknowledged") {
+    qualityChanges.acknowledge(message.request, message.error);
     const problem = tools.scene.acknowledge(message.request, message.error);
     if (problem !== null) tools.say(problem);
   }
-  if (message.type === "welcome" && capturing !== null && ++welcomes > 1 && !message.resumed) tools.scene.placeAgain();
-  if (message.type === "composite") told = "";
+  if (message.type === "welcome" && capturing !== null && ++welcomes > 1 && !message.resumed) beginAgain();
+  if (message.type === "composite" || message.type === "layer") told = "";
   if (message.type === "light" && lightMode !== null) receiveLight(message);
+}
+
+/** The server was started anew, or another camera is used. */
+function beginAgain(): void {
+  tools.scene.placeAgain();
+  panels.note("the session has begun anew: what had been scanned is gone unless the server keeps the room; objects are placed again");
 }
 
 /** In light mode a light is the answer to its frame. */
 function receiveLight(light: Light): void {
   told = "";
   lightMode?.setLight(light);
-  const seen = capturing?.seenIn(light.frame) ?? null;
+  const seen = capturing?.seenIn(light.frame, null) ?? null;
   panels.noteAnswer(seen?.world_from_camera ?? null);
   if (seen !== null) fitPicture(seen.camera);
   tools.show(seen);
+}
+
+function receiveLayer({ layer, parts, times }: Extract<News, { kind: "layer" }>): void {
+  const shot = capturing?.shotOf(layer.frame) ?? null;
+  if (layerMode === null || shot === null) return closeParts(parts);
+  fitPicture(shot.camera);
+  captionPicture(layer);
+  layerMode.setLayer(layer, { parts, lens: shot.camera, world_from_camera: shot.world_from_camera }, times);
+  tools.show(capturing?.seenIn(layer.frame, layer.world_from_camera) ?? null);
 }
 
 /** The connection's state in a word for the eye and a sentence for everybody. */
@@ -88,11 +117,11 @@ function describe(now_ms: number): { kind: string; text: string } {
     case "connecting":
       return { kind: "busy", text: "Connecting…" };
     case "lost":
-      return { kind: "bad", text: `Disconnected: ${connection.reason}` };
+      return connection.isFull ? { kind: "busy", text: `Not let in yet: ${connection.reason}` } : { kind: "bad", text: `Disconnected: ${connection.reason}` };
     case "refused":
       return { kind: "bad", text: `Refused: ${connection.reason}` };
     case "open":
-      if (panels.lastAnswer_ms === Number.NEGATIVE_INFINITY) return { kind: "busy", text: capturing ? "Connected, waiting for the first picture" : "Connected, waiting for a session" };
+      if (panels.lastAnswer_ms === Number.NEGATIVE_INFINITY) return { kind: "busy", text: capturing ? "Connected, waiting for the first picture" : `Connected, waiting for a session${watched}` };
       if (now_ms - panels.lastAnswer_ms > QUIET_AFTER_MS) return { kind: "busy", text: "Connected, no new pictures" };
       return { kind: "good", text: capturing ? "Live, captured here" : "Live" };
   }
@@ -101,6 +130,7 @@ function describe(now_ms: number): { kind: string; text: string } {
 function refresh(): void {
   const now_ms = performance.now();
   panels.refresh(now_ms);
+  showAges(layerMode?.ages ?? null);
   const { kind, text } = describe(now_ms);
   setText(byId("state"), text);
   document.documentElement.dataset["state"] = kind;
@@ -118,6 +148,12 @@ function say(text: string): void {
   refresh();
 }
 
+/** What a source tells is said for a moment and kept among the notes. */
+function advise(text: string): void {
+  panels.note(text);
+  say(text);
+}
+
 function fail(text: string): void {
   setText(byId("capture-said"), text);
   say(text);
@@ -125,6 +161,7 @@ function fail(text: string): void {
 
 function watch(): void {
   const { room, key } = read(form);
+  watched = room === "" ? "" : ` of room “${room}”${key === "" ? "; one with a key needs it in the form below" : " with that key"}`;
   begin();
   remote.watch(streamUrl(page), { type: "watch", session: page.searchParams.get("session"), room: room || null, room_key: key || null });
 }
@@ -141,18 +178,22 @@ async function capture(choice: Choice): Promise<void> {
   await endCapture();
   begin();
   try {
-    const local = choice.answer === "light" ? await LightMode.load(() => tools.scene.placed, say) : null;
-    const next = new Capturing(remote, { say: (text, isEnd) => (isEnd ? void leave(text) : say(text)) }, local?.draw ?? null);
+    const light = choice.answer === "light" ? await LightMode.load(() => tools.scene.placed, say) : null;
+    const layers = choice.answer === "layer" ? new LayerMode() : null;
+    const next = new Capturing(remote, { say: (text, isEnd) => (isEnd ? void leave(text) : advise(text)) }, layers ?? light);
     await next.start(choice, stage, streamUrl(page));
+    qualityChanges.begin(choice);
     capturing = next;
-    lightMode = local;
+    lightMode = light;
+    layerMode = layers;
   } catch (error) {
     watch();
     return fail(reasonOf(error));
   }
-  stage.classList.toggle("local", lightMode !== null);
+  tools.begin();
+  stage.classList.toggle("local", choice.source === "xr" && choice.answer !== "picture");
   stopButton.hidden = false;
-  showFull(true);
+  showFull(choice.source !== "recorded");
   refresh();
 }
 
@@ -165,7 +206,8 @@ async function leave(reason: string): Promise<void> {
 
 async function endCapture(): Promise<void> {
   const ended = capturing;
-  capturing = lightMode = null;
+  layerMode?.stop();
+  capturing = lightMode = layerMode = null;
   stage.classList.remove("local");
   stopButton.hidden = true;
   showFull(false);
@@ -232,7 +274,7 @@ function start(): void {
   form.addEventListener("change", (event) => {
     noteChoice();
     const name = (event.target as HTMLInputElement).name;
-    if (capturing !== null && (name === "preset" || name === "budget")) remote.request({ type: "quality", ...quality(read(form)) } as Parameters<Remote["request"]>[0]);
+    if (capturing !== null && (name === "preset" || name === "budget")) qualityChanges.change();
   });
   stopButton.addEventListener("click", () => void leave(""));
   fullButton.addEventListener("click", () => void toggleFull());

@@ -4,7 +4,7 @@ import { byId, setText } from "./dom";
 import { showLight } from "./light";
 import { addNote, clearNotes, showNotes } from "./notes";
 import { showPlan } from "./plan";
-import type { Composite, Light, ServerMessage } from "./protocol";
+import type { Composite, Layer, Light, ServerMessage } from "./protocol";
 import { FrameRate } from "./rate";
 import { addTimings, clearTimings, showTimings } from "./timings";
 
@@ -12,7 +12,7 @@ import { addTimings, clearTimings, showTimings } from "./timings";
 const LIGHT_MS = 100;
 
 export class Panels {
-  private composite: Composite | null = null;
+  private answer: Composite | Layer | null = null;
   lastAnswer_ms = Number.NEGATIVE_INFINITY;
   private readonly rate = new FrameRate();
   private light: Light | null = null;
@@ -32,6 +32,7 @@ export class Panels {
         this.isLightDue = true;
         return;
       case "composite":
+      case "layer":
         this.receivePicture(message);
         return;
       case "dropped":
@@ -59,7 +60,7 @@ export class Panels {
   }
 
   clear(): void {
-    this.composite = this.light = this.worldFromCamera = null;
+    this.answer = this.light = this.worldFromCamera = null;
     this.lastAnswer_ms = Number.NEGATIVE_INFINITY;
   }
 
@@ -86,8 +87,8 @@ export class Panels {
     clearNotes();
   }
 
-  private receivePicture(message: Composite): void {
-    this.composite = message;
+  private receivePicture(message: Composite | Layer): void {
+    this.answer = message;
     this.noteAnswer(message.world_from_camera);
     addTimings(message.timings);
     for (const note of message.notes) addNote(note, message.frame);
@@ -98,9 +99,9 @@ export class Panels {
 
   private draw(): void {
     this.isDrawing = false;
-    if (this.composite === null) return;
-    showTimings(this.composite.timings);
-    showPlan(this.composite.plan);
+    if (this.answer === null) return;
+    showTimings(this.answer.timings);
+    showPlan(this.answer.plan);
     showNotes();
     this.refresh(performance.now());
   }

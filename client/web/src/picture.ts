@@ -1,7 +1,7 @@
 // The composited picture, the newest that was decoded.
 
 import { byId, context2d, setText } from "./dom";
-import type { Composite } from "./protocol";
+import type { Composite, Layer } from "./protocol";
 import { TRACKING } from "./words";
 
 const canvas = byId<HTMLCanvasElement>("picture");
@@ -22,14 +22,23 @@ export function fitPicture({ width, height }: { width: number; height: number })
 
 /** Show a composite's picture, which is closed. */
 export function showPicture(composite: Composite, bitmap: ImageBitmap): void {
-  fitPicture(bitmap);
-  context.drawImage(bitmap, 0, 0);
+  drawPicture(bitmap);
   bitmap.close();
+  captionPicture(composite);
+}
+
+export function drawPicture(picture: ImageBitmap | HTMLCanvasElement): void {
+  fitPicture(picture);
+  context.drawImage(picture, 0, 0);
   frame.classList.add("has-picture");
+}
+
+/** Say of which frame the virtual things on the screen are. */
+export function captionPicture(answer: Composite | Layer): void {
   const size = `${canvas.width}×${canvas.height}`;
-  canvas.setAttribute("aria-label", `Camera picture with the virtual objects in it, ${size}, frame ${composite.frame}`);
-  setText(caption, `Frame ${composite.frame} · ${size} · ${composite.timestamp_s.toFixed(2)} s · ${TRACKING[composite.tracking]}`);
-  caption.classList.toggle("bad", composite.tracking === "lost");
+  canvas.setAttribute("aria-label", `Camera picture with the virtual objects in it, ${size}, frame ${answer.frame}`);
+  setText(caption, `Frame ${answer.frame} · ${size} · ${answer.timestamp_s.toFixed(2)} s · ${TRACKING[answer.tracking]}`);
+  caption.classList.toggle("bad", answer.tracking === "lost");
 }
 
 /** Say whether what is seen is current. */

@@ -1,6 +1,6 @@
 // The page's end of the worker.
 
-import type { Captured } from "./capture/source";
+import type { Captured, Packed } from "./capture/source";
 import type { Request, Setup } from "./capture/stream";
 import type { FromWorker, News, ToWorker } from "./worker_messages";
 import type { Watch } from "./protocol";
@@ -40,12 +40,10 @@ export class Remote {
   }
 
   /** Hand a frame over, picture and depth with it; its number. */
-  send(captured: Captured): number {
+  send(taken: Captured | Packed): number {
     this.isWanted = false;
     const number = this.frames++;
-    const { color, depth } = captured;
-    const transfer: Transferable[] = ["close" in color ? color : color.buffer, ...(depth === null ? [] : [depth.buffer])];
-    this.post({ kind: "frame", frame: { ...captured, number } }, transfer);
+    this.post({ kind: "frame", frame: { ...taken, number } }, "packed" in taken ? [] : picturesOf(taken));
     return number;
   }
 
@@ -69,4 +67,8 @@ export class Remote {
   private post(message: ToWorker, transfer: Transferable[] = []): void {
     this.worker.postMessage(message, transfer);
   }
+}
+
+function picturesOf({ color, depth }: Captured): Transferable[] {
+  return ["close" in color ? color : color.buffer, ...(depth === null ? [] : [depth.buffer])];
 }

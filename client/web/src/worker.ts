@@ -4,13 +4,14 @@ import { encodeFrame } from "./capture/encode";
 import { reasonOf } from "./capture/source";
 import { CaptureStream, type Times } from "./capture/stream";
 import { Connection } from "./connection";
-import type { Composite, ServerMessage } from "./protocol";
+import { decodeLayer, transferOf } from "./local/layer_parts";
+import type { Composite, Layer, LayerPatch, ServerMessage } from "./protocol";
 import type { FromWorker, News, ToWorker } from "./worker_messages";
 
 let watching: Connection | null = null;
 let stream: CaptureStream | null = null;
-/** A picture to be decoded. */
-let waiting: { composite: Composite; times: Times | null } | null = null;
+/** An answer whose pictures are to be decoded. */
+let waiting: { answer: Composite | Layer; times: Times | null } | null = null;
 let isDecoding = false;
 
 let run = 0;
@@ -70,33 +71,44 @@ function stop(reason: string): void {
 }
 
 function tell(message: ServerMessage, times: Times | null): void {
-  if (message.type !== "composite") return post({ kind: "message", message });
-  post({ kind: "message", message: withoutBytes(message) });
-  waiting = { composite: message, times };
+  if (message.type !== "composite" && message.type !== "layer") return post({ kind: "message", message });
+  post({ kind: "message", message: message.type === "composite" ? withoutBytes(message) : bare(message) });
+  waiting = { answer: message, times };
   void decodeWaiting();
 }
 
-const withoutBytes = (composite: Composite): Composite => ({ ...composite, color: { ...composite.color, data: new Uint8Array() } });
+const withoutData = <T extends { data: Uint8Array }>(image: T): T => ({ ...image, data: new Uint8Array() });
+const withoutBytes = (composite: Composite): Composite => ({ ...composite, color: withoutData(composite.color) });
+const bare = (layer: Layer): Layer => ({ ...layer, virtual: barePatch(layer.virtual), ratio: barePatch(layer.ratio) });
+const barePatch = (patch: LayerPatch | null): LayerPatch | null =>
+  patch === null ? null : { ...patch, color: withoutData(patch.color), depth: withoutData(patch.depth) };
 
 /** The newest picture; one that arrives while another is being decoded replaces an older one that waits. */
 async function decodeWaiting(): Promise<void> {
   if (isDecoding) return;
   isDecoding = true;
   while (waiting !== null) {
-    const { composite, times }: NonNullable<typeof waiting> = waiting;
+    const { answer, times }: NonNullable<typeof waiting> = waiting;
     waiting = null;
     try {
-      const begun = run;
-      const bitmap = await decode(composite);
-      if (begun === run) post({ kind: "picture", composite: withoutBytes(composite), bitmap, times }, [bitmap]);
+      await (answer.type === "composite" ? decodePicture(answer, times) : decodeParts(answer, times));
     } catch (error) {
-      say(`picture ${composite.frame} cannot be shown: ${reasonOf(error)}`);
+      say(`picture ${answer.frame} cannot be shown: ${reasonOf(error)}`);
     }
   }
   isDecoding = false;
 }
 
-function decode({ color }: Composite): Promise<ImageBitmap> {
+async function decodePicture(composite: Composite, times: Times | null): Promise<void> {
+  const { color } = composite;
   if (color.codec === "raw") throw new Error("it is raw, which this page does not show");
-  return createImageBitmap(new Blob([new Uint8Array(color.data)], { type: `image/${color.codec}` }));
+  const begun = run;
+  const bitmap = await createImageBitmap(new Blob([new Uint8Array(color.data)], { type: `image/${color.codec}` }));
+  if (begun === run) post({ kind: "picture", composite: withoutBytes(composite), bitmap, times }, [bitmap]);
+}
+
+async function decodeParts(layer: Layer, times: Times | null): Promise<void> {
+  const begun = run;
+  const parts = await decodeLayer(layer);
+  if (begun === run) post({ kind: "layer", layer: bare(layer), parts, times }, transferOf(parts));
 }

@@ -2,7 +2,8 @@
 
 import type { Numbered, Request, Setup, Times } from "./capture/stream";
 import type { ConnectionState } from "./connection";
-import type { Composite, ServerMessage, Watch } from "./protocol";
+import type { LayerParts } from "./local/layer_parts";
+import type { Composite, Layer, ServerMessage, Watch } from "./protocol";
 
 export type ToWorker =
   /** `run`: of watching or capturing; what is left of an earlier one is not heard. */
@@ -15,10 +16,12 @@ export type ToWorker =
 
 export type News =
   | { kind: "state"; state: ConnectionState }
-  /** Every message of the server's; a composite without the bytes of its picture. */
+  /** Every message of the server's; a composite and a layer without the bytes of their pictures. */
   | { kind: "message"; message: ServerMessage }
   /** A composite's picture, decoded; of those that come too fast, some are left out. */
   | { kind: "picture"; composite: Composite; bitmap: ImageBitmap; times: Times | null }
+  /** A layer, likewise. */
+  | { kind: "layer"; layer: Layer; parts: LayerParts; times: Times | null }
   | { kind: "wanted" }
   | { kind: "say"; text: string };
 

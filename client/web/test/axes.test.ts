@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 import { depthLens, depthUnits, isSameCamera, lensOf, upright, worldFromCamera } from "../src/capture/axes";
 import { fitted, halvings } from "../src/capture/readback";
-import { levelAt, project, surfaceAt } from "../src/objects/picking";
+import { floorOf, levelAt, project, surfaceAt, uprightAxes } from "../src/objects/picking";
 
 /** Column-major: a camera that is turned by 90 degrees about +y and looks along -x. */
 const TURNED = new Float32Array([0, 0, -1, 0, 0, 1, 0, 0, 1, 0, 0, 0, 2, 3, 4, 1]);
@@ -90,7 +90,20 @@ test("a finger finds the surface, or the level where none was measured", () => {
   const [x, y, z] = surfaceAt({ camera, world_from_camera, depth }, { x: 31.5, y: 13.5 })!;
   assert.ok(Math.hypot(x, y - 1.9, z + 2) < 1e-9);
   assert.equal(surfaceAt({ camera, world_from_camera, depth }, { x: 31.5, y: 45 }), null);
-  const [fx, fy, fz] = levelAt({ camera, world_from_camera }, { x: 31.5, y: 48.5 }, 0)!;
+  const up = [0, 1, 0] as const;
+  const [fx, fy, fz] = levelAt({ camera, world_from_camera, up }, { x: 31.5, y: 48.5 }, 0)!;
   assert.ok(Math.hypot(fx, fy, fz + 3) < 1e-9);
-  assert.equal(levelAt({ camera, world_from_camera }, { x: 31.5, y: 10 }, 0), null); // above the horizon
+  assert.equal(levelAt({ camera, world_from_camera, up }, { x: 31.5, y: 10 }, 0), null); // above the horizon
+});
+
+test("what is level is so in any world", () => {
+  const camera = { width: 64, height: 48, fx: 50, fy: 50, cx: 31.5, cy: 23.5, depth_scale_m: 0.001, depth: null };
+  const world_from_camera = [1, 0, 0, 0, 0, 0, 1, 0, 0, -1, 0, 1.5, 0, 0, 0, 1]; // 1.5 m up along z, looking along y
+  const up = [0, 0, 1] as const;
+  const place = levelAt({ camera, world_from_camera, up }, { x: 31.5, y: 48.5 }, 0)!;
+  assert.ok(Math.hypot(place[0], place[1] - 3, place[2]) < 1e-9, `${place.join(" ")}`);
+  const depth = new Uint16Array(64 * 48).fill(2000);
+  assert.ok(Math.abs(floorOf({ camera, world_from_camera, up, depth })! - (1.5 - (2 * 24.5) / 50)) < 0.06);
+  assert.deepEqual(uprightAxes(up).map((axis) => axis.map(Math.round)), [[1, 0, 0], [0, 0, 1], [0, -1, 0]]);
+  assert.deepEqual(uprightAxes([1, 0, 0]).map((axis) => axis.map(Math.round)), [[0, 1, 0], [1, 0, 0], [0, 0, -1]]);
 });

@@ -8,17 +8,16 @@ import type { Numbered } from "./stream";
 const JPEG_QUALITY = 0.85;
 
 export async function encodeFrame(frame: Numbered): Promise<Frame> {
+  const { number, timestamp_s, world_from_camera } = frame;
+  const pictures = "packed" in frame ? frame.packed : await packed(frame);
+  return { type: "frame", frame: number, timestamp_s, world_from_camera, ...pictures };
+}
+
+async function packed(frame: Captured): Promise<Pick<Frame, "color" | "depth">> {
   const { camera, depth } = frame;
   const lens = camera.depth ?? camera;
   const [color, coded] = await Promise.all([encodeColor(frame), depth === null ? null : encodeDepth(depth, lens.width)]);
-  return {
-    type: "frame",
-    frame: frame.number,
-    timestamp_s: frame.timestamp_s,
-    world_from_camera: frame.world_from_camera,
-    color,
-    depth: coded,
-  };
+  return { color, depth: coded };
 }
 
 async function encodeColor({ color, camera: { width, height } }: Captured): Promise<ColorImage> {

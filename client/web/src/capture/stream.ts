@@ -2,17 +2,15 @@
 // after a lost connection (protocol/README.md).
 
 import { CAPTURING, Connection, type ConnectionState, REFUSED_CAPTURE } from "../connection";
-import type { CameraModel, ClientMessage, Composite, Frame, Hello, Light, ServerMessage } from "../protocol";
+import type { CameraModel, ClientMessage, Composite, Frame, Hello, Layer, Light, ServerMessage } from "../protocol";
 import { isSameCamera } from "./axes";
-import { type Captured, now_ms } from "./source";
+import { type Captured, now_ms, type Packed } from "./source";
 
 /** What a person chose: a hello but for the camera. */
 export type Setup = Omit<Hello, "type" | "camera" | "resume">;
 export type Request = Extract<ClientMessage, { request: number }>;
 
-export interface Numbered extends Captured {
-  number: number;
-}
+export type Numbered = (Captured | Packed) & { number: number };
 
 /** When a frame was where, in milliseconds that page and worker count alike. */
 export interface Times {
@@ -54,26 +52,27 @@ export class CaptureStream {
     private readonly hooks: StreamHooks,
   ) {}
 
-  /** Begin: the first frame says of which camera the session is. */
-  start(): void {
-    this.askForFrame();
+  /** Begin, with a camera; where it is not known yet, the first frame says it and is not sent. */
+  start(camera: CameraModel | null = null): void {
+    if (camera !== null) this.openFor(camera);
+    else this.askForFrame();
   }
 
-  /** Send a frame that was asked for. */
-  async offer(frame: Numbered): Promise<void> {
+  /** Send a frame that was asked for; whether it was sent. */
+  async offer(frame: Numbered): Promise<boolean> {
     this.wasAsked = false;
-    if (this.camera === null || !isSameCamera(this.camera, frame.camera)) {
-      release(frame);
-      return this.openFor(frame.camera);
-    }
-    if (!this.hasRoom()) return release(frame);
+    const isOther = this.camera === null || !isSameCamera(this.camera, frame.camera);
+    if (isOther || !this.hasRoom()) release(frame);
+    if (isOther) this.openFor(frame.camera);
+    if (isOther || !this.hasRoom()) return false;
     const { epoch } = this;
     this.isEncoding = true;
     try {
       const message = await this.encodeFrame(frame);
-      if (epoch !== this.epoch) return;
+      if (epoch !== this.epoch) return false;
       this.unanswered.set(frame.number, { captured_ms: frame.captured_ms, sent_ms: now_ms() });
       this.connection?.send(message);
+      return true;
     } finally {
       if (epoch === this.epoch) this.isEncoding = false;
       this.askForFrame();
@@ -158,6 +157,7 @@ export class CaptureStream {
       case "light":
         return this.setup.wishes?.answer === "light" ? this.answered(message) : null;
       case "composite":
+      case "layer":
       case "dropped":
         return this.answered(message);
       default:
@@ -165,13 +165,13 @@ export class CaptureStream {
     }
   }
 
-  private answered(message: { frame: number } & (Composite | Light | { type: "dropped" })): Times | null {
+  private answered(message: { frame: number } & (Composite | Layer | Light | { type: "dropped" })): Times | null {
     const sent = this.unanswered.get(message.frame);
     this.unanswered.delete(message.frame);
     return sent === undefined ? null : { ...sent, answered_ms: now_ms() };
   }
 }
 
-function release(frame: Captured): void {
-  if ("close" in frame.color) frame.color.close();
+function release(frame: Numbered): void {
+  if ("color" in frame && "close" in frame.color) frame.color.close();
 }

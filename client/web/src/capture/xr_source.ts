@@ -7,8 +7,10 @@ import { type XrBinding, type XrDepth, type XrFrame, type XrLayer, type XrSessio
 
 const LONGEST_PX = 640;
 
-/** Draws over what the device shows of the room, each time that the device draws. */
-export type Draw = (view: XrView, layer: XrLayer, gl: WebGL2RenderingContext) => void;
+/** Draws over what the device shows of the room, each time that the device draws. `camera`: its picture of now, if there is one. */
+export type Draw = (view: XrView, layer: XrLayer, gl: WebGL2RenderingContext, camera: CameraImage) => void;
+/** The bottom row first; holds only while a frame of the session is drawn. */
+type CameraImage = () => WebGLTexture | null;
 
 /** Begin a session whose overlay is `root`; to be called by a tap. Throws SourceError. */
 export async function startXr(root: Element, sink: Sink, draw: Draw | null = null): Promise<Source> {
@@ -21,7 +23,7 @@ export async function startXr(root: Element, sink: Sink, draw: Draw | null = nul
     const layer = new XRWebGLLayer(session, gl);
     session.updateRenderState({ baseLayer: layer });
     const space = await session.requestReferenceSpace("local");
-    const onView = draw === null ? null : (view: XrView) => draw(view, layer, gl);
+    const onView = draw === null ? null : (view: XrView, camera: CameraImage) => draw(view, layer, gl, camera);
     return new XrSource(session, space, new XRWebGLBinding(session, gl), new Readback(gl), sink, onView);
   } catch (error) {
     await session.end().catch(() => undefined); // what went wrong first is what is told
@@ -56,7 +58,7 @@ class XrSource implements Source {
     private readonly binding: XrBinding,
     private readonly readback: Readback,
     private readonly sink: Sink,
-    private readonly onView: ((view: XrView) => void) | null,
+    private readonly onView: ((view: XrView, camera: CameraImage) => void) | null,
   ) {
     session.addEventListener("end", () => this.end("The browser has ended augmented reality."));
     space.addEventListener("reset", () => this.end("The device has lost its place in the room: start again."));
@@ -82,20 +84,27 @@ class XrSource implements Source {
     this.session.requestAnimationFrame(this.onFrame);
     try {
       const view = frame.getViewerPose(this.space)?.views[0];
-      if (view !== undefined) this.onView?.(view);
+      const camera = this.cameraImage(view);
+      if (view !== undefined) this.onView?.(view, camera);
       if (!this.sink.wantsFrame()) return;
-      const captured = this.capture(time_ms, frame);
+      const captured = this.capture(time_ms, frame, camera);
       if (captured !== null) this.sink.take(captured);
     } catch (error) {
       this.end(`The camera cannot be read: ${reasonOf(error)}.`);
     }
   };
 
-  private capture(time_ms: number, frame: XrFrame): Captured | null {
+  /** Asked for at most once a frame. */
+  private cameraImage(view: XrView | undefined): CameraImage {
+    let image: WebGLTexture | null | undefined;
+    return () => (image === undefined ? (image = view?.camera ? this.binding.getCameraImage(view.camera) : null) : image);
+  }
+
+  private capture(time_ms: number, frame: XrFrame, camera: CameraImage): Captured | null {
     const pose = frame.getViewerPose(this.space);
     const view = pose?.views[0];
     if (!pose || !view || pose.emulatedPosition) return this.wait("The device does not know yet where it is: move it slowly.");
-    const texture = view.camera ? this.binding.getCameraImage(view.camera) : null;
+    const texture = camera();
     if (!view.camera || texture === null) return this.wait("The camera gives no picture yet.");
     const depth = this.depthOf(frame, view);
     if (depth === null) return this.wait("The device measures no depth yet: move it slowly from side to side.");

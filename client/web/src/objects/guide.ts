@@ -3,7 +3,7 @@
 import type { Lens } from "../capture/axes";
 import { context2d } from "../dom";
 import type { Vector3 } from "../sh";
-import { type Pixel, project } from "./picking";
+import { type Pixel, project, scaled, sum, uprightAxes } from "./picking";
 
 const CELL_M = 0.1;
 const CELLS = 4;
@@ -11,6 +11,7 @@ const ROUND = 32;
 
 export interface Standing {
   position: Vector3;
+  up: Vector3;
   radius_m: number;
   height_m: number;
   yaw_deg: number;
@@ -22,8 +23,9 @@ export function drawGuide(canvas: HTMLCanvasElement, camera: Lens, worldFromCame
   context.clearRect(0, 0, canvas.width, canvas.height);
   if (standing === null) return;
   const { position, radius_m, height_m, yaw_deg } = standing;
+  const [right, up, front] = uprightAxes(standing.up);
   const at = (x: number, z: number, y = 0): Pixel | null =>
-    project(camera, worldFromCamera, [position[0] + x, position[1] + y, position[2] + z]);
+    project(camera, worldFromCamera, sum(position, scaled(right, x), scaled(up, y), scaled(front, z)));
   const thin = Math.max(1, canvas.width / 640);
   drawGrid(context, at, thin);
   const ring = Array.from({ length: ROUND + 1 }, (_, i) => at(...around(radius_m, (360 * i) / ROUND)));
@@ -37,7 +39,7 @@ export function drawGuide(canvas: HTMLCanvasElement, camera: Lens, worldFromCame
   stroke(context, "rgb(255 180 84 / 70%)", thin);
 }
 
-/** x and z at an angle about +y; 0 is +z, the front of a model. */
+/** How far right and to the front, at an angle about up; 0 is the front of a model. */
 function around(radius: number, angle_deg: number): [number, number] {
   const angle = (angle_deg * Math.PI) / 180;
   return [radius * Math.sin(angle), radius * Math.cos(angle)];

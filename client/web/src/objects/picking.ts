@@ -1,16 +1,50 @@
-// From a finger on the picture to a place in the room, and back. World axes of a WebXR session: +y is up.
+// From a finger on the picture to a place in the room, and back.
 
 import type { Lens } from "../capture/axes";
-import type { CameraModel } from "../protocol";
+import { decodeDepth } from "../depth";
+import type { CameraModel, DepthImage } from "../protocol";
 import { toCamera, toWorld, type Vector3 } from "../sh";
+
+/** Of a WebXR session's world. */
+export const Y_UP: Vector3 = [0, 1, 0];
 
 /** A frame as far as a finger needs it. */
 export interface Seen {
   camera: CameraModel;
   /** Row-major. */
   world_from_camera: readonly number[];
+  /** Unit, in the world. */
+  up: Vector3;
+  /** Packed as long as no finger has needed it. */
+  depth: Uint16Array | DepthImage;
+}
+
+export interface Measured extends Seen {
   depth: Uint16Array;
 }
+
+export const isMeasured = (seen: Seen): seen is Measured => seen.depth instanceof Uint16Array;
+
+/** With its depth unpacked, for the next time too. Throws Error. */
+export async function measured(seen: Seen): Promise<Measured> {
+  if (!isMeasured(seen)) seen.depth = await decodeDepth(seen.depth as DepthImage);
+  return seen as Measured;
+}
+
+/** The level axes that a model at yaw 0 stands in, as server/scene/placement.py has them: right, up, front. */
+export function uprightAxes(up: Vector3): readonly [Vector3, Vector3, Vector3] {
+  let right = levelled([1, 0, 0], up);
+  if (Math.hypot(...right) < 1e-3) right = levelled([0, 1, 0], up);
+  right = scaled(right, 1 / Math.hypot(...right));
+  return [right, up, cross(right, up)];
+}
+
+export const dot = (a: Vector3, b: Vector3): number => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+export const scaled = (a: Vector3, by: number): Vector3 => [a[0] * by, a[1] * by, a[2] * by];
+export const sum = (...all: readonly Vector3[]): Vector3 => all.reduce((a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]]);
+export const cross = (a: Vector3, b: Vector3): Vector3 => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+/** What is level of a direction. */
+export const levelled = (a: Vector3, up: Vector3): Vector3 => sum(a, scaled(up, -dot(a, up)));
 
 export interface Pixel {
   x: number;
@@ -35,7 +69,7 @@ export function project(lens: Lens, worldFromCamera: readonly number[], [x, y, z
 const FARTHEST_PX = 6;
 
 /** The surface under a pixel of the picture; null where none was measured there or near. */
-export function surfaceAt({ camera, world_from_camera, depth }: Seen, pixel: Pixel): Vector3 | null {
+export function surfaceAt({ camera, world_from_camera, depth }: Omit<Measured, "up">, pixel: Pixel): Vector3 | null {
   const [right, down] = slopes(camera, pixel);
   const lens = camera.depth ?? camera;
   const column = Math.round(lens.cx + lens.fx * right);
@@ -49,14 +83,13 @@ export function surfaceAt({ camera, world_from_camera, depth }: Seen, pixel: Pix
   return null;
 }
 
-/** Where the ray through a pixel meets the level plane at height `y`; null where it does not, or beyond 20 m. */
-export function levelAt({ camera, world_from_camera }: Omit<Seen, "depth">, pixel: Pixel, y: number): Vector3 | null {
+/** Where the ray through a pixel meets the level plane of a height; null where it does not, or beyond 20 m. */
+export function levelAt({ camera, world_from_camera, up }: Omit<Seen, "depth">, pixel: Pixel, height_m: number): Vector3 | null {
   const [right, down] = slopes(camera, pixel);
   const ray = toWorld(world_from_camera, [right, down, 1]);
   const from = positionOf(world_from_camera);
-  const ahead = (y - from[1]) / ray[1];
-  if (!Number.isFinite(ahead) || ahead <= 0 || ahead > 20) return null;
-  return [from[0] + ahead * ray[0], y, from[2] + ahead * ray[2]];
+  const ahead = (height_m - dot(up, from)) / dot(up, ray);
+  return Number.isFinite(ahead) && ahead > 0 && ahead <= 20 ? sum(from, scaled(ray, ahead)) : null;
 }
 
 /** How far a pixel's ray goes right and down for each metre ahead. */
@@ -79,14 +112,14 @@ function medianAround(depth: Uint16Array, { width, height }: Lens, column: numbe
 const LOWEST_SHARE = 0.02;
 
 /** Height of the lowest surface in sight, a few outliers aside; null without depth. */
-export function floorOf({ camera, world_from_camera, depth }: Seen): number | null {
+export function floorOf({ camera, world_from_camera, up, depth }: Measured): number | null {
   const lens = camera.depth ?? camera;
   const heights: number[] = [];
   for (let i = 0; i < depth.length; i += 7) {
     const ahead = depth[i]! * (camera.depth_scale_m ?? 0.001);
     if (ahead === 0) continue;
     const [x, y] = [i % lens.width, Math.floor(i / lens.width)];
-    heights.push(toWorldPoint(world_from_camera, [((x - lens.cx) / lens.fx) * ahead, ((y - lens.cy) / lens.fy) * ahead, ahead])[1]);
+    heights.push(dot(up, toWorldPoint(world_from_camera, [((x - lens.cx) / lens.fx) * ahead, ((y - lens.cy) / lens.fy) * ahead, ahead])));
   }
   heights.sort((a, b) => a - b);
   return heights[Math.floor(heights.length * LOWEST_SHARE)] ?? null;

@@ -1,28 +1,23 @@
 // The tools for objects: choose, place, move, turn, size, delete; by finger, by buttons and by keys alike.
 
-import { byId, make, setText } from "../dom";
-import { MAX_MESH_BYTES } from "../protocol";
+import { reasonOf } from "../capture/source";
+import { byId, setText } from "../dom";
 import type { Asked } from "../remote";
 import { toWorld, type Vector3 } from "../sh";
-import { sizeOfGlb, toGlb } from "./glb";
 import { drawGuide } from "./guide";
-import { floorOf, levelAt, type Pixel, project, type Seen, surfaceAt } from "./picking";
-import { type Model, type Placed, Scene } from "./scene";
-import { ball, cube, vase } from "./shapes";
+import { Models } from "./models";
+import { cross, floorOf, isMeasured, levelAt, levelled, type Measured, measured, type Pixel, project, scaled, type Seen, sum, surfaceAt } from "./picking";
+import { type Placed, Scene } from "./scene";
 import { GROWTH, handleTouch, TURN_DEG } from "./touch";
 
 const NEAR_PX = 28;
 const STEP_M = 0.02;
-/** Of a file whose size is not known here. */
-const UNKNOWN_M = 0.2;
-const FORMATS = ["glb", "obj", "ply", "stl"] as const;
 
 export class ObjectTools {
   readonly scene: Scene;
-  private readonly models = new Map<string, Model>();
+  private readonly models = new Models(byId<HTMLSelectElement>("model"), (text) => this.say(text));
   private readonly guide = byId<HTMLCanvasElement>("guide");
   private readonly frame = byId("picture-frame");
-  private readonly choice = byId<HTMLSelectElement>("model");
   private readonly list = byId<HTMLSelectElement>("objects");
   private readonly placeButton = byId<HTMLButtonElement>("place");
   private readonly said = byId("object-said");
@@ -30,16 +25,11 @@ export class ObjectTools {
   private seen: Seen | null = null;
   private floor_m: number | null = null;
   private isPlacing = false;
+  private drags = 0;
+  private lastDrag = 0;
 
   constructor(ask: (asked: Asked) => number | null) {
     this.scene = new Scene(ask, () => this.refresh());
-    for (const [name, shape, radius_m, height_m] of [
-      ["Vase", vase(), 0.077, 0.24],
-      ["Ball", ball(), 0.08, 0.16],
-      ["Cube", cube(), 0.106, 0.15],
-    ] as const) {
-      this.offer({ name, format: "glb", data: toGlb(shape), radius_m, height_m });
-    }
     this.listen();
     this.refresh();
   }
@@ -47,10 +37,14 @@ export class ObjectTools {
   /** The frame of which the picture is on the screen; null: there is nothing to place anything on. */
   show(seen: Seen | null): void {
     this.seen = seen;
-    const floor = seen === null ? null : floorOf(seen);
-    if (floor !== null) this.floor_m = this.floor_m === null ? floor : Math.min(this.floor_m, floor);
+    if (seen !== null && isMeasured(seen)) this.noteFloor(seen);
     byId("object-tools").hidden = seen === null;
     this.draw();
+  }
+
+  /** A session begins: what can be placed in it. */
+  begin(): void {
+    void this.models.refresh();
   }
 
   /** A session ends: its floor and what was placed are not those of the next. */
@@ -65,20 +59,10 @@ export class ObjectTools {
     setText(this.said, text);
   }
 
-  private offer(model: Model): void {
-    this.models.set(model.name, model);
-    const known = [...this.choice.options].find((option) => option.value === model.name);
-    const option = known ?? make("option", "", model.name);
-    option.value = model.name;
-    this.choice.append(option);
-    this.choice.value = model.name;
-    if (this.models.size <= 3) this.choice.selectedIndex = 0;
-  }
-
   private listen(): void {
     handleTouch(this.frame, byId<HTMLCanvasElement>("picture"), {
-      begin: (pixel) => this.begin(pixel),
-      drag: (pixel) => this.drag(pixel),
+      begin: (pixel) => this.touch(pixel),
+      drag: (pixel) => void this.drag(pixel),
       turn: (by_deg) => this.turn(by_deg),
       step: (right, away) => this.step(right, away),
       scale: (by) => this.scale(by),
@@ -99,24 +83,14 @@ export class ObjectTools {
     ];
     for (const [id, act] of buttons) byId(id).addEventListener("click", act);
     const file = byId<HTMLInputElement>("model-file");
-    file.addEventListener("change", () => void this.read(file.files?.[0]));
-    this.frame.addEventListener("dragover", (event) => event.preventDefault());
-    this.frame.addEventListener("drop", (event) => {
-      event.preventDefault();
-      void this.read(event.dataTransfer?.files[0]);
-    });
-  }
-
-  private async read(file: File | undefined): Promise<void> {
-    if (file === undefined) return;
-    const dot = file.name.lastIndexOf(".");
-    const format = FORMATS.find((each) => each === file.name.slice(dot + 1).toLowerCase());
-    if (format === undefined) return this.say(`${file.name} is no model that can be placed: choose a .glb, .obj, .ply or .stl file.`);
-    if (file.size > MAX_MESH_BYTES) return this.say(`${file.name} has ${Math.ceil(file.size / 2 ** 20)} MiB, more than the ${MAX_MESH_BYTES / 2 ** 20} MiB that the server takes.`);
-    const data = new Uint8Array(await file.arrayBuffer());
-    const [width, height, depth] = (format === "glb" ? sizeOfGlb(data) : null) ?? [UNKNOWN_M, UNKNOWN_M, UNKNOWN_M];
-    this.offer({ name: file.name.slice(0, dot) || "Model", format, data, radius_m: Math.hypot(width, depth) / 2, height_m: height });
-    this.say(`${file.name} can be placed now.`);
+    file.addEventListener("change", () => void this.models.read(file.files?.[0]));
+    for (const target of [this.frame, byId("object-tools")]) {
+      target.addEventListener("dragover", (event) => event.preventDefault());
+      target.addEventListener("drop", (event) => {
+        event.preventDefault();
+        void this.models.read(event.dataTransfer?.files[0]);
+      });
+    }
   }
 
   /** By a finger: the next tap says where. By a key: in the middle of the picture, from where keys move it. */
@@ -127,33 +101,47 @@ export class ObjectTools {
       return this.say(this.isPlacing ? "Tap where it shall stand." : "");
     }
     const size = byId<HTMLCanvasElement>("picture");
-    this.placeAt({ x: (size.width - 1) / 2, y: (size.height - 1) / 2 });
+    void this.placeAt({ x: (size.width - 1) / 2, y: (size.height - 1) / 2 });
     this.frame.focus();
   }
 
-  private begin(pixel: Pixel): boolean {
+  private touch(pixel: Pixel): boolean {
     if (this.seen === null) return false;
-    if (this.isPlacing) return this.placeAt(pixel);
+    if (this.isPlacing) {
+      this.scene.select(null); // what is dragged from now on is what is placed
+      void this.placeAt(pixel);
+      return true;
+    }
     this.scene.select(this.nearest(pixel));
     return this.scene.selected !== null;
   }
 
-  private placeAt(pixel: Pixel): boolean {
-    const model = this.models.get(this.choice.value);
-    const place = this.placeUnder(pixel);
-    if (model === undefined || place === null) {
-      this.say("No surface was measured there: tap somewhere else, or move closer.");
-      return false;
+  private async placeAt(pixel: Pixel): Promise<void> {
+    const { seen } = this;
+    if (seen === null) return;
+    this.isPlacing = false; // a second tap while a model is fetched places no second one
+    try {
+      const [model, place] = await Promise.all([this.models.chosen(), this.placeUnder(seen, pixel)]);
+      if (this.seen === null) return; // the session is over
+      if (place === null) throw new Error("No surface was measured there: tap somewhere else, or move closer.");
+      this.scene.place(model, place);
+      this.say(`${model.name} placed. Drag it, or move it with the arrow keys; [ and ] turn it, Delete removes it.`);
+    } catch (error) {
+      this.isPlacing = true;
+      this.refresh();
+      this.say(reasonOf(error));
     }
-    this.isPlacing = false;
-    this.scene.place(model, place);
-    this.say(`${model.name} placed. Drag it, or move it with the arrow keys; [ and ] turn it, Delete removes it.`);
-    return true;
   }
 
-  private placeUnder(pixel: Pixel): Vector3 | null {
-    if (this.seen === null) return null;
-    return surfaceAt(this.seen, pixel) ?? (this.floor_m === null ? null : levelAt(this.seen, pixel, this.floor_m));
+  private async placeUnder(seen: Seen, pixel: Pixel): Promise<Vector3 | null> {
+    const known = await measured(seen);
+    this.noteFloor(known);
+    return surfaceAt(known, pixel) ?? (this.floor_m === null ? null : levelAt(known, pixel, this.floor_m));
+  }
+
+  private noteFloor(seen: Measured): void {
+    const floor = floorOf(seen);
+    if (floor !== null) this.floor_m = this.floor_m === null ? floor : Math.min(this.floor_m, floor);
   }
 
   /** The object under a finger. */
@@ -163,9 +151,9 @@ export class ObjectTools {
     const canvas = this.guide;
     const pixels = canvas.width / Math.max(1, canvas.getBoundingClientRect().width);
     const distances = this.scene.placed.map((placed) => {
-      const [x, y, z] = placed.position;
-      const middle = project(seen.camera, seen.world_from_camera, [x, y + (placed.model.height_m * placed.scale) / 2, z]);
-      const side = project(seen.camera, seen.world_from_camera, [x, y, z]);
+      const half_m = (placed.model.height_m * placed.scale) / 2;
+      const middle = project(seen.camera, seen.world_from_camera, sum(placed.position, scaled(seen.up, half_m)));
+      const side = project(seen.camera, seen.world_from_camera, placed.position);
       if (middle === null || side === null) return { placed, beyond: Number.POSITIVE_INFINITY };
       const reach = Math.max(NEAR_PX * pixels, Math.hypot(side.x - middle.x, side.y - middle.y));
       return { placed, beyond: Math.hypot(pixel.x - middle.x, pixel.y - middle.y) / reach };
@@ -174,24 +162,26 @@ export class ObjectTools {
     return best !== undefined && best.beyond <= 1.2 ? best.placed : null;
   }
 
-  private drag(pixel: Pixel): void {
-    const place = this.placeUnder(pixel);
-    if (place !== null && this.scene.selected !== null) this.scene.change(this.scene.selected, { position: place });
+  private async drag(pixel: Pixel): Promise<void> {
+    const { seen, scene } = this;
+    const { selected } = scene;
+    if (seen === null || selected === null) return;
+    const drag = ++this.drags;
+    const place = await this.placeUnder(seen, pixel).catch(() => null); // of depth that cannot be read: it stays where it is
+    if (place === null || drag < this.lastDrag || scene.selected !== selected) return;
+    this.lastDrag = drag;
+    scene.change(selected, { position: place });
   }
 
   /** On its level, to the picture's right and away from the camera. */
   private step(right: number, away: number): void {
     const { selected } = this.scene;
     if (selected === null || this.seen === null) return;
-    const level = (axis: Vector3): [number, number] => {
-      const [x, , z] = toWorld(this.seen!.world_from_camera, axis);
-      const length = Math.hypot(x, z) || 1;
-      return [x / length, z / length];
-    };
-    const [rx, rz] = level([1, 0, 0]);
-    const [ax, az] = [rz, -rx]; // level, and at a right angle, however the camera is tilted
-    const [x, y, z] = selected.position;
-    this.scene.change(selected, { position: [x + STEP_M * (right * rx + away * ax), y, z + STEP_M * (right * rz + away * az)] });
+    const { up, world_from_camera } = this.seen;
+    const level = levelled(toWorld(world_from_camera, [1, 0, 0]), up);
+    const toRight = scaled(level, 1 / (Math.hypot(...level) || 1));
+    const toAway = cross(up, toRight); // level, and at a right angle, however the camera is tilted
+    this.scene.change(selected, { position: sum(selected.position, scaled(toRight, STEP_M * right), scaled(toAway, STEP_M * away)) });
     this.say(`${selected.model.name} moved ${words(right, away)}.`);
   }
 
@@ -231,7 +221,7 @@ export class ObjectTools {
     const { selected } = this.scene;
     if (this.seen === null || selected === null) return drawGuide(this.guide, NO_LENS, NO_POSE, null);
     const { position, yaw_deg, scale, model } = selected;
-    const standing = { position, yaw_deg, radius_m: model.radius_m * scale, height_m: model.height_m * scale };
+    const standing = { position, up: this.seen.up, yaw_deg, radius_m: model.radius_m * scale, height_m: model.height_m * scale };
     drawGuide(this.guide, this.seen.camera, this.seen.world_from_camera, standing);
   }
 }

@@ -1,0 +1,159 @@
+// A recorded sequence as a camera: its frames as they were recorded, at their own pace, from a file of this device.
+
+import type { CameraModel, Wishes } from "../protocol";
+import { pictureOf } from "./recorded_picture";
+import { framesOf, type RecordedFrame } from "./recording";
+import { now_ms, type Packed, reasonOf, type Sink, type Source, SourceError } from "./source";
+
+/** Between looks whether a frame is due or wanted. */
+const LOOK_MS = 4;
+/** Of a sequence of one frame. */
+const STILL_STEP_S = 1 / 15;
+/** A page that was asleep does not make up for more. */
+const LATEST_MS = 200;
+/** A longer pause in a recording is cut down to this: nobody waits for it. */
+const LONGEST_STEP_S = 5;
+
+/** The newest picture, for whoever shows it before the server has answered. Closed when the next one is here. */
+export interface Shown {
+  bitmap: ImageBitmap;
+  camera: CameraModel;
+  /** Row-major. */
+  world_from_camera: number[] | null;
+}
+
+/** Begin to play `file`: again and again, or once, after which its last frame stands. Throws SourceError. */
+export async function startRecorded(file: File, loops: boolean, sink: Sink, onShown: ((shown: Shown) => void) | null = null): Promise<Source> {
+  const first = (await framesOf(file, () => undefined).next()).value ?? null;
+  if (first === null) throw new SourceError(`${file.name} holds no frames: choose a file that probeless stream SOURCE --record FILE has made.`);
+  return new RecordedSource(file, first, loops, sink, onShown);
+}
+
+export class RecordedSource implements Source {
+  readonly wishes: Wishes;
+  private hasEnded = false;
+  private shown: Shown | null = null;
+  private isShowing = false;
+  /** Where the frame that is due now stands in time, seconds since the beginning. */
+  private time_s = 0;
+
+  constructor(
+    private readonly file: File,
+    first: RecordedFrame,
+    private readonly loops: boolean,
+    private readonly sink: Sink,
+    private readonly onShown: ((shown: Shown) => void) | null,
+  ) {
+    this.wishes = wishesOf(first);
+    void this.play(first).catch((error: unknown) => this.end(error instanceof SourceError ? error.message : `The recording cannot be played: ${reasonOf(error)}`));
+  }
+
+  stop(): Promise<void> {
+    this.hasEnded = true;
+    this.shown?.bitmap.close();
+    this.shown = null;
+    return Promise.resolve();
+  }
+
+  private end(reason: string): void {
+    if (this.hasEnded) return;
+    void this.stop();
+    this.sink.ended(reason);
+  }
+
+  private async play(first: RecordedFrame): Promise<void> {
+    await this.announce(first);
+    let due_ms = performance.now();
+    let now: RecordedFrame | null = null;
+    let isSent = true;
+    for await (const { next, step_s } of this.paced()) {
+      due_ms = Math.max(due_ms + 1000 * step_s, performance.now() - LATEST_MS);
+      do {
+        if (now !== null && !isSent) isSent = this.send(now);
+        await pause(LOOK_MS); // also where it is late: the page has other things to do
+      } while (!this.hasEnded && performance.now() < due_ms);
+      this.time_s += step_s;
+      if (this.hasEnded) return;
+      now = next;
+      void this.show(next);
+      isSent = this.send(next);
+    }
+  }
+
+  /** The session begins with a frame that says which camera it is, and is not sent. */
+  private async announce(first: RecordedFrame): Promise<void> {
+    while (!this.sink.wantsFrame()) {
+      if (this.hasEnded) return;
+      await pause(LOOK_MS);
+    }
+    this.send(first);
+    while (!this.hasEnded && !this.sink.wantsFrame()) await pause(LOOK_MS);
+  }
+
+  /** Every frame, and for how long the one before it is seen; endless. */
+  private async *paced(): AsyncGenerator<{ next: RecordedFrame; step_s: number }> {
+    let last: RecordedFrame | null = null;
+    let usual_s = STILL_STEP_S;
+    do {
+      let before: RecordedFrame | null = null;
+      for await (const next of framesOf(this.file, (text) => this.sayOnce(text))) {
+        const step_s: number = before === null ? (last === null ? 0 : usual_s) : next.frame.timestamp_s - before.frame.timestamp_s;
+        if (before !== null && step_s > 0) usual_s = Math.min(step_s, LONGEST_STEP_S);
+        yield { next, step_s: Math.min(Math.max(step_s, 0), LONGEST_STEP_S) };
+        before = last = next;
+      }
+    } while (this.loops && last !== null);
+    this.sink.say("The recording has come to its end: its last picture stands.");
+    while (last !== null) yield { next: last, step_s: usual_s };
+  }
+
+  private hasSaid = false;
+
+  private sayOnce(text: string): void {
+    if (!this.hasSaid) this.sink.say(text);
+    this.hasSaid = true;
+  }
+
+  /** Whether it is sent: the server may be busy. */
+  private send({ camera, frame }: RecordedFrame): boolean {
+    if (this.hasEnded || !this.sink.wantsFrame()) return false;
+    const { world_from_camera, color = null, depth = null, exposure = null } = frame;
+    const packed: Packed["packed"] = { color, depth, exposure };
+    this.sink.take({ timestamp_s: this.time_s, captured_ms: now_ms(), camera, world_from_camera, packed });
+    return true;
+  }
+
+  /** Unpack the picture for who shows it; while one is being unpacked, others are left out. */
+  private async show({ camera, frame }: RecordedFrame): Promise<void> {
+    if (this.onShown === null || this.isShowing || !frame.color) return;
+    this.isShowing = true;
+    try {
+      const shown = { bitmap: await pictureOf(frame.color), camera, world_from_camera: frame.world_from_camera };
+      if (this.hasEnded) return shown.bitmap.close();
+      this.shown?.bitmap.close();
+      this.shown = shown;
+      this.onShown(shown);
+    } catch (error) {
+      this.sayOnce(`A picture of the recording cannot be shown: ${reasonOf(error)}`);
+    } finally {
+      this.isShowing = false;
+    }
+  }
+}
+
+/** What its session asks: of geometry and exposure as whoever recorded it did, and always what is up. */
+function wishesOf({ wishes, frame }: RecordedFrame): Wishes {
+  const { poses, volume_m, voxel_m, exposure, denoise, lamps } = wishes;
+  const asked: Wishes = { up: wishes.up ?? upOf(frame.world_from_camera), poses: poses ?? (frame.world_from_camera === null ? "track" : "given") };
+  for (const [name, value] of Object.entries({ volume_m, voxel_m, exposure, denoise, lamps })) {
+    if (value !== undefined) Object.assign(asked, { [name]: value });
+  }
+  return asked;
+}
+
+/** The first camera's -y, as the server has it where nothing is said. */
+function upOf(pose: readonly number[] | null): [number, number, number] {
+  return pose === null ? [0, -1, 0] : [-pose[1]!, -pose[5]!, -pose[9]!];
+}
+
+const pause = (milliseconds: number): Promise<void> => new Promise((resolve) => setTimeout(resolve, milliseconds));

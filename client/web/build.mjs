@@ -1,5 +1,5 @@
 // `node build.mjs [FOLDER]` bundles the page into FOLDER (default dist); `--tests` bundles the tests into .test, `--library`
-// what the npm package offers into lib.
+// what the npm package offers into lib; `--types` finishes the types that tsc has put there.
 // The same sources and the pinned packages give the same bytes on every machine.
 import { copyFile, mkdir, readdir, readFile, rm, writeFile } from "node:fs/promises";
 import { join } from "node:path";
@@ -42,6 +42,14 @@ async function buildLibrary(folder) {
   });
 }
 
+/** Node.js wants to be told which file is meant; the page's own sources need not say it. */
+async function nameFiles(folder) {
+  for (const name of (await readdir(folder)).filter((each) => each.endsWith(".d.ts"))) {
+    const text = await readFile(join(folder, name), "utf8");
+    await writeFile(join(folder, name), text.replace(/(from "\.\/[\w/]+)"/g, '$1.js"'));
+  }
+}
+
 async function buildTests(folder) {
   await rm(folder, { recursive: true, force: true });
   const names = (await readdir("test")).filter((name) => name.endsWith(".test.ts"));
@@ -59,4 +67,5 @@ async function buildTests(folder) {
 
 if (argument === "--tests") await buildTests(".test");
 else if (argument === "--library") await buildLibrary("lib");
+else if (argument === "--types") await nameFiles("lib/types");
 else await buildPage(argument);

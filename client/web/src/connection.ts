@@ -34,13 +34,20 @@ export function pause_ms(attempt: number, random: () => number = Math.random, pa
   return full * (1 - random() / 4);
 }
 
+/** What is used of a URL. */
+export interface Address {
+  readonly protocol: string;
+  readonly host: string;
+  readonly searchParams: { get(name: string): string | null };
+}
+
 /** `ws(s)` URL of the stream on the host the page came from, with the token that the page was opened with. */
-export function streamUrl(page: URL): string {
+export function streamUrl(page: Address): string {
   return `${page.protocol === "https:" ? "wss" : "ws"}://${page.host}/v1/stream${tokenQuery(page)}`;
 }
 
 /** `?token=...` as the page's own URL has it, or nothing. */
-export function tokenQuery(page: URL): string {
+export function tokenQuery(page: Address): string {
   const token = page.searchParams.get("token");
   return token === null ? "" : `?token=${encodeURIComponent(token)}`;
 }

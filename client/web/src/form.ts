@@ -1,7 +1,7 @@
 // What a person asks for: from the page's address or the form.
 
-import type { Setup } from "./capture/stream";
 import type { Marker, Wishes } from "./protocol";
+import type { Setup } from "./session";
 
 export type SourceName = "watch" | "xr" | "camera" | "recorded";
 

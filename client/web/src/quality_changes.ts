@@ -1,7 +1,7 @@
 // How finely light is sampled, changed in the form while a session runs.
 
 import { type Choice, putQuality, quality, read } from "./form";
-import type { Asked } from "./remote";
+import type { Asked } from "./session";
 
 export class QualityChanges {
   /** What was asked for last and is not answered yet, and what holds. */

@@ -1,12 +1,9 @@
 // The page's end of the worker.
 
 import type { Captured, Packed } from "./capture/source";
-import type { Request, Setup } from "./capture/stream";
 import type { FromWorker, News, ToWorker } from "./worker_messages";
 import type { Watch } from "./protocol";
-
-/** A request before it has its number. */
-export type Asked = { [K in Request["type"]]: Omit<Extract<Request, { type: K }>, "request"> }[Request["type"]];
+import type { Asked, Request, Setup } from "./session";
 
 export class Remote {
   private readonly worker = new Worker("worker.js", { type: "module" });

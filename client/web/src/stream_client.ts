@@ -1,10 +1,10 @@
 // One capturing session for a program, in a browser or in Node.js: frames out, the room's light and pictures back.
 
-import { CaptureStream, type Numbered, type Request, type Setup } from "./capture/stream";
+import { CaptureStream, type Numbered } from "./capture/stream";
 import { type ConnectionState, streamUrl } from "./connection";
 import { encodeDepth } from "./depth";
 import type { Acknowledged, CameraModel, ColorImage, Composite, DepthImage, Dropped, Frame, Layer, Light, ServerMessage, Welcome } from "./protocol";
-import type { Asked } from "./remote";
+import type { Asked, Request, Setup } from "./session";
 
 /** What a session begins with; see protocol/README.md. */
 export interface SessionOptions extends Setup {

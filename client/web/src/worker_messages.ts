@@ -1,9 +1,10 @@
 // What the page and its worker say to each other.
 
-import type { Numbered, Request, Setup, Times } from "./capture/stream";
+import type { Numbered, Times } from "./capture/stream";
 import type { ConnectionState } from "./connection";
 import type { LayerParts } from "./local/layer_parts";
 import type { Composite, Layer, ServerMessage, Watch } from "./protocol";
+import type { Request, Setup } from "./session";
 
 export type ToWorker =
   /** `run`: of watching or capturing; what is left of an earlier one is not heard. */

@@ -6,7 +6,7 @@ import { sizeOfGlb, toGlb } from "../src/objects/glb";
 import { type Model, Scene } from "../src/objects/scene";
 import { ball, cube, vase } from "../src/objects/shapes";
 import { pixelAt } from "../src/objects/touch";
-import type { Asked } from "../src/remote";
+import type { Asked } from "../src/session";
 
 const MODEL: Model = { name: "Box", format: "glb", data: new Uint8Array(4), radius_m: 0.1, height_m: 0.1 };
 

@@ -2,13 +2,10 @@
 // after a lost connection (protocol/README.md).
 
 import { CAPTURING, Connection, type ConnectionState, REFUSED_CAPTURE } from "../connection";
-import type { CameraModel, ClientMessage, Composite, Frame, Hello, Layer, Light, ServerMessage } from "../protocol";
+import type { CameraModel, Composite, Frame, Layer, Light, ServerMessage } from "../protocol";
+import type { Request, Setup } from "../session";
 import { isSameCamera } from "./axes";
 import { type Captured, now_ms, type Packed } from "./source";
-
-/** What a person chose: a hello but for the camera. */
-export type Setup = Omit<Hello, "type" | "camera" | "resume">;
-export type Request = Extract<ClientMessage, { request: number }>;
 
 export type Numbered = (Captured | Packed) & { number: number };
 

@@ -1,7 +1,7 @@
 // The virtual objects of this client, and what the server has been asked of them. At most one request of an object is
 // under way: where a finger moves it on meanwhile, only the last place is asked for.
 
-import type { Asked } from "../remote";
+import type { Asked } from "../session";
 import type { Vector3 } from "../sh";
 
 export interface Model {

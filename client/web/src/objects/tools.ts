@@ -2,7 +2,7 @@
 
 import { reasonOf } from "../capture/source";
 import { byId, setText } from "../dom";
-import type { Asked } from "../remote";
+import type { Asked } from "../session";
 import { toWorld, type Vector3 } from "../sh";
 import { drawGuide } from "./guide";
 import { Models } from "./models";

@@ -1,0 +1,182 @@
+"""The npm package: packed, installed elsewhere, and used by a program in Node.js against the real service."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import threading
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from client.web.build import FOLDER, install, npm, pack
+from server.door import Door
+from server.opencl.device import Device
+from server.serve import BackgroundServer, start_in_background
+from server.service import Service
+from tests.data import ROOT
+from tests.service.conftest import keys_are_left_here  # noqa: F401
+from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
+from tests.service.test_examples import node
+
+TOKEN = "a-token"
+PATIENCE_S = 120
+UNREACHABLE = ("ENOTFOUND", "EAI_AGAIN", "ECONNREFUSED", "ETIMEDOUT", "ENETUNREACH", "ECONNRESET")
+
+STRICT = """
+import { type Answer, type Dropped, encodeDepth, type Light, StreamClient, streamUrl } from "probeless";
+
+export async function first(url: string): Promise<Light | string> {
+  const camera = { width: 2, height: 1, fx: 1, fy: 1, cx: 0, cy: 0 };
+  const client = await StreamClient.connect(url, { client: "typed", camera, wishes: { preset: "reg8" } });
+  const depth = await encodeDepth(new Uint16Array(2), 2);
+  const answer: Answer | Dropped = await client.send({ timestamp_s: 0, world_from_camera: null, color: null, depth });
+  const done = await client.request({ type: "remove_object", object: "chair" });
+  return answer.type === "answer" ? answer.light : answer.reason + done.error + client.welcome.session;
+}
+"""
+
+
+def _npm(*arguments: str, folder: Path) -> None:
+    try:
+        npm(*arguments, folder=folder)
+    except subprocess.CalledProcessError as error:
+        output = f"{error.stdout}{error.stderr}"
+        if any(code in output for code in UNREACHABLE):
+            pytest.skip("the npm registry cannot be reached and its packages are not in npm's cache")
+        pytest.fail(f"npm {' '.join(arguments)}:\n{output}")
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the sources with their packages."""
+    folder = tmp_path_factory.mktemp("web") / "sources"
+    ignored = shutil.ignore_patterns("node_modules", "dist", ".test", "lib", "__pycache__")
+    shutil.copytree(FOLDER, folder, ignore=ignored)
+    try:
+        install(folder)
+    except subprocess.CalledProcessError as error:
+        if any(code in f"{error.stdout}{error.stderr}" for code in UNREACHABLE):
+            pytest.skip("the npm registry cannot be reached and its packages are not in npm's cache")
+        raise
+    return folder
+
+
+@pytest.fixture(scope="module")
+def program(sources: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the packed package installed, and the example in it."""
+    folder = tmp_path_factory.mktemp("program")
+    pack(folder, sources)
+    (folder / "package.json").write_text('{"type": "module", "private": true}')
+    _npm("install", "--no-audit", "--no-fund", "--prefer-offline", str(next(folder.glob("*.tgz"))), folder=folder)
+    shutil.copy(ROOT / "docs" / "examples" / "stream.mjs", folder)
+    return folder
+
+
+@pytest.fixture
+def server(device: Device) -> Iterator[BackgroundServer]:
+    with start_in_background(Service(device), door=Door(TOKEN)) as server:
+        yield server
+
+
+def run(program: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """A program of the folder, by the Node.js of the tests."""
+    environment = {**os.environ, "NODE_NO_WARNINGS": "1"}
+    command = [node(), *arguments]
+    return subprocess.run(
+        command, cwd=program, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+
+
+def test_a_program_streams_frames_and_gets_the_light(server: BackgroundServer, program: Path) -> None:
+    done = run(program, "stream.mjs", server.way_in, "3")
+    assert done.returncode == 0, done.stderr
+    lights = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [light["frame"] for light in lights] == [0, 1, 2]
+    assert all(len(light["sh"]) == 27 for light in lights)
+    assert np.isfinite(lights[-1]["sh"]).all()
+
+
+def test_what_is_refused_is_told_in_one_sentence(server: BackgroundServer, program: Path) -> None:
+    script = """
+        import { StreamClient } from "probeless";
+        const camera = { width: 160, height: 120, fx: 150, fy: 150, cx: 79.5, cy: 59.5 };
+        const tell = (error) => console.log(error.message);
+        await StreamClient.connect(process.argv[1], { client: "test", camera }).catch(tell);
+    """
+    done = run(program, "--input-type=module", "--eval", script, "--", server.url)
+    assert done.stdout == (
+        "the token is missing: use the URL that the server printed at its start, which ends in ?token=...\n"
+    ), done.stderr
+    done = run(program, "--input-type=module", "--eval", script, "--", "http://127.0.0.1:9")
+    assert done.stdout.startswith("the server does not answer; see that it runs (probeless serve)"), done.stderr
+
+
+def test_objects_are_placed_and_a_server_that_stops_ends_what_waits(program: Path) -> None:
+    script = """
+        import { StreamClient } from "probeless";
+        const camera = { width: 48, height: 32, fx: 40, fy: 41, cx: 23.5, cy: 15.5 };
+        const options = { client: "test", camera, patience_s: 1 };
+        const client = await StreamClient.connect(process.argv[1], options);
+        const data = new TextEncoder().encode("a mesh");
+        const place = (object, data) => client.request({ type: "place_object", object, format: "obj", data });
+        console.log((await place("chair", data)).error);
+        console.log((await place("none", new TextEncoder().encode("no mesh"))).error);
+        const color = { width: 48, height: 32, codec: "raw", data: new Uint8Array(3 * 48 * 32) };
+        const depth = new Uint16Array(48 * 32).fill(1000);
+        const send = () => client.send({ timestamp_s: 0, world_from_camera: null, color, depth });
+        const answer = await send();
+        console.log(answer.type, answer.composite.color.codec, answer.light.frame === answer.composite.frame);
+        console.log("stop");
+        for (;;) await send().catch((error) => { console.log(error.message); process.exit(0); });
+    """
+    lab = Lab()
+    service = Service(FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh)
+    with start_in_background(service) as server:
+        command = [node(), "--input-type=module", "--eval", script, "--", server.url]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        with subprocess.Popen(command, cwd=program, text=True, **pipes) as process:
+            timer = threading.Timer(PATIENCE_S, process.kill)
+            timer.start()
+            said = []
+            for line in process.stdout:
+                said.append(line.strip())
+                if line == "stop\n":
+                    threading.Thread(target=server.stop).start()
+            timer.cancel()
+            errors = process.stderr.read()
+    assert process.returncode == 0, errors
+    placed, refused, answer, _, ended = said
+    assert placed == "null"
+    assert refused == "the object is no GLB: its first bytes are not glTF"
+    assert answer == "answer jpeg true"
+    assert ended == "the server did not answer for 1 s"
+    assert lab.log[0][:3] == ("place", "chair", ("obj", b"a mesh"))
+
+
+def test_its_types_need_no_dom(program: Path, sources: Path) -> None:
+    (program / "typed.ts").write_text(STRICT)
+    options = {"target": "es2022", "module": "nodenext", "lib": ["es2023"], "types": [], "strict": True, "noEmit": True}
+    (program / "tsconfig.json").write_text(json.dumps({"compilerOptions": options, "files": ["typed.ts"]}))
+    compiler = [node(), str(sources / "node_modules" / "typescript" / "bin" / "tsc"), "-p", str(program)]
+    done = subprocess.run(compiler, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (program / "typed.ts").write_text(STRICT.replace("answer.light :", "answer.lihgt :"))
+    done = subprocess.run(compiler, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert "lihgt" in done.stdout
+
+
+def test_it_holds_what_it_says_and_has_the_projects_version(program: Path) -> None:
+    package = program / "node_modules" / "probeless"
+    described = json.loads((package / "package.json").read_text())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert (described["version"], described["license"]) == (project["version"], project["license"])
+    assert (package / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
+    names = {path.relative_to(package).as_posix() for path in package.rglob("*") if path.is_file()}
+    assert {"README.md", "lib/probeless.js", "lib/types/library.d.ts"} <= names
+    assert not any(name.startswith(("src", "dist", "node_modules", "test")) for name in names)

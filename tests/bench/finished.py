@@ -90,7 +90,7 @@ class Finished:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _path(self, name: str) -> Path:
-        return self._folder / f"{name.replace(' ', '_')}.json"
+        return self._folder / f"{name.replace(' ', '_').replace('/', '_')}.json"
 
     def _read(self, name: str) -> Part | None:
         try:

@@ -124,6 +124,10 @@ def stream(
     depth_noise: Annotated[
         float | None, typer.Option(metavar="M", help="of the sensor at 1 m: depth may be rounded by that times z^2")
     ] = None,
+    answer: Annotated[
+        str | None,
+        typer.Option(metavar="picture|layer|light", help="layer: put over the picture here; default: picture"),
+    ] = None,
     view: Annotated[bool, typer.Option("--view", help="the picture in the terminal, in half blocks")] = False,
     mesh: o.Mesh = False,
     room: o.RoomName = None,
@@ -141,7 +145,7 @@ def stream(
     if mesh and out is None:
         raise OptionError("--mesh writes files: say where with --out")
     refuse_depth_noise(depth_noise, lossless)
-    capture = prepare(options, lossless=lossless)
+    capture = prepare(options, lossless=lossless, answer=answer)
     from client.client import Access
     from client.laptop.stream import Sending
     from client.laptop.stream import stream as send

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import count
+from typing import TypeGuard
 
 from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed
@@ -26,6 +27,7 @@ from protocol.messages import (
     Error,
     Frame,
     Hello,
+    Layer,
     Light,
     Marker,
     MeshFormat,
@@ -59,7 +61,15 @@ class Answer:
     """What the server made of one frame."""
 
     light: Light
-    composite: Composite
+    composite: Composite | None = None
+    """As `wishes.answer` is where nothing is said."""
+    layer: Layer | None = None
+    """Where it is `layer`."""
+
+    @property
+    def drawn(self) -> Composite | Layer | None:
+        """None: the light is the whole answer."""
+        return self.layer if self.composite is None else self.composite
 
 
 @dataclass
@@ -452,19 +462,30 @@ class StreamClient:
             return ClientError(f"the server at {self._url} has gone: the connection was lost")
         return ClientError(f"the server at {self._url} closed the connection: {reason or f'code {error.rcvd.code}'}")
 
+    def _ends_answer(self, message: ServerMessage) -> TypeGuard[Composite | Layer | Light | Dropped]:
+        """Whether nothing else comes for its frame."""
+        if isinstance(message, Light):
+            return self._hello is not None and self._hello.wishes.answer == "light"
+        return isinstance(message, Composite | Layer | Dropped)
+
     async def _take(self, message: ServerMessage) -> None:
         if self._tap is not None:
             self._tap(message)
+        if self._ends_answer(message) and message.frame in self._lost:
+            self._lost.discard(message.frame)  # it was still worked on, but is told to be lost already
+            return
         match message:
-            case Composite() | Dropped() if message.frame in self._lost:
-                self._lost.discard(message.frame)  # it was still worked on, but is told to be lost already
             case Welcome():
                 self._welcome = message
                 self._max_inflight = message.max_inflight
             case Light():
                 self._light = message
-            case Composite() if self._light is not None:
-                await self._deliver(Answer(self._light, message))
+                if self._ends_answer(message):
+                    await self._deliver(Answer(message))
+                    self._unanswered.pop(message.frame, None)
+            case Composite() | Layer() if self._light is not None:
+                drawn = {"layer" if isinstance(message, Layer) else "composite": message}
+                await self._deliver(Answer(self._light, **drawn))
                 self._unanswered.pop(message.frame, None)
             case Dropped():
                 await self._deliver(message)

@@ -34,9 +34,10 @@ class Capture:
         return None if self.frames.stop >= ENDLESS else len(self.frames)
 
 
-def prepare(options: CaptureOptions, lossless: bool = False) -> Capture:
+def prepare(options: CaptureOptions, lossless: bool = False, answer: str | None = None) -> Capture:
     """Open the source and settle every default. Raises OptionError, SourceError, ObjectError."""
     refuse_unknown(options)
+    _choice("--answer", answer, ("picture", "layer", "light"))
     objects = tuple(parse_object(text) for text in options.object or ())
     up, volume = parse_up(options.up), parse_volume(options.volume)
     wishes = _wishes_of_options(options)
@@ -49,8 +50,9 @@ def prepare(options: CaptureOptions, lossless: bool = False) -> Capture:
     voxel = options.voxel or default_voxel(seen)
     is_seen_whole = source.has_poses and not is_live(source)
     volume = volume or (seen if is_seen_whole else with_room_to_move(seen))
-    settled = {"volume_m": volume, "voxel_m": voxel, "up": up or source.up, "poses": poses, "lossless": lossless}
-    return Capture(source, frames, Wishes(**wishes, **settled), objects)
+    settled = {"volume_m": volume, "voxel_m": voxel, "up": up or source.up, "poses": poses}
+    answered = {"answer": answer or "picture", "lossless": lossless}
+    return Capture(source, frames, Wishes(**wishes, **settled, **answered), objects)
 
 
 def choose_poses(asked: str | None, source: Source) -> str:

@@ -71,6 +71,13 @@ class OutputWriter:
         except OSError as error:
             raise _unwritable(self.folder, error) from error
 
+    def write_light(self, light: Light) -> None:
+        """Write the light alone of a frame without a picture. Raises OutputError."""
+        try:
+            self._line("light.jsonl", _json(light_row(light), light.frame))
+        except OSError as error:
+            raise _unwritable(self.folder, error) from error
+
     def write_mesh(self, files: Mapping[MeshFormat, bytes]) -> None:
         """Write mesh.ply and mesh.glb. Raises OutputError."""
         try:

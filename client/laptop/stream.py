@@ -13,6 +13,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -26,9 +27,10 @@ from client.laptop.source import ENDLESS, Source, is_live
 from client.laptop.stopping import stop_on_interrupt
 from client.laptop.stream_figures import STAGES, StreamFigures
 from client.laptop.stream_view import StreamView
+from client.layers import decode_layer, put_over, shown_picture
 from protocol.frames import CameraModel
-from protocol.images import decode_color
-from protocol.messages import ClientMessage, Composite, Dropped, Error, MeshFormat, ServerMessage, Welcome, Wishes
+from protocol.images import Color, decode_color
+from protocol.messages import ClientMessage, Dropped, Error, Layer, MeshFormat, ServerMessage, Welcome, Wishes
 from protocol.recording import write_message
 
 LOOK_S = 0.002
@@ -141,6 +143,8 @@ class _Stream:
         self._fixed = Coding(depth_noise_per_m=job.sending.depth_noise_per_m)
         self._out: dict[int, tuple[float, int]] = {}
         """When each frame without an answer was sent, and its bytes."""
+        self._pictures: dict[int, Color] = {}
+        """Of frames without an answer, for what is put over them here."""
         self._last_sent_s = -math.inf
         total = None if job.frames.stop >= ENDLESS else len(job.frames)
         self._bar = progress.add_task(job.source.name, total=total, note="connecting")
@@ -229,6 +233,8 @@ class _Stream:
         sent_s = self._last_sent_s = time.perf_counter()
         size = picture_bytes(message)
         self._out[frame.index] = sent_s, size
+        if self._job.wishes.answer == "layer":
+            self._pictures[frame.index] = frame.color
         self._figures.note_sent(frame.index, captured_s, sent_s, size)
         await client.send_encoded(message)
         self._summary.sent += 1
@@ -268,42 +274,51 @@ class _Stream:
 
     async def _keep(self, answer: Answer, reconnected: int) -> None:
         returned_s = time.perf_counter()
-        composite = answer.composite
+        drawn, size = answer.drawn, answer_bytes(answer)
+        computed_s = 0.0 if drawn is None else drawn.timings.total / 1e3
         if self._adaptive is not None:
-            self._measure(composite, returned_s, reconnected)
-        picture = None
-        if self._writer is not None or self._view.wants_pictures:
-            output = await asyncio.to_thread(frame_output, answer, self._job.source.camera)
-            picture = output.color
-            if self._writer is not None:
-                await asyncio.to_thread(self._writer.write, output)
+            self._measure(answer.light.frame, returned_s, computed_s, size, reconnected)
+        picture = await asyncio.to_thread(self._kept_picture, answer)
         coding = self._fixed if self._adaptive is None else self._adaptive.coding
         shown_s = time.perf_counter()
-        self._view.show(shown_s, answer.light, composite, picture, coding, reconnected)
-        size = len(composite.color.data)
-        self._figures.note_answer(composite.frame, returned_s, shown_s, composite.timings.total / 1e3, size)
-        for note in composite.notes:
+        self._view.show(shown_s, answer.light, drawn, picture, coding, reconnected)
+        self._figures.note_answer(answer.light.frame, returned_s, shown_s, computed_s, size)
+        for note in () if drawn is None else drawn.notes:
             self._tell(note)
         self._summary.answered += 1
         self._advance()
 
-    def _measure(self, composite: Composite, returned_s: float, reconnected: int) -> None:
+    def _kept_picture(self, answer: Answer) -> NDArray[np.uint8] | None:
+        """Write an answer where there is a folder; its picture, where it has one that is wanted."""
+        own = self._pictures.pop(answer.light.frame, None)
+        if answer.drawn is None:
+            if self._writer is not None:
+                self._writer.write_light(answer.light)
+            return None
+        if self._writer is None and not self._view.wants_pictures:
+            return None
+        output = frame_output(answer, self._job.source.camera, own)
+        if self._writer is not None:
+            self._writer.write(output)
+        return output.color
+
+    def _measure(self, number: int, returned_s: float, computed_s: float, bytes_down: int, reconnected: int) -> None:
         """Tell what the frame's way was like."""
         assert self._adaptive is not None
         if reconnected != self._summary.reconnected:
             self._summary.reconnected = reconnected
             self._adaptive.note_lost()
             self._out.clear()
-        sent = self._out.pop(composite.frame, None)
+        sent = self._out.pop(number, None)
         if sent is not None:
-            times = (sent[0], returned_s, composite.timings.total / 1e3)
-            self._adaptive.note(Measured(*times, bytes_up=sent[1], bytes_down=len(composite.color.data)))
+            self._adaptive.note(Measured(sent[0], returned_s, computed_s, bytes_up=sent[1], bytes_down=bytes_down))
 
     def _note_dropped(self, dropped: Dropped) -> None:
         if self._job.wishes.lossless:
             raise ClientError(f"frame {dropped.frame}: {dropped.reason}")
         self._summary.dropped += 1
         self._out.pop(dropped.frame, None)
+        self._pictures.pop(dropped.frame, None)
         self._figures.forget(dropped.frame)
         self._tell(f"frame {dropped.frame}: {dropped.reason}")
         self._advance()
@@ -320,26 +335,43 @@ class _Stream:
 
 
 def _adaptive(job: _Job, delay_s: float) -> Adaptive | None:
-    """What follows the link, where quality may."""
-    if not job.realtime or not job.sending.adapts:
+    """What follows the link, where quality may. A light alone does not say how long the server took for it."""
+    if not job.realtime or not job.sending.adapts or job.wishes.answer == "light":
         return None
     return Adaptive(1 / job.source.fps, delay_s, job.sending.depth_noise_per_m)
 
 
-def frame_output(answer: Answer, camera: CameraModel) -> FrameOutput:
-    """An answer as the output writer takes it; the picture decoded. Raises ProtocolError."""
-    composite = answer.composite
+def frame_output(answer: Answer, camera: CameraModel, own: Color | None = None) -> FrameOutput:
+    """An answer as the output writer takes it: its picture decoded, or its layer put over the frame's `own` picture.
+
+    Raises ProtocolError for what cannot be decoded.
+    """
+    drawn = answer.drawn
+    assert drawn is not None
+    if isinstance(drawn, Layer):
+        assert own is not None
+        color = put_over(decode_layer(drawn, camera), shown_picture(own, camera), camera)
+    else:
+        color = decode_color(drawn.color, camera, "srgb8")
     return FrameOutput(
-        frame=composite.frame,
-        timestamp_s=composite.timestamp_s,
-        color=decode_color(composite.color, camera, "srgb8"),
+        frame=drawn.frame,
+        timestamp_s=drawn.timestamp_s,
+        color=color,
         light=answer.light,
-        world_from_camera=np.array(composite.world_from_camera, np.float64).reshape(4, 4),
-        tracking=composite.tracking,
-        timings=composite.timings,
-        plan=composite.plan,
-        notes=composite.notes,
+        world_from_camera=np.array(drawn.world_from_camera, np.float64).reshape(4, 4),
+        tracking=drawn.tracking,
+        timings=drawn.timings,
+        plan=drawn.plan,
+        notes=drawn.notes,
     )
+
+
+def answer_bytes(answer: Answer) -> int:
+    """Bytes of an answer's pictures; the rest is small."""
+    if answer.composite is not None:
+        return len(answer.composite.color.data)
+    parts = () if answer.layer is None else (answer.layer.virtual, answer.layer.ratio)
+    return sum(len(part.color.data) + len(part.depth.data) for part in parts if part is not None)
 
 
 @contextlib.contextmanager

@@ -19,7 +19,7 @@ from rich.text import Text
 
 from client.coding import Coding
 from client.laptop.stream_figures import STAGES, StreamFigures
-from protocol.messages import Composite, Light
+from protocol.messages import Composite, Layer, Light
 
 PICTURE_COLUMNS = 80
 TABLE_ROWS = 14
@@ -31,6 +31,8 @@ LABELS = {
     "show": "returned to shown",
     "whole": "captured to shown",
 }
+TOLD_BY_SERVER = ("wait", "compute")
+"""A light alone does not say them: they are part of the way then."""
 
 
 class StreamView:
@@ -41,7 +43,7 @@ class StreamView:
         self._with_picture = with_picture
         self.is_on = console.is_terminal
         self._light: Light | None = None
-        self._composite: Composite | None = None
+        self._drawn: Composite | Layer | None = None
         self._picture: Text | None = None
         self._coding: Coding | None = None
         self._reconnected = 0
@@ -57,13 +59,13 @@ class StreamView:
         self,
         now_s: float,
         light: Light,
-        composite: Composite,
+        drawn: Composite | Layer | None,
         picture: NDArray[np.uint8] | None,
         coding: Coding | None,
         reconnected: int,
     ) -> None:
         """The newest answer; it is drawn with the next refresh. `coding`: how frames are sent now."""
-        self._now_s, self._light, self._composite = now_s, light, composite
+        self._now_s, self._light, self._drawn = now_s, light, drawn
         self._coding, self._reconnected = coding, reconnected
         if picture is not None and self.wants_pictures:
             self._picture = half_blocks(picture, self._columns(picture))
@@ -73,8 +75,8 @@ class StreamView:
         parts: list[RenderableType] = [self._progress.get_renderable()]
         if self._picture is not None:
             parts.append(self._picture)
-        if self._light is not None and self._composite is not None:
-            parts.append(self._table(self._light, self._composite))
+        if self._light is not None:
+            parts.append(self._table(self._light, self._drawn))
         return Group(*parts)
 
     def __enter__(self) -> StreamView:
@@ -92,17 +94,19 @@ class StreamView:
         rows = max(self._live.console.height - TABLE_ROWS, 4)
         return max(min(PICTURE_COLUMNS, self._live.console.width, 2 * rows * picture.shape[1] // picture.shape[0]), 8)
 
-    def _table(self, light: Light, composite: Composite) -> Table:
+    def _table(self, light: Light, drawn: Composite | Layer | None) -> Table:
         table = Table.grid(padding=(0, 2))
         table.add_column(style="dim")
         sent, up, answered, down = self._figures.rates(self._now_s)
         table.add_row("rate", f"{sent:.1f} sent, {answered:.1f} answered a second; {up:.1f} Mbit/s up, {down:.1f} down")
         for stage in STAGES:
             found = self._figures.percentiles(stage)
-            if found is not None:
+            is_told = drawn is not None or stage not in TOLD_BY_SERVER
+            if found is not None and is_told:
                 table.add_row(LABELS[stage], f"p50 {found[0]:.0f} ms, p99 {found[1]:.0f} ms")
         table.add_row("light", light_line(light))
-        table.add_row("plan", plan_line(composite))
+        if drawn is not None:
+            table.add_row("plan", plan_line(drawn))
         if self._coding is not None:
             table.add_row("sent as", coding_line(self._coding))
         table.add_row("connection", f"restored {self._reconnected} times" if self._reconnected else "held")
@@ -117,12 +121,12 @@ def light_line(light: Light) -> str:
     return f"from ({x:+.2f}, {y:+.2f}, {z:+.2f}), intensity {light.dominant_intensity:.2g}{lamps}{sure}"
 
 
-def plan_line(composite: Composite) -> str:
+def plan_line(drawn: Composite | Layer) -> str:
     """What ran, what did not, and where it was sampled."""
-    plan = composite.plan
+    plan = drawn.plan
     left_out = f"; left out: {', '.join(item.effect for item in plan.left_out)}" if plan.left_out else ""
     point = f"; {plan.point.settings} ({plan.point.reason})" if plan.point is not None else ""
-    return f"{', '.join(plan.run)}{left_out}{point}; camera {composite.tracking}"
+    return f"{', '.join(plan.run)}{left_out}{point}; camera {drawn.tracking}"
 
 
 def coding_line(coding: Coding) -> str:

@@ -54,7 +54,8 @@ def run_in_process(source: FakeSource, frames: range, folder: Path) -> None:
     with OutputWriter(folder) as writer:
         for i in frames:
             frame = source[i]
-            result = vars(fake_result(frame))
+            result = {**vars(fake_result(frame))}
+            assert result.pop("layer") is None  # not wished for
             writer.write(FrameOutput(frame=frame.index, timestamp_s=frame.timestamp_s, **result))
 
 

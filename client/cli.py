@@ -181,6 +181,13 @@ def serve(
     data: Annotated[
         str | None, typer.Option(metavar="DIR|none", help="where rooms are kept; default: the user's data folder")
     ] = None,
+    data_gib: Annotated[
+        float | None,
+        typer.Option(min=0, help="that rooms may take there, oldest removed first; default 16, 0: no limit"),
+    ] = None,
+    data_days: Annotated[
+        float | None, typer.Option(min=0, help="after which rooms nobody entered are removed; default 180, 0: never")
+    ] = None,
     log: Annotated[str, typer.Option(metavar="text|json", help="how events are written to standard error")] = "text",
     objects: Annotated[Path | None, typer.Option(metavar="DIR", help="models that clients may place, by name")] = None,
 ) -> int:
@@ -209,6 +216,8 @@ def serve(
         volume_memory=volume_memory,
         sessions=sessions,
         sessions_per_address=sessions_per_address,
+        data_gib=data_gib,
+        data_days=data_days,
     )
     limits, door, log_format = limits_of(options), door_of(options), log_format_of(log)
     certificate = certificate_of(options)

@@ -460,6 +460,8 @@ class StreamClient:
         reason = self._reason_given or (error.rcvd.reason if error.rcvd is not None else "")
         if error.rcvd is None:
             return ClientError(f"the server at {self._url} has gone: the connection was lost")
+        if error.rcvd.code == RESTART and self._hello is not None and self._hello.room is None:
+            reason = f"{reason}; a session without a room ends with its server"
         return ClientError(f"the server at {self._url} closed the connection: {reason or f'code {error.rcvd.code}'}")
 
     def _ends_answer(self, message: ServerMessage) -> TypeGuard[Composite | Layer | Light | Dropped]:

@@ -16,7 +16,8 @@ from platformdirs import user_data_path
 from client.laptop.errors import OptionError, RunError
 from server.door import MAX_TOKEN_CHARS, Door, is_loopback, is_token, new_token
 from server.events import LogFormat
-from server.limits import DEFAULT_LIMITS, MIB, Limits
+from server.limits import DEFAULT_LIMITS, GIB, MIB, Limits
+from server.saving.upkeep import DAY_S, KeptLimits
 from server.tls import Certificate, CertificateError, given_certificate, own_certificate
 
 NO_TOKEN = "none"
@@ -40,6 +41,8 @@ class ServeOptions:
     """MiB."""
     sessions: int | None = None
     sessions_per_address: int | None = None
+    data_gib: float | None = None
+    data_days: float | None = None
 
 
 def door_of(options: ServeOptions) -> Door:
@@ -82,11 +85,22 @@ def limits_of(options: ServeOptions) -> Limits:
                 f"--volume-memory {options.volume_memory}: expected MiB, {LEAST_VOLUME_MIB} to {MOST_VOLUME_MIB}"
             )
         limits = replace(limits, volume_bytes=options.volume_memory * MIB)
+    limits = replace(limits, kept=_kept_limits(options))
     sessions = limits.sessions if options.sessions is None else options.sessions
     per_address = min(sessions, limits.sessions_per_address)
     if options.sessions_per_address is not None:
         per_address = options.sessions_per_address
     return replace(limits, sessions=sessions, sessions_per_address=per_address)
+
+
+def _kept_limits(options: ServeOptions) -> KeptLimits:
+    """0 is no limit."""
+    kept = DEFAULT_LIMITS.kept
+    if options.data_gib is not None:
+        kept = replace(kept, space_bytes=int(options.data_gib * GIB) or None)
+    if options.data_days is not None:
+        kept = replace(kept, age_s=options.data_days * DAY_S or None)
+    return kept
 
 
 def data_folder(text: str | None) -> Path | None:
@@ -105,6 +119,13 @@ def data_folder(text: str | None) -> Path | None:
     return folder
 
 
+def objects_folder(path: Path | None) -> Path | None:
+    """Where models are that clients may place; None: nowhere. Raises OptionError."""
+    if path is not None and not path.is_dir():
+        raise OptionError(f"--objects {path}: no such folder; give one with .glb, .obj, .ply or .stl files in it")
+    return path
+
+
 def log_format_of(text: str) -> LogFormat:
     """Raises OptionError."""
     if text not in get_args(LogFormat):
@@ -119,13 +140,6 @@ def leave_soon(status: int) -> None:
         sys.stderr.write("probeless: a session is stuck on the device and was given up\n")
         sys.stderr.flush()
         os._exit(status)
-def objects_folder(path: Path | None) -> Path | None:
-    """Where models are that clients may place; None: nowhere. Raises OptionError."""
-    if path is not None and not path.is_dir():
-        raise OptionError(f"--objects {path}: no such folder; give one with .glb, .obj, .ply or .stl files in it")
-    return path
-
-
 
     timer = threading.Timer(LEAVING_PATIENCE_S, leave)
     timer.daemon = True

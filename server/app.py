@@ -73,6 +73,8 @@ def _add_health(app: FastAPI, service: Service) -> None:
     @app.get("/healthz")
     async def healthz() -> JSONResponse:
         state = {"ready": service.ready, "device": service.device_name, "sessions": service.sessions}
+        if service.kept is not None:
+            state["kept_rooms"], state["kept_bytes"] = service.kept.rooms, service.kept.space_bytes
         if service.departure.has_begun:
             state["draining"] = True
         if service.failure is not None:

@@ -7,7 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-MIB = 1 << 20
+from server.saving.upkeep import DAY_S, KeptLimits
+
+MIB, GIB = 1 << 20, 1 << 30
+KEPT = KeptLimits(space_bytes=16 * GIB, age_s=180 * DAY_S)
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,8 @@ class Limits:
     """The same at which nobody new is taken in."""
     volume_bytes: int = 512 * MIB
     """Device memory of one session's volume."""
+    kept: KeptLimits = KEPT
+    """Of the rooms on disk."""
 
 
 DEFAULT_LIMITS = Limits()

@@ -12,11 +12,12 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from protocol.messages import Frame, MoveObject, PlaceObject, Quality, RemoveObject, RequestMesh
 
 Control = PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh
+T = TypeVar("T", bound=Control)
 
 MAX_WAITING_LETTERS = 64
 MAX_WAITING_BYTES = 48 << 20
@@ -102,6 +103,17 @@ class Mailbox:
         if self._on_taken is not None:
             self._on_taken()
         return letter
+
+    def take_more(self, kind: type[T]) -> list[T]:
+        """What is next, as long as it is of that kind; waits for nothing."""
+        taken: list[T] = []
+        with self._changed:
+            while self._letters and isinstance(message := self._letters[0].message, kind):
+                taken.append(message)
+                self._remove(0)
+        if taken and self._on_taken is not None:
+            self._on_taken()
+        return taken
 
     def note_answered(self) -> None:
         """The reader is about to answer the frame it took last: from now on the client may send another."""

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
 from protocol.messages import Timings
+
+if TYPE_CHECKING:
+    from server.kept_rooms import KeptRooms
 
 BUCKETS_MS = (0.5, 1, 2, 5, 10, 20, 35, 50, 75, 100, 150, 250, 500, 1000, 2500, 5000)
 STAGES = Timings.__struct_fields__
@@ -42,7 +48,8 @@ class Metrics:
             ("kind",),
             registry=self._registry,
         )
-        for kind in ("mesh", "picture"):
+        self._rooms = Gauge("probeless_rooms", "Rooms that somebody is in", registry=self._registry)
+        for kind in ("mesh", "picture", "video"):
             self.parser_deaths.labels(kind)
         for stage in STAGES:
             self.stage_ms.labels(stage)
@@ -51,6 +58,19 @@ class Metrics:
 
     def _histogram(self, name: str, help_text: str, labels: tuple[str, ...] = ()) -> Histogram:
         return Histogram(f"probeless_{name}", help_text, labels, buckets=BUCKETS_MS, registry=self._registry)
+
+    def watch_rooms(self, count: Callable[[], int], keeping: KeptRooms | None) -> None:
+        """Have rows of rooms; of those on disk where they are kept."""
+        self._rooms.set_function(lambda: float(count()))
+        if keeping is not None:
+            rows: dict[str, tuple[str, Callable[[], float]]] = {
+                "kept_rooms": ("Rooms on disk", lambda: keeping.kept.rooms),
+                "kept_bytes": ("Bytes that rooms take on disk", lambda: keeping.kept.space_bytes),
+                "kept_removed": ("Rooms and damaged saves removed for age or space", lambda: keeping.kept.removed),
+                "unsaved_rooms": ("Rooms whose last save failed", lambda: keeping.unsaved),
+            }
+            for name, (help_text, value) in rows.items():
+                Gauge(f"probeless_{name}", help_text, registry=self._registry).set_function(value)
 
     def observe_stages(self, timings: Timings) -> None:
         """Add one frame's timings to the histograms of the stages."""

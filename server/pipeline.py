@@ -31,6 +31,7 @@ from server.rendering import Made, Rendering, Wanted
 from server.rest import Rest
 from server.room import Room
 from server.scene.mesh import Mesh
+from server.scene.objects import check_room
 from server.scene.placement import Placement, check_size
 from server.settings import Settings, read_wishes
 from server.stages.composite import shown_picture, srgb_codes
@@ -100,6 +101,7 @@ class Pipeline:
         self._objects = self._room.objects
         self._waiting: list[tuple[str, Mesh, Placement]] = []
         """Objects of a client that does not know yet where it is."""
+        self._is_told_what_is_owed = False
         self._changes = 0
         self._webxr_from_client: NDArray[np.float64] | None = None
         self._mean_sent = np.zeros(3)
@@ -121,6 +123,10 @@ class Pipeline:
             result = self._process(self._imagined(frame) if isinstance(frame, Viewpoint) else frame, wanted)
             self._room.changes += 1
             self._changes = self._room.changes
+            if not self._is_told_what_is_owed:
+                self._is_told_what_is_owed = True
+                own = {name for name, _, _ in self._waiting}
+                result = replace(result, notes=(*result.notes, *self._objects.owed_notes(besides=own)))
             return result
 
     def _imagined(self, seen_from: Viewpoint) -> RgbdFrame:
@@ -282,8 +288,11 @@ class Pipeline:
                 self._objects.place(object_id, mesh, self._alignment.placed(placement))
                 self._room.changes += 1
             else:
+                others = [w for w in self._waiting if w[0] != object_id]
+                check_room((other for _, other, _ in others), mesh)
                 check_size(mesh, placement)
-                self._waiting = [*(w for w in self._waiting if w[0] != object_id), (object_id, mesh, placement)]
+                self._waiting = [*others, (object_id, mesh, placement)]
+                self._objects.owe(object_id)
                 return (*mesh.notes, "it is placed once this client is aligned with the room")
         return mesh.notes
 
@@ -303,6 +312,7 @@ class Pipeline:
             left = [waiting for waiting in self._waiting if waiting[0] != object_id]
             if len(left) < len(self._waiting):
                 self._waiting = left
+                self._objects.forgive(object_id)
                 return
             self._objects.remove(object_id)
             self._room.changes += 1

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterable
 
 from server.room import Room
-from server.room_store import RoomStore, RoomStoreError, Saved
+from server.room_store import RoomStore, RoomStoreError
+from server.saving.room_saves import Saved
 
 EVERY_S = 2.0
 """Between saves: with the time that one takes, what a crash may cost."""
+TIDY_EVERY_S = 60.0
 
 log = logging.getLogger(__name__)
 
@@ -24,8 +27,13 @@ class RoomSaver:
         rooms: Callable[[], Iterable[Room]],
         every_s: float = EVERY_S,
         on_saved: Callable[[Room, Saved], None] = lambda _room, _saved: None,
+        tidy: Callable[[], None] = lambda: None,
     ) -> None:
-        """`rooms`: those that are open, asked from the saver's thread each time; `on_saved` is called there too."""
+        """`rooms`: those that are open, asked from the saver's thread each time; `on_saved` is called there too.
+
+        `tidy`: called there at first and every minute; may raise RoomStoreError.
+        """
+        self._tidy = tidy
         self._store = store
         self._rooms = rooms
         self._every_s = every_s
@@ -53,23 +61,33 @@ class RoomSaver:
 
     def save(self, room: Room) -> bool:
         """Save one room now, as before it is closed; whether that went well. It must stay open meanwhile."""
-        if room.name is None:
-            return True
+        return room.name is None or self._is_done(room.name, lambda: self._on_saved(room, self._store.save(room)))
+
+    def save_moves(self, room: Room) -> bool:
+        """Likewise where its objects have been moved to, before that is acknowledged."""
+        return room.name is None or self._is_done(room.name, lambda: self._store.save_moves(room))
+
+    def _is_done(self, name: str, work: Callable[[], None]) -> bool:
         try:
-            saved = self._store.save(room)
+            work()
         except RoomStoreError as error:
-            if self.problems.get(room.name) != str(error):
+            if self.problems.get(name) != str(error):
                 log.warning("%s", error)
-            self.problems[room.name] = str(error)
+            self.problems[name] = str(error)
             return False
-        if self.problems.pop(room.name, None) is not None:
-            log.info("room %r is saved again", room.name)
-        self._on_saved(room, saved)
+        if self.problems.pop(name, None) is not None:
+            log.info("room %r is saved again", name)
         return True
 
     def _run(self) -> None:
+        tidied_s = float("-inf")
         while not self._stopped.wait(self._every_s):
             try:
                 self.save_all()
+                if time.monotonic() - tidied_s > TIDY_EVERY_S:
+                    tidied_s = time.monotonic()
+                    self._tidy()
+            except RoomStoreError as error:
+                log.warning("%s", error)
             except Exception:  # a fault of ours: the other rooms and the next time shall not suffer from it
                 log.exception("rooms could not be saved")

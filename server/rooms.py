@@ -27,11 +27,27 @@ def lock_of(key: str | None) -> bytes:
     return b"" if key is None else sha256(key.encode()).digest()
 
 
+def _compare(name: str, digest: bytes | None, lock: bytes) -> None:
+    """`digest`: None for a room that has no key yet. Raises RoomLocked."""
+    if digest is not None and not compare_digest(digest, lock):
+        raise RoomLocked(f"room {name!r} has a key of its own, and this is not it: ask who opened it")
+
+
 class Rooms:
     """For any number of threads; a room is opened and closed by one of them while the others wait."""
 
-    def __init__(self, open_room: RoomFactory, on_closed: Callable[[Room], None] = lambda _room: None) -> None:
-        """`on_closed`: called with a room that nobody is in any more, before its memory is given back."""
+    def __init__(
+        self,
+        open_room: RoomFactory,
+        on_closed: Callable[[Room], None] = lambda _room: None,
+        kept_digest: Callable[[str], bytes | None] = lambda _name: None,
+    ) -> None:
+        """`on_closed`: called with a room that nobody is in any more, before its memory is given back.
+
+        `kept_digest`: of the key of a room that is not open; None where it has none yet. Like `open_room` it may raise
+        ValueError.
+        """
+        self._kept_digest = kept_digest
         self._open_room = open_room
         self._on_closed = on_closed
         self._rooms: dict[str, Room] = {}
@@ -52,15 +68,19 @@ class Rooms:
             self._guests[name] += 1
         try:
             with self._door(name):
-                if name not in self._rooms:
-                    self._rooms[name] = self._open_room(wishes, name)
-                room = self._rooms[name]
-            room.key_digest = lock if room.key_digest is None else room.key_digest
-            if not compare_digest(room.key_digest, lock):
-                raise RoomLocked(f"room {name!r} has a key of its own, and this is not it: ask who opened it")
+                room = self._rooms.get(name) or self._opened(name, wishes, lock)
+            _compare(name, room.key_digest, lock)
             yield room
         finally:
             self._leave(name)
+
+    def _opened(self, name: str, wishes: Wishes, lock: bytes) -> Room:
+        """By whoever is at its door; not before the key fits: opening takes disk and device."""
+        _compare(name, self._kept_digest(name), lock)
+        room = self._open_room(wishes, name)
+        room.key_digest = lock if room.key_digest is None else room.key_digest
+        self._rooms[name] = room
+        return room
 
     def named(self, name: str) -> Room | None:
         """For somebody who is in it."""
@@ -84,14 +104,18 @@ class Rooms:
             self._guests[name] -= 1
             if self._guests[name]:
                 return
-        with self._door(name):
+        door = self._door(name)
+        with door:
             with self._lock:
-                is_empty = not self._guests[name]  # nobody has come meanwhile
-                room = self._rooms.pop(name, None) if is_empty else None
-                if is_empty:
-                    del self._guests[name]
+                if self._guests[name] or self._doors.get(name) is not door:
+                    return  # somebody has come meanwhile, or has closed it
+                del self._guests[name]
+                room = self._rooms.pop(name, None)
             if room is not None:
                 self._close(room)
+            with self._lock:
+                if not self._guests[name]:
+                    del self._doors[name]  # whoever comes makes a new one
 
     def _door(self, name: str) -> threading.Lock:
         with self._lock:

@@ -27,6 +27,7 @@ from server.limits import DEFAULT_LIMITS, Limits
 from server.metrics import Metrics
 from server.parsing.parsers import Parsers
 from server.rooms import RoomFactory, Rooms, lock_of
+from server.saving.upkeep import Kept
 from server.scene.mesh import Mesh
 from server.scheduler import Scheduler
 from server.session import MAX_INFLIGHT, CaptureSession, LoopOutlet
@@ -100,9 +101,12 @@ class Service:
         self.departure.on_begin.append(self._give_up_waiting)
         self._scheduler = Scheduler(at_once)
         self._factory = pipeline_factory or _real_pipeline()
-        self._keeping = KeptRooms(data, device) if data is not None else None
-        open_room = self._keeping.open_room if self._keeping else room_factory or _real_room(device)
-        self.rooms = Rooms(open_room, self._keeping.keep if self._keeping else lambda _room: None)
+        self._keeping = KeptRooms(data, device, self.limits.kept) if data is not None else None
+        if self._keeping is not None:
+            self.rooms = Rooms(self._keeping.open_room, self._keeping.keep, self._keeping.key_digest)
+        else:
+            self.rooms = Rooms(room_factory or _real_room(device))
+        self.metrics.watch_rooms(lambda: self.rooms.count, self._keeping)
         self._workshop = Workshop(
             opened_pipeline=self._opened_pipeline,
             scheduler=self._scheduler,
@@ -110,19 +114,14 @@ class Service:
             load_mesh=mesh_loader or self._parsers.load_mesh,
             decode_color=self._parsers.decode_color,
             metrics=self.metrics,
-            keep_room=self._keep_room,
+            keep_room=self._keeping.keep_now if self._keeping else lambda _name: None,
+            keep_moves=self._keeping.keep_moves if self._keeping else lambda _name: None,
         )
         self._preparing: asyncio.Task[None] | None = None
 
     async def _stop_keeping(self) -> None:
         assert self._keeping is not None
         await asyncio.to_thread(self._keeping.stop)
-
-    def _keep_room(self, name: str) -> None:
-        """Thread of a worker that is in it."""
-        room = self.rooms.named(name)
-        if self._keeping is not None and room is not None:
-            self._keeping.keep_now(room)
 
     def _entered(self, name: str, hello: Hello) -> contextlib.AbstractContextManager[Room]:
         return self.rooms.entered(name, hello.wishes, hello.room_key)
@@ -145,6 +144,11 @@ class Service:
     def sessions(self) -> int:
         """Capturing sessions now."""
         return self._sessions
+
+    @property
+    def kept(self) -> Kept | None:
+        """What the folder of rooms held when it was last looked through; None: nothing is kept."""
+        return self._keeping.kept if self._keeping else None
 
     def start(self) -> None:
         """Begin to warm up, without waiting for it. Needs the running event loop that will serve."""

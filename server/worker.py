@@ -89,6 +89,8 @@ class Workshop:
     decode_color: Callable[[ColorImage, CameraModel], Color] = decode_color
     keep_room: Callable[[str], None] = lambda _name: None
     """Save a room, before its objects' coming or going is acknowledged: a server that is killed loses none."""
+    keep_moves: Callable[[str], None] = lambda _name: None
+    """Likewise where its objects have been moved to, which takes less."""
 
 
 class Worker:
@@ -131,11 +133,21 @@ class Worker:
             self._answer_frame(pipeline, letter.message)
         elif isinstance(letter.message, RequestMesh):
             self._send_mesh(pipeline, letter.message.request)
+        elif isinstance(letter.message, MoveObject):
+            self._answer_moves(pipeline, [letter.message, *self._mailbox.take_more(MoveObject)])
         else:
-            self._answer_control(pipeline, letter.message)
+            self._outlet.send(self._done(pipeline, letter.message))
 
-    def _answer_control(self, pipeline: Pipeline, message: SceneControl) -> None:
-        """Do it once, however often it is sent."""
+    def _answer_moves(self, pipeline: Pipeline, moves: list[MoveObject]) -> None:
+        """Moves that waited one behind the other: kept together, then acknowledged."""
+        answers = [self._done(pipeline, move) for move in moves]
+        if self._hello.room is not None:
+            self._workshop.keep_moves(self._hello.room)
+        for answer in answers:
+            self._outlet.send(answer)
+
+    def _done(self, pipeline: Pipeline, message: SceneControl) -> bytes:
+        """Its acknowledgement; it is done once, however often it is sent."""
         done = self._acknowledged.get(message.request)
         if done is None:
             acknowledged = apply_control(pipeline, message, self._workshop.load_mesh)
@@ -147,7 +159,7 @@ class Worker:
             done = self._acknowledged[message.request] = encode(acknowledged)
             if len(self._acknowledged) > KEPT_ACKNOWLEDGEMENTS:
                 self._acknowledged.popitem(last=False)
-        self._outlet.send(done)
+        return done
 
     def _answer_frame(self, pipeline: Pipeline, frame: Frame) -> None:
         known = next((answer for number, answer in self._answers if number == frame.frame), None)

@@ -26,6 +26,7 @@ from server.saving.state import (
     state_from_bytes,
     state_to_bytes,
 )
+from server.saving.upkeep import ASIDE
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.stages.volume import Volume
@@ -98,18 +99,18 @@ class Slot:
         except msgspec.MsgspecError as error:
             raise DamagedFile(f"{path} is no save: {error}") from error
 
+    def key_digest(self) -> bytes | None:
+        """Of the room's key, by the save alone; None where that does not say. Raises DamagedFile, OSError."""
+        check_file(self.folder / SAVE)
+        header = self.header()
+        if header is not None and header.key_digest is not None:
+            return header.key_digest
+        return self._state().key_digest
+
     def read(self) -> RoomState:
         """The save, after all its files have been compared with their checksums. Raises DamagedFile, OSError."""
-        path = self.folder / SAVE
-        check_file(path)
-        header = self.header()
-        if header is None or header.version != VERSION:
-            raise DamagedFile(f"{path} is of version {header and header.version}, this program reads {VERSION}")
-        try:
-            _, packed = read_parts(path)
-            state = state_from_bytes(packed)
-        except ValueError as error:
-            raise DamagedFile(f"{path} is no save: {error}") from error
+        check_file(self.folder / SAVE)
+        state = self._state()
         meshes: dict[FileName, Mesh | None] = dict.fromkeys(kept.mesh for kept in state.objects)
         files = state.volume.files if state.volume else ()
         for file in self.paths((*files, *meshes)):
@@ -117,6 +118,16 @@ class Slot:
         self._meshes = meshes
         self._read = files, state.volume.bricks_in_files if state.volume else 0
         return state
+
+    def _state(self) -> RoomState:
+        path, header = self.folder / SAVE, self.header()
+        if header is None or header.version != VERSION:
+            raise DamagedFile(f"{path} is of version {header and header.version}, this program reads {VERSION}")
+        try:
+            _, packed = read_parts(path)
+            return state_from_bytes(packed)
+        except ValueError as error:
+            raise DamagedFile(f"{path} is no save: {error}") from error
 
     def write(self, header: Header, taken: Snapshot) -> int:
         """Make the save that of `taken`; bytes written. Raises OSError, the save is then as it was, or durable soon.
@@ -196,11 +207,11 @@ class Slot:
     def set_aside(self) -> Path:
         """Give the folder another name, for a person to look at; the name. Raises OSError."""
         room = self.folder.parent
-        number = next(n for n in range(1, 1 << 30) if not (room / f"set-aside-{n}").exists())
-        os.replace(self.folder, room / f"set-aside-{number}")
+        number = next(n for n in range(1, 1 << 30) if not (room / f"{ASIDE}{n}").exists())
+        os.replace(self.folder, room / f"{ASIDE}{number}")
         sync_folder(room)
         self._bricks, self._meshes = None, {}
-        return room / f"set-aside-{number}"
+        return room / f"{ASIDE}{number}"
 
 
 def _place_of(kept: KeptObject, mesh: FileName) -> KeptPlace:

@@ -12,7 +12,7 @@ import numpy as np
 from server.opencl.device import Device
 from server.parsing.mesh_bytes import mesh_from_bytes
 from server.room import Room
-from server.room_objects import KeptObject
+from server.room_objects import Inventory, KeptObject
 from server.saving.brick_files import Batch, merged
 from server.saving.files import DamagedFile, read_parts
 from server.saving.slot import Slot
@@ -29,13 +29,18 @@ class Snapshot:
 
     state: RoomState
     """Without the objects, and without the files of the volume."""
-    objects: list[KeptObject]
+    inventory: Inventory
     volume: Volume | None
     bricks: list[Batch]
     change: int
     """The volume's `changes` at that moment."""
     lock_ms: float = 0.0
     """For how long no frame could be worked on."""
+
+    @property
+    def objects(self) -> tuple[KeptObject, ...]:
+        """All of them."""
+        return self.inventory.objects
 
 
 def snapshot(room: Room, slot: Slot) -> Snapshot:
@@ -60,7 +65,7 @@ def snapshot_within(room: Room, slot: Slot) -> Snapshot:
         lamps=room.lamps.found,
         key_digest=room.key_digest,
     )
-    return Snapshot(state, room.objects.kept(), volume, bricks, volume.changes if volume else 0)
+    return Snapshot(state, room.objects.inventory(), volume, bricks, volume.changes if volume else 0)
 
 
 def _kept(volume: Volume, exposure_logarithms: float) -> KeptVolume:

@@ -78,11 +78,16 @@ class Header(Struct, frozen=True):
     name: str
     sequence: int
     """Grows from save to save of a room."""
+    key_digest: bytes | None = None
+    """The state's, to be compared before all else is read; earlier programs left it out."""
+    revision: int = 0
+    """Of the objects (see Inventory), by which moves are told that came after."""
+    owed: tuple[str, ...] = ()
 
 
 def state_to_bytes(state: RoomState) -> bytes:
     """Packed."""
-    return zstandard.ZstdCompressor(level=1).compress(msgspec.msgpack.encode(state, enc_hook=_array_to_list))
+    return zstandard.ZstdCompressor(level=1).compress(msgspec.msgpack.encode(state, enc_hook=array_to_list))
 
 
 def state_from_bytes(data: bytes) -> RoomState:
@@ -91,12 +96,13 @@ def state_from_bytes(data: bytes) -> RoomState:
         if zstandard.frame_content_size(data) > _MOST_BYTES:
             raise ValueError("it is larger than any room")
         packed = zstandard.ZstdDecompressor().decompress(data)
-        return msgspec.msgpack.decode(packed, type=RoomState, dec_hook=_array_from_list)
+        return msgspec.msgpack.decode(packed, type=RoomState, dec_hook=array_from_list)
     except (zstandard.ZstdError, msgspec.MsgspecError) as error:
         raise ValueError(str(error)) from error
 
 
-def _array_to_list(value: Any) -> Any:
+def array_to_list(value: Any) -> Any:
+    """For msgspec's `enc_hook`."""
     if isinstance(value, np.ndarray):
         return [value.dtype.str, value.shape, np.ascontiguousarray(value).tobytes()]
     if isinstance(value, np.generic):
@@ -104,8 +110,8 @@ def _array_to_list(value: Any) -> Any:
     raise NotImplementedError(f"a {type(value).__name__} is not kept")
 
 
-def _array_from_list(asked: Any, value: Any) -> Any:
-    """An own copy. Raises ValueError for another type than `asked`, an NDArray's."""
+def array_from_list(asked: Any, value: Any) -> Any:
+    """For msgspec's `dec_hook`: an own copy. Raises ValueError for another type than `asked`, an NDArray's."""
     if get_origin(asked) is not np.ndarray:
         raise NotImplementedError(f"a {asked} is not kept")
     kind = np.dtype(get_args(get_args(asked)[1])[0])

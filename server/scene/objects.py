@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -69,9 +69,11 @@ class SceneObjects:
 
     def move(self, object_id: str, placement: Placement) -> None:
         """Give an object another place. Raises KeyError if there is none of that id, ValueError as place() does."""
-        entry = self._entries[object_id]
-        placed = world_from_model(entry.mesh, placement, self.up)
-        self._entries[object_id] = SceneObject(entry.mesh, entry.digest, placed)
+        self.move_to(object_id, world_from_model(self._entries[object_id].mesh, placement, self.up))
+
+    def move_to(self, object_id: str, matrix: NDArray[np.float64]) -> None:
+        """The same where world_from_model `matrix` [4, 4] is known."""
+        self._entries[object_id] = replace(self._entries[object_id], world_from_model=matrix)
 
     def remove(self, object_id: str) -> None:
         """Take an object away. Raises KeyError if there is none of that id."""

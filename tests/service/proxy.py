@@ -31,7 +31,9 @@ class Proxy:
         self._pairs: list[tuple[socket.socket, socket.socket]] = []
         self.connections = 0
         self.url = f"{target.scheme}://127.0.0.1:{self._listener.getsockname()[1]}"
-        threading.Thread(target=self._accept, daemon=True).start()
+        self._ways: list[_Way] = []
+        self._accepting = threading.Thread(target=self._accept, name="proxy-accept", daemon=True)
+        self._accepting.start()
 
     def cut(self) -> None:
         """Break every connection, as a network does: without a word of the protocol."""
@@ -45,10 +47,15 @@ class Proxy:
                 end.close()
 
     def close(self) -> None:
-        """End it and all that goes through it."""
+        """End it and all that goes through it; no thread is left."""
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)  # closing alone lets a thread in accept() wait for ever
         self._listener.close()
+        self._accepting.join()
         self.flows.set()
         self.cut()
+        for way in self._ways:
+            way.join()
 
     def _accept(self) -> None:
         with contextlib.suppress(OSError):
@@ -67,7 +74,7 @@ class Proxy:
                 for pair in ((client, server), (server, client)):
                     for end in pair:
                         end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    _Way(self, *pair)
+                    self._ways.append(_Way(self, *pair))
 
 
 class _Way:
@@ -77,8 +84,17 @@ class _Way:
         self._proxy, self._source, self._sink = proxy, source, sink
         self._held: deque[tuple[float, bytes]] = deque()
         self._changed = threading.Condition()
-        for work in (self._read, self._write):
-            threading.Thread(target=work, daemon=True).start()
+        self._is_broken = False
+        """Nobody takes any more what is held."""
+        works = (self._read, self._write)
+        self._threads = [threading.Thread(target=work, name="proxy-way", daemon=True) for work in works]
+        for thread in self._threads:
+            thread.start()
+
+    def join(self) -> None:
+        """Wait for its end, after its sockets have been closed."""
+        for thread in self._threads:
+            thread.join()
 
     def _read(self) -> None:
         data = b"x"
@@ -88,11 +104,19 @@ class _Way:
             except OSError:
                 data = b""
             with self._changed:
-                self._changed.wait_for(lambda: len(self._held) < 64)
+                self._changed.wait_for(lambda: len(self._held) < 64 or self._is_broken)
+                if self._is_broken:
+                    return
                 self._held.append((time.perf_counter() + self._proxy.delay_s, data))
                 self._changed.notify_all()
 
     def _write(self) -> None:
+        self._forward()
+        with self._changed:
+            self._is_broken = True
+            self._changed.notify_all()
+
+    def _forward(self) -> None:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: bool(self._held))

@@ -2,44 +2,244 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import trimesh
 
+from protocol.codec import decode_server
 from protocol.frames import IDENTITY
-from protocol.messages import Acknowledged, Hello, PlaceObject, RemoveObject, Welcome
+from protocol.messages import (
+    Acknowledged,
+    Composite,
+    Hello,
+    MoveObject,
+    PlaceObject,
+    RemoveObject,
+    ServerMessage,
+    Welcome,
+    Wishes,
+)
+from server.mailbox import Mailbox
+from server.metrics import Metrics
 from server.opencl.device import Device
+from server.room import Room
 from server.room_store import RoomStore
-from server.serve import start_in_background
+from server.scheduler import Scheduler
+from server.serve import BackgroundServer, start_in_background
 from server.service import Service
-from tests.rooms import CAMERA, wishes
+from server.worker import Worker, Workshop
+from tests.rooms import CAMERA, frame_at, view_at, wishes
+from tests.service import fakes
+from tests.service.fakes import PATIENCE_S, FakePipeline, Lab, fake_mesh, frame_message
+from tests.service.test_rooms_service import answered, message_of
 from tests.service.wire import Wire
 
 CUBE = trimesh.creation.box((0.2, 0.2, 0.2)).export(file_type="ply")
 
 
-def kept(folder: Path, device: Device) -> set[str]:
-    """Objects of the room as another server would find it now."""
+@contextlib.contextmanager
+def found(folder: Path, device: Device) -> Iterator[Room | None]:
+    """The room as another server would find it now."""
     room = RoomStore(folder).load("study", device)
-    if room is None:
-        return set()
-    names = {kept.object_id for kept in room.objects.kept()}
-    room.close()
-    return names
+    try:
+        yield room
+    finally:
+        if room is not None:
+            room.close()
 
 
-def test_what_is_acknowledged_is_kept(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("server.room_saver.RoomSaver.start", lambda _self: None)  # nothing else saves
-    with start_in_background(Service(device, data=tmp_path)) as server:
-        wire = Wire(server.url)
-        wire.say(Hello(client="test", camera=CAMERA, wishes=wishes("given"), room="study", room_from_world=IDENTITY))
-        assert isinstance(wire.hear(), Welcome)
-        for request, name in enumerate(("a", "b")):
-            wire.say(PlaceObject(request=request, object=name, format="ply", data=CUBE, position_m=(0, 0, 1)))
-            assert wire.hear_until(Acknowledged)[-1].error is None
-            assert name in kept(tmp_path, device)
-        wire.say(RemoveObject(request=7, object="a"))
+def kept(folder: Path, device: Device) -> set[str]:
+    """Objects of that room."""
+    with found(folder, device) as room:
+        return {kept.object_id for kept in room.objects.kept()} if room else set()
+
+
+def middle_of(folder: Path, device: Device, name: str) -> list[float]:
+    """Where the object stands there: the bottom's middle; metres, world."""
+    with found(folder, device) as room:
+        assert room is not None
+        (place,) = (kept.place for kept in room.objects.kept() if kept.object_id == name)
+        if not isinstance(place, np.ndarray):
+            return list(place.position_m)
+        return (place @ [0.0, 0.0, -0.1, 1.0])[:3].round(6).tolist()  # of the cube; PLY: +z is up
+
+
+@pytest.fixture
+def server(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[BackgroundServer]:
+    """One that saves nothing by itself."""
+    monkeypatch.setattr("server.room_saver.RoomSaver.start", lambda _self: None)
+    with start_in_background(Service(device, data=tmp_path / "rooms")) as server:
+        yield server
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "rooms"
+
+
+def enter(server: BackgroundServer, **said: object) -> Wire:
+    wire = Wire(server.url)
+    wire.say(Hello(client="test", camera=CAMERA, wishes=wishes("given"), room="study", **said))
+    assert isinstance(wire.hear(), Welcome)
+    return wire
+
+
+def place(wire: Wire, request: int, name: str) -> Acknowledged:
+    wire.say(PlaceObject(request=request, object=name, format="ply", data=CUBE, position_m=(0, 0, 1)))
+    return wire.hear_until(Acknowledged)[-1]
+
+
+def test_what_is_acknowledged_is_kept(server: BackgroundServer, folder: Path, device: Device) -> None:
+    wire = enter(server, room_from_world=IDENTITY)
+    for request, name in enumerate(("a", "b")):
+        assert place(wire, request, name).error is None
+        assert name in kept(folder, device)
+    wire.say(RemoveObject(request=7, object="a"))
+    assert wire.hear_until(Acknowledged)[-1].error is None
+    assert kept(folder, device) == {"b"}
+    wire.hang_up()
+
+
+@pytest.mark.parametrize("frames", [0, 1])
+def test_a_move_that_is_acknowledged_is_kept(
+    server: BackgroundServer, folder: Path, device: Device, frames: int
+) -> None:
+    wire = enter(server)
+    for step in range(frames):
+        answered(wire, step)
+    for request, name in enumerate(("a", "b")):
+        assert place(wire, request, name).error is None
+    for step in range(3):
+        target = (0.1 * step, 0.2, 1.0)
+        wire.say(MoveObject(request=10 + step, object="a", position_m=target))
         assert wire.hear_until(Acknowledged)[-1].error is None
-        assert kept(tmp_path, device) == {"b"}
+        assert middle_of(folder, device, "a") == pytest.approx(target)
+    assert middle_of(folder, device, "b") == pytest.approx((0, 0, 1))
+    wire.say(RemoveObject(request=20, object="a"))  # a whole save: the moves are of one before
+    wire.hear_until(Acknowledged)
+    assert kept(folder, device) == {"b"}
+    wire.hang_up()
+
+
+def test_an_object_of_a_client_that_is_not_aligned_is_told_after_a_crash(
+    server: BackgroundServer, folder: Path, device: Device
+) -> None:
+    first = enter(server)
+    for step in range(3):
+        answered(first, step)
+    lost = enter(server)  # says nothing of its world, and shows nothing that it is known by
+    acknowledged = place(lost, 1, "vase")
+    assert acknowledged.error is None
+    assert acknowledged.notes == ("it is placed once this client is aligned with the room",)
+    assert kept(folder, device) == set()
+    with start_in_background(Service(device, data=folder)) as other:  # as after a kill
+        again = enter(other, room_from_world=IDENTITY)
+        note = "'vase'"
+        assert any(note in line for line in answered(again, 4).notes)
+        assert not any(note in line for line in answered(again, 5).notes)  # once for each client
+        assert place(again, 2, "vase").error is None
+        later = enter(other, room_from_world=IDENTITY)
+        assert not any(note in line for line in answered(later, 6).notes)
+        for wire in (again, later):
+            wire.hang_up()
+    for wire in (first, lost):
         wire.hang_up()
+
+
+def test_what_is_owed_may_be_taken_back(server: BackgroundServer, folder: Path, device: Device) -> None:
+    first = enter(server)
+    answered(first, 0)
+    lost = enter(server)
+    assert place(lost, 1, "vase").error is None
+    with found(folder, device) as room:
+        assert room is not None
+        assert room.objects.inventory().owed == ("vase",)
+    first.say(RemoveObject(request=1, object="vase"))
+    assert first.hear_until(Acknowledged)[-1].error is None
+    with found(folder, device) as room:
+        assert room is not None
+        assert room.objects.inventory().owed == ()
+    for wire in (first, lost):
+        wire.hang_up()
+
+
+def test_once_its_client_is_aligned_nothing_is_owed(server: BackgroundServer, folder: Path, device: Device) -> None:
+    first = enter(server)
+    for step in range(3):
+        answered(first, step)
+    second = enter(server)
+    assert place(second, 1, "vase").error is None
+    second.say(message_of(frame_at(view_at(1), 0, given=view_at(1))))  # shows what the first has shown
+    assert second.hear_until(Composite)[-1].tracking == "given"
+    assert place(second, 2, "other").error is None
+    assert kept(folder, device) == {"vase", "other"}
+    with found(folder, device) as room:
+        assert room is not None
+        assert room.objects.inventory().owed == ()
+    for wire in (first, second):
+        wire.hang_up()
+
+
+class Inbox:
+    """An outlet that notes what has been kept when something is sent."""
+
+    waited_s = 0.0
+
+    def __init__(self) -> None:
+        self.kept: list[int] = []
+        self.heard: list[tuple[ServerMessage, int]] = []
+        self.all_heard = threading.Event()
+
+    def greet(self, device_name: str) -> None:
+        pass
+
+    def is_watched(self) -> bool:
+        return False
+
+    def publish(self, messages: tuple[bytes, ...]) -> None:
+        pass
+
+    def send(self, data: bytes) -> None:
+        message = decode_server(data)
+        self.heard.append((message, len(self.kept)))
+        if isinstance(message, Acknowledged) and message.request == 99:
+            self.all_heard.set()
+
+
+def test_moves_that_wait_behind_a_frame_are_kept_together() -> None:
+    """Each is done and acknowledged; the disk is waited for once."""
+    lab, inbox = Lab(hold=True), Inbox()
+    pipeline = FakePipeline(lab)
+    workshop = Workshop(
+        opened_pipeline=lambda _hello: contextlib.nullcontext(pipeline),
+        load_mesh=fake_mesh,
+        metrics=Metrics(),
+        scheduler=Scheduler(),
+        keep_moves=lambda _name: inbox.kept.append(len(lab.log)),
+    )
+    mailbox = Mailbox(2)
+    hello = Hello(client="test", camera=fakes.CAMERA, wishes=Wishes(answer="light"), room="study")
+    worker = Worker(workshop, hello, mailbox, inbox)
+    working = threading.Thread(target=worker.run)
+    working.start()
+    mailbox.post(PlaceObject(request=0, object="vase", format="ply", data=b"mesh", position_m=(0, 0, 1)))
+    mailbox.post(frame_message(0))
+    lab.next_entered()
+    for request in range(1, 6):
+        mailbox.post(MoveObject(request=request, object="vase", position_m=(0, 0, request)))
+    mailbox.post(RemoveObject(request=6, object="vase"))
+    mailbox.post(MoveObject(request=99, object="vase", position_m=(0, 0, 1)))
+    lab.release()
+    assert inbox.all_heard.wait(PATIENCE_S)
+    mailbox.close()
+    working.join(PATIENCE_S)
+    answers = [(message.request, kept, message.error) for message, kept in inbox.heard if hasattr(message, "request")]
+    assert [request for request, _, _ in answers] == [0, 1, 2, 3, 4, 5, 6, 99]
+    assert [kept for request, kept, _ in answers if 1 <= request <= 5] == [1] * 5
+    assert "no object" in answers[-1][2]
+    assert [entry[0] for entry in lab.log].count("move") == 6

@@ -158,3 +158,17 @@ def test_two_threads_lose_no_control_message_and_end_with_the_newest_frame(windo
     for i, message in enumerate(taken):
         if isinstance(message, Frame):  # its own move came before it
             assert MoveObject(request=message.frame, object="a", position_m=(0.0, 0.0, 0.0)) in taken[:i]
+
+
+def test_more_of_a_kind_is_taken_only_as_far_as_it_is_next() -> None:
+    taken: list[None] = []
+    mailbox = Mailbox(2, on_taken=lambda: taken.append(None))
+    moves = [MoveObject(request=request, object="vase", position_m=(0, 0, 1)) for request in range(4)]
+    for message in (*moves[:3], quality(3), moves[3]):
+        mailbox.post(message)
+    assert mailbox.take().message is moves[0]
+    assert mailbox.take_more(MoveObject) == moves[1:3]
+    assert mailbox.take_more(MoveObject) == []
+    assert drain(mailbox, 2) == [quality(3), moves[3]]
+    assert mailbox.take_more(MoveObject) == []  # and waits for none
+    assert len(taken) == 4

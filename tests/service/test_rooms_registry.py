@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from types import SimpleNamespace
 
@@ -22,7 +23,9 @@ class House:
         self.kept: list[str] = []
         self.slow = threading.Event()
         self.slow.set()
-        self.rooms = Rooms(self.open, lambda room: self.kept.append(room.name))
+        self.digests: dict[str, bytes] = {}
+        """Of rooms that were left."""
+        self.rooms = Rooms(self.open, lambda room: self.kept.append(room.name), self.digests.get)
 
     def open(self, _wishes: Wishes, name: str) -> SimpleNamespace:
         assert name != "slow" or self.slow.wait(PATIENCE_S)
@@ -110,3 +113,21 @@ def test_whoever_opens_a_room_sets_its_key(house: House) -> None:
             pass
     assert lock_of(None) == b""
     assert b"k3y" not in lock_of("k3y")
+
+
+def test_a_room_that_was_left_is_not_opened_for_a_wrong_key(house: House) -> None:
+    house.digests["a"] = lock_of("k3y")
+    for key in (None, "guess"):
+        with pytest.raises(RoomLocked, match="has a key of its own"), house.rooms.entered("a", Wishes(), key):
+            pass
+    assert (house.opened, house.rooms.count) == ([], 0)
+    with house.rooms.entered("a", Wishes(), "k3y"):
+        assert house.opened == ["a"]
+
+
+def test_nothing_is_kept_of_rooms_that_were_left(house: House) -> None:
+    for name in ("a", "b", "broken"):
+        with contextlib.suppress(ValueError), house.rooms.entered(name, Wishes()):
+            pass
+    assert not house.rooms._doors
+    assert not house.rooms._guests

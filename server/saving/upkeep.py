@@ -1,0 +1,86 @@
+"""What of the rooms on disk is too much: what nobody has used for long, and the oldest where they take too much."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ASIDE = "set-aside-"
+"""Begins the name of a damaged save, in its room's folder."""
+IN_USE_S = 600.0
+"""A room that was used so recently may be at work in another process."""
+DAY_S = 86400.0
+
+
+@dataclass(frozen=True)
+class KeptLimits:
+    """Of all rooms in a folder; None: no limit."""
+
+    space_bytes: int | None = None
+    age_s: float | None = None
+    """Since somebody was in a room."""
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a folder holds."""
+
+    rooms: int = 0
+    space_bytes: int = 0
+    """Damaged saves that were set aside are counted too."""
+    removed: int = 0
+    """Of it, until now."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """What is removed as one: a room, or a damaged save of one."""
+
+    folder: Path
+    space_bytes: int
+    used_s: float
+    """When, in seconds since 1970."""
+    is_room: bool
+
+
+def pieces_in(folder: Path, skipped: str) -> Iterator[Piece]:
+    """Of all rooms in `folder`; names that begin with `skipped` are none. Raises OSError."""
+    for room in folder.iterdir() if folder.exists() else ():
+        if not room.is_dir() or room.name.startswith(skipped):
+            continue
+        asides = [_piece(aside, is_room=False) for aside in room.glob(f"{ASIDE}*")]
+        yield from asides
+        whole = _piece(room, is_room=True)
+        own_bytes = whole.space_bytes - sum(aside.space_bytes for aside in asides)
+        if own_bytes:
+            yield Piece(room, own_bytes, whole.used_s, is_room=True)
+
+
+def surplus(
+    pieces: list[Piece], limits: KeptLimits, now_s: float, in_use: Collection[Path]
+) -> Iterator[tuple[Piece, str]]:
+    """What is to be removed, with the reason in words: damaged saves first, then rooms, the oldest first."""
+    free = [p for p in pieces if not (p.is_room and (p.folder in in_use or now_s - p.used_s < IN_USE_S))]
+    total_bytes = sum(piece.space_bytes for piece in pieces)
+    for piece in sorted(free, key=lambda piece: (piece.is_room, piece.used_s)):
+        if limits.age_s is not None and now_s - piece.used_s > limits.age_s:
+            why = f"not used for {(now_s - piece.used_s) / DAY_S:.0f} days"
+        elif limits.space_bytes is not None and total_bytes > limits.space_bytes:
+            why = f"rooms take {total_bytes / 2**20:.0f} MiB, more than {limits.space_bytes / 2**20:.0f}"
+        else:
+            continue
+        total_bytes -= piece.space_bytes
+        yield piece, why
+
+
+def _piece(folder: Path, *, is_room: bool) -> Piece:
+    used_s, space_bytes = folder.stat().st_mtime, 0
+    for path in folder.rglob("*"):
+        with contextlib.suppress(FileNotFoundError):  # renewed meanwhile
+            status = path.stat()
+            space_bytes += 0 if path.is_dir() else status.st_size
+            if path.parent.parent == folder and ASIDE not in path.parent.name:
+                used_s = max(used_s, status.st_mtime)
+    return Piece(folder, space_bytes, used_s, is_room)

@@ -43,7 +43,7 @@ export class LayerMode {
   readonly draw: Draw = (view, { framebuffer, framebufferWidth: width, framebufferHeight: height }, gl, camera) => {
     const texture = camera();
     this.picture_frames = texture === null ? this.picture_frames + 1 : 0;
-    if (texture !== null) this.fill(gl, { texture, isTopRowFirst: false }, view, { framebuffer, width, height });
+    if (texture !== null) this.fill(gl, { texture, isTopRowFirst: false, distorted: null }, view, { framebuffer, width, height });
   };
 
   /** The newest picture of a source that the page itself displays. */

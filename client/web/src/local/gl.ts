@@ -17,6 +17,15 @@ export function makeProgram(gl: WebGL2RenderingContext, vertex: string, fragment
   return program;
 }
 
+/** Where each uniform of a program is, looked up once. */
+export function uniformsOf(gl: WebGL2RenderingContext, program: WebGLProgram): (name: string) => WebGLUniformLocation | null {
+  const known = new Map<string, WebGLUniformLocation | null>();
+  return (name) => {
+    if (!known.has(name)) known.set(name, gl.getUniformLocation(program, name));
+    return known.get(name)!;
+  };
+}
+
 /** Draw with a context that belongs to others too: what they have set is as it was afterwards. `units`: textures used. */
 export function keepingState(gl: WebGL2RenderingContext, units: number, draw: () => void): void {
   const get = <T>(name: number): T => gl.getParameter(name) as T;

@@ -4,7 +4,7 @@
 // all is mixed: picture = coverage * virtual + (1 - coverage) * ratio * camera, in linear light (protocol/README.md).
 
 import type { Lens } from "../capture/axes";
-import { keepingState, makeProgram } from "./gl";
+import { keepingState, makeProgram, uniformsOf } from "./gl";
 import type { LayerParts } from "./layer_parts";
 import { Surface } from "./surface";
 import { clipFromCamera, STANDING, type View, viewOf } from "./view_matrix";
@@ -17,10 +17,13 @@ export interface PosedLayer {
   world_from_camera: readonly number[] | null;
 }
 
-/** A camera's picture, sRGB codes, that fills the view. WebXR and WebGL have the bottom row first. */
+/** A camera's picture, sRGB codes, that fills the view. */
 export interface CameraPicture {
   texture: WebGLTexture;
+  /** WebXR and WebGL have the bottom row first. */
   isTopRowFirst: boolean;
+  /** Of a lens that distorts; null: it does not. */
+  distorted: (Lens & { distortion: readonly number[] }) | null;
 }
 
 export interface Target {
@@ -41,13 +44,25 @@ void main() {
 const MIX = `#version 300 es
 precision highp float;
 uniform highp sampler2D camera, things, ratios;
-uniform bool is_top_first;
+uniform bool is_top_first, is_distorted;
+uniform vec4 lens;  // fx, fy, cx, cy, of the picture's width and height as 1
+uniform float distortion[5];  // k1, k2, p1, p2, k3 as OpenCV has them
 in vec2 at;
 out vec4 color;
+vec2 distorted(vec2 place) {
+  vec2 p = (place - lens.zw) / lens.xy;
+  float r2 = dot(p, p);
+  float radial = 1.0 + r2 * (distortion[0] + r2 * (distortion[1] + r2 * distortion[4]));
+  vec2 tangential = 2.0 * p.x * p.y * vec2(distortion[2], distortion[3]) + (r2 + 2.0 * p * p) * vec2(distortion[3], distortion[2]);
+  return (p * radial + tangential) * lens.xy + lens.zw;
+}
 vec3 linear(vec3 code) { return mix(code / 12.92, pow((code + 0.055) / 1.055, vec3(2.4)), step(0.04045, code)); }
 vec3 coded(vec3 value) { return mix(value * 12.92, 1.055 * pow(value, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, value)); }
 void main() {
-  vec3 real = linear(texture(camera, is_top_first ? vec2(at.x, 1.0 - at.y) : at).rgb);
+  vec2 place = vec2(at.x, 1.0 - at.y);
+  if (is_distorted) place = distorted(place);
+  vec3 real = linear(texture(camera, is_top_first ? place : vec2(place.x, 1.0 - place.y)).rgb);
+  if (any(lessThan(place, vec2(0.0))) || any(greaterThan(place, vec2(1.0)))) real = vec3(0.0);
   vec4 thing = texture(things, at);
   vec3 ratio = texture(ratios, at).rgb * (255.0 / 128.0);
   color = vec4(coded(clamp(thing.rgb + (1.0 - thing.a) * ratio * real, 0.0, 1.0)), 1.0);
@@ -57,7 +72,7 @@ export class LayerView {
   private readonly virtual: Surface;
   private readonly ratio: Surface;
   private readonly mix: WebGLProgram;
-  private readonly isTopFirst: WebGLUniformLocation | null;
+  private readonly at: (name: string) => WebGLUniformLocation | null;
   private readonly linear: WebGLSampler;
   private readonly things: Canvas;
   private readonly ratios: Canvas;
@@ -68,7 +83,7 @@ export class LayerView {
     this.virtual = new Surface(gl, "virtual");
     this.ratio = new Surface(gl, "ratio");
     this.mix = makeProgram(gl, VERTEX, MIX);
-    this.isTopFirst = gl.getUniformLocation(this.mix, "is_top_first");
+    this.at = uniformsOf(gl, this.mix);
     this.linear = gl.createSampler()!;
     for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.samplerParameteri(this.linear, name, gl.LINEAR);
     for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.samplerParameteri(this.linear, name, gl.CLAMP_TO_EDGE);
@@ -76,7 +91,7 @@ export class LayerView {
     this.ratios = new Canvas(gl, gl.RGBA8);
     keepingState(gl, 3, () => {
       gl.useProgram(this.mix);
-      ["camera", "things", "ratios"].forEach((name, unit) => gl.uniform1i(gl.getUniformLocation(this.mix, name), unit));
+      ["camera", "things", "ratios"].forEach((name, unit) => gl.uniform1i(this.at(name), unit));
     });
   }
 
@@ -116,7 +131,7 @@ export class LayerView {
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
     gl.viewport(0, 0, width, height);
     gl.useProgram(this.mix);
-    gl.uniform1i(this.isTopFirst, Number(camera.isTopRowFirst));
+    this.setCamera(camera);
     [camera.texture, this.things.texture, this.ratios.texture].forEach((texture, unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, texture);
@@ -124,6 +139,16 @@ export class LayerView {
     });
     gl.bindVertexArray(null);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  private setCamera({ isTopRowFirst, distorted }: CameraPicture): void {
+    const { gl, at } = this;
+    gl.uniform1i(at("is_top_first"), Number(isTopRowFirst));
+    gl.uniform1i(at("is_distorted"), Number(distorted !== null));
+    if (distorted === null) return;
+    const { width, height, fx, fy, cx, cy, distortion } = distorted;
+    gl.uniform4f(at("lens"), fx / width, fy / height, (cx + 0.5) / width, (cy + 0.5) / height);
+    gl.uniform1fv(at("distortion"), distortion);
   }
 }
 

@@ -1,13 +1,13 @@
 // A canvas of the page's own for pictures that no WebXR session displays, drawn as often as the browser draws.
 
-import type { Lens } from "../capture/axes";
 import type { Shown } from "../capture/recorded_source";
+import type { CameraModel } from "../protocol";
 import type { CameraPicture } from "./layer_view";
 
 export class OwnDisplay {
   readonly gl: WebGL2RenderingContext;
-  readonly picture: CameraPicture;
-  lens: Lens = { width: 1, height: 1, fx: 1, fy: 1, cx: 0, cy: 0 };
+  private readonly texture: WebGLTexture;
+  lens: CameraModel = { width: 1, height: 1, fx: 1, fy: 1, cx: 0, cy: 0 };
   /** Row-major. */
   pose: readonly number[] | null = null;
   private isThere = false;
@@ -19,19 +19,25 @@ export class OwnDisplay {
     const gl = document.createElement("canvas").getContext("webgl2", { alpha: false, antialias: false, depth: false });
     if (gl === null) throw new Error("this browser gives no WebGL 2, by which objects are put over the picture");
     this.gl = gl;
-    this.picture = { texture: gl.createTexture(), isTopRowFirst: true };
+    this.texture = gl.createTexture();
     this.handle = requestAnimationFrame(this.onFrame);
   }
 
   take({ bitmap, camera, world_from_camera }: Shown): void {
     const { gl } = this;
-    gl.bindTexture(gl.TEXTURE_2D, this.picture.texture);
+    gl.bindTexture(gl.TEXTURE_2D, this.texture);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, bitmap);
     gl.bindTexture(gl.TEXTURE_2D, null);
     if (gl.canvas.width !== camera.width || gl.canvas.height !== camera.height) [gl.canvas.width, gl.canvas.height] = [camera.width, camera.height];
     this.lens = camera;
     this.pose = world_from_camera;
     this.isThere = this.isNew = true;
+  }
+
+  get picture(): CameraPicture {
+    const { lens, texture } = this;
+    const distortion = lens.distortion ?? [];
+    return { texture, isTopRowFirst: true, distorted: distortion.some((value) => value !== 0) ? { ...lens, distortion } : null };
   }
 
   stop(): void {

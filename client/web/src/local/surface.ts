@@ -1,7 +1,7 @@
 // A part of a layer on the GPU: its picture, and the surface that it lies on, drawn as another camera sees them.
 
 import type { Lens } from "../capture/axes";
-import { makeProgram } from "./gl";
+import { makeProgram, uniformsOf } from "./gl";
 import type { LayerPart } from "./layer_parts";
 
 const VERTEX = `#version 300 es
@@ -51,7 +51,7 @@ export class Surface {
   private readonly vertices: WebGLBuffer;
   private readonly indices: WebGLBuffer;
   private readonly texture: WebGLTexture;
-  private readonly uniforms: Record<"clip_from_camera" | "lens" | "first", WebGLUniformLocation | null>;
+  private readonly at: (name: string) => WebGLUniformLocation | null;
   private first: readonly [number, number] = [0, 0];
   private count = 0;
 
@@ -60,8 +60,7 @@ export class Surface {
     private readonly kind: keyof typeof FRAGMENTS,
   ) {
     this.program = makeProgram(gl, VERTEX, FRAGMENTS[kind]);
-    const at = (name: string): WebGLUniformLocation | null => gl.getUniformLocation(this.program, name);
-    this.uniforms = { clip_from_camera: at("clip_from_camera"), lens: at("lens"), first: at("first") };
+    this.at = uniformsOf(gl, this.program);
     this.vertexArray = gl.createVertexArray();
     this.vertices = gl.createBuffer();
     this.indices = gl.createBuffer();
@@ -91,11 +90,11 @@ export class Surface {
   /** Draw, with depth, into the framebuffer that is bound; `sampler` at texture unit 0 is linear. */
   draw(clipFromCamera: Float32Array, { fx, fy, cx, cy }: Lens): void {
     if (this.count === 0) return;
-    const { gl, uniforms } = this;
+    const { gl, at } = this;
     gl.useProgram(this.program);
-    gl.uniformMatrix4fv(uniforms.clip_from_camera, false, clipFromCamera);
-    gl.uniform4f(uniforms.lens, fx, fy, cx, cy);
-    gl.uniform2f(uniforms.first, ...this.first);
+    gl.uniformMatrix4fv(at("clip_from_camera"), false, clipFromCamera);
+    gl.uniform4f(at("lens"), fx, fy, cx, cy);
+    gl.uniform2f(at("first"), ...this.first);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, this.texture);
     gl.bindVertexArray(this.vertexArray);

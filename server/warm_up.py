@@ -24,7 +24,7 @@ def warm_up(device: Device) -> None:
 
     Raises CheckFailed where the device then computes what is wrong.
     """
-    wishes = Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.02)
+    wishes = Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.02, answer="layer")
     _run(device, wishes)
     _run(device, structs.replace(wishes, preset="art4"))
     _run(device, structs.replace(wishes, preset="gr15fast", light=SHARP_LIGHT))
@@ -41,6 +41,7 @@ def _run(device: Device, wishes: Wishes) -> None:
         depth=np.full((48, 64), 1000, np.uint16),
         world_from_camera=np.eye(4),
     )
-    pipeline.process(frame)
-    pipeline.process(replace(frame, index=1, color=np.full((48, 64, 3), 96, np.uint8)))  # of another exposure
+    pipeline.process(frame, watched=True)  # a layer and a picture
+    another = replace(frame, index=1, color=np.full((48, 64, 3), 96, np.uint8))  # of another exposure
+    pipeline.process(another, watched=True)
     pipeline.close()

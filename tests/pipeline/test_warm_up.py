@@ -14,7 +14,17 @@ from server.warm_up import SHARP_LIGHT, warm_up
 from tests.rooms import CAMERA, frame_at, view_at, wishes
 
 
-@pytest.mark.parametrize("asked", [{}, {"preset": "gr15fast"}, {"preset": "art4"}, {"light": SHARP_LIGHT}])
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {},
+        {"preset": "gr15fast"},
+        {"preset": "art4"},
+        {"light": SHARP_LIGHT},
+        {"answer": "layer"},
+        {"preset": "gr15fast", "light": SHARP_LIGHT, "answer": "layer"},
+    ],
+)
 def test_later_sessions_compile_nothing(asked: dict[str, object]) -> None:
     device = open_device(None)
     warm_up(device)

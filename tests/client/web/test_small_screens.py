@@ -1,0 +1,59 @@
+"""On a phone the tools leave the picture its room, and what ends the session stays in sight."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+from playwright.sync_api import Page
+
+from server.serve import BackgroundServer, start_in_background
+from server.service import Service
+from tests.client.web.conftest import OpenPage, wait_for_text
+from tests.client.web.sequence import of_device
+from tests.client.web.test_capture import start_capture
+from tests.client.web.test_light_mode import CAMERA, plane
+from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
+
+PLACES = """() => Object.fromEntries([".side", "#stop", "#full", "#selected-tools"].map(
+    (name) => [name, document.querySelector(name).getBoundingClientRect().toJSON()]))"""
+
+
+@pytest.fixture
+def server() -> Iterator[BackgroundServer]:
+    with start_in_background(Service(FAKE_DEVICE, pipeline_factory=Lab().build, mesh_loader=fake_mesh)) as server:
+        yield server
+
+
+@pytest.mark.parametrize("answer", ["light", "picture"])
+@pytest.mark.parametrize("size", [(360, 640), (640, 360)], ids=["upright", "across"])
+def test_the_tools_of_a_selected_object_leave_most_of_the_screen(
+    server: BackgroundServer,
+    open_page: OpenPage,
+    keep_picture: Callable[[Page, str], None],
+    size: tuple[int, int],
+    answer: str,
+) -> None:
+    width, height = size
+    page = open_page(server.url, of_device(CAMERA, [plane()], loops=True), size=size)
+    page.locator("input[value=xr]").check()
+    page.locator("[name=answer]").select_option(answer)
+    start_capture(page)
+    wait_for_text(page, "#state", "Live, captured here")
+    page.locator("#place").focus()
+    page.keyboard.press("Enter")
+    wait_for_text(page, "#object-said", "placed")
+    keep_picture(page, f"tools_{answer}_{width}")
+    found = page.evaluate(PLACES)
+    panel = found[".side"]
+    assert panel["width"] * panel["height"] < 0.37 * width * height
+    assert panel["bottom"] <= height
+    for name in ("#stop", "#full"):
+        box = found[name]
+        assert box["left"] >= panel["left"]
+        assert box["right"] <= width
+        assert box["bottom"] <= height
+        assert min(box["width"], box["height"]) >= 44
+    assert found["#selected-tools"]["top"] < height
+    middle = page.evaluate("() => document.elementFromPoint(innerWidth / 3, innerHeight / 2).id")
+    assert middle in ("picture-frame", "picture", "guide")

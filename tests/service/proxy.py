@@ -18,8 +18,7 @@ class Proxy:
 
     def __init__(self, url: str, delay_s: float = 0.0, bytes_per_s: float | None = None) -> None:
         """`delay_s`: each way. `bytes_per_s`: each way too."""
-        target = urlsplit(url)
-        self._target = (target.hostname, target.port)
+        self.lead_to(url)
         self.delay_s = delay_s
         self.bytes_per_s = bytes_per_s
         self.flows = threading.Event()
@@ -30,10 +29,14 @@ class Proxy:
         self._listener = socket.create_server(("127.0.0.1", 0))
         self._pairs: list[tuple[socket.socket, socket.socket]] = []
         self.connections = 0
-        self.url = f"{target.scheme}://127.0.0.1:{self._listener.getsockname()[1]}"
+        self.url = f"{urlsplit(url).scheme}://127.0.0.1:{self._listener.getsockname()[1]}"
         self._ways: list[_Way] = []
         self._accepting = threading.Thread(target=self._accept, name="proxy-accept", daemon=True)
         self._accepting.start()
+
+    def lead_to(self, url: str) -> None:
+        """New connections go there from now on."""
+        self._target = (urlsplit(url).hostname, urlsplit(url).port)
 
     def cut(self) -> None:
         """Break every connection, as a network does: without a word of the protocol."""

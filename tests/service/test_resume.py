@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import pytest
 
-from client.client import Answer, ClientError, StreamClient
+from client.client import Answer, ClientError, RoomPlace, StreamClient
 from protocol.messages import Acknowledged, Composite, Dropped, Hello, MoveObject, PlaceObject, Welcome, Wishes
 from tests.service.fakes import CAMERA, EXPLODE_MM, PATIENCE_S, Lab, frame_message, rgbd_frame
 from tests.service.proxy import Proxy, impaired
@@ -190,6 +191,65 @@ def test_a_client_that_cannot_come_back_says_so(proxy: Proxy) -> None:
 
     with pytest.raises(ClientError, match="the connection was lost, and could not be restored"):
         asyncio.run(stream())
+
+
+async def until_it_ends(client: StreamClient, lab: Lab, stop: Callable[[], None]) -> None:
+    """A frame and a request are on the way, and answers are waited for, when the server stops. Raises ClientError."""
+    lab.hold = True
+    await client.send_frame(rgbd_frame(0))
+    await asyncio.to_thread(lab.next_entered)
+    placing = asyncio.create_task(client.place_object("vase", "ply", b"mesh"))
+    reading = asyncio.create_task(anext(client.answers()))
+    stopping = asyncio.create_task(asyncio.to_thread(stop))
+    async with asyncio.timeout(PATIENCE_S):
+        ended = await asyncio.gather(placing, reading, client.wait_until_answered(), return_exceptions=True)
+    lab.release(10)
+    await stopping
+    assert [type(error) for error in ended] == [ClientError] * 3
+    assert len({str(error) for error in ended}) == 1
+    raise ended[0]
+
+
+def test_a_session_without_a_room_ends_with_its_server_and_says_so(server, lab: Lab) -> None:
+    """It has nothing to come back to: no try is made, however long it would have been kept."""
+
+    async def stream() -> None:
+        client = await StreamClient.connect(server.url)
+        await client.hello(CAMERA, keep_s=300.0)
+        try:
+            await until_it_ends(client, lab, server.stop)
+        finally:
+            assert client.reconnected == 0
+            await client.close()
+
+    line = "the server is stopping: connect again in a while; a session without a room ends with its server"
+    with pytest.raises(ClientError, match=line):
+        asyncio.run(stream())
+
+
+def test_a_client_in_a_room_goes_on_with_the_server_that_comes_after(start_server) -> None:
+    rooms = {"room_factory": lambda _wishes, name: SimpleNamespace(name=name, key_digest=None, close=lambda: None)}
+    first = start_server(**rooms)
+
+    async def stream(between: Proxy) -> list[int]:
+        client = await StreamClient.connect(between.url)
+        await client.hello(CAMERA, room=RoomPlace("study"))
+        await client.send_frame(rgbd_frame(0))
+        await client.wait_until_answered()
+        between.refuses = True
+        await asyncio.to_thread(first.stop)
+        between.lead_to(start_server(**rooms).url)
+        between.refuses = False
+        async with asyncio.timeout(PATIENCE_S):
+            assert (await client.place_object("vase", "ply", b"mesh")).error is None
+            await client.send_frame(rgbd_frame(1))
+            await client.wait_until_answered()
+        assert client.reconnected == 1
+        await client.close()
+        return [answer.composite.frame async for answer in client.answers() if isinstance(answer, Answer)]
+
+    with impaired(first.url) as between:
+        assert asyncio.run(stream(between)) == [0, 1]
 
 
 def test_a_server_that_leaves_does_not_wait_for_a_client_that_is_away(server, proxy: Proxy, lab: Lab) -> None:

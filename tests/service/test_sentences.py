@@ -1,0 +1,89 @@
+"""What the Python client tells a person whose server is full, leaving, started anew, another's, or does not want it."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from types import SimpleNamespace
+
+import pytest
+
+from client.client import Access, ClientError, RoomPlace, StreamClient
+from protocol.messages import Hello
+from server.departure import DRAINING, GOODBYE
+from server.door import Door
+from tests.service.fakes import CAMERA, PATIENCE_S, frame_message
+from tests.service.wire import Wire
+
+
+def told(url: str, **options: object) -> str:
+    """The line of a client that says hello, without the address in front."""
+
+    async def hello() -> None:
+        client = await StreamClient.connect(url, access=options.pop("access", None))
+        try:
+            await client.hello(CAMERA, **options)
+        finally:
+            await client.close()
+
+    with pytest.raises(ClientError) as error:
+        asyncio.run(asyncio.wait_for(hello(), PATIENCE_S))
+    line = str(error.value)
+    assert "\n" not in line
+    start = f"the server at {url.partition('?')[0].removesuffix('/')} closed the connection: "
+    assert line.startswith(start)
+    return line.removeprefix(start)
+
+
+def test_a_full_server(start_server) -> None:
+    server = start_server(max_sessions=1)
+    wire = Wire(server.url)
+    wire.greet()
+    assert told(server.url) == "all 1 sessions of this server are taken: try again later"
+    wire.hang_up()
+
+
+def test_a_server_of_another_version(start_server, monkeypatch) -> None:
+    monkeypatch.setattr("server.connection.SUBPROTOCOL", "probeless-v9")
+    assert told(start_server().url) == (
+        "this server speaks probeless-v9, you asked for probeless-v1: use the same version on both sides"
+    )
+
+
+@pytest.mark.parametrize(
+    ("access", "word"), [(None, "missing"), (Access(token="another"), "wrong")], ids=["missing", "wrong"]
+)
+def test_a_wrong_token(start_server, access: Access | None, word: str, monkeypatch) -> None:
+    monkeypatch.setattr("client.access.find_key", lambda _port: None)  # as on another machine
+    assert told(start_server(door=Door("a-token")).url, access=access) == (
+        f"the token is {word}: use the URL that the server printed at its start, which ends in ?token=..."
+    )
+
+
+def test_a_room_with_another_key(start_server) -> None:
+    room = SimpleNamespace(close=lambda: None, key_digest=None, name="kitchen")
+    server = start_server(room_factory=lambda *_: room)
+    wire = Wire(server.url)
+    wire.say(Hello(client="test", camera=CAMERA, room="kitchen", room_key="right"))
+    wire.hear()
+    for key in ("wrong", None):
+        assert told(server.url, room=RoomPlace("kitchen", key=key)) == (
+            "room 'kitchen' has a key of its own, and this is not it: ask who opened it"
+        )
+    wire.hang_up()
+
+
+def test_a_server_that_is_draining(start_server, lab, monkeypatch) -> None:
+    monkeypatch.setattr("server.serve.DRAIN_PATIENCE_S", 10 * PATIENCE_S)
+    server = start_server()
+    lab.hold = True
+    wire = Wire(server.url)
+    wire.greet()
+    wire.say(frame_message(0))
+    lab.next_entered()
+    stopping = threading.Thread(target=server.stop)
+    stopping.start()
+    assert wire.ending()[1] == GOODBYE
+    assert told(server.url) == DRAINING
+    lab.release()
+    stopping.join(PATIENCE_S)

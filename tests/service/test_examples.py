@@ -60,6 +60,16 @@ def test_the_examples_light_is_the_servers(load) -> None:
     np.testing.assert_allclose(load("stream_frames").light_on(light, tuple(normal)), expected, atol=1e-4)
 
 
+def test_layers_are_put_over_the_newest_picture(device: Device, load, capsys) -> None:
+    with start_in_background(Service(device)) as server:
+        pictures = asyncio.run(load("newest_picture").main(server.url, 20))
+    assert len(pictures) == 20
+    sign = np.abs(pictures[-1].astype(int) - 180).max(axis=-1) > 20
+    assert 0.005 < sign.mean() < 0.5
+    assert sign[:, :20].sum() == 0
+    assert "20 of 20 pictures have the sign" in capsys.readouterr().out
+
+
 def test_two_programs_share_a_room(device: Device, load, capsys) -> None:
     with start_in_background(Service(device)) as server:
         light = asyncio.run(load("share_a_room").main(server.url, 2))

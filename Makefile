@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 DATA ?= ../shared/data
 
-.PHONY: help install install-bench install-cluster install-oak demo test lint bench check-races web package lock clean
+.PHONY: help install install-bench install-cluster install-oak install-video demo test lint bench check-races web package lock clean
 help:
 	@echo "make demo    the main job: server, streaming client, pictures in out/demo"
 	@echo "make test    the tests           make lint   formatting, types"
@@ -11,12 +11,13 @@ help:
 	@echo "make package the npm package of client/web, into out"
 	@echo "make check-races   the kernels in a simulator that finds data races (downloads it)"
 	@echo "make install the program alone, as .venv/bin/probeless; install-cluster: and Ray Serve, for many machines"
-	@echo "make install-oak   that, and what reads an OAK camera"
+	@echo "make install-oak   that, and what reads an OAK camera; install-video: what reads and writes H.264"
 
 install: .venv/installed
 install-bench: .venv/installed-bench
 install-cluster: .venv/installed-cluster
 install-oak: .venv/installed-oak
+install-video: .venv/installed-video
 
 demo: .venv/installed
 	$(BIN)/probeless demo
@@ -63,6 +64,8 @@ lock: .venv/installed-test
 		--constraint requirements-bench.lock pyproject.toml -o requirements-cluster.lock
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh --extra oak \
 		--constraint requirements.lock pyproject.toml -o requirements-oak.lock
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh --extra video \
+		--constraint requirements-test.lock pyproject.toml -o requirements-video.lock
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
@@ -80,6 +83,10 @@ lock: .venv/installed-test
 
 .venv/installed-oak: requirements-oak.lock .venv/installed
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-oak.lock
+	@touch $@
+
+.venv/installed-video: requirements-video.lock .venv/installed
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-video.lock
 	@touch $@
 
 .venv/installed-bench: requirements-bench.lock .venv/installed-test

@@ -20,11 +20,11 @@ from client.coding import Coding
 
 LADDER = (
     Coding(90),
-    Coding(80, depth_level=9),
-    Coding(65, depth_level=9),
-    Coding(50, depth_level=9),
-    Coding(75, 2, depth_level=9),
-    Coding(50, 2, depth_level=9),
+    Coding(80, depth_level=6),
+    Coding(65, depth_level=6),
+    Coding(50, depth_level=6),
+    Coding(75, 2, depth_level=6),
+    Coding(50, 2, depth_level=6),
 )
 """From the best to the cheapest. Depth is exact on every rung, or rounded as asked for."""
 SHARE = 0.9

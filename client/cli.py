@@ -13,7 +13,7 @@ import typer
 from client import capture_options as o
 from client.capture_options import CaptureOptions, capturing
 from client.laptop.errors import OptionError
-from client.options import prepare, refuse_depth_noise
+from client.options import prepare, refuse_depth_noise, refuse_video
 from client.progress import Stopwatch, note, progress_bar, say, track
 
 USAGE_STATUS, FAILURE_STATUS, INTERRUPTED_STATUS = 2, 1, 130
@@ -124,6 +124,9 @@ def stream(
     depth_noise: Annotated[
         float | None, typer.Option(metavar="M", help="of the sensor at 1 m: depth may be rounded by that times z^2")
     ] = None,
+    video: Annotated[
+        str | None, typer.Option(metavar="h264", help="colour as video instead of JPEG, where both sides have PyAV")
+    ] = None,
     answer: Annotated[
         str | None,
         typer.Option(metavar="picture|layer|light", help="layer: put over the picture here; default: picture"),
@@ -145,6 +148,7 @@ def stream(
     if mesh and out is None:
         raise OptionError("--mesh writes files: say where with --out")
     refuse_depth_noise(depth_noise, lossless)
+    refuse_video(video, lossless)
     capture = prepare(options, lossless=lossless, answer=answer)
     from client.client import Access
     from client.laptop.stream import Sending
@@ -154,7 +158,7 @@ def stream(
     place = room_place(room, room_from_world, marker, room_key)
     access = Access(token, tls_fingerprint, tls_ca)
     others = {"frames": capture.frames, "mesh": mesh, "room": place, "access": access}
-    others["sending"] = Sending(adapt, depth_noise, view)
+    others["sending"] = Sending(adapt, depth_noise, view, video is not None)
     done = send(capture.source, server, capture.objects, capture.wishes, out, lossless, record, **others)
     written = f", written to {out}" if out is not None else ""
     speed = done.answered / done.seconds if done.seconds > 0 else 0.0
@@ -178,6 +182,7 @@ def serve(
     volume_memory: Annotated[int | None, typer.Option(metavar="MIB", help="of one volume; default 512")] = None,
     sessions: Annotated[int | None, typer.Option(min=1, help="that capture at once; default 16")] = None,
     sessions_per_address: Annotated[int | None, typer.Option(min=1, help="of one client; default 8")] = None,
+    objects: Annotated[Path | None, typer.Option(metavar="DIR", help="models that clients may place, by name")] = None,
     data: Annotated[
         str | None, typer.Option(metavar="DIR|none", help="where rooms are kept; default: the user's data folder")
     ] = None,
@@ -189,7 +194,6 @@ def serve(
         float | None, typer.Option(min=0, help="after which rooms nobody entered are removed; default 180, 0: never")
     ] = None,
     log: Annotated[str, typer.Option(metavar="text|json", help="how events are written to standard error")] = "text",
-    objects: Annotated[Path | None, typer.Option(metavar="DIR", help="models that clients may place, by name")] = None,
 ) -> int:
     """The server. It asks for a token, which the URL that it prints brings along."""
     from client.serving import (

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import TypeGuard
 
@@ -16,6 +16,7 @@ from websockets.exceptions import ConnectionClosed
 from client.access import Access, stream_url, without_query
 from client.coding import DEFAULT_CODING, Coding, frame_message
 from client.opening import ClientError, open_client_socket
+from client.video import VideoEncoder
 from protocol.codec import ProtocolError, decode_server, encode
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import (
@@ -129,6 +130,8 @@ class StreamClient:
         self._is_connected = True
         self.reconnected = 0
         """Times that a lost connection was restored."""
+        self.video: VideoEncoder | None = None
+        """By which colour is sent; to be set after `hello`, where `welcome.codecs` has `h264`."""
         self._requests = count()
         self._max_inflight = 1
         self._unanswered: dict[int, Frame | None] = {}
@@ -225,7 +228,10 @@ class StreamClient:
         """A frame as `send_frame` sends it, encoded in a thread of its own. Raises ClientError before `hello`."""
         if self._hello is None:
             raise ClientError("a frame can only be sent after hello")
-        return await asyncio.to_thread(frame_message, frame, self._hello.camera, self._hello.wishes.lossless, coding)
+        lossless = self._hello.wishes.lossless
+        if self._welcome is not None and coding.depth_codec not in self._welcome.depth_codecs:
+            coding = replace(coding, depth_codec="zstd-delta")  # a server of before
+        return await asyncio.to_thread(frame_message, frame, self._hello.camera, lossless, coding, self.video)
 
     async def send_encoded(self, message: Frame) -> None:
         """Send what `encode_frame` made, waiting for room in the window first. Raises ClientError."""
@@ -441,6 +447,8 @@ class StreamClient:
     async def _go_on(self, socket: ClientConnection, welcome: Welcome) -> None:
         """Take the new connection, and send what has no answer yet again."""
         self._socket, self._welcome, self._reason_given = socket, welcome, None
+        if self.video is not None:
+            self.video.need_key()
         if self._mesh is not None:
             self._mesh.begin_anew()
         for request in self._unacknowledged.values():
@@ -504,6 +512,8 @@ class StreamClient:
 
     async def _deliver(self, answer: Answer | Dropped | Error) -> None:
         """Keep an answer for `answers`, once there is room for it."""
+        if isinstance(answer, Dropped) and self.video is not None:
+            self.video.need_key()
         async with self._changed:
             await self._changed.wait_for(lambda: len(self._unread) < UNREAD_ANSWERS or self._leaving)
             self._unread.append(answer)

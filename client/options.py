@@ -90,6 +90,19 @@ def refuse_depth_noise(noise_per_m: float | None, lossless: bool) -> None:
         raise OptionError("--depth-noise rounds depth and --lossless keeps every bit; leave one out")
 
 
+def refuse_video(codec: str | None, lossless: bool) -> None:
+    """Raise OptionError for a codec that is not known, cannot be written here, or stands beside `--lossless`."""
+    from client.video import IS_POSSIBLE
+
+    if codec is None:
+        return
+    _choice("--video", codec, ("h264",))
+    if lossless:
+        raise OptionError("--video loses a little of each picture and --lossless keeps every bit; leave one out")
+    if not IS_POSSIBLE:
+        raise OptionError("--video h264 needs PyAV, which is not installed: make install-video, or pip install av")
+
+
 _SAMPLED_BY = ("rays", "stride", "interleave", "upsampling", "visibility_state", "auxiliary_views")
 
 

@@ -3,24 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.codec import ProtocolError
-from protocol.depth_codec import LEVEL, deflate, filter_depth, inflate, unfilter_depth, zstd_compress, zstd_decompress
+from protocol.depth_codec import (
+    LEVEL,
+    deflate,
+    filter_depth,
+    inflate,
+    most_rank_bytes,
+    rank_depth,
+    unfilter_depth,
+    unrank_depth,
+    zstd_compress,
+    zstd_decompress,
+)
 from protocol.frames import CameraModel, ColorEncoding, DepthCamera
-from protocol.messages import ColorImage, DepthImage, Payload
+from protocol.messages import ColorCodec, ColorImage, DepthCodec, DepthImage, Payload
 from protocol.picture_headers import jpeg_size, png_size
 
-ColorCodec = Literal["jpeg", "png", "raw"]
-DepthCodec = Literal["raw", "zdelta", "zstd-delta"]
+StillCodec = Literal["jpeg", "png", "raw"]
+"""Of pictures that are read by themselves."""
 Color = NDArray[np.uint8] | NDArray[np.uint16]
 
 DEFAULT_DEPTH_CODEC: DepthCodec = "zstd-delta"
+DEPTH_CODECS: tuple[DepthCodec, ...] = get_args(DepthCodec)
 DEFAULT_JPEG_QUALITY = 90
+REDUCIBLE = ("jpeg", "h264")
+"""Codecs of colour that may be sent smaller than the camera's."""
 
 _COLOR_DTYPE: dict[ColorEncoding, str] = {"srgb8": "u1", "linear16": "<u2"}
 # An EXIF orientation must not turn a picture whose size has been checked.
@@ -28,7 +42,7 @@ _READ_RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 def encode_color(
-    rgb: Color, codec: ColorCodec = "jpeg", encoding: ColorEncoding = "srgb8", quality: int = DEFAULT_JPEG_QUALITY
+    rgb: Color, codec: StillCodec = "jpeg", encoding: ColorEncoding = "srgb8", quality: int = DEFAULT_JPEG_QUALITY
 ) -> ColorImage:
     """[h, w, 3] RGB -> payload. uint8 sRGB (`srgb8`), or uint16 linear (`linear16`, codec `raw` only).
 
@@ -48,23 +62,25 @@ def decode_color(
     camera: CameraModel,
     encoding: ColorEncoding | None = None,
     decompress: Callable[[bytes], NDArray[np.uint8]] | None = None,
+    video: Callable[[ColorImage], NDArray[np.uint8]] | None = None,
 ) -> Color:
     """Payload -> [h, w, 3] RGB, uint8 (`srgb8`) or uint16 (`linear16`), of exactly the camera's size.
 
-    A JPEG of a half or a quarter of the camera's width and height, rounded up, is enlarged to it. `encoding` is what
-    the reader expects: None means the camera's own; a composite is always `srgb8`. `decompress` decodes a JPEG or PNG
-    whose header has been checked (default: `decode_picture`).
+    A JPEG or video of a half or a quarter of the camera's width and height, rounded up, is enlarged to it. `encoding`
+    is what the reader expects: None means the camera's own; a composite is always `srgb8`. `decompress` decodes a JPEG
+    or PNG whose header has been checked (default: `decode_picture`), `video` checks and decodes a picture of H.264,
+    which rests on those before it: without it none is read.
     Raises ProtocolError, before anything is allocated, for a picture that is not what it declares.
     """
     expected = encoding or camera.color_encoding
     if image.encoding != expected:
         raise ProtocolError(f"color.encoding is {image.encoding}, this session's is {expected}")
     _require_codec(image.codec, image.encoding)
-    if image.codec != "jpeg" or (image.width, image.height) not in reduced_sizes(camera):
+    if image.codec not in REDUCIBLE or (image.width, image.height) not in reduced_sizes(camera):
         _require_size("color", image, camera)
     if image.codec == "raw":
         return _raw("color", image, _COLOR_DTYPE[image.encoding], 3).reshape(image.height, image.width, 3)
-    rgb = _decompress_color(image, decompress or decode_picture)
+    rgb = _of_video(image, video) if image.codec == "h264" else _decompress_color(image, decompress or decode_picture)
     if (image.width, image.height) == (camera.width, camera.height):
         return rgb
     return cv2.resize(rgb, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR).astype(np.uint8, copy=False)
@@ -100,11 +116,15 @@ def encode_depth(
     if depth.ndim != 2 or depth.dtype != np.uint16:
         raise ValueError(f"depth must be [h, w] uint16, is {depth.shape} {depth.dtype}")
     height, width = depth.shape
-    if codec == "raw":
-        data = depth.astype("<u2").tobytes()
-    else:
-        planes = filter_depth(depth)
-        data = deflate(planes) if codec == "zdelta" else zstd_compress(planes, level)
+    match codec:
+        case "raw":
+            data = depth.astype("<u2").tobytes()
+        case "zdelta":
+            data = deflate(filter_depth(depth))
+        case "zstd-delta":
+            data = zstd_compress(filter_depth(depth), level)
+        case "zstd-ranks":
+            data = zstd_compress(rank_depth(depth), level)
     return DepthImage(width=width, height=height, data=data, codec=codec, rounded_per_m=rounded_per_m)
 
 
@@ -116,6 +136,9 @@ def decode_depth(image: DepthImage, camera: CameraModel) -> NDArray[np.uint16]:
     _require_size("depth", image, camera.depth_lens)
     if image.codec == "raw":
         return _raw("depth", image, "<u2", 1).reshape(image.height, image.width)
+    if image.codec == "zstd-ranks":
+        most = most_rank_bytes(image.width, image.height)
+        return unrank_depth(zstd_decompress(image.data, most, least_bytes=0), image.width, image.height)
     decompress = inflate if image.codec == "zdelta" else zstd_decompress
     return unfilter_depth(decompress(image.data, 2 * image.width * image.height), image.width, image.height)
 
@@ -139,7 +162,7 @@ def _raw(field: str, image: Payload, dtype: str, channels: int) -> NDArray[Any]:
     return np.frombuffer(image.data, dtype).astype(np.dtype(dtype).newbyteorder("="))
 
 
-def _compress_color(rgb: Color, codec: ColorCodec, encoding: ColorEncoding, quality: int) -> bytes:
+def _compress_color(rgb: Color, codec: StillCodec, encoding: ColorEncoding, quality: int) -> bytes:
     if codec == "raw":
         return rgb.astype(_COLOR_DTYPE[encoding]).tobytes()
     # OpenCV's own choice for PNG takes half the time of its level 1, and gives no more bytes.
@@ -149,6 +172,15 @@ def _compress_color(rgb: Color, codec: ColorCodec, encoding: ColorEncoding, qual
         raise ValueError(f"OpenCV could not encode a picture of {rgb.shape} as {codec}")
     data: bytes = buffer.tobytes()
     return data
+
+
+def _of_video(image: ColorImage, video: Callable[[ColorImage], NDArray[np.uint8]] | None) -> NDArray[np.uint8]:
+    if video is None:
+        raise ProtocolError("color.codec is h264, whose pictures are read one after the other only")
+    rgb = video(image)
+    if rgb.shape != (image.height, image.width, 3):
+        raise ProtocolError(f"color.data is a picture of {rgb.shape[1]}x{rgb.shape[0]}, not of what color declares")
+    return rgb
 
 
 def _decompress_color(image: ColorImage, decompress: Callable[[bytes], NDArray[np.uint8]]) -> NDArray[np.uint8]:

@@ -42,6 +42,8 @@ Poses = Literal["given", "track", "refine"]
 Dictionary = Literal["4x4_50", "5x5_100", "6x6_250", "7x7_1000", "apriltag_36h11"]
 Tracking = Literal["given", "tracked", "lost"]
 MeshFormat = Literal["ply", "glb"]
+ColorCodec = Literal["jpeg", "png", "raw", "h264"]
+DepthCodec = Literal["raw", "zdelta", "zstd-delta", "zstd-ranks"]
 
 
 def _require_auto(where: str, preset: str, *chosen_by: float | None) -> None:
@@ -70,19 +72,23 @@ class Payload(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class ColorImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Colour: `jpeg` and `png` are sRGB 8-bit; `raw` is interleaved RGB, little endian, in `encoding`."""
+    """Colour: `jpeg` and `png` are sRGB 8-bit; `raw` is interleaved RGB, little endian, in `encoding`.
 
-    codec: Literal["jpeg", "png", "raw"]
+    `h264`, of frames only and where `welcome.codecs` has it: the next picture of a session's video.
+    """
+
+    codec: ColorCodec
     encoding: ColorEncoding = "srgb8"
 
 
 class DepthImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
     """uint16 depth, lossless.
 
-    `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd.
+    `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd. `zstd-ranks`: the same of
+    the values' ranks, two in a byte.
     """
 
-    codec: Literal["raw", "zdelta", "zstd-delta"]
+    codec: DepthCodec
     rounded_per_m: Annotated[float, Meta(gt=0, le=1)] | None = None
     """What the sender changed before: each depth z (metres) by at most this times z^2; None: nothing."""
 
@@ -325,6 +331,10 @@ class Welcome(Message, frozen=True, kw_only=True, omit_defaults=True, tag="welco
     """Frames that were sent before are not answered any more, unless the session is lossless; requests are, if they
     are sent again."""
     room: Name | None = None
+    codecs: tuple[ColorCodec, ...] = ("jpeg", "png", "raw")
+    """That frames' colour may have."""
+    depth_codecs: tuple[DepthCodec, ...] = ("raw", "zdelta", "zstd-delta")
+    """That their depth may have."""
 
 
 class LeftOut(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -435,6 +445,8 @@ class Composite(Message, frozen=True, kw_only=True, tag="composite"):
     plan: Plan
     notes: tuple[str, ...] = ()
     """What was wrong with this frame's input, one line each."""
+    waited_ms: float = 0.0
+    """From when the frame had arrived until the device began with it: unread, decoded, waiting for its turn."""
 
 
 class LayerPatch(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -458,8 +470,9 @@ class Layer(Message, frozen=True, kw_only=True, tag="layer"):
     frame: Index
     timestamp_s: float
     virtual: LayerPatch | None
-    """Colour of four channels: sRGB, not multiplied by coverage, which is the fourth, 255 for all of a pixel. None: none
-    is seen."""
+    """Colour of four channels: sRGB, not multiplied by coverage, which is the fourth, 255 for all of a pixel.
+
+    None: nothing is seen of it."""
     ratio: LayerPatch | None
     """Colour of three channels: by what real surface is multiplied, times 128. None: real surface stays as it is."""
     depth_scale_m: Annotated[float, Meta(gt=0, le=1)]
@@ -470,6 +483,8 @@ class Layer(Message, frozen=True, kw_only=True, tag="layer"):
     plan: Plan
     notes: tuple[str, ...] = ()
     """What was wrong with this frame's input, one line each."""
+    waited_ms: float = 0.0
+    """From when the frame had arrived until the device began with it: unread, decoded, waiting for its turn."""
 
 
 class Dropped(Message, frozen=True, kw_only=True, tag="dropped"):

@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from protocol.codec import encode, one_line
+from protocol.colors import readable_codecs
 from protocol.frames import CameraModel
+from protocol.images import DEPTH_CODECS
 from protocol.messages import Bye, Hello, Watch, Welcome, Wishes
 from server.broadcast import Broadcast, serve_watcher
 from server.connection import GONE, INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
@@ -112,7 +114,7 @@ class Service:
             scheduler=self._scheduler,
             wanted_period_s=self.limits.wanted_period_s,
             load_mesh=mesh_loader or self._parsers.load_mesh,
-            decode_color=self._parsers.decode_color,
+            color_reader=self._parsers.color_reader,
             metrics=self.metrics,
             keep_room=self._keeping.keep_now if self._keeping else lambda _name: None,
             keep_moves=self._keeping.keep_moves if self._keeping else lambda _name: None,
@@ -226,7 +228,14 @@ class Service:
             await self._until_ready()
             key = secrets.token_urlsafe(24) if hello.keep_s > 0 else None
             welcome = Welcome(
-                session=name, server=SERVER_NAME, device="", max_inflight=MAX_INFLIGHT, key=key, room=hello.room
+                session=name,
+                server=SERVER_NAME,
+                device="",
+                max_inflight=MAX_INFLIGHT,
+                key=key,
+                room=hello.room,
+                codecs=readable_codecs(),
+                depth_codecs=DEPTH_CODECS,
             )
             lock = lock_of(hello.room_key)
             outlet = LoopOutlet(welcome, connection, self._broadcast, is_kept=key is not None, lock=lock)

@@ -14,11 +14,11 @@ import numpy as np
 from msgspec import structs
 
 from protocol.codec import ProtocolError, encode, one_line
+from protocol.colors import ColorReader
 from protocol.frames import CameraModel, RgbdFrame, Viewpoint
-from protocol.images import Color, decode_color, decode_depth, encode_color
+from protocol.images import decode_depth, encode_color
 from protocol.messages import (
     Acknowledged,
-    ColorImage,
     Composite,
     Dropped,
     Frame,
@@ -86,7 +86,7 @@ class Workshop:
     scheduler: Scheduler
     wanted_period_s: float = 0.25
     """Between two frames of sessions that share the device: when it is longer, they sample more cheaply."""
-    decode_color: Callable[[ColorImage, CameraModel], Color] = decode_color
+    color_reader: Callable[[CameraModel], ColorReader] = ColorReader
     keep_room: Callable[[str], None] = lambda _name: None
     """Save a room, before its objects' coming or going is acknowledged: a server that is killed loses none."""
     keep_moves: Callable[[str], None] = lambda _name: None
@@ -102,6 +102,9 @@ class Worker:
         self._mailbox = mailbox
         self._outlet = outlet
         self._share = workshop.scheduler.join(hello.room)
+        self._colors = workshop.color_reader(hello.camera)
+        self._arrived_s = self._waited_ms = 0.0
+        """Of the newest frame: when it came, and for how long it then waited."""
         self._pressure = Pressure(hello.wishes, workshop.wanted_period_s)
         self._acknowledged: OrderedDict[int, bytes] = OrderedDict()
         """Requests that were done: a client that lost its connection may send them again."""
@@ -126,9 +129,11 @@ class Worker:
                     self._handle(pipeline, letter)
         finally:
             self._workshop.scheduler.leave(self._share)
+            self._colors.close()
 
     def _handle(self, pipeline: Pipeline, letter: Letter) -> None:
         if isinstance(letter.message, Frame):
+            self._arrived_s = letter.arrived_s
             self._workshop.metrics.queue_age_ms.observe(letter.age_ms)
             self._answer_frame(pipeline, letter.message)
         elif isinstance(letter.message, RequestMesh):
@@ -172,6 +177,7 @@ class Worker:
             return self._drop(frame, "unreadable", error)
         try:
             with overhead.left_out(), self._workshop.scheduler.turn(self._share) as waited_s:
+                self._waited_ms = (time.perf_counter() - self._arrived_s) * 1e3
                 result = pipeline.process(rgbd, watched=self._outlet.is_watched())
                 self._follow_pressure(pipeline)
         except ValueError as error:
@@ -209,7 +215,7 @@ class Worker:
         rgbd = RgbdFrame(
             index=frame.frame,
             timestamp_s=frame.timestamp_s,
-            color=self._workshop.decode_color(frame.color, camera),
+            color=self._colors.decode(frame.color),
             depth=no_depth if frame.depth is None else decode_depth(frame.depth, camera),
             world_from_camera=pose,
             exposure=frame.exposure,
@@ -257,7 +263,7 @@ class Worker:
     def _timed(self, make: Callable[[], Composite | Layer]) -> bytes:
         """An answer, encoded; notes how long that takes."""
         start_s = time.perf_counter()
-        data = encode(make())
+        data = encode(structs.replace(make(), waited_ms=self._waited_ms))
         self._workshop.metrics.encode_ms.observe((time.perf_counter() - start_s) * 1e3)
         return data
 

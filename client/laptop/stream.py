@@ -28,6 +28,7 @@ from client.laptop.stopping import stop_on_interrupt
 from client.laptop.stream_figures import STAGES, StreamFigures
 from client.laptop.stream_view import StreamView
 from client.layers import decode_layer, put_over, shown_picture
+from client.video import IS_POSSIBLE, VideoEncoder
 from protocol.frames import CameraModel
 from protocol.images import Color, decode_color
 from protocol.messages import ClientMessage, Dropped, Error, Layer, MeshFormat, ServerMessage, Welcome, Wishes
@@ -52,6 +53,8 @@ class StreamSummary:
     """Sent, and refused or replaced by the server."""
     seconds: float = 0.0
     """From the first frame's sending to the last answer."""
+    first_picture_s: float = math.nan
+    """From connecting until the first answer was shown."""
     reconnected: int = 0
     latency_ms: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """p50 and p99 of the last frames, by `stream_figures.STAGES`."""
@@ -67,6 +70,8 @@ class Sending:
     """Depth may be moved by this times z^2 (metres); None: it is sent bit for bit."""
     view: bool = False
     """The picture in the terminal."""
+    video: bool = False
+    """Colour goes as H.264; not in a lossless session."""
 
 
 def stream(
@@ -146,6 +151,7 @@ class _Stream:
         self._pictures: dict[int, Color] = {}
         """Of frames without an answer, for what is put over them here."""
         self._last_sent_s = -math.inf
+        self._began_s = 0.0
         total = None if job.frames.stop >= ENDLESS else len(job.frames)
         self._bar = progress.add_task(job.source.name, total=total, note="connecting")
         self._summary = StreamSummary()
@@ -153,10 +159,15 @@ class _Stream:
 
     async def run(self, tap: Callable[[ClientMessage | ServerMessage], None] | None) -> StreamSummary:
         meshes = [pack_mesh(item.path) for item in self._job.objects]  # a bad file is told before anything is sent
+        self._began_s = time.perf_counter()
         client = await StreamClient.connect(self._job.server_url, tap, self._job.access)
         try:
             job = self._job
-            self._note_welcome(await client.hello(job.source.camera, job.wishes, "probeless stream", job.room))
+            welcome = await client.hello(job.source.camera, job.wishes, "probeless stream", job.room)
+            self._note_welcome(welcome)
+            if job.sending.video and not job.wishes.lossless:
+                client.video = open_video(welcome)
+                self._view.codec = "H.264"
             await self._place_objects(client, meshes)
             if self._adaptive is not None:
                 self._adaptive = _adaptive(job, await client.ping())
@@ -281,8 +292,11 @@ class _Stream:
         picture = await asyncio.to_thread(self._kept_picture, answer)
         coding = self._fixed if self._adaptive is None else self._adaptive.coding
         shown_s = time.perf_counter()
+        if not self._summary.answered:
+            self._summary.first_picture_s = shown_s - self._began_s
         self._view.show(shown_s, answer.light, drawn, picture, coding, reconnected)
-        self._figures.note_answer(answer.light.frame, returned_s, shown_s, computed_s, size)
+        waited_s = 0.0 if drawn is None else drawn.waited_ms / 1e3
+        self._figures.note_answer(answer.light.frame, returned_s, shown_s, computed_s, size, waited_s)
         for note in () if drawn is None else drawn.notes:
             self._tell(note)
         self._summary.answered += 1
@@ -332,6 +346,17 @@ class _Stream:
         if line not in self._told:
             self._told.add(line)
             self._progress.console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def open_video(welcome: Welcome) -> VideoEncoder:
+    """What colour is sent with. Raises ClientError where either side has no PyAV."""
+    if "h264" not in welcome.codecs:
+        raise ClientError(
+            f"{welcome.server} reads no H.264 (it lacks PyAV: make install-video there); leave out --video"
+        )
+    if not IS_POSSIBLE:
+        raise ClientError("--video h264 needs PyAV, which is not installed: make install-video, or pip install av")
+    return VideoEncoder()
 
 
 def _adaptive(job: _Job, delay_s: float) -> Adaptive | None:

@@ -1,6 +1,6 @@
 """What a stream is like while it runs: frames and bits a second, and milliseconds of each stage of a frame's way.
 
-All by the client's clock. `way` is the round trip less the server's computing: there, waiting at the server, and back.
+All by the client's clock. `way` is the round trip less what the server says of its own: there and back.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-STAGES = ("encode", "way", "compute", "show", "whole")
-"""Captured to sent; sent to returned, less the next; the server's own figure; returned to shown; captured to shown."""
+STAGES = ("encode", "way", "wait", "compute", "show", "whole")
+"""Captured to sent; sent to returned, less the next two; received to computing, and computing, as the server says;
+returned to shown; captured to shown."""
 KEPT = 512
 RATE_S = 5.0
 
@@ -36,15 +37,23 @@ class StreamFigures:
         self._under_way[number] = _Frame(captured_s, sent_s)
         self._sent.append((sent_s, size_bytes))
 
-    def note_answer(self, number: int, returned_s: float, shown_s: float, computed_s: float, size_bytes: int) -> None:
-        """Its answer is here, and on show."""
+    def note_answer(
+        self,
+        number: int,
+        returned_s: float,
+        shown_s: float,
+        computed_s: float,
+        size_bytes: int,
+        waited_s: float = 0.0,
+    ) -> None:
+        """Its answer is here, and on show. `waited_s`: at the server, before it was computed."""
         self._answered.append((returned_s, size_bytes))
         frame = self._under_way.pop(number, None)
         if frame is None:
             return
-        way_s = max(returned_s - frame.sent_s - computed_s, 0.0)
+        way_s = max(returned_s - frame.sent_s - waited_s - computed_s, 0.0)
         whole_s = shown_s - frame.captured_s
-        times = (frame.sent_s - frame.captured_s, way_s, computed_s, shown_s - returned_s, whole_s)
+        times = (frame.sent_s - frame.captured_s, way_s, waited_s, computed_s, shown_s - returned_s, whole_s)
         for name, seconds in zip(STAGES, times, strict=True):
             self.milliseconds[name].append(1e3 * seconds)
 

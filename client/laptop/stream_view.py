@@ -26,7 +26,8 @@ TABLE_ROWS = 14
 REFRESH_HZ = 4
 LABELS = {
     "encode": "captured to sent",
-    "way": "there, waiting, back",
+    "way": "there and back",
+    "wait": "waited at the server",
     "compute": "computed by the server",
     "show": "returned to shown",
     "whole": "captured to shown",
@@ -41,6 +42,8 @@ class StreamView:
     def __init__(self, console: Console, progress: Progress, figures: StreamFigures, with_picture: bool) -> None:
         self._progress, self._figures = progress, figures
         self._with_picture = with_picture
+        self.codec = "JPEG"
+        """By which colour is sent, in words."""
         self.is_on = console.is_terminal
         self._light: Light | None = None
         self._drawn: Composite | Layer | None = None
@@ -108,7 +111,7 @@ class StreamView:
         if drawn is not None:
             table.add_row("plan", plan_line(drawn))
         if self._coding is not None:
-            table.add_row("sent as", coding_line(self._coding))
+            table.add_row("sent as", coding_line(self._coding, self.codec))
         table.add_row("connection", f"restored {self._reconnected} times" if self._reconnected else "held")
         return table
 
@@ -129,12 +132,12 @@ def plan_line(drawn: Composite | Layer) -> str:
     return f"{', '.join(plan.run)}{left_out}{point}; camera {drawn.tracking}"
 
 
-def coding_line(coding: Coding) -> str:
+def coding_line(coding: Coding, codec: str = "JPEG") -> str:
     """How frames are sent."""
     size = f" at 1/{coding.divisor} of the size" if coding.divisor > 1 else ""
     noise_per_m = coding.depth_noise_per_m
     depth = "exact depth" if noise_per_m is None else f"depth to within {1e3 * noise_per_m:g} mm at 1 m"
-    return f"JPEG of quality {coding.quality}{size}, {depth}"
+    return f"{codec} of quality {coding.quality}{size}, {depth}"
 
 
 def half_blocks(picture: NDArray[np.uint8], columns: int) -> Text:

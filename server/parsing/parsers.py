@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import mmap
 import struct
+import threading
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.codec import ProtocolError
+from protocol.colors import ColorReader
 from protocol.frames import CameraModel
-from protocol.images import Color, decode_color
 from protocol.limits import MAX_IMAGE_PIXELS
-from protocol.messages import ColorImage
 from server.parsing.children import IS_POSSIBLE, ChildDied, Children, Work
 from server.parsing.mesh_bytes import GREATEST_BYTES, mesh_from_bytes
 from server.scene.limits import MeshError
@@ -27,6 +28,7 @@ PICTURE_WORK = Work(
     greatest_answer=4096,
     shared_bytes=3 * MAX_IMAGE_PIXELS,
 )
+VIDEO_WORK = replace(PICTURE_WORK, job="server.parsing.read_video:read_video")
 _SIZE = struct.Struct("<II")
 MESH_CHILDREN, PICTURE_CHILDREN = 2, 2
 """So that a file that takes long keeps nobody else waiting."""
@@ -39,11 +41,17 @@ class Parsers:
         self,
         mesh_work: Work = MESH_WORK,
         picture_work: Work = PICTURE_WORK,
+        video_work: Work = VIDEO_WORK,
     ) -> None:
         self.on_death: Callable[[str], None] = lambda _kind: None
-        """Called, by the thread that waits, with `mesh` or `picture` for each child that dies at work."""
+        """Called, by the thread that waits, with `mesh`, `picture` or `video` for each child that dies at work."""
         self.meshes = Children(mesh_work, MESH_CHILDREN, lambda: self.on_death("mesh"))
         self.pictures = Children(picture_work, PICTURE_CHILDREN, lambda: self.on_death("picture"))
+        self._video_work = video_work
+        self._videos: set[Children] = set()
+        """One child for each session that sends video."""
+        self._changing = threading.Lock()
+        self._has_stopped = False
 
     def start(self) -> None:
         """One child of each kind begins to load, without being waited for."""
@@ -55,6 +63,11 @@ class Parsers:
         """End all children."""
         self.meshes.stop()
         self.pictures.stop()
+        with self._changing:
+            self._has_stopped = True
+            videos = tuple(self._videos)
+        for video in videos:
+            video.stop()
 
     def load_mesh(self, data: bytes, file_format: str) -> Mesh:
         """As server.scene.mesh.load_mesh. Raises MeshError, also where the file takes too much or kills its reader."""
@@ -69,19 +82,50 @@ class Parsers:
         assert isinstance(answer, bytearray)
         return mesh_from_bytes(answer)
 
-    def decode_color(self, image: ColorImage, camera: CameraModel) -> Color:
-        """As protocol.images.decode_color. Raises ProtocolError."""
-        return decode_color(image, camera, decompress=self._decompress if IS_POSSIBLE else None)
+    def color_reader(self, camera: CameraModel) -> ColorReader:
+        """For one session's colour; to be closed."""
+        return ColorReader(camera, self._decompress, self._open_video) if IS_POSSIBLE else ColorReader(camera)
 
     def _decompress(self, data: bytes) -> NDArray[np.uint8]:
-        try:
-            picture = self.pictures.ask(data, _shared_picture)
-        except ChildDied as error:
-            raise ProtocolError(f"color.data: the picture's reader {error}") from error
-        except ValueError as error:
-            raise ProtocolError(str(error)) from error
-        assert isinstance(picture, np.ndarray)
-        return picture
+        return _picture_of(self.pictures, data)
+
+    def _open_video(self) -> _Video:
+        children = Children(self._video_work, 1, lambda: self.on_death("video"))
+        with self._changing:
+            self._videos.add(children)
+            if self._has_stopped:
+                children.stop()
+        return _Video(children, self._forget)
+
+    def _forget(self, children: Children) -> None:
+        with self._changing:
+            self._videos.discard(children)
+
+
+class _Video:
+    """A child of a session's own; one that dies is followed by one that knows nothing."""
+
+    def __init__(self, children: Children, on_close: Callable[[Children], None]) -> None:
+        self._children, self._on_close = children, on_close
+
+    def decode(self, data: bytes) -> NDArray[np.uint8]:
+        return _picture_of(self._children, data)
+
+    def close(self) -> None:
+        self._on_close(self._children)
+        self._children.stop()
+
+
+def _picture_of(children: Children, data: bytes) -> NDArray[np.uint8]:
+    """Raises ProtocolError."""
+    try:
+        picture = children.ask(data, _shared_picture)
+    except ChildDied as error:
+        raise ProtocolError(f"color.data: the picture's reader {error}") from error
+    except ValueError as error:
+        raise ProtocolError(str(error)) from error
+    assert isinstance(picture, np.ndarray)
+    return picture
 
 
 def _shared_picture(answer: bytearray, memory: mmap.mmap | None) -> NDArray[np.uint8]:

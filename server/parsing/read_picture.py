@@ -5,6 +5,8 @@ from __future__ import annotations
 import struct
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from protocol.images import decode_picture
 from server.parsing.child import shared_memory
@@ -16,7 +18,11 @@ cv2.setNumThreads(1)  # a child may start no threads
 
 def read_picture(request: bytes) -> bytes:
     """A JPEG or PNG -> its height and width; [h, w, 3] RGB is in the shared memory. Raises ValueError."""
-    rgb = decode_picture(request)
+    return share(decode_picture(request))
+
+
+def share(rgb: NDArray[np.uint8]) -> bytes:
+    """Put [h, w, 3] into the shared memory; its height and width. Raises ValueError for what is too large."""
     memory = shared_memory()
     if rgb.nbytes > len(memory):
         raise ValueError("color.data is a larger picture than may be")

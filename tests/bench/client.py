@@ -1,32 +1,50 @@
-"""`probeless bench client`: what the laptop client's frames take on the way up, what sparing them costs, their age.
+"""`probeless bench client`: what a thin client's frames take on the way up, what sparing them costs, how old they get.
 
-Of 7-Scenes' kitchen, 640x480, and of stereo depth like an OAK-D's, made from a synthetic room; bits at 15 frames/s.
+Of 7-Scenes' kitchen, 640x480, and of stereo depth like an OAK-D's, made from a synthetic room; bits at 15 frames/s. A
+run that was stopped goes on with the parts that are missing: finished ones lie in out/bench/client/parts.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-from server.evaluation.report import Report, Unmeasured
+from server.evaluation.report import Report
 from server.opencl.device import open_device
-from tests.bench.client_bandwidth import KITCHEN, bandwidth_rows, cost_rows
-from tests.bench.client_latency import latency_rows
+from tests.bench.client_bandwidth import bandwidth_part, cost_part
+from tests.bench.client_browser import browser_part
+from tests.bench.client_latency import LINKS, latency_part
+from tests.bench.client_layer import layer_screen_part, layer_wire_part
+from tests.bench.client_video import video_part
+from tests.bench.finished import ROOT, Finished, Part
+from tests.bench.run import Run
 
-FRAMES, QUICK_FRAMES = {"bandwidth": 40, "cost": 20, "latency": 3000}, {"bandwidth": 10, "cost": 6, "latency": 600}
+OUT = ROOT / "out" / "bench" / "client"
+PARTS: dict[str, Callable[..., Part]] = {
+    "bandwidth": bandwidth_part,
+    "cost": cost_part,
+    "video": video_part,
+    **{f"latency, {name}": partial(latency_part, name) for name in LINKS},
+    "browser": browser_part,
+    "layers on the wire": layer_wire_part,
+    "layers on the screen": layer_screen_part,
+}
 
 
 def run_suite(quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
     """Measure; `say` gets progress."""
-    sizes = QUICK_FRAMES if quick else FRAMES
-    device = open_device(None)
-    report = Report(device.name, sizes={f"frames of {name}": count for name, count in sizes.items()})
-    if not KITCHEN.is_dir():
-        report.unmeasured.append(Unmeasured("all of it", f"no data at {KITCHEN}"))
-        return report.as_dict()
-    report.rows += bandwidth_rows(sizes["bandwidth"], say)
-    report.rows += cost_rows(device, sizes["cost"], say)
-    report.rows += latency_rows(sizes["latency"], say)
-    reason = "the server does not say when a frame arrived; waiting and both ways are one figure"
-    report.unmeasured.append(Unmeasured("latency: received and returned apart", reason))
-    return report.as_dict()
+    run = Run(open_device(None), quick, say)
+    OUT.mkdir(parents=True, exist_ok=True)
+    finished = Finished(OUT, run.device.name, quick)
+    report = Report(run.device.name)
+    for name, measure in PARTS.items():
+        part = finished.part(name, lambda measure=measure: measure(run, OUT), say)  # type: ignore[misc]
+        report.rows += part.rows
+        report.unmeasured += part.unmeasured
+        report.sizes |= part.sizes
+    result = report.as_dict()
+    (OUT / "result.json").write_text(json.dumps(result, indent=1, allow_nan=False))
+    finished.forget()
+    return result

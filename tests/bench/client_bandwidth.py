@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
+from pathlib import Path
 
 import cv2
 import msgspec
@@ -17,18 +17,18 @@ from client.laptop.source import Source, open_source
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import decode_color, decode_depth
 from server.evaluation.environment import direction_error_deg
-from server.evaluation.report import Row
 from server.opencl.device import Device
 from server.pipeline import Pipeline
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from server.scene.vase import vase_glb
+from tests.bench.finished import Part
 from tests.bench.light_runs import wishes_for
+from tests.bench.run import Run, data_source
 from tests.bench.service_speed import looked_at
-from tests.data import ROOT
 
 FPS = 15
-KITCHEN = ROOT.parent / "shared" / "data" / "rgbd_7scenes_redkitchen"
+QUICK_FRAMES, FRAMES = {"bandwidth": 10, "cost": 6}, {"bandwidth": 40, "cost": 20}
 KINECT_NOISE_PER_M = 0.00285
 """One step of its disparity, an eighth of a pixel at 585 px and 7.5 cm: what one and the same point flickers by."""
 OAK_BASELINE_M = 0.075
@@ -54,37 +54,58 @@ def oak_noise_per_m(camera: CameraModel) -> float:
     return OAK_DISPARITY_NOISE_PX / (camera.fx * OAK_BASELINE_M)
 
 
+Seen = tuple[NDArray[np.uint8], NDArray[np.float64]]
+"""Picture and SH of one frame."""
+
+
 def mbit_per_s(frames: list[RgbdFrame], camera: CameraModel, coding: Coding) -> float:
     """At 15 frames a second."""
     sizes = [picture_bytes(frame_message(frame, camera, coding=coding)) for frame in frames]
     return float(np.mean(sizes)) * 8e-6 * FPS
 
 
-def bandwidth_rows(count: int, say: Callable[[str], None]) -> list[Row]:
+def depth_mbit_per_s(frames: list[RgbdFrame], camera: CameraModel, coding: Coding) -> float:
+    """Of that, what depth takes."""
+    found = [frame_message(frame, camera, coding=coding).depth for frame in frames]
+    return float(np.mean([len(depth.data) for depth in found if depth is not None])) * 8e-6 * FPS
+
+
+def kitchen() -> Source:
+    """7-Scenes' kitchen. Raises UnmeasurableError where it is not."""
+    return data_source("rgbd_7scenes_redkitchen")
+
+
+def psnr_db(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
+    """Of all channels."""
+    squared = np.mean((picture.astype(np.float64) - truth) ** 2)
+    return float(10 * np.log10(255**2 / max(squared, 1e-9)))
+
+
+def bandwidth_part(run: Run, _out: Path) -> Part:
     """Of the kitchen and of OAK-like depth."""
-    kitchen, room = open_source(str(KITCHEN)), open_source("synthetic:room?frames=40")
-    frames = _spread(kitchen, count)
-    say(f"bandwidth of {len(frames)} frames of each source")
+    source, room = kitchen(), open_source("synthetic:room?frames=40")
+    count = run.of(QUICK_FRAMES["bandwidth"], FRAMES["bandwidth"])
+    part = Part(sizes={"frames of bandwidth": count})
+    frames = _spread(source, count)
     coded = {"full quality": Coding(), "exact depth": EXACT, "depth within a step": ROUNDED, "within two": COARSER}
     goals = {"exact depth": "<= 12", "depth within a step": "<= 4", "within two": "<= 4"}
-    rows = [
-        Row(f"kitchen, {name}", mbit_per_s(frames, kitchen.camera, coding), "Mbit/s", goals.get(name, ""))
-        for name, coding in coded.items()
-    ]
+    for name, coding in coded.items():
+        part.add(f"kitchen, {name}", mbit_per_s(frames, source.camera, coding), "Mbit/s", goals.get(name, ""))
+    part.add("kitchen, exact depth: depth alone", depth_mbit_per_s(frames, source.camera, EXACT), "Mbit/s")
     oak = [replace(f, depth=oak_like(f.depth, room.camera, f.index)) for f in _spread(room, min(count, 10))]
     rounded = replace(LADDER[5], depth_noise_per_m=oak_noise_per_m(room.camera))
     for name, coding in {"full quality": Coding(), "exact depth": EXACT, "depth below its noise": rounded}.items():
-        rows.append(Row(f"OAK-like room, {name}", mbit_per_s(oak, room.camera, coding), "Mbit/s", ""))
-    return rows
+        part.add(f"OAK-like room, {name}", mbit_per_s(oak, room.camera, coding), "Mbit/s")
+    return part
 
 
-def cost_rows(device: Device, count: int, say: Callable[[str], None]) -> list[Row]:
+def cost_part(run: Run, _out: Path) -> Part:
     """Light and picture with what is left out, against the frames themselves."""
-    source = open_source(str(KITCHEN))
+    source, count = kitchen(), run.of(QUICK_FRAMES["cost"], FRAMES["cost"])
+    part = Part(sizes={"frames of cost": count})
     frames = list(islice((source[i] for i in range(len(source))), count))
-    truth = _run(device, source, frames)
+    truth = run_pipeline(run.device, source, frames)
     virtual = [(np.abs(p.astype(int) - f.color) > 2).any(-1) for (p, _), f in zip(truth, frames, strict=True)]
-    rows = []
     codings = {
         "exact depth, reduced colour": EXACT,
         "full colour, depth within a step": Coding(depth_noise_per_m=KINECT_NOISE_PER_M),
@@ -92,19 +113,22 @@ def cost_rows(device: Device, count: int, say: Callable[[str], None]) -> list[Ro
         "reduced colour, depth within a step": ROUNDED,
     }
     for name, coding in codings.items():
-        say(f"cost of {name}, {count} frames")
-        found = _run(device, source, [_over_the_wire(frame, source.camera, coding) for frame in frames])
-        pairs = list(zip(found, truth, strict=True))
-        turns = [direction_error_deg(light, true_light) for (_, light), (_, true_light) in pairs]
-        errors = [np.abs(picture.astype(int) - true) for (picture, _), (true, _) in pairs]
+        run.say(f"cost of {name}, {count} frames")
+        found = run_pipeline(run.device, source, [_over_the_wire(frame, source.camera, coding) for frame in frames])
+        turns = turns_deg(found, truth)
+        errors = [np.abs(p.astype(int) - true) for (p, _), (true, _) in zip(found, truth, strict=True)]
         on_virtual = np.concatenate([error[mask].ravel() for error, mask in zip(errors, virtual, strict=True)])
-        rows += [
-            Row(f"cost of {name}: direction of the light, last frame", turns[-1], "degrees", ""),
-            Row(f"cost of {name}: direction, mean", float(np.mean(turns)), "degrees", ""),
-            Row(f"cost of {name}: picture, mean", float(np.mean(errors)), "of 255", ""),
-            Row(f"cost of {name}: virtual pixels, mean", float(on_virtual.mean()), "of 255", ""),
-        ]
-    return rows
+        part.add(f"cost of {name}: direction of the light, last frame", turns[-1], "degrees")
+        part.add(f"cost of {name}: direction, mean", float(np.mean(turns)), "degrees")
+        part.add(f"cost of {name}: picture, mean", float(np.mean(errors)), "of 255")
+        part.add(f"cost of {name}: virtual pixels, mean", float(on_virtual.mean()), "of 255")
+    return part
+
+
+def turns_deg(found: list[Seen], truth: list[Seen]) -> list[float]:
+    """By how much the dominant direction of each frame's light is off."""
+    pairs = zip(found, truth, strict=True)
+    return [direction_error_deg(light, true_light) for (_, light), (_, true_light) in pairs]
 
 
 def _spread(source: Source, count: int) -> list[RgbdFrame]:
@@ -118,9 +142,7 @@ def _over_the_wire(frame: RgbdFrame, camera: CameraModel, coding: Coding) -> Rgb
     return replace(frame, color=decode_color(message.color, camera), depth=decode_depth(message.depth, camera))
 
 
-def _run(
-    device: Device, source: Source, frames: list[RgbdFrame]
-) -> list[tuple[NDArray[np.uint8], NDArray[np.float64]]]:
+def run_pipeline(device: Device, source: Source, frames: list[RgbdFrame]) -> list[Seen]:
     """Picture and light of each frame, with a vase where the first one looks."""
     wishes = msgspec.structs.replace(wishes_for(source, range(len(source))), preset="reg4")
     pipeline = Pipeline(device, source.camera, wishes)

@@ -22,9 +22,9 @@ def test_a_frames_way_is_taken_apart() -> None:
     figures = StreamFigures()
     assert figures.percentiles("way") is None
     figures.note_sent(7, captured_s=10.0, sent_s=10.005, size_bytes=1000)
-    figures.note_answer(7, returned_s=10.105, shown_s=10.115, computed_s=0.06, size_bytes=500)
+    figures.note_answer(7, returned_s=10.105, shown_s=10.115, computed_s=0.06, size_bytes=500, waited_s=0.01)
     found = {stage: figures.percentiles(stage)[0] for stage in figures.milliseconds}
-    assert found == pytest.approx({"encode": 5, "way": 40, "compute": 60, "show": 10, "whole": 115})
+    assert found == pytest.approx({"encode": 5, "way": 30, "wait": 10, "compute": 60, "show": 10, "whole": 115})
 
 
 def test_percentiles_are_of_many_frames_and_dropped_ones_do_not_count() -> None:
@@ -82,7 +82,8 @@ def shown(is_terminal: bool, with_picture: bool = True) -> str:
 def test_the_terminal_shows_rates_stages_light_plan_and_reconnects() -> None:
     text = shown(True)
     for words in (
-        "there, waiting, back",
+        "there and back",
+        "waited at the server",
         "p50 90 ms",
         "intensity",
         "composite",
@@ -103,4 +104,5 @@ def test_words_for_light_and_coding() -> None:
     assert light_line(unsure).startswith("from (+0.00, +1.00, +0.00), intensity")
     assert light_line(unsure).endswith("not fixed by the pictures so far")
     assert coding_line(Coding()) == "JPEG of quality 90, exact depth"
+    assert coding_line(Coding(75), "H.264") == "H.264 of quality 75, exact depth"
     assert coding_line(Coding(50, 2, 9, 0.0014)).endswith("depth to within 1.4 mm at 1 m")

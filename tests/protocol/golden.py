@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from protocol.codec import encode
 from protocol.images import encode_depth
-from protocol.messages import ClientMessage, ServerMessage
+from protocol.messages import ClientMessage, ColorImage, ServerMessage
 from tests.protocol.samples import CLIENT, COLOR, SERVER
 
 FOLDER = Path(__file__).resolve().parents[1] / "golden"
@@ -31,9 +31,11 @@ def depth_ramp() -> NDArray[np.uint16]:
 
 
 def messages() -> dict[str, ClientMessage | ServerMessage]:
-    """Every sample, and a frame whose depth is really compressed."""
+    """Every sample, a frame whose depth is really compressed, and one whose colour is of a video."""
     deflated = msgspec.structs.replace(CLIENT["frame"], color=COLOR, depth=encode_depth(depth_ramp(), "zdelta"))
-    return {**CLIENT, **SERVER, "frame_zdelta": deflated}
+    video = ColorImage(width=2, height=2, codec="h264", data=b"\x00\x00\x01\x65")
+    filmed = msgspec.structs.replace(CLIENT["frame"], color=video)
+    return {**CLIENT, **SERVER, "frame_zdelta": deflated, "frame_video": filmed}
 
 
 def render_expected() -> str:

@@ -104,6 +104,14 @@ CLIENT: dict[str, ClientMessage] = {
 
 SERVER: dict[str, ServerMessage] = {
     "welcome": Welcome(session="kitchen", server="probeless 0.1.0", device="PoCL CPU", max_inflight=2),
+    "welcome_codecs": Welcome(
+        session="session-4",
+        server="probeless 0.1.0",
+        device="PoCL CPU",
+        max_inflight=2,
+        codecs=("jpeg", "png", "raw", "h264"),
+        depth_codecs=("raw", "zdelta", "zstd-delta", "zstd-ranks"),
+    ),
     "welcome_back": Welcome(
         session="session-1",
         server="probeless 0.1.0",

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from protocol.codec import ProtocolError
 from protocol.frames import CameraModel
-from protocol.images import decode_color, decode_depth, encode_color, encode_depth
+from protocol.images import DEPTH_CODECS, decode_color, decode_depth, encode_color, encode_depth
 from protocol.messages import ColorImage, DepthImage
 from protocol.picture_headers import MAX_JPEG_SCANS, jpeg_size, png_size
 from tests.data import data_folder
@@ -58,7 +58,7 @@ def _depths(seed: int) -> dict[str, NDArray[np.uint16]]:
 # ---- depth -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("codec", ["raw", "zdelta", "zstd-delta"])
+@pytest.mark.parametrize("codec", DEPTH_CODECS)
 @pytest.mark.parametrize("seed", range(8))
 def test_depth_survives_bit_for_bit(codec: Any, seed: int) -> None:
     for name, depth in _depths(seed).items():
@@ -89,6 +89,47 @@ def test_depth_layout_is_the_documented_one(seed: int) -> None:
         assert zstandard.decompress(encode_depth(depth, "zstd-delta").data) == planes
 
 
+def _ranks_by_hand(depth: NDArray[np.uint16]) -> bytes:
+    """The layout as README.md words it, one value at a time."""
+    values = sorted(set(depth.ravel().tolist()))
+    halves, escaped = [], []
+    for row in depth.tolist():
+        left, found = 0, []
+        for value in row:
+            rank = values.index(value)
+            delta = (rank - left + 32768) % 65536 - 32768
+            zigzag = 2 * delta if delta >= 0 else -2 * delta - 1
+            found.append(min(zigzag, 15))
+            escaped += [zigzag - 15] if zigzag >= 15 else []
+            left = rank
+        halves.append(found)
+    if len(halves) % 2:
+        halves.append([0] * len(halves[0]))
+    pairs = [
+        a | b << 4
+        for upper, lower in zip(halves[0::2], halves[1::2], strict=True)
+        for a, b in zip(upper, lower, strict=True)
+    ]
+    steps = [value - before for before, value in zip([0, *values], values, strict=False)]
+    low_high = [bytes(n & 255 for n in some) + bytes(n >> 8 for n in some) for some in (steps, escaped)]
+    return struct.pack("<II", len(values), len(escaped)) + low_high[0] + bytes(pairs) + low_high[1]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_layout_of_ranks_is_the_documented_one(seed: int) -> None:
+    for depth in _depths(seed).values():
+        small = depth[:17, :23]
+        assert zstandard.decompress(encode_depth(small, "zstd-ranks").data) == _ranks_by_hand(small)
+
+
+def test_ranks_take_less_of_a_sensor_that_knows_few_distances() -> None:
+    y, x = np.mgrid[0:120, 0:160]
+    disparity = np.rint(40 + 0.05 * x + 0.02 * y + np.random.default_rng(0).normal(0, 0.7, x.shape))
+    depth = (585 * 75 / disparity * 8).astype(np.uint16)
+    sizes = {codec: len(encode_depth(depth, codec).data) for codec in DEPTH_CODECS}
+    assert sizes["zstd-ranks"] < 0.7 * sizes["zstd-delta"]
+
+
 def test_raw_depth_is_little_endian() -> None:
     assert encode_depth(np.full((8, 8), 0x0102, np.uint16), "raw").data == b"\x02\x01" * 64
 
@@ -97,7 +138,7 @@ def test_raw_depth_is_little_endian() -> None:
 def test_real_depth_survives_and_shrinks() -> None:
     path = data_folder("rgbd_7scenes_redkitchen") / "data" / "frame-000000.depth.png"
     depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    for codec in ("zdelta", "zstd-delta"):
+    for codec in ("zdelta", "zstd-delta", "zstd-ranks"):
         image = encode_depth(depth, codec)
         assert np.array_equal(decode_depth(image, _camera(640, 480)), depth)
         assert len(image.data) < depth.nbytes / 5
@@ -112,7 +153,15 @@ def _deflate(size_bytes: int) -> bytes:
     return compressor.compress(bytes(size_bytes)) + compressor.flush()
 
 
+def _ranks(values: list[int], pairs: bytes, escaped: bytes = b"", counts: tuple[int, int] | None = None) -> bytes:
+    steps = np.diff(np.array(values, np.int64), prepend=0) % 65536
+    planes = bytes(n & 255 for n in steps.tolist()) + bytes(n >> 8 for n in steps.tolist())
+    declared = struct.pack("<II", *(counts or (len(values), len(escaped) // 2)))
+    return zstandard.compress(declared + planes + pairs + escaped)
+
+
 SIZE = 2 * WIDTH * HEIGHT
+PAIRS = WIDTH * HEIGHT // 2
 HOSTILE_DEPTH: dict[str, tuple[str, bytes]] = {
     "raw too short": ("raw", bytes(SIZE - 1)),
     "raw too long": ("raw", bytes(SIZE + 2)),
@@ -127,6 +176,23 @@ HOSTILE_DEPTH: dict[str, tuple[str, bytes]] = {
     "zstd bytes after it": ("zstd-delta", _zstd(SIZE) + b"\x00"),
     "zstd a second frame": ("zstd-delta", _zstd(SIZE) + _zstd(SIZE)),
     "zstd skippable frame": ("zstd-delta", b"\x50\x2a\x4d\x18\x04\x00\x00\x00abcd"),
+    "ranks empty": ("zstd-ranks", b""),
+    "ranks of nothing": ("zstd-ranks", zstandard.compress(b"")),
+    "ranks without counts": ("zstd-ranks", zstandard.compress(bytes(7))),
+    "ranks without values": ("zstd-ranks", _ranks([], bytes(PAIRS))),
+    "ranks too short": ("zstd-ranks", _ranks([0, 5], bytes(PAIRS - 1))),
+    "ranks too long": ("zstd-ranks", _ranks([0, 5], bytes(PAIRS + 1))),
+    "ranks that lie of their values": ("zstd-ranks", _ranks([0, 5], bytes(PAIRS), counts=(1, 0))),
+    "ranks of four thousand million": ("zstd-ranks", _ranks([0, 5], bytes(PAIRS), counts=(2**32 - 1, 2**32 - 1))),
+    "ranks beyond the values": ("zstd-ranks", _ranks([0, 5], b"\x04" + bytes(PAIRS - 1))),
+    "ranks below the first": ("zstd-ranks", _ranks([0, 5], b"\x01" + bytes(PAIRS - 1))),
+    "ranks whose values exceed 16 bits": ("zstd-ranks", _ranks([60000, 55535], bytes(PAIRS))),
+    "ranks without an escape": ("zstd-ranks", _ranks([0, 5], b"\x0f" + bytes(PAIRS - 1))),
+    "ranks with an escape too many": ("zstd-ranks", _ranks([0, 5], bytes(PAIRS), bytes(2))),
+    "ranks with half an escape": ("zstd-ranks", _ranks([0, 5], b"\x0f" + bytes(PAIRS - 1), bytes(3), (2, 1))),
+    "ranks bomb": ("zstd-ranks", _zstd(200 << 20)),
+    "ranks bomb that declares nothing": ("zstd-ranks", _zstd(64 << 20, write_content_size=False)),
+    "ranks bytes after it": ("zstd-ranks", _ranks([0, 5], bytes(PAIRS)) + b"\x00"),
     "zlib empty": ("zdelta", b""),
     "zlib truncated": ("zdelta", _deflate(SIZE)[:-2]),
     "zlib with a zlib header": ("zdelta", zlib.compress(bytes(SIZE))),

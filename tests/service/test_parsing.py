@@ -20,6 +20,7 @@ import pytest
 import trimesh
 
 from protocol.codec import ProtocolError
+from protocol.colors import ColorReader
 from protocol.frames import CameraModel
 from protocol.images import decode_color, encode_color
 from protocol.messages import Acknowledged, Composite, Dropped, PlaceObject
@@ -332,7 +333,7 @@ def picture(codec: str) -> tuple[object, CameraModel]:
 @pytest.mark.parametrize("codec", ["jpeg", "png", "raw"])
 def test_a_picture_is_what_it_would_be_if_read_here(parsers: Parsers, codec: str) -> None:
     image, camera = picture(codec)
-    there = parsers.decode_color(image, camera)
+    there = parsers.color_reader(camera).decode(image)
     np.testing.assert_array_equal(there, decode_color(image, camera))
     assert there.flags.writeable
 
@@ -341,7 +342,7 @@ def test_a_larger_picture_after_a_smaller_leaves_nothing_of_it(parsers: Parsers)
     for side in (32, 512, 64):
         camera = msgspec.structs.replace(CAMERA, width=side, height=side)
         rgb = np.full((side, side, 3), side % 256, np.uint8)
-        np.testing.assert_array_equal(parsers.decode_color(encode_color(rgb, "png"), camera), rgb)
+        np.testing.assert_array_equal(parsers.color_reader(camera).decode(encode_color(rgb, "png")), rgb)
 
 
 def test_damaged_pictures_are_refused_as_they_would_be_here(parsers: Parsers) -> None:
@@ -350,9 +351,9 @@ def test_damaged_pictures_are_refused_as_they_would_be_here(parsers: Parsers) ->
     wrong = msgspec.structs.replace(image, width=95)
     for bad in (wrong, damaged):
         outcomes = []
-        for read in (decode_color, parsers.decode_color):
+        for reader in (ColorReader(camera), parsers.color_reader(camera)):
             try:
-                outcomes.append(read(bad, camera).tobytes())
+                outcomes.append(reader.decode(bad).tobytes())
             except ProtocolError as error:
                 outcomes.append(str(error))
         assert outcomes[0] == outcomes[1]

@@ -163,25 +163,30 @@ export interface Watch {
   room_key?: string | null;
 }
 
-/** Colour: `jpeg` and `png` are sRGB 8-bit; `raw` is interleaved RGB, little endian, in `encoding`. */
+/**
+ * Colour: `jpeg` and `png` are sRGB 8-bit; `raw` is interleaved RGB, little endian, in `encoding`.
+ *
+ * `h264`, of frames only and where `welcome.codecs` has it: the next picture of a session's video.
+ */
 export interface ColorImage {
   width: number;
   height: number;
   data: Uint8Array;
-  codec: "jpeg" | "png" | "raw";
+  codec: "h264" | "jpeg" | "png" | "raw";
   encoding?: "linear16" | "srgb8";
 }
 
 /**
  * uint16 depth, lossless.
  *
- * `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd.
+ * `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd. `zstd-ranks`: the same of
+ * the values' ranks, two in a byte.
  */
 export interface DepthImage {
   width: number;
   height: number;
   data: Uint8Array;
-  codec: "raw" | "zdelta" | "zstd-delta";
+  codec: "raw" | "zdelta" | "zstd-delta" | "zstd-ranks";
   /** What the sender changed before: each depth z (metres) by at most this times z^2; null: nothing. */
   rounded_per_m?: number | null;
 }
@@ -271,6 +276,10 @@ export interface Welcome {
    */
   resumed: boolean;
   room: string | null;
+  /** That frames' colour may have. */
+  codecs: Array<"h264" | "jpeg" | "png" | "raw">;
+  /** That their depth may have. */
+  depth_codecs: Array<"raw" | "zdelta" | "zstd-delta" | "zstd-ranks">;
 }
 
 /** Milliseconds under the thesis's row names (table 6.2): device plus host time; total is wall time. */
@@ -323,6 +332,8 @@ export interface Composite {
   plan: Plan;
   /** What was wrong with this frame's input, one line each. */
   notes: Array<string>;
+  /** From when the frame had arrived until the device began with it: unread, decoded, waiting for its turn. */
+  waited_ms: number;
 }
 
 /** A part of the camera's picture, and how far away each of its pixels is. */
@@ -346,8 +357,9 @@ export interface Layer {
   frame: number;
   timestamp_s: number;
   /**
-   * Colour of four channels: sRGB, not multiplied by coverage, which is the fourth, 255 for all of a pixel. null: none
-   * is seen.
+   * Colour of four channels: sRGB, not multiplied by coverage, which is the fourth, 255 for all of a pixel.
+   *
+   * null: nothing is seen of it.
    */
   virtual: LayerPatch | null;
   /** Colour of three channels: by what real surface is multiplied, times 128. null: real surface stays as it is. */
@@ -360,6 +372,8 @@ export interface Layer {
   plan: Plan;
   /** What was wrong with this frame's input, one line each. */
   notes: Array<string>;
+  /** From when the frame had arrived until the device began with it: unread, decoded, waiting for its turn. */
+  waited_ms: number;
 }
 
 /** One of the lights that the room's light is made of, besides an even sky. */

@@ -1,0 +1,52 @@
+"""H.264 pictures to RGB, through PyAV (FFmpeg) where it is installed; it has been checked by protocol.h264."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.codec import ProtocolError
+
+IS_POSSIBLE = find_spec("av") is not None
+"""Whether PyAV is installed."""
+OPTIONS = {"flags": "low_delay", "err_detect": "explode"}
+"""Each picture comes out at once; a damaged one is an error, not an invention."""
+
+
+class VideoDecoder:
+    """Of one stream; used by one thread."""
+
+    def __init__(self) -> None:
+        """Raises ImportError without PyAV."""
+        import av
+        from av.video.reformatter import ColorRange, Colorspace
+
+        self._av = av
+        self._decoder = av.CodecContext.create("h264", "r")
+        self._decoder.options = dict(OPTIONS)
+        self._decoder.thread_count = 1
+        self._unsaid = {"src_colorspace": Colorspace.ITU601, "src_color_range": ColorRange.JPEG}
+        self._matrices = {1: Colorspace.ITU709, 7: Colorspace.SMPTE240M}
+        self._limited = ColorRange.MPEG
+
+    def decode(self, data: bytes) -> NDArray[np.uint8]:
+        """One picture -> [h, w, 3] sRGB. Raises ProtocolError; then the next one must be a key picture."""
+        try:
+            pictures = self._decoder.decode(self._av.Packet(data))
+        except self._av.FFmpegError as error:
+            raise ProtocolError(f"color.data cannot be decoded as h264: {error.strerror}") from error
+        if len(pictures) != 1 or pictures[0].format.name not in ("yuv420p", "yuvj420p"):
+            raise ProtocolError("color.data cannot be decoded as h264: it is not one picture of 4:2:0")
+        return np.asarray(pictures[0].to_ndarray(format="rgb24", **self._color_of(pictures[0])), np.uint8)
+
+    def _color_of(self, picture: Any) -> dict[str, Any]:
+        """Matrix and range as the stream says them; what it does not say is as in JPEG."""
+        said = dict(self._unsaid)
+        if picture.colorspace in self._matrices:
+            said["src_colorspace"] = self._matrices[picture.colorspace]
+        if picture.color_range == self._limited:
+            said["src_color_range"] = self._limited
+        return said

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ import pytest
 from client.web.build import FOLDER, build, install, npm
 from protocol.codec import decode_client
 from protocol.frames import CameraModel
-from protocol.images import decode_depth
+from protocol.images import decode_depth, encode_depth
 from protocol.limits import SUBPROTOCOL
+from protocol.messages import DepthCodec
 from tests.protocol.golden import FOLDER as GOLDEN
 from tests.protocol.golden import depth_ramp
 
@@ -81,6 +83,12 @@ def test_typescript_tests_pass_and_python_reads_what_a_browser_writes(
     written = tmp_path / "frame.msgpack"
     monkeypatch.setenv("PROBELESS_GOLDEN", str(GOLDEN))
     monkeypatch.setenv("PROBELESS_BROWSER_FRAME", str(written))
+    depths = tmp_path / "depths"
+    depths.mkdir()
+    for codec in get_args(DepthCodec):
+        for rows in (7, 8):
+            (depths / f"{codec}_{rows}").write_bytes(encode_depth(depth_ramp()[:rows], codec).data)
+    monkeypatch.setenv("PROBELESS_PYTHON_DEPTHS", str(depths))
     _run("test", folder=sources)
     frame = decode_client(written.read_bytes())
     height, width = depth_ramp().shape

@@ -1,5 +1,6 @@
 // Depth as the wire's `zdelta` (protocol/README.md): a browser writes and reads it with nothing but what it has.
 
+import { unrankDepth } from "./depth_ranks";
 import type { DepthImage } from "./protocol";
 
 /** Low bytes of the zigzagged row deltas, row-major, then their high bytes. */
@@ -31,21 +32,25 @@ export async function encodeDepth(depth: Uint16Array, width: number): Promise<De
 }
 
 export async function decodeDepth(image: DepthImage): Promise<Uint16Array<ArrayBuffer>> {
-  const bytes = await unpacked(image);
-  if (bytes.length !== 2 * image.width * image.height) throw new Error("depth is not of the size it declares");
-  return image.codec === "raw" ? new Uint16Array(bytes.slice().buffer) : unfilterDepth(bytes, image.width);
+  const { width, height } = image;
+  const codec: string = image.codec; // a recording may be of a later version
+  const bytes = await unpacked(codec, image.data);
+  if (codec === "zstd-ranks") return unrankDepth(bytes, width, height);
+  if (bytes.length !== 2 * width * height) throw new Error("depth is not of the size it declares");
+  return codec === "raw" ? new Uint16Array(bytes.slice().buffer) : unfilterDepth(bytes, width);
 }
 
-async function unpacked({ codec, data }: DepthImage): Promise<Uint8Array> {
+async function unpacked(codec: string, data: Uint8Array): Promise<Uint8Array> {
   switch (codec) {
     case "raw":
       return data;
     case "zdelta":
       return pipe(new Uint8Array(data), new DecompressionStream("deflate-raw"));
-    case "zstd-delta": // no browser has Zstandard for pages
+    case "zstd-delta":
+    case "zstd-ranks": // no browser has Zstandard for pages
       return (await import("fzstd")).decompress(data);
     default:
-      throw new Error(`depth codec ${String(codec)} is not read here`);
+      throw new Error(`depth codec ${codec} is not read here`);
   }
 }
 

@@ -6,8 +6,9 @@ import { join } from "node:path";
 import { test } from "node:test";
 import { decode } from "@msgpack/msgpack";
 import { decodeDepth, encodeDepth, filterDepth, unfilterDepth } from "../src/depth";
+import { unrankDepth } from "../src/depth_ranks";
 import { decodeServer, encode } from "../src/messages";
-import type { ClientMessage, Frame } from "../src/protocol";
+import type { ClientMessage, DepthImage, Frame } from "../src/protocol";
 
 const folder = process.env["PROBELESS_GOLDEN"] ?? join(import.meta.dirname, "..", "..", "..", "tests", "golden");
 
@@ -61,6 +62,34 @@ test("depth survives, whatever it is", async () => {
     assert.deepEqual(unfilterDepth(filterDepth(noise, width), width), noise);
     assert.deepEqual(await decodeDepth(await encodeDepth(noise, width)), noise);
   }
+});
+
+const written = process.env["PROBELESS_PYTHON_DEPTHS"];
+
+test("every codec of depth that Python writes is read bit for bit", { skip: written === undefined }, async () => {
+  const files = readdirSync(written!);
+  assert.ok(files.length >= 6);
+  for (const file of files) {
+    const [codec, rows] = file.split("_") as [DepthImage["codec"], string];
+    const image = { width: WIDTH, height: Number(rows), codec, data: new Uint8Array(readFileSync(join(written!, file))) };
+    assert.deepEqual(await decodeDepth(image), ramp.subarray(0, WIDTH * image.height).slice(), file);
+    await assert.rejects(decodeDepth({ ...image, height: image.height + 2 }), file);
+    await assert.rejects(decodeDepth({ ...image, data: image.data.subarray(0, -1) }), file);
+  }
+});
+
+test("ranks that are no picture are refused", () => {
+  const picture = (values: number, escapes: number, ...rest: number[]): Uint8Array => {
+    const counts = new Uint32Array([values, escapes]);
+    return new Uint8Array([...new Uint8Array(counts.buffer), ...rest]);
+  };
+  assert.deepEqual(unrankDepth(picture(2, 0, 0, 5, 0, 1, 0x20, 0), 2, 2), new Uint16Array([0, 0, 261, 261]));
+  assert.throws(() => unrankDepth(new Uint8Array(7), 2, 2));
+  assert.throws(() => unrankDepth(picture(2, 0, 0, 5, 0, 0, 0x20), 2, 2), /size/);
+  assert.throws(() => unrankDepth(picture(2 ** 32 - 1, 2 ** 32 - 1, 0, 5, 0, 0, 0x20, 0), 2, 2), /size/);
+  assert.throws(() => unrankDepth(picture(2, 0, 0, 5, 0, 0, 0x40, 0), 2, 2), /does not hold/);
+  assert.throws(() => unrankDepth(picture(2, 0, 0, 5, 0, 0, 0x10, 0), 2, 2), /does not hold/);
+  assert.throws(() => unrankDepth(picture(2, 1, 0, 5, 0, 0, 0, 0, 0, 0), 2, 2), /size/);
 });
 
 test("a frame as a browser writes it", async () => {

@@ -115,8 +115,8 @@ class Scheduler:
     def _charge(self, share: Share, spent_s: float) -> None:
         share.had_s += spent_s
         share.frames += 1
-        if share.frames <= 2 or share.cost_s is None:
-            share.cost_s = spent_s  # the second takes the place of the first
-        else:
+        if share.frames == 2:
+            share.cost_s = spent_s  # the first foretells nothing
+        elif share.cost_s is not None:
             share.cost_s += _RATE * (spent_s - share.cost_s)
         share.last_s = self._clock()

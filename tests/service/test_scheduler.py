@@ -95,6 +95,7 @@ def test_the_period_foretells_what_sessions_get() -> None:
 def test_first_frames_in_which_kernels_are_loaded_foretell_nothing() -> None:
     device = Device({"a": 2.0, "b": 2.0})
     device.serve(4.0)
+    assert device.scheduler.period_s(newcomers=1) == 0.0
     device.costs |= {"a": 0.1, "b": 0.1}
     device.serve(0.2)
     assert device.scheduler.period_s() == pytest.approx(0.2)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.stages.layer import DEPTH_SCALE_M, NEUTRAL, NOTHING, Layer, LayerPart, compose_layer
 from tests.kernels.test_composite import (
@@ -27,6 +28,7 @@ from tests.kernels.test_composite import (
     plane,
     samples,
 )
+from tests.kernels.test_lanes import Narrow, Wide
 from tests.reference import composite as twin
 
 CAMERA_FROM_VOLUME = np.linalg.inv(VOLUME_FROM_CAMERA)
@@ -67,8 +69,10 @@ def hard_scene() -> tuple[Codes, tuple[Any, ...], Floats]:
     return shown, (radiance, real, virtual, occluded, ratio), inverse_depths
 
 
+@pytest.mark.parametrize("kind", [Narrow, Wide])
 @pytest.mark.parametrize("is_smooth", [True, False])
-def test_layer_is_the_twins(engine: Engine, is_smooth: bool) -> None:
+def test_layer_is_the_twins(device: Device, is_smooth: bool, kind: type[Engine]) -> None:
+    engine = kind(device)
     _, (radiance, real, *virtual), fine = hard_scene()
     fine = fine if is_smooth else None
     found = layer_of(engine, radiance, real, *virtual, inverse_depths=fine)
@@ -93,6 +97,7 @@ def test_layer_is_the_twins(engine: Engine, is_smooth: bool) -> None:
     assert np.abs(got_real[inside].astype(int) - real_depths[inside]).max() <= 1
     assert (factors == 255).any()
     assert 0 < inside.mean() < 1
+    engine.close()
 
 
 def test_parts_are_no_larger_than_what_they_hold(engine: Engine) -> None:

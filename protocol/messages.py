@@ -428,6 +428,8 @@ class Light(Message, frozen=True, kw_only=True, tag="light"):
     exposure: float = 1.0
     """Of this frame relative to the session's first. All radiance here is in units of this frame's picture: over
     `exposure` it is in those of the first one's, which a room under steady light keeps."""
+    up: Vector3 | None = None
+    """World, unit: along it objects stand, as whoever opened the room asked."""
     condition: float | None
     """Condition number of the unregularised normal equations; null when infinite."""
     valid: bool

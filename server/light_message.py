@@ -52,6 +52,7 @@ def light_message(
         ),
         lamps=tuple(_lamp(lamp, exposure) for lamp in lamps),
         exposure=exposure,
+        up=_rgb(webxr_from_world[1]),
         condition=estimate.condition if math.isfinite(estimate.condition) else None,
         valid=estimate.valid,
     )

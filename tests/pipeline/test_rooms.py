@@ -122,14 +122,18 @@ def test_each_client_is_told_the_light_in_its_own_world(device: Device) -> None:
     hello = Hello(client="test", camera=corners.CAMERA, room="corner", room_from_world=said(inverse_rigid(ELSEWHERE)))
     first = Pipeline(device, corners.CAMERA, corners.WISHES, room)
     second = Pipeline(device, corners.CAMERA, corners.WISHES, room, hello)
+    ups = [None, None]
     for index in range(12):
         frame = corner_frame(index % 2, index, LIGHT)
         if index % 2:
             frame = RgbdFrame(index, index / 30, frame.color, frame.depth, ELSEWHERE @ frame.world_from_camera)
         result = (first, second)[index % 2].process(frame)
+        ups[index % 2] = result.light.up
     for client in (first, second):
         client.close()
     room.close()
+    assert ups[0] == pytest.approx(corners.WISHES.up)
+    assert ups[1] == pytest.approx(ELSEWHERE[:3, :3] @ ups[0])
     np.testing.assert_allclose(result.world_from_camera, frame.world_from_camera, atol=1e-9)
     assert degrees_between(result.light.dominant_direction, ELSEWHERE[:3, :3] @ TOWARDS) < 5
     assert result.light.valid

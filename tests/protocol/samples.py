@@ -184,6 +184,7 @@ SERVER: dict[str, ServerMessage] = {
         dominant_direction=(0.0, 0.6, -0.8),
         dominant_intensity=1.25,
         exposure=1.5,
+        up=(0.0, -0.6, 0.8),
         condition=12.5,
         valid=False,
     ),

@@ -28,7 +28,7 @@ export interface Screen {
 export class Capturing implements Sink {
   private source: Source | null = null;
   private up: Vector3 = Y_UP;
-  private readonly seen = new Map<number, Omit<Seen, "world_from_camera"> & Pick<Shot, "world_from_camera">>();
+  private readonly seen = new Map<number, Pick<Seen, "camera" | "depth"> & Pick<Shot, "world_from_camera">>();
   private readonly shots = new Map<number, Shot>();
 
   constructor(
@@ -65,7 +65,12 @@ export class Capturing implements Sink {
   seenIn(frame: number, answered: readonly number[] | null): Seen | null {
     const seen = this.seen.get(frame);
     const world_from_camera = seen?.world_from_camera ?? answered;
-    return seen === undefined || world_from_camera === null ? null : { ...seen, world_from_camera };
+    return seen === undefined || world_from_camera === null ? null : { ...seen, up: this.up, world_from_camera };
+  }
+
+  /** In a room that somebody else has opened, what is up there; in the axes of this session. */
+  noteUp(up: Vector3): void {
+    this.up = up;
   }
 
   async stop(): Promise<void> {
@@ -82,7 +87,7 @@ export class Capturing implements Sink {
     const depth = "packed" in frame ? (frame.packed.depth ?? null) : (frame.depth?.slice() ?? null); // the frame's own goes to the worker
     const number = this.remote.send(frame);
     keep(this.shots, number, { camera, world_from_camera, timestamp_s, captured_ms });
-    if (depth !== null) keep(this.seen, number, { camera, world_from_camera, up: this.up, depth });
+    if (depth !== null) keep(this.seen, number, { camera, world_from_camera, depth });
   }
 
   say(text: string): void {

@@ -83,6 +83,7 @@ function receiveServer(message: ServerMessage): void {
   }
   if (message.type === "welcome" && capturing !== null && ++welcomes > 1 && !message.resumed) beginAgain();
   if (message.type === "composite" || message.type === "layer") told = "";
+  if (message.type === "light" && message.up) capturing?.noteUp(message.up);
   if (message.type === "light" && lightMode !== null) receiveLight(message);
 }
 

@@ -427,6 +427,8 @@ export interface Light {
    * `exposure` it is in those of the first one's, which a room under steady light keeps.
    */
   exposure: number;
+  /** World, unit: along it objects stand, as whoever opened the room asked. */
+  up: [number, number, number] | null;
   /** Condition number of the unregularised normal equations; null when infinite. */
   condition: number | null;
   valid: boolean;

@@ -121,7 +121,7 @@ class Rendering:
         """What is wanted, and the plan that says what was left out, `left_out` of the spine with it.
 
         rest: where a view that stands still holds what was made of it; None: everything is to be made. What it learns
-        does not depend on who watches.
+        does not depend on who watches: a session that is answered by lights alone rests once its light has settled.
         """
         is_held = rest is not None and rest.omission is not None
         old: Picture | None = None

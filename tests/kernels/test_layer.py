@@ -63,7 +63,8 @@ def hard_scene() -> tuple[Codes, tuple[Any, ...], Floats]:
     real = buffer(*plane(1.0), random.random((HEIGHT, WIDTH)) < 0.9)
     ratio = samples(4, random.uniform(0.0, 2.2, (HEIGHT // 4, WIDTH // 4, 3)))
     ratio.values[: len(ratio.values) // 3, :, :3] = 1  # a part of the picture is not touched
-    ratio.values[-4:, -6:, :3] = 2.5  # and one is brighter than there are codes for
+    ratio.values[-4:, -6:, :3] = 2.5  # one is brighter than there are codes for
+    ratio.values[-4:, :4, :3] = 0.004  # and one is as dark as below things that stand on it
     occluded = samples(2, random.uniform(0, 0.2, (HEIGHT // 2, WIDTH // 2, 3)))
     occluded.values[..., 3] = virtual.positions[1::2, 1::2, 3]
     return shown, (radiance, real, virtual, occluded, ratio), inverse_depths

@@ -136,9 +136,9 @@ def test_watchers_see_no_break(server, proxy: Proxy) -> None:
     second.hang_up()
 
 
-async def streamed(url: str, proxy: Proxy, frames: int, cuts: set[int], *, lossless: bool) -> tuple[list, int]:
+async def streamed(url: str, proxy: Proxy, frames: int, cuts: set[int], wishes: Wishes) -> tuple[list, int]:
     client = await StreamClient.connect(url)
-    await client.hello(CAMERA, Wishes(lossless=lossless))
+    await client.hello(CAMERA, wishes)
     taken: list = []
 
     async def read() -> None:
@@ -158,13 +158,14 @@ async def streamed(url: str, proxy: Proxy, frames: int, cuts: set[int], *, lossl
     return taken, client.reconnected
 
 
+@pytest.mark.parametrize("answer", ["picture", "layer", "light"])
 @pytest.mark.parametrize("lossless", [False, True])
-def test_the_client_comes_back_by_itself(proxy: Proxy, lab: Lab, lossless: bool) -> None:
+def test_the_client_comes_back_by_itself(proxy: Proxy, lab: Lab, lossless: bool, answer: str) -> None:
     cuts = {3, 7, 12}
-    taken, reconnected = asyncio.run(streamed(proxy.url, proxy, 20, cuts, lossless=lossless))
+    taken, reconnected = asyncio.run(streamed(proxy.url, proxy, 20, cuts, Wishes(lossless=lossless, answer=answer)))
     assert reconnected == 3
     assert sorted(placed(lab)) == sorted(f"object-{index}" for index in cuts)
-    numbers = [a.composite.frame if isinstance(a, Answer) else a.frame for a in taken]
+    numbers = [a.light.frame if isinstance(a, Answer) else a.frame for a in taken]
     assert sorted(numbers) == list(range(20))  # each frame has one answer, or is told to be lost
     lost = [a for a in taken if isinstance(a, Dropped)]
     if lossless:

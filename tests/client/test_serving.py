@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from client.laptop.errors import OptionError
-from client.serving import ServeOptions, certificate_of, door_of, limits_of
+from client.serving import ServeOptions, certificate_of, door_of, limits_of, objects_folder
 
 
 def test_a_token_is_made_unless_one_is_given() -> None:
@@ -41,3 +43,12 @@ def test_limits() -> None:
 
 def test_no_tls_unless_asked_for() -> None:
     assert certificate_of(ServeOptions(host="h")) is None
+
+
+def test_a_folder_of_objects_must_be_one(tmp_path: Path) -> None:
+    assert objects_folder(None) is None
+    assert objects_folder(tmp_path) == tmp_path
+    (tmp_path / "sofa.glb").touch()
+    for wrong in ("sofa.glb", "gone"):
+        with pytest.raises(OptionError, match=r"--objects .*: no such folder; give one with \.glb"):
+            objects_folder(tmp_path / wrong)

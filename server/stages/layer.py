@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -66,10 +67,11 @@ def compose_layer(engine: Engine, mixture: Mixture) -> Layer:
 def _cropped(
     color: NDArray[np.uint8], depth: NDArray[np.uint16], counts: NDArray[np.bool_], margin: int = 0
 ) -> LayerPart | None:
-    """The box of the pixels that count, and `margin` pixels around it; None where there are none."""
+    """The box of the pixels that count, and `margin` pixels around them; None where there are none."""
     rows, cols = (np.flatnonzero(counts.any(axis=axis)) for axis in (1, 0))
     if not rows.size:
         return None
     top, left = max(rows[0] - margin, 0), max(cols[0] - margin, 0)
     box = slice(top, rows[-1] + 1 + margin), slice(left, cols[-1] + 1 + margin)
-    return LayerPart(int(left), int(top), np.ascontiguousarray(color[box]), np.ascontiguousarray(depth[box]))
+    near = cv2.dilate(counts[box].astype(np.uint8), np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)) > 0
+    return LayerPart(int(left), int(top), np.ascontiguousarray(color[box]), np.where(near, depth[box], np.uint16(0)))

@@ -20,6 +20,7 @@ from client.laptop.stream import StreamSummary, stream
 from client.layers import NEUTRAL, decode_layer, put_over
 from protocol.images import encode_depth
 from protocol.messages import Bye, Composite, Dropped, Layer, Light, Wishes
+from server.layer_message import STEPS_PER_M
 from server.opencl.device import Device
 from server.serve import start_in_background
 from server.service import Service
@@ -56,7 +57,10 @@ def test_frame_is_answered_by_its_light_and_then_its_layer(dial) -> None:
     assert (layer.virtual.x, layer.virtual.y, layer.virtual.color.codec) == (3, 2, "png")
     assert np.array_equal(np.reshape(layer.world_from_camera, (4, 4)), POSE)
     read, sent = decode_layer(layer, CAMERA).virtual, said(3)
-    np.testing.assert_allclose(read.depth_m, sent.depth * layer.depth_scale_m, rtol=1e-6)
+    depth_m = sent.depth * layer.depth_scale_m
+    half_a_unit = layer.depth_scale_m / 2 / depth_m**2
+    assert (np.abs(1 / read.depth_m - 1 / depth_m) <= 0.5 / STEPS_PER_M + half_a_unit + 1e-6).all()
+    assert len(np.unique(np.rint(STEPS_PER_M / read.depth_m))) == len(np.unique(read.depth_m))
     np.testing.assert_allclose(read.values[..., 3], sent.color[..., 3] / 255, rtol=1e-6)
 
 

@@ -38,7 +38,7 @@
   device.keep = () => {
     if (device.keeps === 0) return;
     const { at, count, seen } = device;
-    device.displayed.push({ at, count, seen, caption: document.getElementById("picture-caption").textContent });
+    device.displayed.push({ at, count, seen, time_ms: performance.now(), caption: document.getElementById("picture-caption").textContent });
     if (device.displayed.length > device.keeps) device.displayed.shift();
   };
 

@@ -38,6 +38,8 @@ class Displayed:
     """[h, w, 3] sRGB on the display's framebuffer."""
     layer_frame: int | None
     """Of which frame the virtual things were, as the page says."""
+    time_ms: float = 0.0
+    """On the page's clock."""
 
     @property
     def picture_age(self) -> int:
@@ -56,7 +58,9 @@ def display(page: Page, count: int) -> list[Displayed]:
 def _read(each: dict[str, Any]) -> Displayed:
     rgba = np.frombuffer(base64.b64decode(each["seen"]), np.uint8).reshape(each["height"], each["width"], 4)
     frame = re.match(r"Frame (\d+)", each["caption"])
-    return Displayed(each["at"], each["count"], rgba[::-1, :, :3], None if frame is None else int(frame[1]))
+    return Displayed(
+        each["at"], each["count"], rgba[::-1, :, :3], None if frame is None else int(frame[1]), each["time_ms"]
+    )
 
 
 def centroid_px(mask: NDArray[np.bool_]) -> NDArray[np.float64]:

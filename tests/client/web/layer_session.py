@@ -21,6 +21,10 @@ from server.serve import BackgroundServer, start_in_background
 from server.service import Service
 from tests.client.web.red_ball import TurningTable, red_ball
 
+IS_RED = """(pixels) => pixels?.some((value, i) => {
+  return i % 4 === 0 && value > 90 && value > 3 * pixels[i + 1] && value > 3 * pixels[i + 2];
+})"""
+"""That something red is on the display."""
 TOUCHED = (0.68, 0.62)
 """Of the picture's width and height as the camera looks straight ahead: the table, with nothing around."""
 
@@ -77,7 +81,12 @@ def place_ball(page: Page, source: TurningTable, seen: Seen) -> None:
     page.locator("#place").click()
     page.touchscreen.tap(*_on_screen(page, pixel, (camera.width, camera.height)))
     assert seen.is_placed.wait(30), page.locator("#object-said").text_content()
-    page.wait_for_function("() => device.seen !== undefined")
+
+
+def show_ball(page: Page, source: TurningTable) -> None:
+    """Wait for it on the display, then let the camera turn."""
+    page.wait_for_function(f"() => ({IS_RED})(device.seen)")
+    page.evaluate("fps => { device.fps = fps; }", source.steps_per_s)
 
 
 def _seen_at(source: TurningTable, frame: RgbdFrame, point: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from server.opencl.device import Device
 from tests.client.web.conftest import PICTURES, OpenPage
 from tests.client.web.displayed import display
 from tests.client.web.layer_figures import errors_of
-from tests.client.web.layer_session import Seen, begin, foot_of, place_ball, watched_server
+from tests.client.web.layer_session import Seen, begin, foot_of, place_ball, show_ball, watched_server
 from tests.client.web.red_ball import TurningTable, is_red, silhouette
 from tests.client.web.sequence import of_device
 from tests.service.proxy import impaired
@@ -36,8 +36,7 @@ def test_a_ball_placed_by_touch_stays_where_it_stands_while_the_camera_turns(
         page = open_page(link.url, of_device(source.camera, frames) | {"fps": 1e-6}, size=(600, 800))
         begin(page, "gr15fast")
         place_ball(page, source, seen)
-        page.wait_for_function(f"() => ({IS_RED})(device.seen)")
-        page.evaluate("fps => { device.fps = fps; }", source.steps_per_s)
+        show_ball(page, source)
         page.wait_for_timeout(1500)
         shown = display(page, 30)
         keep_picture(page, "layer_mode_served")
@@ -51,8 +50,3 @@ def test_a_ball_placed_by_touch_stays_where_it_stands_while_the_camera_turns(
     assert errors.still_px[:, 0].mean() > 3
     assert (errors.shares < 0.25).all()
     assert max(each.picture_age for each in shown) <= 2
-
-
-IS_RED = """(pixels) => pixels?.some((value, i) => {
-  return i % 4 === 0 && value > 90 && value > 3 * pixels[i + 1] && value > 3 * pixels[i + 2];
-})"""

@@ -16,6 +16,8 @@ export interface Choice {
   budget_ms: number;
   /** Who draws the objects: the server into the picture, or to go over the newest one; or this device in the light that the server finds. */
   answer: NonNullable<Wishes["answer"]>;
+  /** How the camera's colour goes over the wire. */
+  color: "jpeg" | "h264";
   /** Of a recorded sequence. */
   file: File | null;
   loops: boolean;
@@ -29,7 +31,7 @@ export const KEEP_S = 30;
 
 /** Fill the form with what the address says: `?room=kitchen&key=...&source=xr`. */
 export function fill(form: HTMLFormElement, page: URL): void {
-  for (const name of ["room", "key", "marker", "side", "view", "preset", "budget", "answer", "repeat"]) {
+  for (const name of ["room", "key", "marker", "side", "view", "preset", "budget", "answer", "color", "repeat"]) {
     const value = page.searchParams.get(name);
     const field = form.elements.namedItem(name);
     if (value !== null && (field instanceof HTMLInputElement || field instanceof HTMLSelectElement)) field.value = value;
@@ -53,6 +55,7 @@ export function read(form: HTMLFormElement): Choice {
     budget_ms: Number(text("budget")),
     answer: ANSWERS[text("source")]?.find((each) => each === text("answer")) ?? "picture",
     file: file instanceof File && file.name !== "" ? file : null,
+    color: text("color") === "h264" ? "h264" : "jpeg",
     loops: text("repeat") !== "once",
   };
 }

@@ -1,15 +1,17 @@
 // The worker: the socket, and all that is packed and unpacked, away from the page's own thread.
 
-import { encodeFrame } from "./capture/encode";
+import { FrameEncoder } from "./capture/encode";
 import { reasonOf } from "./capture/source";
 import { CaptureStream, type Times } from "./capture/stream";
 import { Connection } from "./connection";
 import { decodeLayer, transferOf } from "./local/layer_parts";
 import type { Composite, Layer, LayerPatch, ServerMessage } from "./protocol";
+import type { Setup } from "./session";
 import type { FromWorker, News, ToWorker } from "./worker_messages";
 
 let watching: Connection | null = null;
 let stream: CaptureStream | null = null;
+let encoder: FrameEncoder | null = null;
 /** An answer whose pictures are to be decoded. */
 let waiting: { answer: Composite | Layer; times: Times | null } | null = null;
 let isDecoding = false;
@@ -33,13 +35,7 @@ self.onmessage = ({ data }: MessageEvent<ToWorker>): void => {
       return;
     case "capture":
       begin(data.run);
-      stream = new CaptureStream(data.url, data.setup, encodeFrame, {
-        onWanted: () => post({ kind: "wanted" }),
-        onState: (state) => post({ kind: "state", state }),
-        onMessage: tell,
-        say,
-      });
-      stream.start();
+      beginStream(data.url, data.setup, new FrameEncoder(data.video, say));
       return;
     case "frame":
       stream?.offer(data.frame).catch((error: unknown) => say(`a frame cannot be packed: ${reasonOf(error)}`));
@@ -64,10 +60,25 @@ function begin(next: number): void {
   run = next;
 }
 
+function beginStream(url: string, setup: Setup, frames: FrameEncoder): void {
+  encoder = frames;
+  stream = new CaptureStream(url, setup, (frame) => frames.encode(frame), {
+    onWanted: () => post({ kind: "wanted" }),
+    onState: (state) => post({ kind: "state", state }),
+    onMessage: (message, times) => {
+      tell(message, times); // a welcome clears the notes
+      void frames.hear(message);
+    },
+    say,
+  });
+  stream.start();
+}
+
 function stop(reason: string): void {
   watching?.stop(reason);
   stream?.stop(reason);
-  watching = stream = waiting = null;
+  encoder?.close();
+  watching = stream = encoder = waiting = null;
 }
 
 function tell(message: ServerMessage, times: Times | null): void {

@@ -9,7 +9,8 @@ import type { Request, Setup } from "./session";
 export type ToWorker =
   /** `run`: of watching or capturing; what is left of an earlier one is not heard. */
   | { kind: "watch"; run: number; url: string; watch: Watch }
-  | { kind: "capture"; run: number; url: string; setup: Setup }
+  /** `video`: colour is to go as H.264, where that can be. */
+  | { kind: "capture"; run: number; url: string; setup: Setup; video: boolean }
   | { kind: "frame"; frame: Numbered }
   | { kind: "request"; request: Request }
   | { kind: "retry" }

@@ -52,3 +52,12 @@ def test_a_folder_of_objects_must_be_one(tmp_path: Path) -> None:
     for wrong in ("sofa.glb", "gone"):
         with pytest.raises(OptionError, match=r"--objects .*: no such folder; give one with \.glb"):
             objects_folder(tmp_path / wrong)
+
+
+def test_limits_of_rooms_on_disk() -> None:
+    usual = limits_of(ServeOptions("localhost")).kept
+    assert (usual.space_bytes, usual.age_s) == (16 << 30, 180 * 86400)
+    other = limits_of(ServeOptions("localhost", data_gib=0.5, data_days=2)).kept
+    assert (other.space_bytes, other.age_s) == (1 << 29, 2 * 86400)
+    none = limits_of(ServeOptions("localhost", data_gib=0, data_days=0)).kept
+    assert (none.space_bytes, none.age_s) == (None, None)

@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+import time
 from pathlib import Path
 
 import httpx
@@ -33,6 +34,22 @@ def test_health_counts_sessions(server, dial) -> None:
     assert response.json() == {"ready": True, "device": "a fake device", "sessions": 0}
     dial().greet()
     assert get(server, "/healthz").json()["sessions"] == 1
+
+
+def test_health_and_metrics_say_what_is_kept_of_rooms(start_server, tmp_path: Path) -> None:
+    folder = tmp_path / "rooms" / "study-1" / "0"
+    folder.mkdir(parents=True)
+    (folder / "save").write_bytes(bytes(1000))
+    server = start_server(data=tmp_path / "rooms")
+    end_s = time.monotonic() + PATIENCE_S
+    while (state := get(server, "/healthz").json())["kept_rooms"] == 0:
+        assert time.monotonic() < end_s
+        time.sleep(0.1)
+    assert (state["kept_rooms"], state["kept_bytes"]) == (1, 1000)
+    found = rows(server)
+    told = {name: found[f"probeless_{name}",] for name in ("kept_rooms", "kept_bytes", "kept_removed", "unsaved_rooms")}
+    assert told == {"kept_rooms": 1, "kept_bytes": 1000, "kept_removed": 0, "unsaved_rooms": 0}
+    assert found["probeless_rooms",] == 0
 
 
 def test_clients_wait_for_the_warm_up(lab) -> None:

@@ -22,7 +22,10 @@ from protocol.picture_headers import png_size
 NEUTRAL = 128
 """Code of a ratio of 1."""
 JUMP = 0.05
-"""Neighbours that are farther apart than this share of their depth are of two surfaces."""
+"""Neighbours that are farther apart than this share of their depth are of two surfaces,"""
+ALIKE_PER_M = 0.004
+"""unless their inverse depths differ by no more than this: they are so far away that both move alike. It is more than a
+step in which servers send depth."""
 NEAREST_M = 0.01
 """Before the camera; what comes nearer is not drawn."""
 NOWHERE = np.float32(-1e6)
@@ -177,7 +180,7 @@ def _corner_depths(depth_m: Floats) -> Floats:
     padded = np.pad(depth_m, 1)
     z = np.stack([padded[k >> 1 : (k >> 1) + height + 1, k & 1 : (k & 1) + width + 1] for k in range(4)])
     near, far = np.minimum(z[:, None], z[None]), np.maximum(z[:, None], z[None])
-    goes_on = (near > 0) & (far - near <= JUMP * near)
+    goes_on = (near > 0) & (far - near <= near * np.maximum(JUMP, ALIKE_PER_M * far))
     for _ in range(2):  # from one to the next and the one after that, up to all four
         goes_on = np.stack([(goes_on[k][:, None] & goes_on).any(axis=0) for k in range(4)])
     inverse = np.divide(1, z, out=np.zeros_like(z), where=z > 0)

@@ -132,6 +132,21 @@ def test_the_nearer_of_two_surfaces_is_seen() -> None:
     assert set(apart[75:93].ravel()) == {100}
 
 
+def test_far_surface_is_not_torn_between_the_steps_of_its_depth() -> None:
+    """A floor 15 to 45 m away, in steps of 1 / 400 of its inverse: more than JUMP each, from 20 m on."""
+    inverse = np.rint(400 * np.broadcast_to(np.linspace(1 / 45, 1 / 15, 30)[:, None], (30, 40))) / 400
+    layer = read(virtual=patch(60, 40, full(255), 1 / inverse))
+    for up_m in (-2.0, 2.0):  # so far that gaps between steps would be half a pixel wide
+        step = np.eye(4)
+        step[1, 3] = up_m
+        seen = covered(layer, POSE @ step)
+        rows, columns = np.nonzero(seen)
+        assert seen.sum() > 600
+        for row in np.unique(rows):  # no pixel is missing between the first and the last
+            assert seen[row, columns[rows == row].min() : columns[rows == row].max() + 1].all()
+        assert (np.diff(np.unique(rows)) == 1).all()
+
+
 def test_what_is_behind_the_camera_is_not_seen() -> None:
     layer = read(virtual=patch(60, 40, full(255), 0.5))
     assert covered(layer, moved(z_m=0.45)).mean() > 0.9  # 5 cm before the camera

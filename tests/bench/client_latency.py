@@ -18,6 +18,7 @@ from client.client import Access
 from client.laptop.source import Source
 from client.laptop.stream import Sending, StreamSummary, stream
 from client.laptop.stream_figures import STAGES
+from client.video import IS_POSSIBLE
 from protocol.colors import ColorReader
 from protocol.frames import RgbdFrame
 from protocol.messages import Frame
@@ -29,7 +30,7 @@ from tests.bench.run import Run
 from tests.bench.service_process import Served, serving
 from tests.service.proxy import impaired
 
-QUICK_FRAMES, FRAMES = 600, 3000
+QUICK_FRAMES, FRAMES = 450, 1800
 WARM_UP_FRAMES = 30
 LOOKED_AT = 5
 """Every how many of the pictures that were sent are compared with the camera's."""
@@ -69,6 +70,8 @@ LINKS = {
     "40 ms and 2 Mbit/s": Link(0.02, 2.0),
 }
 SENDINGS = {"adaptive": Sending(), "fixed": Sending(adapts=False)}
+if IS_POSSIBLE:
+    SENDINGS["adaptive, H.264"] = Sending(video=True)
 
 
 class ThereAndBack:

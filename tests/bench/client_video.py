@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from client.coding import Coding, frame_message
 from client.laptop.source import Source, open_source
-from client.video import IS_POSSIBLE, VideoEncoder, rate_factor
+from client.video import IS_POSSIBLE, VideoEncoder
 from protocol.colors import ColorReader
 from protocol.frames import RgbdFrame
 from tests.bench.client_bandwidth import FPS, kitchen, psnr_db, run_pipeline, turns_deg
 from tests.bench.finished import Part, UnmeasurableError
 from tests.bench.run import Run
 
-QUICK_FRAMES, FRAMES = {"colour": 20, "light": 10}, {"colour": 80, "light": 40}
+QUICK_FRAMES, FRAMES = {"colour": 12, "light": 8}, {"colour": 40, "light": 20}
 SOURCES: dict[str, Callable[[], Source]] = {
     "kitchen": kitchen,
     "synthetic room": lambda: open_source("synthetic:room?frames=160&noise=1"),
@@ -113,4 +113,3 @@ if __name__ == "__main__":
     run = Run(open_device(None), "--quick" in sys.argv, lambda line: print(line, file=sys.stderr))
     for row in video_part(run, Path()).rows:
         print(f"{row.name:60} {row.value:8.3f} {row.unit}")
-    print([(quality, rate_factor(quality)) for quality in (50, 65, 75, 80, 90)])

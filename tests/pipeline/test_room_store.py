@@ -350,8 +350,8 @@ def test_a_save_is_of_one_moment(device: Device, room: Room, store: RoomStore, m
     had = {2: print_of(room)}
     process, sample, came, stop = client._process, client._sample, threading.Event(), threading.Event()
 
-    def noted(frame: RgbdFrame) -> FrameResult:
-        result = process(frame)
+    def noted(*given: Any) -> FrameResult:
+        result = process(*given)
         had[room.reconstruction.volume.frames] = print_of(room)
         return result
 

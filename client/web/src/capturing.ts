@@ -1,5 +1,6 @@
 // A session of this page's own: from the form's button to its end.
 
+import { worldFromCamera } from "./capture/axes";
 import { startCamera } from "./capture/camera_source";
 import { type Shown, startRecorded } from "./capture/recorded_source";
 import { type Captured, type Packed, reasonOf, type Shot, type Sink, type Source, SourceError } from "./capture/source";
@@ -15,6 +16,8 @@ const KEPT = 8;
 export interface CapturingHooks {
   /** Something that the person should know; `isEnd`: the session is over with it. */
   say(text: string, isEnd: boolean): void;
+  /** The picture on the screen is the device's newest, taken from there (row-major). */
+  look(worldFromCamera: readonly number[]): void;
 }
 
 /** Who draws on this device, where anybody does. */
@@ -52,8 +55,20 @@ export class Capturing implements Sink {
   }
 
   private open({ source, file, loops, view_deg }: Choice, stage: Element): Promise<Source> {
-    if (source === "recorded") return startRecorded(file!, loops, this, this.screen?.show ?? null);
-    return source === "xr" ? startXr(stage, this, this.screen?.draw ?? null) : startCamera(view_deg, this);
+    const { hooks, screen } = this;
+    if (source === "camera") return startCamera(view_deg, this);
+    if (source === "xr") {
+      const draw: Draw = (view, ...others) => {
+        hooks.look(worldFromCamera(view.transform.matrix));
+        screen!.draw(view, ...others);
+      };
+      return startXr(stage, this, screen === null ? null : draw);
+    }
+    const show = (shown: Shown): void => {
+      if (shown.world_from_camera !== null) hooks.look(shown.world_from_camera);
+      screen?.show?.(shown);
+    };
+    return startRecorded(file!, loops, this, screen?.show === undefined ? null : show);
   }
 
   /** With which lens and from where a frame was taken, as far as it is not long ago. */

@@ -49,6 +49,7 @@ export class LayerMode {
   /** The newest picture of a source that the page itself displays. */
   readonly show = (shown: Shown): void => {
     this.own ??= new OwnDisplay((own, isNew) => this.display(own, isNew));
+    this.view ??= new LayerView(this.own.gl); // what is wrong with it is told by who shows a picture
     this.own.take(shown);
   };
 

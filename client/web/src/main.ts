@@ -181,7 +181,8 @@ async function capture(choice: Choice): Promise<void> {
   try {
     const light = choice.answer === "light" ? await LightMode.load(() => tools.scene.placed, say) : null;
     const layers = choice.answer === "layer" ? new LayerMode() : null;
-    const next = new Capturing(remote, { say: (text, isEnd) => (isEnd ? void leave(text) : advise(text)) }, layers ?? light);
+    const hooks = { say: (text: string, isEnd: boolean) => (isEnd ? void leave(text) : advise(text)), look: (pose: readonly number[]) => tools.look(pose) };
+    const next = new Capturing(remote, hooks, layers ?? light);
     await next.start(choice, stage, streamUrl(page));
     qualityChanges.begin(choice);
     capturing = next;

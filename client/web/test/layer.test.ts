@@ -5,7 +5,7 @@ import { test } from "node:test";
 import { lensOf, worldFromCamera } from "../src/capture/axes";
 import { type DepthPart, type LayerMesh, meshOf } from "../src/local/layer_mesh";
 import { clipFromCamera, type View, viewOf } from "../src/local/view_matrix";
-import { project } from "../src/objects/picking";
+import { type Measured, project, seenFrom, surfaceAt } from "../src/objects/picking";
 
 const SCALE_M = 0.001;
 
@@ -81,4 +81,24 @@ test("a point of one camera is seen by another where the world says that it is",
     const found = onScreen(clipFromCamera(each, pose), point);
     assert.ok(Math.hypot(found[0]! - expected[0]!, found[1]! - expected[1]!) < 1e-5, `${found} ${expected}`);
   }
+});
+
+test("a finger on the newest picture finds the surface that an older frame has measured", () => {
+  const [pose, now] = [worldFromCamera(FRAME), worldFromCamera(NOW)];
+  const lens = { width: 160, height: 120, fx: 140, fy: 140, cx: 79.5, cy: 59.5 };
+  const metres = (x: number): number => (x >= 90 ? 0.6 : 1.1); // a box before a wall
+  const depth = Uint16Array.from({ length: 160 * 120 }, (_, i) => Math.round(1000 * metres(i % 160)));
+  const measured = { camera: lens, world_from_camera: pose, up: [0, 1, 0], depth } as const;
+  const seen = seenFrom(seenFrom(measured, pose), now) as Measured;
+  for (const [x, y] of [[40, 60], [70, 30], [110, 50], [125, 80]] as const) {
+    const z = metres(x);
+    const place = surfaceAt(measured, { x, y })!;
+    const pixel = project(lens, now, place)!;
+    const found = surfaceAt(seen, pixel)!;
+    const error_m = Math.hypot(found[0] - place[0], found[1] - place[1], found[2] - place[2]);
+    assert.ok(error_m < 0.01 * z, `${x}, ${y}: ${error_m} m`);
+    const unmoved = surfaceAt(measured, pixel);
+    assert.ok(unmoved === null || Math.hypot(unmoved[0] - place[0], unmoved[2] - place[2]) > 0.05);
+  }
+  assert.equal(surfaceAt(seen, { x: 2000, y: 60 }), null);
 });

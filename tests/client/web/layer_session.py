@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -81,6 +82,16 @@ def place_ball(page: Page, source: TurningTable, seen: Seen) -> None:
     page.locator("#place").click()
     page.touchscreen.tap(*_on_screen(page, pixel, (camera.width, camera.height)))
     assert seen.is_placed.wait(30), page.locator("#object-said").text_content()
+
+
+def guide_error_px(page: Page, source: TurningTable, seen: Seen) -> float:
+    """From the middle of what marks the selected ball to where its foot is in the picture on the display."""
+    found = page.evaluate("() => ({ at: device.at, url: document.getElementById('guide').toDataURL('image/png') })")
+    png = np.frombuffer(base64.b64decode(found["url"].partition(",")[2]), np.uint8)
+    blue, _, red, alpha = np.moveaxis(cv2.imdecode(png, cv2.IMREAD_UNCHANGED).astype(int), -1, 0)
+    rows, columns = np.nonzero((alpha > 128) & (red - blue > 80))
+    middle = np.array([columns.mean(), rows.mean()])
+    return float(np.linalg.norm(middle - _seen_at(source, source[found["at"]], np.array(foot_of(seen)))))
 
 
 def show_ball(page: Page, source: TurningTable) -> None:

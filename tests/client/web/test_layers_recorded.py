@@ -104,7 +104,11 @@ def test_a_picture_of_a_lens_that_distorts_is_straightened_under_the_layer(
 
 
 def test_things_stay_where_they_stand_while_a_recorded_camera_turns(
-    serve: Callable[[float], BackgroundServer], received: Received, open_page: OpenPage, tmp_path: Path
+    serve: Callable[[float], BackgroundServer],
+    received: Received,
+    open_page: OpenPage,
+    keep_picture: Callable[[Page, str], None],
+    tmp_path: Path,
 ) -> None:
     there = turning()
     frames = [*there, *there[-2:0:-1]]
@@ -114,3 +118,7 @@ def test_things_stay_where_they_stand_while_a_recorded_camera_turns(
     errors = errors_of(seen, CAMERA, is_ball, lambda frame: is_ball(composite(frame)), frames, received.frames)
     assert errors.still_px[:, 0].mean() > 2
     assert (errors.shares < 0.25).all()
+    page.locator("#latency").scroll_into_view_if_needed()
+    keep_picture(page, "layer_mode_ages")
+    assert float(page.locator("#age-layer-median").inner_text()) > 1e3 * SLOW_S
+    assert int(page.locator("#age-picture").inner_text()) < 30

@@ -13,7 +13,7 @@ from server.opencl.device import Device
 from tests.client.web.conftest import PICTURES, OpenPage
 from tests.client.web.displayed import display
 from tests.client.web.layer_figures import errors_of
-from tests.client.web.layer_session import Seen, begin, foot_of, place_ball, show_ball, watched_server
+from tests.client.web.layer_session import Seen, begin, foot_of, guide_error_px, place_ball, show_ball, watched_server
 from tests.client.web.red_ball import TurningTable, is_red, silhouette
 from tests.client.web.sequence import of_device
 from tests.service.proxy import impaired
@@ -40,6 +40,7 @@ def test_a_ball_placed_by_touch_stays_where_it_stands_while_the_camera_turns(
         page.wait_for_timeout(1500)
         shown = display(page, 30)
         keep_picture(page, "layer_mode_served")
+        guides_px = [guide_error_px(page, source, seen) for _ in range(8)]
         page.close()
     errors = errors_of(
         shown, source.camera, is_red, lambda frame: silhouette(source.camera, frame, foot_of(seen)), frames, seen.frames
@@ -50,3 +51,4 @@ def test_a_ball_placed_by_touch_stays_where_it_stands_while_the_camera_turns(
     assert errors.still_px[:, 0].mean() > 3
     assert (errors.shares < 0.25).all()
     assert max(each.picture_age for each in shown) <= 2
+    assert max(guides_px) < 3  # what marks the ball is around it, and moves with it

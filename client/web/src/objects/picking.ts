@@ -11,8 +11,10 @@ export const Y_UP: Vector3 = [0, 1, 0];
 /** A frame as far as a finger needs it. */
 export interface Seen {
   camera: CameraModel;
-  /** Row-major. */
+  /** Row-major, of the picture on the screen. */
   world_from_camera: readonly number[];
+  /** Of the depth, where that is of another picture. */
+  measured_from?: readonly number[];
   /** Unit, in the world. */
   up: Vector3;
   /** Packed as long as no finger has needed it. */
@@ -29,6 +31,11 @@ export const isMeasured = (seen: Seen): seen is Measured => seen.depth instanceo
 export async function measured(seen: Seen): Promise<Measured> {
   if (!isMeasured(seen)) seen.depth = await decodeDepth(seen.depth as DepthImage);
   return seen as Measured;
+}
+
+/** The same depth, under a picture that was taken from elsewhere. */
+export function seenFrom(seen: Seen, world_from_camera: readonly number[]): Seen {
+  return { ...seen, world_from_camera, measured_from: seen.measured_from ?? seen.world_from_camera };
 }
 
 /** The level axes that a model at yaw 0 stands in, as server/scene/placement.py has them: right, up, front. */
@@ -67,21 +74,38 @@ export function project(lens: Lens, worldFromCamera: readonly number[], [x, y, z
 }
 
 const FARTHEST_PX = 6;
+const [FIRST_GUESS_M, CLOSE_M, MOST_STEPS] = [1.5, 1e-3, 8] as const;
+const SAME_PLACE: readonly number[] = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
 
-/** The surface under a pixel of the picture; null where none was measured there or near. */
-export function surfaceAt({ camera, world_from_camera, depth }: Omit<Measured, "up">, pixel: Pixel): Vector3 | null {
-  const [right, down] = slopes(camera, pixel);
-  const lens = camera.depth ?? camera;
-  const column = Math.round(lens.cx + lens.fx * right);
-  const row = Math.round(lens.cy + lens.fy * down);
+/** The surface under a pixel of the picture; null where none was measured there or near. Distortion is left out. */
+export function surfaceAt(seen: Omit<Measured, "up">, pixel: Pixel): Vector3 | null {
+  const [right, down] = slopes(seen.camera, pixel);
   for (let reach = 1; reach <= FARTHEST_PX; reach += 2) {
-    const units = medianAround(depth, lens, column, row, reach);
-    if (units === null) continue;
-    const ahead = units * (camera.depth_scale_m ?? 0.001);
-    return toWorldPoint(world_from_camera, [right * ahead, down * ahead, ahead]);
+    const ahead = aheadOf(seen, right, down, reach);
+    if (ahead !== null) return toWorldPoint(seen.world_from_camera, [right * ahead, down * ahead, ahead]);
   }
   return null;
 }
+
+/** How far ahead of the colour camera its ray meets the surface: from where a lens beside it sees it, step by step. */
+function aheadOf({ camera, depth }: Pick<Measured, "camera" | "depth">, right: number, down: number, reach: number): number | null {
+  const lens = camera.depth ?? camera;
+  const fromLens = camera.depth?.color_from_depth ?? SAME_PLACE;
+  let ahead = FIRST_GUESS_M;
+  for (let step = 0; step < MOST_STEPS; step++) {
+    const place = project(lens, fromLens, [right * ahead, down * ahead, ahead]);
+    if (place === null) return null;
+    const [column, row] = [Math.round(place.x), Math.round(place.y)];
+    const units = medianAround(depth, lens, column, row, reach);
+    if (units === null) return null;
+    const before = ahead;
+    ahead = toWorldPoint(fromLens, fromPixel(lens, place, units * (camera.depth_scale_m ?? 0.001)))[2];
+    if (Math.abs(ahead - before) < CLOSE_M) break;
+  }
+  return ahead;
+}
+
+const fromPixel = (lens: Lens, { x, y }: Pixel, ahead: number): Vector3 => [((x - lens.cx) / lens.fx) * ahead, ((y - lens.cy) / lens.fy) * ahead, ahead];
 
 /** Where the ray through a pixel meets the level plane of a height; null where it does not, or beyond 20 m. */
 export function levelAt({ camera, world_from_camera, up }: Omit<Seen, "depth">, pixel: Pixel, height_m: number): Vector3 | null {
@@ -112,14 +136,15 @@ function medianAround(depth: Uint16Array, { width, height }: Lens, column: numbe
 const LOWEST_SHARE = 0.02;
 
 /** Height of the lowest surface in sight, a few outliers aside; null without depth. */
-export function floorOf({ camera, world_from_camera, up, depth }: Measured): number | null {
+export function floorOf({ camera, world_from_camera, measured_from = world_from_camera, up, depth }: Measured): number | null {
   const lens = camera.depth ?? camera;
+  const fromLens = camera.depth?.color_from_depth ?? SAME_PLACE;
   const heights: number[] = [];
   for (let i = 0; i < depth.length; i += 7) {
     const ahead = depth[i]! * (camera.depth_scale_m ?? 0.001);
     if (ahead === 0) continue;
-    const [x, y] = [i % lens.width, Math.floor(i / lens.width)];
-    heights.push(dot(up, toWorldPoint(world_from_camera, [((x - lens.cx) / lens.fx) * ahead, ((y - lens.cy) / lens.fy) * ahead, ahead])));
+    const inCamera = toWorldPoint(fromLens, fromPixel(lens, { x: i % lens.width, y: Math.floor(i / lens.width) }, ahead));
+    heights.push(dot(up, toWorldPoint(world_from_camera, inCamera)));
   }
   heights.sort((a, b) => a - b);
   return heights[Math.floor(heights.length * LOWEST_SHARE)] ?? null;

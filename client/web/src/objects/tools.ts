@@ -6,7 +6,7 @@ import type { Asked } from "../session";
 import { toWorld, type Vector3 } from "../sh";
 import { drawGuide } from "./guide";
 import { Models } from "./models";
-import { cross, floorOf, isMeasured, levelAt, levelled, type Measured, measured, type Pixel, project, scaled, type Seen, sum, surfaceAt } from "./picking";
+import { cross, floorOf, isMeasured, levelAt, levelled, type Measured, measured, type Pixel, project, scaled, type Seen, seenFrom, sum, surfaceAt } from "./picking";
 import { type Placed, Scene } from "./scene";
 import { GROWTH, handleTouch, TURN_DEG } from "./touch";
 
@@ -23,6 +23,8 @@ export class ObjectTools {
   private readonly said = byId("object-said");
   /** Of the picture on the screen; null where nothing can be placed. */
   private seen: Seen | null = null;
+  /** From where, if that is another picture than the one that was measured. */
+  private from: readonly number[] | null = null;
   private floor_m: number | null = null;
   private isPlacing = false;
   private drags = 0;
@@ -36,10 +38,18 @@ export class ObjectTools {
 
   /** The frame of which the picture is on the screen; null: there is nothing to place anything on. */
   show(seen: Seen | null): void {
-    this.seen = seen;
+    this.seen = seen === null || this.from === null ? seen : seenFrom(seen, this.from);
     if (seen !== null && isMeasured(seen)) this.noteFloor(seen);
     byId("object-tools").hidden = seen === null;
     this.draw();
+  }
+
+  /** The picture on the screen is a newer one, taken from there (row-major). */
+  look(worldFromCamera: readonly number[]): void {
+    this.from = worldFromCamera;
+    if (this.seen === null) return;
+    this.seen = seenFrom(this.seen, worldFromCamera);
+    if (this.scene.selected !== null) this.draw();
   }
 
   /** A session begins: what can be placed in it. */
@@ -49,7 +59,7 @@ export class ObjectTools {
 
   /** A session ends: its floor and what was placed are not those of the next. */
   clear(): void {
-    this.floor_m = null;
+    this.floor_m = this.from = null;
     this.isPlacing = false;
     this.scene.clear();
     this.show(null);

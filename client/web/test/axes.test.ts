@@ -107,3 +107,20 @@ test("what is level is so in any world", () => {
   assert.deepEqual(uprightAxes(up).map((axis) => axis.map(Math.round)), [[1, 0, 0], [0, 0, 1], [0, -1, 0]]);
   assert.deepEqual(uprightAxes([1, 0, 0]).map((axis) => axis.map(Math.round)), [[0, 1, 0], [1, 0, 0], [0, 0, -1]]);
 });
+
+test("a lens of depth beside the camera's own sees the surface from there", () => {
+  const lens = { width: 64, height: 48, fx: 50, fy: 50, cx: 31.5, cy: 23.5 };
+  const color_from_depth = [1, 0, 0, 0.2, 0, 1, 0, 0, 0, 0, 1, 0.05, 0, 0, 0, 1]; // 20 cm to the right, 5 cm ahead
+  const camera = { ...lens, depth_scale_m: 0.001, depth: { ...lens, color_from_depth } };
+  const world_from_camera = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
+  const wall = (point: readonly [number, number, number]): number => point[2] - 0.5 * point[0] - 2; // 0 on it
+  const depth = Uint16Array.from({ length: 64 * 48 }, (_, i) => {
+    const right = ((i % 64) - lens.cx) / lens.fx;
+    return Math.round((1000 * (2 + 0.5 * 0.2 - 0.05)) / (1 - 0.5 * right));
+  });
+  for (const pixel of [{ x: 20, y: 10 }, { x: 31.5, y: 23.5 }, { x: 45, y: 40 }]) {
+    const place = surfaceAt({ camera, world_from_camera, depth }, pixel)!;
+    assert.ok(Math.abs(wall([place[0], place[1], place[2]])) < 0.03, `${place.join(" ")}`);
+    assert.ok(Math.abs(lens.fx * (place[0] / place[2]) + lens.cx - pixel.x) < 1e-6);
+  }
+});

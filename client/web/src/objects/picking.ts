@@ -74,8 +74,8 @@ export function project(lens: Lens, worldFromCamera: readonly number[], [x, y, z
 }
 
 const FARTHEST_PX = 6;
-const [FIRST_GUESS_M, CLOSE_M, MOST_STEPS] = [1.5, 1e-3, 8] as const;
-const SAME_PLACE: readonly number[] = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
+/** Of the way along a ray; what is further behind a surface than its thickness is hidden by it. */
+const [FIRST_M, LAST_M, STEP, THICKNESS] = [0.1, 20, 1.01, 0.03] as const;
 
 /** The surface under a pixel of the picture; null where none was measured there or near. Distortion is left out. */
 export function surfaceAt(seen: Omit<Measured, "up">, pixel: Pixel): Vector3 | null {
@@ -87,23 +87,47 @@ export function surfaceAt(seen: Omit<Measured, "up">, pixel: Pixel): Vector3 | n
   return null;
 }
 
-/** How far ahead of the colour camera its ray meets the surface: from where a lens beside it sees it, step by step. */
-function aheadOf({ camera, depth }: Pick<Measured, "camera" | "depth">, right: number, down: number, reach: number): number | null {
+/** How far ahead of the camera the ray first meets what was measured; where depth is of another place, step by step. */
+function aheadOf(seen: Omit<Measured, "up">, right: number, down: number, reach: number): number | null {
+  const { camera, world_from_camera, depth } = seen;
   const lens = camera.depth ?? camera;
-  const fromLens = camera.depth?.color_from_depth ?? SAME_PLACE;
-  let ahead = FIRST_GUESS_M;
-  for (let step = 0; step < MOST_STEPS; step++) {
-    const place = project(lens, fromLens, [right * ahead, down * ahead, ahead]);
-    if (place === null) return null;
-    const [column, row] = [Math.round(place.x), Math.round(place.y)];
-    const units = medianAround(depth, lens, column, row, reach);
-    if (units === null) return null;
-    const before = ahead;
-    ahead = toWorldPoint(fromLens, fromPixel(lens, place, units * (camera.depth_scale_m ?? 0.001)))[2];
-    if (Math.abs(ahead - before) < CLOSE_M) break;
+  const inWorld = (ahead: number): Vector3 => toWorldPoint(world_from_camera, [right * ahead, down * ahead, ahead]);
+  const worldFromLens = worldFromLensOf(seen);
+  /** By how much a point of the ray is behind the surface; null where none was measured. */
+  const behind = (ahead: number): number | null => {
+    const point = inWorld(ahead);
+    const place = project(lens, worldFromLens, point);
+    const units = place === null ? null : medianAround(depth, lens, Math.round(place.x), Math.round(place.y), reach);
+    return units === null ? null : aheadIn(worldFromLens, point) - units * (camera.depth_scale_m ?? 0.001);
+  };
+  if (worldFromLens === world_from_camera) {
+    const there = behind(FIRST_M);
+    return there === null ? null : FIRST_M - there;
   }
-  return ahead;
+  let [before, beforeBehind]: [number, number | null] = [FIRST_M, null];
+  for (let ahead = FIRST_M; ahead < LAST_M; ahead *= STEP) {
+    const now = behind(ahead);
+    if (now !== null && now >= 0 && now < THICKNESS * ahead) {
+      return beforeBehind === null ? ahead : before + ((ahead - before) * -beforeBehind) / (now - beforeBehind);
+    }
+    [before, beforeBehind] = [ahead, now !== null && now < 0 ? now : null];
+  }
+  return null;
 }
+
+/** Of the depth's lens; the camera's own where they are one. */
+function worldFromLensOf({ camera, world_from_camera, measured_from = world_from_camera }: Pick<Measured, "camera" | "world_from_camera" | "measured_from">): readonly number[] {
+  const fromLens = camera.depth?.color_from_depth;
+  if (fromLens === undefined) return measured_from;
+  const column = (i: number): Vector3 => toWorld(measured_from, [fromLens[i]!, fromLens[4 + i]!, fromLens[8 + i]!]);
+  const [x, y, z] = [column(0), column(1), column(2)];
+  const place = toWorldPoint(measured_from, positionOf(fromLens));
+  return [0, 1, 2].flatMap((row) => [x[row]!, y[row]!, z[row]!, place[row]!]).concat([0, 0, 0, 1]);
+}
+
+/** How far ahead of a camera a point of the world is. */
+const aheadIn = (worldFromCamera: readonly number[], point: Vector3): number =>
+  toCamera(worldFromCamera, sum(point, scaled(positionOf(worldFromCamera), -1)))[2];
 
 const fromPixel = (lens: Lens, { x, y }: Pixel, ahead: number): Vector3 => [((x - lens.cx) / lens.fx) * ahead, ((y - lens.cy) / lens.fy) * ahead, ahead];
 
@@ -136,15 +160,16 @@ function medianAround(depth: Uint16Array, { width, height }: Lens, column: numbe
 const LOWEST_SHARE = 0.02;
 
 /** Height of the lowest surface in sight, a few outliers aside; null without depth. */
-export function floorOf({ camera, world_from_camera, measured_from = world_from_camera, up, depth }: Measured): number | null {
+export function floorOf(seen: Measured): number | null {
+  const { camera, up, depth } = seen;
   const lens = camera.depth ?? camera;
-  const fromLens = camera.depth?.color_from_depth ?? SAME_PLACE;
+  const worldFromLens = worldFromLensOf(seen);
   const heights: number[] = [];
   for (let i = 0; i < depth.length; i += 7) {
     const ahead = depth[i]! * (camera.depth_scale_m ?? 0.001);
     if (ahead === 0) continue;
-    const inCamera = toWorldPoint(fromLens, fromPixel(lens, { x: i % lens.width, y: Math.floor(i / lens.width) }, ahead));
-    heights.push(dot(up, toWorldPoint(world_from_camera, inCamera)));
+    const pixel = { x: i % lens.width, y: Math.floor(i / lens.width) };
+    heights.push(dot(up, toWorldPoint(worldFromLens, fromPixel(lens, pixel, ahead))));
   }
   heights.sort((a, b) => a - b);
   return heights[Math.floor(heights.length * LOWEST_SHARE)] ?? null;

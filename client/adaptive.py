@@ -1,6 +1,7 @@
 """What a link carries: JPEG quality, picture size and rate, from the round trips of the frames that were answered.
 
-A frame's time on the way is its round trip less the server's computing and less the wait behind the frame before it.
+A frame's time on the way is its round trip less the server's computing and less what it waited there: behind the frame
+before it, or for a device that others use too.
 What exceeds the link's own delay is transfer, from which throughput follows. Three decisions rest on it:
 
 - *rate*: the next frame is sent when the slowest of computing, sending and returning is done with the one before, so
@@ -51,6 +52,8 @@ class Measured:
     """Of it, in the server's pipeline."""
     bytes_up: int
     bytes_down: int
+    waited_s: float | None = None
+    """At the server, before it was computed; None: the server does not say it."""
 
 
 class Adaptive:
@@ -105,8 +108,9 @@ class Adaptive:
 
     def note(self, frame: Measured) -> None:
         """A frame was answered."""
-        # It may have waited while the one before was computed, which was not answered yet when this one went.
-        waited_s = min(max(self._last_answer_s - frame.sent_s, 0.0), self._last_computed_s)
+        waited_s = frame.waited_s
+        if waited_s is None:  # while the one before was computed, which was not answered yet when this one went
+            waited_s = min(max(self._last_answer_s - frame.sent_s, 0.0), self._last_computed_s)
         way_s = max(frame.answered_s - frame.sent_s - frame.computed_s - waited_s, 0.0)
         self._last_answer_s, self._last_computed_s = frame.answered_s, frame.computed_s
         self._ways.append(way_s)

@@ -8,7 +8,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import msgspec
@@ -288,15 +288,17 @@ class _Stream:
         drawn, size = answer.drawn, answer_bytes(answer)
         computed_s = 0.0 if drawn is None else drawn.timings.total / 1e3
         if self._adaptive is not None:
-            self._measure(answer.light.frame, returned_s, computed_s, size, reconnected)
+            waited_s = None if drawn is None or not drawn.waited_ms else drawn.waited_ms / 1e3
+            measured = Measured(0.0, returned_s, computed_s, 0, bytes_down=size, waited_s=waited_s)
+            self._measure(answer.light.frame, measured, reconnected)
         picture = await asyncio.to_thread(self._kept_picture, answer)
         coding = self._fixed if self._adaptive is None else self._adaptive.coding
         shown_s = time.perf_counter()
         if not self._summary.answered:
             self._summary.first_picture_s = shown_s - self._began_s
         self._view.show(shown_s, answer.light, drawn, picture, coding, reconnected)
-        waited_s = 0.0 if drawn is None else drawn.waited_ms / 1e3
-        self._figures.note_answer(answer.light.frame, returned_s, shown_s, computed_s, size, waited_s)
+        waited_ms = 0.0 if drawn is None else drawn.waited_ms
+        self._figures.note_answer(answer.light.frame, returned_s, shown_s, computed_s, size, waited_ms / 1e3)
         for note in () if drawn is None else drawn.notes:
             self._tell(note)
         self._summary.answered += 1
@@ -316,8 +318,8 @@ class _Stream:
             self._writer.write(output)
         return output.color
 
-    def _measure(self, number: int, returned_s: float, computed_s: float, bytes_down: int, reconnected: int) -> None:
-        """Tell what the frame's way was like."""
+    def _measure(self, number: int, answered: Measured, reconnected: int) -> None:
+        """Tell what the frame's way was like; when and with how many bytes it was sent is known here."""
         assert self._adaptive is not None
         if reconnected != self._summary.reconnected:
             self._summary.reconnected = reconnected
@@ -325,7 +327,7 @@ class _Stream:
             self._out.clear()
         sent = self._out.pop(number, None)
         if sent is not None:
-            self._adaptive.note(Measured(sent[0], returned_s, computed_s, bytes_up=sent[1], bytes_down=bytes_down))
+            self._adaptive.note(replace(answered, sent_s=sent[0], bytes_up=sent[1]))
 
     def _note_dropped(self, dropped: Dropped) -> None:
         if self._job.wishes.lossless:

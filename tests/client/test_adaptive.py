@@ -26,6 +26,9 @@ class Link:
     delay_s: float = 0.02
     computed_s: float = 0.02
     overhead_s: float = 0.0
+    turn_s: float = 0.0
+    """That others use the device before each frame."""
+    says_wait: bool = False
     up_free_s: float = 0.0
     server_free_s: float = 0.0
     down_free_s: float = 0.0
@@ -35,10 +38,13 @@ class Link:
     def send(self, sent_s: float, size: int) -> Measured:
         arrived_s = max(sent_s, self.up_free_s) + size / self.bytes_per_s
         self.up_free_s = arrived_s
-        done_s = max(arrived_s + self.delay_s, self.server_free_s) + self.computed_s + self.overhead_s
+        here_s = arrived_s + self.delay_s
+        begun_s = max(here_s, self.server_free_s) + self.turn_s
+        done_s = begun_s + self.computed_s + self.overhead_s
         self.server_free_s = done_s
         self.down_free_s = max(done_s, self.down_free_s) + ANSWER_BYTES / self.bytes_per_s
-        return Measured(sent_s, self.down_free_s + self.delay_s, self.computed_s, size, ANSWER_BYTES)
+        waited_s = begun_s - here_s if self.says_wait else None
+        return Measured(sent_s, self.down_free_s + self.delay_s, self.computed_s, size, ANSWER_BYTES, waited_s)
 
 
 def stream(adaptive: Adaptive, link: Link, seconds: float, start_s: float = 0.0, color: tuple = COLOR_BYTES) -> list:
@@ -78,6 +84,16 @@ def test_a_slow_link_gets_fewer_bytes_and_nothing_waits() -> None:
     full = Link(12e6 / 8)
     held = stream(_Fixed(), full, 30)
     assert len(done) > 1.15 * len(held)
+
+
+@pytest.mark.parametrize("says_wait", [True, False])
+def test_a_device_that_others_use_is_not_taken_for_a_narrow_link(says_wait: bool) -> None:
+    adaptive = Adaptive(1 / FPS, delay_s=0.04)
+    link = Link(100e6 / 8, turn_s=0.3, says_wait=says_wait)
+    for second in range(30):  # alone at times, so that what is least on the way is known
+        link.turn_s = 0.0 if second % 6 == 0 else 0.3
+        stream(adaptive, link, 1, float(second))
+    assert (adaptive.rung == 0) is says_wait
 
 
 class _Fixed(Adaptive):

@@ -27,7 +27,10 @@ from protocol.depth_codec import (
     deflate,
     filter_depth,
     inflate,
+    most_rank_bytes,
+    rank_depth,
     unfilter_depth,
+    unrank_depth,
     zstd_compress,
     zstd_decompress,
 )
@@ -74,6 +77,29 @@ def _unpng(data: bytes, width: int, height: int) -> Depth:
     return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED).reshape(height, width)
 
 
+def _ranks(depth: Depth) -> tuple[bytes, Depth]:
+    """Its values, with their number before them, and the rank of each pixel's among them."""
+    values, ranks = np.unique(depth, return_inverse=True)
+    return np.array([len(values), *values], "<u4").tobytes(), ranks.reshape(depth.shape).astype(np.uint16)
+
+
+def _png_of_ranks(depth: Depth) -> bytes:
+    table, ranks = _ranks(depth)
+    options = (cv2.IMWRITE_PNG_COMPRESSION, 6, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP)
+    return table + cv2.imencode(".png", ranks, options)[1].tobytes()
+
+
+def _jp2_of_ranks(depth: Depth) -> bytes:
+    table, ranks = _ranks(depth)
+    return table + cv2.imencode(".jp2", ranks, (cv2.IMWRITE_JPEG2000_COMPRESSION_X1000, 1000))[1].tobytes()
+
+
+def _unpng_of_ranks(data: bytes, width: int, height: int) -> Depth:
+    begun = 4 + 4 * int.from_bytes(data[:4], "little")
+    values = np.frombuffer(data[4:begun], "<u4").astype(np.uint16)
+    return values[_unpng(data[begun:], width, height)]
+
+
 CANDIDATES = (
     Candidate("raw", lambda d: d.tobytes(), _unpack),
     Candidate("PNG, level 1 (OpenCV)", _png, _unpng),
@@ -94,6 +120,17 @@ CANDIDATES = (
         lambda b, w, h: unfilter_depth(zstd_decompress(b, 2 * w * h), w, h),
     ),
     Candidate("filter alone", filter_depth, unfilter_depth),
+    *(
+        Candidate(
+            f"zstd {level}, ranks = zstd-ranks",
+            lambda d, level=level: encode_depth(d, "zstd-ranks", level=level).data,
+            lambda b, w, h: unrank_depth(zstd_decompress(b, most_rank_bytes(w, h), least_bytes=0), w, h),
+        )
+        for level in (1, 6, 19)
+    ),
+    Candidate("ranks alone", rank_depth, unrank_depth),
+    Candidate("PNG of ranks, level 6 (OpenCV)", _png_of_ranks, _unpng_of_ranks),
+    Candidate("JPEG 2000 of ranks (OpenCV)", _jp2_of_ranks, _unpng_of_ranks),
 )
 
 

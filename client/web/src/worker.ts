@@ -4,7 +4,7 @@ import { FrameEncoder } from "./capture/encode";
 import { reasonOf } from "./capture/source";
 import { CaptureStream, type Times } from "./capture/stream";
 import { Connection } from "./connection";
-import { decodeLayer, transferOf } from "./local/layer_parts";
+import { closeParts, decodeLayer, transferOf } from "./local/layer_parts";
 import type { Composite, Layer, LayerPatch, ServerMessage } from "./protocol";
 import type { Setup } from "./session";
 import type { FromWorker, News, ToWorker } from "./worker_messages";
@@ -121,5 +121,6 @@ async function decodePicture(composite: Composite, times: Times | null): Promise
 async function decodeParts(layer: Layer, times: Times | null): Promise<void> {
   const begun = run;
   const parts = await decodeLayer(layer);
-  if (begun === run) post({ kind: "layer", layer: bare(layer), parts, times }, transferOf(parts));
+  if (begun !== run) return closeParts(parts);
+  post({ kind: "layer", layer: bare(layer), parts, times }, transferOf(parts));
 }

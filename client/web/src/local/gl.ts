@@ -29,12 +29,20 @@ export function uniformsOf(gl: WebGL2RenderingContext, program: WebGLProgram): (
 /** Draw with a context that belongs to others too: what they have set is as it was afterwards. `units`: textures used. */
 export function keepingState(gl: WebGL2RenderingContext, units: number, draw: () => void): void {
   const get = <T>(name: number): T => gl.getParameter(name) as T;
-  const [drawn, read] = [get<WebGLFramebuffer | null>(gl.DRAW_FRAMEBUFFER_BINDING), get<WebGLFramebuffer | null>(gl.READ_FRAMEBUFFER_BINDING)];
-  const [program, vertexArray, buffer] = [get<WebGLProgram | null>(gl.CURRENT_PROGRAM), get<WebGLVertexArrayObject | null>(gl.VERTEX_ARRAY_BINDING), get<WebGLBuffer | null>(gl.ARRAY_BUFFER_BINDING)];
+  const drawn = get<WebGLFramebuffer | null>(gl.DRAW_FRAMEBUFFER_BINDING);
+  const read = get<WebGLFramebuffer | null>(gl.READ_FRAMEBUFFER_BINDING);
   const renderbuffer = get<WebGLRenderbuffer | null>(gl.RENDERBUFFER_BINDING);
-  const [viewport, colorMask, depthMask, depthFunc] = [get<Int32Array>(gl.VIEWPORT), get<boolean[]>(gl.COLOR_WRITEMASK), get<boolean>(gl.DEPTH_WRITEMASK), get<number>(gl.DEPTH_FUNC)];
-  const abilities = [gl.BLEND, gl.CULL_FACE, gl.DEPTH_TEST, gl.SCISSOR_TEST, gl.STENCIL_TEST].map((name) => [name, gl.isEnabled(name)] as const);
-  const storage = [gl.UNPACK_FLIP_Y_WEBGL, gl.UNPACK_PREMULTIPLY_ALPHA_WEBGL, gl.UNPACK_COLORSPACE_CONVERSION_WEBGL].map((name) => [name, get<number>(name)] as const);
+  const program = get<WebGLProgram | null>(gl.CURRENT_PROGRAM);
+  const vertexArray = get<WebGLVertexArrayObject | null>(gl.VERTEX_ARRAY_BINDING);
+  const buffer = get<WebGLBuffer | null>(gl.ARRAY_BUFFER_BINDING);
+  const viewport = get<Int32Array>(gl.VIEWPORT);
+  const colorMask = get<boolean[]>(gl.COLOR_WRITEMASK);
+  const depthMask = get<boolean>(gl.DEPTH_WRITEMASK);
+  const depthFunc = get<number>(gl.DEPTH_FUNC);
+  const switches = [gl.BLEND, gl.CULL_FACE, gl.DEPTH_TEST, gl.SCISSOR_TEST, gl.STENCIL_TEST];
+  const abilities = switches.map((name) => [name, gl.isEnabled(name)] as const);
+  const settings = [gl.UNPACK_FLIP_Y_WEBGL, gl.UNPACK_PREMULTIPLY_ALPHA_WEBGL, gl.UNPACK_COLORSPACE_CONVERSION_WEBGL];
+  const storage = settings.map((name) => [name, get<number>(name)] as const);
   const active = get<number>(gl.ACTIVE_TEXTURE);
   const textures = Array.from({ length: units }, (_, unit) => {
     gl.activeTexture(gl.TEXTURE0 + unit);

@@ -8,6 +8,9 @@ import pytest
 
 from client.coding import Coding, frame_message, picture_bytes
 from client.depth_rounding import round_depth
+from client.laptop.errors import OptionError
+from client.options import refuse_video
+from client.video import VideoEncoder
 from protocol.codec import ProtocolError, decode_client, encode
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import decode_color, decode_depth, encode_color
@@ -87,6 +90,29 @@ def test_the_wire_says_by_how_much_depth_was_rounded() -> None:
     assert decode_client(encode(rounded)).depth.rounded_per_m == 0.003
     assert len(rounded.depth.data) < 0.8 * len(exact.depth.data)
     assert picture_bytes(rounded) == len(rounded.depth.data) + len(rounded.color.data)
+
+
+def test_pictures_of_odd_sides_stay_jpeg_beside_video() -> None:
+    pytest.importorskip("av")
+    video, even = VideoEncoder(), msgspec.structs.replace(CAMERA, width=96, height=64)
+    found = [
+        frame_message(a_frame(camera), camera, coding=Coding(80, divisor), video=video).color
+        for camera, divisor in ((CAMERA, 1), (CAMERA, 2), (even, 1), (even, 2))
+    ]
+    assert [(image.codec, image.width) for image in found] == [("jpeg", 97), ("jpeg", 49), ("h264", 96), ("h264", 48)]
+
+
+@pytest.mark.parametrize(("codec", "lossless", "words"), [("hevc", False, "h264"), ("h264", True, "--lossless")])
+def test_video_that_cannot_be_is_refused(codec: str, lossless: bool, words: str) -> None:
+    with pytest.raises(OptionError, match=words):
+        refuse_video(codec, lossless)
+
+
+def test_without_its_library_video_is_refused_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("client.video.IS_POSSIBLE", False)
+    with pytest.raises(OptionError, match="needs PyAV, which is not installed: make install-video"):
+        refuse_video("h264", False)
+    refuse_video(None, False)
 
 
 @pytest.mark.data

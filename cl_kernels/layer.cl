@@ -9,8 +9,9 @@ static inline ushort depth_code(const float z, const float depth_scale_m) {
     return (ushort)clamp(z / depth_scale_m + 0.5f, 1.0f, 65535.0f);
 }
 
+// Of its root, so that dark shadows have codes enough.
 static inline uchar ratio_code(const float factor) {
-    return (uchar)clamp(NEUTRAL * factor + 0.5f, 0.0f, 255.0f);
+    return (uchar)clamp(NEUTRAL * sqrt(factor) + 0.5f, 0.0f, 255.0f);
 }
 
 static inline ushort depth_at(global const float4 *positions, const int pixel, const float16 camera_from_volume,

@@ -68,7 +68,7 @@ def decode_layer(layer: Layer, camera: CameraModel) -> DecodedLayer:
         virtual = Part(layer.virtual.x, layer.virtual.y, values, depth_m)
     if layer.ratio is not None:
         codes, depth_m = _read(layer.ratio, 3, camera, layer.depth_scale_m)
-        ratio = Part(layer.ratio.x, layer.ratio.y, codes.astype(np.float32) / NEUTRAL - 1, depth_m)
+        ratio = Part(layer.ratio.x, layer.ratio.y, (codes.astype(np.float32) / NEUTRAL) ** 2 - 1, depth_m)
     return DecodedLayer(virtual, ratio, pose)
 
 

@@ -26,7 +26,7 @@ class LayerPart:
     """Its first column."""
     y: int
     color: NDArray[np.uint8]
-    """[h, w, 4] sRGB and coverage (255: all of the pixel), or [h, w, 3] factors times 128."""
+    """[h, w, 4] sRGB and coverage (255: all of the pixel), or [h, w, 3] roots of factors times 128."""
     depth: NDArray[np.uint16]
     """[h, w] along the camera's z, in DEPTH_SCALE_M; 0: the pixel says nothing."""
 

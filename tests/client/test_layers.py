@@ -69,10 +69,10 @@ def test_nothing_changes_nothing() -> None:
 
 
 def test_layers_are_mixed_in_linear_light() -> None:
-    half = np.full((20, 20, 3), NEUTRAL // 2, np.uint8)
+    half = np.full((20, 20, 3), 91, np.uint8)  # (91 / 128)^2 is 0.505
     layer = read(virtual=patch(10, 10, full(255, 128, 20, 20), 1.0), ratio=patch(10, 10, half, 1.0))
     picture = put_over(layer, np.full_like(PICTURE, 255), CAMERA)
-    # 128 / 255 of white and the rest of half of white: 0.751, which is code 225; half of white alone is 188.
+    # 128 / 255 of white and the rest of half of white: 0.754, which is code 225; half of white alone is 188.
     assert set(picture[10:30, 10:30].ravel()) == {225}
     assert set(
         put_over(read(ratio=patch(10, 10, half, 1.0)), np.full_like(PICTURE, 255), CAMERA)[10:30, 10:30].ravel()

@@ -63,7 +63,7 @@ def hard_scene() -> tuple[Codes, tuple[Any, ...], Floats]:
     real = buffer(*plane(1.0), random.random((HEIGHT, WIDTH)) < 0.9)
     ratio = samples(4, random.uniform(0.0, 2.2, (HEIGHT // 4, WIDTH // 4, 3)))
     ratio.values[: len(ratio.values) // 3, :, :3] = 1  # a part of the picture is not touched
-    ratio.values[-4:, -6:, :3] = 2.5  # one is brighter than there are codes for
+    ratio.values[-4:, -6:, :3] = 4.5  # one is brighter than there are codes for
     ratio.values[-4:, :4, :3] = 0.004  # and one is as dark as below things that stand on it
     occluded = samples(2, random.uniform(0, 0.2, (HEIGHT // 2, WIDTH // 2, 3)))
     occluded.values[..., 3] = virtual.positions[1::2, 1::2, 3]
@@ -119,9 +119,9 @@ def linear_of(codes: Floats) -> Floats:
 
 
 def test_layer_over_the_camera_picture_is_the_composite(engine: Engine) -> None:
-    """But for the rounding of colours, of factors (which are not told apart above 1.99) and of the picture."""
+    """But for the rounding of colours, of factors (which are not told apart above 3.97) and of the picture."""
     shown, (radiance, real, virtual, occluded, ratio), fine = hard_scene()
-    mixed = (radiance, real, virtual, occluded, replace(ratio, values=np.minimum(ratio.values, 1.9)))
+    mixed = (radiance, real, virtual, occluded, replace(ratio, values=np.minimum(ratio.values, 3.9)))
     picture = compose(engine, shown, *mixed, inverse_depths=fine).astype(int)
     layer = layer_of(engine, *mixed, inverse_depths=fine)
     (colors, _), (factors, _) = whole(layer.virtual), whole(layer.ratio, NEUTRAL, channels=3)
@@ -129,8 +129,8 @@ def test_layer_over_the_camera_picture_is_the_composite(engine: Engine) -> None:
     assert (colors[..., :3] < 255).all()  # what is brighter than white shows in mixtures
     bounds = []
     for half in (-0.5, 0.5):
-        own, factor = linear_of(colors[..., :3] + half), np.where(factors == NEUTRAL, NEUTRAL, factors + half) / NEUTRAL
-        bounds.append(twin.srgb_codes(coverage * own + (1 - coverage) * factor * radiance[..., :3]).astype(int))
+        own, root = linear_of(colors[..., :3] + half), np.where(factors == NEUTRAL, NEUTRAL, factors + half) / NEUTRAL
+        bounds.append(twin.srgb_codes(coverage * own + (1 - coverage) * root**2 * radiance[..., :3]).astype(int))
     inside = radiance[..., 3] >= 0
     assert ((bounds[0] - 1 <= picture) & (picture <= bounds[1] + 1))[inside].all()
     assert (picture != shown).any(-1).mean() > 0.3
@@ -175,9 +175,9 @@ def test_an_object_behind_real_surface_is_not_in_the_layer(engine: Engine) -> No
     assert layer.ratio is None
 
 
-def test_half_a_shadow_is_half_the_code_of_none(engine: Engine) -> None:
+def test_a_quarter_of_the_light_is_half_the_code_of_all(engine: Engine) -> None:
     _, radiance = camera_picture()
-    layer = layer_of(engine, radiance, WALL, ratio=samples(4, 0.5))
+    layer = layer_of(engine, radiance, WALL, ratio=samples(4, 0.25))
     assert layer.virtual is None
     assert layer.ratio is not None
     assert layer.ratio.depth.shape == (HEIGHT, WIDTH)

@@ -183,5 +183,5 @@ def layer(depth_scale_m: float, mixed: Mixed) -> tuple[NDArray[np.uint8], ...]:
     is_seen = mixed.part > 0
     colors = np.where(is_seen[..., None], srgb_codes(mixed.own), 0)
     virtual = np.concatenate([colors, np.floor(255 * mixed.part + 0.5)[..., None]], axis=-1).astype(np.uint8)
-    ratio = np.clip(np.floor(128 * mixed.factor + 0.5), 0, 255).astype(np.uint8)
+    ratio = np.clip(np.floor(128 * np.sqrt(mixed.factor) + 0.5), 0, 255).astype(np.uint8)
     return virtual, ratio, depths(mixed.virtual_z), depths(mixed.real_z)

@@ -31,13 +31,13 @@ class Seen:
     virtual_depth: NDArray[np.uint16]
     """[h, w] in DEPTH_SCALE_M, as all depths here."""
     ratio: NDArray[np.uint8]
-    """[h, w, 3] times NEUTRAL."""
+    """[h, w, 3] the root of it, times NEUTRAL."""
     wall_depth: NDArray[np.uint16]
 
     def over(self, picture: NDArray[np.uint8]) -> Floats:
         """[h, w, 3] the camera's picture (sRGB) with the layer over it, not rounded, 0 to 255."""
         coverage = self.virtual[..., 3:] / 255.0
-        behind = self.ratio / NEUTRAL * linear(picture)
+        behind = (self.ratio / NEUTRAL) ** 2 * linear(picture)
         return srgb(coverage * linear(self.virtual[..., :3]) + (1 - coverage) * behind)
 
     def layer(self) -> Layer:
@@ -72,7 +72,7 @@ def look(world_from_camera: Floats) -> Seen:
     return Seen(
         virtual=np.dstack([np.rint(srgb(mean_color)), np.rint(255 * hits / SUBPIXELS**2)]).astype(np.uint8),
         virtual_depth=np.rint(mean_depth_m / DEPTH_SCALE_M).astype(np.uint16),
-        ratio=np.repeat(np.rint(NEUTRAL * ratio)[..., None], 3, axis=-1).astype(np.uint8),
+        ratio=np.repeat(np.rint(NEUTRAL * np.sqrt(ratio))[..., None], 3, axis=-1).astype(np.uint8),
         wall_depth=np.rint(ahead_m / DEPTH_SCALE_M).astype(np.uint16),
     )
 

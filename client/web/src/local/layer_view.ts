@@ -64,7 +64,8 @@ void main() {
   vec3 real = linear(texture(camera, is_top_first ? place : vec2(place.x, 1.0 - place.y)).rgb);
   if (any(lessThan(place, vec2(0.0))) || any(greaterThan(place, vec2(1.0)))) real = vec3(0.0);
   vec4 thing = texture(things, at);
-  vec3 ratio = texture(ratios, at).rgb * (255.0 / 128.0);
+  vec3 root = texture(ratios, at).rgb * (255.0 / 128.0);
+  vec3 ratio = root * root;
   color = vec4(coded(clamp(thing.rgb + (1.0 - thing.a) * ratio * real, 0.0, 1.0)), 1.0);
 }`;
 

@@ -22,10 +22,11 @@ from server.service import Service
 from tests.data import ROOT
 from tests.service.conftest import keys_are_left_here  # noqa: F401
 from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
+from tests.service.proxy import impaired
 from tests.service.test_examples import node
 
 TOKEN = "a-token"
-PATIENCE_S = 120
+PATIENCE_S = 60
 UNREACHABLE = ("ENOTFOUND", "EAI_AGAIN", "ECONNREFUSED", "ETIMEDOUT", "ENETUNREACH", "ECONNRESET")
 
 STRICT = """
@@ -157,6 +158,42 @@ def test_objects_are_placed_and_a_server_that_stops_ends_what_waits(program: Pat
     assert answer == "answer jpeg true"
     assert ended == "the server did not answer for 1 s"
     assert lab.log[0][:3] == ("place", "chair", ("obj", b"a mesh"))
+
+
+def test_a_lost_connection_is_restored_and_the_session_goes_on(program: Path) -> None:
+    script = """
+        import { StreamClient } from "probeless";
+        const camera = { width: 48, height: 32, fx: 40, fy: 41, cx: 23.5, cy: 15.5 };
+        const onNote = (text) => console.log(`note: ${text}`);
+        const client = await StreamClient.connect(process.argv[1], { client: "test", camera, keep_s: 30, onNote });
+        const color = { width: 48, height: 32, codec: "raw", data: new Uint8Array(3 * 48 * 32) };
+        const depth = new Uint16Array(48 * 32).fill(1000);
+        while (!client.welcome.resumed) {
+            await client.send({ timestamp_s: 0, world_from_camera: null, color, depth });
+            console.log("sent");
+        }
+        const answer = await client.send({ timestamp_s: 0, world_from_camera: null, color, depth });
+        console.log(answer.type, client.welcome.session);
+        client.close();
+    """
+    lab = Lab()
+    service = Service(FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh)
+    with start_in_background(service) as server, impaired(server.url) as proxy:
+        command = [node(), "--input-type=module", "--eval", script, "--", proxy.url]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        with subprocess.Popen(command, cwd=program, text=True, **pipes) as process:
+            timer = threading.Timer(PATIENCE_S, process.kill)
+            timer.start()
+            said = []
+            for line in process.stdout:
+                said.append(line.strip())
+                if said.count("sent") == 2 and line == "sent\n":
+                    proxy.cut()
+            timer.cancel()
+            errors = process.stderr.read()
+    assert process.returncode == 0, errors
+    assert any(line.startswith("note: the connection was lost (") for line in said)
+    assert said[-1] == "answer session-1"
 
 
 def test_its_types_need_no_dom(program: Path, sources: Path) -> None:

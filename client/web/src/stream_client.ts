@@ -125,7 +125,6 @@ export class StreamClient {
       this.fail(new Error(state.reason));
       this.stream.stop("");
     } else if (state.kind === "lost") {
-      this.isWanted = false;
       this.options.onNote?.(`the connection was lost (${state.reason}); it is tried again`);
     }
     if (state.kind !== "open" && this.failure === null) this.giveUpLater();

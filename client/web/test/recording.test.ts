@@ -77,3 +77,9 @@ test("what is no recording is told in one sentence", async () => {
     await assert.rejects(readAll([...parts]), (error: Error) => why.test(error.message) && /probeless stream SOURCE --record FILE/.test(error.message));
   }
 });
+
+test("a recording of video is told to be one", async () => {
+  const color = { width: 8, height: 4, codec: "h264" as const, data: new Uint8Array(9) };
+  const video = encode({ type: "frame", frame: 0, timestamp_s: 0, world_from_camera: null, color, depth: null });
+  await assert.rejects(readAll([HELLO, video]), /kitchen.rec holds h264 video, .* \(stream --record without --video\)/);
+});

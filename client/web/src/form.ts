@@ -75,6 +75,14 @@ export function quality({ preset, budget_ms }: Choice): Pick<Wishes, "preset" | 
   return preset === "auto" ? { preset, budget_ms } : { preset, budget_ms: null };
 }
 
+/** Whether objects may be drawn here in the light that is fetched: only over what a WebXR session shows. */
+export function offerLight(form: HTMLFormElement, isOffered: boolean): void {
+  const answer = form.elements.namedItem("answer") as HTMLSelectElement;
+  const light = answer.querySelector<HTMLOptionElement>('[value="light"]')!;
+  light.hidden = light.disabled = !isOffered;
+  if (!isOffered && answer.value === "light") answer.value = "picture";
+}
+
 /** Let the form say it. */
 export function putQuality(form: HTMLFormElement, { preset, budget_ms }: Choice): void {
   (form.elements.namedItem("preset") as HTMLSelectElement).value = preset;

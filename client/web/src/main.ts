@@ -5,7 +5,7 @@ import { findSupport } from "./capture/support";
 import { Capturing } from "./capturing";
 import { type ConnectionState, streamUrl, tokenQuery } from "./connection";
 import { byId, make, setText } from "./dom";
-import { type Choice, fill, missing, read } from "./form";
+import { type Choice, fill, missing, offerLight, read } from "./form";
 import { clearLatency, noteShown, showAges } from "./latency";
 import { LayerMode } from "./layer_mode";
 import { LightMode } from "./light_mode";
@@ -251,6 +251,7 @@ async function showSupport(): Promise<void> {
 
 function noteChoice(): void {
   const choice = read(form);
+  offerLight(form, choice.source !== "recorded");
   form.dataset["source"] = choice.source;
   form.dataset["preset"] = choice.preset;
 }

@@ -130,8 +130,9 @@ def test_at_its_end_the_last_picture_stands(
 def test_a_file_that_is_none_and_one_that_was_cut_off_are_told(
     fake_server: BackgroundServer, received: Received, recording: Path, open_page: OpenPage, tmp_path: Path
 ) -> None:
-    page = open_page(fake_server.url)
+    page = open_page(f"{fake_server.url}/?answer=light")
     page.locator("input[name=source][value=recorded]").check()
+    assert page.locator("[name=answer]").input_value() == "picture"  # light is for what WebXR shows
     page.locator("#start").click()
     wait_for_text(
         page, "#capture-said", "Choose the recording: a file that probeless stream SOURCE --record FILE has made."

@@ -53,8 +53,10 @@ class VideoEncoder:
             self._encoder, self._setting = self._opened(*setting), setting
         picture = self._av.VideoFrame.from_ndarray(rgb, "rgb24").reformat(format="yuv420p", **self._color)
         picture.pts = self._count
-        picture.pict_type = self._key if self._needs_key.is_set() else self._by_itself
-        self._needs_key.clear()
+        picture.pict_type = self._by_itself
+        if self._needs_key.is_set():
+            self._needs_key.clear()
+            picture.pict_type = self._key
         self._count += 1
         data = b"".join(bytes(packet) for packet in self._encoder.encode(picture))
         return ColorImage(width=width, height=height, data=data, codec="h264")

@@ -6,7 +6,8 @@ What exceeds the link's own delay is transfer, from which throughput follows. Th
 
 - *rate*: the next frame is sent when the slowest of computing, sending and returning is done with the one before, so
   that no frame waits in a queue and grows old there; the client takes its newest frame at that moment.
-- *quality*: the highest rung of `LADDER` whose transfer keeps below `SHARE` of a frame's time at the wanted rate.
+- *quality*: the highest rung of `LADDER` whose transfer keeps below `SHARE` of a frame's time at the wanted rate, or at
+  the server's where that is slower, but not for longer than a person would see.
 - *going back*: a rung that proved too heavy is tried again later and later; a link that eases is found out all
   the same.
 """
@@ -30,6 +31,8 @@ LADDER = (
 """From the best to the cheapest. Depth is exact on every rung, or rounded as asked for."""
 SHARE = 0.9
 """Of the time between frames that the busier way may take."""
+LONGEST_TRANSFER_S = 0.2
+"""Where the server is slower still, quality would cost nothing but age: a way may not take more than a share of this."""
 SMOOTHING = 0.25
 """Weight of the newest measurement."""
 BAD_ANSWERS = 2
@@ -132,7 +135,7 @@ class Adaptive:
         self._step(+1, -math.inf)
 
     def _choose(self, one_way_s: float, now_s: float) -> None:
-        most_s = SHARE * max(self._wanted_s, self._computed_s)
+        most_s = SHARE * min(max(self._wanted_s, self._computed_s), max(self._wanted_s, LONGEST_TRANSFER_S))
         self._bad = self._bad + 1 if one_way_s > most_s else 0
         self._good = self._good + 1 if one_way_s < SPARE * most_s else 0
         if self._bad >= BAD_ANSWERS:

@@ -86,6 +86,15 @@ def test_a_slow_link_gets_fewer_bytes_and_nothing_waits() -> None:
     assert len(done) > 1.15 * len(held)
 
 
+def test_a_slow_server_is_no_reason_to_send_old_pictures() -> None:
+    adaptive, link = Adaptive(1 / FPS, delay_s=0.04), Link(2e6 / 8, computed_s=1.0, says_wait=True)
+    stream(adaptive, link, 40)
+    assert adaptive.rung == len(LADDER) - 1
+    quick = Adaptive(1 / FPS, delay_s=0.04)
+    stream(quick, Link(10e6 / 8, computed_s=1.0, says_wait=True), 40)
+    assert quick.rung == 0
+
+
 @pytest.mark.parametrize("says_wait", [True, False])
 def test_a_device_that_others_use_is_not_taken_for_a_narrow_link(says_wait: bool) -> None:
     adaptive = Adaptive(1 / FPS, delay_s=0.04)

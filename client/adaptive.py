@@ -32,7 +32,7 @@ LADDER = (
 SHARE = 0.9
 """Of the time between frames that the busier way may take."""
 LONGEST_TRANSFER_S = 0.2
-"""Where the server is slower still, quality would cost nothing but age: a way may not take more than a share of this."""
+"""Where the server is slower still, quality costs nothing but age: a way may not take more than a share of this."""
 SMOOTHING = 0.25
 """Weight of the newest measurement."""
 BAD_ANSWERS = 2

@@ -16,6 +16,7 @@ from protocol.frames import CameraModel
 from protocol.images import decode_depth, encode_depth
 from protocol.limits import SUBPROTOCOL
 from protocol.messages import DepthCodec
+from tests.client.link_series import write_link_series
 from tests.protocol.golden import FOLDER as GOLDEN
 from tests.protocol.golden import depth_ramp
 
@@ -89,6 +90,8 @@ def test_typescript_tests_pass_and_python_reads_what_a_browser_writes(
         for rows in (7, 8):
             (depths / f"{codec}_{rows}").write_bytes(encode_depth(depth_ramp()[:rows], codec).data)
     monkeypatch.setenv("PROBELESS_PYTHON_DEPTHS", str(depths))
+    assert write_link_series(tmp_path / "links.json") > 10_000
+    monkeypatch.setenv("PROBELESS_LINK_SERIES", str(tmp_path / "links.json"))
     _run("test", folder=sources)
     frame = decode_client(written.read_bytes())
     height, width = depth_ramp().shape

@@ -51,7 +51,7 @@ export class Capturing implements Sink {
     const wishes = { ...setup.wishes, ...this.source.wishes };
     const up = wishes.up ?? Y_UP;
     this.up = scaled(up, 1 / Math.hypot(...up));
-    this.remote.capture(url, { ...setup, wishes }, choice.color === "h264");
+    this.remote.capture(url, { ...setup, wishes }, choice.color === "h264", choice.adapts);
   }
 
   private open({ source, file, loops, view_deg }: Choice, stage: Element): Promise<Source> {

@@ -18,6 +18,8 @@ export interface Choice {
   answer: NonNullable<Wishes["answer"]>;
   /** How the camera's colour goes over the wire. */
   color: "jpeg" | "h264";
+  /** Quality, size and rate follow the link. */
+  adapts: boolean;
   /** Of a recorded sequence. */
   file: File | null;
   loops: boolean;
@@ -31,7 +33,7 @@ export const KEEP_S = 30;
 
 /** Fill the form with what the address says: `?room=kitchen&key=...&source=xr`. */
 export function fill(form: HTMLFormElement, page: URL): void {
-  for (const name of ["room", "key", "marker", "side", "view", "preset", "budget", "answer", "color", "repeat"]) {
+  for (const name of ["room", "key", "marker", "side", "view", "preset", "budget", "answer", "color", "adapt", "repeat"]) {
     const value = page.searchParams.get(name);
     const field = form.elements.namedItem(name);
     if (value !== null && (field instanceof HTMLInputElement || field instanceof HTMLSelectElement)) field.value = value;
@@ -56,6 +58,7 @@ export function read(form: HTMLFormElement): Choice {
     answer: ANSWERS[text("source")]?.find((each) => each === text("answer")) ?? "picture",
     file: file instanceof File && file.name !== "" ? file : null,
     color: text("color") === "h264" ? "h264" : "jpeg",
+    adapts: text("adapt") !== "no",
     loops: text("repeat") !== "once",
   };
 }

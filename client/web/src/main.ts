@@ -16,6 +16,7 @@ import { captionPicture, fitPicture, markPicture, showPicture } from "./picture"
 import type { Light, ServerMessage } from "./protocol";
 import { QualityChanges } from "./quality_changes";
 import { Remote } from "./remote";
+import { clearSending, noteSending, showSending } from "./sending";
 import type { News } from "./worker_messages";
 
 const QUIET_AFTER_MS = 3000;
@@ -69,6 +70,9 @@ function receive(message: News): void {
       return;
     case "wanted":
       return; // the remote's own
+    case "sending":
+      noteSending(message.sending);
+      return;
     default:
       message satisfies never;
   }
@@ -132,6 +136,7 @@ function refresh(): void {
   const now_ms = performance.now();
   panels.refresh(now_ms);
   showAges(layerMode?.ages ?? null);
+  showSending(now_ms);
   const { kind, text } = describe(now_ms);
   setText(byId("state"), text);
   document.documentElement.dataset["state"] = kind;
@@ -172,6 +177,7 @@ function begin(): void {
   welcomes = 0;
   panels.clear();
   clearLatency();
+  clearSending();
   tools.clear();
 }
 

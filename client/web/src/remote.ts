@@ -26,9 +26,9 @@ export class Remote {
     this.post({ kind: "watch", run: ++this.run, url, watch });
   }
 
-  capture(url: string, setup: Setup, video: boolean): void {
+  capture(url: string, setup: Setup, video: boolean, adapts: boolean): void {
     this.isWanted = false;
-    this.post({ kind: "capture", run: ++this.run, url, setup, video });
+    this.post({ kind: "capture", run: ++this.run, url, setup, video, adapts });
   }
 
   /** Whether a frame would be sent at once. */

@@ -1,5 +1,6 @@
 // Numbers and names of the protocol in words.
 
+import type { Sending } from "./capture/encode";
 import type { OperatingPoint } from "./protocol";
 import type { Vector3 } from "./sh";
 
@@ -34,6 +35,15 @@ export function describePoint(point: OperatingPoint | null): string {
   const expected = point.expected_ms == null ? "" : `, ${milliseconds(point.expected_ms)} ms expected`;
   const error = point.light_error_deg == null ? "" : `, light off by ${number(point.light_error_deg)}° where measured`;
   return `${point.settings} (${point.reason})${expected}${error}`;
+}
+
+/** How frames are sent; `fps`: how many a second, where it is known. */
+export function describeSending(sending: Sending, fps: number | null): string {
+  const often = fps === null ? "" : `, ${fps < 2.95 ? fps.toFixed(1) : Math.round(fps)} frames/s`;
+  if (sending.as === "recorded") return `as recorded${often}`;
+  const { divisor, quality, videoShare } = sending.coding;
+  if (sending.as === "jpeg") return `${divisor === 1 ? "full" : divisor === 2 ? "half" : "a quarter of its"} size, quality ${quality}${often}`;
+  return `video at ${videoShare === 1 ? "its full bit rate" : `${Math.round(100 * videoShare)} % of its bit rate`}${often}`;
 }
 
 /** Three significant digits, without an exponent where that is short enough to read. */

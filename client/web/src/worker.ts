@@ -1,13 +1,17 @@
 // The worker: the socket, and all that is packed and unpacked, away from the page's own thread.
 
+import { Adaptive, LADDER } from "./capture/adaptive";
 import { FrameEncoder } from "./capture/encode";
+import { measureDelay_s } from "./capture/link";
 import { reasonOf } from "./capture/source";
 import { CaptureStream, type Times } from "./capture/stream";
 import { Connection } from "./connection";
 import { closeParts, decodeLayer, transferOf } from "./local/layer_parts";
 import type { Composite, Layer, LayerPatch, ServerMessage } from "./protocol";
-import type { Setup } from "./session";
 import type { FromWorker, News, ToWorker } from "./worker_messages";
+
+/** Quality yields until so many frames are carried, or as many as the server computes. */
+const WANTED_INTERVAL_S = 1 / 15;
 
 let watching: Connection | null = null;
 let stream: CaptureStream | null = null;
@@ -35,7 +39,7 @@ self.onmessage = ({ data }: MessageEvent<ToWorker>): void => {
       return;
     case "capture":
       begin(data.run);
-      beginStream(data.url, data.setup, new FrameEncoder(data.video, say));
+      beginStream(data);
       return;
     case "frame":
       stream?.offer(data.frame).catch((error: unknown) => say(`a frame cannot be packed: ${reasonOf(error)}`));
@@ -60,7 +64,11 @@ function begin(next: number): void {
   run = next;
 }
 
-function beginStream(url: string, setup: Setup, frames: FrameEncoder): void {
+function beginStream({ url, setup, video, adapts }: Extract<ToWorker, { kind: "capture" }>): void {
+  // A light alone does not say how long the server took for it.
+  const pace = adapts && setup.wishes?.answer !== "light" ? new Adaptive(WANTED_INTERVAL_S) : null;
+  if (pace !== null) void measureDelay_s(url).then((delay_s) => (pace.delay_s = delay_s));
+  const frames = new FrameEncoder(video, say, () => pace?.coding ?? LADDER[0]!, (sending) => post({ kind: "sending", sending }));
   encoder = frames;
   stream = new CaptureStream(url, setup, (frame) => frames.encode(frame), {
     onWanted: () => post({ kind: "wanted" }),
@@ -70,7 +78,7 @@ function beginStream(url: string, setup: Setup, frames: FrameEncoder): void {
       void frames.hear(message);
     },
     say,
-  });
+  }, pace);
   stream.start();
 }
 

@@ -1,5 +1,6 @@
 // What the page and its worker say to each other.
 
+import type { Sending } from "./capture/encode";
 import type { Numbered, Times } from "./capture/stream";
 import type { ConnectionState } from "./connection";
 import type { LayerParts } from "./local/layer_parts";
@@ -9,8 +10,8 @@ import type { Request, Setup } from "./session";
 export type ToWorker =
   /** `run`: of watching or capturing; what is left of an earlier one is not heard. */
   | { kind: "watch"; run: number; url: string; watch: Watch }
-  /** `video`: colour is to go as H.264, where that can be. */
-  | { kind: "capture"; run: number; url: string; setup: Setup; video: boolean }
+  /** `video`: colour is to go as H.264, where that can be. `adapts`: quality, size and rate follow the link. */
+  | { kind: "capture"; run: number; url: string; setup: Setup; video: boolean; adapts: boolean }
   | { kind: "frame"; frame: Numbered }
   | { kind: "request"; request: Request }
   | { kind: "retry" }
@@ -25,6 +26,8 @@ export type News =
   /** A layer, likewise. */
   | { kind: "layer"; layer: Layer; parts: LayerParts; times: Times | null }
   | { kind: "wanted" }
+  /** A frame goes to the server. */
+  | { kind: "sending"; sending: Sending }
   | { kind: "say"; text: string };
 
 export type FromWorker = News & { run: number };

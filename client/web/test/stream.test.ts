@@ -3,6 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { decode } from "@msgpack/msgpack";
+import { Adaptive } from "../src/capture/adaptive";
 import { CaptureStream, type Numbered } from "../src/capture/stream";
 import { encode } from "../src/messages";
 import type { CameraModel, ClientMessage, Frame, ServerMessage, Wishes } from "../src/protocol";
@@ -37,7 +38,7 @@ const welcome = (more: object = {}): object => ({
   type: "welcome", session: "s", server: "p", device: "d", max_inflight: 2, key: "secret", resumed: false, room: null, ...more,
 });
 
-function begin(wishes: Wishes = {}): { stream: CaptureStream; wanted: () => number; heard: ServerMessage[]; frame: (number: number, camera?: CameraModel) => Numbered } {
+function begin(wishes: Wishes = {}, pace: Adaptive | null = null): { stream: CaptureStream; wanted: () => number; heard: ServerMessage[]; frame: (number: number, camera?: CameraModel) => Numbered } {
   FakeSocket.all = [];
   Object.assign(globalThis, { WebSocket: FakeSocket });
   let wanted = 0;
@@ -49,7 +50,7 @@ function begin(wishes: Wishes = {}): { stream: CaptureStream; wanted: () => numb
     onState: () => undefined,
     onMessage: (message) => heard.push(message),
     say: () => undefined,
-  });
+  }, pace);
   stream.start();
   const frame = (number: number, camera = CAMERA): Numbered => ({
     number, camera, timestamp_s: number, captured_ms: 0, world_from_camera: null, color: new Uint8ClampedArray(4), depth: null,
@@ -59,8 +60,8 @@ function begin(wishes: Wishes = {}): { stream: CaptureStream; wanted: () => numb
 
 const framesOf = (socket: FakeSocket): number[] => socket.sent.filter((each) => each.type === "frame").map((each) => each.frame);
 
-async function opened(wishes?: Wishes): Promise<ReturnType<typeof begin>> {
-  const session = begin(wishes);
+async function opened(wishes?: Wishes, pace?: Adaptive): Promise<ReturnType<typeof begin>> {
+  const session = begin(wishes, pace);
   await session.stream.offer(session.frame(0));
   FakeSocket.last.onopen();
   FakeSocket.last.say(welcome());
@@ -140,5 +141,53 @@ test("a camera that was turned is a session of its own", async () => {
   FakeSocket.last.onopen();
   const hello = FakeSocket.last.sent[0]!;
   assert.ok(FakeSocket.last !== first && hello.type === "hello" && hello.camera.width === 48 && hello.resume === null);
+  stream.stop("");
+});
+
+const composite = (frame: number, more: object = {}): object => ({
+  type: "composite", frame, color: { width: 64, height: 48, codec: "jpeg", data: new Uint8Array(1000) }, timings: { total: 200 }, waited_ms: 0, ...more,
+});
+
+test("with a pace a frame is asked for when the one before it is past the slowest stage", async (context) => {
+  context.mock.timers.enable({ apis: ["setTimeout"] });
+  let now_ms = 0;
+  context.mock.method(performance, "now", () => now_ms);
+  const pace = new Adaptive(1 / 15, 0.02);
+  const { stream, wanted, frame } = await opened({}, pace);
+  const socket = FakeSocket.last;
+  await stream.offer(frame(1));
+  assert.equal(wanted(), 3); // nothing is known yet
+  now_ms = 220;
+  socket.say(composite(1));
+  assert.ok(Math.abs(pace.busy_s - 0.2) < 1e-6); // computing: 20 ms on the way are the link's own
+  await stream.offer(frame(2));
+  assert.equal(wanted(), 3); // it has just gone
+  const later = (ms: number): void => {
+    now_ms += ms;
+    context.mock.timers.tick(ms);
+  };
+  later(150);
+  assert.equal(wanted(), 3);
+  later(60);
+  assert.equal(wanted(), 4);
+  await stream.offer(frame(3));
+  later(1000);
+  assert.equal(wanted(), 4); // two are under way
+  socket.say(composite(2, { waited_ms: 1010 }));
+  assert.ok(Math.abs(pace.busy_s - 0.2) < 1e-3); // that the server let it wait is no transfer
+  later(210);
+  assert.equal(wanted(), 5);
+  stream.stop("");
+});
+
+test("after a lost connection a rung down is sent", async (context) => {
+  context.mock.timers.enable({ apis: ["setTimeout"] });
+  const pace = new Adaptive(1 / 15);
+  const { stream } = await opened({}, pace);
+  FakeSocket.last.onclose!({ code: 1006, reason: "" });
+  assert.equal(pace.rung, 1);
+  context.mock.timers.tick(200);
+  FakeSocket.last.onclose!({ code: 1006, reason: "" }); // nothing was sent on this one
+  assert.equal(pace.rung, 1);
   stream.stop("");
 });

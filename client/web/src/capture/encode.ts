@@ -2,11 +2,13 @@
 
 import { encodeDepth } from "../depth";
 import type { ColorImage, Frame, ServerMessage } from "../protocol";
+import { type Coding, LADDER } from "./adaptive";
 import { type Captured, reasonOf } from "./source";
 import type { Numbered } from "./stream";
 import { canBeVideo, videoLack, VideoStream } from "./video";
 
-const JPEG_QUALITY = 0.85;
+/** How a frame was sent. */
+export type Sending = { as: "jpeg" | "video"; coding: Coding } | { as: "recorded" };
 
 /** Of one session; one frame after the other. Told of what the server says, on which video depends. */
 export class FrameEncoder {
@@ -17,6 +19,8 @@ export class FrameEncoder {
   constructor(
     private readonly wantsVideo: boolean,
     private readonly say: (text: string) => void,
+    private readonly codingOf: () => Coding = () => LADDER[0]!,
+    private readonly onSending: (sending: Sending) => void = () => undefined,
   ) {}
 
   /** What the server said; `dropped` and a new connection break the video. */
@@ -33,6 +37,7 @@ export class FrameEncoder {
 
   async encode(frame: Numbered): Promise<Frame> {
     const { number, timestamp_s, world_from_camera } = frame;
+    if ("packed" in frame) this.onSending({ as: "recorded" });
     const pictures = "packed" in frame ? frame.packed : await this.packed(frame);
     return { type: "frame", frame: number, timestamp_s, world_from_camera, ...pictures };
   }
@@ -50,22 +55,26 @@ export class FrameEncoder {
 
   private async encodeColor(frame: Captured): Promise<ColorImage> {
     const { width, height } = frame.camera;
-    if (!this.isVideo || !canBeVideo(width, height)) return encodeJpeg(frame);
+    const coding = this.codingOf();
+    if (!this.isVideo || !canBeVideo(width, height)) return this.encodeJpeg(frame, coding);
     const rgba = "close" in frame.color ? pixelsOf(frame) : frame.color;
     try {
-      return await this.video.encode({ rgba, width, height });
+      const image = await this.video.encode({ rgba, width, height }, coding.videoShare);
+      this.onSending({ as: "video", coding });
+      return image;
     } catch (error) {
       this.isVideo = false;
       this.say(`The browser’s video encoder failed (${reasonOf(error)}): colour is sent as JPEG.`);
-      return encodeJpeg({ ...frame, color: new Uint8ClampedArray(rgba) });
+      return this.encodeJpeg({ ...frame, color: new Uint8ClampedArray(rgba) }, coding);
     }
   }
-}
 
-async function encodeJpeg(frame: Captured): Promise<ColorImage> {
-  const { width, height } = frame.camera;
-  const blob = await drawn(frame).canvas.convertToBlob({ type: "image/jpeg", quality: JPEG_QUALITY });
-  return { width, height, codec: "jpeg", data: new Uint8Array(await blob.arrayBuffer()) };
+  private async encodeJpeg(frame: Captured, coding: Coding): Promise<ColorImage> {
+    this.onSending({ as: "jpeg", coding });
+    const { canvas } = reduced(drawn(frame), coding.divisor);
+    const blob = await canvas.convertToBlob({ type: "image/jpeg", quality: coding.quality / 100 });
+    return { width: canvas.width, height: canvas.height, codec: "jpeg", data: new Uint8Array(await blob.arrayBuffer()) };
+  }
 }
 
 function pixelsOf(frame: Captured): Uint8ClampedArray {
@@ -75,13 +84,28 @@ function pixelsOf(frame: Captured): Uint8ClampedArray {
 
 /** The picture on a canvas; a bitmap is disposed of. */
 function drawn({ color, camera: { width, height } }: Captured): OffscreenCanvasRenderingContext2D {
-  const context = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
-  if (context === null) throw new Error("this browser gives no 2D canvas to a worker");
+  const context = canvasOf(width, height);
   if ("close" in color) {
     context.drawImage(color, 0, 0);
     color.close();
   } else {
     context.putImageData(new ImageData(color, width, height), 0, 0);
   }
+  return context;
+}
+
+/** The picture at 1/divisor of its width and height, as the server enlarges it. */
+function reduced(full: OffscreenCanvasRenderingContext2D, divisor: number): OffscreenCanvasRenderingContext2D {
+  if (divisor === 1) return full;
+  const { width, height } = full.canvas;
+  const context = canvasOf(Math.ceil(width / divisor), Math.ceil(height / divisor));
+  context.imageSmoothingQuality = "medium"; // means of pixels; "low" leaves pixels out
+  context.drawImage(full.canvas, 0, 0, context.canvas.width, context.canvas.height);
+  return context;
+}
+
+function canvasOf(width: number, height: number): OffscreenCanvasRenderingContext2D {
+  const context = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+  if (context === null) throw new Error("this browser gives no 2D canvas to a worker");
   return context;
 }

@@ -4,7 +4,9 @@
 import { CAPTURING, Connection, type ConnectionState, REFUSED_CAPTURE } from "../connection";
 import type { CameraModel, Composite, Frame, Layer, Light, ServerMessage } from "../protocol";
 import type { Request, Setup } from "../session";
+import type { Adaptive } from "./adaptive";
 import { isSameCamera } from "./axes";
+import { bytesOf, measuredOf } from "./link";
 import { type Captured, now_ms, type Packed } from "./source";
 
 export type Numbered = (Captured | Packed) & { number: number };
@@ -36,17 +38,23 @@ export class CaptureStream {
   private maxInflight = 1;
   private wasAsked = false;
   private isEncoding = false;
-  private readonly unanswered = new Map<number, { captured_ms: number; sent_ms: number }>();
+  private readonly unanswered = new Map<number, { captured_ms: number; sent_ms: number; bytes: number }>();
+  private lastSent_ms = -Infinity;
+  private timer: ReturnType<typeof setTimeout> | undefined;
   private readonly requests = new Map<number, Request>();
   /** Of the connection: what was begun on another one is not sent on this one. */
   private epoch = 0;
 
-  /** `encodeFrame`: to what goes over the wire; picture and depth are its to dispose of. */
+  /**
+   * `encodeFrame`: to what goes over the wire; picture and depth are its to dispose of. `pace`: what the link carries; null:
+   * a frame is sent whenever the server has room.
+   */
   constructor(
     private readonly url: string,
     private readonly setup: Setup,
     private readonly encodeFrame: (frame: Numbered) => Promise<Frame>,
     private readonly hooks: StreamHooks,
+    private readonly pace: Adaptive | null = null,
   ) {}
 
   /** Begin, with a camera; where it is not known yet, the first frame says it and is not sent. */
@@ -67,7 +75,8 @@ export class CaptureStream {
     try {
       const message = await this.encodeFrame(frame);
       if (epoch !== this.epoch) return false;
-      this.unanswered.set(frame.number, { captured_ms: frame.captured_ms, sent_ms: now_ms() });
+      this.lastSent_ms = now_ms();
+      this.unanswered.set(frame.number, { captured_ms: frame.captured_ms, sent_ms: this.lastSent_ms, bytes: bytesOf(message) });
       this.connection?.send(message);
       return true;
     } finally {
@@ -108,6 +117,7 @@ export class CaptureStream {
         onMessage: (message) => this.receive(message),
         onClosed: (code) => {
           if (code === GONE) this.key = null;
+          if (this.isWelcome) this.pace?.noteLost();
           this.leave();
         },
       },
@@ -119,6 +129,7 @@ export class CaptureStream {
 
   private leave(): void {
     this.epoch++;
+    clearTimeout(this.timer);
     this.isWelcome = this.isEncoding = false;
     for (const number of this.unanswered.keys()) this.hooks.onMessage({ type: "dropped", frame: number, reason: LOST }, null);
     this.unanswered.clear();
@@ -129,9 +140,20 @@ export class CaptureStream {
   }
 
   private askForFrame(): void {
+    clearTimeout(this.timer);
     if (this.wasAsked || !(this.camera === null || this.hasRoom())) return;
+    const wait_ms = this.wait_ms();
+    if (wait_ms > 0) {
+      if (wait_ms < Infinity) this.timer = setTimeout(() => this.askForFrame(), wait_ms); // else the next answer asks
+      return;
+    }
     this.wasAsked = true;
     this.hooks.onWanted();
+  }
+
+  /** Until a frame that is sent waits on its way for no other. */
+  private wait_ms(): number {
+    return 1000 * (this.pace?.wait_s(now_ms() / 1000, this.lastSent_ms / 1000, this.unanswered.size) ?? 0);
   }
 
   private receive(message: ServerMessage): void {
@@ -165,7 +187,11 @@ export class CaptureStream {
   private answered(message: { frame: number } & (Composite | Layer | Light | { type: "dropped" })): Times | null {
     const sent = this.unanswered.get(message.frame);
     this.unanswered.delete(message.frame);
-    return sent === undefined ? null : { ...sent, answered_ms: now_ms() };
+    if (sent === undefined) return null;
+    const { captured_ms, sent_ms, bytes } = sent;
+    const answered_ms = now_ms();
+    if (message.type === "composite" || message.type === "layer") this.pace?.note(measuredOf(message, bytes, sent_ms, answered_ms));
+    return { captured_ms, sent_ms, answered_ms };
   }
 }
 

@@ -16,14 +16,14 @@ export interface Picture {
   height: number;
 }
 
-const configOf = (width: number, height: number): VideoEncoderConfig => ({
+const configOf = (width: number, height: number, share = 1): VideoEncoderConfig => ({
   codec: CODEC,
   width,
   height,
   avc: { format: "annexb" },
   latencyMode: "realtime",
   framerate: FRAMES_PER_S,
-  bitrate: BITS_PER_PIXEL * width * height * FRAMES_PER_S,
+  bitrate: Math.round(share * BITS_PER_PIXEL * width * height * FRAMES_PER_S),
 });
 
 /** Why colour cannot be sent as video here, in one sentence; null: it can. */
@@ -40,6 +40,7 @@ export const canBeVideo = (width: number, height: number): boolean => width % 2 
 export class VideoStream {
   private encoder: VideoEncoder | null = null;
   private size = "";
+  private share = 1;
   private chunks: Uint8Array[] = [];
   private failure: string | null = null;
   private isKeyNeeded = true;
@@ -50,10 +51,10 @@ export class VideoStream {
     this.isKeyNeeded = true;
   }
 
-  /** The next picture. Throws Error where the browser's encoder fails. */
-  async encode(picture: Picture): Promise<ColorImage> {
+  /** The next picture, of a share of the best one's bits. Throws Error where the browser's encoder fails. */
+  async encode(picture: Picture, share = 1): Promise<ColorImage> {
     const { width, height } = picture;
-    const encoder = this.encoderOf(width, height);
+    const encoder = this.encoderOf(width, height, share);
     const frame = new VideoFrame(planesOf(picture), {
       format: "I420",
       codedWidth: width,
@@ -82,11 +83,15 @@ export class VideoStream {
     this.isKeyNeeded = true;
   }
 
-  private encoderOf(width: number, height: number): VideoEncoder {
+  private encoderOf(width: number, height: number, share: number): VideoEncoder {
     const size = `${width}x${height}`;
-    if (this.encoder !== null && this.size === size && this.encoder.state === "configured") return this.encoder;
+    if (this.encoder !== null && this.size === size && this.encoder.state === "configured") {
+      if (share !== this.share) this.encoder.configure(configOf(width, height, share)); // the video goes on
+      this.share = share;
+      return this.encoder;
+    }
     this.close();
-    this.size = size;
+    [this.size, this.share] = [size, share];
     this.encoder = new VideoEncoder({
       output: (chunk) => {
         const data = new Uint8Array(chunk.byteLength);
@@ -95,7 +100,7 @@ export class VideoStream {
       },
       error: (error) => (this.failure = error.message),
     });
-    this.encoder.configure(configOf(width, height));
+    this.encoder.configure(configOf(width, height, share));
     return this.encoder;
   }
 }

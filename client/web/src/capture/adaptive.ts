@@ -1,0 +1,155 @@
+// What a link carries: picture quality, size and rate, from the round trips of the frames that were answered; the rules of
+// client/adaptive.py, which says why they are so. Pure logic; times of one clock, in seconds.
+
+/** How a frame's colour goes over the wire. Depth is exact on every rung. */
+export interface Coding {
+  /** JPEG's, 0 to 100. */
+  readonly quality: number;
+  /** The picture is sent at 1/divisor of its width and height; the server enlarges it. */
+  readonly divisor: number;
+  /** Of the best video's bits, which are what video has in place of both. */
+  readonly videoShare: number;
+}
+
+/** From the best to the cheapest. */
+export const LADDER: readonly Coding[] = [
+  { quality: 90, divisor: 1, videoShare: 1 },
+  { quality: 80, divisor: 1, videoShare: 0.7 },
+  { quality: 65, divisor: 1, videoShare: 0.5 },
+  { quality: 50, divisor: 1, videoShare: 0.35 },
+  { quality: 75, divisor: 2, videoShare: 0.2 },
+  { quality: 50, divisor: 2, videoShare: 0.12 },
+];
+/** Of the time between frames that the busier way may take. */
+const SHARE = 0.9;
+/** Where the server is slower still, quality would cost nothing but age: no way may take longer than the share of this. */
+const LONGEST_TRANSFER_S = 0.2;
+/** Weight of the newest measurement. */
+const SMOOTHING = 0.25;
+/** So many frames in a row that took too long: one rung down. */
+const BAD_ANSWERS = 2;
+/** So many in a row with time to spare: one up. Doubled each time that it was wrong. */
+const GOOD_ANSWERS = 8;
+const MOST_GOOD_ANSWERS = 128;
+/** A rung up is tried where transfer takes less than this share of what it may. */
+const SPARE = 0.8;
+const WINDOW = 32;
+
+/** One answered frame. */
+export interface Measured {
+  /** Before its first byte went. */
+  sent_s: number;
+  answered_s: number;
+  /** Of it, in the server's pipeline. */
+  computed_s: number;
+  bytes_up: number;
+  bytes_down: number;
+  /** At the server, before it was computed; null: the server does not say it. */
+  waited_s: number | null;
+}
+
+/** Told of answers, asked for the rung and for when the next frame may go. */
+export class Adaptive {
+  private place = 0;
+  private readonly ways_s: number[] = [];
+  private lastAnswer_s = -Infinity;
+  private lastComputed_s = 0;
+  private computed_s = 0;
+  private way_s = 0;
+  private transfer_s = 0;
+  private bytesUp = 0;
+  private bytesDown = 0;
+  private bad = 0;
+  private good = 0;
+  private patience = GOOD_ANSWERS;
+  private hasClimbed = false;
+  private told = 0;
+  private stepped_s = -Infinity;
+
+  /** `wantedInterval_s`: between the frames that are wanted. `delay_s`: round trip of an empty message, where measured. */
+  constructor(
+    private readonly wantedInterval_s: number,
+    public delay_s = Infinity,
+  ) {}
+
+  /** Position in `LADDER`. */
+  get rung(): number {
+    return this.place;
+  }
+
+  /** How the next frame is to be sent. */
+  get coding(): Coding {
+    return LADDER[this.place]!;
+  }
+
+  /** Of the slowest stage that a frame passes: the next one would wait there. Stages overlap and do not add. */
+  get busy_s(): number {
+    return Math.max(this.computed_s, this.transfer_s * greaterShare(this.bytesUp, this.bytesDown));
+  }
+
+  /** For how long a frame sent now would wait for others; Infinity: an answer has to come first. */
+  wait_s(now_s: number, lastSent_s: number, unanswered: number): number {
+    if (unanswered === 0) return 0;
+    if (unanswered > 1) return Infinity;
+    // The frame on the way was begun when it was sent, or when the answer before it left the server.
+    const begun_s = Math.max(lastSent_s, this.lastAnswer_s - this.way_s);
+    return Math.max(this.busy_s - (now_s - begun_s), 0);
+  }
+
+  /** Whether a frame sent now would wait for nobody. */
+  maySend(now_s: number, lastSent_s: number, unanswered: number): boolean {
+    return this.wait_s(now_s, lastSent_s, unanswered) === 0;
+  }
+
+  /** A frame was answered. */
+  note(frame: Measured): void {
+    const { sent_s, answered_s, computed_s, bytes_up, bytes_down } = frame;
+    // While the one before was computed, which was not answered yet when this one went.
+    const waited_s = frame.waited_s ?? Math.min(Math.max(this.lastAnswer_s - sent_s, 0), this.lastComputed_s);
+    const way_s = Math.max(answered_s - sent_s - computed_s - waited_s, 0);
+    [this.lastAnswer_s, this.lastComputed_s] = [answered_s, computed_s];
+    this.ways_s.push(way_s);
+    if (this.ways_s.length > WINDOW) this.ways_s.shift();
+    const transfer_s = Math.max(way_s - Math.min(this.delay_s, ...this.ways_s), 0);
+    const weight = Math.max(SMOOTHING, 1 / ++this.told);
+    this.way_s += weight * (way_s - this.way_s);
+    this.computed_s += weight * (computed_s - this.computed_s);
+    this.transfer_s += weight * (transfer_s - this.transfer_s);
+    this.bytesUp += weight * (bytes_up - this.bytesUp);
+    this.bytesDown += weight * (bytes_down - this.bytesDown);
+    // Those that were under way at a step tell of the rung before.
+    if (sent_s >= this.stepped_s) this.choose(transfer_s * greaterShare(bytes_up, bytes_down), answered_s);
+  }
+
+  /** The connection was restored: what was measured before says nothing of it, and a rung down is safe. */
+  noteLost(): void {
+    this.ways_s.length = 0;
+    this.lastAnswer_s = -Infinity;
+    this.step(+1, -Infinity);
+  }
+
+  private choose(oneWay_s: number, now_s: number): void {
+    const wanted_s = this.wantedInterval_s;
+    const most_s = SHARE * Math.min(Math.max(wanted_s, this.computed_s), Math.max(wanted_s, LONGEST_TRANSFER_S));
+    this.bad = oneWay_s > most_s ? this.bad + 1 : 0;
+    this.good = oneWay_s < SPARE * most_s ? this.good + 1 : 0;
+    if (this.bad >= BAD_ANSWERS) {
+      if (this.hasClimbed) this.patience = Math.min(2 * this.patience, MOST_GOOD_ANSWERS);
+      this.step(+1, now_s);
+    } else if (this.good >= this.patience) {
+      if (this.hasClimbed) this.patience = GOOD_ANSWERS; // the last step up has held
+      this.step(-1, now_s);
+      this.hasClimbed = true;
+    }
+  }
+
+  private step(down: number, now_s: number): void {
+    this.place = Math.min(Math.max(this.place + down, 0), LADDER.length - 1);
+    this.bad = this.good = 0;
+    this.hasClimbed = false;
+    this.stepped_s = now_s;
+  }
+}
+
+/** Of both ways' bytes, that of the busier one: the ways carry at the same time. */
+const greaterShare = (up: number, down: number): number => Math.max(up, down) / Math.max(up + down, 1);

@@ -1,0 +1,146 @@
+"""The page sends what the link carries: quality, size and rate, over a proxy that lets little through."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from statistics import median
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import Page
+
+from protocol.frames import CameraModel, RgbdFrame
+from protocol.messages import ColorImage
+from server.serve import BackgroundServer, start_in_background
+from server.service import Service
+from tests.client.web.conftest import OpenPage, wait_for_text
+from tests.client.web.sequence import of_device
+from tests.client.web.test_capture import start_capture
+from tests.service.fakes import FAKE_DEVICE, FakePipeline, FakeResult, Lab, fake_mesh
+from tests.service.proxy import impaired
+
+CAMERA = CameraModel(width=480, height=360, fx=400.0, fy=400.0, cx=239.5, cy=179.5, depth_scale_m=0.001)
+DEPTH_SIZE = (36, 48)
+BYTES_PER_S = 2e6 / 8
+DELAY_S = 0.02
+SETTLED, LOOKED_AT = 12, 10
+"""Answers until the page has found its rung, and those whose age is then looked at."""
+LONGEST_S = 30.0
+AGE_BOUND_MS = 500.0
+"""Of a frame when it is answered, from its capture. One at the best takes this long over the link alone, two twice as long."""
+
+
+@dataclass
+class Seen:
+    """Every picture that the server was sent."""
+
+    images: list[ColorImage] = field(default_factory=list)
+
+    def wait(self, is_enough: Callable[[list[ColorImage]], bool]) -> None:
+        until_s = time.monotonic() + LONGEST_S
+        while not is_enough(self.images):
+            assert time.monotonic() < until_s, [(image.width, len(image.data)) for image in self.images]
+            time.sleep(0.05)
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> Seen:
+    from protocol.colors import ColorReader
+
+    seen, decode = Seen(), ColorReader.decode
+
+    def noting(self: ColorReader, image: ColorImage) -> object:
+        seen.images.append(image)
+        return decode(self, image)
+
+    monkeypatch.setattr(ColorReader, "decode", noting)
+    return seen
+
+
+class _Brief(FakePipeline):
+    """Answers with a picture that takes few bytes, so that sending is what the link limits."""
+
+    def process(self, frame: RgbdFrame, **wanted: bool) -> FakeResult:
+        return replace(super().process(frame, **wanted), color=np.full_like(frame.color, 128))
+
+
+@pytest.fixture
+def server() -> Iterator[BackgroundServer]:
+    service = Service(FAKE_DEVICE, pipeline_factory=lambda *_: _Brief(Lab()), mesh_loader=fake_mesh)
+    with start_in_background(service) as server:
+        yield server
+
+
+def textured(count: int = 3) -> list[RgbdFrame]:
+    """Pictures as full of detail as a room: about 100 kB at the best, 10 kB at the cheapest."""
+    frames = []
+    for index in range(count):
+        random = np.random.default_rng(index)
+        noise = random.integers(0, 256, (CAMERA.height // 2, CAMERA.width // 2, 3), np.uint8)
+        color = cv2.resize(noise, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_CUBIC)
+        depth = np.full(DEPTH_SIZE, 1500 + index, np.uint16)
+        frames.append(RgbdFrame(index, index / 30, color, depth, np.eye(4)))
+    return frames
+
+
+def note_ages(page: Page) -> None:
+    """Keep how old each frame was when its answer was there: what the page itself measures."""
+    page.evaluate(
+        """() => {
+          window.ages = [];
+          const read = (stage) => Number(document.getElementById(`latency-${stage}`).textContent);
+          const note = () => window.ages.push(read("packed") + read("answered"));
+          const shown = document.getElementById("latency-all");
+          new MutationObserver(note).observe(shown, { childList: true, characterData: true, subtree: true });
+        }"""
+    )
+
+
+def settled_age_ms(page: Page) -> float:
+    page.wait_for_function("count => window.ages.length >= count", arg=SETTLED + LOOKED_AT, timeout=1e3 * LONGEST_S)
+    return median(page.evaluate("() => window.ages")[SETTLED:])
+
+
+def test_a_narrow_link_gets_smaller_pictures_younger_frames_and_the_best_again_when_it_eases(
+    server: BackgroundServer, seen: Seen, open_page: OpenPage, keep_picture: Callable[[Page, str], None]
+) -> None:
+    device = of_device(CAMERA, textured(), loops=True)
+    with impaired(server.url, DELAY_S, BYTES_PER_S) as link, closing(open_page(link.url, device, (900, 900))) as page:
+        note_ages(page)
+        start_capture(page)
+        wait_for_text(page, "#sending", "Sent now: full size, quality 90")
+        wait_for_text(page, "#sending", "half size, quality")
+        age_ms = settled_age_ms(page)
+        first, last = seen.images[0], seen.images[-1]
+        assert (first.width, first.height) == (CAMERA.width, CAMERA.height)
+        assert (last.width, last.height) == (CAMERA.width // 2, CAMERA.height // 2)
+        assert len(last.data) < len(first.data) / 4
+        page.locator("#full").click()  # back to the whole page
+        page.locator("#sending").focus()
+        assert page.evaluate("document.activeElement.id") == "sending"
+        assert page.locator("#sending").get_attribute("aria-live") is None
+        keep_picture(page, "sending_half")
+        assert age_ms < AGE_BOUND_MS
+
+        link.bytes_per_s = None
+        wait_for_text(page, "#sending", "Sent now: full size, quality 90")
+        seen.wait(lambda images: images[-1].width == CAMERA.width and len(images[-1].data) > 0.9 * len(first.data))
+        page.goto("about:blank")
+
+
+def test_without_adapting_frames_are_older_than_that(server: BackgroundServer, seen: Seen, open_page: OpenPage) -> None:
+    device = of_device(CAMERA, textured(), loops=True)
+    with impaired(server.url, DELAY_S, BYTES_PER_S) as link, closing(open_page(link.url, device, (900, 900))) as page:
+        note_ages(page)
+        page.locator("input[name=source][value=xr]").check()
+        page.locator("[name=adapt]").select_option("no")
+        start_capture(page)
+        age_ms = settled_age_ms(page)
+        assert age_ms > AGE_BOUND_MS
+        assert {image.width for image in seen.images} == {CAMERA.width}
+        wait_for_text(page, "#sending", "Sent now: full size, quality 90")
+        page.goto("about:blank")

@@ -30,7 +30,7 @@ from tests.bench.run import Run
 from tests.bench.service_process import Served, serving
 from tests.service.proxy import impaired
 
-QUICK_FRAMES, FRAMES = 450, 1800
+QUICK_FRAMES, FRAMES = 450, 1200
 WARM_UP_FRAMES = 30
 LOOKED_AT = 5
 """Every how many of the pictures that were sent are compared with the camera's."""

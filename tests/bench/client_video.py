@@ -21,7 +21,7 @@ from tests.bench.client_bandwidth import FPS, kitchen, psnr_db, run_pipeline, tu
 from tests.bench.finished import Part, UnmeasurableError
 from tests.bench.run import Run
 
-QUICK_FRAMES, FRAMES = {"colour": 12, "light": 8}, {"colour": 40, "light": 20}
+QUICK_FRAMES, FRAMES = {"colour": 12, "light": 8}, {"colour": 24, "light": 20}
 SOURCES: dict[str, Callable[[], Source]] = {
     "kitchen": kitchen,
     "synthetic room": lambda: open_source("synthetic:room?frames=160&noise=1"),

@@ -206,8 +206,8 @@ def serve(
         log_format_of,
         objects_folder,
     )
-    from server.events import log_events
-    from server.serve import serve as serve_forever
+    from server.service.events import log_events
+    from server.service.serve import serve as serve_forever
 
     options = ServeOptions(
         host=host,

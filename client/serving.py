@@ -14,11 +14,11 @@ from urllib.parse import urlsplit
 from platformdirs import user_data_path
 
 from client.laptop.errors import OptionError, RunError
-from server.door import MAX_TOKEN_CHARS, Door, is_loopback, is_token, new_token
-from server.events import LogFormat
-from server.limits import DEFAULT_LIMITS, GIB, MIB, Limits
-from server.saving.upkeep import DAY_S, KeptLimits
-from server.tls import Certificate, CertificateError, given_certificate, own_certificate
+from server.service.door import MAX_TOKEN_CHARS, Door, is_loopback, is_token, new_token
+from server.service.events import LogFormat
+from server.service.limits import DEFAULT_LIMITS, GIB, MIB, Limits
+from server.service.saving.upkeep import DAY_S, KeptLimits
+from server.service.tls import Certificate, CertificateError, given_certificate, own_certificate
 
 NO_TOKEN = "none"
 NO_DATA = "none"

@@ -476,7 +476,9 @@ class Layer(Message, frozen=True, kw_only=True, tag="layer"):
 
     None: nothing is seen of it."""
     ratio: LayerPatch | None
-    """Colour of three channels: 128 times the root of what real surface is multiplied by. None: real surface stays as it is."""
+    """Colour of three channels: 128 times the root of what real surface is multiplied by.
+
+    None: real surface stays as it is."""
     depth_scale_m: Annotated[float, Meta(gt=0, le=1)]
     """Metres of a unit of depth."""
     world_from_camera: Matrix4

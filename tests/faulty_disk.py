@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-MODULES = ("server.saving.files", "server.saving.slot", "server.room_store")
+MODULES = ("server.service.saving.files", "server.service.saving.slot", "server.service.room_store")
 
 
 class PowerCut(BaseException):

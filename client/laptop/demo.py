@@ -14,9 +14,9 @@ from client.laptop.stream import StreamSummary, stream
 from client.laptop.volume import default_volume, default_voxel
 from client.progress import say
 from protocol.messages import Wishes
-from server.door import Door, new_token
 from server.scene.vase import vase_glb
-from server.serve import open_service, start_in_background
+from server.service.door import Door, new_token
+from server.service.serve import open_service, start_in_background
 
 SOURCE = "synthetic:table?light=7&frames="
 FRAMES, FRAMES_TO_WATCH = 30, 300

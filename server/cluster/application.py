@@ -15,7 +15,7 @@ from server.cluster.ingress import Ingress, create_ingress_app
 from server.cluster.keeper import Keeper
 from server.cluster.ray_places import RayPlaces
 from server.cluster.settings import ClusterSettings, read_settings
-from server.door import Door, is_token
+from server.service.door import Door, is_token
 
 TOKEN = "PROBELESS_TOKEN"
 

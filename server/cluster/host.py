@@ -16,10 +16,10 @@ from prometheus_client.parser import text_string_to_metric_families
 from server.cluster.places import Address
 from server.cluster.settings import ClusterSettings
 from server.cluster.warmth import warm_up_node
-from server.door import Door, new_token
-from server.limits import DEFAULT_LIMITS, MIB, Limits
-from server.serve import BackgroundServer
-from server.service import Service
+from server.service.door import Door, new_token
+from server.service.limits import DEFAULT_LIMITS, MIB, Limits
+from server.service.serve import BackgroundServer
+from server.service.service import Service
 
 FOR_ALL = 1 << 30
 """Of limits by address, which the ingress would fill alone."""
@@ -85,7 +85,7 @@ def open_room_host(settings: ClusterSettings) -> RoomHost:
     import ray
 
     from server.opencl.device import open_device
-    from server.warm_up import warm_up
+    from server.service.warm_up import warm_up
 
     device = open_device(settings.device)
     limits = limits_of(settings)

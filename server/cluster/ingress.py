@@ -13,15 +13,15 @@ from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import InvalidHandshake
 
 from protocol.messages import ClientMessage
-from server.app import PAGE_FOLDER, STREAM_PATH
 from server.cluster.places import NoPlace, NotYet, Places
 from server.cluster.relay import open_host, relay
 from server.cluster.routing import Route, route_of
-from server.connection import GONE, POLICY, TRY_LATER, BadMessage, Connection, Refusal
-from server.door import Door
-from server.limits import DEFAULT_LIMITS, Limits
-from server.object_library import ObjectLibrary
-from server.object_routes import add_objects
+from server.service.app import PAGE_FOLDER, STREAM_PATH
+from server.service.connection import GONE, POLICY, TRY_LATER, BadMessage, Connection, Refusal
+from server.service.door import Door
+from server.service.limits import DEFAULT_LIMITS, Limits
+from server.service.object_library import ObjectLibrary
+from server.service.object_routes import add_objects
 
 ASK_AGAIN_S = 0.25
 PATIENCE_S = 20.0

@@ -13,7 +13,7 @@ from ray.exceptions import RayActorError
 from server.cluster.host import HostStatus, open_room_host
 from server.cluster.places import Address, NoPlace, NotYet
 from server.cluster.settings import ClusterSettings
-from server.events import log_events
+from server.service.events import log_events
 
 NAMESPACE = "probeless"
 PREFIX = "room-"

@@ -24,7 +24,7 @@ from tests.bench.service_process import serving
 QUICK_ANSWERS, ANSWERS = 30, 100
 SEQUENCE = 8
 """Frames that the device shows, there and back."""
-SHOWN_LINKS = ("loopback", "40 ms and 10 Mbit/s")
+SHOWN_LINKS = ("loopback", "40 ms and 10 Mbit/s", "40 ms and 2 Mbit/s")
 STAGES = {
     "packed": "captured to sent",
     "answered": "sent to answered",

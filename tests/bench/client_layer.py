@@ -18,12 +18,12 @@ from client.laptop.source import Source
 from protocol.codec import encode
 from protocol.images import encode_color, encode_depth
 from protocol.messages import Frame
-from server.layer_message import layer_message
 from server.pipeline import FrameResult, Pipeline
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from server.scene.vase import vase_glb
-from server.worker import JPEG_QUALITY
+from server.service.layer_message import layer_message
+from server.service.worker import JPEG_QUALITY
 from tests.bench.client_bandwidth import FPS, kitchen
 from tests.bench.client_browser import PATIENCE_MS, WEB, chromium
 from tests.bench.finished import Part

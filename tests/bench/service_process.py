@@ -163,13 +163,13 @@ def children(pid: int, named: str = "") -> list[int]:
 
 def _serve_unusually(unusual: Unusual, arguments: list[str]) -> None:
     from client import cli
-    from server import service
+    from server.service import service
 
     class Service(service.Service):
         def __init__(self, *given: Any, **more: Any) -> None:
             super().__init__(*given, **{"at_once": unusual.at_once} | more)
 
-    with patch("server.serve.Service", Service):
+    with patch("server.service.serve.Service", Service):
         if unusual.fault:
             injected = INJECTED[unusual.fault]()
             signal.signal(BEGIN, lambda *_: injected.begin())

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from client.web.build import FOLDER, install, npm, pack
-from server.door import Door
 from server.opencl.device import Device
-from server.serve import BackgroundServer, start_in_background
-from server.service import Service
+from server.service.door import Door
+from server.service.serve import BackgroundServer, start_in_background
+from server.service.service import Service
 from tests.data import ROOT
 from tests.service.conftest import keys_are_left_here  # noqa: F401
 from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh

@@ -12,9 +12,9 @@ import uvicorn
 from server.cluster.host import RoomHost
 from server.cluster.ingress import Ingress, create_ingress_app
 from server.cluster.places import Address, NoPlace, NotYet
-from server.door import Door
-from server.serve import listen, url_of
-from server.service import Service
+from server.service.door import Door
+from server.service.serve import listen, url_of
+from server.service.service import Service
 from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
 from tests.service.wire import Wire
 

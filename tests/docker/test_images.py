@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from server.cluster.settings import read_settings
-from server.serve import STOP_PATIENCE_S
+from server.service.serve import STOP_PATIENCE_S
 from tests.docker.dockerfile import ROOT, Image, copies, install_steps, read_image
 
 IMAGES = {name: read_image(ROOT / f"docker/{name}.Dockerfile") for name in ("cpu", "gpu", "cluster")}

@@ -12,8 +12,8 @@ import pytest
 import trimesh
 
 from server.opencl.device import Device
-from server.serve import start_in_background
-from server.service import Service
+from server.service.serve import start_in_background
+from server.service.service import Service
 from tests.bench.service_bytes import Fed, _Kept, feed
 from tests.bench.service_faults import Tally, part_of
 from tests.bench.service_guests import CAMERA, FIRST_PX, FULL_S, LAST_PX, WALL_M, Guest, clock_frame, clock_s

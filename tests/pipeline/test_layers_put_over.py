@@ -15,9 +15,9 @@ from protocol.codec import decode_server, encode
 from protocol.frames import RgbdFrame
 from protocol.images import encode_color, encode_depth
 from protocol.messages import Frame
-from server.layer_message import layer_message
 from server.opencl.device import Device
 from server.pipeline import FrameResult
+from server.service.layer_message import layer_message
 from tests.pipeline.test_layers import answered, played
 
 TURNED_DEG, MOVED_M = 9.0, 0.05

@@ -14,9 +14,9 @@ import pytest
 
 from server.opencl.device import Device
 from server.room import Room
-from server.room_store import RoomStore, RoomStoreError, folder_name
-from server.saving.files import read_parts, write_parts
 from server.scene.placement import Placement
+from server.service.room_store import RoomStore, RoomStoreError, folder_name
+from server.service.saving.files import read_parts, write_parts
 from tests.faulty_disk import FaultyDisk, PowerCut, full
 from tests.kept_rooms import CUBE, PLACE, client_of, print_of, scan
 from tests.rooms import wishes

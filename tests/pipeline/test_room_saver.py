@@ -11,9 +11,9 @@ import pytest
 
 from server.opencl.device import Device
 from server.room import Room
-from server.room_saver import RoomSaver
-from server.room_store import RoomStore
-from server.saving.room_saves import Saved
+from server.service.room_saver import RoomSaver
+from server.service.room_store import RoomStore
+from server.service.saving.room_saves import Saved
 from tests.faulty_disk import FaultyDisk, full
 from tests.kept_rooms import client_of, print_of, scan
 from tests.rooms import wishes

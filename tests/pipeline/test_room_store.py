@@ -22,9 +22,9 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import FrameResult, Pipeline
 from server.room import Room
-from server.room_store import RoomStore, folder_name
-from server.saving.brick_files import merged, read_bricks, write_bricks
 from server.scene.placement import Placement
+from server.service.room_store import RoomStore, folder_name
+from server.service.saving.brick_files import merged, read_bricks, write_bricks
 from server.settings import read_wishes
 from server.stages.integrate import integrate
 from server.stages.light_estimation import LightEstimate

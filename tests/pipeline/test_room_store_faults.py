@@ -15,10 +15,10 @@ import pytest
 from protocol.messages import Marker
 from server.opencl.device import Device
 from server.room import Room
-from server.room_store import RoomStore, RoomStoreError, folder_name
-from server.saving import slot as slots
-from server.saving import state as states
 from server.scene.placement import Placement
+from server.service.room_store import RoomStore, RoomStoreError, folder_name
+from server.service.saving import slot as slots
+from server.service.saving import state as states
 from tests.faulty_disk import FaultyDisk, PowerCut, full
 from tests.kept_rooms import CUBE, PLACE, client_of, layout_of, print_of, scan
 from tests.rooms import wishes

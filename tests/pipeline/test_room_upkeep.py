@@ -11,9 +11,9 @@ import pytest
 
 from server.opencl.device import Device
 from server.room import Room
-from server.room_saver import RoomSaver
-from server.room_store import RoomStore, folder_name
-from server.saving.upkeep import DAY_S, KeptLimits
+from server.service.room_saver import RoomSaver
+from server.service.room_store import RoomStore, folder_name
+from server.service.saving.upkeep import DAY_S, KeptLimits
 from tests.rooms import wishes
 
 NOW_S = 2.0e9

@@ -9,10 +9,10 @@ import pytest
 from msgspec import structs
 
 from protocol.frames import RgbdFrame
-from server import self_check
 from server.opencl.device import Device
 from server.pipeline import FrameResult, Pipeline
-from server.self_check import (
+from server.service import self_check
+from server.service.self_check import (
     LEAST_OBJECT_PIXELS,
     LIGHT_BOUND_DEG,
     CheckFailed,

@@ -10,7 +10,7 @@ from server.opencl.device import open_device
 from server.pipeline import Pipeline
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
-from server.warm_up import SHARP_LIGHT, warm_up
+from server.service.warm_up import SHARP_LIGHT, warm_up
 from tests.rooms import CAMERA, frame_at, view_at, wishes
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from server.serve import BackgroundServer, start_in_background
-from server.service import Service
+from server.service.serve import BackgroundServer, start_in_background
+from server.service.service import Service
 from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
 from tests.service.wire import Wire
 

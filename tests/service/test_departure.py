@@ -11,8 +11,8 @@ import threading
 import httpx
 
 from protocol.messages import Bye, Composite, Error
-from server.departure import DRAINING, GOODBYE, Departure
-from server.serve import BackgroundServer
+from server.service.departure import DRAINING, GOODBYE, Departure
+from server.service.serve import BackgroundServer
 from tests.data import ROOT
 from tests.service.fakes import PATIENCE_S, frame_message
 from tests.service.test_http import get
@@ -43,7 +43,7 @@ def test_everybody_is_told_goodbye_with_1012(start_server) -> None:
 
 def test_while_a_session_ends_nobody_new_is_taken_and_health_says_so(start_server, lab, monkeypatch) -> None:
     server = start_server()
-    monkeypatch.setattr("server.serve.DRAIN_PATIENCE_S", 10 * PATIENCE_S)
+    monkeypatch.setattr("server.service.serve.DRAIN_PATIENCE_S", 10 * PATIENCE_S)
     lab.hold = True
     wire = Wire(server.url)
     wire.greet()

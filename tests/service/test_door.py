@@ -11,10 +11,10 @@ import pytest
 from client.client import Access, ClientError, StreamClient
 from protocol.local_keys import LocalKey, find_key, key_left, key_path
 from protocol.messages import Error
-from server.app import create_app
-from server.door import Door, is_loopback, is_token, new_token
-from server.serve import BackgroundServer
-from server.service import Service
+from server.service.app import create_app
+from server.service.door import Door, is_loopback, is_token, new_token
+from server.service.serve import BackgroundServer
+from server.service.service import Service
 from tests.service.fakes import CAMERA, FAKE_DEVICE, PATIENCE_S, fake_mesh
 from tests.service.wire import Wire
 

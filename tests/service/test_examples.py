@@ -19,8 +19,8 @@ import pytest
 from client.client import StreamClient
 from server.maths.sh import lambert_transfer
 from server.opencl.device import Device
-from server.serve import start_in_background
-from server.service import Service
+from server.service.serve import start_in_background
+from server.service.service import Service
 from tests.protocol.samples import SERVER
 from tests.service.fakes import CAMERA, rgbd_frame
 

@@ -18,7 +18,7 @@ from protocol.messages import (
     Quality,
     RemoveObject,
 )
-from server import mailbox
+from server.service import mailbox
 from tests.service.fakes import CAMERA, POSE, REFUSE_MM, fake_light, frame_message, rgbd_frame
 
 

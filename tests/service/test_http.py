@@ -10,10 +10,10 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from protocol.messages import Composite, Error, Hello, Timings
-from server.app import create_app
-from server.self_check import CheckFailed
-from server.serve import start_in_background
-from server.service import Service
+from server.service.app import create_app
+from server.service.self_check import CheckFailed
+from server.service.serve import start_in_background
+from server.service.service import Service
 from tests.service.fakes import CAMERA, FAKE_DEVICE, PATIENCE_S, REFUSE_MM, fake_mesh, frame_message
 from tests.service.wire import Wire
 

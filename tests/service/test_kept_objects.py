@@ -24,15 +24,15 @@ from protocol.messages import (
     Welcome,
     Wishes,
 )
-from server.mailbox import Mailbox
-from server.metrics import Metrics
 from server.opencl.device import Device
 from server.room import Room
-from server.room_store import RoomStore
-from server.scheduler import Scheduler
-from server.serve import BackgroundServer, start_in_background
-from server.service import Service
-from server.worker import Worker, Workshop
+from server.service.mailbox import Mailbox
+from server.service.metrics import Metrics
+from server.service.room_store import RoomStore
+from server.service.scheduler import Scheduler
+from server.service.serve import BackgroundServer, start_in_background
+from server.service.service import Service
+from server.service.worker import Worker, Workshop
 from tests.rooms import CAMERA, frame_at, view_at, wishes
 from tests.service import fakes
 from tests.service.fakes import PATIENCE_S, FakePipeline, Lab, fake_mesh, frame_message
@@ -72,7 +72,7 @@ def middle_of(folder: Path, device: Device, name: str) -> list[float]:
 @pytest.fixture
 def server(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[BackgroundServer]:
     """One that saves nothing by itself."""
-    monkeypatch.setattr("server.room_saver.RoomSaver.start", lambda _self: None)
+    monkeypatch.setattr("server.service.room_saver.RoomSaver.start", lambda _self: None)
     with start_in_background(Service(device, data=tmp_path / "rooms")) as server:
         yield server
 

@@ -20,10 +20,10 @@ from client.laptop.stream import StreamSummary, stream
 from client.layers import NEUTRAL, decode_layer, put_over
 from protocol.images import encode_depth
 from protocol.messages import Bye, Composite, Dropped, Layer, Light, Wishes
-from server.layer_message import STEPS_PER_M
 from server.opencl.device import Device
-from server.serve import start_in_background
-from server.service import Service
+from server.service.layer_message import STEPS_PER_M
+from server.service.serve import start_in_background
+from server.service.service import Service
 from server.stages import layer as of_server
 from server.stages.layer import LayerPart
 from tests.service.fakes import CAMERA, POSE, REFUSE_MM, fake_layer, fake_light, frame_message, rgbd_frame

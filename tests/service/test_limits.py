@@ -4,9 +4,9 @@ import pytest
 
 from protocol.codec import encode
 from protocol.messages import Acknowledged, Composite, Error, Hello, Quality, Welcome
-from server.guests import network_of
-from server.limits import Limits
-from server.pace import Allowance, Pace
+from server.service.guests import network_of
+from server.service.limits import Limits
+from server.service.pace import Allowance, Pace
 from tests.service.fakes import CAMERA, frame_message
 from tests.service.wire import Wire
 

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from protocol.messages import Frame, MoveObject, PlaceObject, Quality
-from server.mailbox import MAX_WAITING_BYTES, MAX_WAITING_LETTERS, Mailbox
+from server.service.mailbox import MAX_WAITING_BYTES, MAX_WAITING_LETTERS, Mailbox
 from tests.service.fakes import PATIENCE_S, frame_message
 
 

@@ -14,8 +14,8 @@ from client.client import ClientError, StreamClient
 from protocol.codec import decode_client, encode
 from protocol.limits import MAX_MESH_PART_BYTES, SUBPROTOCOL
 from protocol.messages import Acknowledged, Composite, Hello, Light, MeshPart, RequestMesh, Welcome, Wishes
-from server import mesh_message
 from server.meshing.files import mesh_files
+from server.service import mesh_message
 from tests.service.fakes import CAMERA, PATIENCE_S, frame_message, terrain
 from tests.service.test_client import with_client
 from tests.service.test_stream import FakeSource, files, quietly

@@ -8,9 +8,9 @@ import httpx
 import pytest
 
 from protocol.limits import MAX_MESH_BYTES
-from server.door import Door
-from server.object_library import MAX_OBJECTS, NoObject, ObjectLibrary
 from server.scene.mesh import load_mesh
+from server.service.door import Door
+from server.service.object_library import MAX_OBJECTS, NoObject, ObjectLibrary
 from tests.service.fakes import PATIENCE_S
 
 TOKEN = "a-token"

@@ -18,8 +18,8 @@ from server.opencl.device import Device
 from server.pipeline import Pipeline
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
-from server.serve import start_in_background
-from server.service import Service
+from server.service.serve import start_in_background
+from server.service.service import Service
 
 FRAMES = 3
 CAMERA = CameraModel(width=96, height=72, fx=80.0, fy=80.0, cx=47.5, cy=35.5)

@@ -12,7 +12,7 @@ import pytest
 
 from server.opencl.device import Device
 from server.room import Room
-from server.scheduler import Scheduler
+from server.service.scheduler import Scheduler
 from tests.rooms import wishes
 from tests.service.fakes import PATIENCE_S
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from protocol.messages import Wishes
-from server.rooms import RoomLocked, Rooms, lock_of
+from server.service.rooms import RoomLocked, Rooms, lock_of
 
 PATIENCE_S = 10.0
 

@@ -17,10 +17,10 @@ from client.room_options import room_place
 from protocol.frames import IDENTITY, RgbdFrame
 from protocol.images import encode_color, encode_depth
 from protocol.messages import Acknowledged, Composite, Error, Frame, Hello, Light, Marker, PlaceObject, Watch, Welcome
-from server.limits import Limits
 from server.opencl.device import Device
-from server.serve import BackgroundServer, start_in_background
-from server.service import Service
+from server.service.limits import Limits
+from server.service.serve import BackgroundServer, start_in_background
+from server.service.service import Service
 from tests.rooms import CAMERA, frame_at, view_at, wishes
 from tests.service import fakes
 from tests.service.wire import Wire

@@ -8,8 +8,8 @@ from collections import Counter
 import pytest
 
 from protocol.messages import Wishes
-from server.pressure import CALM_FRAMES, DOWN_FRAMES, Pressure, Quality
-from server.scheduler import AWAY_S, CREDIT_S, Scheduler, Share
+from server.service.pressure import CALM_FRAMES, DOWN_FRAMES, Pressure, Quality
+from server.service.scheduler import AWAY_S, CREDIT_S, Scheduler, Share
 
 
 class Clock:

@@ -10,8 +10,8 @@ import pytest
 
 from client.client import Access, ClientError, RoomPlace, StreamClient
 from protocol.messages import Hello
-from server.departure import DRAINING, GOODBYE
-from server.door import Door
+from server.service.departure import DRAINING, GOODBYE
+from server.service.door import Door
 from tests.service.fakes import CAMERA, PATIENCE_S, frame_message
 from tests.service.wire import Wire
 
@@ -44,7 +44,7 @@ def test_a_full_server(start_server) -> None:
 
 
 def test_a_server_of_another_version(start_server, monkeypatch) -> None:
-    monkeypatch.setattr("server.connection.SUBPROTOCOL", "probeless-v9")
+    monkeypatch.setattr("server.service.connection.SUBPROTOCOL", "probeless-v9")
     assert told(start_server().url) == (
         "this server speaks probeless-v9, you asked for probeless-v1: use the same version on both sides"
     )
@@ -74,7 +74,7 @@ def test_a_room_with_another_key(start_server) -> None:
 
 
 def test_a_server_that_is_draining(start_server, lab, monkeypatch) -> None:
-    monkeypatch.setattr("server.serve.DRAIN_PATIENCE_S", 10 * PATIENCE_S)
+    monkeypatch.setattr("server.service.serve.DRAIN_PATIENCE_S", 10 * PATIENCE_S)
     server = start_server()
     lab.hold = True
     wire = Wire(server.url)

@@ -9,16 +9,16 @@ import threading
 import httpx
 import pytest
 
-from server.serve import ServeError, listen, serve, start_in_background, url_of
-from server.service import Service
+from server.service.serve import ServeError, listen, serve, start_in_background, url_of
+from server.service.service import Service
 from tests.data import ROOT
 from tests.service.fakes import FAKE_DEVICE, PATIENCE_S, fake_mesh
 from tests.service.wire import Wire
 
 SERVE_FAKE = """
 import sys
-from server.serve import listen, serve_on
-from server.service import Service
+from server.service.serve import listen, serve_on
+from server.service.service import Service
 from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
 
 service = Service(FAKE_DEVICE, pipeline_factory=Lab().build, mesh_loader=fake_mesh)

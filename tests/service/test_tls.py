@@ -16,10 +16,10 @@ from cryptography import x509
 
 from client.access import AccessError, entrance, fingerprint_bytes
 from client.client import Access
-from server import tls
-from server.door import Door
-from server.serve import BackgroundServer
-from server.tls import Certificate, CertificateError, given_certificate, own_certificate
+from server.service import tls
+from server.service.door import Door
+from server.service.serve import BackgroundServer
+from server.service.tls import Certificate, CertificateError, given_certificate, own_certificate
 from tests.service.test_door import TOKEN, connected, not_connected
 
 

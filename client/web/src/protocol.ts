@@ -362,7 +362,11 @@ export interface Layer {
    * null: nothing is seen of it.
    */
   virtual: LayerPatch | null;
-  /** Colour of three channels: 128 times the root of what real surface is multiplied by. null: real surface stays as it is. */
+  /**
+   * Colour of three channels: 128 times the root of what real surface is multiplied by.
+   *
+   * null: real surface stays as it is.
+   */
   ratio: LayerPatch | null;
   /** Metres of a unit of depth. */
   depth_scale_m: number;

@@ -18,8 +18,8 @@ from server.opencl.device import Device
 from server.pipeline import FrameResult, Pipeline
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
-from server.serve import BackgroundServer, start_in_background
-from server.service import Service
+from server.service.serve import BackgroundServer, start_in_background
+from server.service.service import Service
 from tests.client.web.red_ball import TurningTable, red_ball
 
 IS_RED = """(pixels) => pixels?.some((value, i) => {

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from statistics import median
 
 import cv2
@@ -13,13 +15,17 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page
 
+from client.coding import frame_message, picture_bytes
 from protocol.frames import CameraModel, RgbdFrame
-from protocol.messages import ColorImage
-from server.serve import BackgroundServer, start_in_background
-from server.service import Service
+from protocol.h264 import is_key_picture
+from protocol.messages import ColorImage, Hello, Wishes
+from protocol.recording import write_message
+from server.service.serve import BackgroundServer, start_in_background
+from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.sequence import of_device
 from tests.client.web.test_capture import start_capture
+from tests.client.web.test_recorded import start_recording
 from tests.service.fakes import FAKE_DEVICE, FakePipeline, FakeResult, Lab, fake_mesh
 from tests.service.proxy import impaired
 
@@ -31,7 +37,7 @@ SETTLED, LOOKED_AT = 12, 10
 """Answers until the page has found its rung, and those whose age is then looked at."""
 LONGEST_S = 30.0
 AGE_BOUND_MS = 500.0
-"""Of a frame when it is answered, from its capture. One at the best takes this long over the link alone, two twice as long."""
+"""Of a frame when it is answered, from its capture: about what one picture at the best takes over the link."""
 
 
 @dataclass
@@ -144,3 +150,47 @@ def test_without_adapting_frames_are_older_than_that(server: BackgroundServer, s
         assert {image.width for image in seen.images} == {CAMERA.width}
         wait_for_text(page, "#sending", "Sent now: full size, quality 90")
         page.goto("about:blank")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("av") is None, reason="the server reads no video without PyAV")
+def test_video_gets_fewer_bits_and_goes_on(server: BackgroundServer, seen: Seen, open_page: OpenPage) -> None:
+    device = of_device(CAMERA, textured(), loops=True)
+    with impaired(server.url, DELAY_S, BYTES_PER_S) as link, closing(open_page(link.url, device, (900, 900))) as page:
+        page.locator("input[name=source][value=xr]").check()
+        page.locator("select[name=color]").select_option("h264")
+        start_capture(page)
+        wait_for_text(page, "#sending", "Sent now: video at its full bit rate")
+        wait_for_text(page, "#sending", "Sent now: video at 20 % of its bit rate")
+        seen.wait(lambda images: len(images) > 40)
+        page.goto("about:blank")
+    assert {(image.codec, image.width) for image in seen.images} == {("h264", CAMERA.width)}
+    assert sum(len(image.data) for image in seen.images[-5:]) < 0.5 * sum(len(image.data) for image in seen.images[:5])
+    keys = [is_key_picture(image.data) for image in seen.images]
+    assert keys[0]
+    assert keys.count(True) < len(keys) / 3
+
+
+@pytest.mark.parametrize("adapts", ["yes", "no"])
+def test_a_recording_is_sent_as_it_is_when_the_link_is_free(
+    adapts: str, server: BackgroundServer, seen: Seen, open_page: OpenPage, tmp_path: Path
+) -> None:
+    messages = [frame_message(frame, CAMERA) for frame in recorded_frames()]
+    with (tmp_path / "textured.rec").open("wb") as file:
+        for message in (Hello(client="test", camera=CAMERA, wishes=Wishes(poses="given")), *messages):
+            write_message(file, message)
+    with impaired(server.url, DELAY_S, BYTES_PER_S) as link, closing(open_page(link.url, size=(900, 900))) as page:
+        note_ages(page)
+        page.locator("input[name=source][value=recorded]").check()
+        page.locator("[name=adapt]").select_option(adapts)
+        start_recording(page, tmp_path / "textured.rec")
+        wait_for_text(page, "#sending", "Sent now: as recorded, ")
+        age_ms = settled_age_ms(page)
+        page.goto("about:blank")
+    assert {image.data for image in seen.images} <= {message.color.data for message in messages}
+    one_ms = 1e3 * max(map(picture_bytes, messages)) / BYTES_PER_S
+    assert (age_ms < 1.4 * one_ms + 1e3 * 2 * DELAY_S) == (adapts == "yes")
+
+
+def recorded_frames() -> list[RgbdFrame]:
+    """The same pictures with depth of their size."""
+    return [replace(frame, depth=np.full((CAMERA.height, CAMERA.width), 1500, np.uint16)) for frame in textured()]

@@ -16,8 +16,8 @@ from playwright.sync_api import Page
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Hello, Wishes
-from server.serve import BackgroundServer, start_in_background
-from server.service import Service
+from server.service.serve import BackgroundServer, start_in_background
+from server.service.service import Service
 from tests.client.web.conftest import PATIENCE_MS, OpenPage, wait_for_text
 from tests.client.web.sequence import ACROSS, STRAIGHT, of_device
 from tests.service.fakes import FAKE_DEVICE, FakePipeline, FakeResult, Lab, fake_mesh

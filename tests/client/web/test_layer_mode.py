@@ -15,8 +15,8 @@ from playwright.sync_api import Page
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
-from server.serve import BackgroundServer, start_in_background
-from server.service import Service
+from server.service.serve import BackgroundServer, start_in_background
+from server.service.service import Service
 from tests.client.web.ball_scene import CAMERA, linear, look
 from tests.client.web.conftest import PICTURES, OpenPage, wait_for_text
 from tests.client.web.displayed import display

@@ -18,7 +18,7 @@ from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import encode_color, encode_depth
 from protocol.messages import Frame, Hello
 from protocol.recording import write_message
-from server.serve import BackgroundServer
+from server.service.serve import BackgroundServer
 from tests.client.web.ball_scene import CAMERA, look
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.displayed import Displayed

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page
 
-from server.door import Door
-from server.object_library import ObjectLibrary
 from server.scene.vase import vase_glb
-from server.serve import BackgroundServer, start_in_background
-from server.service import Service
+from server.service.door import Door
+from server.service.object_library import ObjectLibrary
+from server.service.serve import BackgroundServer, start_in_background
+from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.sequence import of_device
 from tests.client.web.test_capture import CAMERA, frames_seen, start_capture

@@ -21,8 +21,8 @@ from server.opencl.device import Device
 from server.pipeline import Pipeline
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
-from server.serve import BackgroundServer, start_in_background
-from server.service import Service
+from server.service.serve import BackgroundServer, start_in_background
+from server.service.service import Service
 from tests.client.web.conftest import PICTURES, OpenPage, wait_for_text
 from tests.client.web.sequence import FLIP, of_device
 from tests.client.web.test_capture import Received, start_capture

@@ -18,8 +18,8 @@ from server.opencl.device import Device
 from server.pipeline import Pipeline
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
-from server.serve import BackgroundServer, start_in_background
-from server.service import Service
+from server.service.serve import BackgroundServer, start_in_background
+from server.service.service import Service
 from tests.client.web.conftest import PATIENCE_MS, OpenPage, wait_for_text
 from tests.client.web.sequence import of_device
 from tests.client.web.test_capture import start_capture

@@ -19,8 +19,8 @@ from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
 from protocol.recording import read_messages
 from server.opencl.device import Device
-from server.serve import BackgroundServer, start_in_background
-from server.service import Service
+from server.service.serve import BackgroundServer, start_in_background
+from server.service.service import Service
 from tests.client.web.conftest import PATIENCE_MS, OpenPage, wait_for_text
 from tests.client.web.test_capture import Received
 from tests.client.web.test_objects import (

@@ -11,11 +11,11 @@ from playwright.sync_api import Page
 
 from protocol.limits import SUBPROTOCOL
 from protocol.messages import Hello
-from server.departure import DRAINING, GOODBYE
-from server.door import Door
-from server.rooms import lock_of
-from server.serve import BackgroundServer, start_in_background
-from server.service import Service
+from server.service.departure import DRAINING, GOODBYE
+from server.service.door import Door
+from server.service.rooms import lock_of
+from server.service.serve import BackgroundServer, start_in_background
+from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.sequence import of_device
 from tests.client.web.test_capture import CAMERA, frames_seen, start_capture
@@ -110,7 +110,7 @@ def test_a_server_that_is_full(start: StartServer, open_page: OpenPage) -> None:
 
 
 def test_a_server_that_is_draining(start: StartServer, lab: Lab, open_page: OpenPage, monkeypatch) -> None:
-    monkeypatch.setattr("server.serve.DRAIN_PATIENCE_S", 10 * PATIENCE_S)
+    monkeypatch.setattr("server.service.serve.DRAIN_PATIENCE_S", 10 * PATIENCE_S)
     server = start()
     page = open_page(server.url)
     wait_for_text(page, "#state", "waiting for a session")
@@ -130,7 +130,7 @@ def test_a_server_that_is_draining(start: StartServer, lab: Lab, open_page: Open
 
 
 def test_a_server_of_another_version(start: StartServer, open_page: OpenPage, monkeypatch) -> None:
-    monkeypatch.setattr("server.connection.SUBPROTOCOL", "probeless-v9")
+    monkeypatch.setattr("server.service.connection.SUBPROTOCOL", "probeless-v9")
     page = open_page(start().url)
     wait_for_text(page, "#state", "Refused")
     assert state(page) == (

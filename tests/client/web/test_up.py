@@ -11,8 +11,8 @@ import pytest
 from msgspec import structs
 
 from protocol.frames import RgbdFrame
-from server.serve import BackgroundServer, start_in_background
-from server.service import Service
+from server.service.serve import BackgroundServer, start_in_background
+from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.sequence import of_device
 from tests.client.web.test_capture import start_capture

@@ -11,10 +11,10 @@ from msgspec import structs
 
 from protocol.codec import encode
 from protocol.messages import Bye, ClientMessage, Dropped, Error, Frame, Hello, Watch, Welcome
-from server.broadcast import Broadcast
-from server.connection import GONE, INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
-from server.mailbox import Mailbox
-from server.worker import Worker, Workshop
+from server.service.broadcast import Broadcast
+from server.service.connection import GONE, INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
+from server.service.mailbox import Mailbox
+from server.service.worker import Worker, Workshop
 
 MAX_INFLIGHT = 2
 FAR_TOO_MANY_INFLIGHT = 4 * MAX_INFLIGHT

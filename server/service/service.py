@@ -19,21 +19,21 @@ from protocol.colors import readable_codecs
 from protocol.frames import CameraModel
 from protocol.images import DEPTH_CODECS
 from protocol.messages import Bye, Hello, Watch, Welcome, Wishes
-from server.broadcast import Broadcast, serve_watcher
-from server.connection import GONE, INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
-from server.departure import Departure
-from server.events import about
-from server.guests import Guests
-from server.kept_rooms import KeptRooms
-from server.limits import DEFAULT_LIMITS, Limits
-from server.metrics import Metrics
 from server.parsing.parsers import Parsers
-from server.rooms import RoomFactory, Rooms, lock_of
-from server.saving.upkeep import Kept
 from server.scene.mesh import Mesh
-from server.scheduler import Scheduler
-from server.session import MAX_INFLIGHT, CaptureSession, LoopOutlet
-from server.worker import Workshop
+from server.service.broadcast import Broadcast, serve_watcher
+from server.service.connection import GONE, INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
+from server.service.departure import Departure
+from server.service.events import about
+from server.service.guests import Guests
+from server.service.kept_rooms import KeptRooms
+from server.service.limits import DEFAULT_LIMITS, Limits
+from server.service.metrics import Metrics
+from server.service.rooms import RoomFactory, Rooms, lock_of
+from server.service.saving.upkeep import Kept
+from server.service.scheduler import Scheduler
+from server.service.session import MAX_INFLIGHT, CaptureSession, LoopOutlet
+from server.service.worker import Workshop
 
 if TYPE_CHECKING:
     from server.opencl.device import Device

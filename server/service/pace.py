@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from server.limits import MIB, Limits
+from server.service.limits import MIB, Limits
 
 
 class Allowance:

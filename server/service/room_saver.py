@@ -8,8 +8,8 @@ import time
 from collections.abc import Callable, Iterable
 
 from server.room import Room
-from server.room_store import RoomStore, RoomStoreError
-from server.saving.room_saves import Saved
+from server.service.room_store import RoomStore, RoomStoreError
+from server.service.saving.room_saves import Saved
 
 EVERY_S = 2.0
 """Between saves: with the time that one takes, what a crash may cost."""

@@ -11,7 +11,7 @@ from urllib.parse import quote, urlsplit
 
 from starlette.requests import HTTPConnection
 
-from server.connection import FORBIDDEN, UNAUTHORIZED, Refusal
+from server.service.connection import FORBIDDEN, UNAUTHORIZED, Refusal
 
 MAX_TOKEN_CHARS = 256
 WHERE_IT_IS = "use the URL that the server printed at its start, which ends in ?token=..."

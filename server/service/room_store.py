@@ -22,10 +22,10 @@ import pyopencl as cl
 
 from server.opencl.device import Device
 from server.room import Room
-from server.saving.files import DamagedFile, sync_folder
-from server.saving.room_saves import SLOTS, RoomSaves, Saved, header_of
-from server.saving.slot import Slot
-from server.saving.upkeep import Kept, KeptLimits, Piece, pieces_in, surplus
+from server.service.saving.files import DamagedFile, sync_folder
+from server.service.saving.room_saves import SLOTS, RoomSaves, Saved, header_of
+from server.service.saving.slot import Slot
+from server.service.saving.upkeep import Kept, KeptLimits, Piece, pieces_in, surplus
 
 FORGOTTEN = ".forgotten-"
 """Begins the name of a folder that is about to be deleted, and of no room's."""

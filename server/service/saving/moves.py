@@ -11,9 +11,9 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from server.room_objects import Inventory, Place
-from server.saving.files import DamagedFile, check_file, read_parts, sync_folder, write_parts
-from server.saving.state import array_from_list, array_to_list
 from server.scene.placement import Placement
+from server.service.saving.files import DamagedFile, check_file, read_parts, sync_folder, write_parts
+from server.service.saving.state import array_from_list, array_to_list
 
 VERSION = 1
 MOVES, PART = "moves", "moves.part"

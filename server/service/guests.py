@@ -7,8 +7,8 @@ import ipaddress
 from collections import Counter
 from collections.abc import Iterator
 
-from server.connection import TRY_LATER, Refusal
-from server.limits import Limits
+from server.service.connection import TRY_LATER, Refusal
+from server.service.limits import Limits
 
 
 class Guests:

@@ -11,11 +11,11 @@ from fastapi.responses import JSONResponse, PlainTextResponse, Response
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST
 
-from server.connection import POLICY, Connection, Refusal
-from server.door import WHERE_IT_IS, Door
-from server.object_library import ObjectLibrary
-from server.object_routes import add_objects
-from server.service import Service
+from server.service.connection import POLICY, Connection, Refusal
+from server.service.door import WHERE_IT_IS, Door
+from server.service.object_library import ObjectLibrary
+from server.service.object_routes import add_objects
+from server.service.service import Service
 
 STREAM_PATH = "/v1/stream"
 PAGE_FOLDER = Path(__file__).resolve().parents[1] / "client" / "web" / "dist"

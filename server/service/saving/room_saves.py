@@ -12,11 +12,11 @@ from pathlib import Path
 
 from server.opencl.device import Device
 from server.room import Room
-from server.saving.files import DamagedFile
-from server.saving.moves import Moves, forget_moves, moves_since, read_moves, write_moves
-from server.saving.slot import Slot
-from server.saving.snapshot import Snapshot, rebuilt, snapshot
-from server.saving.state import VERSION, Header, state_to_bytes
+from server.service.saving.files import DamagedFile
+from server.service.saving.moves import Moves, forget_moves, moves_since, read_moves, write_moves
+from server.service.saving.slot import Slot
+from server.service.saving.snapshot import Snapshot, rebuilt, snapshot
+from server.service.saving.state import VERSION, Header, state_to_bytes
 
 SLOTS = ("0", "1")
 NOTE_USE_S = 60.0

@@ -14,9 +14,11 @@ import msgspec
 from msgspec import structs
 
 from server.parsing.mesh_bytes import mesh_to_bytes
-from server.saving.brick_files import Batch, merged, write_bricks
-from server.saving.files import DamagedFile, check_file, read_parts, sync_folder, write_parts
-from server.saving.state import (
+from server.scene.mesh import Mesh
+from server.scene.placement import Placement
+from server.service.saving.brick_files import Batch, merged, write_bricks
+from server.service.saving.files import DamagedFile, check_file, read_parts, sync_folder, write_parts
+from server.service.saving.state import (
     VERSION,
     FileName,
     Header,
@@ -26,14 +28,12 @@ from server.saving.state import (
     state_from_bytes,
     state_to_bytes,
 )
-from server.saving.upkeep import ASIDE
-from server.scene.mesh import Mesh
-from server.scene.placement import Placement
+from server.service.saving.upkeep import ASIDE
 from server.stages.volume import Volume
 
 if TYPE_CHECKING:
     from server.room_objects import KeptObject
-    from server.saving.snapshot import Snapshot
+    from server.service.saving.snapshot import Snapshot
 
 SAVE, PART = "save", "save.part"
 """What a save is read by; it names all other files."""

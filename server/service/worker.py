@@ -31,18 +31,18 @@ from protocol.messages import (
     RemoveObject,
     RequestMesh,
 )
-from server.connection import POLICY, UNAUTHORIZED, Refusal
-from server.layer_message import layer_message, row_major
-from server.mailbox import Letter, Mailbox
-from server.mesh_message import mesh_parts
 from server.meshing.files import mesh_files
-from server.metrics import Metrics
-from server.pressure import Pressure
-from server.pressure import Quality as Asked
-from server.rooms import RoomLocked
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
-from server.scheduler import Scheduler
+from server.service.connection import POLICY, UNAUTHORIZED, Refusal
+from server.service.layer_message import layer_message, row_major
+from server.service.mailbox import Letter, Mailbox
+from server.service.mesh_message import mesh_parts
+from server.service.metrics import Metrics
+from server.service.pressure import Pressure
+from server.service.pressure import Quality as Asked
+from server.service.rooms import RoomLocked
+from server.service.scheduler import Scheduler
 
 if TYPE_CHECKING:
     from server.pipeline import FrameResult, Pipeline

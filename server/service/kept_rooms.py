@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from protocol.messages import Wishes
-from server.saving.upkeep import Kept, KeptLimits
+from server.service.saving.upkeep import Kept, KeptLimits
 
 if TYPE_CHECKING:
     from server.opencl.device import Device
     from server.room import Room
-    from server.room_saver import RoomSaver
-    from server.room_store import RoomStore
-    from server.rooms import Rooms
+    from server.service.room_saver import RoomSaver
+    from server.service.room_store import RoomStore
+    from server.service.rooms import Rooms
 
 log = logging.getLogger(__name__)
 
@@ -36,8 +36,8 @@ class KeptRooms:
 
     def start(self, rooms: Rooms) -> None:
         """Begin to save those of `rooms` that are open, every few seconds, and to keep the folder within its limits."""
-        from server.room_saver import RoomSaver  # loads OpenCL, which a service without rooms does not need
-        from server.room_store import RoomStore
+        from server.service.room_saver import RoomSaver  # loads OpenCL, which a service without rooms does not need
+        from server.service.room_store import RoomStore
 
         self._rooms, self._store = rooms, RoomStore(self._folder)
         self._saver = RoomSaver(self._store, rooms.visited, tidy=self.tidy)
@@ -50,7 +50,7 @@ class KeptRooms:
 
     def key_digest(self, name: str) -> bytes | None:
         """Of the key that a room was left with, read before all else. Raises ValueError, one line."""
-        from server.room_store import RoomStoreError
+        from server.service.room_store import RoomStoreError
 
         assert self._store is not None
         try:
@@ -61,7 +61,7 @@ class KeptRooms:
     def open_room(self, wishes: Wishes, name: str) -> Room:
         """The room as it was left, else a new one. Raises ValueError, one line, where what was left cannot be read."""
         from server.room import Room
-        from server.room_store import RoomStoreError
+        from server.service.room_store import RoomStoreError
 
         assert self._store is not None
         try:

@@ -7,9 +7,9 @@ from dataclasses import asdict
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, PlainTextResponse, Response
 
-from server.connection import UNAUTHORIZED
-from server.door import Door
-from server.object_library import NoObject, ObjectLibrary
+from server.service.connection import UNAUTHORIZED
+from server.service.door import Door
+from server.service.object_library import NoObject, ObjectLibrary
 
 OBJECTS_PATH = "/v1/objects"
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from server.saving.upkeep import DAY_S, KeptLimits
+from server.service.saving.upkeep import DAY_S, KeptLimits
 
 MIB, GIB = 1 << 20, 1 << 30
 KEPT = KeptLimits(space_bytes=16 * GIB, age_s=180 * DAY_S)

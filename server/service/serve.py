@@ -19,13 +19,13 @@ import uvicorn
 
 from protocol.limits import MAX_MESSAGE_BYTES
 from protocol.local_keys import LocalKey, key_left
-from server.app import create_app
-from server.door import Door, is_loopback, new_token
-from server.limits import DEFAULT_LIMITS, Limits
-from server.linger import LingeringWebSocket
-from server.object_library import ObjectLibrary
-from server.service import Service
-from server.tls import Certificate
+from server.service.app import create_app
+from server.service.door import Door, is_loopback, new_token
+from server.service.limits import DEFAULT_LIMITS, Limits
+from server.service.linger import LingeringWebSocket
+from server.service.object_library import ObjectLibrary
+from server.service.service import Service
+from server.service.tls import Certificate
 
 if TYPE_CHECKING:
     from server.opencl.device import Device
@@ -289,7 +289,7 @@ def _server(service: Service, door: Door, certificate: Certificate | None, libra
 
 
 def _warm_up(device: Device) -> None:
-    from server.warm_up import warm_up
+    from server.service.warm_up import warm_up
 
     warm_up(device)
 

@@ -13,7 +13,7 @@ from server.maths.directional_fit import directional_sh
 from server.opencl.device import Device
 from server.pipeline import Pipeline
 from server.scene.placement import Placement
-from server.self_check import CAMERA, check_answers, triangle
+from server.service.self_check import CAMERA, check_answers, triangle
 
 _LAMP = np.outer(directional_sh(np.array([0.0, -1.0, 0.0]), 0.2, 4), np.ones(3))
 SHARP_LIGHT = tuple((float(r), float(g), float(b)) for r, g, b in _LAMP)

@@ -10,7 +10,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, gene
 from protocol.messages import Timings
 
 if TYPE_CHECKING:
-    from server.kept_rooms import KeptRooms
+    from server.service.kept_rooms import KeptRooms
 
 BUCKETS_MS = (0.5, 1, 2, 5, 10, 20, 35, 50, 75, 100, 150, 250, 500, 1000, 2500, 5000)
 STAGES = Timings.__struct_fields__

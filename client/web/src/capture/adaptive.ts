@@ -22,7 +22,7 @@ export const LADDER: readonly Coding[] = [
 ];
 /** Of the time between frames that the busier way may take. */
 const SHARE = 0.9;
-/** Where the server is slower still, quality would cost nothing but age: no way may take longer than the share of this. */
+/** Where the server is slower still, quality costs nothing but age: a way may not take more than a share of this. */
 const LONGEST_TRANSFER_S = 0.2;
 /** Weight of the newest measurement. */
 const SMOOTHING = 0.25;

@@ -18,7 +18,7 @@ from server.service.object_routes import add_objects
 from server.service.service import Service
 
 STREAM_PATH = "/v1/stream"
-PAGE_FOLDER = Path(__file__).resolve().parents[1] / "client" / "web" / "dist"
+PAGE_FOLDER = Path(__file__).resolve().parents[2] / "client" / "web" / "dist"
 
 
 def create_app(

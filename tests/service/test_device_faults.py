@@ -16,10 +16,10 @@ def test_a_device_without_memory_is_told(dial, monkeypatch: pytest.MonkeyPatch, 
     bad.greet()
     process = FakePipeline.process
 
-    def failing(pipeline: FakePipeline, frame: object) -> object:
+    def failing(pipeline: FakePipeline, frame: object, **wanted: bool) -> object:
         if frame.index == 7:
             raise error
-        return process(pipeline, frame)
+        return process(pipeline, frame, **wanted)
 
     monkeypatch.setattr(FakePipeline, "process", failing)
     bad.say(frame_message(7))

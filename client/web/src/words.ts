@@ -42,7 +42,7 @@ export function describeSending(sending: Sending, fps: number | null): string {
   const often = fps === null ? "" : `, ${fps < 2.95 ? fps.toFixed(1) : Math.round(fps)} frames/s`;
   if (sending.as === "recorded") return `as recorded${often}`;
   const { divisor, quality, videoShare } = sending.coding;
-  if (sending.as === "jpeg") return `${divisor === 1 ? "full" : divisor === 2 ? "half" : "a quarter of its"} size, quality ${quality}${often}`;
+  if (sending.as === "jpeg") return `${divisor === 1 ? "full" : divisor === 2 ? "half" : "quarter"} size, quality ${quality}${often}`;
   return `video at ${videoShare === 1 ? "its full bit rate" : `${Math.round(100 * videoShare)} % of its bit rate`}${often}`;
 }
 

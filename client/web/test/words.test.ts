@@ -2,9 +2,10 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
+import { LADDER } from "../src/capture/adaptive";
 import { pause_ms, streamUrl } from "../src/connection";
 import { FrameRate } from "../src/rate";
-import { describeBound, describeDirection, describePoint, milliseconds, number, plain } from "../src/words";
+import { describeBound, describeDirection, describePoint, describeSending, milliseconds, number, plain } from "../src/words";
 
 test("directions", () => {
   assert.equal(describeDirection([0, -1, 0]), "from behind the camera, 90° up");
@@ -51,6 +52,15 @@ test("frame rate", () => {
   assert.equal(rate.value(1150), 10); // 200 and 300 are left
   assert.equal(rate.value(1250), null); // 300 alone says nothing
   assert.equal(rate.value(5000), null);
+});
+
+test("what is sent is said as a person would", () => {
+  const [best, , , , half] = LADDER;
+  assert.equal(describeSending({ as: "jpeg", coding: best! }, null), "full size, quality 90");
+  assert.equal(describeSending({ as: "jpeg", coding: half! }, 6.2), "half size, quality 75, 6 frames/s");
+  assert.equal(describeSending({ as: "video", coding: best! }, 14.6), "video at its full bit rate, 15 frames/s");
+  assert.equal(describeSending({ as: "video", coding: half! }, 2.84), "video at 20 % of its bit rate, 2.8 frames/s");
+  assert.equal(describeSending({ as: "recorded" }, 9), "as recorded, 9 frames/s");
 });
 
 test("pauses grow to a limit and differ between pages", () => {

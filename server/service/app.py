@@ -70,7 +70,7 @@ def _add_stream(app: FastAPI, service: Service, door: Door) -> None:
 
 
 def _add_health(app: FastAPI, service: Service) -> None:
-    @app.get("/healthz")
+    @app.get("/healthz", responses={503: {"description": "Not ready: what is missing is in the answer"}})
     async def healthz() -> JSONResponse:
         state = {"ready": service.ready, "device": service.device_name, "sessions": service.sessions}
         if service.kept is not None:
@@ -85,7 +85,7 @@ def _add_health(app: FastAPI, service: Service) -> None:
 
 
 def _add_metrics(app: FastAPI, service: Service, door: Door) -> None:
-    @app.get("/metrics")
+    @app.get("/metrics", response_class=PlainTextResponse, responses={401: {"description": "No token"}})
     async def metrics(request: Request) -> Response:
         if not door.shows_metrics_to(request):
             return PlainTextResponse(f"The token is missing or wrong: {WHERE_IT_IS}.\n", status_code=401)

@@ -3,27 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, PlainTextResponse, Response
 
 from server.service.connection import UNAUTHORIZED
 from server.service.door import Door
-from server.service.object_library import NoObject, ObjectLibrary
+from server.service.object_library import MEDIA_TYPES, NoObject, ObjectLibrary
 
 OBJECTS_PATH = "/v1/objects"
+_TEXT: dict[str, Any] = {"content": {"text/plain": {}}}
+REFUSED: dict[int | str, dict[str, Any]] = {
+    401: _TEXT | {"description": "The token is missing or wrong"},
+    403: _TEXT | {"description": "A page of another origin"},
+}
+FILES: dict[int | str, dict[str, Any]] = {
+    200: {"description": "The file", "content": {media: {} for media in sorted(set(MEDIA_TYPES.values()))}},
+    304: {"description": "As it was"},
+    404: _TEXT | {"description": "No such object"},
+}
 
 
 def add_objects(app: FastAPI, library: ObjectLibrary, door: Door) -> None:
     """Whoever may open the stream may have the objects; in threads, since files are read."""
 
-    @app.get(OBJECTS_PATH)
+    @app.get(OBJECTS_PATH, responses=REFUSED)
     def listing(request: Request) -> Response:
         return _refusal(door, request) or JSONResponse(
             {"objects": [asdict(offered) for offered in library.listing()]}, headers=_headers(request)
         )
 
-    @app.get(OBJECTS_PATH + "/{name}")
+    @app.get(OBJECTS_PATH + "/{name}", response_class=Response, responses=REFUSED | FILES)
     def one(request: Request, name: str) -> Response:
         if (refusal := _refusal(door, request)) is not None:
             return refusal

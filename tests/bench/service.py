@@ -18,7 +18,7 @@ from tests.bench.finished import ROOT, Finished, Part
 from tests.bench.run import Run
 from tests.bench.service_bytes import decoder_part, socket_part
 from tests.bench.service_faults import FAULTS, fault_part, server_killed_part
-from tests.bench.service_http import http_part
+from tests.bench.service_http import http_part, schema_part
 from tests.bench.service_load import load_part, side_by_side_part
 from tests.bench.service_planes import planes_part
 from tests.bench.service_replay import replay_part
@@ -34,6 +34,7 @@ PARTS: dict[str, Callable[..., Part]] = {
     "mutated messages": decoder_part,
     "mutated messages over the socket": socket_part,
     "bad requests": http_part,
+    "requests by the schema": schema_part,
     "two planes": planes_part,
     "replay": replay_part,
 }

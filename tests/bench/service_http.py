@@ -9,11 +9,17 @@ from pathlib import Path
 
 import httpx
 
+from server.service.app import create_app
+from server.service.service import Service
 from tests.bench.finished import Part
 from tests.bench.run import Run
 from tests.bench.service_process import Served, serving
+from tests.service.by_schema import requests_by_schema
+from tests.service.fakes import FAKE_DEVICE
 
 REQUESTS, QUICK_REQUESTS = 20_000, 300
+EXAMPLES, QUICK_EXAMPLES = 1000, 20
+"""A route and kind."""
 SEED = 8
 PATIENCE_S = 20.0
 METHODS = ("GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH", "TRACE", "CONNECT", "get", "BREW", "G\x00T")
@@ -90,6 +96,20 @@ def http_part(run: Run, out: Path) -> Part:
     part.sizes["bad requests"] = count
     part.add("bad requests: hangs, failures, answers of 500 and above", len(wrong), "requests", "<= 0")
     part.add("bad requests: errors in the server's log", len(errors), "errors", "<= 0")
+    return part
+
+
+def schema_part(run: Run, out: Path) -> Part:
+    """Requests that schemathesis makes up from what the routes say of themselves."""
+    app = create_app(Service(FAKE_DEVICE))  # for its description
+    (out / "schema.log").unlink(missing_ok=True)
+    with serving(out / "schema.log", "--data", "none", "--token", "none") as served:
+        found = requests_by_schema(app, served.bare_url, run.of(QUICK_EXAMPLES, EXAMPLES))
+        errors = [event for event in served.events() if event.get("level") == "error"]
+    part = Part(details={"requests": found.requests, "wrong": found.wrong[:20], "errors": errors[:20]})
+    part.sizes["requests by the schema"] = sum(found.requests.values())
+    part.add("requests by the schema: answers that are not as described", len(found.wrong), "requests", "<= 0")
+    part.add("requests by the schema: errors in the server's log", len(errors), "errors", "<= 0")
     return part
 
 

@@ -1,0 +1,37 @@
+"""The HTTP side keeps to its own description, whatever is asked."""
+
+from __future__ import annotations
+
+from fastapi import FastAPI, Response
+
+from server.service.app import create_app
+from server.service.door import Door
+from server.service.serve import start_in_background
+from server.service.service import Service
+from tests.service.by_schema import requests_by_schema
+from tests.service.fakes import FAKE_DEVICE
+
+EXAMPLES = 15
+
+
+def test_every_answer_is_described(server) -> None:
+    found = requests_by_schema(create_app(Service(FAKE_DEVICE)), server.url, EXAMPLES)
+    assert not found.wrong
+    assert set(found.requests) == {"GET /healthz", "GET /metrics", "GET /v1/objects", "GET /v1/objects/{name}"}
+    assert found.requests["GET /v1/objects/{name}"] >= EXAMPLES
+
+
+def test_refusals_are_described() -> None:
+    with start_in_background(Service(FAKE_DEVICE), door=Door("secret")) as guarded:
+        url = guarded.url.partition("?")[0].rstrip("/")
+        found = requests_by_schema(create_app(Service(FAKE_DEVICE)), url, EXAMPLES)
+    assert not found.wrong
+
+
+def test_an_answer_that_is_not_described_is_seen(server) -> None:
+    app = FastAPI()
+
+    @app.get("/healthz", responses={200: {"content": {"text/html": {}}}}, response_class=Response)
+    def other() -> None: ...
+
+    assert "Content-Type" in requests_by_schema(app, server.url, 2).wrong[0]

@@ -125,6 +125,27 @@ def test_javascript_gets_the_light(server, tmp_path: Path) -> None:
     assert told["frame"] >= 0
 
 
+WITH_THREE = """
+import { LightProbe } from "three";
+import { applyLight } from "./light.mjs";
+const probe = new LightProbe();
+applyLight(probe, { sh_webxr: Array.from({ length: 27 }, (_, i) => i), valid: true });
+console.log(JSON.stringify(probe.sh.coefficients.map(({ x, y, z }) => [x, y, z])));
+"""
+
+
+def test_three_js_takes_the_light_as_the_example_gives_it(tmp_path: Path) -> None:
+    program = node()
+    if not (MODULES / "three").is_dir():
+        pytest.skip("client/web/node_modules is not there: make web")
+    shutil.copy(EXAMPLES / "light.mjs", tmp_path)
+    (tmp_path / "node_modules").symlink_to(MODULES)
+    (tmp_path / "with_three.mjs").write_text(WITH_THREE)
+    ran = subprocess.run([program, "with_three.mjs"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert json.loads(ran.stdout) == [[3 * i, 3 * i + 1, 3 * i + 2] for i in range(9)]
+
+
 def test_the_page_names_every_example_and_its_code_is_theirs() -> None:
     page = (ROOT / "docs" / "library.md").read_text()
     for path in (*EXAMPLES.glob("*.py"), *EXAMPLES.glob("*.mjs")):

@@ -118,14 +118,18 @@ def deflate(data: bytes) -> bytes:
     return compressor.compress(data) + compressor.flush()
 
 
-def inflate(data: bytes, size_bytes: int) -> bytes:
-    """Undo `deflate`. Raises ProtocolError unless exactly `size_bytes` come out and nothing is left over."""
+def inflate(data: bytes, size_bytes: int, least_bytes: int | None = None) -> bytes:
+    """Undo `deflate`. Raises ProtocolError unless exactly `size_bytes` come out and nothing is left over.
+
+    `least_bytes`: or any size from that up.
+    """
     decompressor = zlib.decompressobj(-zlib.MAX_WBITS)
     try:
         raw = decompressor.decompress(data, size_bytes + 1)
     except zlib.error as error:
         raise ProtocolError(f"depth.data is not raw deflate: {error}") from error
-    if len(raw) != size_bytes or not decompressor.eof or decompressor.unused_data:
+    is_whole = decompressor.eof and not decompressor.unused_data
+    if not (size_bytes if least_bytes is None else least_bytes) <= len(raw) <= size_bytes or not is_whole:
         raise ProtocolError(f"depth.data is truncated or does not hold the {size_bytes} bytes its size declares")
     return raw
 

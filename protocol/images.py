@@ -121,6 +121,8 @@ def encode_depth(
             data = depth.astype("<u2").tobytes()
         case "zdelta":
             data = deflate(filter_depth(depth))
+        case "zranks":
+            data = deflate(rank_depth(depth))
         case "zstd-delta":
             data = zstd_compress(filter_depth(depth), level)
         case "zstd-ranks":
@@ -136,10 +138,10 @@ def decode_depth(image: DepthImage, camera: CameraModel) -> NDArray[np.uint16]:
     _require_size("depth", image, camera.depth_lens)
     if image.codec == "raw":
         return _raw("depth", image, "<u2", 1).reshape(image.height, image.width)
-    if image.codec == "zstd-ranks":
+    decompress = inflate if image.codec in ("zdelta", "zranks") else zstd_decompress
+    if image.codec in ("zranks", "zstd-ranks"):
         most = most_rank_bytes(image.width, image.height)
-        return unrank_depth(zstd_decompress(image.data, most, least_bytes=0), image.width, image.height)
-    decompress = inflate if image.codec == "zdelta" else zstd_decompress
+        return unrank_depth(decompress(image.data, most, least_bytes=0), image.width, image.height)
     return unfilter_depth(decompress(image.data, 2 * image.width * image.height), image.width, image.height)
 
 

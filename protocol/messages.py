@@ -43,7 +43,7 @@ Dictionary = Literal["4x4_50", "5x5_100", "6x6_250", "7x7_1000", "apriltag_36h11
 Tracking = Literal["given", "tracked", "lost"]
 MeshFormat = Literal["ply", "glb"]
 ColorCodec = Literal["jpeg", "png", "raw", "h264"]
-DepthCodec = Literal["raw", "zdelta", "zstd-delta", "zstd-ranks"]
+DepthCodec = Literal["raw", "zdelta", "zranks", "zstd-delta", "zstd-ranks"]
 
 
 def _require_auto(where: str, preset: str, *chosen_by: float | None) -> None:
@@ -84,8 +84,8 @@ class ColorImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True)
 class DepthImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
     """uint16 depth, lossless.
 
-    `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd. `zstd-ranks`: the same of
-    the values' ranks, two in a byte.
+    `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd. `zranks` and `zstd-ranks`:
+    the same of the values' ranks, two in a byte.
     """
 
     codec: DepthCodec

@@ -110,7 +110,7 @@ SERVER: dict[str, ServerMessage] = {
         device="PoCL CPU",
         max_inflight=2,
         codecs=("jpeg", "png", "raw", "h264"),
-        depth_codecs=("raw", "zdelta", "zstd-delta", "zstd-ranks"),
+        depth_codecs=("raw", "zdelta", "zranks", "zstd-delta", "zstd-ranks"),
     ),
     "welcome_back": Welcome(
         session="session-1",

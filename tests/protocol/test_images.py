@@ -120,6 +120,7 @@ def test_the_layout_of_ranks_is_the_documented_one(seed: int) -> None:
     for depth in _depths(seed).values():
         small = depth[:17, :23]
         assert zstandard.decompress(encode_depth(small, "zstd-ranks").data) == _ranks_by_hand(small)
+        assert zlib.decompress(encode_depth(small, "zranks").data, -15) == _ranks_by_hand(small)
 
 
 def test_ranks_take_less_of_a_sensor_that_knows_few_distances() -> None:
@@ -128,6 +129,7 @@ def test_ranks_take_less_of_a_sensor_that_knows_few_distances() -> None:
     depth = (585 * 75 / disparity * 8).astype(np.uint16)
     sizes = {codec: len(encode_depth(depth, codec).data) for codec in DEPTH_CODECS}
     assert sizes["zstd-ranks"] < 0.7 * sizes["zstd-delta"]
+    assert sizes["zranks"] < 0.7 * sizes["zdelta"]
 
 
 def test_raw_depth_is_little_endian() -> None:
@@ -138,7 +140,7 @@ def test_raw_depth_is_little_endian() -> None:
 def test_real_depth_survives_and_shrinks() -> None:
     path = data_folder("rgbd_7scenes_redkitchen") / "data" / "frame-000000.depth.png"
     depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    for codec in ("zdelta", "zstd-delta", "zstd-ranks"):
+    for codec in ("zdelta", "zranks", "zstd-delta", "zstd-ranks"):
         image = encode_depth(depth, codec)
         assert np.array_equal(decode_depth(image, _camera(640, 480)), depth)
         assert len(image.data) < depth.nbytes / 5
@@ -193,6 +195,11 @@ HOSTILE_DEPTH: dict[str, tuple[str, bytes]] = {
     "ranks bomb": ("zstd-ranks", _zstd(200 << 20)),
     "ranks bomb that declares nothing": ("zstd-ranks", _zstd(64 << 20, write_content_size=False)),
     "ranks bytes after it": ("zstd-ranks", _ranks([0, 5], bytes(PAIRS)) + b"\x00"),
+    "zlib ranks empty": ("zranks", b""),
+    "zlib ranks of nothing": ("zranks", _deflate(0)),
+    "zlib ranks truncated": ("zranks", _deflate(8 + PAIRS)[:-2]),
+    "zlib ranks without values": ("zranks", _deflate(8 + PAIRS)),
+    "zlib ranks bomb": ("zranks", _deflate(50 << 20)),
     "zlib empty": ("zdelta", b""),
     "zlib truncated": ("zdelta", _deflate(SIZE)[:-2]),
     "zlib with a zlib header": ("zdelta", zlib.compress(bytes(SIZE))),

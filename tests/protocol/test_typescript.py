@@ -32,7 +32,7 @@ def test_every_message_and_every_field_is_there_with_its_tag() -> None:
 
 def test_kinds_of_fields() -> None:
     assert "  data: Uint8Array;" in _interface("ColorImage")
-    assert '  codec: "raw" | "zdelta" | "zstd-delta" | "zstd-ranks";' in _interface("DepthImage")
+    assert '  codec: "raw" | "zdelta" | "zranks" | "zstd-delta" | "zstd-ranks";' in _interface("DepthImage")
     assert "  world_from_camera: Array<number> | null;" in _interface("Frame")
     assert "  sh_std: Array<[number | null, number | null, number | null]>;" in _interface("Light")
     assert "  wishes?: Wishes;" in _interface("Hello")

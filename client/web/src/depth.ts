@@ -1,6 +1,6 @@
-// Depth as the wire's `zdelta` (protocol/README.md): a browser writes and reads it with nothing but what it has.
+// Depth as the wire has it (protocol/README.md): a browser writes `zranks` and `zdelta` with nothing but what it has.
 
-import { unrankDepth } from "./depth_ranks";
+import { rankDepth, unrankDepth } from "./depth_ranks";
 import type { DepthImage } from "./protocol";
 
 /** Low bytes of the zigzagged row deltas, row-major, then their high bytes. */
@@ -26,16 +26,16 @@ export function unfilterDepth(planes: Uint8Array, width: number): Uint16Array<Ar
   return depth;
 }
 
-export async function encodeDepth(depth: Uint16Array, width: number): Promise<DepthImage> {
-  const data = await pipe(filterDepth(depth, width), new CompressionStream("deflate-raw"));
-  return { width, height: depth.length / width, codec: "zdelta", data };
+export async function encodeDepth(depth: Uint16Array, width: number, codec: "zdelta" | "zranks" = "zdelta"): Promise<DepthImage> {
+  const bytes = codec === "zranks" ? rankDepth(depth, width) : filterDepth(depth, width);
+  return { width, height: depth.length / width, codec, data: await pipe(bytes, new CompressionStream("deflate-raw")) };
 }
 
 export async function decodeDepth(image: DepthImage): Promise<Uint16Array<ArrayBuffer>> {
   const { width, height } = image;
   const codec: string = image.codec; // a recording may be of a later version
   const bytes = await unpacked(codec, image.data);
-  if (codec === "zstd-ranks") return unrankDepth(bytes, width, height);
+  if (codec === "zstd-ranks" || codec === "zranks") return unrankDepth(bytes, width, height);
   if (bytes.length !== 2 * width * height) throw new Error("depth is not of the size it declares");
   return codec === "raw" ? new Uint16Array(bytes.slice().buffer) : unfilterDepth(bytes, width);
 }
@@ -45,6 +45,7 @@ async function unpacked(codec: string, data: Uint8Array): Promise<Uint8Array> {
     case "raw":
       return data;
     case "zdelta":
+    case "zranks":
       return pipe(new Uint8Array(data), new DecompressionStream("deflate-raw"));
     case "zstd-delta":
     case "zstd-ranks": // no browser has Zstandard for pages

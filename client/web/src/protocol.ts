@@ -179,14 +179,14 @@ export interface ColorImage {
 /**
  * uint16 depth, lossless.
  *
- * `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd. `zstd-ranks`: the same of
- * the values' ranks, two in a byte.
+ * `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd. `zranks` and `zstd-ranks`:
+ * the same of the values' ranks, two in a byte.
  */
 export interface DepthImage {
   width: number;
   height: number;
   data: Uint8Array;
-  codec: "raw" | "zdelta" | "zstd-delta" | "zstd-ranks";
+  codec: "raw" | "zdelta" | "zranks" | "zstd-delta" | "zstd-ranks";
   /** What the sender changed before: each depth z (metres) by at most this times z^2; null: nothing. */
   rounded_per_m?: number | null;
 }
@@ -279,7 +279,7 @@ export interface Welcome {
   /** That frames' colour may have. */
   codecs: Array<"h264" | "jpeg" | "png" | "raw">;
   /** That their depth may have. */
-  depth_codecs: Array<"raw" | "zdelta" | "zstd-delta" | "zstd-ranks">;
+  depth_codecs: Array<"raw" | "zdelta" | "zranks" | "zstd-delta" | "zstd-ranks">;
 }
 
 /** Milliseconds under the thesis's row names (table 6.2): device plus host time; total is wall time. */

@@ -4,9 +4,10 @@ import assert from "node:assert/strict";
 import { readdirSync, readFileSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { test } from "node:test";
+import { inflateRawSync } from "node:zlib";
 import { decode } from "@msgpack/msgpack";
 import { decodeDepth, encodeDepth, filterDepth, unfilterDepth } from "../src/depth";
-import { unrankDepth } from "../src/depth_ranks";
+import { rankDepth, unrankDepth } from "../src/depth_ranks";
 import { decodeServer, encode } from "../src/messages";
 import type { ClientMessage, DepthImage, Frame } from "../src/protocol";
 
@@ -60,7 +61,7 @@ test("depth survives, whatever it is", async () => {
   for (const width of [1, 7, 64]) {
     const noise = Uint16Array.from({ length: 3 * width }, (_, i) => (i * 40503 + width * 977) % 65536);
     assert.deepEqual(unfilterDepth(filterDepth(noise, width), width), noise);
-    assert.deepEqual(await decodeDepth(await encodeDepth(noise, width)), noise);
+    for (const codec of ["zdelta", "zranks"] as const) assert.deepEqual(await decodeDepth(await encodeDepth(noise, width, codec)), noise);
   }
 });
 
@@ -72,7 +73,9 @@ test("every codec of depth that Python writes is read bit for bit", { skip: writ
   for (const file of files) {
     const [codec, rows] = file.split("_") as [DepthImage["codec"], string];
     const image = { width: WIDTH, height: Number(rows), codec, data: new Uint8Array(readFileSync(join(written!, file))) };
-    assert.deepEqual(await decodeDepth(image), ramp.subarray(0, WIDTH * image.height).slice(), file);
+    const depth = ramp.subarray(0, WIDTH * image.height).slice();
+    assert.deepEqual(await decodeDepth(image), depth, file);
+    if (codec === "zranks") assert.deepEqual(rankDepth(depth, WIDTH), new Uint8Array(inflateRawSync(image.data)));
     await assert.rejects(decodeDepth({ ...image, height: image.height + 2 }), file);
     await assert.rejects(decodeDepth({ ...image, data: image.data.subarray(0, -1) }), file);
   }

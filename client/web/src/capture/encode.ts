@@ -14,6 +14,7 @@ export type Sending = { as: "jpeg" | "video"; coding: Coding } | { as: "recorded
 export class FrameEncoder {
   private readonly video = new VideoStream();
   private isVideo = false;
+  private depthCodec: "zdelta" | "zranks" = "zdelta";
 
   /** `wantsVideo`: colour as H.264, where server and browser can; `say`: why it is not. */
   constructor(
@@ -28,6 +29,7 @@ export class FrameEncoder {
     if (message.type === "dropped") this.video.needKey();
     if (message.type !== "welcome") return;
     this.video.needKey();
+    this.depthCodec = message.depth_codecs?.includes("zranks") === true ? "zranks" : "zdelta";
     if (!this.wantsVideo) return;
     const isRead = message.codecs?.includes("h264") === true; // older servers say nothing of it
     const lack = isRead ? await videoLack() : "This server reads no video: colour is sent as JPEG.";
@@ -49,7 +51,7 @@ export class FrameEncoder {
   private async packed(frame: Captured): Promise<Pick<Frame, "color" | "depth">> {
     const { camera, depth } = frame;
     const lens = camera.depth ?? camera;
-    const [color, coded] = await Promise.all([this.encodeColor(frame), depth === null ? null : encodeDepth(depth, lens.width)]);
+    const [color, coded] = await Promise.all([this.encodeColor(frame), depth === null ? null : encodeDepth(depth, lens.width, this.depthCodec)]);
     return { color, depth: coded };
   }
 

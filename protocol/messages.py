@@ -84,8 +84,8 @@ class ColorImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True)
 class DepthImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
     """uint16 depth, lossless.
 
-    `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd. `zranks` and `zstd-ranks`:
-    the same of the values' ranks, two in a byte.
+    `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd.
+    `zranks` and `zstd-ranks`: the same of the values' ranks, two in a byte.
     """
 
     codec: DepthCodec

@@ -179,8 +179,8 @@ export interface ColorImage {
 /**
  * uint16 depth, lossless.
  *
- * `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd. `zranks` and `zstd-ranks`:
- * the same of the values' ranks, two in a byte.
+ * `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd.
+ * `zranks` and `zstd-ranks`: the same of the values' ranks, two in a byte.
  */
 export interface DepthImage {
   width: number;

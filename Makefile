@@ -22,8 +22,16 @@ install-video: .venv/installed-video
 demo: .venv/installed
 	$(BIN)/probeless demo
 
+# What only computes runs side by side; sockets and browsers have the machine to themselves.
+ALONE := tests/client tests/cluster tests/docker tests/service
+test: export PROBELESS_DATA := $(or $(PROBELESS_DATA),$(DATA))
 test: .venv/installed-test
-	PROBELESS_DATA=$${PROBELESS_DATA:-$(DATA)} $(BIN)/python -m pytest $(TESTS)
+ifdef TESTS
+	$(BIN)/python -m pytest $(TESTS)
+else
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(ALONE:%=--ignore=%)
+	$(BIN)/python -m pytest $(ALONE)
+endif
 
 lint: .venv/installed-test
 	$(BIN)/ruff format --check .

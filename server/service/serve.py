@@ -146,7 +146,10 @@ def serve_on(
 
 @contextlib.contextmanager
 def _ended_like_interrupted() -> Iterator[None]:
-    """SIGTERM, which uvicorn too raises again when it has shut down, is KeyboardInterrupt and not the end at once."""
+    """What uvicorn raises again when it has shut down is KeyboardInterrupt.
+
+    SIGTERM would be the end at once, and SIGINT nothing where a shell in the background has it ignored.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -154,11 +157,12 @@ def _ended_like_interrupted() -> Iterator[None]:
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _ways_in(listener: socket.socket, door: Door, certificate: Certificate | None, is_left: bool) -> list[str]:

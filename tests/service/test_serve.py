@@ -60,9 +60,14 @@ def test_ipv6_url_has_brackets() -> None:
         assert url_of(listener) == f"http://[::1]:{listener.getsockname()[1]}"
 
 
-def test_interrupt_ends_the_server_in_order() -> None:
+@pytest.mark.parametrize("shell", ["", "trap '' INT; "], ids=["as usual", "ignored, as by shells in the background"])
+def test_interrupt_ends_the_server_in_order(shell: str) -> None:
     process = subprocess.Popen(
-        [sys.executable, "-c", SERVE_FAKE], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ["sh", "-c", shell + 'exec "$0" -c "$1"', sys.executable, SERVE_FAKE],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     try:
         serves, ready = process.stdout.readline(), process.stdout.readline()

@@ -435,12 +435,11 @@ class Light(Message, frozen=True, kw_only=True, tag="light"):
     valid: bool
 
 
-class Composite(Message, frozen=True, kw_only=True, tag="composite"):
-    """The finished picture of one frame."""
+class Drawn(Message, frozen=True, kw_only=True):
+    """What comes with the picture, or the layer, of one frame."""
 
     frame: Index
     timestamp_s: float
-    color: ColorImage
     world_from_camera: Matrix4
     tracking: Tracking
     timings: Timings
@@ -449,6 +448,12 @@ class Composite(Message, frozen=True, kw_only=True, tag="composite"):
     """What was wrong with this frame's input, one line each."""
     waited_ms: float = 0.0
     """From when the frame had arrived until the device began with it: unread, decoded, waiting for its turn."""
+
+
+class Composite(Drawn, frozen=True, kw_only=True, tag="composite"):
+    """The finished picture of one frame."""
+
+    color: ColorImage
 
 
 class LayerPatch(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -463,14 +468,12 @@ class LayerPatch(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Of the same size, along the camera's z; 0: the pixel says nothing."""
 
 
-class Layer(Message, frozen=True, kw_only=True, tag="layer"):
+class Layer(Drawn, frozen=True, kw_only=True, tag="layer"):
     """What is virtual in one frame (`wishes.answer`), to be put over a camera picture p, of this frame or a later one.
 
     All linear: picture = coverage * virtual + (1 - coverage) * ratio * p (thesis 7.2.1).
     """
 
-    frame: Index
-    timestamp_s: float
     virtual: LayerPatch | None
     """Colour of four channels: sRGB, not multiplied by coverage, which is the fourth, 255 for all of a pixel.
 
@@ -481,14 +484,6 @@ class Layer(Message, frozen=True, kw_only=True, tag="layer"):
     None: real surface stays as it is."""
     depth_scale_m: Annotated[float, Meta(gt=0, le=1)]
     """Metres of a unit of depth."""
-    world_from_camera: Matrix4
-    tracking: Tracking
-    timings: Timings
-    plan: Plan
-    notes: tuple[str, ...] = ()
-    """What was wrong with this frame's input, one line each."""
-    waited_ms: float = 0.0
-    """From when the frame had arrived until the device began with it: unread, decoded, waiting for its turn."""
 
 
 class Dropped(Message, frozen=True, kw_only=True, tag="dropped"):

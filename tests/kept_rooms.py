@@ -15,6 +15,7 @@ from server.opencl.device import Device
 from server.pipeline import Pipeline
 from server.room import Room
 from server.scene.placement import Placement
+from server.service.room_store import RoomStore
 from server.service.saving.slot import Slot
 from server.service.saving.snapshot import snapshot_within
 from server.service.saving.state import state_to_bytes
@@ -55,6 +56,16 @@ def print_of(room: Room) -> tuple[str, ...]:
     for place, data in sorted(voxels_of(room.reconstruction.volume).items() if room.reconstruction.volume else ()):
         voxels.update(f"{place}".encode() + data)
     return voxels.hexdigest(), state_to_bytes(taken.state).hex(), *map(_print_of_object, taken.objects)
+
+
+def found(folder: Path, device: Device) -> tuple[str, ...]:
+    """Print of what a server finds that was started anew."""
+    room = RoomStore(folder).load("study", device)
+    assert room is not None
+    try:
+        return print_of(room)
+    finally:
+        room.close()
 
 
 def _print_of_object(kept: Any) -> str:

@@ -16,7 +16,7 @@ from client.progress import say
 from protocol.messages import Wishes
 from server.scene.vase import vase_glb
 from server.service.door import Door, new_token
-from server.service.serve import open_service, start_in_background
+from server.service.serve import BackgroundServer, open_service
 
 SOURCE = "synthetic:table?light=7&frames="
 FRAMES, FRAMES_TO_WATCH = 30, 300
@@ -39,7 +39,7 @@ def run_demo(out: Path, device_name: str | None, keep: bool, port: int = 0) -> N
     Raises ServeError, ClientError or UserError, each with one line.
     """
     service, door = open_service(device_name), Door(new_token())
-    with _prepared(FRAMES) as demo, start_in_background(service, port=port, door=door) as server:
+    with _prepared(FRAMES) as demo, BackgroundServer(service, port=port, door=door) as server:
         say(f"watch it at {server.way_in}")
         done = _stream(demo, server.way_in, out)
         say(f"{done.answered} frames in {done.seconds:.1f} s, pictures in {out / 'frames'}")

@@ -199,7 +199,7 @@ def _key_left(listener: socket.socket, door: Door, certificate: Certificate | No
 
 
 class BackgroundServer:
-    """A server in a thread of this process; also a context manager that stops it."""
+    """A server in a thread of this process (port 0: a free one); also a context manager that stops it."""
 
     def __init__(
         self,
@@ -243,18 +243,6 @@ class BackgroundServer:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.stop()
-
-
-def start_in_background(
-    service: Service,
-    host: str = DEFAULT_HOST,
-    port: int = 0,
-    door: Door = OPEN_DOOR,
-    certificate: Certificate | None = None,
-    library: ObjectLibrary | None = None,
-) -> BackgroundServer:
-    """Serve `service` from a thread; `.url` says where (port 0: a free one), `.stop()` ends it. Raises ServeError."""
-    return BackgroundServer(service, host, port, door, certificate, library)
 
 
 class _Server(uvicorn.Server):

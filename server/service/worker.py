@@ -16,7 +16,7 @@ from msgspec import structs
 from protocol.codec import ProtocolError, encode, one_line
 from protocol.colors import ColorReader
 from protocol.frames import CameraModel, RgbdFrame, Viewpoint
-from protocol.images import decode_depth, encode_color
+from protocol.images import decode_depth
 from protocol.messages import (
     Acknowledged,
     Composite,
@@ -34,8 +34,8 @@ from protocol.messages import (
 from server.meshing.files import mesh_files
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
+from server.service.answers import composite_message, layer_message
 from server.service.connection import POLICY, UNAUTHORIZED, Refusal
-from server.service.layer_message import layer_message, row_major
 from server.service.mailbox import Letter, Mailbox
 from server.service.mesh_message import mesh_parts
 from server.service.metrics import Metrics
@@ -47,7 +47,6 @@ from server.service.scheduler import Scheduler
 if TYPE_CHECKING:
     from server.pipeline import FrameResult, Pipeline
 
-JPEG_QUALITY = 90
 KEPT_ACKNOWLEDGEMENTS = 256
 KEPT_ANSWERS = 4
 """More than a client may have unanswered (session.MAX_INFLIGHT)."""
@@ -231,18 +230,22 @@ class Worker:
 
     def _deliver(self, frame: Frame, result: FrameResult) -> None:
         wishes, light = self._hello.wishes, encode(result.light)
+        plan = self._plan(result.plan)
+
+        def composite(*, lossless: bool) -> bytes:
+            return self._timed(lambda: composite_message(frame, result, plan, lossless=lossless))
+
         answer: tuple[bytes, ...] = (light,)
         if wishes.answer == "layer":
-            answer = (light, self._timed(lambda: layer_message(frame, result, self._plan(result.plan))))
+            answer = (light, self._timed(lambda: layer_message(frame, result, plan)))
         elif wishes.answer == "picture":
-            answer = (light, self._timed(lambda: self._composite(frame, result, lossless=wishes.lossless)))
+            answer = (light, composite(lossless=wishes.lossless))
         if wishes.lossless:
             self._answers.append((frame.frame, answer))
         self._send_answer(answer)
         if self._outlet.is_watched() and result.color is not None:
             is_shown = wishes.answer == "picture" and not wishes.lossless
-            shown = answer[-1] if is_shown else self._timed(lambda: self._composite(frame, result, lossless=False))
-            self._outlet.publish((light, shown))
+            self._outlet.publish((light, answer[-1] if is_shown else composite(lossless=False)))
 
     def _send_answer(self, answer: tuple[bytes, ...]) -> None:
         *before, last = answer
@@ -266,19 +269,6 @@ class Worker:
         data = encode(structs.replace(make(), waited_ms=self._waited_ms))
         self._workshop.metrics.encode_ms.observe((time.perf_counter() - start_s) * 1e3)
         return data
-
-    def _composite(self, frame: Frame, result: FrameResult, *, lossless: bool) -> Composite:
-        assert result.color is not None
-        return Composite(
-            frame=frame.frame,
-            timestamp_s=frame.timestamp_s,
-            color=encode_color(result.color, "png" if lossless else "jpeg", quality=JPEG_QUALITY),
-            world_from_camera=row_major(result.world_from_camera),
-            tracking=result.tracking,
-            timings=result.timings,
-            plan=self._plan(result.plan),
-            notes=result.notes,
-        )
 
 
 class _Overhead:

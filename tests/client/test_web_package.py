@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import threading
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ import pytest
 from client.web.build import FOLDER, install, npm, pack
 from server.opencl.device import Device
 from server.service.door import Door
-from server.service.serve import BackgroundServer, start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.data import ROOT
 from tests.service.conftest import keys_are_left_here  # noqa: F401
@@ -81,7 +81,7 @@ def program(sources: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def server(device: Device) -> Iterator[BackgroundServer]:
-    with start_in_background(Service(device), door=Door(TOKEN)) as server:
+    with BackgroundServer(Service(device), door=Door(TOKEN)) as server:
         yield server
 
 
@@ -118,6 +118,22 @@ def test_what_is_refused_is_told_in_one_sentence(server: BackgroundServer, progr
     assert done.stdout.startswith("the server does not answer; see that it runs (probeless serve)"), done.stderr
 
 
+def listened_to(folder: Path, script: str, url: str, hear: Callable[[list[str]], None]) -> list[str]:
+    """Lines that a script says which is given `url`; `hear` gets all so far with each."""
+    command = [node(), "--input-type=module", "--eval", script, "--", url]
+    said: list[str] = []
+    with subprocess.Popen(command, cwd=folder, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        timer = threading.Timer(PATIENCE_S, process.kill)
+        timer.start()
+        for line in process.stdout:
+            said.append(line.strip())
+            hear(said)
+        timer.cancel()
+        errors = process.stderr.read()
+    assert process.returncode == 0, errors
+    return said
+
+
 def test_objects_are_placed_and_a_server_that_stops_ends_what_waits(program: Path) -> None:
     script = """
         import { StreamClient } from "probeless";
@@ -138,20 +154,13 @@ def test_objects_are_placed_and_a_server_that_stops_ends_what_waits(program: Pat
     """
     lab = Lab()
     service = Service(FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh)
-    with start_in_background(service) as server:
-        command = [node(), "--input-type=module", "--eval", script, "--", server.url]
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        with subprocess.Popen(command, cwd=program, text=True, **pipes) as process:
-            timer = threading.Timer(PATIENCE_S, process.kill)
-            timer.start()
-            said = []
-            for line in process.stdout:
-                said.append(line.strip())
-                if line == "stop\n":
-                    threading.Thread(target=server.stop).start()
-            timer.cancel()
-            errors = process.stderr.read()
-    assert process.returncode == 0, errors
+    with BackgroundServer(service) as server:
+
+        def hear(said: list[str]) -> None:
+            if said[-1] == "stop":
+                threading.Thread(target=server.stop).start()
+
+        said = listened_to(program, script, server.url, hear)
     placed, refused, answer, _, ended = said
     assert placed == "null"
     assert refused == "the object is no GLB: its first bytes are not glTF"
@@ -178,20 +187,13 @@ def test_a_lost_connection_is_restored_and_the_session_goes_on(program: Path) ->
     """
     lab = Lab()
     service = Service(FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh)
-    with start_in_background(service) as server, impaired(server.url) as proxy:
-        command = [node(), "--input-type=module", "--eval", script, "--", proxy.url]
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        with subprocess.Popen(command, cwd=program, text=True, **pipes) as process:
-            timer = threading.Timer(PATIENCE_S, process.kill)
-            timer.start()
-            said = []
-            for line in process.stdout:
-                said.append(line.strip())
-                if said.count("sent") == 2 and line == "sent\n":
-                    proxy.cut()
-            timer.cancel()
-            errors = process.stderr.read()
-    assert process.returncode == 0, errors
+    with BackgroundServer(service) as server, impaired(server.url) as proxy:
+
+        def hear(said: list[str]) -> None:
+            if said.count("sent") == 2 and said[-1] == "sent":
+                proxy.cut()
+
+        said = listened_to(program, script, proxy.url, hear)
     assert any(line.startswith("note: the connection was lost (") for line in said)
     assert said[-1] == "answer session-1"
 

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from server.opencl.device import Device
-from server.service.serve import start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.bench.service_bytes import Fed, _Kept, feed
 from tests.bench.service_faults import Tally, part_of
@@ -42,7 +42,7 @@ def test_what_a_room_has_fused_is_read_over_the_socket(device: Device) -> None:
         await guest.leave()
         return shown_s, fused_s
 
-    with start_in_background(Service(device)) as server:
+    with BackgroundServer(Service(device)) as server:
         shown_s, fused_s = asyncio.run(stream(server.url))
     assert fused_s == pytest.approx(shown_s, abs=0.6)
 

@@ -18,7 +18,7 @@ from server.scene.placement import Placement
 from server.service.room_store import RoomStore, RoomStoreError, folder_name
 from server.service.saving.files import read_parts, write_parts
 from tests.faulty_disk import FaultyDisk, PowerCut, full
-from tests.kept_rooms import CUBE, PLACE, client_of, print_of, scan
+from tests.kept_rooms import CUBE, PLACE, client_of, found, print_of, scan
 from tests.rooms import wishes
 
 PATIENCE_S = 20.0
@@ -48,16 +48,6 @@ def move(room: Room, x_m: float) -> tuple[str, ...]:
     """The room's print then."""
     room.objects.move("cube", Placement(position_m=(x_m, 0.5, 1.0)))
     return print_of(room)
-
-
-def found(folder: Path, device: Device) -> tuple[str, ...]:
-    """Print of what a server finds that was started anew."""
-    room = RoomStore(folder).load("study", device)
-    assert room is not None
-    try:
-        return print_of(room)
-    finally:
-        room.close()
 
 
 def written(folder: Path) -> dict[str, int]:

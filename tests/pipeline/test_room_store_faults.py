@@ -20,7 +20,7 @@ from server.service.room_store import RoomStore, RoomStoreError, folder_name
 from server.service.saving import slot as slots
 from server.service.saving import state as states
 from tests.faulty_disk import FaultyDisk, PowerCut, full
-from tests.kept_rooms import CUBE, PLACE, client_of, layout_of, print_of, scan
+from tests.kept_rooms import CUBE, PLACE, client_of, found, layout_of, print_of, scan
 from tests.rooms import wishes
 
 
@@ -55,16 +55,6 @@ def changed(room: Room, number: int) -> tuple[str, ...]:
     """The same; the room's print then."""
     change(room, number)
     return print_of(room)
-
-
-def found(folder: Path, device: Device) -> tuple[str, ...]:
-    """Print of what a server finds that was started anew."""
-    room = RoomStore(folder).load("study", device)
-    assert room is not None
-    try:
-        return print_of(room)
-    finally:
-        room.close()
 
 
 def saved_thrice(folder: Path, room: Room, first: int) -> tuple[RoomStore, list[tuple[str, ...]]]:

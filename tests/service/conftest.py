@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from server.service.serve import BackgroundServer, start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
 from tests.service.wire import Wire
@@ -35,7 +35,7 @@ def start_server(lab: Lab) -> Iterator[StartServer]:
     def start(**options: object) -> BackgroundServer:
         at_the_door = {name: options.pop(name) for name in ("door", "certificate", "library") if name in options}
         service = Service(FAKE_DEVICE, **{"pipeline_factory": lab.build, "mesh_loader": fake_mesh} | options)
-        servers.append(start_in_background(service, **at_the_door))
+        servers.append(BackgroundServer(service, **at_the_door))
         return servers[-1]
 
     yield start

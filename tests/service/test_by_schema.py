@@ -6,7 +6,7 @@ from fastapi import FastAPI, Response
 
 from server.service.app import create_app
 from server.service.door import Door
-from server.service.serve import start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.service.by_schema import requests_by_schema
 from tests.service.fakes import FAKE_DEVICE
@@ -22,7 +22,7 @@ def test_every_answer_is_described(server) -> None:
 
 
 def test_refusals_are_described() -> None:
-    with start_in_background(Service(FAKE_DEVICE), door=Door("secret")) as guarded:
+    with BackgroundServer(Service(FAKE_DEVICE), door=Door("secret")) as guarded:
         url = guarded.url.partition("?")[0].rstrip("/")
         found = requests_by_schema(create_app(Service(FAKE_DEVICE)), url, EXAMPLES)
     assert not found.wrong

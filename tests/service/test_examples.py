@@ -19,7 +19,7 @@ import pytest
 from client.client import StreamClient
 from server.maths.sh import lambert_transfer
 from server.opencl.device import Device
-from server.service.serve import start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.protocol.samples import SERVER
 from tests.service.fakes import CAMERA, rgbd_frame
@@ -61,7 +61,7 @@ def test_the_examples_light_is_the_servers(load) -> None:
 
 
 def test_layers_are_put_over_the_newest_picture(device: Device, load, capsys) -> None:
-    with start_in_background(Service(device)) as server:
+    with BackgroundServer(Service(device)) as server:
         pictures = asyncio.run(load("newest_picture").main(server.url, 20))
     assert len(pictures) == 20
     sign = np.abs(pictures[-1].astype(int) - 180).max(axis=-1) > 20
@@ -71,7 +71,7 @@ def test_layers_are_put_over_the_newest_picture(device: Device, load, capsys) ->
 
 
 def test_two_programs_share_a_room(device: Device, load, capsys) -> None:
-    with start_in_background(Service(device)) as server:
+    with BackgroundServer(Service(device)) as server:
         light = asyncio.run(load("share_a_room").main(server.url, 2))
     assert len(light.sh_webxr) == 27
     assert "27 floats" in capsys.readouterr().out

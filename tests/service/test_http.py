@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from protocol.messages import Composite, Error, Hello, Timings
 from server.service.app import create_app
 from server.service.self_check import CheckFailed
-from server.service.serve import start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.service.fakes import CAMERA, FAKE_DEVICE, PATIENCE_S, REFUSE_MM, fake_mesh, frame_message
 from tests.service.wire import Wire
@@ -58,7 +58,7 @@ def test_clients_wait_for_the_warm_up(lab) -> None:
         FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh, warm_up=lambda _: warm.wait(PATIENCE_S)
     )
     service.on_prepared = prepared.set
-    with start_in_background(service) as server:
+    with BackgroundServer(service) as server:
         response = get(server, "/healthz")
         assert response.status_code == 503
         assert response.json()["ready"] is False
@@ -78,7 +78,7 @@ def test_failed_warm_up_is_told_to_everybody(lab) -> None:
     prepared = threading.Event()
     service = Service(FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh, warm_up=fail)
     service.on_prepared = prepared.set
-    with start_in_background(service) as server:
+    with BackgroundServer(service) as server:
         assert prepared.wait(PATIENCE_S)
         response = get(server, "/healthz")
         assert response.status_code == 503
@@ -98,7 +98,7 @@ def test_a_wrong_answer_of_the_device_is_named(lab) -> None:
     prepared = threading.Event()
     service = Service(FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh, warm_up=fail)
     service.on_prepared = prepared.set
-    with start_in_background(service) as server:
+    with BackgroundServer(service) as server:
         assert prepared.wait(PATIENCE_S)
         state = get(server, "/healthz").json()
         assert (state["ready"], state["failed_check"]) == (False, "light")

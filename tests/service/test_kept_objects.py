@@ -30,7 +30,7 @@ from server.service.mailbox import Mailbox
 from server.service.metrics import Metrics
 from server.service.room_store import RoomStore
 from server.service.scheduler import Scheduler
-from server.service.serve import BackgroundServer, start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from server.service.worker import Worker, Workshop
 from tests.rooms import CAMERA, frame_at, view_at, wishes
@@ -73,7 +73,7 @@ def middle_of(folder: Path, device: Device, name: str) -> list[float]:
 def server(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[BackgroundServer]:
     """One that saves nothing by itself."""
     monkeypatch.setattr("server.service.room_saver.RoomSaver.start", lambda _self: None)
-    with start_in_background(Service(device, data=tmp_path / "rooms")) as server:
+    with BackgroundServer(Service(device, data=tmp_path / "rooms")) as server:
         yield server
 
 
@@ -137,7 +137,7 @@ def test_an_object_of_a_client_that_is_not_aligned_is_told_after_a_crash(
     assert acknowledged.error is None
     assert acknowledged.notes == ("it is placed once this client is aligned with the room",)
     assert kept(folder, device) == set()
-    with start_in_background(Service(device, data=folder)) as other:  # as after a kill
+    with BackgroundServer(Service(device, data=folder)) as other:  # as after a kill
         again = enter(other, room_from_world=IDENTITY)
         note = "'vase'"
         assert any(note in line for line in answered(again, 4).notes)

@@ -21,8 +21,8 @@ from client.layers import NEUTRAL, decode_layer, put_over
 from protocol.images import encode_depth
 from protocol.messages import Bye, Composite, Dropped, Layer, Light, Wishes
 from server.opencl.device import Device
-from server.service.layer_message import STEPS_PER_M
-from server.service.serve import start_in_background
+from server.service.answers import STEPS_PER_M
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from server.stages import layer as of_server
 from server.stages.layer import LayerPart
@@ -198,7 +198,7 @@ def test_real_layers_over_the_socket_make_the_pictures_of_a_lossless_stream(devi
     file.write_text("v -1 0 -1\nv 1 0 -1\nv 0 0 1\nv 0 2 0\nf 1 2 4\nf 2 3 4\nf 3 1 4\nf 1 3 2\n")
     thing = ObjectFile(file, (0.1, 0.0, 0.0), 0.15, 0.0)
     for folder, answer in (("picture", "picture"), ("layer", "layer"), ("again", "layer"), ("light", "light")):
-        with start_in_background(Service(device)) as server:
+        with BackgroundServer(Service(device)) as server:
             wishes, out = Wishes(**bounds, light=source.light, answer=answer), tmp_path / folder
             quietly(source, server.url, [thing], wishes, out, lossless=True, frames=range(3))
     lights = {folder: (tmp_path / folder / "light.jsonl").read_bytes() for folder in ("picture", "layer", "light")}
@@ -225,7 +225,7 @@ def test_a_real_layer_of_nothing_is_put_over_a_picture(device: Device) -> None:
         picture = put_over(decode_layer(layer, source.camera), source[0].color, source.camera)
         np.testing.assert_array_equal(picture, source[0].color)
 
-    with start_in_background(Service(device)) as server:
+    with BackgroundServer(Service(device)) as server:
         with_client(server.url, talk)
 
 

@@ -18,7 +18,7 @@ from server.opencl.device import Device
 from server.pipeline import Pipeline
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
-from server.service.serve import start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 
 FRAMES = 3
@@ -81,7 +81,7 @@ def comparable(folder: Path) -> dict[str, bytes]:
 
 def test_lossless_stream_gives_the_bits_of_an_in_process_run(device: Device, scene: Scene, tmp_path: Path) -> None:
     run_in_process(device, scene, tmp_path / "run")
-    with start_in_background(Service(device)) as server:
+    with BackgroundServer(Service(device)) as server:
         quiet = Console(file=io.StringIO())
         options = {"lossless": True, "mesh": True, "console": quiet}
         stream(scene.source, server.url, [scene.item], WISHES, tmp_path / "stream", **options)

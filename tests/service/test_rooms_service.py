@@ -19,7 +19,7 @@ from protocol.images import encode_color, encode_depth
 from protocol.messages import Acknowledged, Composite, Error, Frame, Hello, Light, Marker, PlaceObject, Watch, Welcome
 from server.opencl.device import Device
 from server.service.limits import Limits
-from server.service.serve import BackgroundServer, start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.rooms import CAMERA, frame_at, view_at, wishes
 from tests.service import fakes
@@ -31,7 +31,7 @@ PATIENT = Limits(longest_period_s=3600.0)
 
 @pytest.fixture
 def real_server(device: Device) -> Iterator[BackgroundServer]:
-    with start_in_background(Service(device, limits=PATIENT)) as server:
+    with BackgroundServer(Service(device, limits=PATIENT)) as server:
         yield server
 
 
@@ -215,14 +215,14 @@ def test_a_room_with_a_key_is_for_those_who_have_it(real_server: BackgroundServe
 
 def test_rooms_are_as_they_were_after_a_restart(device: Device, tmp_path: Path) -> None:
     mesh = trimesh.creation.box((0.2, 0.2, 0.2)).export(file_type="ply")
-    with start_in_background(Service(device, data=tmp_path)) as server:
+    with BackgroundServer(Service(device, data=tmp_path)) as server:
         wire, _ = enter(server.url, room_key="k3y")
         for step in range(12):
             before = answered(wire, step)
         wire.say(PlaceObject(request=1, object="cube", format="ply", data=mesh, position_m=(-0.9, 0.6, 1.0)))
         wire.hear_until(Acknowledged)
     assert "rasterize" not in before.plan.run
-    with start_in_background(Service(device, data=tmp_path)) as server:
+    with BackgroundServer(Service(device, data=tmp_path)) as server:
         refused = Wire(server.url)
         refused.say(Hello(client="test", camera=CAMERA, wishes=wishes("given"), room="study"))
         assert refused.ending()[0] == 4401

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 from types import SimpleNamespace
 
 import pytest
@@ -12,7 +11,8 @@ from client.client import Access, ClientError, RoomPlace, StreamClient
 from protocol.messages import Hello
 from server.service.departure import DRAINING, GOODBYE
 from server.service.door import Door
-from tests.service.fakes import CAMERA, PATIENCE_S, frame_message
+from tests.service.draining import draining
+from tests.service.fakes import CAMERA, PATIENCE_S
 from tests.service.wire import Wire
 
 
@@ -74,16 +74,7 @@ def test_a_room_with_another_key(start_server) -> None:
 
 
 def test_a_server_that_is_draining(start_server, lab, monkeypatch) -> None:
-    monkeypatch.setattr("server.service.serve.DRAIN_PATIENCE_S", 10 * PATIENCE_S)
     server = start_server()
-    lab.hold = True
-    wire = Wire(server.url)
-    wire.greet()
-    wire.say(frame_message(0))
-    lab.next_entered()
-    stopping = threading.Thread(target=server.stop)
-    stopping.start()
-    assert wire.ending()[1] == GOODBYE
-    assert told(server.url) == DRAINING
-    lab.release()
-    stopping.join(PATIENCE_S)
+    with draining(server, lab, monkeypatch) as wire:
+        assert wire.ending()[1] == GOODBYE
+        assert told(server.url) == DRAINING

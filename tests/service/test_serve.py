@@ -9,7 +9,7 @@ import threading
 import httpx
 import pytest
 
-from server.service.serve import ServeError, listen, serve, start_in_background, url_of
+from server.service.serve import BackgroundServer, ServeError, listen, serve, url_of
 from server.service.service import Service
 from tests.data import ROOT
 from tests.service.fakes import FAKE_DEVICE, PATIENCE_S, fake_mesh
@@ -89,7 +89,7 @@ def test_interrupt_ends_the_server_in_order(shell: str) -> None:
 def test_stopping_in_background_closes_sockets_and_threads(lab) -> None:
     threads = threading.active_count()
     service = Service(FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh)
-    server = start_in_background(service)
+    server = BackgroundServer(service)
     wire = Wire(server.url)
     wire.greet()
     server.stop()

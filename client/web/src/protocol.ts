@@ -325,7 +325,6 @@ export interface Composite {
   type: "composite";
   frame: number;
   timestamp_s: number;
-  color: ColorImage;
   world_from_camera: Array<number>;
   tracking: "given" | "lost" | "tracked";
   timings: Timings;
@@ -334,6 +333,7 @@ export interface Composite {
   notes: Array<string>;
   /** From when the frame had arrived until the device began with it: unread, decoded, waiting for its turn. */
   waited_ms: number;
+  color: ColorImage;
 }
 
 /** A part of the camera's picture, and how far away each of its pixels is. */
@@ -356,6 +356,14 @@ export interface Layer {
   type: "layer";
   frame: number;
   timestamp_s: number;
+  world_from_camera: Array<number>;
+  tracking: "given" | "lost" | "tracked";
+  timings: Timings;
+  plan: Plan;
+  /** What was wrong with this frame's input, one line each. */
+  notes: Array<string>;
+  /** From when the frame had arrived until the device began with it: unread, decoded, waiting for its turn. */
+  waited_ms: number;
   /**
    * Colour of four channels: sRGB, not multiplied by coverage, which is the fourth, 255 for all of a pixel.
    *
@@ -370,14 +378,6 @@ export interface Layer {
   ratio: LayerPatch | null;
   /** Metres of a unit of depth. */
   depth_scale_m: number;
-  world_from_camera: Array<number>;
-  tracking: "given" | "lost" | "tracked";
-  timings: Timings;
-  plan: Plan;
-  /** What was wrong with this frame's input, one line each. */
-  notes: Array<string>;
-  /** From when the frame had arrived until the device began with it: unread, decoded, waiting for its turn. */
-  waited_ms: number;
 }
 
 /** One of the lights that the room's light is made of, besides an even sky. */

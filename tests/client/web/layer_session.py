@@ -18,7 +18,7 @@ from server.opencl.device import Device
 from server.pipeline import FrameResult, Pipeline
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
-from server.service.serve import BackgroundServer, start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.client.web.red_ball import TurningTable, red_ball
 
@@ -55,7 +55,7 @@ def watched_server(device: Device, seen: Seen) -> Iterator[BackgroundServer]:
             seen.is_placed.set()
             return notes
 
-    with start_in_background(Service(device, pipeline_factory=Watched)) as server:
+    with BackgroundServer(Service(device, pipeline_factory=Watched)) as server:
         yield server
 
 

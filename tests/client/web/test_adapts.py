@@ -20,12 +20,11 @@ from protocol.frames import CameraModel, RgbdFrame
 from protocol.h264 import is_key_picture
 from protocol.messages import ColorImage, Hello, Wishes
 from protocol.recording import write_message
-from server.service.serve import BackgroundServer, start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
+from tests.client.web.page import start_capture, start_recording
 from tests.client.web.sequence import of_device
-from tests.client.web.test_capture import start_capture
-from tests.client.web.test_recorded import start_recording
 from tests.service.fakes import FAKE_DEVICE, FakePipeline, FakeResult, Lab, fake_mesh
 from tests.service.proxy import impaired
 
@@ -77,7 +76,7 @@ class _Brief(FakePipeline):
 @pytest.fixture
 def server() -> Iterator[BackgroundServer]:
     service = Service(FAKE_DEVICE, pipeline_factory=lambda *_: _Brief(Lab()), mesh_loader=fake_mesh)
-    with start_in_background(service) as server:
+    with BackgroundServer(service) as server:
         yield server
 
 

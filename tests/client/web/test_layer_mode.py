@@ -15,15 +15,16 @@ from playwright.sync_api import Page
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
-from server.service.serve import BackgroundServer, start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.client.web.ball_scene import CAMERA, linear, look
 from tests.client.web.conftest import PICTURES, OpenPage, wait_for_text
 from tests.client.web.displayed import display
 from tests.client.web.layer_figures import errors_of
+from tests.client.web.page import start_capture
+from tests.client.web.received import Received
 from tests.client.web.red_ball import DEGREES_PER_S, turned
 from tests.client.web.sequence import of_device
-from tests.client.web.test_capture import Received, start_capture
 from tests.service import fakes
 from tests.service.fakes import FAKE_DEVICE, FakeResult, fake_mesh
 
@@ -63,7 +64,7 @@ def serve(received: Received) -> Iterator[Callable[[float], BackgroundServer]]:
             return Drawing(received, takes_s)
 
         service = Service(FAKE_DEVICE, pipeline_factory=build, mesh_loader=fake_mesh)
-        running.append(start_in_background(service))
+        running.append(BackgroundServer(service))
         return running[-1].__enter__()
 
     yield start

@@ -23,8 +23,8 @@ from tests.client.web.ball_scene import CAMERA, look
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.displayed import Displayed
 from tests.client.web.layer_figures import errors_of
+from tests.client.web.received import Received
 from tests.client.web.red_ball import turned
-from tests.client.web.test_capture import Received
 from tests.client.web.test_layer_mode import (
     SLOW_S,
     colorful,

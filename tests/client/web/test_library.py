@@ -11,11 +11,12 @@ from playwright.sync_api import Page
 from server.scene.vase import vase_glb
 from server.service.door import Door
 from server.service.object_library import ObjectLibrary
-from server.service.serve import BackgroundServer, start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
+from tests.client.web.page import start_capture
+from tests.client.web.received import CAMERA, frames_seen
 from tests.client.web.sequence import of_device
-from tests.client.web.test_capture import CAMERA, frames_seen, start_capture
 from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
 
 SOFA = b"v 0 0 0\nv 2 0 0\nv 0 2 0\nf 1 2 3\n"
@@ -36,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
 @pytest.fixture
 def server(lab: Lab, folder: Path) -> Iterator[BackgroundServer]:
     service = Service(FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh)
-    with start_in_background(service, door=Door("a-token"), library=ObjectLibrary(folder)) as server:
+    with BackgroundServer(service, door=Door("a-token"), library=ObjectLibrary(folder)) as server:
         yield server
 
 

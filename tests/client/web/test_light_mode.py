@@ -21,11 +21,12 @@ from server.opencl.device import Device
 from server.pipeline import Pipeline
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
-from server.service.serve import BackgroundServer, start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.client.web.conftest import PICTURES, OpenPage, wait_for_text
+from tests.client.web.page import start_capture
+from tests.client.web.received import Received
 from tests.client.web.sequence import FLIP, of_device
-from tests.client.web.test_capture import Received, start_capture
 from tests.service import fakes
 from tests.service.fakes import FAKE_DEVICE, FakeResult, fake_mesh
 from tests.service.wire import Wire
@@ -58,7 +59,7 @@ def server(received: Received) -> Iterator[BackgroundServer]:
         received.wishes.append(wishes)
         return _Lit(received.lab)
 
-    with start_in_background(Service(FAKE_DEVICE, pipeline_factory=build, mesh_loader=fake_mesh)) as server:
+    with BackgroundServer(Service(FAKE_DEVICE, pipeline_factory=build, mesh_loader=fake_mesh)) as server:
         yield server
 
 

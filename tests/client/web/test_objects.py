@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import time
 from collections.abc import Callable, Iterator
 
 import cv2
@@ -15,94 +13,37 @@ from playwright.sync_api import Page
 from client.laptop.source import open_source
 from protocol.frames import CameraModel, RgbdFrame
 from server.opencl.device import Device
-from server.pipeline import Pipeline
-from server.scene.mesh import Mesh
-from server.scene.placement import Placement
-from server.service.serve import BackgroundServer, start_in_background
-from server.service.service import Service
-from tests.client.web.conftest import PATIENCE_MS, OpenPage, wait_for_text
+from server.service.serve import BackgroundServer
+from tests.client.web.conftest import OpenPage, wait_for_text
+from tests.client.web.page import newer_pictures, on_screen, picture, start_capture, wait_until
 from tests.client.web.sequence import of_device
-from tests.client.web.test_capture import start_capture
+from tests.client.web.watched import SIZE, TOUCHED, point_under, wait_for, watched_server
 
 SOURCE = "synthetic:table?light=7&size=160x120&frames=1"
-SIZE = (600, 800)
-TOUCHED = (112.0, 69.0)
-"""Pixel of the table that a finger points at."""
 DRAGGED_TO = (52.0, 95.0)
 """Another one, at the front."""
 
 
-class Watched(Pipeline):
-    """A real pipeline that tells what it was asked."""
-
-    asked: list[tuple[str, Placement | None]]
-
-    def place_object(self, object_id: str, mesh: Mesh, placement: Placement) -> tuple[str, ...]:
-        notes = super().place_object(object_id, mesh, placement)
-        self.asked.append(("place", placement))
-        return notes
-
-    def move_object(self, object_id: str, placement: Placement) -> None:
-        super().move_object(object_id, placement)
-        self.asked.append(("move", placement))
-
-    def remove_object(self, object_id: str) -> None:
-        super().remove_object(object_id)
-        self.asked.append(("remove", None))
+@pytest.fixture
+def watched(device: Device) -> Iterator[tuple[BackgroundServer, list]]:
+    with watched_server(device) as watched:
+        yield watched
 
 
 @pytest.fixture
-def asked() -> list[tuple[str, Placement | None]]:
-    return []
+def server(watched: tuple[BackgroundServer, list]) -> BackgroundServer:
+    return watched[0]
 
 
 @pytest.fixture
-def server(device: Device, asked: list) -> Iterator[BackgroundServer]:
-    def build(*given: object) -> Watched:
-        pipeline = Watched(*given)
-        pipeline.asked = asked
-        return pipeline
-
-    with start_in_background(Service(device, pipeline_factory=build)) as server:
-        yield server
+def asked(watched: tuple[BackgroundServer, list]) -> list:
+    return watched[1]
 
 
 def still() -> tuple[CameraModel, RgbdFrame]:
     source = open_source(SOURCE)
     assert source.up == (0.0, 1.0, 0.0)  # as in WebXR
     return source.camera, source[0]
-
-
-def point_under(camera: CameraModel, frame: RgbdFrame, u: float, v: float) -> NDArray[np.float64]:
-    z = frame.depth[round(v), round(u)] * camera.depth_scale_m
-    point = np.array([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z, 1.0])
-    return (frame.world_from_camera @ point)[:3]
-
-
-def picture(page: Page) -> NDArray[np.float64]:
-    """[height, width] luma of what the page shows."""
-    url = page.evaluate("() => document.getElementById('picture').toDataURL('image/png')")
-    png = np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8)
-    return cv2.imdecode(png, cv2.IMREAD_COLOR_RGB) @ np.array([0.2126, 0.7152, 0.0722])
-
-
-def newer_pictures(page: Page, count: int = 3) -> None:
-    """Until pictures of frames that were captured from now on are shown."""
-    caption = "() => Number(document.getElementById('picture-caption').textContent.match(/Frame (\\d+)/)?.[1] ?? -1)"
-    first = page.evaluate(caption)
-    page.wait_for_function(f"first => ({caption})() >= first + {count}", arg=first)
-
-
-def wait_until(holds: Callable[[], bool]) -> None:
-    until_s = time.monotonic() + PATIENCE_MS / 1e3
-    while not holds():
-        assert time.monotonic() < until_s
-        time.sleep(0.02)
-
-
-def wait_for(asked: list, count: int) -> tuple[str, Placement | None]:
-    wait_until(lambda: len(asked) >= count)
-    return asked[-1]
 
 
 def view(frame: RgbdFrame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -114,17 +55,6 @@ def view(frame: RgbdFrame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def matrix(camera: CameraModel) -> NDArray[np.float64]:
     """[3, 3] of the lens."""
     return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-
-
-def on_screen(page: Page, u: float, v: float) -> tuple[float, float]:
-    """Where on the page a pixel of the picture is."""
-    box = page.locator("#picture").bounding_box()
-    width, height = page.evaluate("() => [picture.width, picture.height]")
-    assert box is not None
-    scale = min(box["width"] / width, box["height"] / height)
-    left = box["x"] + (box["width"] - scale * width) / 2
-    top = box["y"] + (box["height"] - scale * height) / 2
-    return left + scale * (u + 0.5), top + scale * (v + 0.5)
 
 
 def test_a_vase_is_placed_by_touch_throws_a_shadow_and_is_moved_turned_and_deleted(

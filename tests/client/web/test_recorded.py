@@ -19,27 +19,19 @@ from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
 from protocol.recording import read_messages
 from server.opencl.device import Device
-from server.service.serve import BackgroundServer, start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.client.web.conftest import PATIENCE_MS, OpenPage, wait_for_text
-from tests.client.web.test_capture import Received
-from tests.client.web.test_objects import (
-    Watched,
-    may_be_seen,
-    newer_pictures,
-    on_screen,
-    picture,
-    point_under,
-    wait_for,
-)
+from tests.client.web.page import newer_pictures, on_screen, picture, start_recording
+from tests.client.web.received import Received
+from tests.client.web.test_objects import may_be_seen
+from tests.client.web.watched import SIZE, TOUCHED, point_under, wait_for, watched_server
 from tests.service.fakes import FAKE_DEVICE, fake_mesh
 from tests.service.proxy import impaired
 
 FRAMES = 8
 SOURCE = f"synthetic:table?light=7&size=160x120&frames={FRAMES}"
 COUNT = 8 * FRAMES
-SIZE = (600, 800)
-TOUCHED = (112.0, 69.0)
 
 
 @pytest.fixture
@@ -50,7 +42,7 @@ def received() -> Received:
 @pytest.fixture
 def fake_server(received: Received) -> Iterator[BackgroundServer]:
     """With pipelines that keep what they were given."""
-    with start_in_background(Service(FAKE_DEVICE, pipeline_factory=received.build, mesh_loader=fake_mesh)) as server:
+    with BackgroundServer(Service(FAKE_DEVICE, pipeline_factory=received.build, mesh_loader=fake_mesh)) as server:
         yield server
 
 
@@ -67,13 +59,6 @@ def recording(fake_server: BackgroundServer, received: Received, tmp_path: Path)
     for kept in (received.hellos, received.cameras, received.wishes, received.frames):
         kept.clear()
     return path
-
-
-def start_recording(page: Page, path: Path, repeat: str = "loop") -> None:
-    page.locator("input[name=source][value=recorded]").check()
-    page.locator("[name=repeat]").select_option(repeat)
-    page.locator("[name=recording]").set_input_files(path)
-    page.locator("#start").click()
 
 
 def same_pixels(a: RgbdFrame, b: RgbdFrame) -> bool:
@@ -173,19 +158,19 @@ def test_a_large_file_is_never_in_memory_as_a_whole(
 
 
 @pytest.fixture
-def asked() -> list:
-    return []
+def watched(device: Device) -> Iterator[tuple[BackgroundServer, list]]:
+    with watched_server(device) as watched:
+        yield watched
 
 
 @pytest.fixture
-def server(device: Device, asked: list) -> Iterator[BackgroundServer]:
-    def build(*given: object) -> Watched:
-        pipeline = Watched(*given)
-        pipeline.asked = asked
-        return pipeline
+def server(watched: tuple[BackgroundServer, list]) -> BackgroundServer:
+    return watched[0]
 
-    with start_in_background(Service(device, pipeline_factory=build)) as server:
-        yield server
+
+@pytest.fixture
+def asked(watched: tuple[BackgroundServer, list]) -> list:
+    return watched[1]
 
 
 def test_the_real_server_renders_into_it_objects_are_placed_by_touch_and_a_cut_is_mended(

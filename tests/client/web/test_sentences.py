@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
@@ -14,13 +13,15 @@ from protocol.messages import Hello
 from server.service.departure import DRAINING, GOODBYE
 from server.service.door import Door
 from server.service.rooms import lock_of
-from server.service.serve import BackgroundServer, start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
+from tests.client.web.page import start_capture
+from tests.client.web.received import CAMERA, frames_seen
 from tests.client.web.sequence import of_device
-from tests.client.web.test_capture import CAMERA, frames_seen, start_capture
 from tests.service import fakes
-from tests.service.fakes import FAKE_DEVICE, PATIENCE_S, Lab, fake_mesh, frame_message
+from tests.service.draining import draining
+from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
 from tests.service.proxy import impaired
 from tests.service.wire import Wire
 
@@ -40,7 +41,7 @@ def start(lab: Lab) -> Iterator[StartServer]:
     def start_one(door: Door | None = None, port: int = 0, **options: object) -> BackgroundServer:
         room = SimpleNamespace(close=lambda: None, key_digest=None)
         factories = {"pipeline_factory": lab.build, "mesh_loader": fake_mesh, "room_factory": lambda *_: room}
-        servers.append(start_in_background(Service(FAKE_DEVICE, **factories | options), port=port, door=door or Door()))
+        servers.append(BackgroundServer(Service(FAKE_DEVICE, **factories | options), port=port, door=door or Door()))
         return servers[-1]
 
     yield start_one
@@ -110,22 +111,12 @@ def test_a_server_that_is_full(start: StartServer, open_page: OpenPage) -> None:
 
 
 def test_a_server_that_is_draining(start: StartServer, lab: Lab, open_page: OpenPage, monkeypatch) -> None:
-    monkeypatch.setattr("server.service.serve.DRAIN_PATIENCE_S", 10 * PATIENCE_S)
     server = start()
     page = open_page(server.url)
     wait_for_text(page, "#state", "waiting for a session")
-    lab.hold = True
-    wire = Wire(server.url)
-    wire.greet()
-    wire.say(frame_message(0))
-    lab.next_entered()
-    stopping = threading.Thread(target=server.stop)
-    stopping.start()
-    wait_for_text(page, "#state", "draining")
-    assert state(page) == f"Not let in yet: {DRAINING}"
-    lab.release()
-    stopping.join(PATIENCE_S)
-    wire.hang_up()
+    with draining(server, lab, monkeypatch):
+        wait_for_text(page, "#state", "draining")
+        assert state(page) == f"Not let in yet: {DRAINING}"
     page.goto("about:blank")
 
 

@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator
 import pytest
 from playwright.sync_api import Page
 
-from server.service.serve import BackgroundServer, start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
+from tests.client.web.page import start_capture
 from tests.client.web.sequence import of_device
-from tests.client.web.test_capture import start_capture
 from tests.client.web.test_light_mode import CAMERA, plane
 from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
 
@@ -21,7 +21,7 @@ PLACES = """() => Object.fromEntries([".side", "#stop", "#full", "#selected-tool
 
 @pytest.fixture
 def server() -> Iterator[BackgroundServer]:
-    with start_in_background(Service(FAKE_DEVICE, pipeline_factory=Lab().build, mesh_loader=fake_mesh)) as server:
+    with BackgroundServer(Service(FAKE_DEVICE, pipeline_factory=Lab().build, mesh_loader=fake_mesh)) as server:
         yield server
 
 

@@ -11,13 +11,12 @@ import pytest
 from msgspec import structs
 
 from protocol.frames import RgbdFrame
-from server.service.serve import BackgroundServer, start_in_background
+from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
+from tests.client.web.page import start_capture, wait_until
 from tests.client.web.sequence import of_device
-from tests.client.web.test_capture import start_capture
 from tests.client.web.test_light_mode import CAMERA, plane
-from tests.client.web.test_objects import wait_until
 from tests.service.fakes import FAKE_DEVICE, FakePipeline, FakeResult, Lab, fake_mesh
 
 UP = cv2.Rodrigues(np.array([0.0, 0.0, 0.5]))[0] @ np.array([0.0, 1.0, 0.0])
@@ -38,7 +37,7 @@ def lab() -> Lab:
 @pytest.fixture
 def server(lab: Lab) -> Iterator[BackgroundServer]:
     service = Service(FAKE_DEVICE, pipeline_factory=lambda *_: _Leaning(lab), mesh_loader=fake_mesh)
-    with start_in_background(service) as server:
+    with BackgroundServer(service) as server:
         yield server
 
 

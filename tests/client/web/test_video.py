@@ -14,8 +14,10 @@ from protocol.h264 import is_key_picture
 from protocol.messages import ColorImage
 from server.service.serve import BackgroundServer
 from tests.client.web.conftest import OpenPage, wait_for_text
+from tests.client.web.page import start_capture
+from tests.client.web.received import CAMERA, Received, frames_seen
 from tests.client.web.sequence import STRAIGHT, of_device
-from tests.client.web.test_capture import CAMERA, Received, frames_seen, received, server, start_capture
+from tests.client.web.test_capture import received, server
 
 __all__ = ["received", "server"]
 

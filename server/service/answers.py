@@ -1,16 +1,16 @@
-"""A frame's layer as it is sent: pictures as PNG, depth with little loss (protocol/README.md, "Layers")."""
+"""What a frame is answered by, as it is sent; of layers, depth with little loss (protocol/README.md, "Layers")."""
 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.images import encode_depth
-from protocol.messages import ColorImage, Frame, Layer, LayerPatch, Plan
+from protocol.images import encode_color, encode_depth
+from protocol.messages import ColorImage, Composite, Frame, Layer, LayerPatch, Plan
 
 if TYPE_CHECKING:
     from server.pipeline import FrameResult
@@ -18,11 +18,19 @@ if TYPE_CHECKING:
 
 Codec = Literal["zdelta", "zstd-delta"]
 
+JPEG_QUALITY = 90
 STEPS_PER_M = 400
 """Depth is rounded to steps of its inverse, of which so many make up 1/m: half a step moves what a lens of 525 px
 sees by 0.07 px where the camera moves by 10 cm, however far away it is. Finer differences are mostly noise."""
 _FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 _BGR_FROM = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
+
+
+def composite_message(frame: Frame, result: FrameResult, plan: Plan, *, lossless: bool) -> Composite:
+    """The answer to `frame`; PNG where it is to be lossless."""
+    assert result.color is not None
+    color = encode_color(result.color, "png" if lossless else "jpeg", quality=JPEG_QUALITY)
+    return Composite(color=color, **_drawn(frame, result, plan))
 
 
 def layer_message(frame: Frame, result: FrameResult, plan: Plan) -> Layer:
@@ -32,22 +40,24 @@ def layer_message(frame: Frame, result: FrameResult, plan: Plan) -> Layer:
     reads_zstd = frame.depth is not None and frame.depth.codec.startswith("zstd")
     codec: Codec = "zstd-delta" if reads_zstd else "zdelta"
     return Layer(
-        frame=frame.frame,
-        timestamp_s=frame.timestamp_s,
         virtual=_patch(layer.virtual, codec, layer.depth_scale_m),
         ratio=_patch(layer.ratio, codec, layer.depth_scale_m),
         depth_scale_m=layer.depth_scale_m,
-        world_from_camera=row_major(result.world_from_camera),
-        tracking=result.tracking,
-        timings=result.timings,
-        plan=plan,
-        notes=result.notes,
+        **_drawn(frame, result, plan),
     )
 
 
-def row_major(matrix: NDArray[np.float64]) -> tuple[float, ...]:
-    """A matrix as messages have it."""
-    return tuple(matrix.ravel().tolist())
+def _drawn(frame: Frame, result: FrameResult, plan: Plan) -> dict[str, Any]:
+    """What both say of a frame."""
+    return {
+        "frame": frame.frame,
+        "timestamp_s": frame.timestamp_s,
+        "world_from_camera": tuple(result.world_from_camera.ravel().tolist()),
+        "tracking": result.tracking,
+        "timings": result.timings,
+        "plan": plan,
+        "notes": result.notes,
+    }
 
 
 def _patch(part: LayerPart | None, codec: Codec, depth_scale_m: float) -> LayerPatch | None:

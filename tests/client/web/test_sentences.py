@@ -50,11 +50,15 @@ def start(lab: Lab) -> Iterator[StartServer]:
         server.stop()
 
 
+SETTLED = """() => {
+  const text = document.getElementById("state").textContent;
+  return !/^(Connect|Live)/.test(text) && text;
+}"""
+
+
 def state(page: Page) -> str:
     """What the page says of its connection, once it has settled."""
-    page.wait_for_function("() => !/Connecting|Live/.test(document.getElementById('state').textContent)")
-    said = page.locator("#state").text_content()
-    assert said is not None
+    said = page.wait_for_function(SETTLED).json_value()  # it may change the moment after
     assert "\n" not in said
     return said
 
@@ -74,7 +78,7 @@ def test_a_server_that_is_gone(start: StartServer, open_page: OpenPage) -> None:
         wait_for_text(page, "#state-countdown", "next try in")
         assert page.locator("#retry").is_visible()
         proxy.refuses = False
-        page.locator("#retry").click()
+        page.evaluate("() => document.getElementById('retry').click()")  # it may be gone: the page tries by itself too
         wait_for_text(page, "#state", "waiting for a session")
         page.goto("about:blank")
 

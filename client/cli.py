@@ -277,8 +277,8 @@ def tune(device: o.DeviceOption = None) -> None:
     """This device's front of accuracy against time, measured once and kept for --budget-ms and --preset auto."""
     from client.laptop.tune import lines_of
     from client.laptop.tune import tune as measure
-    from server.fronts import write_front
     from server.opencl.device import open_device
+    from server.quality.pareto_front import write_front
 
     with progress_bar("points") as progress:
         front = measure(open_device(device), progress)

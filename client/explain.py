@@ -12,7 +12,7 @@ from client.laptop.run import Run
 from client.options import Capture
 from protocol.messages import LeftOut, Plan, Wishes
 from server.opencl.device import open_device
-from server.rest import ECHO, NOISE
+from server.reuse.temporal_reuse import ECHO, NOISE
 
 PURPOSES = {
     "rasterize": "draws the virtual objects",

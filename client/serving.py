@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 from platformdirs import user_data_path
 
 from client.laptop.errors import OptionError, RunError
-from server.service.door import MAX_TOKEN_CHARS, Door, is_loopback, is_token, new_token
+from server.service.authenticator import MAX_TOKEN_CHARS, Authenticator, is_loopback, is_token, new_token
 from server.service.events import LogFormat
 from server.service.limits import DEFAULT_LIMITS, GIB, MIB, Limits
 from server.service.saving.upkeep import DAY_S, KeptLimits
@@ -45,7 +45,7 @@ class ServeOptions:
     data_days: float | None = None
 
 
-def door_of(options: ServeOptions) -> Door:
+def door_of(options: ServeOptions) -> Authenticator:
     """Raises OptionError."""
     origins = frozenset(_origin(text) for text in options.allow_origin)
     if options.token == NO_TOKEN:
@@ -54,12 +54,12 @@ def door_of(options: ServeOptions) -> Door:
                 f"--token none lets in everybody who reaches {options.host}: leave it out, or add --insecure if that "
                 "is meant, say behind a proxy that asks who comes"
             )
-        return Door(None, origins)
+        return Authenticator(None, origins)
     if options.insecure:
         raise OptionError("--insecure goes with --token none: leave it out")
     if options.token is not None and not is_token(options.token):
         raise OptionError(f"--token: expected up to {MAX_TOKEN_CHARS} ASCII characters without spaces, or none")
-    return Door(options.token or new_token(), origins)
+    return Authenticator(options.token or new_token(), origins)
 
 
 def certificate_of(options: ServeOptions) -> Certificate | None:

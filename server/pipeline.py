@@ -13,40 +13,40 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame, Viewpoint
 from protocol.messages import Hello, LeftOut, Light, OperatingPoint, Plan, Preset, Timings, Tracking, Wishes
-from server.alignment import Alignment
-from server.effects import effects_of
-from server.geometry import Geometry, GeometryFrame
-from server.held import Sampled
-from server.light_message import light_message, seen_from
+from server.culling.reason import CullReason
+from server.effects.table import effects_of
+from server.geometry.geometry import Geometry, GeometryFrame
+from server.input.denoise import denoise_radiance
+from server.light.light_estimation import LightEstimate
+from server.light.light_message import light_message, seen_from
+from server.light.near_light import remove_lamps
+from server.light.static_light import static_estimate
 from server.maths.rigid import repaired_pose
 from server.maths.sh import webxr_from_world
 from server.meshing.scene_mesh import SceneMesh, scene_mesh
 from server.meshing.surface import MeshingError
+from server.objects.rasterize import Placed
+from server.objects.scene_objects import check_room
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.operating_points import Point, asked_for
-from server.plan import Omission
-from server.point_control import control_for
-from server.rendering import Made, Rendering, Wanted
-from server.rest import Rest
-from server.room import Room
+from server.quality.operating_point_control import control_for
+from server.quality.sampling_settings import SamplingSettings, asked_for
+from server.quality.settings import Settings, read_wishes
+from server.rendering import Rendering, RenderRequest, SpineOutputs
+from server.reuse.frame_cache import TransferSamples
+from server.reuse.temporal_reuse import TemporalReuse
+from server.room.room import Room
 from server.scene.mesh import Mesh
-from server.scene.objects import check_room
 from server.scene.placement import Placement, check_size
-from server.settings import Settings, read_wishes
-from server.stages.composite import shown_picture, srgb_codes
-from server.stages.denoise import denoise_radiance
-from server.stages.exposure import scene_radiance
-from server.stages.indirect import observe_indirect
-from server.stages.layer import NOTHING, Layer
-from server.stages.light_estimation import LightEstimate
-from server.stages.near_light import remove_lamps
-from server.stages.rasterize import Placed
-from server.stages.raycast import raycast
-from server.stages.sampling import TransferSampler
-from server.stages.view_colors import view_colors
-from server.stages.volume import Volume
-from server.static_light import static_estimate
+from server.shading.composite import shown_picture, srgb_codes
+from server.shading.layer import NOTHING, Layer
+from server.tracking.alignment import Alignment
+from server.tracking.exposure import scene_radiance
+from server.transfer.indirect import observe_indirect
+from server.transfer.sampling import TransferSampler
+from server.volume.raycast import raycast
+from server.volume.view_colors import view_colors
+from server.volume.volume import Volume
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Pipeline:
         with self._room.lock:
             if self._changes != self._room.changes:
                 self._wake()
-            wanted = Wanted(self._answer, watched)
+            wanted = RenderRequest(self._answer, watched)
             result = self._process(self._imagined(frame) if isinstance(frame, Viewpoint) else frame, wanted)
             self._room.changes += 1
             self._changes = self._room.changes
@@ -147,7 +147,7 @@ class Pipeline:
         depth = np.zeros((lens.height, lens.width), np.uint16)
         return RgbdFrame(seen_from.index, seen_from.timestamp_s, color, depth, pose, has_depth=False)
 
-    def _process(self, frame: RgbdFrame, wanted: Wanted) -> FrameResult:
+    def _process(self, frame: RgbdFrame, wanted: RenderRequest) -> FrameResult:
         started = time.perf_counter()
         engine, settings, stage = self._engine, self._settings, self._engine.profile.stage
         engine.profile.forget()
@@ -182,7 +182,7 @@ class Pipeline:
                 )
         with stage("rendering"):  # 7.1-7.2, the effects this frame calls for
             planes, is_given = self._room_light.planes, self._room_light.is_given
-            made = Made(frame, geometry, volume, placed, self._sampler, sampled, estimate.sh, planes, is_given)
+            made = SpineOutputs(frame, geometry, volume, placed, self._sampler, sampled, estimate.sh, planes, is_given)
             drawn = self._rendering.draw(made, settings, left_out, self._rest, wanted)
         if not self._room_light.is_given and frame.has_depth:  # B4, for the frames to come
             with stage("light_estimation"):
@@ -205,7 +205,7 @@ class Pipeline:
         )
 
     def _lost(
-        self, frame: RgbdFrame, geometry: GeometryFrame, volume: Volume, started: float, wanted: Wanted
+        self, frame: RgbdFrame, geometry: GeometryFrame, volume: Volume, started: float, wanted: RenderRequest
     ) -> FrameResult:
         """The camera's own picture and the last light: where it is not known, nothing can be drawn or learnt."""
         self._wake()
@@ -242,8 +242,8 @@ class Pipeline:
         return self._rest is not None and self._rest.holds(frame, self._lamps.lamps)
 
     def _sample(
-        self, geometry: GeometryFrame, volume: Volume, placed: list[Placed], wanted: Wanted
-    ) -> tuple[Sampled, dict[str, Omission]]:
+        self, geometry: GeometryFrame, volume: Volume, placed: list[Placed], wanted: RenderRequest
+    ) -> tuple[TransferSamples, dict[str, CullReason]]:
         """Transfer, and what surfaces send (7.3.3); what of the spine is left out of this frame."""
         rest, draws = self._rest, bool(placed) and wanted.last is not None
         if rest is not None:
@@ -253,7 +253,7 @@ class Pipeline:
             return self._sample_anew(geometry, volume), {"light_of_still_frames": echo} if echo else {}
         stages = ("estimate_light", *(SURFACE_STAGES if geometry.is_held else ()))
         left_out = dict.fromkeys(stages, rest.omission)
-        kept = rest.held.sampled.get(rest.turn) if draws else Sampled(None, None)
+        kept = rest.held.sampled.get(rest.turn) if draws else TransferSamples(None, None)
         if kept is None:
             kept = self._sample_anew(geometry, volume)
             rest.held.keep_sampled(rest.turn, kept)
@@ -261,16 +261,16 @@ class Pipeline:
         self._sampler.pass_frame()
         return kept, left_out | {"transfer_radiance": rest.omission}
 
-    def _sample_anew(self, geometry: GeometryFrame, volume: Volume) -> Sampled:
+    def _sample_anew(self, geometry: GeometryFrame, volume: Volume) -> TransferSamples:
         engine, camera, reach_m, surface = self._engine, self._camera, self._settings.reach_m, geometry.surface
         pose, up = geometry.volume_from_camera, self._objects.up
         transfer = self._sampler.transfer(volume, surface, pose, up, reach_m)
         if self._settings.indirect == "none":
-            return Sampled(transfer, None)
+            return TransferSamples(transfer, None)
         sent = observe_indirect(engine, camera, volume, surface, transfer, self._sampler.rays, reach_m)
         if sent.mean.any():  # where next to nothing is hidden, noise decides whether anything is met
             self._mean_sent = sent.mean
-        return Sampled(transfer, replace(sent, mean=self._mean_sent))
+        return TransferSamples(transfer, replace(sent, mean=self._mean_sent))
 
     def _light_message(
         self, frame: RgbdFrame, geometry: GeometryFrame, estimate: LightEstimate, volume: Volume
@@ -341,7 +341,9 @@ class Pipeline:
         )
         control = control_for(self._device, asked)
         as_asked = (
-            Point.of(self._asked) if preset == self._asked.preset else Point(preset=preset, rays=self._asked.rays)
+            SamplingSettings.of(self._asked)
+            if preset == self._asked.preset
+            else SamplingSettings(preset=preset, rays=self._asked.rays)
         )
         with self._room.lock:
             self._sample_at(control.chosen.point if control else as_asked)
@@ -359,7 +361,7 @@ class Pipeline:
         self._sample_at(self._control.chosen.point)
         return said
 
-    def _sample_at(self, point: Point) -> None:
+    def _sample_at(self, point: SamplingSettings) -> None:
         """Nothing is remembered from another point but the room and its light. Raises ValueError."""
         wishes = point.wishes(self._wishes)
         settings = read_wishes(wishes)
@@ -396,12 +398,12 @@ class Pipeline:
         settings = self._settings
         return TransferSampler(self._engine, self._camera, settings.sampling, settings.rays, settings.bands)
 
-    def _make_rest(self) -> Rest | None:
+    def _make_rest(self) -> TemporalReuse | None:
         """None where everything is to be simulated."""
         if self._settings.plan == "everything":
             return None
         engine, camera, poses = self._engine, self._camera, self._asked.poses
-        return Rest(engine, camera, poses=poses, period=self._sampler.period)
+        return TemporalReuse(engine, camera, poses=poses, period=self._sampler.period)
 
     def _wake(self) -> None:
         """Something that pictures do not show is new."""
@@ -430,9 +432,9 @@ def _notes(estimate: LightEstimate) -> tuple[str, ...]:
     return ("no usable surface has been seen yet, the light is unknown",) if estimate.std is None else ()
 
 
-NOTHING_TO_LEARN = Omission("the light is given, and nothing else is learnt from the picture", 0.0)
+NOTHING_TO_LEARN = CullReason("the light is given, and nothing else is learnt from the picture", 0.0)
 
-ONLY_LOOKS = Omission("a client without depth adds nothing to the room's light", 0.0)
+ONLY_LOOKS = CullReason("a client without depth adds nothing to the room's light", 0.0)
 
 SURFACE_STAGES = ("locate", "raycast", "merge_depth")
 """Of the geometry, what is not done where nothing has changed."""

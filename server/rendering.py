@@ -13,25 +13,26 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import LeftOut, Plan
-from server.effect_functions import View, composite, shadow_everywhere
-from server.effects import EFFECTS, Answer
-from server.facts_finder import FactsFinder
-from server.geometry import GeometryFrame
-from server.held import Finished, Held, Sampled
+from server.culling.facts_finder import FactsFinder
+from server.culling.reason import CullReason
+from server.effects.functions import View, composite, shadow_everywhere
+from server.effects.plan import Effect, execute, make_plan
+from server.effects.table import EFFECTS, Answer
+from server.geometry.geometry import GeometryFrame
+from server.light.continuation import PlaneArrays
 from server.maths.direct_lights import split_light
+from server.objects.rasterize import Placed
 from server.opencl.engine import Engine
-from server.plan import Effect, Omission, execute, make_plan
-from server.rest import Rest
-from server.settings import Settings
-from server.stages.composite import shown_picture
-from server.stages.continuation import PlaneArrays
-from server.stages.layer import Layer
-from server.stages.radiance_transfer import TURNS
-from server.stages.rasterize import Placed
-from server.stages.sampling import TransferSampler
-from server.stages.tone_mapping import AverageMemory, Averages, measure_averages
-from server.stages.traced_scene import DeviceLight, take_discs, upload_light
-from server.stages.volume import Volume
+from server.quality.settings import Settings
+from server.reuse.frame_cache import CachedEffects, FrameCache, TransferSamples
+from server.reuse.temporal_reuse import TemporalReuse
+from server.shading.composite import shown_picture
+from server.shading.layer import Layer
+from server.shading.tone_mapping import AverageMemory, Averages, measure_averages
+from server.shading.traced_scene import DeviceLight, take_discs, upload_light
+from server.transfer.radiance_transfer import TURNS
+from server.transfer.sampling import TransferSampler
+from server.volume.volume import Volume
 
 Picture = NDArray[np.uint8]
 
@@ -58,7 +59,7 @@ SEEN = frozenset({"view", "shown", "measurement", "surface", "volume"})
 
 
 @dataclass(frozen=True)
-class Made:
+class SpineOutputs:
     """What the spine made of a frame."""
 
     frame: RgbdFrame
@@ -66,7 +67,7 @@ class Made:
     volume: Volume
     objects: list[Placed]
     sampler: TransferSampler
-    sampled: Sampled
+    sampled: TransferSamples
     """Its own, or a held one. Not read where nothing virtual is there."""
     sh: NDArray[np.float64]
     """[bands^2, 3] the light, in the first picture's units."""
@@ -75,7 +76,7 @@ class Made:
 
 
 @dataclass(frozen=True)
-class Wanted:
+class RenderRequest:
     """What is to be drawn of a frame."""
 
     answer: Answer = "picture"
@@ -112,11 +113,11 @@ class Rendering:
 
     def draw(
         self,
-        made: Made,
+        made: SpineOutputs,
         settings: Settings,
-        left_out: Mapping[str, Omission],
-        rest: Rest | None,
-        wanted: Wanted,
+        left_out: Mapping[str, CullReason],
+        rest: TemporalReuse | None,
+        wanted: RenderRequest,
     ) -> Drawn:
         """What is wanted, and the plan that says what was left out, `left_out` of the spine with it.
 
@@ -145,10 +146,10 @@ class Rendering:
 
     def _make(
         self,
-        made: Made,
+        made: SpineOutputs,
         settings: Settings,
         shown: Picture,
-        left_out: Mapping[str, Omission],
+        left_out: Mapping[str, CullReason],
         last: Effect[Any],
     ) -> tuple[Picture | Layer, dict[str, Any], Plan]:
         """What the last effect makes, what it reads, and the plan that ends with it."""
@@ -174,7 +175,7 @@ class Rendering:
             plan = _with_share(plan, float(self._engine.download(parts["reached"]).mean()), bool(given["light"].discs))
         return result, parts, plan
 
-    def _given(self, made: Made, settings: Settings, shown: Picture) -> dict[str, Any]:
+    def _given(self, made: SpineOutputs, settings: Settings, shown: Picture) -> dict[str, Any]:
         """The resources that effects begin with."""
         engine, geometry, rays = self._engine, made.geometry, made.sampler.rays
         transfer, indirect = made.sampled.transfer, made.sampled.indirect
@@ -198,11 +199,11 @@ class Rendering:
             "averages": averages,
         }
 
-    def _view(self, made: Made, settings: Settings) -> View:
+    def _view(self, made: SpineOutputs, settings: Settings) -> View:
         is_smooth, pose = settings.edges == "smooth", made.geometry.volume_from_camera
         return View(self._engine, self._camera, pose, settings.reach_m, made.sampler.sampling, is_smooth)
 
-    def _averages(self, made: Made, settings: Settings, light: DeviceLight) -> Averages | None:
+    def _averages(self, made: SpineOutputs, settings: Settings, light: DeviceLight) -> Averages | None:
         """What pictures and their shading are on average, if virtual things are to match them."""
         asked, transfer, indirect = settings.tone_mapping, made.sampled.transfer, made.sampled.indirect
         if transfer is None or asked == "light" or (asked == "auto" and made.is_light_given):
@@ -223,13 +224,13 @@ class Rendering:
 
     def _finish(
         self,
-        made: Made,
+        made: SpineOutputs,
         settings: Settings,
         shown: Picture,
-        finished: Finished,
-        left_out: Mapping[str, Omission],
-        why: Omission,
-        wanted: Wanted,
+        finished: CachedEffects,
+        left_out: Mapping[str, CullReason],
+        why: CullReason,
+        wanted: RenderRequest,
     ) -> Drawn:
         """What is wanted, of what has been made of a frame that was sampled alike."""
         assert wanted.last is not None
@@ -249,7 +250,9 @@ class Rendering:
         return _drawn(result, parts, shown, plan, wanted)
 
 
-def _drawn(result: Picture | Layer, parts: Mapping[str, Any], shown: Picture, plan: Plan, wanted: Wanted) -> Drawn:
+def _drawn(
+    result: Picture | Layer, parts: Mapping[str, Any], shown: Picture, plan: Plan, wanted: RenderRequest
+) -> Drawn:
     """What the last effect of a plan made of `parts`, and the picture where that is wanted besides."""
     if not isinstance(result, Layer):
         return Drawn(result, None, plan)
@@ -259,13 +262,13 @@ def _drawn(result: Picture | Layer, parts: Mapping[str, Any], shown: Picture, pl
     return Drawn(picture, result, structs.replace(plan, run=(*plan.run, PICTURE.name)))
 
 
-def _undrawn(left_out: Mapping[str, Omission]) -> Plan:
+def _undrawn(left_out: Mapping[str, CullReason]) -> Plan:
     """Of a frame that is answered by its light alone."""
     omissions = {**left_out, **{effect.name: BY_ITSELF for effect in EFFECTS}}
     return Plan(run=(), left_out=tuple(_left_out(name, why) for name, why in omissions.items()))
 
 
-def _picture_of_old(held: Held, parts: Mapping[str, Any], shown: Picture) -> Picture:
+def _picture_of_old(held: FrameCache, parts: Mapping[str, Any], shown: Picture) -> Picture:
     """What is virtual in this frame, put into what the camera saw when the view began to stand still."""
     shown, measurement = held.keep_old(shown, parts["measurement"])
     return composite(**{**parts, "shown": shown, "measurement": measurement})
@@ -273,7 +276,7 @@ def _picture_of_old(held: Held, parts: Mapping[str, Any], shown: Picture) -> Pic
 
 PICTURE: Effect[Any] = next(effect for effect in EFFECTS if effect.writes == "picture")
 LAYER: Effect[Any] = next(effect for effect in EFFECTS if effect.writes == "layer")
-BY_ITSELF = Omission("asked for: the client draws by itself", 0.0)
+BY_ITSELF = CullReason("asked for: the client draws by itself", 0.0)
 
 
 def _with_share(plan: Plan, share: float, has_sharp_shadows: bool) -> Plan:
@@ -287,7 +290,7 @@ def _with_share(plan: Plan, share: float, has_sharp_shadows: bool) -> Plan:
     return structs.replace(plan, left_out=tuple(said))
 
 
-def _left_out(name: str, why: Omission) -> LeftOut:
+def _left_out(name: str, why: CullReason) -> LeftOut:
     return LeftOut(effect=name, reason=why.reason, error_bound=why.error_bound)
 
 

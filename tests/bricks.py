@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from server.stages.volume import BRICK, TRUNCATION_VOXELS, Bricks
+from server.volume.volume import BRICK, TRUNCATION_VOXELS, Bricks
 
 Field = Callable[[NDArray[np.float64]], NDArray[Any]]
 """Points [..., 3] (x, y, z) in voxel units to one value, or one colour, each."""

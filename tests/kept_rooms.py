@@ -13,13 +13,13 @@ import trimesh
 from protocol.messages import Hello, Wishes
 from server.opencl.device import Device
 from server.pipeline import Pipeline
-from server.room import Room
+from server.room.room import Room
 from server.scene.placement import Placement
 from server.service.room_store import RoomStore
 from server.service.saving.slot import Slot
 from server.service.saving.snapshot import snapshot_within
 from server.service.saving.state import state_to_bytes
-from server.stages.volume import Volume
+from server.volume.volume import Volume
 from tests.meshes import shape_of
 from tests.rooms import CAMERA, frame_at, view_at
 

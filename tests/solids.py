@@ -15,8 +15,8 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import ArrayLike, NDArray
 
 from server.opencl.engine import Engine
-from server.stages.raycast import LABEL_NONE, LABEL_STATIC, Surface
-from server.stages.volume import BRICK, Volume
+from server.volume.raycast import LABEL_NONE, LABEL_STATIC, Surface
+from server.volume.volume import BRICK, Volume
 from tests.volumes import fill, vectors
 
 Floats = NDArray[np.float64]

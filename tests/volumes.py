@@ -10,13 +10,13 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from server.input.measure import Measurement
 from server.opencl.engine import Engine
-from server.stages.brick_pool import BRICK_VOXELS
-from server.stages.brick_table import AWAY_SLOT, BRICK
-from server.stages.integrate import integrate
-from server.stages.measure import Measurement
-from server.stages.raycast import raycast
-from server.stages.volume import Volume
+from server.volume.brick_pool import BRICK_VOXELS
+from server.volume.brick_table import AWAY_SLOT, BRICK
+from server.volume.integrate import integrate
+from server.volume.raycast import raycast
+from server.volume.volume import Volume
 
 Floats = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from client.laptop.volume import default_volume, default_voxel
 from client.progress import say
 from protocol.messages import Wishes
 from server.scene.vase import vase_glb
-from server.service.door import Door, new_token
+from server.service.authenticator import Authenticator, new_token
 from server.service.serve import BackgroundServer, open_service
 
 SOURCE = "synthetic:table?light=7&frames="
@@ -38,7 +38,7 @@ def run_demo(out: Path, device_name: str | None, keep: bool, port: int = 0) -> N
 
     Raises ServeError, ClientError or UserError, each with one line.
     """
-    service, door = open_service(device_name), Door(new_token())
+    service, door = open_service(device_name), Authenticator(new_token())
     with _prepared(FRAMES) as demo, BackgroundServer(service, port=port, door=door) as server:
         say(f"watch it at {server.way_in}")
         done = _stream(demo, server.way_in, out)

@@ -12,7 +12,7 @@ import numpy as np
 from client.laptop.errors import OptionError
 from protocol.limits import MAX_SH_BANDS
 from protocol.messages import Rgb
-from server.stages.panorama import PanoramaError, panorama_sh, read_panorama
+from server.light.panorama import PanoramaError, panorama_sh, read_panorama
 
 _COUNTS = tuple(bands * bands for bands in range(1, MAX_SH_BANDS + 1))
 

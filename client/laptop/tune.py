@@ -7,26 +7,26 @@ from collections.abc import Callable, Iterator, Sequence
 
 from client.laptop.tune_scenes import FRAMES, LIT_FRAMES, SETTLING, SIZE, LitRoom, Stage
 from client.progress import progress_bar
-from server.fronts import Front, FrontPoint, NoFrontError, own_version, read_front, write_front
 from server.opencl.device import Device
-from server.operating_points import Point
+from server.quality.pareto_front import NoFrontError, ParetoFront, ParetoPoint, own_version, read_front, write_front
+from server.quality.sampling_settings import SamplingSettings
 
-POINTS: tuple[Point, ...] = (
-    *(Point(preset="reg8", rays=rays) for rays in (25, 49, 81, 169)),
-    *(Point(preset="reg4", rays=rays) for rays in (49, 81, 169)),
-    *(Point(preset="gr15fast", rays=rays) for rays in (49, 81, 169)),
-    Point(preset="art8"),
-    Point(preset="art4"),
-    Point(preset="gr15"),
-    Point(preset="art1"),
-    Point(preset="rm"),
+POINTS: tuple[SamplingSettings, ...] = (
+    *(SamplingSettings(preset="reg8", rays=rays) for rays in (25, 49, 81, 169)),
+    *(SamplingSettings(preset="reg4", rays=rays) for rays in (49, 81, 169)),
+    *(SamplingSettings(preset="gr15fast", rays=rays) for rays in (49, 81, 169)),
+    SamplingSettings(preset="art8"),
+    SamplingSettings(preset="art4"),
+    SamplingSettings(preset="gr15"),
+    SamplingSettings(preset="art1"),
+    SamplingSettings(preset="rm"),
 )
 """From coarse and fast to fine and slow; which of them lie on the front, the device says."""
 
 Progress = Callable[[int, int], None]
 
 
-def tune(device: Device, progress: Progress, points: Sequence[Point] = POINTS) -> Front:
+def tune(device: Device, progress: Progress, points: Sequence[SamplingSettings] = POINTS) -> ParetoFront:
     """Measure `points` on the device; `progress` is told frames done and in all."""
     total, done = LIT_FRAMES + len(points) * (FRAMES + LIT_FRAMES), 0
 
@@ -35,18 +35,18 @@ def tune(device: Device, progress: Progress, points: Sequence[Point] = POINTS) -
 
     room, stage = LitRoom(device, say), Stage()
     done += LIT_FRAMES
-    measured: list[FrontPoint] = []
+    measured: list[ParetoPoint] = []
     for point in points:
         cost = stage.cost(device, point, say)
         done += FRAMES
         error_deg = room.error_deg(device, point, say)
         done += LIT_FRAMES
         measured.append(
-            FrontPoint(point=point, ms=cost.ms, light_error_deg=error_deg, picture_error=cost.picture_error)
+            ParetoPoint(point=point, ms=cost.ms, light_error_deg=error_deg, picture_error=cost.picture_error)
         )
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
     scene = f"synthetic stage, {SIZE}, two objects; light error: synthetic room under known lights"
-    return Front(device=device.name, version=own_version(), measured=today, scene=scene, points=tuple(measured))
+    return ParetoFront(device=device.name, version=own_version(), measured=today, scene=scene, points=tuple(measured))
 
 
 def ensure_front(device: Device, note: Callable[[str], None]) -> None:
@@ -60,7 +60,7 @@ def ensure_front(device: Device, note: Callable[[str], None]) -> None:
         note(f"kept in {path}")
 
 
-def lines_of(front: Front) -> Iterator[str]:
+def lines_of(front: ParetoFront) -> Iterator[str]:
     """A front as a table, fastest first."""
     best = {point.point for point in front.best()}
     yield f"{front.device}, {front.measured}: median of {FRAMES - SETTLING} frames, {SIZE}, two objects in view"

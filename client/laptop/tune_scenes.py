@@ -25,14 +25,14 @@ from client.laptop.synthetic.lights import disc_light
 from client.laptop.synthetic.source import SyntheticSource, open_synthetic
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Wishes
-from server.costs import rows_of
 from server.evaluation.e1 import LitFrame, moving_light, score, shaded_views
 from server.evaluation.environment import direction_error_deg
 from server.maths.sh import spherical_fibonacci
 from server.opencl.device import Device
-from server.operating_points import Point
 from server.pipeline import FrameResult, Pipeline
-from server.stages.composite import srgb_codes
+from server.quality.costs import rows_of
+from server.quality.sampling_settings import SamplingSettings
+from server.shading.composite import srgb_codes
 
 Say = Callable[[int], None]
 """Told how many frames of a point are done."""
@@ -68,14 +68,14 @@ class Stage:
         self._composites = [srgb_codes(self._guests.truth(i).radiance) for i in range(FRAMES)]
         self._changed = [(a != b).any(axis=-1) for a, b in zip(self._composites, bare, strict=True)]
 
-    def cost(self, device: Device, point: Point, say: Say) -> Cost:
+    def cost(self, device: Device, point: SamplingSettings, say: Say) -> Cost:
         """Run the frames at a point."""
         found = self._results(device, point, say)
         rows = [rows_of(result.timings) for result in found[SETTLING:]]
         errors = [self._difference(i, found[i].color) for i in range(SETTLING, FRAMES)]
         return Cost({name: median(row[name] for row in rows) for name in rows[0]}, median(errors))
 
-    def _results(self, device: Device, point: Point, say: Say) -> list[FrameResult]:
+    def _results(self, device: Device, point: SamplingSettings, say: Say) -> list[FrameResult]:
         usual = _usual(self.source)
         wishes = structs.replace(point.wishes(usual), albedo="estimated", indirect="observed")
         pipeline = Pipeline(device, self.source.camera, wishes)
@@ -111,7 +111,7 @@ class LitRoom:
             self._frames.append(frame)
             say(len(self._frames))
 
-    def error_deg(self, device: Device, point: Point, say: Say) -> float:
+    def error_deg(self, device: Device, point: SamplingSettings, say: Say) -> float:
         """Of the dominant direction, median over frames."""
         found = score(device, self._source.camera, _told(self._frames, say), point.wishes(self._wishes))
         errors = [direction_error_deg(a, b.sh) for a, b in zip(found.lights, self._frames, strict=True)]

@@ -15,7 +15,7 @@ from server.cluster.ingress import Ingress, create_ingress_app
 from server.cluster.keeper import Keeper
 from server.cluster.ray_places import RayPlaces
 from server.cluster.settings import ClusterSettings, read_settings
-from server.service.door import Door, is_token
+from server.service.authenticator import Authenticator, is_token
 
 TOKEN = "PROBELESS_TOKEN"
 
@@ -23,7 +23,7 @@ TOKEN = "PROBELESS_TOKEN"
 class IngressReplica:
     """One replica: its sockets."""
 
-    def __init__(self, settings: ClusterSettings, door: Door, _keeper: object) -> None:
+    def __init__(self, settings: ClusterSettings, door: Authenticator, _keeper: object) -> None:
         """`_keeper`: named here, so that Serve runs one."""
         self._ingress = Ingress(RayPlaces(settings), door)
 
@@ -53,11 +53,11 @@ def build(args: dict[str, Any]) -> Any:
     return ingress.bind(settings, door_from_environment(), keeper.bind(settings))
 
 
-def door_from_environment() -> Door:
+def door_from_environment() -> Authenticator:
     """Raises ValueError where no token is set, or one that cannot be one."""
     token = os.environ.get(TOKEN, "")
     if token == "none":
-        return Door(None)
+        return Authenticator(None)
     if not is_token(token):
         raise ValueError(f"set {TOKEN} to a secret of yours (openssl rand -hex 24), or to none to let everybody in")
-    return Door(token)
+    return Authenticator(token)

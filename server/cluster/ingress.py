@@ -17,8 +17,8 @@ from server.cluster.places import NoPlace, NotYet, Places
 from server.cluster.relay import open_host, relay
 from server.cluster.routing import Route, route_of
 from server.service.app import PAGE_FOLDER, STREAM_PATH
+from server.service.authenticator import Authenticator
 from server.service.connection import GONE, POLICY, TRY_LATER, BadMessage, Connection, Refusal
-from server.service.door import Door
 from server.service.limits import DEFAULT_LIMITS, Limits
 from server.service.object_library import ObjectLibrary
 from server.service.object_routes import add_objects
@@ -34,7 +34,7 @@ class Ingress:
     """Of one replica: any number of sockets, each of them one client's."""
 
     def __init__(
-        self, places: Places, door: Door, limits: Limits = DEFAULT_LIMITS, patience_s: float = PATIENCE_S
+        self, places: Places, door: Authenticator, limits: Limits = DEFAULT_LIMITS, patience_s: float = PATIENCE_S
     ) -> None:
         self._places = places
         self.door = door

@@ -82,7 +82,7 @@ class Basis:
 
 
 def prior_variance() -> Floats:
-    """[FINE_BANDS^2] of the harmonics of a light, relative (server.stages.light_estimation.prior_precision)."""
+    """[FINE_BANDS^2] of the harmonics of a light, relative (server.light.light_estimation.prior_precision)."""
     band = band_of(FINE_BANDS**2)
     return np.asarray(1 / (1.0 + band * (band + 1.0)))
 

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.evaluation.bases import Basis
+from server.light.light_estimation import ASSUMED_ALBEDO, TileSums, sample_dependence
 from server.maths.bayes import NormalEquations, solve_with_evidence, solve_with_ratio
 from server.maths.nonnegative import nonnegative_mean
 from server.maths.nonnegative_qp import solve_nonnegative
-from server.stages.light_estimation import ASSUMED_ALBEDO, TileSums, sample_dependence
 
 Floats = NDArray[np.float64]
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.evaluation.environment import CUBE_SIDE, cube_directions
+from server.light.panorama import panorama_directions
 from server.maths.sh import GOLDEN_TURN, sh_basis, spherical_fibonacci
-from server.stages.panorama import panorama_directions
 
 Floats = NDArray[np.float64]
 

@@ -20,16 +20,16 @@ from protocol.messages import Wishes
 from server.evaluation.bases import Basis
 from server.evaluation.bases_lights import LATTICE, HardLight, lattice
 from server.evaluation.e1 import ALBEDO, BACKGROUND
-from server.geometry import Geometry
+from server.geometry.geometry import Geometry
+from server.input.measure import measure
+from server.light.light_estimation import TileSums, sum_tiles
 from server.maths.sh import GOLDEN_TURN, lambert_transfer, spherical_fibonacci
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.settings import WHOLE_ROOM_M
-from server.stages.composite import srgb_codes
-from server.stages.light_estimation import TileSums, sum_tiles
-from server.stages.measure import measure
-from server.stages.radiance_transfer import SETS, Directions, Transfer, direction_sets, transfer_radiance
-from server.stages.raycast import LABEL_STATIC, Surface
+from server.quality.settings import WHOLE_ROOM_M
+from server.shading.composite import srgb_codes
+from server.transfer.radiance_transfer import SETS, Directions, Transfer, direction_sets, transfer_radiance
+from server.volume.raycast import LABEL_STATIC, Surface
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -16,8 +16,8 @@ from server.evaluation.composites import (
     shadow_slope,
 )
 from server.evaluation.flip import Codes, flip_map
-from server.stages.composite import srgb_codes
-from server.stages.measure import linear_values
+from server.input.measure import linear_values
+from server.shading.composite import srgb_codes
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

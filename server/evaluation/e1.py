@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from server.evaluation.environment import direction_dot, direction_error_deg, environment_difference
-from server.geometry import Geometry
+from server.geometry.geometry import Geometry
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import Pipeline
-from server.settings import WHOLE_ROOM_M, Bounds
-from server.stages.composite import srgb_codes
-from server.stages.radiance_transfer import Transfer, direction_sets, transfer_radiance
+from server.quality.settings import WHOLE_ROOM_M
+from server.shading.composite import srgb_codes
+from server.transfer.radiance_transfer import Transfer, direction_sets, transfer_radiance
+from server.volume.bounds import Bounds
 
 Floats = NDArray[np.float64]
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from protocol.messages import Wishes
 from server.evaluation.hand import Frames, HandBefore
-from server.geometry import Geometry, GeometryFrame
+from server.geometry.geometry import Geometry, GeometryFrame
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.settings import Bounds
-from server.stages.raycast import Surface
+from server.volume.bounds import Bounds
+from server.volume.raycast import Surface
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

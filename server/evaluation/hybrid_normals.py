@@ -13,7 +13,7 @@ from server.evaluation.hand import Frames
 from server.evaluation.hybrid import run_geometry, vectors
 from server.evaluation.noise import NormalError, depth_normals
 from server.opencl.device import Device
-from server.settings import Bounds
+from server.volume.bounds import Bounds
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

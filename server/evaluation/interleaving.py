@@ -12,7 +12,7 @@ from protocol.frames import CameraModel, RgbdFrame
 from server.evaluation.rooms import LIVING_ROOM, fuse_frame, looking, seen_depth
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.stages.volume import Volume
+from server.volume.volume import Volume
 
 Floats = NDArray[np.float64]
 VOXEL_M = 0.015

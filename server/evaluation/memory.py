@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from server.evaluation.rooms import CAMERA, LIVING_ROOM, fuse_frame, seen_depth, walk
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.stages.volume import Volume
+from server.volume.volume import Volume
 
 Floats = NDArray[np.float64]
 VOXEL_M = 0.01

@@ -17,7 +17,7 @@ from protocol.frames import CameraModel
 from server.evaluation.environment import bands_of
 from server.evaluation.flip import Codes
 from server.maths.sh import lambert_transfer
-from server.stages.composite import srgb_codes
+from server.shading.composite import srgb_codes
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

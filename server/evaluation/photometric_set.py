@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.evaluation.probe import POOL, shading_equations
+from server.light.light_estimation import prior_precision
 from server.maths.bayes import NormalEquations, solve_with_evidence
 from server.maths.dominant import DominantLight, dominant_lights
 from server.maths.sh import LUMINANCE, dominant_direction, lambert_transfer
-from server.stages.light_estimation import prior_precision
 
 BANDS = 5
 CLIPPED = 0.98

@@ -1,7 +1,7 @@
 """Light probes (thesis 5.3, 6.2.3.1): the light from a sphere whose place is known, to hold the estimate against.
 
 Passive (E2): a matte grey sphere; its shading gives the light by the estimator's own solver. Active (E3): a mirror
-sphere; its pixels are the light. (A panorama as an active probe: `server.stages.panorama`.) The sphere stands in the
+sphere; its pixels are the light. (A panorama as an active probe: `server.light.panorama`.) The sphere stands in the
 camera's axes (x right, y down, z forward, metres); a marker beside it can say where.
 """
 
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from protocol.messages import Dictionary, Marker
-from server.markers import find_marker
+from server.light.light_estimation import prior_precision
 from server.maths.bayes import NormalEquations, Posterior, solve_with_evidence
 from server.maths.sh import lambert_transfer, sh_basis
-from server.stages.light_estimation import prior_precision
+from server.tracking.markers import find_marker
 
 LEAST_FACING = 0.2
 """Cosine of the steepest usable view: nearer to the rim a pixel mixes sphere and background."""

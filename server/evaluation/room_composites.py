@@ -17,7 +17,7 @@ from protocol.frames import CameraModel
 from server.evaluation.composite_truth import CompositeTruth
 from server.evaluation.mitsuba_room import OBJECTS, RoomSet
 from server.evaluation.pasting import ObjectNormals, pasted
-from server.stages.composite import srgb_codes
+from server.shading.composite import srgb_codes
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
+from server.input.measure import measure
 from server.opencl.engine import Engine
-from server.stages.integrate import integrate
-from server.stages.measure import measure
-from server.stages.raycast import raycast
-from server.stages.volume import Volume
+from server.volume.integrate import integrate
+from server.volume.raycast import raycast
+from server.volume.volume import Volume
 
 Floats = NDArray[np.float64]
 CAMERA = CameraModel(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5, depth_scale_m=0.0005)

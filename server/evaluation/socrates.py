@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
-from server.geometry import Geometry
+from server.geometry.geometry import Geometry
+from server.light.light_estimation import prior_precision
 from server.maths.bayes import NormalEquations, solve_with_evidence
 from server.maths.dominant import dominant_lights
 from server.maths.sh import LUMINANCE, dominant_direction, sh_basis
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.stages.light_estimation import prior_precision
-from server.stages.radiance_transfer import direction_sets, transfer_radiance
+from server.transfer.radiance_transfer import direction_sets, transfer_radiance
 
 BANDS = 5
 VIEWS = 4

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
-from server.geometry import Geometry, GeometryFrame
+from server.geometry.geometry import Geometry, GeometryFrame
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.settings import Bounds
+from server.volume.bounds import Bounds
 
 
 @dataclass(frozen=True)

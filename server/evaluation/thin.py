@@ -13,7 +13,7 @@ from protocol.frames import CameraModel, RgbdFrame
 from server.evaluation.hybrid import follow
 from server.evaluation.rooms import CAMERA, Room
 from server.opencl.device import Device
-from server.settings import Bounds
+from server.volume.bounds import Bounds
 
 Floats = NDArray[np.float64]
 Sensor = Callable[[Floats, int], Floats]

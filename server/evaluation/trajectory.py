@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Poses, Tracking, Wishes
 from server.evaluation.rooms import seen_depth
-from server.geometry import Geometry
+from server.geometry.geometry import Geometry
+from server.input.measure import measure
 from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine
-from server.settings import Bounds
-from server.stages.measure import measure
+from server.volume.bounds import Bounds
 
 Floats = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from server.stages.volume import BRICK, Bricks
+from server.volume.volume import BRICK, Bricks
 
 CHUNK_BRICKS = 4
 SIDE = CHUNK_BRICKS * BRICK + 1

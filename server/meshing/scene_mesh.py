@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.meshing.surface import MeshingError, VoxelMesh, extract_surface
-from server.stages.volume import BRICK, Bricks
+from server.volume.volume import BRICK, Bricks
 
 LEAST_PIECE_VOXELS = BRICK
 """A piece that hangs together and is smaller than this along x, y and z is noise."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from server.meshing.chunks import SIDE, Chunk, ChunkedBricks
 from server.scene.normals import corner_angles, face_crosses, unit
-from server.stages.volume import BRICK, Bricks
+from server.volume.volume import BRICK, Bricks
 
 LEAST_TSDF = 1e-3
 """Values nearer to zero are moved this far away: a crossing then is never a grid point, which belongs to six edges."""

@@ -38,7 +38,7 @@ class Engine:
         return 1 if self.device.is_gpu else 8
 
     def kernel(self, file: str, name: str, **defines: Define) -> cl.Kernel:
-        """Kernel `name` of `cl_kernels/<file>`; retrieved once, because a kernel object carries its arguments."""
+        """Kernel `name` of the kernel file `file`; retrieved once, because a kernel object carries its arguments."""
         key = (file, name, define_options(defines))  # as text: 1, 1.0 and True are equal in Python
         if key not in self._kernels:
             self._kernels[key] = cl.Kernel(self.device.programs.get(file, defines), name)

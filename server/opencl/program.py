@@ -10,6 +10,8 @@ import pyopencl as cl
 import cl_kernels
 
 KERNEL_FOLDER = Path(cl_kernels.__file__).parent
+KERNEL_FILES = {path.name: path for path in KERNEL_FOLDER.glob("*/*.cl")}
+"""Every file that can be built, by its name; names are unique over the folders."""
 _OPTIONS = ("-cl-std=CL1.2", "-Werror", "-cl-fp32-correctly-rounded-divide-sqrt")
 _PROLOGUE = """#ifdef __clang__
 #pragma clang diagnostic ignored "-Wpsabi"
@@ -48,7 +50,7 @@ class ProgramCache:
         self._options = [o for o in _OPTIONS if exact or "correctly-rounded" not in o]
 
     def get(self, file: str, defines: dict[str, Define]) -> cl.Program:
-        """The program built from `cl_kernels/<file>` with `defines`. Raises KernelBuildError."""
+        """The program built from the kernel file of that name with `defines`. Raises KernelBuildError."""
         key = (file, define_options(defines))
         with self._lock:
             if key not in self._programs:
@@ -56,10 +58,11 @@ class ProgramCache:
             return self._programs[key]
 
     def _build(self, file: str, defines: tuple[str, ...]) -> cl.Program:
-        source = f'{_PROLOGUE}#line 1 "{file}"\n' + (KERNEL_FOLDER / file).read_text()
+        source = f'{_PROLOGUE}#line 1 "{file}"\n' + KERNEL_FILES[file].read_text()
         options = [*self._options, "-I", str(KERNEL_FOLDER / "include"), *defines]
         try:
             program: cl.Program = cl.Program(self._context, source).build(options)
         except cl.RuntimeError as error:
-            raise KernelBuildError(f"cl_kernels/{file} with {' '.join(defines) or 'no defines'}: {error}") from error
+            path = KERNEL_FILES[file].relative_to(KERNEL_FOLDER.parent)
+            raise KernelBuildError(f"{path} with {' '.join(defines) or 'no defines'}: {error}") from error
         return program

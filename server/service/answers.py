@@ -14,7 +14,7 @@ from protocol.messages import ColorImage, Composite, Frame, Layer, LayerPatch, P
 
 if TYPE_CHECKING:
     from server.pipeline import FrameResult
-    from server.stages.layer import LayerPart
+    from server.shading.layer import LayerPart
 
 Codec = Literal["zdelta", "zstd-delta"]
 

@@ -11,8 +11,8 @@ from fastapi.responses import JSONResponse, PlainTextResponse, Response
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST
 
+from server.service.authenticator import WHERE_IT_IS, Authenticator
 from server.service.connection import POLICY, Connection, Refusal
-from server.service.door import WHERE_IT_IS, Door
 from server.service.object_library import ObjectLibrary
 from server.service.object_routes import add_objects
 from server.service.service import Service
@@ -24,14 +24,14 @@ PAGE_FOLDER = Path(__file__).resolve().parents[2] / "client" / "web" / "dist"
 def create_app(
     service: Service,
     page_folder: Path = PAGE_FOLDER,
-    door: Door | None = None,
+    door: Authenticator | None = None,
     library: ObjectLibrary | None = None,
 ) -> FastAPI:
     """The ASGI application around `service`, which it starts and stops; `page_folder` holds index.html.
 
     `door`: who may come in; None: everybody. `library`: of objects to place; None: the vase alone.
     """
-    door = door or Door()
+    door = door or Authenticator()
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -48,7 +48,7 @@ def create_app(
     return app
 
 
-def _add_stream(app: FastAPI, service: Service, door: Door) -> None:
+def _add_stream(app: FastAPI, service: Service, door: Authenticator) -> None:
     @app.websocket(STREAM_PATH)
     async def stream(websocket: WebSocket) -> None:
         connection = Connection(websocket, service.limits, service.note_refusal)
@@ -84,7 +84,7 @@ def _add_health(app: FastAPI, service: Service) -> None:
         return JSONResponse(state, status_code=200 if service.ready else 503)
 
 
-def _add_metrics(app: FastAPI, service: Service, door: Door) -> None:
+def _add_metrics(app: FastAPI, service: Service, door: Authenticator) -> None:
     @app.get("/metrics", response_class=PlainTextResponse, responses={401: {"description": "No token"}})
     async def metrics(request: Request) -> Response:
         if not door.shows_metrics_to(request):

@@ -11,7 +11,7 @@ from server.service.saving.upkeep import Kept, KeptLimits
 
 if TYPE_CHECKING:
     from server.opencl.device import Device
-    from server.room import Room
+    from server.room.room import Room
     from server.service.room_saver import RoomSaver
     from server.service.room_store import RoomStore
     from server.service.rooms import Rooms
@@ -60,7 +60,7 @@ class KeptRooms:
 
     def open_room(self, wishes: Wishes, name: str) -> Room:
         """The room as it was left, else a new one. Raises ValueError, one line, where what was left cannot be read."""
-        from server.room import Room
+        from server.room.room import Room
         from server.service.room_store import RoomStoreError
 
         assert self._store is not None

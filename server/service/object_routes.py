@@ -8,8 +8,8 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, PlainTextResponse, Response
 
+from server.service.authenticator import Authenticator
 from server.service.connection import UNAUTHORIZED
-from server.service.door import Door
 from server.service.object_library import MEDIA_TYPES, NoObject, ObjectLibrary
 
 OBJECTS_PATH = "/v1/objects"
@@ -25,7 +25,7 @@ FILES: dict[int | str, dict[str, Any]] = {
 }
 
 
-def add_objects(app: FastAPI, library: ObjectLibrary, door: Door) -> None:
+def add_objects(app: FastAPI, library: ObjectLibrary, door: Authenticator) -> None:
     """Whoever may open the stream may have the objects; in threads, since files are read."""
 
     @app.get(OBJECTS_PATH, responses=REFUSED)
@@ -48,7 +48,7 @@ def add_objects(app: FastAPI, library: ObjectLibrary, door: Door) -> None:
         return Response(found.data, media_type=found.media_type, headers=headers)
 
 
-def _refusal(door: Door, request: Request) -> Response | None:
+def _refusal(door: Authenticator, request: Request) -> Response | None:
     refusal = door.refusal(request)
     if refusal is None:
         return None

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 
-from server.room import Room
+from server.room.room import Room
 from server.service.room_store import RoomStore, RoomStoreError
 from server.service.saving.room_saves import Saved
 

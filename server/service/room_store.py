@@ -21,7 +21,7 @@ from typing import TypeVar
 import pyopencl as cl
 
 from server.opencl.device import Device
-from server.room import Room
+from server.room.room import Room
 from server.service.saving.files import DamagedFile, sync_folder
 from server.service.saving.room_saves import SLOTS, RoomSaves, Saved, header_of
 from server.service.saving.slot import Slot

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from protocol.messages import Wishes
 
 if TYPE_CHECKING:
-    from server.room import Room
+    from server.room.room import Room
 
 RoomFactory = Callable[[Wishes, str], "Room"]
 

@@ -20,7 +20,7 @@ import uvicorn
 from protocol.limits import MAX_MESSAGE_BYTES
 from protocol.local_keys import LocalKey, key_left
 from server.service.app import create_app
-from server.service.door import Door, is_loopback, new_token
+from server.service.authenticator import Authenticator, is_loopback, new_token
 from server.service.limits import DEFAULT_LIMITS, Limits
 from server.service.linger import LingeringWebSocket
 from server.service.object_library import ObjectLibrary
@@ -37,7 +37,7 @@ STOP_PATIENCE_S = 10
 DRAIN_PATIENCE_S = 7
 """Of it, for sessions to end and rooms to be saved."""
 EVERYWHERE = ("0.0.0.0", "::", "")
-OPEN_DOOR = Door()
+OPEN_DOOR = Authenticator()
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ def serve(
     device_name: str | None = None,
     *,
     limits: Limits = DEFAULT_LIMITS,
-    door: Door | None = None,
+    door: Authenticator | None = None,
     certificate: Certificate | None = None,
     data: Path | None = None,
     objects: Path | None = None,
@@ -70,7 +70,7 @@ def serve(
         with listener:
             service = open_service(device_name, limits=limits, data=data)
             library = ObjectLibrary(objects)
-            return serve_on(listener, service, say, door or Door(new_token()), certificate, library)
+            return serve_on(listener, service, say, door or Authenticator(new_token()), certificate, library)
     except ServeError as error:
         sys.stderr.write(f"probeless: {error}\n")
         return 1
@@ -117,7 +117,7 @@ def serve_on(
     listener: socket.socket,
     service: Service,
     say: Callable[[str], None],
-    door: Door = OPEN_DOOR,
+    door: Authenticator = OPEN_DOOR,
     certificate: Certificate | None = None,
     library: ObjectLibrary | None = None,
 ) -> int:
@@ -165,7 +165,7 @@ def _ended_like_interrupted() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _ways_in(listener: socket.socket, door: Door, certificate: Certificate | None, is_left: bool) -> list[str]:
+def _ways_in(listener: socket.socket, door: Authenticator, certificate: Certificate | None, is_left: bool) -> list[str]:
     """What the user opens and runs, here and on other machines."""
     host, url = listener.getsockname()[0], url_of(listener, certificate)
     pin = "" if certificate is None else f" --tls-fingerprint {certificate.fingerprint}"
@@ -181,7 +181,7 @@ def _ways_in(listener: socket.socket, door: Door, certificate: Certificate | Non
 
 
 @contextlib.contextmanager
-def _key_left(listener: socket.socket, door: Door, certificate: Certificate | None) -> Iterator[bool]:
+def _key_left(listener: socket.socket, door: Authenticator, certificate: Certificate | None) -> Iterator[bool]:
     """While it lasts, programs of this user on this machine find the token; whether they do."""
     if door.token is None and certificate is None:
         yield True  # there is nothing to find
@@ -206,7 +206,7 @@ class BackgroundServer:
         service: Service,
         host: str = DEFAULT_HOST,
         port: int = 0,
-        door: Door = OPEN_DOOR,
+        door: Authenticator = OPEN_DOOR,
         certificate: Certificate | None = None,
         library: ObjectLibrary | None = None,
     ) -> None:
@@ -263,7 +263,9 @@ class _Server(uvicorn.Server):
         self.accepting.set()
 
 
-def _server(service: Service, door: Door, certificate: Certificate | None, library: ObjectLibrary | None) -> _Server:
+def _server(
+    service: Service, door: Authenticator, certificate: Certificate | None, library: ObjectLibrary | None
+) -> _Server:
     config = uvicorn.Config(
         create_app(service, door=door, library=library),
         ssl_certfile=None if certificate is None else certificate.certificate,

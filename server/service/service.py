@@ -38,7 +38,7 @@ from server.service.worker import Workshop
 if TYPE_CHECKING:
     from server.opencl.device import Device
     from server.pipeline import Pipeline
-    from server.room import Room
+    from server.room.room import Room
 
 SERVER_NAME = f"probeless {version('probeless')}"
 NO_SESSION = "waiting"
@@ -316,7 +316,7 @@ class Service:
 
 def _real_room(device: Device) -> RoomFactory:
     def open_room(wishes: Wishes, name: str) -> Room:
-        from server.room import Room  # loads OpenCL, as below
+        from server.room.room import Room  # loads OpenCL, as below
 
         return Room(device, wishes, name)
 

@@ -26,12 +26,12 @@ from server.evaluation.bases_estimation import estimate_light
 from server.evaluation.bases_lights import HardLight, disc, of_panorama, sun, two_lamps
 from server.evaluation.bases_scene import Ball, LitScene
 from server.evaluation.bases_scores import Score, Transfers, Truth, score_light
-from server.stages.panorama import read_panorama
+from server.light.panorama import read_panorama
 from tests.bench.accuracy_bases_pictures import draw_bases
 from tests.bench.finished import Part, UnmeasurableError
 from tests.bench.run import Run, data_folder
 
-Point = dict[str, Any]
+SamplingSettings = dict[str, Any]
 Floats = NDArray[np.float64]
 
 __all__ = ["bases_part", "draw_bases"]
@@ -68,7 +68,7 @@ def bases_part(run: Run) -> Part:
     lights = lights_of(part, run.of(2, 8), run.of(2, len(PANORAMAS)))
     trials = run.of(7, 31)
     part.sizes = {"lights of B9": len(lights), "trials of B9's times": trials}
-    points: list[Point] = []
+    points: list[SamplingSettings] = []
     for name in SCENES:
         run.say(f"B9, {name}: {len(lights)} lights")
         scene = scene_of(run, name, lights)
@@ -130,14 +130,16 @@ def device_ms(scene: LitScene, trials: int, *, on_gpu: bool) -> dict[tuple[str, 
     return {key: median(values) for key, values in spent.items()}
 
 
-def _points(name: str, basis: Basis, scene: LitScene, times_ms: Mapping[tuple[str, int], float]) -> list[Point]:
+def _points(
+    name: str, basis: Basis, scene: LitScene, times_ms: Mapping[tuple[str, int], float]
+) -> list[SamplingSettings]:
     """One of each of VARIANTS, and BEST."""
     transfers = Transfers(scene.ball.transfer(basis), scene.floor.transfer(basis))
     truths = [_truth(scene, number) for number in range(len(scene.lights))]
     sums = scene.sums(basis)
     ratio = times_ms[basis.name, basis.size] / times_ms[REFERENCE]
 
-    def point(variant: str, lights: Iterable[Floats]) -> Point:
+    def point(variant: str, lights: Iterable[Floats]) -> SamplingSettings:
         scores = [score_light(basis, light, transfers, truth) for light, truth in zip(lights, truths, strict=True)]
         return _point(name, basis, variant, scores, scene, ratio)
 
@@ -156,7 +158,7 @@ def _points(name: str, basis: Basis, scene: LitScene, times_ms: Mapping[tuple[st
     return [*({**item, "solve_ms": solve_ms} for item in points), {"strength": 1.0, **best, "variant": BEST}]
 
 
-def _largest(name: str, size: int, scene: LitScene, times_ms: Mapping[tuple[str, int], float]) -> Point:
+def _largest(name: str, size: int, scene: LitScene, times_ms: Mapping[tuple[str, int], float]) -> SamplingSettings:
     """Wavelets chosen for each light anew, which must be known for that; they cost what others do."""
     scores = []
     for number, light in enumerate(scene.lights):
@@ -171,7 +173,9 @@ def _truth(scene: LitScene, light: int) -> Truth:
     return Truth.of(scene.lights[light], scene.shading(scene.ball, light), scene.shading(scene.floor, light))
 
 
-def _point(name: str, basis: Basis, variant: str, scores: list[Score], scene: LitScene, ratio: float) -> Point:
+def _point(
+    name: str, basis: Basis, variant: str, scores: list[Score], scene: LitScene, ratio: float
+) -> SamplingSettings:
     """Means over the lights, the least of what rings, and the means of each kind of light."""
     columns = {key: np.array([asdict(score)[key] for score in scores]) for key in asdict(scores[0])}
     kinds = sorted({light.name for light in scene.lights})
@@ -189,7 +193,7 @@ def _point(name: str, basis: Basis, variant: str, scores: list[Score], scene: Li
     }
 
 
-def _add_rows(part: Part, point: Point) -> None:
+def _add_rows(part: Part, point: SamplingSettings) -> None:
     is_reference = point["coefficients"] == REFERENCE[1]
     row = f"B9, {point['scene']}: {point['basis']}, {point['coefficients']} coefficients: {point['variant']}"
     for key in MEASURES if is_reference else FEW:

@@ -19,9 +19,9 @@ from client.laptop.source import Source
 from client.laptop.tune import tune
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Wishes
-from server.fronts import Front, FrontPoint, write_front
 from server.pipeline import FrameResult, Pipeline
-from server.point_control import TOLERANCE
+from server.quality.operating_point_control import TOLERANCE
+from server.quality.pareto_front import ParetoFront, ParetoPoint, write_front
 from tests.bench.finished import ROOT, Part
 from tests.bench.run import Run, data_source
 
@@ -75,7 +75,7 @@ def budget_part(run: Run) -> Part:
 
 
 def _add_rows(
-    part: Part, row: str, budget_ms: float, driven: Driven, front: Front, fixed: dict[str, list[float]]
+    part: Part, row: str, budget_ms: float, driven: Driven, front: ParetoFront, fixed: dict[str, list[float]]
 ) -> None:
     in_time = _in_time(driven.totals_ms, budget_ms)
     part.add(f"{row}: frames within {TOLERANCE:g} times the budget", in_time, "share", f">= {IN_TIME}")
@@ -93,7 +93,7 @@ def _add_rows(
     part.add(f"{row}: light error above that of the best point that fits", above, "deg", ERROR_GOAL)
 
 
-def _front(run: Run) -> Front:
+def _front(run: Run) -> ParetoFront:
     told = [0]
 
     def progress(done: int, total: int) -> None:
@@ -161,7 +161,7 @@ def _results(run: Run, source: Source, frames: int, wishes: Wishes) -> Iterator[
         close()
 
 
-def _plain(point: FrontPoint) -> dict[str, object]:
+def _plain(point: ParetoPoint) -> dict[str, object]:
     return {
         "settings": point.point.settings,
         "ms": point.total_ms,

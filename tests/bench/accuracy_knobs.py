@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from server.stages.sampling import PRESETS
+from server.transfer.sampling import PRESETS
 
 Settings = dict[str, Any]
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from protocol.messages import Wishes
-from server.settings import sampling_of
-from server.stages.sampling import PRESETS
+from server.quality.settings import sampling_of
+from server.transfer.sampling import PRESETS
 from tests.bench.accuracy_front import front_of, interval, light_error, paced_ms, picture_error, wall_ms
 from tests.bench.plotting import COLORS, INK, as_svg, panels, spread_labels
 

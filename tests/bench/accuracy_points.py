@@ -18,8 +18,8 @@ from server.evaluation.environment import direction_error_deg, environment_diffe
 from server.evaluation.flip import flip_map
 from server.evaluation.ssim import ssim_map
 from server.opencl.device import Device
-from server.operating_points import option_of
 from server.pipeline import FrameResult, Pipeline
+from server.quality.sampling_settings import option_of
 from tests.bench.accuracy_scenes import Shot, SweptScene
 
 SETTLING = 2

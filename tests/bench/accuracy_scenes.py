@@ -29,7 +29,7 @@ from server.evaluation.e1 import moving_light, shaded_views
 from server.evaluation.mitsuba_room import OBJECTS, RoomSet
 from server.maths.sh import spherical_fibonacci
 from server.opencl.device import Device
-from server.stages.composite import srgb_codes
+from server.shading.composite import srgb_codes
 from tests.bench.run import data_folder
 
 Floats = NDArray[np.float64]

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from server.input.denoise import bilateral_depth, tv_l1
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.stages.denoise import bilateral_depth, tv_l1
 from tests.bench.finished import Part
 
 ITERATIONS = (30, 100)

@@ -12,7 +12,7 @@ from client.laptop.source import Source
 from server.evaluation.hand import HandBefore
 from server.evaluation.hybrid import depth_of, run_geometry, vectors
 from server.opencl.device import Device
-from server.settings import Bounds
+from server.volume.bounds import Bounds
 from tests.bench.drawing import Picture, bars, depth_picture, difference_picture, normal_picture, side_by_side
 
 LABEL_COLORS = np.array([(0, 0, 0), (170, 170, 170), (60, 60, 230), (60, 200, 230)], np.uint8)

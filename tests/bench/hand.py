@@ -13,7 +13,7 @@ from client.laptop.volume import default_volume, default_voxel
 from server.evaluation.hand import HandBefore
 from server.evaluation.hybrid import HandReport, measure_hand
 from server.opencl.device import Device
-from server.settings import Bounds
+from server.volume.bounds import Bounds
 from tests.bench.finished import Part
 
 AFTERWARDS = 10

@@ -11,7 +11,7 @@ from client.laptop.volume import default_volume, default_voxel
 from server.evaluation.hybrid_normals import BufferNormals, TrueNormals, measure_normals
 from server.evaluation.noise import plane_normals
 from server.opencl.device import Device
-from server.settings import Bounds
+from server.volume.bounds import Bounds
 from tests.bench.finished import Part
 
 HAND_FRAMES = 30

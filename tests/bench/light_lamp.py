@@ -15,15 +15,15 @@ from client.laptop.synthetic.lamps import Lamp
 from client.laptop.synthetic.source import SyntheticSource, open_synthetic
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Wishes
-from server.geometry import Geometry
+from server.geometry.geometry import Geometry
+from server.light.lamp_finder import VIEW_SAMPLES
+from server.light.near_light import search_lamps
+from server.light.near_samples import see_samples
 from server.maths.emitters import Emitter
 from server.maths.near_light import result_of
 from server.maths.sh import LUMINANCE
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.stages.lamp_finder import VIEW_SAMPLES
-from server.stages.near_light import search_lamps
-from server.stages.near_samples import see_samples
 from tests.bench.finished import Part
 from tests.bench.geometry_parts import Run
 

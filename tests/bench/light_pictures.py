@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from server.evaluation.environment import best_scale, lat_long_directions, radiance_from
 from server.maths.sh import dominant_direction, webxr_from_world
-from server.stages.composite import srgb_codes
+from server.shading.composite import srgb_codes
 from tests.bench.drawing import Picture, side_by_side
 from tests.bench.geometry_pictures import save
 

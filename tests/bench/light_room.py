@@ -18,9 +18,9 @@ from protocol.messages import Wishes
 from server.evaluation.environment import direction_error_deg, irradiance_error, relative_rmse
 from server.evaluation.mitsuba_room import OBJECTS, RoomSet, model_for, room_sets
 from server.evaluation.object_shading import ObjectShading
+from server.input.measure import linear_values
 from server.pipeline import FrameResult
-from server.settings import THESIS_REACH_M
-from server.stages.measure import linear_values
+from server.quality.settings import THESIS_REACH_M
 from tests.bench.finished import Part
 from tests.bench.light_runs import PRESETS, REFERENCE, Exposed, at_preset, light_in, refusal, results_of, wishes_for
 from tests.bench.run import Run, data_folder

@@ -18,7 +18,7 @@ from protocol.frames import RgbdFrame
 from protocol.messages import Preset, Wishes
 from server.opencl.device import Device
 from server.pipeline import FrameResult, Pipeline
-from server.settings import read_wishes
+from server.quality.settings import read_wishes
 
 PRESETS = ("rm", "reg4", "reg8", "art1", "art4", "art8", "gr15", "gr15fast")
 REFERENCE: Preset = "rm"

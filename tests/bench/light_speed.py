@@ -11,13 +11,13 @@ import numpy as np
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
-from server.geometry import Geometry
+from server.geometry.geometry import Geometry
+from server.light.light_estimation import LightEstimator, sum_tiles
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import Pipeline
-from server.settings import WHOLE_ROOM_M
-from server.stages.light_estimation import LightEstimator, sum_tiles
-from server.stages.radiance_transfer import direction_sets, transfer_radiance
+from server.quality.settings import WHOLE_ROOM_M
+from server.transfer.radiance_transfer import direction_sets, transfer_radiance
 from tests.bench.finished import Part
 from tests.bench.light_runs import PRESETS, REFERENCE, at_preset, refusal, wishes_for
 from tests.bench.run import Run, data_source

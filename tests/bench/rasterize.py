@@ -15,11 +15,11 @@ import trimesh
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from server.objects.rasterize import Placed, rasterize
+from server.objects.virtual_object import VirtualObject
 from server.opencl.engine import Engine
 from server.scene.materials import MATTE, Material, Texture
 from server.scene.mesh import Mesh
-from server.scene.virtual_object import VirtualObject
-from server.stages.rasterize import Placed, rasterize
 from tests.bench.filters import in_turn
 from tests.bench.finished import Part
 from tests.bench.run import Run

@@ -20,7 +20,7 @@ from server.evaluation.flip import Codes
 from server.evaluation.mitsuba_room import OBJECTS, RoomSet, model_for
 from server.evaluation.object_shading import ObjectShading
 from server.evaluation.room_composites import RoomTruth, SetTruth, set_truth
-from server.settings import THESIS_REACH_M
+from server.quality.settings import THESIS_REACH_M
 from tests.bench.finished import Part
 from tests.bench.light_runs import REFERENCE, at_preset, refusal, results_of, wishes_for
 from tests.bench.rendering_common import OUT, PRESETS, require

@@ -21,8 +21,8 @@ import trimesh
 
 from client.laptop.source import open_source
 from server import rendering
+from server.effects.plan import Effect
 from server.pipeline import Pipeline
-from server.plan import Effect
 from server.scene.mesh import Mesh, load_mesh
 from server.scene.placement import Placement
 from tests.bench.finished import Part
@@ -65,7 +65,7 @@ class StageClock:
         self.cpu_ms[name].append((time.process_time() - cpu) * 1e3)
 
     def execute(self, order: Sequence[Effect[Any]], given: Mapping[str, Any], wanted: str) -> Any:
-        """As `server.plan.execute`, with the time of each effect."""
+        """As `server.effects.plan.execute`, with the time of each effect."""
         resources = dict(given)
         for effect in order:
             reads = {name: resources[name] for name in effect.reads if name in resources}

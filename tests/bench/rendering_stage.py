@@ -13,7 +13,7 @@ from client.laptop.synthetic.source import SyntheticSource, open_synthetic
 from server.evaluation.composite_truth import CompositeTruth
 from server.evaluation.flip import Codes
 from server.evaluation.pasting import pasted
-from server.stages.composite import srgb_codes
+from server.shading.composite import srgb_codes
 from tests.bench.finished import Part
 from tests.bench.light_runs import at_preset, refusal, results_of, wishes_for
 from tests.bench.rendering_common import OUT, PRESETS, require

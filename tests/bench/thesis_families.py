@@ -7,7 +7,7 @@ import numpy as np
 
 from server.evaluation.composites import changed_pixels
 from server.evaluation.flip import flip_map
-from server.stages.composite import srgb_codes
+from server.shading.composite import srgb_codes
 from tests.bench.finished import Part
 from tests.bench.light_runs import at_preset
 from tests.bench.run import Run

@@ -11,7 +11,7 @@ from client.laptop.synthetic.source import SyntheticSource
 from protocol.messages import Wishes
 from server.evaluation.environment import direction_error_deg, environment_difference
 from server.pipeline import FrameResult
-from server.stages.composite import srgb_codes
+from server.shading.composite import srgb_codes
 from tests.bench.finished import Part
 from tests.bench.light_runs import light_in
 from tests.bench.run import Run

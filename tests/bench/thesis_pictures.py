@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from server.evaluation.environment import lat_long_directions, radiance_from
 from server.maths.sh import dominant_direction
-from server.stages.composite import srgb_codes
+from server.shading.composite import srgb_codes
 from tests.bench.plotting import COLORS, INK, bare, panels, save, show
 from tests.bench.thesis_families import ROWS
 from tests.bench.thesis_light import MEASURES, NAIVE, OURS, SETS, WAYS, WHOLE

@@ -20,9 +20,9 @@ from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from server.evaluation.environment import direction_error_deg
 from server.evaluation.probe import Sphere, passive_probe, sphere_pixels
+from server.input.measure import linear_values
 from server.maths.sh import dominant_direction, lambert_transfer
-from server.stages.composite import srgb_codes
-from server.stages.measure import linear_values
+from server.shading.composite import srgb_codes
 from tests.bench.finished import Part
 from tests.bench.light_runs import at_preset, light_in
 from tests.bench.run import Run

@@ -12,7 +12,7 @@ from client.laptop.volume import default_volume, default_voxel
 from server.evaluation.trajectory import Track, aligned_ate_rmse_m, ate_rmse_m, consistency, track_source
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.settings import Bounds
+from server.volume.bounds import Bounds
 from tests.bench.finished import Part
 from tests.bench.peers.contestant import Scene
 from tests.bench.peers.worker import ContestantLostError, Entry, Worker

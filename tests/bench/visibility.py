@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from protocol.messages import Wishes
-from server.geometry import Geometry
+from server.geometry.geometry import Geometry
 from server.meshing.scene_mesh import scene_mesh
 from server.opencl.engine import Engine
-from server.stages.radiance_transfer import Directions, direction_sets
-from server.stages.raycast import Surface
-from server.stages.visibility import Visibility, trace_visibility
-from server.stages.volume import Volume
+from server.transfer.radiance_transfer import Directions, direction_sets
+from server.transfer.visibility import Visibility, trace_visibility
+from server.volume.raycast import Surface
+from server.volume.volume import Volume
 from tests.bench.filters import in_turn
 from tests.bench.finished import Part, UnmeasurableError
 from tests.bench.run import Run, data_source

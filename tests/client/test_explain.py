@@ -10,7 +10,7 @@ from client.laptop.errors import SourceError
 from client.laptop.gallery.scenes import GALLERY
 from client.laptop.source import open_source
 from protocol.messages import LeftOut, Plan
-from server.effects import EFFECTS, effects_of
+from server.effects.table import EFFECTS, effects_of
 
 
 def test_every_effect_has_a_purpose() -> None:

@@ -13,8 +13,8 @@ from client.laptop.errors import OptionError
 from client.laptop.light_file import read_light, read_panorama_light
 from client.options import CaptureOptions, prepare
 from protocol.messages import Wishes
+from server.light.static_light import static_estimate
 from server.maths.sh import dominant_direction, webxr_from_world
-from server.static_light import static_estimate
 from tests import lights
 from tests.client import folders
 from tests.lights import degrees_between

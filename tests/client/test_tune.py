@@ -10,11 +10,11 @@ from client.cli import run_command
 from client.laptop import tune as tuning
 from client.laptop import tune_scenes
 from client.laptop.tune import lines_of, tune
-from server.fronts import read_front, write_front
 from server.opencl.device import Device
-from server.operating_points import Point
+from server.quality.pareto_front import read_front, write_front
+from server.quality.sampling_settings import SamplingSettings
 
-FEW = (Point(preset="reg8", rays=9), Point(preset="reg4", rays=49))
+FEW = (SamplingSettings(preset="reg8", rays=9), SamplingSettings(preset="reg4", rays=49))
 TABLE = "synthetic:table?size=96x72&frames=4"
 
 

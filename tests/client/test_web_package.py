@@ -16,7 +16,7 @@ import pytest
 
 from client.web.build import FOLDER, install, npm, pack
 from server.opencl.device import Device
-from server.service.door import Door
+from server.service.authenticator import Authenticator
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.data import ROOT
@@ -81,7 +81,7 @@ def program(sources: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def server(device: Device) -> Iterator[BackgroundServer]:
-    with BackgroundServer(Service(device), door=Door(TOKEN)) as server:
+    with BackgroundServer(Service(device), door=Authenticator(TOKEN)) as server:
         yield server
 
 

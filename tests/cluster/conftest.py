@@ -12,7 +12,7 @@ import uvicorn
 from server.cluster.host import RoomHost
 from server.cluster.ingress import Ingress, create_ingress_app
 from server.cluster.places import Address, NoPlace, NotYet
-from server.service.door import Door
+from server.service.authenticator import Authenticator
 from server.service.serve import listen, url_of
 from server.service.service import Service
 from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
@@ -73,7 +73,7 @@ def town(lab: Lab) -> Iterator[TownPlaces]:
 @pytest.fixture
 def ingress_url(town: TownPlaces) -> Iterator[str]:
     """Of an ingress before the town."""
-    app = create_ingress_app(Ingress(town, Door(TOKEN), patience_s=PATIENCE_S))
+    app = create_ingress_app(Ingress(town, Authenticator(TOKEN), patience_s=PATIENCE_S))
     config = uvicorn.Config(app, log_config=None, ws_per_message_deflate=False, ws_max_size=32 << 20)
     server = uvicorn.Server(config)
     with listen("127.0.0.1", 0) as listener:

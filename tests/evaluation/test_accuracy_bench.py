@@ -12,7 +12,7 @@ from client.bench import run_bench
 from client.laptop.errors import OptionError
 from protocol.messages import Wishes
 from server.opencl.device import Device
-from server.settings import read_wishes
+from server.quality.settings import read_wishes
 from tests.bench import accuracy_scenes, sweep
 from tests.bench.accuracy_knobs import KNOBS, points
 from tests.bench.accuracy_points import MeasuredPoint, measure_point, words_of

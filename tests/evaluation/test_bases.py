@@ -32,10 +32,10 @@ from server.evaluation.bases_lights import LATTICE, HardLight, disc, lattice, of
 from server.evaluation.bases_scene import STRIDE, Ball, LitScene, rays_in
 from server.evaluation.bases_scores import Transfers, Truth, score_light
 from server.evaluation.environment import CUBE_SIDE, cube_directions
+from server.light.light_estimation import TileSums, prior_precision
 from server.maths.sh import LUMINANCE, spherical_fibonacci
 from server.opencl.device import Device
-from server.stages.light_estimation import TileSums, prior_precision
-from server.stages.radiance_transfer import direction_sets
+from server.transfer.radiance_transfer import direction_sets
 from tests.lights import degrees_between, random_directions, unit
 from tests.reference.sh import lambert_bands, open_transfer, sh_basis, sphere_rule
 

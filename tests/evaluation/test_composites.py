@@ -20,7 +20,7 @@ from server.evaluation.composites import (
     shadow_slope,
 )
 from server.evaluation.flip import flip_map
-from server.stages.composite import srgb_codes
+from server.shading.composite import srgb_codes
 
 
 def picture(seed: int = 3) -> np.ndarray:

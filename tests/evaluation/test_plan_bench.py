@@ -14,14 +14,15 @@ from client.laptop.gallery.source import GallerySource
 from client.laptop.gallery.things import Thing
 from protocol.frames import RgbdFrame
 from protocol.messages import LeftOut, Plan
-from server import effect_functions, facts_finder
-from server.omissions import ELSEWHERE, spared
+from server.culling import facts_finder
+from server.culling.influence_bound import NOWHERE
+from server.culling.rules import ELSEWHERE, spared
+from server.effects import functions as effect_functions
 from server.opencl.device import Device
 from server.pipeline import Pipeline
-from server.rest import NOISY
+from server.reuse.temporal_reuse import NOISY
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
-from server.stages.reach import NOWHERE
 from tests.bench.plan import changed_share, greatest, holds, is_as_known, stated_bound
 
 QUICK = (

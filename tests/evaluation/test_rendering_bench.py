@@ -15,6 +15,7 @@ import trimesh
 from client.laptop.synthetic.lights import disc_light
 from client.laptop.synthetic.render import camera_rays, cast
 from client.laptop.synthetic.source import open_synthetic
+from server.effects.plan import Effect
 from server.evaluation import object_shading
 from server.evaluation.bleeding import Bleeding, to_objects, to_real
 from server.evaluation.composite_truth import CompositeTruth, linear_from_codes, score
@@ -25,8 +26,7 @@ from server.evaluation.room_composites import RoomTruth, SetTruth, set_truth
 from server.maths.sh import lambert_transfer
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.plan import Effect
-from server.stages.composite import srgb_codes
+from server.shading.composite import srgb_codes
 from tests.bench import rendering, rendering_room, rendering_speed, rendering_stage, rendering_turning
 from tests.bench.finished import Part, UnmeasurableError
 from tests.bench.rendering_common import PRESETS, require

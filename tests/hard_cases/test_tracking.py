@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from protocol.frames import RgbdFrame
-from server.geometry import Geometry, GeometryFrame
+from server.geometry.geometry import Geometry, GeometryFrame
 from server.maths.registration import distance_between
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import Pipeline
-from server.stages.relocalize import GREATEST_COUNT, Keyframes, dissimilarity, thumbnail
+from server.tracking.relocalize import GREATEST_COUNT, Keyframes, dissimilarity, thumbnail
 from tests.analytic import Floats, look, look_at, plane, sphere
 from tests.rooms import CAMERA, ROOM, VOXEL_M, frame_at, view_at, wishes
 

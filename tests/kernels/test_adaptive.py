@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.maths.rigid import inverse_rigid
+from server.objects.rasterize import rasterize
+from server.objects.virtual_object import VirtualObject
 from server.opencl.engine import Engine
-from server.scene.virtual_object import VirtualObject
-from server.stages import adaptive, differential_rendering
-from server.stages.differential_rendering import RealShadow, shadow_real, shadow_virtual
-from server.stages.radiance_transfer import Directions, direction_sets, transfer_radiance
-from server.stages.rasterize import rasterize
-from server.stages.raycast import LABEL_STATIC, Surface, raycast
-from server.stages.sample_grid import SampleGrid
-from server.stages.traced_scene import trace_scene, upload_light
+from server.shading import adaptive, differential_rendering
+from server.shading.differential_rendering import RealShadow, shadow_real, shadow_virtual
+from server.shading.traced_scene import trace_scene, upload_light
+from server.transfer.radiance_transfer import Directions, direction_sets, transfer_radiance
+from server.transfer.sample_grid import SampleGrid
+from server.volume.raycast import LABEL_STATIC, Surface, raycast
 from tests.analytic import look_at
 from tests.meshes import shape_of
 from tests.reference import adaptive as twin

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from server.opencl.engine import Engine
-from server.stages.brick_pool import BRICK_VOXELS, BrickPool
-from server.stages.brick_table import AWAY_SLOT, NO_SLOT
+from server.volume.brick_pool import BRICK_VOXELS, BrickPool
+from server.volume.brick_table import AWAY_SLOT, NO_SLOT
 from tests.reference import brick_pool as twin
 from tests.volumes import vectors
 

@@ -9,14 +9,14 @@ import pyopencl.array as cl_array
 import pytest
 
 from protocol.frames import CameraModel
+from server.light.cell_transfer import MOST_POOLS, POOL_PX, PoolGrid, Pools, PoolWindow, cells_of, pool_grid
+from server.light.continuation import LEAST_M, NO_PLANES, SPOKES, spokes
 from server.maths.lobes import CELL_SR, CELLS, cell_directions
 from server.maths.planes import CELL_M
 from server.opencl.engine import Engine
-from server.stages.cell_transfer import MOST_POOLS, POOL_PX, PoolGrid, Pools, PoolWindow, cells_of, pool_grid
-from server.stages.continuation import LEAST_M, NO_PLANES, SPOKES, spokes
-from server.stages.indirect import Indirect
-from server.stages.radiance_transfer import Directions, Transfer, direction_sets, own_sets
-from server.stages.raycast import Surface
+from server.transfer.indirect import Indirect
+from server.transfer.radiance_transfer import Directions, Transfer, direction_sets, own_sets
+from server.volume.raycast import Surface
 from tests.analytic import Floats
 from tests.reference import cell_transfer as twin
 from tests.solids import float4

@@ -12,16 +12,16 @@ import trimesh
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from server.input.measure import linear_values
+from server.objects.rasterize import VirtualSurface, nearest_depths, rasterize
+from server.objects.virtual_object import VirtualObject
 from server.opencl.engine import Engine
-from server.scene.virtual_object import VirtualObject
-from server.stages.composite import Mixture, composite, shown_picture, srgb_codes
-from server.stages.measure import linear_values
-from server.stages.radiance_transfer import direction_sets
-from server.stages.rasterize import VirtualSurface, nearest_depths, rasterize
-from server.stages.raycast import Surface
-from server.stages.sample_grid import SampleGrid
-from server.stages.sampling import Upsampling
-from server.stages.traced_scene import upload_light
+from server.shading.composite import CompositeInputs, composite, shown_picture, srgb_codes
+from server.shading.traced_scene import upload_light
+from server.transfer.radiance_transfer import direction_sets
+from server.transfer.sample_grid import SampleGrid
+from server.transfer.sampling import Upsampling
+from server.volume.raycast import Surface
 from tests import lights
 from tests.meshes import pose, shape_of
 from tests.reference import composite as twin
@@ -95,11 +95,11 @@ def mixture_of(
     refined_ratio: Samples | None = None,
     upsampling: Upsampling = "bilateral",
     inverse_depths: Floats | None = None,
-) -> Mixture:
+) -> CompositeInputs:
     surface: Surface = upload_surface(
         engine, real.positions[..., :3], real.normals[..., :3], real.positions[..., 3] > 0
     )
-    return Mixture(
+    return CompositeInputs(
         CAMERA,
         VOLUME_FROM_CAMERA,
         engine.workspace.upload("radiance", float4(radiance[..., :3], radiance[..., 3])),

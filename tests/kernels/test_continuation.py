@@ -16,13 +16,8 @@ from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import CameraModel
 from protocol.messages import Wishes
 from server.evaluation.environment import direction_error_deg
-from server.maths.lobes import CELLS, RIDGE, cell_directions, lobe_family
-from server.maths.planes import SIDES, STEPS_M, PlanePatch, find_planes
-from server.opencl.device import Device
-from server.opencl.engine import Engine
-from server.pipeline import Pipeline
-from server.stages.cell_transfer import PoolGrid, PoolWindow
-from server.stages.continuation import (
+from server.light.cell_transfer import PoolGrid, PoolWindow
+from server.light.continuation import (
     LEAST_M,
     MOST_GROWTH,
     NO_PLANES,
@@ -34,8 +29,13 @@ from server.stages.continuation import (
     _Trial,
     spokes,
 )
-from server.stages.light_model import LightModel
-from server.stages.lobe_estimator import LobeEstimator
+from server.light.light_model import LightModel
+from server.light.lobe_estimator import LobeEstimator
+from server.maths.lobes import CELLS, RIDGE, cell_directions, lobe_family
+from server.maths.planes import SIDES, STEPS_M, PlanePatch, find_planes
+from server.opencl.device import Device
+from server.opencl.engine import Engine
+from server.pipeline import Pipeline
 from tests.analytic import Floats
 from tests.data import data_folder
 from tests.maths.test_planes import FLOOR, WALL, corner

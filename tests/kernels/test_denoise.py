@@ -11,9 +11,9 @@ import pyopencl.cltypes as cl_types
 import pytest
 from numpy.typing import NDArray
 
+from server.input import denoise
+from server.input.measure import Measurement
 from server.opencl.engine import Engine
-from server.stages import denoise
-from server.stages.measure import Measurement
 from tests.reference import denoise as twin
 from tests.tolerance import relative_tolerance
 from tests.volumes import vectors

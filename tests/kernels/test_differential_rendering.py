@@ -16,17 +16,17 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from protocol.frames import CameraModel
+from server.light.continuation import NO_PLANES, Continuation, PlaneArrays
 from server.maths.planes import PlanePatch
+from server.objects.rasterize import Placed, VirtualSurface
+from server.objects.virtual_object import VirtualObject
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.scene.virtual_object import VirtualObject
-from server.stages.continuation import NO_PLANES, Continuation, PlaneArrays
-from server.stages.differential_rendering import shadow_real, shadow_virtual
-from server.stages.indirect import Indirect
-from server.stages.radiance_transfer import Directions, direction_sets, transfer_radiance
-from server.stages.rasterize import Placed, VirtualSurface
-from server.stages.sample_grid import SampleGrid
-from server.stages.traced_scene import trace_scene, upload_light
+from server.shading.differential_rendering import shadow_real, shadow_virtual
+from server.shading.traced_scene import trace_scene, upload_light
+from server.transfer.indirect import Indirect
+from server.transfer.radiance_transfer import Directions, direction_sets, transfer_radiance
+from server.transfer.sample_grid import SampleGrid
 from tests import lights
 from tests.meshes import pose, shape_of
 from tests.reference import differential_rendering as twin

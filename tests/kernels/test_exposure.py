@@ -10,9 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
+from server.input.measure import Measurement
 from server.opencl.engine import Engine
-from server.stages import exposure as stage
-from server.stages.exposure import (
+from server.tracking import exposure as stage
+from server.tracking.exposure import (
     DEAD_BAND,
     ExposureTracking,
     Samples,
@@ -21,8 +22,7 @@ from server.stages.exposure import (
     locate_exposure,
     scene_radiance,
 )
-from server.stages.measure import Measurement
-from server.stages.volume import Volume
+from server.volume.volume import Volume
 from tests.analytic import look, look_at, room, sphere
 from tests.reference import exposure as twin
 from tests.tolerance import relative_tolerance

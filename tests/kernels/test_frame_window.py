@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from server.light.cell_transfer import PoolGrid, Pools
+from server.light.frame_window import KEPT, RECENT, SLOTS, FrameWindow
+from server.light.light_model import Frame
 from server.maths.light_change import Shot
-from server.stages.cell_transfer import PoolGrid, Pools
-from server.stages.frame_window import KEPT, RECENT, SLOTS, FrameWindow
-from server.stages.light_model import Frame
 
 POOLS = 600
 ALBEDOS = np.random.default_rng(0).uniform(0.2, 0.8, (40, POOLS))

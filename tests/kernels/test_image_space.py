@@ -20,12 +20,12 @@ from server.maths.self_occlusion import (
 )
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.stages import auxiliary_views, image_space
-from server.stages.auxiliary_views import AuxiliaryViews, ViewsAround
-from server.stages.image_space import ImageSpaceTransfer, near_distances, nearest_views, sample_phases
-from server.stages.radiance_transfer import Directions, Transfer, direction_sets
-from server.stages.raycast import LABEL_DYNAMIC, LABEL_FILLED, LABEL_NONE, LABEL_STATIC, Surface
-from server.stages.volume import Volume
+from server.transfer import auxiliary_views, image_space
+from server.transfer.auxiliary_views import AuxiliaryViews, ViewsAround
+from server.transfer.image_space import ImageSpaceTransfer, near_distances, nearest_views, sample_phases
+from server.transfer.radiance_transfer import Directions, Transfer, direction_sets
+from server.volume.raycast import LABEL_DYNAMIC, LABEL_FILLED, LABEL_NONE, LABEL_STATIC, Surface
+from server.volume.volume import Volume
 from tests.analytic import look_at, pixel_rays
 from tests.lights import random_directions, unit
 from tests.reference import image_space as twin

@@ -10,14 +10,14 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from server.light.cell_transfer import PoolWindow, pool_grid
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.stages.brick_table import AWAY_SLOT
-from server.stages.cell_transfer import PoolWindow, pool_grid
-from server.stages.indirect import LEAST_COSINE, Indirect, gather_hits, mean_sent, no_hits
-from server.stages.radiance_transfer import SETS, Directions, Transfer, direction_sets, own_sets, transfer_radiance
-from server.stages.raycast import Surface
-from server.stages.volume import BRICK, Volume
+from server.transfer.indirect import LEAST_COSINE, Indirect, gather_hits, mean_sent, no_hits
+from server.transfer.radiance_transfer import SETS, Directions, Transfer, direction_sets, own_sets, transfer_radiance
+from server.volume.brick_table import AWAY_SLOT
+from server.volume.raycast import Surface
+from server.volume.volume import BRICK, Volume
 from tests.analytic import Floats
 from tests.kernels.test_lanes import Narrow, Wide
 from tests.lights import random_directions

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
-from server.stages.integrate import GREATEST_WEIGHT, integrate
-from server.stages.volume import Volume
+from server.volume.integrate import GREATEST_WEIGHT, integrate
+from server.volume.volume import Volume
 from tests.analytic import look, look_at, plane, room, sphere
 from tests.reference.integrate import integrate as twin
 from tests.reference.integrate import integrate_color, project, voxel_centers
@@ -26,7 +26,7 @@ FLIPS = 1e-3
 """Share of voxels whose pixel float32 rounds to its neighbour, or that lie at the end of the truncation."""
 
 AT_LEAST = -0.5
-"""Mark of a clipped pixel of another exposure than the first, see marks.clh."""
+"""Mark of a clipped pixel of another exposure than the first, see radiance_marks.clh."""
 
 Floats = NDArray[np.float64]
 

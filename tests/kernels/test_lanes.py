@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.stages.volume import Volume
+from server.volume.volume import Volume
 from tests.analytic import look, look_at, room, sphere
 from tests.volumes import cast, fuse
 

@@ -10,7 +10,7 @@ import pytest
 
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.stages.layer import DEPTH_SCALE_M, NEUTRAL, NOTHING, Layer, LayerPart, compose_layer
+from server.shading.layer import DEPTH_SCALE_M, NEUTRAL, NOTHING, Layer, LayerPart, compose_layer
 from tests.kernels.test_composite import (
     HEIGHT,
     LIGHT,

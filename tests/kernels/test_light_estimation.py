@@ -11,9 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.opencl.device import Device
-from server.opencl.engine import Engine
-from server.stages.light_estimation import (
+from server.light.light_estimation import (
     ASSUMED_ALBEDO,
     LEAST_FLAT_SHARE,
     LEAST_FLATNESS,
@@ -26,8 +24,10 @@ from server.stages.light_estimation import (
     sum_tiles,
     unpack_tiles,
 )
-from server.stages.radiance_transfer import Transfer
-from server.stages.raycast import LABEL_DYNAMIC, LABEL_NONE, LABEL_STATIC, Surface
+from server.opencl.device import Device
+from server.opencl.engine import Engine
+from server.transfer.radiance_transfer import Transfer
+from server.volume.raycast import LABEL_DYNAMIC, LABEL_NONE, LABEL_STATIC, Surface
 from tests import lights
 from tests.lights import degrees_between, random_directions
 from tests.reference import light_estimation as twin

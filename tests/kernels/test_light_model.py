@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from server.maths.lobes import RIDGE
-from server.maths.sh import LUMINANCE
-from server.maths.surfaces import Albedos
-from server.stages.light_estimation import ASSUMED_ALBEDO
-from server.stages.light_model import (
+from server.light.light_estimation import ASSUMED_ALBEDO
+from server.light.light_model import (
     ALBEDO_RANGE,
     ALBEDO_SPREAD,
     ALIKE,
@@ -21,6 +18,9 @@ from server.stages.light_model import (
     sums_of,
     with_colors,
 )
+from server.maths.lobes import RIDGE
+from server.maths.sh import LUMINANCE
+from server.maths.surfaces import Albedos
 from tests.analytic import Floats
 
 POOLS, LOBES = 700, 9

@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from server.light.cell_transfer import PoolGrid, Pools
+from server.light.light_estimation import ASSUMED_ALBEDO, LightEstimate
+from server.light.light_model import LightModel
+from server.light.lobe_estimator import LobeEstimator
 from server.maths.light_change import Shot
 from server.maths.lobes import CELL_SR, cell_directions, cells_to_sh
 from server.maths.sh import LUMINANCE, spherical_fibonacci
 from server.opencl.engine import Engine
-from server.stages.cell_transfer import PoolGrid, Pools
-from server.stages.indirect import Indirect, mean_sent
-from server.stages.light_estimation import ASSUMED_ALBEDO, LightEstimate
-from server.stages.light_model import LightModel
-from server.stages.lobe_estimator import LobeEstimator
-from server.stages.radiance_transfer import direction_sets
+from server.transfer.indirect import Indirect, mean_sent
+from server.transfer.radiance_transfer import direction_sets
 from tests.analytic import Floats
 from tests.kernels.test_cell_transfer import Samples
 from tests.lights import degrees_between

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from protocol.frames import CameraModel, RgbdFrame
+from server.input.measure import GREATEST_DEPTH_M, linear_values
+from server.input.measure import measure as measure_stage
 from server.opencl.engine import Engine
-from server.stages.measure import GREATEST_DEPTH_M, linear_values
-from server.stages.measure import measure as measure_stage
 from tests.reference import measure as twin
 from tests.tolerance import relative_tolerance
 from tests.volumes import vectors

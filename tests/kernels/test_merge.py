@@ -12,10 +12,10 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from server.geometry.merge import STILL_WEIGHT, TRUSTED_WEIGHT, merge_depth
 from server.opencl.engine import Engine
-from server.stages.merge import STILL_WEIGHT, TRUSTED_WEIGHT, merge_depth
-from server.stages.raycast import LABEL_DYNAMIC, LABEL_FILLED, LABEL_NONE, LABEL_STATIC, Surface
-from server.stages.volume import Volume
+from server.volume.raycast import LABEL_DYNAMIC, LABEL_FILLED, LABEL_NONE, LABEL_STATIC, Surface
+from server.volume.volume import Volume
 from tests.analytic import look, look_at, pixel_rays, plane, quantised, room, sphere
 from tests.reference import merge as twin
 from tests.tolerance import relative_tolerance

@@ -9,12 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.maths.emitters import Emitter
-from server.opencl.device import Device
-from server.opencl.engine import Engine
-from server.stages.light_estimation import LEAST_FLATNESS, LEAST_OPENNESS
-from server.stages.near_light import CLEARANCE_M, Emitters, remove_lamps, surround_patches
-from server.stages.near_samples import (
+from server.light.light_estimation import LEAST_FLATNESS, LEAST_OPENNESS
+from server.light.near_light import CLEARANCE_M, Emitters, remove_lamps, surround_patches
+from server.light.near_samples import (
     LEAST_SHARE,
     LOBES,
     PooledSamples,
@@ -23,8 +20,11 @@ from server.stages.near_samples import (
     see_samples,
     see_some,
 )
-from server.stages.radiance_transfer import direction_sets
-from server.stages.raycast import LABEL_DYNAMIC
+from server.maths.emitters import Emitter
+from server.opencl.device import Device
+from server.opencl.engine import Engine
+from server.transfer.radiance_transfer import direction_sets
+from server.volume.raycast import LABEL_DYNAMIC
 from tests.kernels.test_light_estimation import random_frame
 from tests.lights import random_directions
 from tests.reference import near_light as twin

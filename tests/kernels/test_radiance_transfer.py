@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.stages.radiance_transfer import SETS, direction_sets, transfer_radiance
-from server.stages.volume import Volume
+from server.transfer.radiance_transfer import SETS, direction_sets, transfer_radiance
+from server.volume.volume import Volume
 from tests.lights import random_directions, unit
 from tests.reference import radiance_transfer as twin
 from tests.reference.sh import open_transfer

@@ -13,12 +13,12 @@ import trimesh
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from server.objects import rasterize as rasterize_module
+from server.objects.rasterize import NEAR_M, VirtualSurface, nearest_depths, rasterize
+from server.objects.virtual_object import VirtualObject
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.scene.mesh import Mesh
-from server.scene.virtual_object import VirtualObject
-from server.stages import rasterize as rasterize_module
-from server.stages.rasterize import NEAR_M, VirtualSurface, nearest_depths, rasterize
 from tests.data import data_folder
 from tests.meshes import mesh_file, mesh_of, pose, public_mesh, shape_of, soup_of
 from tests.reference import rasterize as twin

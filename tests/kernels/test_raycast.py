@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
-from server.stages.raycast import GREATEST_DEPTH_M
-from server.stages.volume import Volume
+from server.volume.raycast import GREATEST_DEPTH_M
+from server.volume.volume import Volume
 from tests.analytic import Shape, Truth, look, look_at, pixel_rays, plane, quantised, room, sphere
 from tests.reference.integrate import voxel_centers
 from tests.reference.raycast import raycast as twin

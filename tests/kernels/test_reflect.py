@@ -7,15 +7,15 @@ import pytest
 from numpy.typing import ArrayLike
 
 from protocol.frames import CameraModel
+from server.objects.rasterize import VirtualSurface
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.scene.materials import MATTE, Material, Texture
 from server.scene.mipmaps import material_tables
-from server.stages.indirect import Indirect
-from server.stages.radiance_transfer import direction_sets
-from server.stages.rasterize import VirtualSurface
-from server.stages.reflect import LEAST_GLOSS, is_glossy, reflect_surroundings
-from server.stages.traced_scene import trace_scene, upload_light
+from server.shading.reflect import LEAST_GLOSS, is_glossy, reflect_surroundings
+from server.shading.traced_scene import trace_scene, upload_light
+from server.transfer.indirect import Indirect
+from server.transfer.radiance_transfer import direction_sets
 from tests import lights
 from tests.analytic import Floats
 from tests.kernels.test_indirect import paint

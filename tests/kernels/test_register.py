@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from protocol.frames import CameraModel, RgbdFrame
+from server.input.measure import GREATEST_DEPTH_M, measure
+from server.input.register import rays_of, register_depth
 from server.opencl.engine import Engine
-from server.stages.measure import GREATEST_DEPTH_M, measure
-from server.stages.register import rays_of, register_depth
 from tests.analytic import look, plane
 from tests.lenses import BALL, CAMERA, LENS, ROOM, WORLD_FROM_COLOR, is_seen_by_both, moved, opencv_rays, seen_by_depth
 from tests.reference import register as twin

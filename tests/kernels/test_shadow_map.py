@@ -10,22 +10,18 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from server import effect_functions as effects
-from server.effect_functions import View, add_objects
+from server.effects import functions as effects
+from server.effects.functions import View, add_objects
+from server.light.continuation import NO_PLANES, Continuation, PlaneArrays
 from server.maths.direct_lights import DirectLight, SplitLight, split_light
 from server.maths.directional_fit import directional_sh
 from server.maths.disc_places import disc_places, ray_places, search_places
 from server.maths.planes import PlanePatch
+from server.objects.rasterize import VirtualSurface
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.stages.continuation import NO_PLANES, Continuation, PlaneArrays
-from server.stages.differential_rendering import RealShadow
-from server.stages.indirect import observe_indirect
-from server.stages.object_glow import place_points
-from server.stages.radiance_transfer import Directions, direction_sets, transfer_radiance
-from server.stages.rasterize import VirtualSurface
-from server.stages.sample_grid import SampleGrid
-from server.stages.shadow_map import (
+from server.shading.differential_rendering import RealShadow
+from server.shading.shadow_map import (
     MAP_SIDE,
     DirectSamples,
     ShadowMaps,
@@ -38,7 +34,11 @@ from server.stages.shadow_map import (
     with_direct,
     without_direct,
 )
-from server.stages.traced_scene import DeviceLight, take_discs, trace_scene, upload_light
+from server.shading.traced_scene import DeviceLight, take_discs, trace_scene, upload_light
+from server.shading.virtual_point_lights import place_points
+from server.transfer.indirect import observe_indirect
+from server.transfer.radiance_transfer import Directions, direction_sets, transfer_radiance
+from server.transfer.sample_grid import SampleGrid
 from tests import lights
 from tests.kernels import test_reflect
 from tests.kernels.test_differential_rendering import camera_of, placed

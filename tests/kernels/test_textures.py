@@ -12,14 +12,14 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from server.objects.rasterize import rasterize
+from server.objects.virtual_object import VirtualObject
 from server.opencl.engine import Engine
 from server.opencl.program import KERNEL_FOLDER
 from server.scene.colors import linear_from_srgb
 from server.scene.materials import Beyond, Material, Texture
 from server.scene.mesh import Mesh
 from server.scene.mipmaps import CHANNEL_VALUES, decoded, encoded, material_tables, mip_chain, shrunk
-from server.scene.virtual_object import VirtualObject
-from server.stages.rasterize import rasterize
 from tests.meshes import mesh_of, pose
 from tests.reference import textures as twin
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from protocol.frames import CameraModel
+from server.light.light_estimation import ASSUMED_ALBEDO
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.stages.indirect import Indirect
-from server.stages.light_estimation import ASSUMED_ALBEDO
-from server.stages.radiance_transfer import Transfer, direction_sets
-from server.stages.tone_mapping import EVERY, LEAST_LUMINANCE, AverageMemory, Averages, measure_averages
-from server.stages.traced_scene import upload_light
-from server.stages.volume import Volume
+from server.shading.tone_mapping import EVERY, LEAST_LUMINANCE, AverageMemory, Averages, measure_averages
+from server.shading.traced_scene import upload_light
+from server.transfer.indirect import Indirect
+from server.transfer.radiance_transfer import Transfer, direction_sets
+from server.volume.volume import Volume
 from tests import lights
 from tests.analytic import Floats
 from tests.reference import tone_mapping as twin

@@ -13,8 +13,7 @@ from protocol.frames import CameraModel
 from server.maths.registration import angle_between, distance_between, motion_of_twist
 from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine, float4, float16
-from server.stages.raycast import Surface, raycast
-from server.stages.track import (
+from server.tracking.track import (
     Registration,
     depth_pyramid,
     finest_level,
@@ -22,7 +21,8 @@ from server.stages.track import (
     register,
     view_model,
 )
-from server.stages.volume import Volume
+from server.volume.raycast import Surface, raycast
+from server.volume.volume import Volume
 from tests.analytic import Floats, Shape, look, look_at, plane, room, sphere
 from tests.reference import track as twin
 from tests.tolerance import relative_tolerance

@@ -8,9 +8,9 @@ from msgspec.structs import replace
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
-from server.stages.raycast import Surface
-from server.stages.view_colors import view_colors
-from server.stages.volume import Volume
+from server.volume.raycast import Surface
+from server.volume.view_colors import view_colors
+from server.volume.volume import Volume
 from tests.kernels.test_indirect import paint
 from tests.reference.view_colors import view_colors as twin
 from tests.solids import download4, float4

@@ -11,12 +11,12 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from server.objects.object_tree import FEW_OBJECTS, tree_rows
+from server.objects.virtual_object import VirtualObject
+from server.objects.voxelize import ObjectTable, object_table
 from server.opencl.engine import Engine
 from server.opencl.program import KERNEL_FOLDER
 from server.scene.mesh import Mesh
-from server.scene.virtual_object import VirtualObject
-from server.stages.object_tree import FEW_OBJECTS, tree_rows
-from server.stages.voxelize import ObjectTable, object_table
 from tests.meshes import mesh_of, pose, public_mesh, shape_of
 from tests.reference import voxelize as twin
 

@@ -11,10 +11,10 @@ from protocol.frames import CameraModel
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.opencl.program import KERNEL_FOLDER
-from server.stages.brick_table import AWAY_SLOT
-from server.stages.radiance_transfer import direction_sets
-from server.stages.visibility import trace_visibility
-from server.stages.volume import BRICK, Volume
+from server.transfer.radiance_transfer import direction_sets
+from server.transfer.visibility import trace_visibility
+from server.volume.brick_table import AWAY_SLOT
+from server.volume.volume import BRICK, Volume
 from tests.kernels.test_lanes import Narrow, Wide
 from tests.lights import random_directions
 from tests.reference import visibility as twin

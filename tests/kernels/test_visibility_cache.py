@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine
-from server.stages.radiance_transfer import direction_sets, first_set, transfer_radiance
-from server.stages.raycast import LABEL_DYNAMIC, LABEL_STATIC, Surface, raycast
-from server.stages.visibility_cache import VisibilityCaches
-from server.stages.volume import Volume
+from server.transfer.radiance_transfer import direction_sets, first_set, transfer_radiance
+from server.transfer.visibility_cache import VisibilityCaches
+from server.volume.raycast import LABEL_DYNAMIC, LABEL_STATIC, Surface, raycast
+from server.volume.volume import Volume
 from tests.analytic import look_at
 from tests.reference import visibility_cache as twin
 from tests.reference.radiance_transfer import direction_set

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
-from server.stages.radiance_transfer import Transfer, direction_sets, transfer_radiance
-from server.stages.raycast import LABEL_STATIC, Surface, raycast
-from server.stages.visibility_state import LEAST_OPEN, VisibilityState
-from server.stages.volume import BRICK, Volume
+from server.transfer.radiance_transfer import Transfer, direction_sets, transfer_radiance
+from server.transfer.visibility_state import LEAST_OPEN, VisibilityState
+from server.volume.raycast import LABEL_STATIC, Surface, raycast
+from server.volume.volume import BRICK, Volume
 from tests.analytic import look_at
 from tests.solids import Scene, ball, download4, fill_volume, floor, signed_distances
 from tests.volumes import fill

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine, int4
-from server.stages.brick_pool import BRICK_BYTES
-from server.stages.volume import BRICK, TRUNCATION_VOXELS, Volume, VolumeSizeError
+from server.volume.brick_pool import BRICK_BYTES
+from server.volume.volume import BRICK, TRUNCATION_VOXELS, Volume, VolumeSizeError
 from tests.analytic import Shape, look, look_at, plane, room, sphere
 from tests.reference import integrate as integrate_twin
 from tests.reference import volume as twin

@@ -11,10 +11,10 @@ import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from server.objects.virtual_object import VirtualObject
+from server.objects.voxelize import LEAST_CELLS, MARGIN_CELLS, MOST_CELLS, NEAR_CELLS, place_grid, squared_distance
 from server.opencl.engine import Engine
 from server.scene.mesh import Mesh
-from server.scene.virtual_object import VirtualObject
-from server.stages.voxelize import LEAST_CELLS, MARGIN_CELLS, MOST_CELLS, NEAR_CELLS, place_grid, squared_distance
 from tests.meshes import mesh_of, public_mesh, shape_of, soup_of
 from tests.reference import voxelize as twin
 

@@ -12,12 +12,12 @@ from client.laptop.source import open_source
 from client.laptop.synthetic.source import SyntheticSource
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Light, Wishes
+from server.input.measure import linear_values
 from server.maths.sh import LUMINANCE
 from server.meshing.scene_mesh import SceneMesh
 from server.opencl.device import Device
 from server.pipeline import FrameResult, Pipeline
 from server.scene.placement import Placement
-from server.stages.measure import linear_values
 from tests.analytic import Floats
 from tests.lights import degrees_between
 from tests.meshes import shape_of

@@ -21,7 +21,7 @@ from server.evaluation.hybrid_normals import TrueNormals, measure_normals
 from server.evaluation.noise import plane_normals
 from server.evaluation.rooms import CAMERA as VGA
 from server.opencl.device import Device
-from server.stages.raycast import LABEL_DYNAMIC, LABEL_STATIC
+from server.volume.raycast import LABEL_DYNAMIC, LABEL_STATIC
 from tests.analytic import Shape, Truth, look, pixel_rays, sphere
 from tests.bench.hand import hand_volume
 from tests.data import data_folder

@@ -12,18 +12,18 @@ from client.laptop.source import open_source
 from client.laptop.synthetic.lights import ring_light
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import CameraModel
+from server.geometry.merge import merge_depth
+from server.input.measure import Measurement, measure
+from server.light.light_estimation import LEAST_FLATNESS, LightEstimator, sum_tiles
 from server.maths.self_occlusion import printed_threshold
 from server.maths.sh import dominant_direction
 from server.opencl.engine import Engine
-from server.stages.image_space import ImageSpaceTransfer
-from server.stages.integrate import integrate
-from server.stages.light_estimation import LEAST_FLATNESS, LightEstimator, sum_tiles
-from server.stages.measure import Measurement, measure
-from server.stages.merge import merge_depth
-from server.stages.radiance_transfer import Transfer, direction_sets, transfer_radiance
-from server.stages.raycast import LABEL_STATIC, Surface, raycast
-from server.stages.sampling import PRESETS
-from server.stages.volume import Volume
+from server.transfer.image_space import ImageSpaceTransfer
+from server.transfer.radiance_transfer import Transfer, direction_sets, transfer_radiance
+from server.transfer.sampling import PRESETS
+from server.volume.integrate import integrate
+from server.volume.raycast import LABEL_STATIC, Surface, raycast
+from server.volume.volume import Volume
 from tests.analytic import look_at, pixel_rays, plane, sphere
 from tests.lights import degrees_between, random_directions, uniform, unit
 from tests.pipeline.test_white_furnace import CAMERA, VIEWS

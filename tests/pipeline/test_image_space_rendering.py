@@ -18,20 +18,21 @@ from client.laptop.source import open_source
 from client.laptop.synthetic.lights import disc_light
 from protocol.frames import CameraModel
 from server import rendering
+from server.culling.reason import CullReason
 from server.maths.rigid import inverse_rigid
+from server.objects.rasterize import Placed, VirtualSurface
+from server.objects.virtual_object import VirtualObject
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import Pipeline
-from server.plan import Omission
 from server.scene.placement import Placement
-from server.scene.virtual_object import VirtualObject
-from server.stages.auxiliary_views import ViewsAround
-from server.stages.differential_rendering import shadow_real, shadow_virtual
-from server.stages.image_space import nearest_views
-from server.stages.image_space_rendering import RealLooks, look_around
-from server.stages.radiance_transfer import direction_sets, transfer_radiance
-from server.stages.rasterize import Placed, VirtualSurface
-from server.stages.traced_scene import TracedScene, trace_scene, upload_light
+from server.shading.depth_views import look_around
+from server.shading.differential_rendering import shadow_real, shadow_virtual
+from server.shading.traced_scene import TracedScene, trace_scene, upload_light
+from server.transfer.auxiliary_views import ViewsAround
+from server.transfer.image_space import nearest_views
+from server.transfer.radiance_transfer import direction_sets, transfer_radiance
+from server.transfer.real_depth_views import RealDepthViews
 from tests import lights
 from tests.bench import rendering_turning as turning
 from tests.bench.light_runs import at_preset, results_of, wishes_for
@@ -81,7 +82,7 @@ def stand(engine: Engine, scene: Scene, objects: list[Placed], side_m: float = 0
     around = ViewsAround(engine, VIEWS)
     views = around.update(volume)
     nothing = np.zeros((SIDE, SIDE, 3))
-    real = RealLooks(
+    real = RealDepthViews(
         views,
         nearest_views(RAYS, around.lattice)[1],
         CAMERA,
@@ -216,7 +217,7 @@ def pictures(device: Device, source: str, preset: str, indirect: str, traced: bo
     )
     pipeline.place_object("ball", shape_of(trimesh.creation.icosphere(4, 0.2)), Placement(position_m=(0.4, 0.0, 0.2)))
     effects = tuple(
-        replace(e, omitted=lambda _: Omission("traced for comparison", 0.0))
+        replace(e, omitted=lambda _: CullReason("traced for comparison", 0.0))
         if traced and e.name == "look_around"
         else e
         for e in rendering.EFFECTS

@@ -19,17 +19,17 @@ from client.laptop.synthetic.lights import ring_light
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
+from server.input.measure import measure
+from server.light.light_estimation import ASSUMED_ALBEDO
 from server.maths.sh import dominant_direction
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import Pipeline
-from server.stages.composite import srgb_codes
-from server.stages.integrate import integrate
-from server.stages.light_estimation import ASSUMED_ALBEDO
-from server.stages.measure import measure
-from server.stages.radiance_transfer import direction_sets, transfer_radiance
-from server.stages.raycast import raycast
-from server.stages.volume import Volume
+from server.shading.composite import srgb_codes
+from server.transfer.radiance_transfer import direction_sets, transfer_radiance
+from server.volume.integrate import integrate
+from server.volume.raycast import raycast
+from server.volume.volume import Volume
 
 FRAMES = range(1, 30, 3)
 STRIDE = 4

@@ -11,15 +11,15 @@ from client.laptop.synthetic.source import open_synthetic
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import CameraModel
 from protocol.messages import Wishes
+from server.light import lamp_finder
+from server.light.lamp_finder import FIRST_VIEWS, FRAMES_A_VIEW, STEPS_A_FRAME, LampFinder
+from server.light.near_samples import LOBES, PooledSamples
 from server.maths.emitters import Emitter
 from server.maths.near_light import LONG_STEP, STEP, Found, Steps
 from server.maths.sh import LUMINANCE
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import FrameResult, Pipeline
-from server.stages import lamp_finder
-from server.stages.lamp_finder import FIRST_VIEWS, FRAMES_A_VIEW, STEPS_A_FRAME, LampFinder
-from server.stages.near_samples import LOBES, PooledSamples
 
 FRAMES = range(0, 128, 2)
 """Three views, a search of 29 frames, and ten more for the sky to follow."""

@@ -13,12 +13,12 @@ from client.laptop.gallery.play import wishes_of
 from client.laptop.gallery.source import GallerySource
 from protocol.codec import encode
 from protocol.messages import Wishes
-from server.effects import EFFECTS
+from server.effects.table import EFFECTS
 from server.opencl.device import Device
 from server.pipeline import FrameResult, Pipeline
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
-from server.stages.layer import NEUTRAL, NOTHING
+from server.shading.layer import NEUTRAL, NOTHING
 
 ENDS = {"composite", "compose_layer"}
 

@@ -11,7 +11,7 @@ import trimesh
 
 from client.laptop.source import open_source
 from protocol.messages import Wishes
-from server.geometry import Geometry
+from server.geometry.geometry import Geometry
 from server.meshing.chunks import CHUNK_BRICKS
 from server.meshing.files import mesh_files
 from server.meshing.scene_mesh import (
@@ -27,7 +27,7 @@ from server.opencl.engine import Engine
 from server.pipeline import Pipeline
 from server.scene.colors import linear_from_srgb
 from server.scene.mesh import load_mesh
-from server.stages.volume import BRICK, TRUNCATION_VOXELS, Bricks
+from server.volume.volume import BRICK, TRUNCATION_VOXELS, Bricks
 from tests.bricks import Field, ball, bricks_of, reordered
 from tests.data import data_folder
 from tests.service.fakes import CAMERA

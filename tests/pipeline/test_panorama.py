@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from server.light.panorama import PanoramaError, panorama_directions, panorama_sh, read_panorama
 from server.maths.sh import dominant_direction, webxr_from_world
-from server.stages.panorama import PanoramaError, panorama_directions, panorama_sh, read_panorama
 from tests import lights
 from tests.data import data_folder
 from tests.lights import degrees_between

@@ -7,20 +7,21 @@ from typing import Any
 
 import pytest
 
-from server.effects import EFFECTS, effects_of
-from server.omissions import ELSEWHERE
-from server.plan import ALLOWANCE, Effect, Omission, PlanError, execute, make_plan
+from server.culling.influence_bound import NOWHERE
+from server.culling.reason import ALLOWANCE, CullReason
+from server.culling.rules import ELSEWHERE
+from server.culling.scene_facts import Brightness, SceneFacts
+from server.effects.plan import Effect, PlanError, execute, make_plan
+from server.effects.table import EFFECTS, effects_of
 from server.rendering import GIVEN as EFFECTS_GIVEN
-from server.scene_facts import Brightness, SceneFacts
-from server.stages.reach import NOWHERE
-from server.stages.tone_mapping import Averages
+from server.shading.tone_mapping import Averages
 
 Toy = Effect[frozenset[str]]
 
 
-def unless(called_for: str, bound: float = 0.0) -> Callable[[frozenset[str]], Omission | None]:
+def unless(called_for: str, bound: float = 0.0) -> Callable[[frozenset[str]], CullReason | None]:
     """Left out where the facts do not hold `called_for`."""
-    return lambda facts: None if called_for in facts else Omission(f"no {called_for}", bound)
+    return lambda facts: None if called_for in facts else CullReason(f"no {called_for}", bound)
 
 
 def render(camera: str) -> str:
@@ -142,9 +143,9 @@ def test_two_writers_are_refused() -> None:
 # ---- what may be left out as needless ----------------------------------------------------------------------------
 
 
-def hidden(bound: float, reason: str = "hardly seen") -> Callable[[frozenset[str]], Omission | None]:
+def hidden(bound: float, reason: str = "hardly seen") -> Callable[[frozenset[str]], CullReason | None]:
     """Needless, whatever the facts are."""
-    return lambda _facts: Omission(reason, bound)
+    return lambda _facts: CullReason(reason, bound)
 
 
 def test_needless_effects_run_where_everything_is_asked_for() -> None:
@@ -305,6 +306,6 @@ def test_a_layer_calls_for_what_a_picture_does() -> None:
 def test_what_rest_may_change_leaves_nothing_to_spare() -> None:
     facts = SceneFacts(objects=1, objects_in_view=1, has_light=True)
     for bound, everywhere in ((1.0, True), (1.0 - ELSEWHERE, False)):
-        stages = {"estimate_light": Omission("nothing has changed", bound)}
+        stages = {"estimate_light": CullReason("nothing has changed", bound)}
         _, plan = make_plan(EFFECTS, "picture", EFFECTS_GIVEN, facts, stages=stages)
         assert ("shadow_everywhere" in plan.run) == everywhere

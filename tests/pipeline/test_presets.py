@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 from client.laptop.source import open_source
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Wishes
+from server.geometry.merge import merge_depth
+from server.input.measure import measure
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import Pipeline
+from server.quality.settings import sampling_of
 from server.scene.placement import Placement
-from server.settings import sampling_of
-from server.stages.integrate import integrate
-from server.stages.measure import measure
-from server.stages.merge import merge_depth
-from server.stages.radiance_transfer import TURNS, direction_sets, transfer_radiance
-from server.stages.raycast import raycast
-from server.stages.sampling import PRESETS, Sampling, TransferSampler
-from server.stages.volume import Volume
+from server.transfer.radiance_transfer import TURNS, direction_sets, transfer_radiance
+from server.transfer.sampling import PRESETS, Sampling, TransferSampler
+from server.volume.integrate import integrate
+from server.volume.raycast import raycast
+from server.volume.volume import Volume
 from tests.meshes import shape_of
 
 SOURCE = "synthetic:table?light=1&frames=30&size=160x120"

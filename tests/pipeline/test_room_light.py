@@ -17,7 +17,7 @@ from protocol.messages import Light, Wishes
 from server.maths.sh import dominant_direction
 from server.opencl.device import Device
 from server.pipeline import Pipeline
-from server.stages.composite import srgb_codes
+from server.shading.composite import srgb_codes
 from tests.analytic import Floats
 from tests.lights import degrees_between
 

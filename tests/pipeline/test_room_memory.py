@@ -15,11 +15,11 @@ from server.evaluation.memory import room_memory
 from server.evaluation.rooms import LIVING_ROOM, walk
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.stages.brick_pool import BRICK_BYTES
-from server.stages.brick_table import AWAY_SLOT, BRICK, NO_SLOT
-from server.stages.radiance_transfer import direction_sets, transfer_radiance
-from server.stages.raycast import raycast
-from server.stages.volume import Volume, VolumeSizeError
+from server.transfer.radiance_transfer import direction_sets, transfer_radiance
+from server.volume.brick_pool import BRICK_BYTES
+from server.volume.brick_table import AWAY_SLOT, BRICK, NO_SLOT
+from server.volume.raycast import raycast
+from server.volume.volume import Volume, VolumeSizeError
 from tests.analytic import look, look_at, plane, room, sphere
 from tests.volumes import cast, fuse, upload_depth
 

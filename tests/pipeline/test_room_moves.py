@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from server.opencl.device import Device
-from server.room import Room
+from server.room.room import Room
 from server.scene.placement import Placement
 from server.service.room_store import RoomStore, RoomStoreError, folder_name
 from server.service.saving.files import read_parts, write_parts

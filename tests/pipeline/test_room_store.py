@@ -16,22 +16,22 @@ from msgspec import structs
 
 from protocol.frames import RgbdFrame
 from protocol.messages import Light, Marker
-from server.light import KnownRoomLight, RoomLight
+from server.input.measure import GREATEST_DEPTH_M, measure
+from server.light.light_estimation import LightEstimate
+from server.light.lobe_estimator import KnownLight
+from server.light.room_light import KnownRoomLight, RoomLight
 from server.maths.registration import distance_between
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import FrameResult, Pipeline
-from server.room import Room
+from server.quality.settings import read_wishes
+from server.room.room import Room
 from server.scene.placement import Placement
 from server.service.room_store import RoomStore, folder_name
 from server.service.saving.brick_files import merged, read_bricks, write_bricks
-from server.settings import read_wishes
-from server.stages.integrate import integrate
-from server.stages.light_estimation import LightEstimate
-from server.stages.lobe_estimator import KnownLight
-from server.stages.measure import GREATEST_DEPTH_M, measure
-from server.stages.raycast import raycast
-from server.stages.volume import Volume
+from server.volume.integrate import integrate
+from server.volume.raycast import raycast
+from server.volume.volume import Volume
 from tests import corners
 from tests.analytic import Floats, look_at
 from tests.corners import FLOOR, WALL, corner_frame
@@ -223,8 +223,8 @@ class Told:
 
 
 def test_a_light_is_forgotten_once_new_frames_say_as_much(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("server.light.gather_samples", lambda *_given: None)
-    monkeypatch.setattr("server.light.no_hits", lambda *_given: None)
+    monkeypatch.setattr("server.light.room_light.gather_samples", lambda *_given: None)
+    monkeypatch.setattr("server.light.room_light.no_hits", lambda *_given: None)
     light = RoomLight(engine, read_wishes(corners.WISHES))
     told = LightEstimate(np.full((16, 3), 2.0), np.full((16, 3), 0.2), 1.0, valid=True)
     light._lobes = Told([0.0, 0.5, 0.0, 0.13, 0.1, 0.5])  # 0: a frame that says nothing

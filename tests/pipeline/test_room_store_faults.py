@@ -14,7 +14,7 @@ import pytest
 
 from protocol.messages import Marker
 from server.opencl.device import Device
-from server.room import Room
+from server.room.room import Room
 from server.scene.placement import Placement
 from server.service.room_store import RoomStore, RoomStoreError, folder_name
 from server.service.saving import slot as slots

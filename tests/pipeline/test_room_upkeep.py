@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from server.opencl.device import Device
-from server.room import Room
+from server.room.room import Room
 from server.service.room_saver import RoomSaver
 from server.service.room_store import RoomStore, folder_name
 from server.service.saving.upkeep import DAY_S, KeptLimits

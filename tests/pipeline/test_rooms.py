@@ -18,7 +18,7 @@ from server.maths.registration import angle_between, distance_between
 from server.maths.rigid import inverse_rigid
 from server.opencl.device import Device
 from server.pipeline import FrameResult, Pipeline
-from server.room import Room
+from server.room.room import Room
 from server.scene.placement import Placement
 from tests import corners
 from tests.analytic import Floats

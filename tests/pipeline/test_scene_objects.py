@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from server.objects import scene_objects
+from server.objects.scene_objects import CELLS, FEWER_CELLS, SceneObjects, check_room, mesh_digest
 from server.opencl.engine import Engine
-from server.scene import objects as scene_objects
 from server.scene.limits import MeshError
 from server.scene.materials import Beyond, Material, Texture
 from server.scene.mesh import Mesh
-from server.scene.objects import CELLS, FEWER_CELLS, SceneObjects, check_room, mesh_digest
 from server.scene.placement import Placement
 from tests.meshes import shape_of
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Preset, Wishes
 from server import rendering
+from server.input.measure import linear_values
 from server.maths.direct_lights import SplitLight, split_light
 from server.maths.directional_fit import directional_sh
 from server.opencl.device import Device
 from server.pipeline import FrameResult, Pipeline
 from server.scene.placement import Placement
-from server.stages.measure import linear_values
 from tests import lights
 from tests.analytic import look, look_at, plane
 from tests.meshes import shape_of
@@ -165,7 +165,7 @@ def test_surfaces_that_send_light_see_both_parts(device: Device) -> None:
     umbra = is_floor & (expected < expected[is_floor].min() + 0.02)
     assert both[umbra].mean() > direct[umbra].mean()
     assert np.abs(both - direct)[is_floor].mean() < 0.05
-    with patch("server.effect_functions.shadow_maps.light_glow"):
+    with patch("server.effects.functions.shadow_maps.light_glow"):
         dim = ratio_of(shown(device, light, indirect=True))
     assert (both >= dim).all()
     assert (both > dim).any()

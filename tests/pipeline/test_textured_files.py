@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from client.laptop.objects import pack_mesh
 from protocol.frames import CameraModel
+from server.objects.rasterize import rasterize
+from server.objects.virtual_object import VirtualObject
 from server.opencl.engine import Engine
 from server.scene.coarse_colors import colors_at
 from server.scene.colors import linear_from_srgb
 from server.scene.materials import Beyond, Material, Texture
 from server.scene.mesh import load_mesh
-from server.scene.virtual_object import VirtualObject
-from server.stages.rasterize import rasterize
 from tests.meshes import mesh_of, pose
 from tests.textured import FACE_COLORS, ROUGHNESS, write_glb, write_obj
 

@@ -11,11 +11,11 @@ import trimesh
 from numpy.typing import NDArray
 
 from protocol.messages import Wishes
+from server.input.measure import linear_values
 from server.maths.sh import LUMINANCE
 from server.opencl.device import Device
 from server.pipeline import FrameResult, Pipeline
 from server.scene.placement import Placement
-from server.stages.measure import linear_values
 from tests import lights
 from tests.meshes import shape_of
 from tests.pipeline.test_static_light import BOUNDS, CAMERA, POLE_M, frame

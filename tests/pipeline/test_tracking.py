@@ -12,7 +12,7 @@ import pytest
 from client.laptop.source import open_source
 from client.laptop.volume import default_volume, default_voxel
 from server.evaluation.trajectory import ate_rmse_m, position_errors_m, track_source
-from server.geometry import Geometry
+from server.geometry.geometry import Geometry
 from server.maths.registration import angle_between, distance_between, motion_of_twist
 from server.opencl.engine import Engine
 from server.pipeline import Pipeline

@@ -8,9 +8,9 @@ from msgspec.structs import replace
 
 from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
-from server.geometry import Geometry
+from server.geometry.geometry import Geometry
 from server.opencl.engine import Engine
-from server.settings import bounds_seen
+from server.volume.bounds import bounds_seen
 from tests.analytic import look
 from tests.lenses import BALL, CAMERA, LENS, ROOM, WORLD_FROM_COLOR, is_seen_by_both, moved, seen_by_depth
 from tests.volumes import vectors

@@ -10,7 +10,7 @@ import pytest
 from protocol.messages import Hello
 from server.opencl.device import Device
 from server.pipeline import Pipeline
-from server.room import Room
+from server.room.room import Room
 from server.scene.placement import Placement
 from tests.kept_rooms import CUBE, scan
 from tests.rooms import CAMERA, wishes

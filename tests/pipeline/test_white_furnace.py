@@ -21,19 +21,19 @@ from scipy import ndimage
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.limits import MAX_SH_BANDS
 from protocol.messages import Preset, Wishes
+from server.geometry.merge import merge_depth
+from server.input.measure import measure
+from server.light.light_estimation import LEAST_FLATNESS
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import FrameResult, Pipeline
+from server.quality.settings import THESIS_REACH_M, WHOLE_ROOM_M
 from server.scene.placement import Placement
-from server.settings import THESIS_REACH_M, WHOLE_ROOM_M
-from server.stages.integrate import integrate
-from server.stages.light_estimation import LEAST_FLATNESS
-from server.stages.measure import measure
-from server.stages.merge import merge_depth
-from server.stages.radiance_transfer import direction_sets, transfer_radiance
-from server.stages.raycast import LABEL_STATIC, Surface, raycast
-from server.stages.sampling import PRESETS
-from server.stages.volume import Volume
+from server.transfer.radiance_transfer import direction_sets, transfer_radiance
+from server.transfer.sampling import PRESETS
+from server.volume.integrate import integrate
+from server.volume.raycast import LABEL_STATIC, Surface, raycast
+from server.volume.volume import Volume
 from tests.analytic import Shape, look, look_at, plane, sphere
 from tests.lights import random_directions, uniform
 from tests.meshes import shape_of

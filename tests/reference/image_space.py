@@ -29,7 +29,7 @@ def first_solid(solid: Bools, voxel_m: float, origin: Floats, directions: Floats
 
 @dataclass(frozen=True)
 class Views:
-    """Auxiliary views: as server.stages.auxiliary_views.AuxiliaryViews, on the host."""
+    """Auxiliary views: as server.transfer.auxiliary_views.AuxiliaryViews, on the host."""
 
     axes: Floats
     """[views, 3, 3] rows right, down, forward."""

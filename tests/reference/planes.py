@@ -1,5 +1,5 @@
 """Float64 twins of how far planes must go on to be met (server/maths/planes.py), and of what a camera looked through
-(server/stages/continuation.py)."""
+(server/light/continuation.py)."""
 
 from __future__ import annotations
 

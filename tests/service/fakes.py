@@ -14,7 +14,7 @@ from protocol.images import encode_color, encode_depth
 from protocol.messages import Frame, LeftOut, Light, Plan, Timings, Wishes
 from server.meshing.scene_mesh import SceneMesh
 from server.meshing.surface import MeshingError
-from server.stages.layer import Layer, LayerPart
+from server.shading.layer import Layer, LayerPart
 
 PATIENCE_S = 20.0
 CAMERA = CameraModel(width=48, height=32, fx=40.0, fy=41.0, cx=23.5, cy=15.5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import FastAPI, Response
 
 from server.service.app import create_app
-from server.service.door import Door
+from server.service.authenticator import Authenticator
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.service.by_schema import requests_by_schema
@@ -22,7 +22,7 @@ def test_every_answer_is_described(server) -> None:
 
 
 def test_refusals_are_described() -> None:
-    with BackgroundServer(Service(FAKE_DEVICE), door=Door("secret")) as guarded:
+    with BackgroundServer(Service(FAKE_DEVICE), door=Authenticator("secret")) as guarded:
         url = guarded.url.partition("?")[0].rstrip("/")
         found = requests_by_schema(create_app(Service(FAKE_DEVICE)), url, EXAMPLES)
     assert not found.wrong

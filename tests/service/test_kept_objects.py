@@ -25,7 +25,7 @@ from protocol.messages import (
     Wishes,
 )
 from server.opencl.device import Device
-from server.room import Room
+from server.room.room import Room
 from server.service.mailbox import Mailbox
 from server.service.metrics import Metrics
 from server.service.room_store import RoomStore

@@ -24,8 +24,8 @@ from server.opencl.device import Device
 from server.service.answers import STEPS_PER_M
 from server.service.serve import BackgroundServer
 from server.service.service import Service
-from server.stages import layer as of_server
-from server.stages.layer import LayerPart
+from server.shading import layer as of_server
+from server.shading.layer import LayerPart
 from tests.service.fakes import CAMERA, POSE, REFUSE_MM, fake_layer, fake_light, frame_message, rgbd_frame
 from tests.service.test_client import next_answer, with_client
 from tests.service.test_stream import FakeSource

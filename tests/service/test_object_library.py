@@ -9,7 +9,7 @@ import pytest
 
 from protocol.limits import MAX_MESH_BYTES
 from server.scene.mesh import load_mesh
-from server.service.door import Door
+from server.service.authenticator import Authenticator
 from server.service.object_library import MAX_OBJECTS, NoObject, ObjectLibrary
 from tests.service.fakes import PATIENCE_S
 
@@ -37,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
 @pytest.fixture
 def ask(start_server, folder: Path):
     """GET a path of a server with that folder."""
-    server = start_server(library=ObjectLibrary(folder), door=Door(TOKEN, frozenset({"https://app.example"})))
+    server = start_server(library=ObjectLibrary(folder), door=Authenticator(TOKEN, frozenset({"https://app.example"})))
 
     def get(path: str, headers: dict[str, str] | None = None, token: str | None = TOKEN) -> httpx.Response:
         headers = (headers or {}) | ({} if token is None else {"Authorization": f"Bearer {token}"})

@@ -24,13 +24,13 @@ from protocol.colors import ColorReader
 from protocol.frames import CameraModel
 from protocol.images import decode_color, encode_color
 from protocol.messages import Acknowledged, Composite, Dropped, PlaceObject
+from server.objects.scene_objects import mesh_digest
 from server.parsing.children import ChildDied, Children
 from server.parsing.mesh_bytes import mesh_from_bytes, mesh_to_bytes
 from server.parsing.parsers import MESH_WORK, PICTURE_WORK, Parsers
 from server.scene.limits import MeshError
 from server.scene.materials import Beyond, Material, Texture
 from server.scene.mesh import Mesh, load_mesh
-from server.scene.objects import mesh_digest
 from tests.data import ROOT
 from tests.gltf_files import assert_well_formed
 from tests.service.fakes import CAMERA, PATIENCE_S, fake_mesh, frame_message, rgbd_frame

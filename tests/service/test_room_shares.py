@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import pytest
 
 from server.opencl.device import Device
-from server.room import Room
+from server.room.room import Room
 from server.service.scheduler import Scheduler
 from tests.rooms import wishes
 from tests.service.fakes import PATIENCE_S

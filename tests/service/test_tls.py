@@ -17,10 +17,10 @@ from cryptography import x509
 from client.access import AccessError, entrance, fingerprint_bytes
 from client.client import Access
 from server.service import tls
-from server.service.door import Door
+from server.service.authenticator import Authenticator
 from server.service.serve import BackgroundServer
 from server.service.tls import Certificate, CertificateError, given_certificate, own_certificate
-from tests.service.test_door import TOKEN, connected, not_connected
+from tests.service.test_authenticator import TOKEN, connected, not_connected
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> Certificate:
 
 @pytest.fixture
 def secure(start_server, certificate: Certificate) -> BackgroundServer:
-    return start_server(door=Door(TOKEN), certificate=certificate)
+    return start_server(door=Authenticator(TOKEN), certificate=certificate)
 
 
 def test_the_certificate_is_made_once_for_the_user_alone(tmp_path: Path) -> None:

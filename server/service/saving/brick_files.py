@@ -14,8 +14,8 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from server.service.saving.files import DamagedFile, read_parts, write_parts
-from server.stages.brick_pool import BRICK_VOXELS
-from server.stages.brick_table import Indices
+from server.volume.brick_pool import BRICK_VOXELS
+from server.volume.brick_table import Indices
 
 Batch = tuple[Indices, NDArray[Any], NDArray[np.uint32]]
 """Places [k], voxels [k, 512] float2 (tsdf, weight), colours [k, 512]."""

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from server.room_objects import Inventory, Place
+from server.room.room_objects import Inventory, Place
 from server.scene.placement import Placement
 from server.service.saving.files import DamagedFile, check_file, read_parts, sync_folder, write_parts
 from server.service.saving.state import array_from_list, array_to_list

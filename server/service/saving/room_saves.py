@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from server.opencl.device import Device
-from server.room import Room
+from server.room.room import Room
 from server.service.saving.files import DamagedFile
 from server.service.saving.moves import Moves, forget_moves, moves_since, read_moves, write_moves
 from server.service.saving.slot import Slot

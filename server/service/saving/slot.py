@@ -29,10 +29,10 @@ from server.service.saving.state import (
     state_to_bytes,
 )
 from server.service.saving.upkeep import ASIDE
-from server.stages.volume import Volume
+from server.volume.volume import Volume
 
 if TYPE_CHECKING:
-    from server.room_objects import KeptObject
+    from server.room.room_objects import KeptObject
     from server.service.saving.snapshot import Snapshot
 
 SAVE, PART = "save", "save.part"

@@ -11,14 +11,14 @@ import numpy as np
 
 from server.opencl.device import Device
 from server.parsing.mesh_bytes import mesh_from_bytes
-from server.room import Room
-from server.room_objects import Inventory, KeptObject
+from server.room.room import Room
+from server.room.room_objects import Inventory, KeptObject
 from server.scene.placement import Placement
 from server.service.saving.brick_files import Batch, merged
 from server.service.saving.files import DamagedFile, read_parts
 from server.service.saving.slot import Slot
 from server.service.saving.state import KeptMarker, KeptVolume, RoomState
-from server.stages.volume import Volume
+from server.volume.volume import Volume
 
 log = logging.getLogger(__name__)
 

@@ -11,10 +11,10 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from protocol.messages import Wishes
-from server.light import KnownRoomLight
+from server.light.room_light import KnownRoomLight
 from server.maths.near_light import Found
 from server.scene.placement import Placement
-from server.stages.relocalize import Keyframe
+from server.tracking.relocalize import Keyframe
 
 VERSION = 1
 """Of all that is written. A change of any of these types, or of those that they are made of, is another version."""

@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
-from server import tracking
 from server.evaluation.surface import model_depth
-from server.geometry import Geometry, GeometryFrame
+from server.geometry.geometry import Geometry, GeometryFrame
+from server.input.denoise import bilateral_depth
+from server.input.measure import Measurement
 from server.opencl.device import open_device
 from server.opencl.engine import Engine
 from server.opencl.profile import Profile
-from server.stages.denoise import bilateral_depth
-from server.stages.measure import Measurement
-from server.stages.raycast import Surface
-from server.stages.volume import Volume
-from server.tracking import CameraTracking, Located
+from server.tracking import camera_tracking as tracking
+from server.tracking.camera_tracking import CameraTracking, PoseEstimate
+from server.volume.raycast import Surface
+from server.volume.volume import Volume
 from tests.bench.peers.contestant import FILTER, INTEGRATE, RAYCAST, TRACK, Scene, Turn
 from tests.bench.peers.worker import device_name
 
@@ -104,11 +104,11 @@ class ClockedTracking(CameraTracking):
         self.turn = Turn()
         tracking.bilateral_depth = self._filter  # type: ignore[assignment]
 
-    def locate(self, frame: RgbdFrame, measurement: Measurement, volume: Volume) -> Located:
+    def locate(self, frame: RgbdFrame, measurement: Measurement, volume: Volume) -> PoseEstimate:
         with self._clock():
             return super().locate(frame, measurement, volume)
 
-    def remember(self, frame: RgbdFrame, located: Located, model: Surface, volume_from_camera: Floats) -> None:
+    def remember(self, frame: RgbdFrame, located: PoseEstimate, model: Surface, volume_from_camera: Floats) -> None:
         with self._clock():
             super().remember(frame, located, model, volume_from_camera)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.stages.layer import Layer, LayerPart
+from server.shading.layer import Layer, LayerPart
 
 CAMERA = CameraModel(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 BALL_M, RADIUS_M = np.array([-0.08, 0.01, 0.7]), 0.07

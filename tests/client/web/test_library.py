@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import Page
 
 from server.scene.vase import vase_glb
-from server.service.door import Door
+from server.service.authenticator import Authenticator
 from server.service.object_library import ObjectLibrary
 from server.service.serve import BackgroundServer
 from server.service.service import Service
@@ -37,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
 @pytest.fixture
 def server(lab: Lab, folder: Path) -> Iterator[BackgroundServer]:
     service = Service(FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh)
-    with BackgroundServer(service, door=Door("a-token"), library=ObjectLibrary(folder)) as server:
+    with BackgroundServer(service, door=Authenticator("a-token"), library=ObjectLibrary(folder)) as server:
         yield server
 
 

@@ -10,8 +10,8 @@ from playwright.sync_api import Page
 
 from protocol.limits import SUBPROTOCOL
 from protocol.messages import Hello
+from server.service.authenticator import Authenticator
 from server.service.departure import DRAINING, GOODBYE
-from server.service.door import Door
 from server.service.rooms import lock_of
 from server.service.serve import BackgroundServer
 from server.service.service import Service
@@ -38,10 +38,12 @@ def start(lab: Lab) -> Iterator[StartServer]:
     """Start a server with fake pipelines; keywords go to the service, but for `door` and `port`."""
     servers: list[BackgroundServer] = []
 
-    def start_one(door: Door | None = None, port: int = 0, **options: object) -> BackgroundServer:
+    def start_one(door: Authenticator | None = None, port: int = 0, **options: object) -> BackgroundServer:
         room = SimpleNamespace(close=lambda: None, key_digest=None)
         factories = {"pipeline_factory": lab.build, "mesh_loader": fake_mesh, "room_factory": lambda *_: room}
-        servers.append(BackgroundServer(Service(FAKE_DEVICE, **factories | options), port=port, door=door or Door()))
+        servers.append(
+            BackgroundServer(Service(FAKE_DEVICE, **factories | options), port=port, door=door or Authenticator())
+        )
         return servers[-1]
 
     yield start_one
@@ -137,7 +139,7 @@ def test_a_server_of_another_version(start: StartServer, open_page: OpenPage, mo
 
 @pytest.mark.parametrize(("query", "word"), [("", "missing"), ("/?token=another", "wrong")])
 def test_a_wrong_token(start: StartServer, open_page: OpenPage, query: str, word: str) -> None:
-    page = open_page(start(door=Door("a-token")).url + query)
+    page = open_page(start(door=Authenticator("a-token")).url + query)
     assert state(page) == (
         f"Refused: the token is {word}: use the URL that the server printed at its start, which ends in ?token=..."
     )

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from msgspec.structs import replace
 
+from server.input.measure import GREATEST_DEPTH_M
 from server.maths.registration import motion_of_twist
 from server.maths.rigid import inverse_rigid
-from server.stages.measure import GREATEST_DEPTH_M
 from tests.analytic import look
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial
 from tests.kernels.test_measure import PLAIN, frame_of, measured, random_frame

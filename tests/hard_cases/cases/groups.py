@@ -7,14 +7,14 @@ from itertools import pairwise
 import numpy as np
 import pyopencl as cl
 
+from server.input.measure import measure
+from server.light.light_estimation import sum_tiles
 from server.opencl.device import Device
 from server.opencl.engine import Engine, KernelArgument
-from server.stages.integrate import integrate
-from server.stages.light_estimation import sum_tiles
-from server.stages.measure import measure
-from server.stages.radiance_transfer import direction_sets, transfer_radiance
-from server.stages.raycast import Surface, raycast
-from server.stages.volume import Volume
+from server.transfer.radiance_transfer import direction_sets, transfer_radiance
+from server.volume.integrate import integrate
+from server.volume.raycast import Surface, raycast
+from server.volume.volume import Volume
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial
 from tests.hard_cases.test_bad_depth import BOUNDS, CAMERA, frame_of, good_depth
 from tests.volumes import vectors

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from server.light.light_estimation import ASSUMED_ALBEDO
+from server.light.light_model import LightModel
+from server.light.lobe_estimator import LobeEstimator
 from server.maths.lobes import cells_to_sh
 from server.maths.sh import LUMINANCE
-from server.stages.light_estimation import ASSUMED_ALBEDO
-from server.stages.light_model import LightModel
-from server.stages.lobe_estimator import LobeEstimator
 from tests.hard_cases.catalogue import Family, Found, Trial
 from tests.kernels.test_lobe_estimator import CONSTANT, GRID, Run, View, direction, halves, sun
 from tests.lights import unit

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from server.light.light_estimation import LightEstimator
 from server.maths.bayes import NormalEquations, solve_plain, solve_with_evidence
 from server.maths.sh import LUMINANCE
-from server.stages.light_estimation import LightEstimator
 from tests.hard_cases.cases.seen import COUNT, FLOAT, LIGHT, SEEN, around, shading, sums, walls
 from tests.hard_cases.catalogue import Family, Found, Trial
 from tests.lights import lobe_and_sky, uniform, unit

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from server.stages.rasterize import NEAR_M
-from server.stages.tone_mapping import AverageMemory, Averages
+from server.objects.rasterize import NEAR_M
+from server.shading.tone_mapping import AverageMemory, Averages
 from tests import lights
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial, share_beyond
 from tests.kernels import test_rasterize

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from server.light.light_estimation import ASSUMED_ALBEDO, LightEstimate, TileSums, sum_tiles
 from server.opencl.engine import Engine
-from server.stages.light_estimation import ASSUMED_ALBEDO, LightEstimate, TileSums, sum_tiles
-from server.stages.raycast import LABEL_STATIC
+from server.volume.raycast import LABEL_STATIC
 from tests import lights
 from tests.kernels.test_light_estimation import Frame
 from tests.reference.sh import open_transfer

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from server.light import light_estimation
+from server.light.light_estimation import LightEstimator, unpack_tiles
 from server.maths.bayes import NormalEquations, solve_plain
 from server.maths.memory import remembered
 from server.maths.registration import motion_of_twist
 from server.maths.rigid import repaired_pose
-from server.stages import light_estimation
-from server.stages.light_estimation import LightEstimator, unpack_tiles
 from tests.hard_cases.cases.seen import FLOAT, LIGHT, SEEN, around, sums
 from tests.hard_cases.catalogue import Family, Found, Trial
 

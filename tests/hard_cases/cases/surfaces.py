@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from server.stages.integrate import GREATEST_WEIGHT, integrate
-from server.stages.near_light import Emitters
-from server.stages.volume import Volume
+from server.light.near_light import Emitters
+from server.volume.integrate import GREATEST_WEIGHT, integrate
+from server.volume.volume import Volume
 from tests.analytic import look, look_at
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial, share_beyond
 from tests.kernels import test_raycast

@@ -1,0 +1,71 @@
+// What composite would mix with the camera's picture, apart from it (thesis 7.2.1): for clients that put it over a later one.
+// Provides compose_layer.
+#include "composite_inputs.clh"
+
+#define NEUTRAL 128  // code of a factor of 1
+
+// Camera depth as a code: 0 says nothing, so what lies nearer than half a unit has 1; what lies too far has the last.
+static inline ushort depth_code(const float z, const float depth_scale_m) {
+    return (ushort)clamp(z / depth_scale_m + 0.5f, 1.0f, 65535.0f);
+}
+
+// Of its root, so that dark shadows have codes enough.
+static inline uchar ratio_code(const float factor) {
+    return (uchar)clamp(NEUTRAL * sqrt(factor) + 0.5f, 0.0f, 255.0f);
+}
+
+static inline ushort depth_at(global const float4 *positions, const int pixel, const float16 camera_from_volume,
+                              const float depth_scale_m) {
+    const float4 position = positions[pixel];
+    return position.w > 0.0f ? depth_code(transform_point(camera_from_volume, position.xyz).z, depth_scale_m) : (ushort)0;
+}
+
+static inline void clear(global uchar4 *virtual_layer, global ushort *virtual_depth, global uchar *ratio_layer, const int pixel) {
+#ifdef HAS_OBJECTS
+    virtual_layer[pixel] = (uchar4)(0);
+    virtual_depth[pixel] = 0;
+#endif
+#ifdef HAS_SHADOWS
+    for (int i = 0; i < 3; i++) ratio_layer[3 * pixel + i] = NEUTRAL;
+#endif
+}
+
+// codes [65536]: sRGB code of linear radiance i / 65535; depth_scale_m: metres of a unit of depth.
+// One item LANES pixels of a row -> virtual_layer [h][w]: sRGB codes and coverage, 255: all; virtual_depth [h][w] of the
+// surface that the colour is of, or none of the two without HAS_OBJECTS. ratio_layer [h][w][3]: codes of factors; real_depth
+// [h][w] of all real surface, or none of the two without HAS_SHADOWS.
+kernel void compose_layer(MIXTURE_ARGUMENTS, const float depth_scale_m, global const uchar *codes, global uchar4 *virtual_layer,
+                          global ushort *virtual_depth, global uchar *ratio_layer, global ushort *real_depth) {
+    const int first = get_global_id(0) * LANES;
+    const int y = get_global_id(1);
+    if (first >= width || y >= height) return;
+    const int end = min(first + LANES, width);
+    for (int x = first; x < end; x++) {
+        clear(virtual_layer, virtual_depth, ratio_layer, y * width + x);
+#ifdef HAS_SHADOWS
+        real_depth[y * width + x] = depth_at(positions, y * width + x, camera_from_volume, depth_scale_m);
+#endif
+    }
+    if (first + LANES <= width && !may_change(MIXTURE, first, y)) return;
+    float4 factors[LANES];
+    factors_of(MIXTURE, first, y, factors);
+    for (int x = first; x < end; x++) {
+        const int pixel = y * width + x;
+        const Mixed mixed = mixed_at(MIXTURE, x, y, factors[x - first]);
+#ifdef HAS_SHADOWS
+        if (mixed.is_touched) {
+            ratio_layer[3 * pixel] = ratio_code(mixed.factor.x);
+            ratio_layer[3 * pixel + 1] = ratio_code(mixed.factor.y);
+            ratio_layer[3 * pixel + 2] = ratio_code(mixed.factor.z);
+        }
+#endif
+#ifdef HAS_OBJECTS
+        if (mixed.part > 0.0f) {
+            const float3 level = clamp(mixed.own, 0.0f, 1.0f) * 65535.0f + 0.5f;
+            virtual_layer[pixel] = (uchar4)(codes[(int)level.x], codes[(int)level.y], codes[(int)level.z],
+                                            (uchar)(255.0f * mixed.part + 0.5f));
+            virtual_depth[pixel] = depth_at(virtual_positions, mixed.source, camera_from_volume, depth_scale_m);
+        }
+#endif
+    }
+}

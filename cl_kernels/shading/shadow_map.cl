@@ -1,0 +1,327 @@
+// Shadow maps along the sharp lights of a room and what these lights bring past them (thesis 7.2.3, fig. 7.7).
+// Provides begin_maps, halve_maps, trace_discs, light_virtual, light_real, light_glow, light_samples, mix_direct,
+// unmix_direct.
+#include "camera.clh"
+#include "clear_origin.clh"
+#include "continued.clh"
+#include "direct_lights.clh"
+#include "direct_mix.clh"
+#include "rays.clh"
+#include "sampled_value.clh"
+#include "upsample_row.clh"
+
+#define RAYS 8  // of a sample to a disc; neighbours have others
+#define RAY_SETS 16
+
+// nearest [count MAP_SIDE][MAP_SIDE]: for each light, bits of 1 / depth of objects drawn from distance_m before the ball's middle, 0
+// where there is none -> level 0 of its map.
+kernel void begin_maps(const int count, const float distance_m, global const uint *nearest, global float2 *maps) {
+    const int x = get_global_id(0);
+    const int y = get_global_id(1);
+    if (x >= MAP_SIDE || y >= count * MAP_SIDE) return;
+    const float inverse = as_float(nearest[y * MAP_SIDE + x]);
+    maps[y / MAP_SIDE * MAP_TEXELS + y % MAP_SIDE * MAP_SIDE + x] = inverse > 0.0f ? (float2)(1.0f, 1.0f / inverse - distance_m) : (float2)(0.0f);
+}
+
+// `level` of all maps from the one before.
+kernel void halve_maps(const int count, const int level, global float2 *maps) {
+    const int x = get_global_id(0);
+    const int y = get_global_id(1);
+    const int side = MAP_SIDE >> level;
+    if (x >= side || y >= side || (int)get_global_id(2) >= count) return;
+    global float2 *map = maps + get_global_id(2) * MAP_TEXELS;
+    global const float2 *finer = map + level_offset(level - 1);
+    float covered = 0.0f, sum = 0.0f;
+    for (int i = 0; i < 4; i++) {
+        const float2 texel = finer[(2 * y + (i >> 1)) * 2 * side + 2 * x + (i & 1)];
+        covered += texel.x;
+        sum += texel.x * texel.y;
+    }
+    map[level_offset(level) + y * side + x] = (float2)(0.25f * covered, covered > 0.0f ? sum / covered : 0.0f);
+}
+
+#define TRACE_PARAMETERS \
+    const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid, global const uchar *octets, \
+        global const float2 *voxels, const float voxel_m, const float truncation_m, const float reach_m, const int plane_count, \
+        global const float4 *planes, global const int4 *shapes, global const uchar *plane_maps, const float cell_m, \
+        const float least_m, global const float2 *ray_places
+#define VOLUME_OF_TRACE make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels)
+#define PLANES_OF_TRACE {plane_count, planes, shapes, plane_maps, cell_m, least_m}
+
+// The part of what a disc brings to the surface that real things leave, along RAYS rays to places [RAYS] in the unit disc. axes: of
+// the disc, as DirectLights has them.
+static float real_part(const Volume volume, const Continued continued, const float reach_m, global const float4 *axes,
+                       const float3 position, const float3 normal, const float3 origin, global const float2 *places) {
+    const float3 right = axes[0].xyz, down = axes[1].xyz, toward = axes[2].xyz;
+    const float tangent = axes[2].w;
+    const Vectors facing = {dot(normal, right), dot(normal, down), -dot(normal, toward)};
+    float all = 0.0f, free = 0.0f;
+    for (int first = 0; first < RAYS; first += LANES) {
+        floatn x, y;
+        load_pairs(places + first, &x, &y);
+        const floatn cosine = cosine_of_part(facing, tangent, x, y);
+        if (!ANY(MASK(cosine > 0.0f))) continue;
+        const floatn shorten = 1.0f / sqrt(1.0f + tangent * tangent * (x * x + y * y));
+        const Vectors direction = {(toward.x + tangent * (x * right.x + y * down.x)) * shorten,
+                                   (toward.y + tangent * (x * right.y + y * down.y)) * shorten,
+                                   (toward.z + tangent * (x * right.z + y * down.z)) * shorten};
+        const Rays rays = make_rays(origin / volume.voxel_m, direction);
+        floatn begin, end;
+        clip_rays(volume, rays, &begin, &end);
+        end = MASK(cosine > 0.0f) ? fmin(end, reach_m / volume.voxel_m) : 0.0f;  // below the horizon nothing is looked for
+        const intn open = MASK(find_solid_voxels(volume, rays, begin, end) >= end);
+        float dx[LANES], dy[LANES], dz[LANES], cosines[LANES], left[LANES];
+        STORE_LANES(direction.x, dx);
+        STORE_LANES(direction.y, dy);
+        STORE_LANES(direction.z, dz);
+        STORE_LANES(cosine, cosines);
+        STORE_LANES(open ? cosine : 0.0f, left);
+        for (int lane = 0; lane < LANES; lane++) {
+            all += cosines[lane];
+            if (left[lane] > 0.0f && !is_hidden(continued, position, (float3)(dx[lane], dy[lane], dz[lane]))) free += left[lane];
+        }
+    }
+    return all > 0.0f ? free / all : 1.0f;
+}
+
+static float4 real_parts(const Volume volume, const Continued continued, const float reach_m, const DirectLights lights,
+                         const float3 position, const float3 normal, const int is_virtual, global const float2 *places) {
+    const float3 origin = is_virtual ? clear_origin(volume, position, normal) : position + volume.voxel_m * normal;
+    float parts[4] = {1.0f, 1.0f, 1.0f, 1.0f};
+    for (int k = 0; k < lights.count; k++)
+        parts[k] = real_part(volume, continued, reach_m, lights.rows + 4 * k, position, normal, origin, places);
+    return vload4(0, parts);
+}
+
+// Samples of a surface, every `stride` pixels: positions, normals [h][w] (w = 0 without surface). ray_places [RAY_SETS][RAYS].
+// -> parts [rows][cols]: of what each disc brings, the part that real things leave (xyz: discs 0 to 2, w = 1 valid).
+kernel void trace_discs(const int cols, const int rows, const int stride, const int width, global const float4 *positions,
+                        global const float4 *normals, const int is_virtual, DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *parts) {
+    const int col = get_global_id(0);
+    const int row = get_global_id(1);
+    if (col >= cols || row >= rows) return;
+    const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
+    const float4 position = positions[pixel], normal = normals[pixel];
+    const Volume volume = VOLUME_OF_TRACE;
+    const Continued continued = PLANES_OF_TRACE;
+    const DirectLights lights = DIRECT_OF_PARAMETERS;
+    float4 result = (float4)(0.0f);
+    if (position.w > 0.0f && normal.w > 0.0f)
+        result = real_parts(volume, continued, reach_m, lights, position.xyz, normal.xyz, is_virtual,
+                            ray_places + RAYS * ((row & 3) * 4 + (col & 3)));
+    parts[row * cols + col] = result;
+}
+
+// The first three of four of LANES neighbours from vectors[i] on, those past `last` 0; `known` where w > 0.
+static inline Vectors neighbours(global const float4 *vectors, const int i, const int last, intn *known) {
+    float w[LANES];
+    for (int lane = 0; lane < LANES; lane++) w[lane] = i + lane <= last ? vectors[i + lane].w : 0.0f;
+    Vectors result;
+    load_vectors(vectors, i, last, &result.x, &result.y, &result.z);
+    *known = MASK(LOAD_LANES(w) > 0.0f);
+    return result;
+}
+
+// [LANES] of a lane each, w = 0; and the other way.
+static inline void lanes_of(const Vectors v, float4 *each) {
+    float x[LANES], y[LANES], z[LANES];
+    STORE_LANES(v.x, x);
+    STORE_LANES(v.y, y);
+    STORE_LANES(v.z, z);
+    for (int lane = 0; lane < LANES; lane++) each[lane] = (float4)(x[lane], y[lane], z[lane], 0.0f);
+}
+
+static inline Vectors from_lanes(const float4 *each) {
+    float x[LANES], y[LANES], z[LANES];
+    for (int lane = 0; lane < LANES; lane++) x[lane] = each[lane].x, y[lane] = each[lane].y, z[lane] = each[lane].z;
+    const Vectors v = {LOAD_LANES(x), LOAD_LANES(y), LOAD_LANES(z)};
+    return v;
+}
+
+static inline void store_vectors(const Vectors v, const float w, const int i, const int last, global float4 *vectors) {
+    float4 each[LANES];
+    lanes_of(v, each);
+    for (int lane = 0; lane < LANES && i + lane <= last; lane++) vectors[i + lane] = (float4)(each[lane].xyz, w);
+}
+
+// positions, normals [h][w] (w = 1 where covered): the virtual geometry buffer; parts [rows][cols]: of trace_discs. One item LANES
+// pixels of a row of `around` (x0 y0 x1 y1, half-open). -> direct [h][w]: what reaches white surface, 0 where there is none.
+kernel void light_virtual(const int width, const int4 around, global const float4 *positions, global const float4 *normals,
+                          const int cols, const int rows, const int stride, global const float4 *parts, const float tolerance_m,
+                          DIRECT_PARAMETERS, global float4 *direct) {
+    const int x = around.x + get_global_id(0) * LANES;
+    const int y = around.y + get_global_id(1);
+    if (x >= around.z || y >= around.w) return;
+    const int pixel = y * width + x, last = y * width + around.z - 1;
+    intn covered;
+    neighbours(positions, pixel, last, &covered);
+    Vectors with = {0.0f, 0.0f, 0.0f};
+    if (ANY(covered)) {
+        const DirectLights lights = DIRECT_OF_PARAMETERS;
+        const Grid grid = {cols, rows, stride, width};
+        const Row row = row_from(grid, positions, normals, x, y);
+        intn found;
+        Vectors left = upsample_row(grid, parts, positions, normals, row, tolerance_m, &found);
+        left.x = found ? left.x : 1.0f;
+        left.y = found ? left.y : 1.0f;
+        left.z = found ? left.z : 1.0f;
+        floatn ahead[MOST_LIGHTS];
+        objects_ahead_of_all(lights, row.position, row.normal, 1, covered, ahead);
+        with = brought_by_discs(lights, row.position, row.normal, 1, left, ahead).with;
+        with.x = covered ? with.x : 0.0f;
+        with.y = covered ? with.y : 0.0f;
+        with.z = covered ? with.z : 0.0f;
+    }
+    store_vectors(with, 0.0f, pixel, last, direct);
+}
+
+// Of LANES pixels, those in whose cells something is touched (see change_mask.cl).
+static inline intn touched_lanes(global const uchar *touched, const int cols, const int stride, const int x, const int y, const int width) {
+    global const uchar *row = touched + (cell_of(y, stride) + 1) * (cols + 1) + 1;
+    int bits[LANES];
+    for (int lane = 0; lane < LANES; lane++) bits[lane] = -(int)(x + lane < width && row[cell_of(x + lane, stride)] != 0);
+    return LOAD_LANES(bits);
+}
+
+// positions, normals [h][w]: real surface; parts [rows][cols]: of trace_discs; ratio, rest [rows][cols], refined [h][w]: R' / R and R
+// of the rest of the light, see composite.cl; touched: of change_mask.cl for `ratio`; least: see direct_mix.clh. One item LANES pixels
+// -> mixed [h][w]: R' / R of all of the light (rgb), w = 1 where it may be other than 1, else all 0.
+kernel void light_real(const int width, const int height, global const float4 *positions, global const float4 *normals,
+                       const int cols, const int rows, const int stride, global const float4 *parts, const float tolerance_m,
+                       global const float4 *ratio, const int has_refined, global const float4 *refined, global const float4 *rest,
+                       global const uchar *touched, const float4 least, DIRECT_PARAMETERS, global float4 *mixed) {
+    const int x = get_global_id(0) * LANES;
+    const int y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    const int pixel = y * width + x, last = y * width + width - 1;
+    const DirectLights lights = DIRECT_OF_PARAMETERS;
+    const Grid grid = {cols, rows, stride, width};
+    intn surface, faced;
+    const Vectors position = neighbours(positions, pixel, last, &surface), normal = neighbours(normals, pixel, last, &faced);
+    surface &= faced;
+    floatn ahead[MOST_LIGHTS];
+    intn wanted = objects_ahead_of_all(lights, position, normal, 0, surface, ahead);
+    wanted = surface & (wanted | touched_lanes(touched, cols, stride, x, y, width));
+    if (!ANY(wanted)) {
+        const Vectors nothing = {0.0f, 0.0f, 0.0f};
+        store_vectors(nothing, 0.0f, pixel, last, mixed);
+        return;
+    }
+    const Row row = row_from(grid, positions, normals, x, y);
+    floatn total = 0.0f;
+    Vectors sums[3] = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};  // of R of the rest, what real things leave, R' / R
+    for (int i = row.first.y; i <= row.last.y; i++) {
+        for (int j = row.first.x; j <= row.last.x; j++) {
+            const int sample = i * cols + j;
+            const float4 values[3] = {rest[sample], parts[sample], ratio[sample]};
+            if (values[0].w <= 0.0f) continue;
+            const floatn weight = weights_of(grid, positions, normals, row, i, j, tolerance_m);
+            total += weight;
+            for (int k = 0; k < 3; k++) {
+                sums[k].x += weight * values[k].x;
+                sums[k].y += weight * values[k].y;
+                sums[k].z += weight * values[k].z;
+            }
+        }
+    }
+    const intn found = MASK(total > 1e-4f);
+    const floatn share = found ? 1.0f / (found ? total : 1.0f) : 0.0f;
+    for (int k = 0; k < 3; k++) sums[k].x *= share, sums[k].y *= share, sums[k].z *= share;
+    const Brought sent = brought_by_discs(lights, position, normal, 0, sums[1], ahead);
+    float4 of_rest[LANES], factor[LANES], without[LANES], with[LANES];
+    int kept[LANES], valid[LANES];
+    lanes_of(sums[0], of_rest);
+    lanes_of(sums[2], factor);
+    lanes_of(sent.without, without);
+    lanes_of(sent.with, with);
+    STORE_LANES(wanted, kept);
+    STORE_LANES(found, valid);
+    for (int lane = 0; lane < LANES && x + lane < width; lane++) {
+        float4 result = (float4)(0.0f);
+        if (kept[lane]) {
+            float4 mean = (float4)(factor[lane].xyz, valid[lane] ? 1.0f : 0.0f);
+#ifndef BICUBIC
+            if (has_refined && refined[pixel + lane].w > 0.0f)
+#endif
+                mean = value_at(grid, ratio, refined, has_refined, positions, normals, x + lane, y, height, tolerance_m);
+            result = (float4)(mixed_ratio(mean.xyz, of_rest[lane].xyz, without[lane].xyz, with[lane].xyz, least.xyz),
+                              valid[lane] ? mean.w : 0.0f);
+        }
+        mixed[pixel + lane] = result;
+    }
+}
+
+// Points on virtual objects send more: points, normals (volume space), albedos [points_count]; radiances [points_count] are added to.
+// One item LANES points.
+kernel void light_glow(const int points_count, global const float4 *points, global const float4 *normals, global const float4 *albedos,
+                       DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *radiances) {
+    const int first = get_global_id(0) * LANES;
+    if (first >= points_count) return;
+    const Volume volume = VOLUME_OF_TRACE;
+    const Continued continued = PLANES_OF_TRACE;
+    const DirectLights lights = DIRECT_OF_PARAMETERS;
+    float left[3][LANES];
+    for (int lane = 0; lane < LANES; lane++) {
+        const int index = min(first + lane, points_count - 1);
+        const float4 parts = real_parts(volume, continued, reach_m, lights, points[index].xyz, normals[index].xyz, 1,
+                                        ray_places + RAYS * (index & 15));
+        left[0][lane] = parts.x, left[1][lane] = parts.y, left[2][lane] = parts.z;
+    }
+    const Vectors parts = {LOAD_LANES(left[0]), LOAD_LANES(left[1]), LOAD_LANES(left[2])};
+    Vectors position, normal;
+    load_vectors(points, first, points_count - 1, &position.x, &position.y, &position.z);
+    load_vectors(normals, first, points_count - 1, &normal.x, &normal.y, &normal.z);
+    floatn ahead[MOST_LIGHTS];
+    objects_ahead_of_all(lights, position, normal, 1, (intn)(-1), ahead);
+    float4 with[LANES];
+    lanes_of(brought_by_discs(lights, position, normal, 1, parts, ahead).with, with);
+    for (int lane = 0; lane < LANES && first + lane < points_count; lane++)
+        radiances[first + lane].xyz += albedos[first + lane].xyz * with[lane].xyz;
+}
+
+// Samples of real surface, every `stride` pixels: positions, normals [h][w]; parts [rows][cols]: of trace_discs. One item LANES samples
+// -> without, with [rows][cols]: what the discs bring to white surface without and with objects (rgb).
+kernel void light_samples(const int cols, const int rows, const int stride, const int width, global const float4 *positions,
+                          global const float4 *normals, global const float4 *parts, DIRECT_PARAMETERS,
+                          global float4 *without, global float4 *with) {
+    const int col = get_global_id(0) * LANES;
+    const int row = get_global_id(1);
+    if (col >= cols || row >= rows) return;
+    const int sample = row * cols + col, last = row * cols + cols - 1;
+    float4 at[LANES], facing[LANES];
+    for (int lane = 0; lane < LANES; lane++) {
+        const int pixel = (stride / 2 + row * stride) * width + stride / 2 + min(col + lane, cols - 1) * stride;
+        at[lane] = positions[pixel], facing[lane] = normals[pixel];
+    }
+    const Vectors position = from_lanes(at), normal = from_lanes(facing);
+    intn known;
+    Vectors left = neighbours(parts, sample, last, &known);
+    left.x = known ? left.x : 0.0f;
+    left.y = known ? left.y : 0.0f;
+    left.z = known ? left.z : 0.0f;
+    const DirectLights lights = DIRECT_OF_PARAMETERS;
+    floatn ahead[MOST_LIGHTS];
+    objects_ahead_of_all(lights, position, normal, 0, known, ahead);
+    const Brought sent = brought_by_discs(lights, position, normal, 0, left, ahead);
+    store_vectors(sent.without, 1.0f, sample, last, without);
+    store_vectors(sent.with, 1.0f, sample, last, with);
+}
+
+// ratio, shaded [count]: R' / R and R of the rest of the light (w = 1 valid); without, with: what its discs bring
+// -> whole, whole_shaded: R' / R and R of both together. least: see direct_mix.clh.
+kernel void mix_direct(const int count, const float4 least, global const float4 *ratio, global const float4 *shaded,
+                       global const float4 *without, global const float4 *with, global float4 *whole, global float4 *whole_shaded) {
+    const int i = get_global_id(0);
+    if (i >= count) return;
+    whole[i] = (float4)(mixed_ratio(ratio[i].xyz, shaded[i].xyz, without[i].xyz, with[i].xyz, least.xyz), ratio[i].w);
+    whole_shaded[i] = (float4)(fmax(shaded[i].xyz, least.xyz) + without[i].xyz, shaded[i].w);
+}
+
+// The other way: the ratio of the rest, from that of both.
+kernel void unmix_direct(const int count, const float4 least, global const float4 *whole, global const float4 *shaded,
+                         global const float4 *without, global const float4 *with, global float4 *ratio) {
+    const int i = get_global_id(0);
+    if (i >= count) return;
+    const float3 rest = fmax(shaded[i].xyz, least.xyz);
+    ratio[i] = (float4)((whole[i].xyz * (rest + without[i].xyz) - with[i].xyz) / rest, whole[i].w);
+}

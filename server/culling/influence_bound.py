@@ -1,0 +1,200 @@
+"""What virtual objects can change of real surface in view at most, without tracing. Kernels: influence_bound.cl.
+
+Each object is taken to be the ball around its box. A few samples come first: most often they say already that there is
+something to be seen, and the rest is not asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.objects.rasterize import Placed
+from server.opencl.engine import Engine, float4
+from server.shading.differential_rendering import ball_around
+from server.shading.traced_scene import DeviceLight, light_arguments
+from server.transfer.indirect import Indirect, no_hits
+from server.transfer.radiance_transfer import Directions, Transfer, sample_arguments
+from server.transfer.sampling import Upsampling
+from server.volume.raycast import Surface
+from server.volume.volume import Volume
+
+MOST_BALLS = 16
+"""Of more objects, one ball around all."""
+WIDER = 1.05
+"""Balls, than the box: rays meet an object as its distance grid has it, up to a cell (a sixtieth) off its surface."""
+EVERY = 4
+"""Of how many samples along an axis one comes first."""
+WINDOW = 16.0
+"""Samples that a pixel's mean is of, at most: the pixel of a sample has at least so large a part of its bound."""
+_CHUNK = 16  # pixels of a work-item, as in influence_bound.cl
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class InfluenceBound:
+    """Bounds that hold at every pixel of real surface; infinite where they were not looked for."""
+
+    change: float
+    """Of |R' / R - 1| (eq. 7.1) by what objects hide and send, less bounced light."""
+    sent: float
+    """Of the same by what objects send."""
+    bounced: float
+    """Of what bounced light changes, over what it bounces off changes."""
+
+
+NOWHERE = InfluenceBound(0.0, 0.0, 0.0)
+UNKNOWN = InfluenceBound(np.inf, np.inf, np.inf)
+
+
+@dataclass(frozen=True)
+class MostSent:
+    """The most radiance that leaves any surface, [3] each, in the picture's units."""
+
+    objects: Floats
+    real: Floats
+
+
+def bound_influence(
+    engine: Engine,
+    camera: CameraModel,
+    surface: Surface,
+    transfer: Transfer,
+    volume: Volume,
+    rays: Directions,
+    reach_m: float,
+    light: DeviceLight,
+    indirect: Indirect | None,
+    objects: Sequence[Placed],
+    most: MostSent,
+    seen_from: float,
+    upsampling: Upsampling = "bilateral",
+) -> InfluenceBound:
+    """Reach of `objects`, of which there is one at least. seen_from: changes of at least so much need no bound: what is
+    found to be more is given back as infinite. Waits for the device."""
+    balls = balls_around(objects)
+
+    def at_samples(every: int, those: NDArray[np.float32]) -> cl_array.Array:
+        return _bound_samples(
+            engine, camera, surface, transfer, volume, rays, reach_m, light, indirect, those, most, every
+        )
+
+    few = _greatest(engine, at_samples(EVERY, balls))
+    is_seen = few.change > WINDOW * seen_from
+    if is_seen and few.bounced > seen_from:
+        return UNKNOWN
+    if is_seen:  # what is left to know needs no directions
+        return replace(_greatest(engine, at_samples(1, balls[:0])), change=np.inf)
+    bounds = at_samples(1, balls)
+    found = _greatest(engine, bounds)
+    is_between = seen_from < found.change <= WINDOW * seen_from
+    if not (is_between or light.discs):
+        return found
+    change, sent, _, is_dimmed = _bound_pixels(
+        engine, camera, surface, transfer, volume, light, balls, bounds, is_between, upsampling
+    )
+    if is_between:
+        found = InfluenceBound(float(change), float(sent), found.bounced)
+    return replace(found, change=np.inf) if is_dimmed > 0 else found
+
+
+def balls_around(objects: Sequence[Placed]) -> NDArray[np.float32]:
+    """[n] float4: centre (volume space) and radius in metres of balls that hold what rays take the objects to be."""
+    groups = [[item] for item in objects] if len(objects) <= MOST_BALLS else [objects]
+    balls = np.array([ball_around(group).tolist() for group in groups], np.float32)
+    balls[:, 3] *= WIDER
+    return balls.view(cl_types.float4)[:, 0]
+
+
+def _greatest(engine: Engine, bounds: cl_array.Array) -> InfluenceBound:
+    most = engine.download(bounds).view(np.float32).reshape(-1, 4).max(axis=0, initial=0.0)
+    return InfluenceBound(*(float(value) for value in most[:3]))
+
+
+def _bound_samples(
+    engine: Engine,
+    camera: CameraModel,
+    surface: Surface,
+    transfer: Transfer,
+    volume: Volume,
+    rays: Directions,
+    reach_m: float,
+    light: DeviceLight,
+    indirect: Indirect | None,
+    balls: NDArray[np.float32],
+    most: MostSent,
+    every: int,
+) -> cl_array.Array:
+    """[rows, cols] float4, see influence_bound.cl."""
+    space = engine.workspace
+    cols, rows = -(-transfer.cols // every), -(-transfer.rows // every)
+    bounds = space.array(f"reach_bounds_{every}", (rows, cols), cl_types.float4)
+    engine.launch(
+        engine.kernel("influence_bound.cl", "bound_samples", **_defines(engine, light, transfer)),
+        (cols, rows),
+        *sample_arguments(engine, camera, surface, transfer),
+        transfer.coefficients,
+        indirect.hits if indirect else no_hits(engine, transfer),
+        light.coefficients,
+        *light_arguments(engine, light, volume, rays, reach_m),
+        len(balls),
+        space.upload("reach_balls", balls) if len(balls) else space.array("unused", (1,), cl_types.float4),
+        float4(*most.objects, 0.0),
+        float4(*most.real, 0.0),
+        every,
+        cols,
+        rows,
+        bounds,
+    )
+    return bounds
+
+
+def _bound_pixels(
+    engine: Engine,
+    camera: CameraModel,
+    surface: Surface,
+    transfer: Transfer,
+    volume: Volume,
+    light: DeviceLight,
+    balls: NDArray[np.float32],
+    bounds: cl_array.Array,
+    has_bounds: bool,
+    upsampling: Upsampling,
+) -> NDArray[np.float32]:
+    """[4] the greatest of all pixels, see influence_bound.cl."""
+    space, chunks = engine.workspace, -(-camera.width // _CHUNK)
+    table = np.array([(*disc.direction, disc.half_angle_rad) for disc in light.discs] or [(0, 0, 1, 0)], np.float32)
+    most = space.array("reach_most", (camera.height, chunks), cl_types.float4)
+    defines = _defines(engine, light, transfer) | ({"BICUBIC": 1} if upsampling == "bicubic" else {})
+    engine.launch(
+        engine.kernel("influence_bound.cl", "bound_pixels", **defines),
+        (chunks, camera.height),
+        camera.width,
+        camera.height,
+        surface.positions,
+        surface.normals,
+        transfer.cols,
+        transfer.rows,
+        transfer.stride,
+        has_bounds,
+        bounds,
+        volume.voxel_m,
+        len(light.discs),
+        space.upload("reach_discs", table.view(cl_types.float4)[:, 0]),
+        len(balls),
+        space.upload("reach_balls", balls),
+        most,
+    )
+    return np.asarray(engine.download(most).view(np.float32).reshape(-1, 4).max(axis=0, initial=0.0))
+
+
+def _defines(engine: Engine, light: DeviceLight, transfer: Transfer) -> dict[str, int]:
+    words = transfer.free_mask.shape[2]
+    return {"BANDS": light.bands, "MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": transfer.interleave}

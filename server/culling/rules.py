@@ -1,0 +1,198 @@
+"""When a scene does not call for an effect, and what leaving it out changes at most.
+
+Bounds are in display units, codes of 1/255 before rounding. Two inequalities turn radiance into them; f is sRGB's
+encoding times 255, which is concave with f(0) = 0:
+
+- of a radiance that changes by no more than d: |f(x + d) - f(x)| <= f(d);
+- of one that is multiplied by 1 + b or 1 - b, and is at most 1, the brightest that is shown:
+  |f(x (1 +- b)) - f(x)| <= f(1) - f(1 - b). Where f is 269 x^(1/2.4) - 14 the difference grows with x; where it is
+  straight, too; and by concavity it is greater downwards than upwards.
+
+A picture's pixel that an object covers in part mixes the two surfaces; what it changes by lies between theirs.
+"""
+
+from __future__ import annotations
+
+import math
+
+from server.culling.reason import ALLOWANCE, CullReason
+from server.culling.scene_facts import SceneFacts
+from server.shading.adaptive import LEAST_CHANGE
+
+SHOWN = 255.0
+"""The most that any pixel can change by: what was asked for is left out whatever it changes."""
+
+
+def codes(radiance: float) -> float:
+    """f: display units of linear radiance, not rounded; 255 from 1 on."""
+    x = min(max(radiance, 0.0), 1.0)
+    return float(SHOWN * (12.92 * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055))
+
+
+def codes_of_share(share: float) -> float:
+    """f(1) - f(1 - b)."""
+    if share <= 0.0:
+        return 0.0
+    return SHOWN - codes(1.0 - share) if share < 1.0 else SHOWN
+
+
+ELSEWHERE = 0.5
+"""Display units that a pixel may change by where virtual things are taken not to change it."""
+
+
+ELSEWHERE_BOUNCED = 0.25
+"""Share of that which may be of light that bounces off real surface."""
+
+
+def share_of_codes(bound: float) -> float:
+    """The greatest share whose codes_of_share is no more than `bound` (0 to 255, where f is not straight)."""
+    return float(1.0 - ((1.0 - bound / SHOWN + 0.055) / 1.055) ** 2.4)
+
+
+# ---- what cannot run, or was asked not to -------------------------------------------------------------------------
+
+
+def no_object(facts: SceneFacts) -> CullReason | None:
+    """Nothing there to run on."""
+    return None if facts.objects else CullReason("there is no virtual object", 0.0)
+
+
+def no_light(facts: SceneFacts) -> CullReason | None:
+    """Nothing is known to shade with."""
+    return None if facts.has_light else CullReason("no light has been found yet", SHOWN)
+
+
+def no_indirect(facts: SceneFacts) -> CullReason | None:
+    """A wish."""
+    return None if facts.indirect else CullReason("asked for: no indirect light", SHOWN)
+
+
+def traced(facts: SceneFacts) -> CullReason | None:
+    """Rays and depth pictures are two ways to one thing; a preset has one of them."""
+    return None if facts.image_space else CullReason("the preset traces rays through the volume", 0.0)
+
+
+def soft(facts: SceneFacts) -> CullReason | None:
+    """The whole light is in what rays bring: there is nothing that a shadow map could be of."""
+    return None if facts.sharp_lights else CullReason("the light is soft", 0.0)
+
+
+def not_matched(facts: SceneFacts) -> CullReason | None:
+    """A wish, or nothing to match."""
+    if facts.averages is None:
+        return CullReason("asked for: virtual things keep the light's own scale", SHOWN)
+    if not facts.averages.are_known:
+        return CullReason("the picture or its shading is empty or black: the light's own scale holds", SHOWN)
+    return None
+
+
+def hard_edges(facts: SceneFacts) -> CullReason | None:
+    """A wish."""
+    return None if facts.smooth_edges else CullReason("asked for: hard edges", SHOWN)
+
+
+def not_refined(facts: SceneFacts) -> CullReason | None:
+    """A preset's."""
+    return None if facts.adaptive else CullReason("asked for: the preset does not refine", SHOWN)
+
+
+# ---- what would hardly be seen ------------------------------------------------------------------------------------
+
+
+def out_of_view(facts: SceneFacts) -> CullReason | None:
+    """The box of pixels that holds all of an object that is in view is empty: no pixel shows any of it."""
+    if facts.objects_in_view:
+        return None
+    return no_object(facts) or CullReason("no virtual object is in view", 0.0)
+
+
+def unlit(facts: SceneFacts) -> CullReason | None:
+    """Virtual surface of no more than the base colour 1 sends no more than what shading it can have (times the gain);
+    without any shading it sends nothing: f(gain max(shading, arriving)); shading takes in what surfaces send."""
+    lit = max(facts.brightness.shading, facts.brightness.arriving)
+    return _if_bounded("hardly any light reaches virtual things", codes(facts.gain * lit))
+
+
+def matt(facts: SceneFacts) -> CullReason | None:
+    """Where nothing is glossy reflect.cl gives 0 and leaves the diffuse light as it is. Else a share s of what arrives
+    comes besides and as much of the diffuse light is kept: both are at least 0, so the change is no more than the
+    greater: f(gain s max(arriving, sent, shading))."""
+    if not facts.glossy:
+        return CullReason("no virtual object in view is glossy", 0.0)
+    arriving = max(facts.brightness.arriving, facts.brightness.shading, facts.brightness.object_sent)
+    if arriving == math.inf:
+        return None
+    return _if_bounded("what virtual things reflect is hardly seen", codes(facts.gain * facts.reflected * arriving))
+
+
+def out_of_reach(facts: SceneFacts) -> CullReason | None:
+    """Real surface: R'/R differs from 1 by b at most, and with bounced light by b (1 + k): see influence_bound.cl. The
+    picture there is multiplied by it. Virtual surface gets light off real surface that is multiplied by the same; all
+    that it gets is not below 0, so it changes by the same share, and by no more than gain b times what real surface
+    sends."""
+    if not facts.objects:
+        return no_object(facts)
+    if math.isinf(facts.reach.change):
+        return None
+    share = facts.reach.change * (1.0 + (facts.reach.bounced if facts.indirect else 0.0))
+    return _if_bounded("virtual things hardly change the light of real surface in view", _codes_of_ratio(facts, share))
+
+
+def hardly_changed(_facts: SceneFacts) -> CullReason:
+    """A pixel of real surface is multiplied by R'/R; where it is no farther from 1 than `spared` lets it
+    (change_mask.cl), it is left as it is. Samples where bounced light can change R'/R by no more than `spared_bounces`
+    (bounce_real) are without: what virtual surface gets off them changes by as much. Both together are ELSEWHERE of the
+    brightest."""
+    return CullReason("virtual things hardly change the rest of the picture", ELSEWHERE)
+
+
+def spared() -> float:
+    """Of R'/R of a pixel."""
+    return (1.0 - ELSEWHERE_BOUNCED) * share_of_codes(ELSEWHERE)
+
+
+def spared_bounces() -> float:
+    """Of R'/R of a sample."""
+    return ELSEWHERE_BOUNCED * share_of_codes(ELSEWHERE)
+
+
+def dark_things(facts: SceneFacts) -> CullReason | None:
+    """What objects send: on real surface a share of R, as above; virtual surface gets no more than gain times it."""
+    if math.isinf(facts.reach.sent) and facts.brightness.object_sent > 0:
+        return None
+    share = facts.reach.sent * (1.0 + facts.reach.bounced) if facts.brightness.object_sent > 0 else 0.0
+    on_virtual = codes(facts.gain * facts.brightness.object_sent) if facts.objects_in_view else 0.0
+    bound = max(_codes_of_ratio(facts, share), on_virtual)
+    return _if_bounded("what virtual things send is hardly seen", bound, ALLOWANCE - ELSEWHERE)
+
+
+def nothing_bounces(facts: SceneFacts) -> CullReason | None:
+    """Bounced light changes R'/R by k times what it bounces off changes: by b at most, or, as no more than all light
+    can be hidden, by 1 and what objects send: k min(b, 1 + b of that)."""
+    reach = facts.reach
+    if math.isinf(reach.bounced):
+        return None
+    change = min(reach.change, 1.0 + reach.sent)
+    share = reach.bounced * change if reach.bounced > 0 else 0.0
+    bound = _codes_of_ratio(facts, share)
+    return _if_bounded("light that bounces off real surface hardly changes", bound, ALLOWANCE - ELSEWHERE)
+
+
+def no_rims(facts: SceneFacts) -> CullReason | None:
+    """Means of ratios within b (1 + k) of 1 differ by no more than twice that: none is refined (adaptive.py)."""
+    share = facts.reach.change * (1.0 + facts.reach.bounced) if facts.reach.change < math.inf else math.inf
+    return CullReason("no shadow has a rim", 0.0) if 2.0 * share < LEAST_CHANGE else None
+
+
+def _codes_of_ratio(facts: SceneFacts, share: float) -> float:
+    """Of real surface, and of virtual surface that it lights, whose light changes by `share` of itself."""
+    if share == 0.0:
+        return 0.0
+    on_real = codes(min(share * facts.brightness.picture, 1.0))
+    on_virtual = codes(min(facts.gain * share * facts.brightness.real_sent, 1.0)) if facts.objects_in_view else 0.0
+    return min(codes_of_share(share), max(on_real, on_virtual))
+
+
+def _if_bounded(reason: str, bound: float, at_most: float = ALLOWANCE) -> CullReason | None:
+    """What is more than may change at all is no reason; ALLOWANCE - ELSEWHERE leaves hardly_changed its part."""
+    return CullReason(reason, bound) if bound <= at_most else None

@@ -1,0 +1,165 @@
+"""The geometry half of the spine (thesis ch. 4): one RGB-D frame folded into the volume, and the surface it shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pyopencl.array as cl_array
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel, RgbdFrame
+from protocol.messages import Tracking, Wishes
+from server.geometry.merge import merge_depth
+from server.input.measure import GREATEST_DEPTH_M, Measurement, measure
+from server.opencl.engine import Engine
+from server.tracking.alignment import Alignment, Markers
+from server.tracking.camera_tracking import CameraTracking, PoseEstimate
+from server.tracking.exposure import ExposureTracking, scene_radiance
+from server.tracking.reconstruction import Reconstruction
+from server.volume.integrate import integrate
+from server.volume.raycast import Surface, raycast
+from server.volume.volume import Volume
+
+
+@dataclass(frozen=True)
+class GeometryFrame:
+    """What one frame gave; arrays are the session's and hold until its next frame."""
+
+    measurement: Measurement
+    exposure: float
+    """Of the picture relative to the session's first."""
+    scene_radiance: cl_array.Array
+    """`measurement.radiance` in the units of the first picture: that over `exposure`."""
+    model: Surface
+    """The volume alone, as the camera sees it."""
+    surface: Surface
+    """The hybrid geometry buffer: the volume, and what changed too fast for it."""
+    world_from_camera: NDArray[np.float64]
+    volume_from_camera: NDArray[np.float64]
+    tracking: Tracking
+    """Where it is lost, the pose and the surfaces are the last good frame's."""
+    notes: tuple[str, ...]
+    """What was wrong with this frame, one line each."""
+    is_held: bool = False
+    """Whether pose and surfaces are those of the frame before, since nothing has changed."""
+
+
+class Geometry:
+    """One camera's way into its volume. Owned by one thread."""
+
+    def __init__(
+        self,
+        engine: Engine,
+        camera: CameraModel,
+        wishes: Wishes,
+        reconstruction: Reconstruction | None = None,
+        alignment: Alignment | None = None,
+    ) -> None:
+        """`reconstruction`: what others scan too; None: one of its own. `alignment`: with theirs."""
+        self._engine = engine
+        self._camera = camera
+        self._wishes = wishes
+        self._reconstruction = reconstruction or Reconstruction(engine)
+        self._alignment = alignment or Alignment(engine, camera, self._reconstruction, Markers())
+        self._tracking = CameraTracking(engine, camera, wishes.poses, self._reconstruction)
+        self._exposure = ExposureTracking(engine, camera, "constant" if wishes.as_thesis else wishes.exposure)
+        self._last: GeometryFrame | None = None
+
+    @property
+    def volume(self) -> Volume | None:
+        """None before the first frame."""
+        return self._reconstruction.volume
+
+    def update(self, frame: RgbdFrame, holds: Callable[[RgbdFrame], bool] = lambda _frame: False) -> GeometryFrame:
+        """Measure, locate, fuse, predict, merge. Raises ValueError, one line, for a frame that is refused.
+
+        holds: whether a frame's geometry is that of the frame before; asked of every frame.
+        """
+        engine, camera, stage = self._engine, self._camera, self._engine.profile.stage
+        self._check_size(frame)
+        guess = self._tracking.first_guess(self._alignment.in_room(frame))
+        volume = self._reconstruction.volume_for(self._wishes, camera, frame, guess)
+
+        with stage("input"):  # 5.1.1
+            measurement = measure(engine, camera, frame)
+            not_aligned = self._alignment.settle(frame, measurement)
+            frame = self._alignment.in_room(frame)
+            is_held = holds(frame)
+        if is_held and self._last is not None:
+            with stage("reconstruct"):
+                return self._held(self._last, frame, measurement, volume)
+        with stage("reconstruct"):  # 4.2.1
+            if not_aligned is None:
+                located = self._tracking.locate(frame, measurement, volume)
+            else:
+                located = PoseEstimate(self._tracking.first_guess(frame), "lost", (not_aligned,))
+            volume_from_camera = volume.volume_from_world() @ located.world_from_camera
+            place = volume_from_camera if located.fuse else None
+            exposure, doubts = self._exposure.update(frame, measurement, volume, place)  # B3
+            scene = scene_radiance(engine, measurement.radiance, exposure)
+            notes = (*located.notes, *doubts, *self._notes(frame, volume))
+            if self._last is not None and not located.fuse:
+                lost = replace(self._last, measurement=measurement, exposure=exposure, scene_radiance=scene)
+                return replace(lost, tracking=located.tracking, notes=notes)
+            if located.fuse and frame.has_depth:
+                self._fuse(volume, volume_from_camera, Measurement(scene, measurement.depth_m), exposure)
+        with stage("surface"):  # 4.2.1
+            model = raycast(engine, camera, volume_from_camera, volume)
+            if located.fuse:
+                self._tracking.remember(frame, located, model, volume_from_camera)
+        with stage("dynamic_geometry"):  # 4.2.2
+            smooth = self._wishes.smooth_depth
+            surface = merge_depth(engine, camera, volume_from_camera, measurement, model, volume, smooth)
+        result = GeometryFrame(
+            measurement=measurement,
+            exposure=exposure,
+            scene_radiance=scene,
+            model=model,
+            surface=surface,
+            world_from_camera=located.world_from_camera,
+            volume_from_camera=volume_from_camera,
+            tracking=located.tracking,
+            notes=notes,
+        )
+        self._last = result if located.fuse else None
+        return result
+
+    def _held(self, last: GeometryFrame, frame: RgbdFrame, measurement: Measurement, volume: Volume) -> GeometryFrame:
+        """Only fused: when something happens, the volume is to be what it would have become."""
+        scene = scene_radiance(self._engine, measurement.radiance, last.exposure)
+        self._fuse(volume, last.volume_from_camera, Measurement(scene, measurement.depth_m), last.exposure)
+        notes = self._notes(frame, volume)
+        return replace(last, measurement=measurement, scene_radiance=scene, notes=notes, is_held=True)
+
+    def _fuse(
+        self, volume: Volume, volume_from_camera: NDArray[np.float64], measured: Measurement, exposure: float
+    ) -> None:
+        volume.allocate(self._camera, volume_from_camera, measured.depth_m)
+        integrate(self._engine, volume, self._camera, volume_from_camera, measured)
+        self._reconstruction.count_exposure(exposure)
+
+    def _check_size(self, frame: RgbdFrame) -> None:
+        color, depth = self._camera, self._camera.depth_lens
+        if frame.color.shape != (color.height, color.width, 3) or frame.depth.shape != (depth.height, depth.width):
+            raise ValueError(
+                f"colour is {frame.color.shape[1]}x{frame.color.shape[0]}, depth {frame.depth.shape[1]}x"
+                f"{frame.depth.shape[0]}; the camera has {color.width}x{color.height} and {depth.width}x{depth.height}"
+            )
+
+    def _notes(self, frame: RgbdFrame, volume: Volume) -> tuple[str, ...]:
+        notes = []
+        if frame.has_depth and not any(
+            self._is_usable(depth).any() for depth in (frame.depth[::16, ::16], frame.depth)
+        ):  # mostly a few do
+            notes.append("the depth picture has no usable value: is the sensor covered?")
+        if volume.is_full:
+            notes.append("the volume's memory is full, new surface is not fused: give a larger --voxel")
+        return tuple(notes)
+
+    def _is_usable(self, depth: NDArray[np.uint16]) -> NDArray[np.bool_]:
+        usable: NDArray[np.bool_] = (
+            (depth > 0) & (depth != 65535) & (depth * self._camera.depth_scale_m <= GREATEST_DEPTH_M)
+        )
+        return usable

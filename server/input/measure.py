@@ -1,0 +1,96 @@
+"""Measure the input (thesis 5.1.1): undistort colour and depth, remove the gamma, bring depth to the colour picture.
+
+Kernels: measure.cl, and register.cl where depth has a lens of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel, ColorEncoding, DepthCamera, RgbdFrame
+from server.input.register import register_depth
+from server.opencl.engine import Engine, float4
+
+GREATEST_DEPTH_M = 10.0
+"""Beyond it no depth camera for rooms measures anything; larger values are taken as no measurement."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """The rectified input on the device."""
+
+    radiance: cl_array.Array
+    """[h, w] float4: linear RGB, w = 1 usable, 0 black or clipped, -1 outside the picture."""
+    depth_m: cl_array.Array
+    """[h, w] float32 metres along the optical axis, 0 = none."""
+
+
+@cache
+def linear_values(encoding: ColorEncoding) -> NDArray[np.float32]:
+    """Linear radiance in [0, 1] of every code value: 256 of sRGB (IEC 61966-2-1) or 65536 of linear16."""
+    if encoding == "linear16":
+        return (np.arange(65536) / 65535).astype(np.float32)
+    code = np.arange(256) / 255
+    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def intrinsics(lens: CameraModel | DepthCamera) -> np.generic:
+    """(fx, fy, cx, cy) as a kernel argument."""
+    return float4(lens.fx, lens.fy, lens.cx, lens.cy)
+
+
+def measure(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> Measurement:
+    """Upload `frame` and rectify it. Its pictures must have the sizes of the camera's lenses."""
+    radiance = _measure_color(engine, camera, frame)
+    units = engine.workspace.upload("depth_units", frame.depth)
+    if camera.depth is None:
+        depth_m = _measure_depth(engine, camera, units)
+    else:
+        depth_m = register_depth(engine, camera, units, GREATEST_DEPTH_M)
+    return Measurement(radiance, depth_m)
+
+
+def _measure_color(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> cl_array.Array:
+    space = engine.workspace
+    radiance = space.array("radiance", (camera.height, camera.width), cl_types.float4)
+    is_linear = camera.color_encoding == "linear16"
+    engine.launch(
+        engine.kernel("measure.cl", "measure_color", LINEAR16=is_linear, DISTORTED=camera.is_distorted),
+        (camera.width, camera.height),
+        camera.width,
+        camera.height,
+        space.upload("color_codes", frame.color),
+        space.constant("linear_values", linear_values(camera.color_encoding)),
+        intrinsics(camera),
+        _distortion(camera),
+        radiance,
+    )
+    return radiance
+
+
+def _measure_depth(engine: Engine, camera: CameraModel, units: cl_array.Array) -> cl_array.Array:
+    depth_m = engine.workspace.array("depth_m", (camera.height, camera.width), np.float32)
+    engine.launch(
+        engine.kernel("measure.cl", "measure_depth", DISTORTED=camera.is_distorted),
+        (camera.width, camera.height),
+        camera.width,
+        camera.height,
+        units,
+        intrinsics(camera),
+        _distortion(camera),
+        camera.depth_scale_m,
+        GREATEST_DEPTH_M,
+        depth_m,
+    )
+    return depth_m
+
+
+def _distortion(camera: CameraModel) -> np.generic:
+    vector: np.generic = cl_types.make_float8(*camera.distortion, 0, 0, 0)  # type: ignore[attr-defined]
+    return vector

@@ -1,0 +1,175 @@
+"""The light of the room from one frame to the next: the estimator that a session's wishes call for.
+
+Where all surfaces are of one albedo and indirect light is left out, spherical harmonics are solved for directly, in a
+few milliseconds; else light, albedos and the room beyond the pictures are found together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cl_array
+
+from protocol.frames import CameraModel
+from server.geometry.geometry import GeometryFrame
+from server.light.continuation import LEAST_GAIN_KNOWN, NO_PLANES, Continuation, PlaneArrays
+from server.light.light_estimation import (
+    LEAST_OPENNESS,
+    Evidence,
+    LightEstimate,
+    LightEstimator,
+    gather_samples,
+    sum_tiles,
+)
+from server.light.light_model import LightModel
+from server.light.lobe_estimator import KnownLight, LobeEstimator
+from server.maths.light_change import Shot
+from server.maths.lobes import cell_directions
+from server.maths.sh import LUMINANCE, sh_basis
+from server.opencl.engine import Engine
+from server.quality.settings import Settings
+from server.transfer.indirect import Indirect, no_hits
+from server.transfer.radiance_transfer import Directions, Transfer
+from server.volume.volume import Volume
+
+AS_SURE = 1.1
+"""New frames tell the light as well as those before a restart did, if they leave at most so many times the doubt."""
+
+
+@dataclass(frozen=True)
+class KnownRoomLight:
+    """What is known of a room's light, to go on with later."""
+
+    given: LightEstimate | None
+    evidence: Evidence | None
+    lobes: KnownLight
+    remembered: LightEstimate | None
+    """What was told last, where frames do not say it any more when it is taken up again."""
+
+
+class RoomLight:
+    """One room's light, by the frames of all its cameras."""
+
+    def __init__(self, engine: Engine, settings: Settings) -> None:
+        self._engine = engine
+        self._settings = settings
+        self._model = _model_of(settings)
+        is_plain = not self._model.albedos and settings.indirect == "none" and self._model.normals == "none"
+        plain = LightEstimator(settings.bands, as_thesis=settings.as_thesis, memory=self._model.memory)
+        self._harmonics = plain if is_plain or settings.as_thesis else None
+        self._least_openness = LEAST_OPENNESS if "openness" in settings.robustness else 0.0
+        self._lobes = LobeEstimator(engine, settings.bands, self._model, Continuation())
+        self._given: LightEstimate | None = None
+        self._remembered: LightEstimate | None = None
+        """Of earlier frames that are not there any more: it holds until new ones say better."""
+
+    @property
+    def is_given(self) -> bool:
+        """Whether the light is known beforehand."""
+        return self._given is not None
+
+    @property
+    def reads_pictures(self) -> bool:
+        """Whether `update` learns anything: of a light that is given, harmonics have nothing to learn."""
+        return not (self._harmonics and self._given)
+
+    def give(self, light: LightEstimate) -> None:
+        """Take this light (S2); what is then found is what of the room hides it."""
+        light = self._colored(light)
+        radiances = sh_basis(cell_directions(), round(len(light.sh) ** 0.5)) @ (light.sh @ LUMINANCE)
+        self._given = light
+        around = Continuation(LEAST_GAIN_KNOWN)
+        self._lobes = LobeEstimator(self._engine, self._settings.bands, self._model, around, np.maximum(radiances, 0.0))
+
+    def estimate(self) -> LightEstimate:
+        """The light as it stands."""
+        if self._given:
+            return self._given
+        if self._harmonics:
+            return self._colored(self._harmonics.estimate())
+        return self._colored(self._remembered or self._lobes.estimate())
+
+    def known(self) -> KnownRoomLight:
+        """All but the frames that it is estimated from."""
+        evidence = self._harmonics.evidence() if self._harmonics else None
+        estimate = self._remembered or self._lobes.estimate()
+        told = estimate if estimate.std is not None else None
+        return KnownRoomLight(self._given, evidence, self._lobes.known(), told)
+
+    def resume(self, known: KnownRoomLight) -> None:
+        """Go on with what was known of this room, by the same settings. The first frames are too few to judge by."""
+        if known.given:
+            self.give(known.given)
+        if self._harmonics and known.evidence:
+            self._harmonics.resume(known.evidence)
+        self._lobes.resume(known.lobes)
+        self._remembered = known.remembered
+
+    def _colored(self, estimate: LightEstimate) -> LightEstimate:
+        return estimate.whitened() if self._settings.light_color == "white" else estimate
+
+    @property
+    def planes(self) -> PlaneArrays:
+        """Surfaces taken to go on beyond what was seen of them: they hide light from virtual things too."""
+        continuation = self._lobes.continuation
+        return continuation.arrays() if continuation and not self._harmonics else NO_PLANES
+
+    def update(
+        self,
+        camera: CameraModel,
+        radiance: cl_array.Array,
+        depth_m: cl_array.Array,
+        geometry: GeometryFrame,
+        volume: Volume,
+        transfer: Transfer,
+        rays: Directions,
+        indirect: Indirect | None,
+    ) -> LightEstimate:
+        """The light with one more frame. radiance: [h, w] float4, depth_m [h, w], as in Measurement.
+
+        indirect: what surfaces send, None to leave it out.
+        """
+        engine, surface = self._engine, geometry.surface
+        if self._harmonics and self._given:
+            return self._given
+        if self._harmonics:
+            tiles = sum_tiles(engine, camera, radiance, surface, transfer, volume.voxel_m, self._least_openness)
+            with engine.profile.host():
+                return self._colored(self._harmonics.update(tiles))
+        steady, before = self._lobes.steady, self._lobes.estimate()
+        observed = gather_samples(engine, camera, radiance, surface, transfer, self._least_openness)
+        estimate = self._lobes.update(
+            surface,
+            camera,
+            transfer,
+            rays,
+            observed,
+            indirect or Indirect(no_hits(engine, transfer), np.zeros(3)),
+            volume.voxel_m,
+            Shot(geometry.volume_from_camera, geometry.exposure),
+            depth_m,
+        )
+        if self._remembered and estimate is not before:
+            has_changed = self._lobes.steady < steady
+            if has_changed or _doubt(estimate) <= AS_SURE * _doubt(self._remembered):
+                self._remembered = None
+        return self._given or self._colored(self._remembered or estimate)
+
+
+def _doubt(estimate: LightEstimate) -> float:
+    """Of the light's direction: one standard deviation, over the even light."""
+    if estimate.std is None:
+        return float("inf")
+    return float(np.linalg.norm(estimate.std[1:4] @ LUMINANCE) / max(float(estimate.sh[0] @ LUMINANCE), 1e-12))
+
+
+def _model_of(settings: Settings) -> LightModel:
+    """What of the estimator is on (P3 and B2)."""
+    asked = settings.robustness
+    return LightModel(
+        albedos=settings.albedo == "estimated",
+        normals="printed" if "normals_printed" in asked else "even" if "normals" in asked else "none",
+        memory="memory" in asked,
+        outliers="outliers" in asked,
+    )

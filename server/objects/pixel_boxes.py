@@ -1,0 +1,61 @@
+"""Which pixels of a picture a box in space can cover."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.objects.pinhole import Pinhole
+
+NEAR_M = 0.05
+"""Nothing nearer to the camera's plane is drawn."""
+
+Floats = NDArray[np.float64]
+PixelBox = tuple[int, int, int, int]
+
+_CORNERS = np.array(list(product((0.0, 1.0), repeat=3)))
+_EDGES = np.array([(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
+"""Pairs of corners that differ in one axis."""
+
+
+def pixel_boxes(
+    camera: CameraModel | Pinhole, camera_from_model: Floats, low: Floats, high: Floats
+) -> tuple[PixelBox | None, ...]:
+    """Box of pixels that holds everything of each model box `low` to `high` that is in view; None if nothing is.
+
+    Matrices [n, 4, 4], corners [n, 3]. x0, y0, x1, y1, half-open, inside the picture.
+    """
+    if not len(low):
+        return ()
+    corners = low[:, None] + _CORNERS * (high - low)[:, None]
+    corners = corners @ camera_from_model[:, :3, :3].transpose(0, 2, 1) + camera_from_model[:, None, :3, 3]
+    points, in_front = _in_front(corners)
+    depth = np.where(in_front, points[..., 2], 1.0)
+    u, v = (points[..., k] / depth * f + c for k, f, c in ((0, camera.fx, camera.cx), (1, camera.fy, camera.cy)))
+    x0, x1 = _span(u, in_front, camera.width)
+    y0, y1 = _span(v, in_front, camera.height)
+    seen = (x0 < x1) & (y0 < y1)
+    rows = np.stack([x0, y0, x1, y1], axis=1).tolist()
+    return tuple((a, b, c, d) if good else None for (a, b, c, d), good in zip(rows, seen.tolist(), strict=True))
+
+
+def _span(places: Floats, valid: NDArray[np.bool_], size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First and last + 1 pixel of the valid `places` [n, m], cut to 0 to `size`; empty where none is valid."""
+    low = np.where(valid, places, np.inf).min(axis=1)
+    high = np.where(valid, places, -np.inf).max(axis=1)
+    first = np.clip(np.floor(low), 0, size).astype(np.int64)
+    return first, np.clip(np.ceil(high) + 1, 0, size).astype(np.int64)
+
+
+def _in_front(corners: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Corners of boxes [n, 8, 3] and where their edges pass the near plane [n, 20, 3], and which of them count."""
+    beyond = corners[..., 2] >= NEAR_M
+    start, end = _EDGES.T
+    crossing = beyond[:, start] != beyond[:, end]
+    a, b = corners[:, start], corners[:, end]
+    rise = np.where(crossing, b[..., 2] - a[..., 2], 1.0)
+    cuts = a + ((NEAR_M - a[..., 2]) / rise)[..., None] * (b - a)
+    return np.concatenate([corners, cuts], axis=1), np.concatenate([beyond, crossing], axis=1)

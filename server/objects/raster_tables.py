@@ -1,0 +1,120 @@
+"""The objects of a picture as the tables that rasterize.cl reads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.objects.arena import Arena, gather
+from server.objects.dirty_region import box_around
+from server.objects.pinhole import Pinhole
+from server.objects.pixel_boxes import PixelBox
+from server.objects.virtual_object import VirtualObject
+from server.opencl.engine import Engine, int2
+
+TILE = 8
+CHUNK = 128
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The objects as one camera sees them: the tables of rasterize.cl."""
+
+    camera: CameraModel | Pinhole
+    arena: Arena
+    objects: cl_array.Array
+    matrices: cl_array.Array
+    vertex_chunks: cl_array.Array
+    triangle_chunks: cl_array.Array
+    count: int
+    vertices: int
+    triangles: int
+    region: PixelBox
+    """Tiles that the objects can cover: x0, y0, x1, y1, half-open; EMPTY where there are none."""
+
+    @property
+    def all_tiles(self) -> PixelBox:
+        """As `region`, of the whole picture."""
+        return 0, 0, -(-self.camera.width // TILE), -(-self.camera.height // TILE)
+
+    @property
+    def size(self) -> np.generic:
+        """Width and height."""
+        return int2(self.camera.width, self.camera.height)
+
+    @property
+    def tiles(self) -> int:
+        """Tiles that cover the picture."""
+        return -(-self.camera.width // TILE) * -(-self.camera.height // TILE)
+
+
+def tabulate(
+    engine: Engine,
+    camera: CameraModel | Pinhole,
+    camera_from_volume: Matrix,
+    objects: Sequence[tuple[VirtualObject, Matrix]],
+    boxes: tuple[PixelBox | None, ...],
+    name: str,
+) -> Picture:
+    """The tables of `objects`, each with its `volume_from_model`; those without a box are not drawn. name: of the
+    workspace's arrays."""
+    things = [thing for thing, _ in objects]
+    volume_from_model = np.array([matrix for _, matrix in objects], np.float64).reshape(-1, 4, 4)
+    arena, space = gather(engine, things), engine.workspace
+    slot = {id(thing): k for k, thing in enumerate(arena.things)}
+    rows = np.zeros((max(len(things), 1), 8), np.int32)
+    in_view = np.array([box is not None for box in boxes], bool)
+    sizes = np.array([(len(t.vertices), len(t.triangles)) for t in things], np.int64).reshape(-1, 2) * in_view[:, None]
+    before = np.cumsum(sizes, axis=0) - sizes
+    if things:
+        rows[:, :3] = arena.firsts[[slot[id(thing)] for thing in things]]
+        rows[:, 3:5], rows[:, 5], rows[:, 6] = sizes, before[:, 1], before[:, 0]
+    return Picture(
+        camera,
+        arena,
+        space.upload(f"{name}_objects", rows.view(cl_types.int8)[:, 0]),
+        space.upload(f"{name}_matrices", _matrices(camera, camera_from_volume, volume_from_model)),
+        space.upload(f"{name}_vertex_chunks", _chunks(sizes[:, 0])),
+        space.upload(f"{name}_triangle_chunks", _chunks(sizes[:, 1])),
+        len(things),
+        int(sizes[:, 0].sum()),
+        int(sizes[:, 1].sum()),
+        _tiles_of(box_around(boxes)),
+    )
+
+
+def _tiles_of(box: PixelBox) -> PixelBox:
+    return box[0] // TILE, box[1] // TILE, -(-box[2] // TILE), -(-box[3] // TILE)
+
+
+def _matrices(
+    camera: CameraModel | Pinhole, camera_from_volume: Matrix, volume_from_model: Matrix
+) -> NDArray[np.float32]:
+    """[3 n] float16: for each object pixel_from_model, model_from_pixel (see rasterize.cl) and volume_from_model."""
+    pixel_from_camera = np.eye(4)
+    pixel_from_camera[:2, :3] = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy]]
+    camera_from_pixel = np.linalg.inv(pixel_from_camera)
+    camera_from_pixel[:3, 3] = 0.0
+    camera_from_model = camera_from_volume @ volume_from_model
+    model_from_pixel = np.linalg.inv(camera_from_model) @ camera_from_pixel
+    model_from_pixel[:, 3] = camera_from_model[:, 2]  # not part of the ray: it takes a model point to its depth
+    matrices = np.stack([pixel_from_camera @ camera_from_model, model_from_pixel, volume_from_model], axis=1)
+    rows = matrices.reshape(-1, 16).astype(np.float32)
+    return (rows if len(rows) else np.zeros((1, 16), np.float32)).view(cl_types.float16)[:, 0]
+
+
+def _chunks(sizes: NDArray[np.int64]) -> NDArray[np.int32]:
+    """[n] int2: object and first item of each work-group that goes over `sizes` items of the objects."""
+    groups = -(-sizes // CHUNK)
+    index = np.repeat(np.arange(len(sizes)), groups)
+    first = (np.arange(len(index)) - np.repeat(np.cumsum(groups) - groups, groups)) * CHUNK
+    rows = np.stack([index, first], axis=1).astype(np.int32)
+    return (rows if len(rows) else np.array([[0, 0]], np.int32)).view(cl_types.int2)[:, 0]

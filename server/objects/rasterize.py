@@ -1,0 +1,302 @@
+"""Virtual geometry buffer (thesis 7.2, fig. 7.5): meshes drawn as position, normal, base colour and material.
+
+Kernels: rasterize.cl. A pixel belongs to the nearest triangle that covers its centre; where two are equally near, to
+the one with the lower number (objects in their order, triangles in the mesh's). The result does not depend on how work
+is scheduled. All objects are drawn together: the number of launches does not depend on theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.objects.dirty_region import dirty_region, is_empty
+from server.objects.pinhole import Pinhole, finer
+from server.objects.pixel_boxes import NEAR_M, PixelBox, pixel_boxes
+from server.objects.raster_tables import CHUNK, TILE, Picture, tabulate
+from server.objects.virtual_object import VirtualObject
+from server.opencl.engine import Engine, int2, int4
+
+__all__ = [
+    "NEAR_M",
+    "SUBPIXELS",
+    "PixelBox",
+    "Placed",
+    "VirtualSurface",
+    "boxes_in_view",
+    "nearest_depths",
+    "rasterize",
+]
+
+SUBPIXELS = 2
+"""Parts of a pixel along either side, for how much of it objects cover."""
+_SCAN_ITEMS = 256
+_LEAST_ENTRIES = 1 << 16
+_LEAST_ROOM = 1 << 10
+_PIECES_PER_PIXEL = 4
+"""Room for so many at first, if there are triangles for them; made larger when they need it."""
+_FRAGMENTS_PER_PIXEL = 2
+"""Room for so many; where there are more, their triangles are gone through a second time."""
+_FRAGMENTS_PER_TRIANGLE = 40
+"""More than a triangle in a square of 8 pixels covers."""
+_MOST_ENTRIES = 1 << 27
+"""Of all tiles together: 512 MiB."""
+
+Matrix = NDArray[np.float64]
+Placed = tuple[VirtualObject, Matrix]
+
+
+@dataclass(frozen=True)
+class VirtualSurface:
+    """What the virtual objects show to one camera; arrays of the workspace, valid until the next call of that name."""
+
+    position: cl_array.Array
+    """[h, w] float4: volume space metres (world axes, origin at the volume's), w = 1; all 0 where there is none."""
+    normal: cl_array.Array
+    """[h, w] float4: unit, volume axes, towards the camera, w = 1; all 0 where there is none."""
+    base_color: cl_array.Array
+    """[h, w] float4: linear RGB, w = 1; all 0 where there is none."""
+    object_index: cl_array.Array
+    """[h, w] int32: position in the sequence of objects, -1 where there is none."""
+    boxes: tuple[PixelBox | None, ...]
+    """For each object x0, y0, x1, y1 (half-open, inside the picture) that holds all its pixels; None: not in view."""
+    material: cl_array.Array | None = None
+    """[h, w] float4: perceptual roughness, metalness, 0, w = 1; 0 where there is none; rasterize() always has it."""
+
+
+@dataclass(frozen=True)
+class _Lists:
+    """Device lists of one picture's triangles: of some size as pieces, sorted into tiles; small ones as fragments."""
+
+    projected: cl_array.Array
+    corners: cl_array.Array
+    inverse_depths: cl_array.Array
+    starts: cl_array.Array
+    entries: cl_array.Array
+    nearest: cl_array.Array
+    fragments: cl_array.Array
+    fragment_count: int
+    """Also of those that had no room."""
+
+
+def rasterize(
+    engine: Engine,
+    camera: CameraModel,
+    camera_from_volume: Matrix,
+    objects: Sequence[Placed],
+    name: str = "virtual",
+) -> VirtualSurface:
+    """Draw `objects`, each with its `volume_from_model`, as a pinhole camera sees them (its distortion is ignored).
+
+    `camera_from_volume` [4, 4] float64, rigid: camera axes x right, y down, z forward. `name` tells the workspace's
+    arrays of one view from those of another. Waits for the device once.
+    """
+    boxes = boxes_in_view(camera, camera_from_volume, objects)
+    picture = tabulate(engine, camera, camera_from_volume, objects, boxes, "raster")
+    _, visible = _draw(engine, picture, "raster")
+    object_index, position, normal, base_color, material = _shade(engine, picture, visible, name)
+    return VirtualSurface(position, normal, base_color, object_index, boxes, material)
+
+
+def nearest_depths(
+    engine: Engine, camera: CameraModel, camera_from_volume: Matrix, objects: Sequence[Placed]
+) -> cl_array.Array:
+    """[SUBPIXELS h, SUBPIXELS w] uint32: bits of 1 / depth (1/metre) of the nearest object at the middles of the parts
+    of each pixel, 0 where there is none."""
+    return drawn_depths(engine, finer(camera, SUBPIXELS), camera_from_volume, objects, "fine")
+
+
+def drawn_depths(
+    engine: Engine, camera: CameraModel | Pinhole, camera_from_volume: Matrix, objects: Sequence[Placed], name: str
+) -> cl_array.Array:
+    """[h, w] uint32: bits of 1 / depth (1/metre) of the nearest object at the pixels' middles, 0 where there is none.
+
+    The array is valid until the next call with that `name`.
+    """
+    boxes = boxes_in_view(camera, camera_from_volume, objects)
+    return _draw(engine, tabulate(engine, camera, camera_from_volume, objects, boxes, name), name)[0]
+
+
+def boxes_in_view(
+    camera: CameraModel | Pinhole, camera_from_volume: Matrix, objects: Sequence[Placed]
+) -> tuple[PixelBox | None, ...]:
+    """For each object the box of pixels that holds all of it that is in view, as VirtualSurface has it."""
+    matrices = np.array([matrix for _, matrix in objects], np.float64).reshape(-1, 4, 4)
+    low, high = (np.array([thing.bounds[k] for thing, _ in objects], np.float64).reshape(-1, 3) for k in (0, 1))
+    return pixel_boxes(camera, camera_from_volume @ matrices, low, high)
+
+
+def _kernel(engine: Engine, name: str) -> cl.Kernel:
+    return engine.kernel("rasterize.cl", name)
+
+
+def _power_of_two(count: int) -> int:
+    return 1 << max(count - 1, 0).bit_length()
+
+
+def _draw(engine: Engine, picture: Picture, name: str) -> tuple[cl_array.Array, cl_array.Array]:
+    """[h, w] bits of the nearest 1 / depth; [h, w] the triangle that has it, in the tiles of `picture.region` only.
+
+    name: of the arrays.
+    """
+    nearest = engine.workspace.array(f"{name}_nearest", (picture.camera.height, picture.camera.width), np.uint32)
+    with dirty_region(engine, f"{name}_nearest", nearest, picture.region, picture.all_tiles) as tiles:
+        lists = _make_lists(engine, picture, name, nearest, tiles)
+        return nearest, _raster(engine, picture, lists, name)
+
+
+def _make_lists(engine: Engine, picture: Picture, name: str, nearest: cl_array.Array, cleared: PixelBox) -> _Lists:
+    """Project, clip and sort; what is too small is made larger, so nothing is lost. cleared: tiles of `nearest`."""
+    space, tiles, shape = engine.workspace, picture.tiles, (picture.camera.height, picture.camera.width)
+    projected = _project(engine, picture)
+    starts = space.array(f"{name}_starts", (tiles + 3,), np.int32)
+    counts = space.array(f"{name}_counts", (2 + tiles,), np.int32)
+    pixels = shape[0] * shape[1]
+    fragment_room = min(_FRAGMENTS_PER_TRIANGLE * picture.triangles, _FRAGMENTS_PER_PIXEL * pixels)
+    fragments = space.array(f"{name}_fragments", (_power_of_two(max(fragment_room, 1)),), cl_types.int4)
+    room, pieces = 0, min(picture.triangles, _PIECES_PER_PIXEL * pixels) + _LEAST_ROOM
+    while pieces > room:
+        room = _power_of_two(pieces)
+        corners = space.array(f"{name}_corners", (room,), cl_types.int8)
+        inverse_depths = space.array(f"{name}_inverse_depths", (room,), cl_types.float4)
+        _clear(engine, picture, counts, nearest, cleared)
+        _setup(engine, picture, projected, counts, corners, inverse_depths, nearest, fragments)
+        scan = _kernel(engine, "scan_tiles")
+        engine.launch(scan, (_SCAN_ITEMS,), tiles, _MOST_ENTRIES // tiles, counts, starts, local=(_SCAN_ITEMS,))
+        total, pieces, fragment_count = (int(value) for value in engine.download(starts[tiles:]))
+    entries = space.array(f"{name}_entries", (_power_of_two(max(total, _LEAST_ENTRIES)),), np.int32)
+    engine.launch(_kernel(engine, "fill_tiles"), (pieces,), pieces, picture.size, corners, starts, counts, entries)
+    return _Lists(projected, corners, inverse_depths, starts, entries, nearest, fragments, fragment_count)
+
+
+def _project(engine: Engine, picture: Picture) -> cl_array.Array:
+    """The vertices of the objects in view on the screen, [vertices] int4."""
+    room = _power_of_two(max(picture.vertices, _LEAST_ROOM))
+    projected = engine.workspace.array("raster_projected", (room,), cl_types.int4)
+    engine.launch(
+        _kernel(engine, "project_vertices"),
+        (len(picture.vertex_chunks) * CHUNK if picture.vertices else 0,),
+        picture.vertex_chunks,
+        picture.objects,
+        picture.matrices,
+        NEAR_M,
+        picture.arena.vertices,
+        projected,
+        local=(CHUNK,),
+    )
+    return projected
+
+
+def _clear(engine: Engine, picture: Picture, counts: cl_array.Array, nearest: cl_array.Array, tiles: PixelBox) -> None:
+    rows = 0 if is_empty(tiles) else (tiles[2] - tiles[0]) * (tiles[3] - tiles[1]) * TILE
+    kernel = _kernel(engine, "clear_picture")
+    engine.launch(kernel, (max(counts.size, rows),), picture.size, int4(*tiles), counts.size, counts, nearest)
+
+
+def _setup(
+    engine: Engine,
+    picture: Picture,
+    projected: cl_array.Array,
+    counts: cl_array.Array,
+    corners: cl_array.Array,
+    inverse_depths: cl_array.Array,
+    nearest: cl_array.Array,
+    fragments: cl_array.Array,
+) -> None:
+    """Fill the lists of pieces and fragments, as far as there is room, and count them."""
+    engine.launch(
+        _kernel(engine, "setup_triangles"),
+        (len(picture.triangle_chunks) * CHUNK if picture.triangles else 0,),
+        picture.size,
+        int2(len(corners), len(fragments)),
+        picture.triangle_chunks,
+        picture.objects,
+        picture.matrices,
+        NEAR_M,
+        picture.arena.vertices,
+        picture.arena.triangles,
+        projected,
+        counts,
+        corners,
+        inverse_depths,
+        nearest,
+        fragments,
+        local=(CHUNK,),
+    )
+
+
+def _raster(engine: Engine, picture: Picture, lists: _Lists, name: str) -> cl_array.Array:
+    """Number of the triangle that each pixel shows, [h, w] int32, 2^31 - 1 where there is none; in `region` only."""
+    x0, y0, x1, y1 = picture.region
+    visible = engine.workspace.array(f"{name}_visible", lists.nearest.shape, np.int32)
+    engine.launch(
+        _kernel(engine, "raster_tiles"),
+        ((x1 - x0) * (y1 - y0) * TILE * TILE,),
+        picture.size,
+        int4(*picture.region),
+        lists.corners,
+        lists.inverse_depths,
+        lists.starts,
+        lists.entries,
+        lists.nearest,
+        visible,
+        local=(TILE * TILE,),
+    )
+    count = lists.fragment_count
+    if count <= len(lists.fragments):
+        engine.launch(_kernel(engine, "settle_fragments"), (count,), count, lists.fragments, lists.nearest, visible)
+    else:
+        engine.launch(
+            _kernel(engine, "settle_triangles"),
+            (len(picture.triangle_chunks) * CHUNK,),
+            picture.size,
+            picture.triangle_chunks,
+            picture.objects,
+            picture.arena.triangles,
+            lists.projected,
+            lists.nearest,
+            visible,
+            local=(CHUNK,),
+        )
+    return visible
+
+
+def _shade(engine: Engine, picture: Picture, visible: cl_array.Array, name: str) -> list[cl_array.Array]:
+    """Index of each pixel's object [h, w] int32; position, normal, base colour and material, [h, w] float4."""
+    space, arena = engine.workspace, picture.arena
+    object_index = space.array(f"{name}_object_index", visible.shape, np.int32)
+    parts = ("position", "normal", "base_color", "material")
+    fields = [space.array(f"{name}_{part}", visible.shape, cl_types.float4) for part in parts]
+    with dirty_region(engine, f"{name}_object_index", object_index, picture.region, picture.all_tiles) as tiles:
+        x0, y0 = TILE * tiles[0], TILE * tiles[1]
+        x1, y1 = min(TILE * tiles[2], picture.camera.width), min(TILE * tiles[3], picture.camera.height)
+        engine.launch(
+            _kernel(engine, "shade_surface"),
+            (x1 - x0, y1 - y0),
+            picture.size,
+            int4(x0, y0, x1, y1),
+            int4(*picture.region),
+            visible,
+            picture.count,
+            picture.objects,
+            picture.matrices,
+            arena.vertices,
+            arena.triangles,
+            arena.attributes,
+            arena.material_of,
+            arena.materials,
+            arena.textures,
+            arena.levels,
+            arena.texels,
+            arena.channel_values,
+            object_index,
+            *fields,
+        )
+    return [object_index, *fields]

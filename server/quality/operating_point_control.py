@@ -1,0 +1,162 @@
+"""Chooses a session's operating point from its device's front: by a budget, a greatest light error, or neither (U1).
+
+A controller of steps, not of a continuous knob: down at once where the budget is broken, up one point at a time and
+only after a while of calm, twice as long after each climb that had to be taken back. So the picture does not pump.
+"""
+
+from __future__ import annotations
+
+from protocol.messages import OperatingPoint, Timings, Wishes
+from server.opencl.device import Device
+from server.quality.costs import CostModel
+from server.quality.pareto_front import ParetoFront, ParetoPoint, read_front
+
+TOLERANCE = 1.1
+"""Frames may take so much of the budget; it is what they are held to."""
+UP_TO = 0.92
+"""A better point must be expected to stay below so much of the budget, its scatter counted, before it is taken."""
+CALM_FRAMES, MOST_CALM_FRAMES = 15, 240
+FIRST_CALM_FRAMES = 4
+"""Before the first climb: a session begins low, and the first frames tell what the scene costs."""
+TAKEN_BACK_FRAMES = 45
+"""A climb that does not last so long was a mistake."""
+BEGIN = 0.75
+"""Of the budget that the first point may be expected to take: nothing is known of the scene yet."""
+SETTLING_FRAMES = 2
+"""After a change: arrays are made and caches are empty, so that these say little. One that is far too slow counts."""
+BADLY = 1.5
+LEAST_KNOWN_FRAMES = 5
+"""Before what frames are expected to take is believed."""
+GOOD_ENOUGH_DEG = 1.0
+"""With nothing asked for: above the least light error."""
+
+
+class OperatingPointControl:
+    """One session's choice. `observe` after every frame; `chosen` is the next one's."""
+
+    def __init__(
+        self, front: ParetoFront, budget_ms: float | None = None, max_light_error_deg: float | None = None
+    ) -> None:
+        self._ladder = front.best()
+        self._costs = CostModel()
+        self._budget_ms = budget_ms
+        self._max_error_deg = max_light_error_deg
+        self._reason = ""
+        self._since = 0
+        self._calm = FIRST_CALM_FRAMES
+        self._slow = 0
+        self._climbed = False
+        self._index = self._begin()
+
+    @property
+    def chosen(self) -> ParetoPoint:
+        """For the next frame."""
+        return self._ladder[self._index]
+
+    @property
+    def said(self) -> OperatingPoint:
+        """What a frame says of it."""
+        chosen = self.chosen
+        return OperatingPoint(
+            settings=chosen.point.settings,
+            reason=self._reason,
+            expected_ms=self._costs.expected_ms(chosen),
+            light_error_deg=chosen.light_error_deg,
+        )
+
+    def observe(self, timings: Timings) -> None:
+        """One frame ran at `chosen`."""
+        self._since += 1
+        if self._since > SETTLING_FRAMES:
+            self._costs.observe(self.chosen, timings)
+        if self._budget_ms is None:
+            return
+        self._count_slow(timings.total, self._budget_ms)
+        if self._must_go_down(self._budget_ms):
+            self._go_down(self._budget_ms)
+        elif self._since >= self._calm and self._costs.known_frames:
+            self._climb(self._budget_ms)
+
+    def _begin(self) -> int:
+        last = len(self._ladder) - 1
+        if self._budget_ms is not None:
+            self._reason = f"the first frames of a budget of {self._budget_ms:g} ms: what the scene costs is not known"
+            return self._most_accurate(BEGIN * self._budget_ms)
+        best_deg = self._ladder[last].light_error_deg
+        most_deg = best_deg + GOOD_ENOUGH_DEG if self._max_error_deg is None else self._max_error_deg
+        fitting = [i for i, point in enumerate(self._ladder) if point.light_error_deg <= most_deg]
+        if not fitting:
+            self._reason = f"no point errs by {most_deg:g} degrees or less on this device: the most accurate"
+            return min(range(last + 1), key=lambda i: self._ladder[i].light_error_deg)
+        words = f"{most_deg:.3g} degrees or less"
+        self._reason = f"the fastest whose light erred by {words} where the device was measured"
+        return fitting[0]
+
+    def _count_slow(self, total_ms: float, budget_ms: float) -> None:
+        badly = total_ms > BADLY * TOLERANCE * budget_ms
+        slow = total_ms > TOLERANCE * budget_ms and (self._since > SETTLING_FRAMES or badly)
+        self._slow = self._slow + 1 + badly if slow else max(0, self._slow - 1)
+
+    def _must_go_down(self, budget_ms: float) -> bool:
+        if self._index == 0:
+            return False
+        if self._slow >= 2:
+            return True
+        settled = self._costs.known_frames >= LEAST_KNOWN_FRAMES
+        return settled and self._costs.expected_ms(self.chosen) * self._costs.spread > TOLERANCE * budget_ms
+
+    def _go_down(self, budget_ms: float) -> None:
+        was = self._index
+        self._index = min(self._most_accurate(UP_TO * budget_ms), self._index - 1)
+        if self._climbed and self._since < TAKEN_BACK_FRAMES:
+            self._calm = min(2 * max(self._calm, CALM_FRAMES), MOST_CALM_FRAMES)
+        self._climbed = False
+        self._moved(was, f"frames at the last point took more than the budget of {budget_ms:g} ms")
+
+    def _climb(self, budget_ms: float) -> None:
+        target = self._most_accurate(UP_TO * budget_ms)
+        if target <= self._index:
+            self._reason = self._reason_here(budget_ms)
+            self._since = min(self._since, self._calm)
+            return
+        was, self._index = self._index, self._index + 1
+        if self._climbed or self._calm < CALM_FRAMES:  # the climb before this one has lasted
+            self._calm = CALM_FRAMES
+        self._climbed = True
+        self._moved(was, f"the next better one was expected to stay below the budget of {budget_ms:g} ms")
+
+    def _reason_here(self, budget_ms: float) -> str:
+        if self._index == len(self._ladder) - 1:
+            return f"the most accurate, and within the budget of {budget_ms:g} ms"
+        if self._index == 0 and self._costs.expected_ms(self.chosen) > budget_ms:
+            return f"the fastest; no point is expected within the budget of {budget_ms:g} ms"
+        return f"the most accurate that is expected within the budget of {budget_ms:g} ms"
+
+    def _moved(self, was: int, reason: str) -> None:
+        if was == self._index:
+            return
+        self._reason = reason
+        self._since = 0
+        self._slow = 0
+        self._costs.changed()
+
+    def _most_accurate(self, below_ms: float) -> int:
+        """The best point expected to take less, its scatter counted; the fastest where none does.
+
+        With a greatest light error, the fastest that keeps it is enough.
+        """
+        spread = self._costs.spread
+        fitting = [i for i, p in enumerate(self._ladder) if self._costs.expected_ms(p) * spread <= below_ms * TOLERANCE]
+        if not fitting:
+            return 0
+        if self._max_error_deg is not None:
+            enough = [i for i in fitting if self._ladder[i].light_error_deg <= self._max_error_deg]
+            return enough[0] if enough else fitting[-1]
+        return fitting[-1]
+
+
+def control_for(device: Device, wishes: Wishes) -> OperatingPointControl | None:
+    """Of a session that lets its point be chosen. Raises NoFrontError where the device was not measured."""
+    if wishes.preset != "auto":
+        return None
+    return OperatingPointControl(read_front(device.name), wishes.budget_ms, wishes.max_light_error_deg)

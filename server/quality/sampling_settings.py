@@ -1,0 +1,52 @@
+"""Operating points: where and how finely transfer is sampled, which is what a budget of time may choose."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from msgspec import Struct, structs
+
+from protocol.messages import OperatingPoint, Preset, Wishes
+
+
+class SamplingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
+    """The wishes that may change while a session runs; see there for what they mean."""
+
+    preset: Preset = "reg4"
+    rays: int = 81
+    stride: int | None = None
+    interleave: Literal[1, 2, 4, 8] | None = None
+    upsampling: Literal["bilateral", "bicubic"] | None = None
+    visibility_state: bool | None = None
+    auxiliary_views: int | None = None
+
+    @classmethod
+    def of(cls, wishes: Wishes) -> SamplingSettings:
+        """That of a session's wishes."""
+        return cls(**{name: getattr(wishes, name) for name in cls.__struct_fields__})
+
+    def wishes(self, others: Wishes) -> Wishes:
+        """`others` at this point: nothing is left to choose."""
+        return structs.replace(others, **structs.asdict(self), budget_ms=None, max_light_error_deg=None)
+
+    @property
+    def settings(self) -> str:
+        """As options of the command line, those that are not the preset's own."""
+        words = [f"--preset {self.preset}", f"--rays {self.rays}"]
+        for name, value in structs.asdict(self).items():
+            if name not in ("preset", "rays") and value is not None:
+                words.append(option_of(name, value))
+        return " ".join(words)
+
+
+def option_of(name: str, value: Any) -> str:
+    """A wish as an option of the command line."""
+    flag = "--" + name.removesuffix("_m").replace("_", "-")
+    if isinstance(value, bool):
+        return flag if value else flag.replace("--", "--no-", 1)
+    return f"{flag} {value:g}" if isinstance(value, float) else f"{flag} {value}"
+
+
+def asked_for(wishes: Wishes) -> OperatingPoint:
+    """What a frame says of a point that was not chosen but wished."""
+    return OperatingPoint(settings=SamplingSettings.of(wishes).settings, reason="asked for")

@@ -1,0 +1,92 @@
+"""What a session's wishes mean: the presets, and which wishes this server can fulfil."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, TypeVar
+
+from protocol.messages import Wishes
+from server.input.denoise import DenoiseMethod
+from server.transfer.sampling import PRESETS, Sampling
+
+WHOLE_ROOM_M = 1000.0
+"""Visibility rays this long leave any volume."""
+THESIS_REACH_M = 0.1
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """A session's operating point."""
+
+    sampling: Sampling
+    lamps: Literal["auto", "on", "off"]
+    """Whether lights inside the room are looked for."""
+    rays: int
+    bands: int
+    reach_m: float
+    as_thesis: bool
+    robustness: frozenset[str]
+    """P3: which of `openness`, `normals`, `normals_printed`, `memory`, `outliers` are on."""
+    edges: Literal["smooth", "hard"]
+    tone_mapping: Literal["auto", "light", "average"]
+    """What virtual things' brightness rests on: the light's scale, or the averages of picture and shading."""
+    light_color: Literal["estimated", "white"]
+    albedo: Literal["constant", "estimated"]
+    indirect: Literal["none", "observed"]
+    denoise: DenoiseMethod
+    denoise_iterations: int
+    plan: Literal["needed", "everything"]
+    """Whether what would hardly be seen is left out."""
+    smooth_depth: bool
+    """Whether merged depth is smoothed once more (D''')."""
+
+
+def read_wishes(wishes: Wishes) -> Settings:
+    """Settings for `wishes`. Raises ValueError, one line, for what this server cannot do."""
+    reach_m = WHOLE_ROOM_M if wishes.ray_length_m is None else wishes.ray_length_m
+    return Settings(
+        sampling=sampling_of(wishes),
+        lamps="off" if wishes.as_thesis else wishes.lamps,
+        rays=wishes.rays,
+        bands=wishes.bands,
+        reach_m=THESIS_REACH_M if wishes.as_thesis else reach_m,
+        as_thesis=wishes.as_thesis,
+        robustness=frozenset(wishes.robustness),
+        edges=wishes.edges,
+        tone_mapping=wishes.tone_mapping,
+        light_color=wishes.light_color,
+        albedo="constant" if wishes.as_thesis else wishes.albedo,
+        indirect="none" if wishes.as_thesis else wishes.indirect,
+        denoise=wishes.denoise,
+        denoise_iterations=wishes.denoise_iterations,
+        plan=wishes.plan,
+        smooth_depth=wishes.smooth_depth,
+    )
+
+
+def sampling_of(wishes: Wishes) -> Sampling:
+    """How the preset samples transfer, with what is wished otherwise.
+
+    Raises ValueError for a preset that does not exist, and for wishes that mean nothing to it.
+    """
+    if wishes.preset not in PRESETS:
+        raise ValueError(f"preset {wishes.preset!r} is not available: use one of {', '.join(PRESETS)}")
+    sampling = PRESETS[wishes.preset]
+    if sampling.image_space and (wishes.interleave not in (None, 1) or wishes.visibility_state):
+        raise ValueError(f"preset {wishes.preset} traces no rays that --interleave or --visibility-state could spare")
+    if not sampling.image_space and wishes.auxiliary_views is not None:
+        raise ValueError(f"preset {wishes.preset} looks into no --auxiliary-views: use gr15 or gr15fast")
+    return replace(
+        sampling,
+        stride=_or(wishes.stride, sampling.stride),
+        interleave=_or(wishes.interleave, sampling.interleave),
+        upsampling=_or(wishes.upsampling, sampling.upsampling),
+        visibility_state=_or(wishes.visibility_state, sampling.visibility_state),
+        views=_or(wishes.auxiliary_views, sampling.views),
+    )
+
+
+def _or(wished: T | None, usual: T) -> T:
+    return usual if wished is None else wished

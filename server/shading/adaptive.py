@@ -1,0 +1,156 @@
+"""Adaptive refinement (thesis 6.1.1, step 1): shading at every pixel where virtual objects make it vary.
+
+Kernels: adaptive.cl. On virtual surface that is beside its edges of depth and normal. On real surface the thesis marks
+what rays from the virtual objects hit; here the samples already say where shading with the objects differs from shading
+without, so what is marked is where that changes from sample to sample: the rims of shadows, not their insides.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.objects.rasterize import VirtualSurface
+from server.opencl.engine import Engine, float4
+from server.opencl.transfer import fill_bytes
+from server.shading.differential_rendering import RealShadow, ball_around
+from server.shading.traced_scene import TracedScene
+from server.transfer.sample_grid import SampleGrid
+from server.volume.raycast import Surface
+
+LEAST_CHANGE = 1 / 8
+"""Of R' / R from the 4 x 4 samples to one side to those to the other, from which on it is sampled at every pixel."""
+MARGIN_PX = 2
+"""Around an edge: half of what a pixel's mean draws on, see upsample.clh."""
+SHOWN_MARGIN_PX = 4
+"""Around real surface that is shown: what a pixel's mean draws on, and one for pixels that are covered in part."""
+_LEAST_LISTED = 1024
+
+
+def refine_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, scene: TracedScene) -> cl_array.Array:
+    """[h, w] float4: radiance that occluders take from the virtual surface near its edges; w = 0 elsewhere."""
+    occluded = _empty(engine, camera, "refined_occluded")
+    edges = engine.workspace.array("virtual_edges", (camera.height, camera.width), np.uint8)
+    kernel = engine.kernel("adaptive.cl", "mark_edges", **_defines(engine, scene.bands))
+    size = (camera.width, camera.height)
+    engine.launch(kernel, size, *size, virtual.position, virtual.normal, scene.volume.voxel_m, edges)
+    near = grown(engine.download(edges) > 0, MARGIN_PX)
+    listed, pixels = _list_pixels(engine, "edge_pixels", near)
+    engine.launch(
+        engine.kernel("adaptive.cl", "refine_virtual", **_defines(engine, scene.bands)),
+        (listed,),
+        listed,
+        pixels,
+        camera.width,
+        virtual.position,
+        virtual.normal,
+        virtual.object_index,
+        *scene.arguments(engine),
+        scene.rays.interleave,
+        occluded,
+    )
+    return occluded
+
+
+def refine_real(
+    engine: Engine,
+    camera: CameraModel,
+    surface: Surface,
+    scene: TracedScene,
+    ratio: RealShadow,
+    virtual: VirtualSurface | None = None,
+    eye: NDArray[np.float64] | None = None,
+) -> cl_array.Array:
+    """[h, w] float4: R' / R of real surface (eq. 7.1) where it varies among the samples of `ratio`; w = 0 elsewhere.
+
+    What `virtual` hides from `eye` ([3], volume space) is left out, if they are given.
+    """
+    refined = _empty(engine, camera, "refined_ratio")
+    cells = varying_cells(engine, ratio, scene.bands)
+    if not cells.any():
+        return refined
+    varying = pixels_of(cells, ratio.stride, camera.width, camera.height)
+    if virtual is not None and eye is not None:
+        varying &= grown(_shown(engine, camera, surface, virtual, eye), SHOWN_MARGIN_PX)
+    listed, pixels = _list_pixels(engine, "varying_pixels", varying)
+    engine.launch(
+        engine.kernel("adaptive.cl", "refine_real", **_defines(engine, scene.bands)),
+        (listed,),
+        listed,
+        pixels,
+        camera.width,
+        surface.positions,
+        surface.normals,
+        *scene.arguments(engine),
+        scene.rays.interleave,
+        ball_around(scene.objects),
+        scene.light.coefficients,
+        ratio.cols,
+        ratio.rows,
+        ratio.stride,
+        ratio.shaded,
+        refined,
+    )
+    return refined
+
+
+def _shown(
+    engine: Engine, camera: CameraModel, surface: Surface, virtual: VirtualSurface, eye: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """[h, w] pixels whose middle the virtual surface does not hide."""
+    shown = engine.workspace.array("shown_pixels", (camera.height, camera.width), np.uint8)
+    size, kernel = (camera.width, camera.height), engine.kernel("adaptive.cl", "mark_shown", **_defines(engine, 2))
+    engine.launch(kernel, size, *size, surface.positions, virtual.position, float4(*eye, 0), shown)
+    return np.asarray(engine.download(shown) > 0)
+
+
+def varying_cells(engine: Engine, ratio: SampleGrid, bands: int) -> NDArray[np.bool_]:
+    """[rows + 1, cols + 1] the cells, from the one before the first sample, around which `ratio` changes."""
+    varying = engine.workspace.array("varying_cells", (ratio.rows + 1, ratio.cols + 1), np.uint8)
+    kernel = engine.kernel("adaptive.cl", "mark_varying", **_defines(engine, bands))
+    size = (ratio.cols + 1, ratio.rows + 1)
+    engine.launch(kernel, size, ratio.cols, ratio.rows, ratio.values, LEAST_CHANGE, varying)
+    return np.asarray(engine.download(varying) > 0)
+
+
+def pixels_of(cells: NDArray[np.bool_], stride: int, width: int, height: int) -> NDArray[np.bool_]:
+    """[height, width] the pixels of `cells` [rows + 1, cols + 1], which begin half a stride before the picture."""
+    row, col = (
+        np.minimum((np.arange(n) + stride - stride // 2) // stride, m - 1)
+        for n, m in zip((height, width), cells.shape, strict=True)
+    )
+    return np.asarray(cells[row][:, col])
+
+
+def grown(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
+    """[h, w] what lies within `by` pixels, along the axes, of `mask`."""
+    result = mask
+    for axis in (0, 1):
+        line = result
+        for step in range(1, by + 1):
+            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
+            ahead[axis], behind[axis] = slice(step, None), slice(None, -step)
+            result = result.copy()
+            result[tuple(ahead)] |= line[tuple(behind)]
+            result[tuple(behind)] |= line[tuple(ahead)]
+    return result
+
+
+def _list_pixels(engine: Engine, name: str, mask: NDArray[np.bool_]) -> tuple[int, cl_array.Array]:
+    """Number and numbers (y width + x) of the pixels of a mask; the array is longer, so that it seldom changes size."""
+    pixels = np.flatnonzero(mask).astype(np.int32)
+    room = max(_LEAST_LISTED, 1 << len(pixels).bit_length())
+    return len(pixels), engine.workspace.upload(name, np.pad(pixels, (0, room - len(pixels))))
+
+
+def _empty(engine: Engine, camera: CameraModel, name: str) -> cl_array.Array:
+    array = engine.workspace.array(name, (camera.height, camera.width), cl_types.float4)
+    fill_bytes(engine.queue, array, 0)
+    return array
+
+
+def _defines(engine: Engine, bands: int) -> dict[str, int]:
+    return {"BANDS": bands, "LANES": engine.lanes}

@@ -1,0 +1,52 @@
+"""Where in the picture virtual objects change real surface by more than is to be left out (thesis 7.1).
+
+Kernel: change_mask.cl.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl.array as cl_array
+
+from protocol.frames import CameraModel
+from server.opencl.engine import Engine
+from server.transfer.sample_grid import SampleGrid
+from server.transfer.sampling import Upsampling
+from server.volume.raycast import Surface
+
+
+def mark_changes(
+    engine: Engine,
+    camera: CameraModel,
+    surface: Surface,
+    ratio: SampleGrid,
+    refined: cl_array.Array | None = None,
+    tolerance_m: float = 1.0,
+    spare: float = 0.0,
+    upsampling: Upsampling = "bilateral",
+) -> cl_array.Array:
+    """[rows + 1, cols + 1] uint8: 0 where R' / R may be taken to be 1, as no pixel's is farther from it than `spare`.
+
+    Cells of the grid as in upsample.clh, from the one before the first sample. ratio: R' / R at samples; refined:
+    [h, w] float4, what stands for it where w = 1; tolerance_m: of upsampling, read where something is spared.
+    """
+    reached = engine.workspace.array("reached", (ratio.rows + 1, ratio.cols + 1), np.uint8)
+    defines = {"BICUBIC": 1} if upsampling == "bicubic" else {}
+    engine.launch(
+        engine.kernel("change_mask.cl", "mark_reached", **defines),
+        (ratio.cols + 1, ratio.rows + 1),
+        ratio.cols,
+        ratio.rows,
+        ratio.stride,
+        camera.width,
+        camera.height,
+        surface.positions,
+        surface.normals,
+        ratio.values,
+        refined is not None,
+        ratio.values if refined is None else refined,
+        tolerance_m,
+        spare,
+        reached,
+    )
+    return reached

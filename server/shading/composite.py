@@ -1,0 +1,159 @@
+"""Compositing (thesis 7.2.1): the finished picture. Kernel: composite.cl."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.input.measure import linear_values
+from server.maths.rigid import inverse_rigid
+from server.objects.rasterize import SUBPIXELS, VirtualSurface
+from server.opencl.engine import Engine, KernelArgument, float16
+from server.shading.change_mask import mark_changes
+from server.shading.traced_scene import DeviceLight
+from server.transfer.sample_grid import SampleGrid
+from server.transfer.sampling import Upsampling
+from server.volume.raycast import Surface
+
+
+def srgb_codes(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """sRGB codes of linear radiance, clipped to [0, 1] (IEC 61966-2-1)."""
+    clipped = np.clip(linear, 0.0, 1.0)
+    encoded = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+    return (255 * encoded + 0.5).astype(np.uint8)
+
+
+@cache
+def _shown_codes() -> NDArray[np.uint8]:
+    return srgb_codes(linear_values("linear16").astype(np.float64))
+
+
+def shown_picture(
+    engine: Engine, camera: CameraModel, color: NDArray[np.uint8] | NDArray[np.uint16], radiance: cl_array.Array
+) -> NDArray[np.uint8]:
+    """[h, w, 3] the camera picture as sRGB codes: unchanged if it is sRGB, sRGB(value / 65535) if linear.
+
+    A distorted camera's picture is shown rectified, because virtual things are drawn as a pinhole camera sees them.
+    """
+    if camera.is_distorted:
+        rectified = engine.download(radiance)
+        return srgb_codes(np.stack([rectified[channel] for channel in "xyz"], axis=-1).astype(np.float64))
+    if camera.color_encoding == "linear16":
+        return _shown_codes()[color]
+    return color.astype(np.uint8, copy=False)
+
+
+@dataclass(frozen=True)
+class CompositeInputs:
+    """What is mixed with the camera's picture, and what it is mixed by: arguments of composite_inputs.clh."""
+
+    camera: CameraModel
+    volume_from_camera: NDArray[np.float64]
+    radiance: cl_array.Array
+    """[h, w] float4, the camera's picture, linear; w < 0 outside of it."""
+    surface: Surface
+    tolerance_m: float
+    """How far behind a real surface a virtual one still shows, for objects that stand on it."""
+    light: DeviceLight
+    virtual: VirtualSurface | None = None
+    occluded: SampleGrid | None = None
+    ratio: SampleGrid | None = None
+    refined_occluded: cl_array.Array | None = None
+    """[h, w] float4: what stands for `occluded` where w = 1."""
+    refined_ratio: cl_array.Array | None = None
+    upsampling: Upsampling = "bilateral"
+    coverage: cl_array.Array | None = None
+    """Of nearest_depths, for smooth edges; without it a pixel is covered as its middle is."""
+    reflected: cl_array.Array | None = None
+    """Of reflect.py."""
+    gain: float = 1.0
+    """By which virtual surface is brighter than `light` makes it (tone_mapping.py)."""
+    direct_virtual: cl_array.Array | None = None
+    """What the light's discs bring besides."""
+    direct_ratio: cl_array.Array | None = None
+    """Stands for `ratio` and `refined_ratio` where the light has discs (shadow_map.py)."""
+    reached: cl_array.Array | None = None
+    """Of change_mask.py, the cells in which `ratio` counts; None: wherever it is not 1."""
+
+    @property
+    def is_nothing(self) -> bool:
+        """Whether nothing is virtual."""
+        return self.virtual is None and self.ratio is None
+
+
+def launch_mixture(engine: Engine, file: str, name: str, mixture: CompositeInputs, *others: KernelArgument) -> None:
+    """Enqueue a kernel whose arguments begin with MIXTURE_ARGUMENTS of composite_inputs.clh; `others` are its own."""
+    camera, light, virtual, ratio = mixture.camera, mixture.light, mixture.virtual, mixture.ratio
+    unused = engine.workspace.array("unused", (1,), cl_types.float4)
+
+    def given(array: cl_array.Array | None) -> cl_array.Array:
+        return unused if array is None else array
+
+    reached = mixture.reached
+    if reached is None and ratio is not None and not light.discs:
+        reached = mark_changes(engine, camera, mixture.surface, ratio)
+    kernel = engine.kernel(
+        file,
+        name,
+        BANDS=round(light.coefficients.shape[0] ** 0.5),
+        HAS_OBJECTS=virtual is not None,
+        HAS_SHADOWS=ratio is not None,
+        BICUBIC=mixture.upsampling == "bicubic",
+        SUBPIXELS=0 if mixture.coverage is None else SUBPIXELS,
+        HAS_GLOSS=mixture.reflected is not None,
+        HAS_DIRECT=bool(light.discs),
+        LANES=engine.lanes,
+    )
+    engine.launch(
+        kernel,
+        (-(-camera.width // engine.lanes), camera.height),
+        camera.width,
+        camera.height,
+        mixture.radiance,
+        mixture.surface.positions,
+        mixture.surface.normals,
+        float16(inverse_rigid(mixture.volume_from_camera)),
+        mixture.tolerance_m,
+        *((virtual.position, virtual.normal, virtual.base_color) if virtual else (unused, unused, unused)),
+        given(mixture.coverage),
+        given(mixture.reflected),
+        light.coefficients,
+        mixture.gain,
+        *_grid(mixture.occluded, unused),
+        *_grid(ratio, unused),
+        given(reached),
+        mixture.refined_occluded is not None,
+        given(mixture.refined_occluded),
+        mixture.refined_ratio is not None,
+        given(mixture.refined_ratio),
+        given(mixture.direct_virtual),
+        given(mixture.direct_ratio),
+        *others,
+    )
+
+
+def srgb_table(engine: Engine) -> cl_array.Array:
+    """[65536] uint8: the sRGB code of linear radiance i / 65535."""
+    return engine.workspace.constant("srgb_codes", _shown_codes())
+
+
+def composite(engine: Engine, shown: NDArray[np.uint8], mixture: CompositeInputs) -> NDArray[np.uint8]:
+    """Picture [h, w, 3] sRGB of the camera picture `shown` with what is virtual; unchanged where nothing virtual is."""
+    if mixture.is_nothing:
+        return shown
+    space, camera = engine.workspace, mixture.camera
+    picture = space.array("picture", (camera.height, camera.width, 3), np.uint8)
+    others = (space.upload("shown", shown), srgb_table(engine), picture)
+    launch_mixture(engine, "composite.cl", "composite", mixture, *others)
+    return engine.download(picture)
+
+
+def _grid(grid: SampleGrid | None, unused: cl_array.Array) -> tuple[KernelArgument, ...]:
+    """cols, rows, stride, values."""
+    return (grid.cols, grid.rows, grid.stride, grid.values) if grid else (0, 0, 1, unused)

@@ -1,0 +1,169 @@
+"""Rendering in image space: GR15 and GR15FAST (thesis 7.3). Kernels: depth_views.cl; include/view_visibility.clh.
+
+What rays find out in the volume family, shading looks up in depth pictures: of real surface in the auxiliary views that
+the light is estimated with (auxiliary_views.py), of virtual objects in views of each from all around. The thesis draws
+objects into the buffers of the room; but an object of 20 cm is a few pixels of these. Here each has pictures of its own
+in its own axes, drawn once: they move with it. The shading itself is that of the volume family.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from server.input.measure import intrinsics
+from server.objects.rasterize import Placed
+from server.objects.voxelize import DistanceGrid
+from server.opencl.engine import Engine, KernelArgument, float4, float16, int4
+from server.opencl.transfer import copy_into
+from server.transfer.real_depth_views import RealDepthViews
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ViewShape:
+    """Of every object's views."""
+
+    cells: int
+    """Views along a side of the octahedral map of the upper half of directions."""
+    px: int
+    """Pixels of a view's side."""
+
+    @property
+    def texels(self) -> int:
+        """Of one object."""
+        return (self.cells * self.px) ** 2
+
+
+FINE, COARSE = ViewShape(24, 32), ViewShape(12, 16)
+"""Neighbouring views are some 7 and 15 degrees apart; an object takes 2.4 MB or 0.15 MB."""
+MOST_FINE = 64
+"""Different meshes up to which they are FINE."""
+
+
+@dataclass(frozen=True)
+class DepthViews:
+    """What shading looks into instead of tracing rays; arrays of the engine's workspace, valid until the next frame."""
+
+    real: RealDepthViews
+    shape: ViewShape
+    texels: cl_array.Array
+    """[slot, cells^2, px, px] uint32: first and last surface along a pixel's line, see views.clh; 0 = none."""
+    slots: cl_array.Array
+    """[objects] int32."""
+
+    def defines(self) -> dict[str, int]:
+        """Shapes that kernels are compiled for."""
+        return {"IMAGE_SPACE": 1, "VIEW_CELLS": self.shape.cells, "VIEW_PX": self.shape.px}
+
+    def arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
+        """VIEW_PARAMETERS of include/views.clh."""
+        views = self.real.views
+        return (
+            views.side,
+            engine.workspace.upload("view_of", self.real.view_of),
+            views.axes,
+            views.depths,
+            float4(*views.center, 0.0),
+            views.distance_m,
+            views.per_pixel,
+            float16(self.real.camera_from_volume),
+            intrinsics(self.real.camera),
+            self.real.camera.width,
+            self.real.camera.height,
+            self.real.depths,
+            self.real.surface.positions,
+            self.real.surface.normals,
+            self.real.near_m,
+            self.real.ratio,
+            self.real.threshold / 2,
+            self.texels,
+            self.slots,
+        )
+
+
+def look_around(engine: Engine, real: RealDepthViews, objects: Sequence[Placed]) -> DepthViews:
+    """The pictures of one frame; those of objects that are new are drawn."""
+    held = _HELD.setdefault(engine, _ObjectViews())
+    grids = [thing.grid for thing, _ in objects]
+    slots = held.slots_of(engine, grids)
+    assert held.texels is not None
+    return DepthViews(real, held.shape, held.texels, engine.workspace.upload("object_slots", slots))
+
+
+class _ObjectViews:
+    """The views of the meshes that were last in the scene, each in a slot of one array."""
+
+    def __init__(self) -> None:
+        self.shape = FINE
+        self.texels: cl_array.Array | None = None
+        self._grids: list[cl_array.Array | None] = []
+        """Whose distances are in each slot; kept, so that none gets another's id."""
+
+    def slots_of(self, engine: Engine, grids: Sequence[DistanceGrid]) -> NDArray[np.int32]:
+        """The slot of each, drawn if it was not there."""
+        unique = {id(grid.distance): grid for grid in grids}
+        shape = FINE if len(unique) <= MOST_FINE else COARSE
+        if shape != self.shape:
+            self.shape, self.texels, self._grids = shape, None, []
+        slots = {id(array): slot for slot, array in enumerate(self._grids) if array is not None}
+        new = [key for key in unique if key not in slots]
+        if new or self.texels is None:
+            gone = [slot for key, slot in slots.items() if key not in unique]
+            for slot in gone:
+                self._grids[slot] = None
+            self._make_room(engine, len(unique))
+            free = (slot for slot, array in enumerate(self._grids) if array is None)
+            for key, slot in zip(new, free, strict=False):
+                self._grids[slot], slots[key] = unique[key].distance, slot
+                draw_object(engine, unique[key], shape, self.texels, slot)
+        return np.array([slots[id(grid.distance)] for grid in grids], np.int32)
+
+    def _make_room(self, engine: Engine, count: int) -> None:
+        """At least `count` slots; what is drawn is kept."""
+        if self.texels is not None and len(self._grids) >= count:
+            return
+        room = max(count, 2 * len(self._grids))
+        before, self.texels = self.texels, cl_array.empty(engine.queue, (room, self.shape.texels), np.uint32)
+        if before is not None:
+            copy_into(engine.queue, self.texels, 0, before)
+        self._grids += [None] * (room - len(self._grids))
+
+
+_HELD: WeakKeyDictionary[Engine, _ObjectViews] = WeakKeyDictionary()
+
+
+def draw_object(engine: Engine, grid: DistanceGrid, shape: ViewShape, texels: cl_array.Array | None, slot: int) -> None:
+    """All views of an object, from its distance grid, into a slot of `texels` [slots, shape.texels]."""
+    axes = np.zeros((shape.cells**2, 3, 4), np.float32)
+    axes[..., :3] = view_axes(shape.cells)
+    engine.launch(
+        engine.kernel("depth_views.cl", "draw_object", LANES=1, VIEW_CELLS=shape.cells, VIEW_PX=shape.px),
+        (shape.px, shape.px, shape.cells**2),
+        int4(*grid.dims, 0),
+        grid.distance,
+        engine.workspace.constant(f"object_view_axes_{shape.cells}", axes.view(cl_types.float4)[..., 0]),
+        slot,
+        texels,
+    )
+
+
+def view_axes(cells: int) -> Floats:
+    """[cells^2, 3, 3] rows right, down and ahead (z >= 0) of an object's views, the grid's axes: as views.clh."""
+    v, u = (np.mgrid[:cells, :cells].reshape(2, -1) + 0.5) * (2 / cells) - 1
+    x, y = (u + v) / 2, (u - v) / 2
+    ahead = np.stack([x, y, 1 - np.abs(x) - np.abs(y)], axis=-1)
+    ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
+    x, y, z = ahead.T
+    a, one = -1 / (1 + z), np.ones_like(x)
+    b = x * y * a
+    return np.stack(
+        [np.stack([one + x * x * a, b, -x], axis=-1), np.stack([b, one + y * y * a, -y], axis=-1), ahead], axis=1
+    )

@@ -1,0 +1,171 @@
+"""Differential rendering (thesis 7.1-7.2): shading with and without virtual objects.
+
+Kernel: differential_rendering.cl.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.objects.rasterize import Placed, VirtualSurface
+from server.opencl.engine import Engine, float4
+from server.shading.traced_scene import Changed, TracedScene
+from server.shading.virtual_point_lights import PlacedPoints, VirtualPointLights, place_points
+from server.transfer.indirect import Indirect, no_hits
+from server.transfer.radiance_transfer import Transfer, sample_arguments
+from server.transfer.sample_grid import SampleGrid
+from server.volume.raycast import Surface
+
+VIRTUAL_STRIDE = 2
+"""Occlusion of virtual surfaces is traced at every second pixel; the unoccluded part is exact at every pixel."""
+BOUNCE_EVERY = 4
+"""Of how many hidden directions a sample follows one, for what its surroundings send it less; its neighbours others."""
+
+
+MOST_POINTS = 8192
+"""Points on objects that are lit one by one, the first objects'; others are taken to see an even light."""
+
+
+@dataclass(frozen=True)
+class RealShadow(SampleGrid):
+    """Ratios R' / R (eq. 7.1) at samples of real surface."""
+
+    shaded: cl_array.Array
+    """[rows, cols] float4: R, what reaches white surface without objects, w = 1 valid."""
+    whole: SampleGrid | None = None
+    """The ratio with the discs' light (shadow_map.py), None where that is this one."""
+
+
+def shadow_real(
+    engine: Engine,
+    camera: CameraModel,
+    surface: Surface,
+    transfer: Transfer,
+    scene: TracedScene,
+    indirect: Indirect | None = None,
+) -> RealShadow:
+    """Ratio R' / R of real surface shaded with and without the objects, at the transfer's samples (eq. 7.1).
+
+    indirect: what surfaces send to the same samples.
+    """
+    shape, space = (transfer.rows, transfer.cols), engine.workspace
+    ratio = space.array("shadow_ratio", shape, cl_types.float4)
+    shaded = space.array("shadow_shaded", shape, cl_types.float4)
+    engine.launch(
+        engine.kernel("differential_rendering.cl", "shadow_real", **_sample_defines(engine, transfer, scene)),
+        (transfer.cols, transfer.rows),
+        *sample_arguments(engine, camera, surface, transfer),
+        transfer.coefficients,
+        indirect.hits if indirect else no_hits(engine, transfer),
+        scene.light.coefficients,
+        *scene.arguments(engine),
+        ball_around(scene.objects),
+        ratio,
+        shaded,
+    )
+    return RealShadow(transfer.stride, ratio, shaded)
+
+
+def bounce_real(
+    engine: Engine,
+    camera: CameraModel,
+    camera_from_volume: NDArray[np.float64],
+    surface: Surface,
+    transfer: Transfer,
+    scene: TracedScene,
+    shadow: RealShadow,
+    returned: float = math.inf,
+    spare: float = 0.0,
+    least: RealShadow | None = None,
+) -> RealShadow:
+    """`shadow` with what real surfaces then send one another less or more (eq. 7.6: R'_ID - R_ID).
+
+    returned: the most radiance by which what any real surface sends can change. Where that is no more than the share
+    `spare` of R, that of `least` or else of `shadow`, nothing is followed.
+    """
+    bounced = engine.workspace.array("shadow_bounced", (transfer.rows, transfer.cols), cl_types.float4)
+    shadowed = replace(scene, changed=Changed(camera, camera_from_volume, surface.positions, shadow))
+    engine.launch(
+        engine.kernel("differential_rendering.cl", "bounce_real", **_sample_defines(engine, transfer, scene)),
+        (transfer.cols, transfer.rows),
+        *sample_arguments(engine, camera, surface, transfer),
+        scene.light.coefficients,
+        *shadowed.arguments(engine),
+        BOUNCE_EVERY,
+        shadow.shaded,
+        returned,
+        spare,
+        (least or shadow).shaded,
+        bounced,
+    )
+    return replace(shadow, values=bounced)
+
+
+def _sample_defines(engine: Engine, transfer: Transfer, scene: TracedScene) -> dict[str, int]:
+    return scene.defines(engine) | {"MASK_WORDS": transfer.free_mask.shape[2], "INTERLEAVE": transfer.interleave}
+
+
+_CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
+"""[8, 3] of a box: 0 for its low side, 1 for its high one."""
+
+
+def ball_around(objects: Sequence[Placed]) -> np.generic:
+    """Centre (volume space) and radius in metres of a ball that holds all objects, as a float4."""
+    matrices = np.array([matrix for _, matrix in objects])
+    bounds = np.array([thing.bounds for thing, _ in objects])
+    in_model = bounds[:, _CORNERS, np.arange(3)]  # [n, 8, 3]
+    corners = (in_model @ matrices[:, :3, :3].swapaxes(1, 2) + matrices[:, None, :3, 3]).reshape(-1, 3)
+    center = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    return float4(*center, float(np.linalg.norm(corners - center, axis=1).max()) * 1.02)
+
+
+def shadow_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, scene: TracedScene) -> SampleGrid:
+    """Radiance that real and virtual occluders take from the virtual surface, at every VIRTUAL_STRIDE-th pixel."""
+    shape = (camera.height // VIRTUAL_STRIDE, camera.width // VIRTUAL_STRIDE)
+    occluded = SampleGrid(VIRTUAL_STRIDE, engine.workspace.array("virtual_occluded", shape, cl_types.float4))
+    engine.launch(
+        engine.kernel("differential_rendering.cl", "shadow_virtual", **scene.defines(engine)),
+        (occluded.cols, occluded.rows),
+        occluded.cols,
+        occluded.rows,
+        VIRTUAL_STRIDE,
+        camera.width,
+        virtual.position,
+        virtual.normal,
+        virtual.object_index,
+        *scene.arguments(engine),
+        scene.rays.interleave,
+        occluded.values,
+    )
+    return occluded
+
+
+def light_points(engine: Engine, scene: TracedScene, placed: PlacedPoints | None = None) -> VirtualPointLights:
+    """What the objects send: their points lit as their pixels are (eq. 7.3), but not by one another.
+
+    placed: of place_points for the scene's objects, None: to be placed.
+    """
+    placed = placed or place_points(engine, scene.objects)
+    radiances = engine.workspace.upload("glow_radiances", placed.under_even_light(scene.light.mean))
+    lit = min(placed.count, MOST_POINTS)
+    engine.launch(
+        engine.kernel("differential_rendering.cl", "light_points", **scene.defines(engine)),
+        (lit,),
+        lit,
+        placed.points,
+        placed.normals,
+        placed.albedos,
+        placed.offsets_m,
+        scene.light.coefficients,
+        *replace(scene, glow=placed.glow).arguments(engine),
+        radiances,
+    )
+    return replace(placed.glow, radiances=radiances)

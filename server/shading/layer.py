@@ -1,0 +1,77 @@
+"""What is virtual in a frame, apart from the camera's picture (thesis 7.2.1). Kernel: layer.cl."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from server.opencl.engine import Engine
+from server.shading.composite import CompositeInputs, launch_mixture, srgb_table
+
+DEPTH_SCALE_M = 0.001
+"""Metres of a unit of a layer's depth: to 65 m; half a unit moves what is 0.5 m away by a tenth of a pixel where the
+camera moves by 10 cm."""
+NEUTRAL = 128
+"""Code of real surface that stays as it is."""
+
+
+@dataclass(frozen=True)
+class LayerPart:
+    """The box of the picture outside of which the layer says nothing."""
+
+    x: int
+    """Its first column."""
+    y: int
+    color: NDArray[np.uint8]
+    """[h, w, 4] sRGB and coverage (255: all of the pixel), or [h, w, 3] roots of factors times 128."""
+    depth: NDArray[np.uint16]
+    """[h, w] along the camera's z, in DEPTH_SCALE_M; 0: the pixel says nothing."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """picture = coverage * virtual + (1 - coverage) * ratio * camera, all linear."""
+
+    virtual: LayerPart | None = None
+    """None: none is seen."""
+    ratio: LayerPart | None = None
+    """None: real surface stays as it is."""
+    depth_scale_m: float = DEPTH_SCALE_M
+
+
+NOTHING = Layer()
+
+
+def compose_layer(engine: Engine, mixture: CompositeInputs) -> Layer:
+    """What composite would mix with the camera's picture."""
+    if mixture.is_nothing:
+        return NOTHING
+    space, size = engine.workspace, (mixture.camera.height, mixture.camera.width)
+    virtual, ratio = (space.array(f"layer_{name}", (*size, n), np.uint8) for name, n in (("virtual", 4), ("ratio", 3)))
+    depths = [space.array(f"layer_{name}_depth", size, np.uint16) for name in ("virtual", "real")]
+    others = (DEPTH_SCALE_M, srgb_table(engine), virtual, depths[0], ratio, depths[1])
+    launch_mixture(engine, "layer.cl", "compose_layer", mixture, *others)
+    seen = changed = None
+    if mixture.virtual is not None:
+        color = engine.download(virtual)
+        seen = _cropped(color, engine.download(depths[0]), color[..., 3] > 0)
+    if mixture.ratio is not None:
+        factors = engine.download(ratio)
+        changed = _cropped(factors, engine.download(depths[1]), (factors != NEUTRAL).any(axis=-1), margin=1)
+    return Layer(seen, changed)
+
+
+def _cropped(
+    color: NDArray[np.uint8], depth: NDArray[np.uint16], counts: NDArray[np.bool_], margin: int = 0
+) -> LayerPart | None:
+    """The box of the pixels that count, and `margin` pixels around them; None where there are none."""
+    rows, cols = (np.flatnonzero(counts.any(axis=axis)) for axis in (1, 0))
+    if not rows.size:
+        return None
+    top, left = max(rows[0] - margin, 0), max(cols[0] - margin, 0)
+    box = slice(top, rows[-1] + 1 + margin), slice(left, cols[-1] + 1 + margin)
+    near = cv2.dilate(counts[box].astype(np.uint8), np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)) > 0
+    return LayerPart(int(left), int(top), np.ascontiguousarray(color[box]), np.where(near, depth[box], np.uint16(0)))

@@ -1,0 +1,315 @@
+"""Shadow maps along the sharp lights of a room (thesis 7.2.3, fig. 7.7). Kernels: shadow_map.cl.
+
+The discs that direct_lights.py takes out of the light bring theirs past a picture of the virtual objects, taken from
+each disc, fitted to them, with a pyramid of coverage and mean depth. A point looks for what stands in a disc's light,
+and then, as wide as that is far away, for the parts of the disc that it leaves, at every pixel. What real things leave
+of a disc is traced through the volume from samples of the surface. Light that they keep is missing with objects and
+without: what real things hide already, virtual ones do not darken again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.maths.direct_lights import DirectLight
+from server.maths.disc_places import disc_places, ray_places, search_places
+from server.maths.dominant import MOST_LIGHTS
+from server.objects.dirty_region import box_around, dirty_region
+from server.objects.pinhole import Pinhole
+from server.objects.rasterize import Placed, VirtualSurface, drawn_depths
+from server.opencl.engine import Engine, KernelArgument, float4, int4
+from server.opencl.program import Define
+from server.shading.change_mask import mark_changes
+from server.shading.differential_rendering import MOST_POINTS, VIRTUAL_STRIDE, RealShadow, ball_around
+from server.shading.traced_scene import DeviceLight
+from server.shading.virtual_point_lights import PlacedPoints, VirtualPointLights
+from server.transfer.auxiliary_views import view_axes
+from server.transfer.sample_grid import SampleGrid
+from server.transfer.sampling import Upsampling
+from server.volume.raycast import Surface
+from server.volume.volume import Volume
+
+MAP_SIDE = 256
+"""Texels along a side of the objects' map."""
+DISTANCE = 1024.0
+"""From where objects are drawn, in radii of the ball around them: as good as from infinity."""
+LEAST_SHADING = 0.02
+"""As in include/shadows.clh."""
+_COARSEST_SIDE = 8
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ShadowMaps:
+    """One frame's; arrays of the engine's workspace, valid until the next."""
+
+    volume: Volume
+    light: DeviceLight
+    reach_m: float
+    """Length of rays to real things."""
+    rows: cl_array.Array
+    """[MOST_LIGHTS, 4] float4: right, down, towards the light (w: tangent of half its angle), irradiance (w: _rows)."""
+    ball: Floats
+    """Middle and radius of the ball around all objects, volume metres."""
+    objects: cl_array.Array
+    """[MOST_LIGHTS, texels of the pyramid] float2: covered part, mean depth in metres from the ball's middle."""
+    traced: list[tuple[Surface, SampleGrid]] = field(default_factory=list)
+    """What trace_real found last, and of what: more than one effect asks for the same."""
+
+    @property
+    def least(self) -> Floats:
+        """[3] shading that counts at least, see include/direct_mix.clh."""
+        least: Floats = LEAST_SHADING * self.light.mean + 1e-9
+        return least
+
+    def arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
+        """DIRECT_PARAMETERS of include/direct_lights.clh."""
+        return (
+            len(self.light.discs),
+            self.rows,
+            engine.workspace.constant("disc_places", _float2(np.concatenate([search_places(), disc_places()]))),
+            float4(*self.ball),
+            self.objects,
+        )
+
+    def trace_arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
+        """TRACE_PARAMETERS of shadow_map.cl."""
+        places = engine.workspace.constant("disc_ray_places", _float2(ray_places()))
+        return (*self.volume.arguments(), self.reach_m, *self.light.continued, places)
+
+
+@dataclass(frozen=True)
+class DirectSamples:
+    """What the discs bring to the samples of a ratio: [rows, cols] float4 each."""
+
+    without: cl_array.Array
+    with_objects: cl_array.Array
+
+
+def draw_shadow_maps(
+    engine: Engine, volume: Volume, light: DeviceLight, objects: Sequence[Placed], reach_m: float
+) -> ShadowMaps:
+    """Pictures of `objects`, each with its `volume_from_model`, from every disc of `light`."""
+    ball = np.array(ball_around(objects).tolist(), np.float64)
+    axes = view_axes(np.stack([disc.direction for disc in light.discs]))
+    rows = engine.workspace.upload("direct_rows", _rows(light.discs, axes))
+    return ShadowMaps(volume, light, reach_m, rows, ball, _draw_objects(engine, axes, ball, objects))
+
+
+def light_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, maps: ShadowMaps) -> cl_array.Array:
+    """[h, w] float4: what the discs bring to virtual surface, were it white."""
+    size, space = (camera.width, camera.height), engine.workspace
+    direct = space.array("direct_virtual", (camera.height, camera.width), cl_types.float4)
+    shape = (camera.height // VIRTUAL_STRIDE, camera.width // VIRTUAL_STRIDE)
+    parts = SampleGrid(VIRTUAL_STRIDE, space.array("direct_virtual_parts", shape, cl_types.float4))
+    _trace_discs(engine, camera, virtual.position, virtual.normal, parts, maps, is_virtual=True)
+    with dirty_region(engine, "direct_virtual", direct, box_around(virtual.boxes), (0, 0, *size)) as (x0, y0, x1, y1):
+        engine.launch(
+            _kernel(engine, "light_virtual"),
+            (-(-(x1 - x0) // engine.lanes), y1 - y0),
+            camera.width,
+            int4(x0, y0, x1, y1),
+            virtual.position,
+            virtual.normal,
+            *_grid(parts),
+            maps.volume.voxel_m,
+            *maps.arguments(engine),
+            direct,
+        )
+    return direct
+
+
+def trace_real(
+    engine: Engine, camera: CameraModel, surface: Surface, ratio: SampleGrid, maps: ShadowMaps
+) -> SampleGrid:
+    """What real things leave of the discs at the samples of `ratio`: float4, a disc each, w = 1 valid."""
+    for traced, parts in maps.traced:
+        if traced is surface and (parts.stride, parts.values.shape) == (ratio.stride, ratio.values.shape):
+            return parts
+    parts = SampleGrid(ratio.stride, engine.workspace.array("direct_parts", ratio.values.shape, cl_types.float4))
+    _trace_discs(engine, camera, surface.positions, surface.normals, parts, maps, is_virtual=False)
+    maps.traced[:] = [(surface, parts)]  # there is one array
+    return parts
+
+
+def light_real(
+    engine: Engine,
+    camera: CameraModel,
+    surface: Surface,
+    ratio: RealShadow,
+    parts: SampleGrid,
+    maps: ShadowMaps,
+    refined: cl_array.Array | None = None,
+    upsampling: Upsampling = "bilateral",
+    reached: cl_array.Array | None = None,
+) -> cl_array.Array:
+    """[h, w] float4: R' / R of real surface under the whole light, w = 1 where it may be other than 1.
+
+    ratio: of the rest of the light; parts: of trace_real; refined: what stands for `ratio` where w = 1; reached: of
+    change_mask.py, the cells in which `ratio` counts, None: wherever it is not 1.
+    """
+    size, space = (camera.width, camera.height), engine.workspace
+    mixed = space.array("direct_ratio", (camera.height, camera.width), cl_types.float4)
+    engine.launch(
+        _kernel(engine, "light_real", BICUBIC=upsampling == "bicubic"),
+        (-(-camera.width // engine.lanes), camera.height),
+        *size,
+        surface.positions,
+        surface.normals,
+        *_grid(parts),
+        maps.volume.voxel_m,
+        ratio.values,
+        refined is not None,
+        ratio.values if refined is None else refined,
+        ratio.shaded,
+        mark_changes(engine, camera, surface, ratio) if reached is None else reached,
+        float4(*maps.least, 0.0),
+        *maps.arguments(engine),
+        mixed,
+    )
+    return mixed
+
+
+def light_glow(engine: Engine, placed: PlacedPoints, glow: VirtualPointLights, maps: ShadowMaps) -> None:
+    """Add what points on objects send of the discs' light. Those past the first are lit evenly as it is."""
+    count = min(placed.count, MOST_POINTS)
+    engine.launch(
+        _kernel(engine, "light_glow"),
+        (-(-count // engine.lanes),),
+        count,
+        placed.points,
+        placed.normals,
+        placed.albedos,
+        *maps.arguments(engine),
+        *maps.trace_arguments(engine),
+        glow.radiances,
+        local=(max(64 // engine.lanes, 1),),
+    )
+
+
+def light_samples(
+    engine: Engine, camera: CameraModel, surface: Surface, parts: SampleGrid, maps: ShadowMaps
+) -> DirectSamples:
+    """At the samples of `parts`, all of them."""
+    shape, space = (parts.rows, parts.cols), engine.workspace
+    without, lit = (space.array(f"direct_samples_{name}", shape, cl_types.float4) for name in ("without", "with"))
+    engine.launch(
+        _kernel(engine, "light_samples"),
+        (-(-parts.cols // engine.lanes), parts.rows),
+        parts.cols,
+        parts.rows,
+        parts.stride,
+        camera.width,
+        surface.positions,
+        surface.normals,
+        parts.values,
+        *maps.arguments(engine),
+        without,
+        lit,
+    )
+    return DirectSamples(without, lit)
+
+
+def with_direct(engine: Engine, shadow: RealShadow, samples: DirectSamples, maps: ShadowMaps) -> RealShadow:
+    """The ratio of the whole light, from that of its rest."""
+    shape, space = (shadow.rows, shadow.cols), engine.workspace
+    whole, shaded = (space.array(f"direct_whole_{name}", shape, cl_types.float4) for name in ("ratio", "shaded"))
+    count = shadow.rows * shadow.cols
+    mixed = (shadow.values, shadow.shaded, samples.without, samples.with_objects)
+    engine.launch(_kernel(engine, "mix_direct"), (count,), count, float4(*maps.least, 0.0), *mixed, whole, shaded)
+    return RealShadow(shadow.stride, whole, shaded)
+
+
+def without_direct(
+    engine: Engine, whole: RealShadow, shadow: RealShadow, samples: DirectSamples, maps: ShadowMaps
+) -> RealShadow:
+    """The ratio of the rest, from that of the whole light; `shadow`: what with_direct was given."""
+    rest = engine.workspace.array("direct_rest_ratio", (shadow.rows, shadow.cols), cl_types.float4)
+    count = shadow.rows * shadow.cols
+    mixed = (whole.values, shadow.shaded, samples.without, samples.with_objects)
+    engine.launch(_kernel(engine, "unmix_direct"), (count,), count, float4(*maps.least, 0.0), *mixed, rest)
+    return replace(shadow, values=rest, whole=whole)
+
+
+def _draw_objects(engine: Engine, axes: Floats, ball: Floats, objects: Sequence[Placed]) -> cl_array.Array:
+    """The pyramids. axes: [lights, 3, 3]."""
+    texels, distance_m = (4 * MAP_SIDE**2 - _COARSEST_SIDE**2) // 3, DISTANCE * float(ball[3])
+    maps = engine.workspace.array("object_maps", (MOST_LIGHTS, texels), cl_types.float2)
+    middle, focal_px = (MAP_SIDE - 1) / 2, DISTANCE * MAP_SIDE / 2
+    camera = Pinhole(MAP_SIDE, MOST_LIGHTS * MAP_SIDE, focal_px, focal_px, middle, middle)
+    drawn: list[Placed] = []
+    for light, rotation in enumerate(
+        axes
+    ):  # one picture, a light's below the other's: each sees the objects for itself
+        camera_from_volume = np.eye(4)
+        camera_from_volume[:3, :3] = rotation
+        camera_from_volume[:3, 3] = -rotation @ ball[:3] + [0.0, 0.0, distance_m]
+        camera_from_volume[1] += light * MAP_SIDE / focal_px * camera_from_volume[2]
+        drawn += [(thing, camera_from_volume @ volume_from_model) for thing, volume_from_model in objects]
+    nearest = drawn_depths(engine, camera, np.eye(4), drawn, "shadow_map")
+    size = (MAP_SIDE, len(axes) * MAP_SIDE)
+    engine.launch(_kernel(engine, "begin_maps"), size, len(axes), distance_m, nearest, maps)
+    for level in range(1, (MAP_SIDE // _COARSEST_SIDE).bit_length()):
+        side = MAP_SIDE >> level
+        engine.launch(_kernel(engine, "halve_maps"), (side, side, len(axes)), len(axes), level, maps)
+    return maps
+
+
+def _trace_discs(
+    engine: Engine,
+    camera: CameraModel,
+    positions: cl_array.Array,
+    normals: cl_array.Array,
+    parts: SampleGrid,
+    maps: ShadowMaps,
+    is_virtual: bool,
+) -> None:
+    engine.launch(
+        _kernel(engine, "trace_discs"),
+        (parts.cols, parts.rows),
+        parts.cols,
+        parts.rows,
+        parts.stride,
+        camera.width,
+        positions,
+        normals,
+        is_virtual,
+        *maps.arguments(engine),
+        *maps.trace_arguments(engine),
+        parts.values,
+    )
+
+
+def _grid(grid: SampleGrid) -> tuple[KernelArgument, ...]:
+    return grid.cols, grid.rows, grid.stride, grid.values
+
+
+def _rows(discs: Sequence[DirectLight], axes: Floats) -> NDArray[np.float32]:
+    """[MOST_LIGHTS, 4] float4. Right, down, towards the light with the tangent of the disc's half angle, and the
+    irradiance with what surface that faces the disc gets of it: the mean cosine of its parts."""
+    rows = np.zeros((MOST_LIGHTS, 4, 4), np.float32)  # always as many: lights come and go, arrays do not
+    count = len(discs)
+    rows[:count, :3, :3] = axes * np.array([1.0, 1.0, -1.0])[:, None]
+    tangent = np.tan([disc.half_angle_rad for disc in discs])
+    rows[:count, 2, 3] = tangent
+    rows[:count, 3, :3] = [disc.irradiance for disc in discs]
+    distance = np.linalg.norm(disc_places(), axis=1)
+    rows[:count, 3, 3] = (1 / np.sqrt(1 + np.outer(tangent, distance) ** 2)).mean(axis=1)
+    return rows.view(cl_types.float4)[..., 0]
+
+
+def _float2(places: Floats) -> NDArray[np.float32]:
+    return np.ascontiguousarray(places, np.float32).view(cl_types.float2)[:, 0]
+
+
+def _kernel(engine: Engine, name: str, **defines: Define) -> cl.Kernel:
+    return engine.kernel("shadow_map.cl", name, MAP_SIDE=MAP_SIDE, LANES=engine.lanes, **defines)

@@ -1,0 +1,106 @@
+"""Tone mapping (thesis 7.1, H of eq. 7.1-7.2): how bright virtual things are beside what the camera pictures.
+
+The light's own scale rests on the albedo that real surfaces are taken to have where nothing tells it, and on the fit of
+the light. H rests on the buffers' averages instead: shading is scaled so that on average a surface of that albedo is as
+bright as the picture, whatever the fit is. Under an estimated light that errs less (path-traced rooms, white and
+textured). On real surface R' / R needs no scale, which would cancel.
+Kernel: tone_mapping.cl.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+
+from protocol.frames import CameraModel
+from server.light.light_estimation import ASSUMED_ALBEDO, FORGETTING
+from server.opencl.engine import Engine
+from server.shading.traced_scene import DeviceLight, light_arguments
+from server.transfer.indirect import Indirect, no_hits
+from server.transfer.radiance_transfer import Directions, Transfer, sample_arguments
+from server.volume.raycast import Surface
+from server.volume.volume import Volume
+
+EVERY = 3
+"""Of how many samples along an axis one counts; an odd number, so that all direction sets take part."""
+LEAST_LUMINANCE = 1e-4
+"""Of an average that says anything; the picture's white is 1."""
+
+
+@dataclass(frozen=True)
+class Averages:
+    """Mean luminances over the usable samples of real surface."""
+
+    picture: float
+    shading: float
+    """R, of white surface without virtual objects."""
+    samples: int
+
+    @property
+    def are_known(self) -> bool:
+        """Whether there is something to match: neither buffer is empty or black."""
+        return self.samples > 0 and min(self.picture, self.shading) > LEAST_LUMINANCE
+
+    @property
+    def gain(self) -> float:
+        """What brings shading to the picture's units; 1, the light's own scale, where the averages are not known."""
+        return self.picture / (ASSUMED_ALBEDO * self.shading) if self.are_known else 1.0
+
+
+class AverageMemory:
+    """A session's averages, over its last frames: what comes into the picture must not make brightness jump."""
+
+    def __init__(self) -> None:
+        self._picture = self._shading = self._weight = 0.0
+        self._samples = 0
+
+    def update(self, frame: Averages, exposure: float) -> Averages:
+        """Averages with one more frame, of that `exposure`; one that cannot be matched leaves them as they are."""
+        if frame.are_known:
+            self._picture = FORGETTING * self._picture + frame.picture / exposure
+            self._shading = FORGETTING * self._shading + frame.shading / exposure
+            self._weight = FORGETTING * self._weight + 1.0
+            self._samples = frame.samples
+        scale = exposure / max(self._weight, 1.0)
+        return Averages(scale * self._picture, scale * self._shading, self._samples)
+
+
+def measure_averages(
+    engine: Engine,
+    camera: CameraModel,
+    radiance: cl_array.Array,
+    surface: Surface,
+    transfer: Transfer,
+    volume: Volume,
+    rays: Directions,
+    light: DeviceLight,
+    indirect: Indirect | None,
+    reach_m: float,
+) -> Averages:
+    """Averages of one frame. radiance: [h, w] float4 as in Measurement; indirect: what surfaces send, None: nothing."""
+    cols, rows = -(-transfer.cols // EVERY), -(-transfer.rows // EVERY)
+    pairs = engine.workspace.array("tone_pairs", (rows, cols), cl_types.float4)
+    words = transfer.free_mask.shape[2]
+    defines = {"BANDS": transfer.bands, "MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": transfer.interleave}
+    engine.launch(
+        engine.kernel("tone_mapping.cl", "shade_pairs", **defines),
+        (cols, rows),
+        *sample_arguments(engine, camera, surface, transfer),
+        radiance,
+        transfer.coefficients,
+        indirect.hits if indirect else no_hits(engine, transfer),
+        light.coefficients,
+        *light_arguments(engine, light, volume, rays, reach_m),
+        EVERY,
+        cols,
+        rows,
+        pairs,
+    )
+    sums = engine.workspace.array("tone_sums", (rows,), cl_types.float4)
+    engine.launch(engine.kernel("tone_mapping.cl", "sum_rows", **defines), (rows,), cols, rows, pairs, sums)
+    total = engine.download(sums).view(np.float32).reshape(-1, 4).sum(axis=0, dtype=np.float64)
+    count = int(total[2])
+    return Averages(float(total[0]) / max(count, 1), float(total[1]) / max(count, 1), count)

@@ -1,0 +1,147 @@
+"""What virtual objects send: one bounce of light off a few points of each (thesis 7.3.3, eq. 7.3-7.7).
+
+The points are dealt over an object's surface once, on both of its sides. Every frame they are lit as its pixels are;
+rays that meet the object take what the points around send. Kernels: differential_rendering.cl (light_points),
+include/virtual_point_lights.clh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from server.objects.rasterize import Placed
+from server.objects.surface_points import SIDES, SurfacePoints, float4_rows
+from server.opencl.engine import Engine, KernelArgument
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class VirtualPointLights:
+    """What Glow of virtual_point_lights.clh takes; arrays of the engine's workspace, valid until the next frame."""
+
+    nearest: cl_array.Array
+    cells: cl_array.Array
+    points: cl_array.Array
+    normals: cl_array.Array
+    radiances: cl_array.Array
+
+    def arguments(self) -> tuple[KernelArgument, ...]:
+        """In the order of OBJECT_PARAMETERS of include/shadows.clh."""
+        return self.nearest, self.cells, self.points, self.normals, self.radiances
+
+
+@dataclass(frozen=True)
+class PlacedPoints:
+    """The points of all objects, to be lit."""
+
+    count: int
+    points: cl_array.Array
+    """[count] float4: volume metres, w = 1."""
+    normals: cl_array.Array
+    """[count] float4: unit, volume axes."""
+    colors: Floats
+    """[count, 3] albedos on the host."""
+    albedos: cl_array.Array
+    """[count] float4."""
+    offsets_m: cl_array.Array
+    """[count] float32: how far off its surface rays of a point begin."""
+    glow: VirtualPointLights
+    """With nothing sent yet."""
+
+    def under_even_light(self, radiance: Floats) -> NDArray[np.float32]:
+        """[count] float4: what the points send under a light [3] from everywhere."""
+        return float4_rows(self.colors * radiance, 1.0)
+
+
+def no_point_lights(engine: Engine, objects: int = 1) -> VirtualPointLights:
+    """So many objects that send nothing: they have no cells."""
+    count = max(objects, 1)
+    empty = engine.workspace.constant("no_glow", np.zeros(1, cl_types.float4))
+    return VirtualPointLights(
+        engine.workspace.constant("no_glow_nearest", np.full(SIDES, -1, np.int32)),
+        engine.workspace.constant(f"no_glow_cells_{count}", np.zeros(count, cl_types.int4)),
+        empty,
+        empty,
+        empty,
+    )
+
+
+@dataclass(frozen=True)
+class _Gathered:
+    """The points of several objects, one object's after the other's, apart from where they stand."""
+
+    surfaces: tuple[SurfacePoints, ...]
+    owners: NDArray[np.int64]
+    """[n] which object."""
+    points: Floats
+    normals: Floats
+    albedos: Floats
+    nearest: NDArray[np.int32]
+    """As Glow has it."""
+    cells: NDArray[np.int32]
+    """[objects, 4]."""
+
+
+_GATHERED: WeakKeyDictionary[Engine, _Gathered] = WeakKeyDictionary()
+"""Of each engine's last objects: they move from frame to frame, but seldom change."""
+
+
+def _gather(engine: Engine, surfaces: tuple[SurfacePoints, ...]) -> _Gathered:
+    held = _GATHERED.get(engine)
+    if held is not None and [*map(id, held.surfaces)] == [*map(id, surfaces)]:
+        return held
+    counts, sizes = [len(s.points) for s in surfaces], [s.nearest[..., 0].size for s in surfaces]
+    first, start = np.cumsum([0, *counts[:-1]]), np.cumsum([0, *sizes[:-1]])
+    nearest = np.concatenate([s.nearest.ravel() for s in surfaces])
+    shift = np.repeat(first, np.multiply(sizes, SIDES))
+    gathered = _Gathered(
+        surfaces,
+        np.repeat(np.arange(len(surfaces)), counts),
+        np.concatenate([s.points for s in surfaces]),
+        np.concatenate([s.normals for s in surfaces]),
+        np.concatenate([s.albedos for s in surfaces]),
+        np.where(nearest >= 0, nearest + shift, -1).astype(np.int32),
+        np.column_stack([[s.nearest.shape[2::-1] for s in surfaces], start]).astype(np.int32),
+    )
+    _GATHERED[engine] = gathered
+    return gathered
+
+
+def place_points(engine: Engine, objects: Sequence[Placed]) -> PlacedPoints:
+    """The points of `objects`, each with its `volume_from_model`, where they are now."""
+    space, every = engine.workspace, _gather(engine, tuple(thing.surface_points for thing, _ in objects))
+    volume_from_model = np.array([matrix for _, matrix in objects])
+    volume_from_grid = volume_from_model @ np.linalg.inv(np.array([thing.grid.grid_from_model for thing, _ in objects]))
+    points = _turned(volume_from_grid[:, :3, :3], every.owners, every.points) + volume_from_grid[every.owners, :3, 3]
+    normals = _turned(volume_from_model[:, :3, :3], every.owners, every.normals)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    cells_m = np.linalg.norm(volume_from_grid[:, :3, 0], axis=1)
+    return PlacedPoints(
+        len(points),
+        space.upload("glow_places", float4_rows(points, 1.0)),
+        space.upload("glow_place_normals", float4_rows(normals)),
+        every.albedos,
+        space.upload("glow_albedos", float4_rows(every.albedos)),
+        space.upload("glow_offsets", cells_m[every.owners].astype(np.float32)),
+        VirtualPointLights(
+            space.upload("glow_nearest", every.nearest),
+            space.upload("glow_cells", every.cells.view(cl_types.int4)[:, 0]),
+            space.upload("glow_points", float4_rows(every.points)),
+            space.upload("glow_normals", float4_rows(every.normals)),
+            space.upload("glow_nothing", np.zeros(len(points), cl_types.float4)),
+        ),
+    )
+
+
+def _turned(matrices: Floats, owners: NDArray[np.int64], vectors: Floats) -> Floats:
+    """[n, 3] each of `vectors` by its owner's matrix [objects, 3, 3]."""
+    turned: Floats = np.einsum("nij,nj->ni", matrices[owners], vectors)
+    return turned

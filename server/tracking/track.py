@@ -1,0 +1,263 @@
+"""Frame-to-model tracking (KinectFusion 3.5; thesis 4.2.1): point-to-plane ICP of the measured depth against the
+surface that the volume predicts. Kernels: track.cl.
+
+Every pixel of the model looks its measurement up: the measured point is a sample, never interpolated, and the surface
+that it is compared with is smooth. All pictures of the pair are camera-centred, so float32 holds at any distance from
+the volume's origin; poses and equations are float64.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.maths.registration import Scale, least_information, motion_of_twist, solve_where_fixed, symmetric
+from server.maths.rigid import inverse_rigid, repaired_pose
+from server.opencl.engine import Engine, float4, float16
+from server.volume.raycast import Surface
+
+Pyramid = tuple[cl_array.Array, ...]
+"""Depth pictures of the levels that are used, finest first."""
+
+_FINEST_WIDTH_PX = 160
+"""Halving averages noise and quantisation away: on 640x480 pictures, ending at 160x120 erred a third as much as ending
+at full size, in a fifth of the time."""
+_LEVELS = 3
+_LANES, _ROWS, _SUMS = 8, 16, 32
+_EDGE = 0.05
+"""Share of the depth within which pixels of a coarser level are one surface."""
+
+NOISE_M = 0.002
+"""Standard deviation of a depth. One that grows with depth, as a sensor's does, erred more: what is near is too little
+to turn by."""
+_GATES_M = (0.05, 0.08, 0.15)
+"""Per level, finest first: farther apart is another surface."""
+_ITERATIONS = (8, 4, 4)
+_WIDEST_CUTOFF, _CLOSEST_CUTOFF = 30.0, 1.0
+"""Tukey's cut-off in standard deviations; between the two it is 4.685 times the residuals' own."""
+_CONVERGED_M = 2e-5
+
+CORRELATED_PIXELS = 64.0
+"""Noise of a depth picture is alike over patches: only one pixel in so many is evidence of its own."""
+NORMAL_NOISE_RAD = 0.03
+"""Of the predicted surface's normals, which otherwise would look like structure."""
+
+
+@dataclass(frozen=True)
+class ModelView:
+    """The predicted surface in the axes of the camera it was predicted for."""
+
+    levels: tuple[cl_array.Array, ...]
+    """Per level, finest first, planes [4, h, pitch] float32: depth (metres, 0 = none), normal x, y, z. Pixel (x, y) of
+    a picture halved i times is pixel (2^i x, 2^i y) of the camera."""
+    volume_from_camera: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Registration:
+    """How the measured depth lies on the model."""
+
+    volume_from_camera: NDArray[np.float64]
+    deviation_m: float
+    """Root mean square distance of the pairs used from the surface."""
+    depth_m: float
+    """Mean depth of the surface compared."""
+    share: float
+    """Of the measured pixels where the model has surface: how many agree with it, 0 to 1."""
+    overlap: float
+    """Share of the picture that was compared."""
+    free: NDArray[np.float64]
+    """[k, 6] directions (turn * radius, shift; world axes) that the scene does not fix: they were not moved."""
+    iterations: int
+
+
+def finest_level(camera: CameraModel) -> int:
+    """How many times pictures are halved before they are compared."""
+    return max(0, round(float(np.log2(camera.width / _FINEST_WIDTH_PX))))
+
+
+def level_intrinsics(camera: CameraModel, level: int) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy of a depth picture halved `level` times."""
+    scale = 0.5**level
+    shift = 0.5 - 0.5 * scale  # the centre of a block of pixels is not its first pixel's
+    return camera.fx * scale, camera.fy * scale, camera.cx * scale - shift, camera.cy * scale - shift
+
+
+def depth_pyramid(engine: Engine, camera: CameraModel, depth_m: cl_array.Array) -> Pyramid:
+    """The used levels of depth [h, w] (0 = none), halved without mixing surfaces."""
+    finest, levels = finest_level(camera), [depth_m]
+    for level in range(1, finest + _LEVELS):
+        width, height = _size(camera, level)
+        halved = engine.workspace.array(f"track_depth_{level}", (height, width), np.float32)
+        engine.launch(
+            engine.kernel("track.cl", "halve_depth", ROWS=_ROWS),
+            (width, height),
+            width,
+            height,
+            _size(camera, level - 1)[0],
+            levels[-1],
+            _EDGE,
+            halved,
+        )
+        levels.append(halved)
+    return tuple(levels[finest:])
+
+
+def view_model(
+    engine: Engine, camera: CameraModel, volume_from_camera: NDArray[np.float64], model: Surface, name: str = "track"
+) -> ModelView:
+    """A copy of the surface predicted at `volume_from_camera`, as `register` wants it; `name`: of its memory."""
+    levels = []
+    for level in range(finest_level(camera), finest_level(camera) + _LEVELS):
+        width, height = _size(camera, level)
+        pitch = _pitch(width)
+        planes = engine.workspace.array(f"{name}_view_{level}", (4, height, pitch), np.float32)
+        engine.launch(
+            engine.kernel("track.cl", "view_model", ROWS=_ROWS),
+            (pitch, height),
+            width,
+            height,
+            pitch,
+            1 << level,
+            camera.width,
+            model.positions,
+            model.normals,
+            float16(inverse_rigid(volume_from_camera)),
+            planes,
+        )
+        levels.append(planes)
+    return ModelView(tuple(levels), volume_from_camera)
+
+
+def register(
+    engine: Engine,
+    camera: CameraModel,
+    view: ModelView,
+    pyramid: Pyramid,
+    guess: NDArray[np.float64],
+    tolerance_m: float,
+) -> Registration | None:
+    """The measured depth laid on the model, from `guess` (volume_from_camera); None where they do not meet.
+
+    `tolerance_m`: directions that the scene fixes less well than this stay where the guess has them.
+    """
+    model_from_current = inverse_rigid(view.volume_from_camera) @ guess
+    cutoff, sums, iterations = _WIDEST_CUTOFF, None, 0
+    free = np.empty((0, 6))
+    for rung in reversed(range(_LEVELS)):
+        level = finest_level(camera) + rung
+        for _ in range(_ITERATIONS[rung]):
+            sums = _sum_equations(
+                engine, camera, view.levels[rung], pyramid[rung], level, model_from_current, cutoff, _GATES_M[rung]
+            )
+            iterations += 1
+            if sums.weight < 6:
+                return None
+            spread = min(_WIDEST_CUTOFF, 4.685 * sums.deviation)
+            cutoff = max(_CLOSEST_CUTOFF, spread)
+            correlated = max(CORRELATED_PIXELS / 4**level, 1.0) * max(sums.deviation, 1.0) ** 2
+            least = least_information(correlated, tolerance_m, NORMAL_NOISE_RAD, sums.total_information)
+            solution = solve_where_fixed(sums.information, sums.gradient, sums.scale(camera), least)
+            model_from_current = motion_of_twist(solution.twist) @ model_from_current
+            free = solution.free
+            if solution.step_m < _CONVERGED_M * 4**rung:
+                break
+    assert sums is not None
+    pose = repaired_pose(view.volume_from_camera @ model_from_current)  # products of rotations wander from them
+    turned = np.kron(np.eye(2), view.volume_from_camera[:3, :3])
+    return Registration(
+        pose, NOISE_M * sums.deviation, sums.depth_m, sums.share, sums.overlap(camera), free @ turned.T, iterations
+    )
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """What sum_equations of track.cl summed."""
+
+    values: NDArray[np.float64]
+    level: int
+
+    @property
+    def information(self) -> NDArray[np.float64]:
+        return symmetric(self.values[:21])
+
+    @property
+    def gradient(self) -> NDArray[np.float64]:
+        return self.values[21:27]
+
+    @property
+    def weight(self) -> float:
+        return float(self.values[28])
+
+    @property
+    def deviation(self) -> float:
+        return float(np.sqrt(self.values[27] / self.values[28]))
+
+    @property
+    def depth_m(self) -> float:
+        return float(self.values[29] / self.values[28])
+
+    @property
+    def share(self) -> float:
+        return float(self.values[28] / max(self.values[30], 1.0))
+
+    @property
+    def total_information(self) -> float:
+        """Sum of w / sigma^2, 1/m^2: the normals are unit vectors."""
+        return float(self.values[[15, 18, 20]].sum())
+
+    def overlap(self, camera: CameraModel) -> float:
+        width, height = _size(camera, self.level)
+        return float(self.values[30] / (width * height))
+
+    def scale(self, camera: CameraModel) -> Scale:
+        """Centre and radius of what a picture at this mean depth holds."""
+        depth_m = self.depth_m
+        half_diagonal = 0.5 * np.hypot(camera.width / camera.fx, camera.height / camera.fy)
+        return Scale(np.array([0.0, 0.0, depth_m]), max(depth_m * half_diagonal / np.sqrt(3), 1e-3))
+
+
+def _sum_equations(
+    engine: Engine,
+    camera: CameraModel,
+    view: cl_array.Array,
+    depth_m: cl_array.Array,
+    level: int,
+    model_from_current: NDArray[np.float64],
+    cutoff: float,
+    gate_m: float,
+) -> _Equations:
+    width, height = _size(camera, level)
+    columns, strips = _pitch(width) // _LANES, -(-height // _ROWS)
+    partial = engine.workspace.array(f"track_sums_{level}", (columns * strips, _SUMS), np.float32)
+    scale = 0.5**level
+    engine.launch(
+        engine.kernel("track.cl", "sum_equations", ROWS=_ROWS),
+        (columns, strips),
+        cl_types.make_int2(width, height),  # type: ignore[attr-defined]
+        _pitch(width),
+        view,
+        depth_m,
+        float4(camera.fx * scale, camera.fy * scale, camera.cx * scale, camera.cy * scale),
+        float4(*level_intrinsics(camera, level)),
+        float16(model_from_current),
+        float16(inverse_rigid(model_from_current)),
+        NOISE_M,
+        cutoff,
+        gate_m,
+        partial,
+    )
+    return _Equations(engine.download(partial).sum(axis=0, dtype=np.float64), level)
+
+
+def _size(camera: CameraModel, level: int) -> tuple[int, int]:
+    return camera.width >> level, camera.height >> level
+
+
+def _pitch(width: int) -> int:
+    return -(-width // _LANES) * _LANES

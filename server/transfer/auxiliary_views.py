@@ -1,0 +1,217 @@
+"""Depth pictures of the volume from all around it (thesis 7.3.2): what the camera does not see still casts shadows.
+
+Kernels: auxiliary_views.cl. The thesis has four (left, right, above, along the dominant light) and marches
+through them; here there are so many that each direction has one that looks nearly along it, so that a single look
+answers it. They are small, and the volume changes little from frame to frame, so only some are drawn anew each frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.maths.sh import GOLDEN_TURN, spherical_fibonacci
+from server.opencl.engine import Engine, float4
+from server.transfer.radiance_transfer import Directions, first_set
+from server.volume.raycast import Surface
+from server.volume.volume import BRICK, Volume
+
+Floats = NDArray[np.float64]
+
+SIDE_PX = 128
+"""Pixels of a view's side."""
+VIEWS = 1024
+"""Views besides the one from the dominant light; neighbours are 6 degrees apart."""
+DISTANCE = 50.0
+"""From a view's eye to the volume's centre, in half diagonals: lines of sight are parallel to 1.2 degrees."""
+_SET_STEP = 8  # samples so far apart along an axis have the same directions
+LEAST_TURN = float(np.cos(np.deg2rad(3.0)))
+"""The view from the dominant light is drawn anew once the light has turned by 3 degrees."""
+GROWTH = 0.03
+"""A view is out of date once the volume has so many more bricks than it was drawn of, as a share.
+
+Whoever enters a room sees much of it for the first time within a second, and light would come through it."""
+YOUNG_FRAMES = 16
+"""Likewise a view of a volume of fewer frames, once there are twice as many: a few noisy frames leave holes."""
+MOST_PER_FRAME = 96
+"""Views that a frame draws at the most, where many are out of date."""
+
+
+@dataclass(frozen=True)
+class AuxiliaryViews:
+    """Views of the volume, on the device. What a view does not see gets no light from where it stands."""
+
+    toward: Floats
+    """[views, 3] unit directions from the scene to the views' eyes, world axes; the last is towards the dominant light,
+    if `has_light_view`."""
+    has_light_view: bool
+    axes: cl_array.Array
+    """[views, 3] float4: right, down and forward of each view, unit, world axes."""
+    depths: cl_array.Array
+    """[views, side, side] float32 metres along the forward axis to the first solid voxel, 0 = none."""
+    center: Floats
+    """[3] volume space: what all views look at."""
+    distance_m: float
+    """From every eye to the centre."""
+    per_pixel: float
+    """Slope between neighbouring lines of sight."""
+
+    @property
+    def side(self) -> int:
+        """Pixels of a view's side."""
+        return int(self.depths.shape[1])
+
+    @property
+    def pixel_m(self) -> float:
+        """Size of a pixel where the scene is."""
+        return self.per_pixel * self.distance_m
+
+
+class ViewsAround:
+    """The views of one session and volume. Owned by one thread."""
+
+    def __init__(self, engine: Engine, count: int = VIEWS, per_frame: int | None = None) -> None:
+        """`per_frame`: views drawn anew each frame, in turn, after the first, and more while the volume grows; None
+        draws all."""
+        self.lattice = spherical_fibonacci(count)
+        self._engine = engine
+        scattered = np.argsort(np.arange(count) * GOLDEN_TURN % 1)
+        self._order = np.append(scattered, count)  # views drawn together lie all around
+        self._axes = np.zeros((count + 1, 3, 4), np.float32)
+        self._axes[:count, :, :3] = view_axes(self.lattice)
+        self._light = np.zeros(3)
+        self._per_frame = count if per_frame is None else min(per_frame, count)
+        self._next: int | None = None
+        self._drawn_of = np.zeros((2, count + 1), np.int64)  # bricks and frames, by view
+
+    def update(self, volume: Volume, dominant_direction: Floats | None = None) -> AuxiliaryViews:
+        """The views, as of this frame. dominant_direction: world, unit, towards the light; None or zeros: not known."""
+        if (
+            dominant_direction is not None
+            and dominant_direction @ self._light < LEAST_TURN
+            and dominant_direction.any()
+        ):
+            self._light = np.array(dominant_direction, np.float64)
+            self._axes[-1, :, :3] = view_axes(self._light)
+            due = np.union1d(self._due(volume), len(self.lattice))
+        else:
+            due = self._due(volume)
+        self._drawn_of[:, due] = [[volume.allocated_bricks], [volume.frames]]
+        views = self._views(volume)
+        draw_views(self._engine, volume, views, due.astype(np.int32))
+        return views
+
+    def _due(self, volume: Volume) -> NDArray[np.int64]:
+        """The views whose turn it is, the light's after the others; the oldest come first."""
+        count = len(self.lattice)
+        if self._next is None:
+            self._next = 0
+            return np.arange(count)
+        bricks, frames = self._drawn_of[:, :count]
+        has_grown = volume.allocated_bricks > (1 + GROWTH) * bricks
+        has_aged = (frames < YOUNG_FRAMES) & (volume.frames >= np.maximum(2 * frames, 1))
+        outdated = int((has_grown | has_aged).sum())
+        most = max(self._per_frame, min(MOST_PER_FRAME, count))
+        share = min(self._per_frame + outdated, most)
+        turns = (self._next + np.arange(share)) % (count + bool(self._light.any()))
+        self._next = int(turns[-1]) + 1
+        return self._order[turns]
+
+    def _views(self, volume: Volume) -> AuxiliaryViews:
+        size_m = np.array(volume.bricks) * (BRICK * volume.voxel_m)
+        has_light = bool(self._light.any())
+        toward = np.concatenate([self.lattice, self._light[None]]) if has_light else self.lattice
+        space = self._engine.workspace
+        return AuxiliaryViews(
+            toward,
+            has_light,
+            space.upload("view_axes", self._axes.view(cl_types.float4)[..., 0]),
+            space.array("view_depths", (len(self._axes), SIDE_PX, SIDE_PX), np.float32),
+            size_m / 2,
+            DISTANCE * float(np.linalg.norm(size_m)) / 2,
+            2 / (SIDE_PX * float(np.sqrt(DISTANCE**2 - 1))),
+        )
+
+
+def view_axes(toward: Floats) -> Floats:
+    """[..., 3, 3] rows right, down and forward of views from unit directions `toward` [..., 3]."""
+    forward = -toward
+    helper = np.eye(3)[np.abs(forward).argmin(-1)]
+    right = np.cross(helper, forward)
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    return np.stack([right, np.cross(forward, right), forward], axis=-2)
+
+
+def draw_views(engine: Engine, volume: Volume, views: AuxiliaryViews, due: NDArray[np.int32]) -> None:
+    """Cast the lines of sight of the views `due`."""
+    engine.launch(
+        _kernel(engine, "draw_views", views, 1),
+        (-(-views.side // engine.lanes), views.side, len(due)),
+        len(due),
+        engine.workspace.upload("due_views", due),
+        *volume.arguments(),
+        float4(*views.center, 0.0),
+        views.distance_m,
+        views.per_pixel,
+        views.axes,
+        views.depths,
+    )
+
+
+def look_into_views(
+    engine: Engine,
+    camera: CameraModel,
+    surface: Surface,
+    normals: cl_array.Array,
+    stride: int,
+    views: AuxiliaryViews,
+    view_of: NDArray[np.int32],
+    rays: Directions,
+    reach_m: float,
+    lift_m: float,
+    turn: int,
+) -> cl_array.Array:
+    """[rows, cols, words] uint32: bit j set where direction j is above the surface of a sample and its view sees it.
+
+    normals: [rows, cols] float4 of the samples, w = 0 without surface. view_of: [SETS, count].
+    """
+    rows, cols = normals.shape
+    words = -(-rays.count // 32)
+    lit = engine.workspace.array("lit", (rows, cols, words), np.uint32)
+    lane_cols = 4 if engine.lanes == 8 else 1
+    block_cols, block_rows = -(-cols // (_SET_STEP * lane_cols)), -(-rows // (_SET_STEP * engine.lanes // lane_cols))
+    engine.launch(
+        _kernel(engine, "look_into_views", views, words),
+        (_SET_STEP**2 * block_cols * block_rows,),
+        cols,
+        rows,
+        stride,
+        camera.width,
+        block_cols,
+        block_rows,
+        surface.positions,
+        normals,
+        rays.count,
+        first_set(turn),
+        rays.on_device(engine),
+        engine.workspace.upload("view_of", view_of),
+        views.axes,
+        views.depths,
+        float4(*views.center, 0.0),
+        views.distance_m,
+        views.per_pixel,
+        reach_m,
+        lift_m,
+        lit,
+    )
+    return lit
+
+
+def _kernel(engine: Engine, name: str, views: AuxiliaryViews, words: int) -> cl.Kernel:
+    return engine.kernel("auxiliary_views.cl", name, MASK_WORDS=words, LANES=engine.lanes, SIDE=views.side)

@@ -1,0 +1,260 @@
+"""Radiance transfer in image space: GR15 and GR15FAST (thesis 6.2). Kernels: image_space.cl.
+
+Visibility is looked up instead of traced. A direction's far part is one look into the auxiliary view from where its
+light comes. Its near part, finer than their pixels, and what moves too fast for the volume is marched through the
+camera's own geometry buffer: samples at distances that grow by a constant ratio, so that each stands for a piece of
+the direction's cone, beginning elsewhere in each of 2 x 2 samples (6.2.1), with the self-occlusion correction of 6.2.2.
+
+Eq. 6.4 as printed, chi = cos(half the angle), lets V' rise over nearly 90 degrees, and what merely stands beside a
+direction blocks it; 1 - cos, which its text wants, wins (tests/pipeline/test_image_space.py). In the auxiliary views
+nothing is left to correct: they look along the direction.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.input.measure import intrinsics
+from server.maths.rigid import inverse_rigid
+from server.maths.self_occlusion import occlusion_threshold
+from server.maths.sh import GOLDEN_TURN
+from server.opencl.engine import Engine, float16
+from server.transfer.auxiliary_views import VIEWS, AuxiliaryViews, ViewsAround, look_into_views
+from server.transfer.radiance_transfer import (
+    Directions,
+    Transfer,
+    first_set,
+    own_sets,
+    room_for_transfer,
+    window_arguments,
+)
+from server.transfer.real_depth_views import RealDepthViews
+from server.volume.raycast import Surface
+from server.volume.volume import Volume
+
+Floats = NDArray[np.float64]
+
+VIEWS_PER_FRAME = 32
+"""Auxiliary views drawn anew each frame: all in 32 frames."""
+NEAR_STEPS = 4
+"""Samples along a direction in the camera's picture."""
+NEAR_PIXELS = 4.0
+"""How far they reach, in pixels of the auxiliary views. Farther, what merely stands beside a direction in the picture
+darkens more than it corrects: at 38 cm the lights around the synthetic table are off by 14 degrees, at 10 cm by 3."""
+FURTHER_STEPS = 8
+"""Samples where something in the picture is unknown to the volume (a hand); it alone counts beyond the near part."""
+LEAST_RATIO = 1.3
+"""Between a sample's distance and the next's: 8 samples reach 8 times as far as the first."""
+FIRST_VOXELS = 2.0
+"""Distance of the first of them from the ray's origin, which is one voxel off the surface."""
+SLACK = 0.15
+"""How much deeper than it looks a surface may be, as a share of a sample's distance: about what passes unseen between
+two samples."""
+LIFT_VOXELS = 1.5
+"""What stands less than this above a point's tangent plane is the point's own surface: voxels are taken whole."""
+
+
+class ImageSpaceTransfer:
+    """One session's image-space transfer and its auxiliary views. Owned by one thread."""
+
+    def __init__(
+        self, engine: Engine, rays: Directions, views: int = VIEWS, views_per_frame: int | None = VIEWS_PER_FRAME
+    ) -> None:
+        """`views_per_frame`: None draws all auxiliary views every frame."""
+        self._engine = engine
+        self._rays = rays
+        self._around = ViewsAround(engine, views, views_per_frame)
+        self._cosines, self._nearest = nearest_views(rays, self._around.lattice)
+        self._threshold = occlusion_threshold(rays.directions[0, :, :3].astype(np.float64))
+        self.looks: RealDepthViews | None = None
+
+    def transfer(
+        self,
+        camera: CameraModel,
+        volume_from_camera: Floats,
+        volume: Volume,
+        surface: Surface,
+        stride: int,
+        reach_m: float,
+        dominant_direction: Floats | None = None,
+        threshold: float | None = None,
+        turn: int = 0,
+    ) -> Transfer:
+        """Transfer of the real world alone at every `stride`-th pixel, in the arrays that `transfer_radiance` gives.
+
+        surface: the hybrid geometry buffer. dominant_direction: world, unit, towards the light so far, which gets a
+        view of its own; None or zeros: not known. threshold: chi of eq. 6.3, None: 1 - cos of half the median angle. Of
+        what lies beyond the near part only what is first seen from the light counts: with a `reach_m` that ends
+        inside the scene, a thing behind which another is out of reach may be missed. turn: as in `transfer_radiance`.
+        """
+        views = self._around.update(volume, dominant_direction)
+        view_of = self._views_for(views)
+        near_m = near_reach_m(views, reach_m)
+        self.looks = RealDepthViews(
+            views,
+            view_of,
+            camera,
+            inverse_rigid(volume_from_camera),
+            surface,
+            depth_room(self._engine, camera),
+            near_m,
+            near_distances(self._rays.count, volume.voxel_m, near_m)[1],
+            threshold or self._threshold,
+        )
+        return transfer_from_views(
+            self._engine,
+            camera,
+            volume_from_camera,
+            volume,
+            surface,
+            views,
+            view_of,
+            stride,
+            self._rays,
+            reach_m,
+            threshold or self._threshold,
+            turn,
+        )
+
+    def _views_for(self, views: AuxiliaryViews) -> NDArray[np.int32]:
+        """[SETS, count] the view that looks most nearly along each direction."""
+        if not views.has_light_view:
+            return self._nearest
+        to_light = self._rays.directions[..., :3] @ views.toward[-1].astype(np.float32)
+        return np.where(to_light > self._cosines, len(views.toward) - 1, self._nearest).astype(np.int32)
+
+
+def nearest_views(rays: Directions, toward: Floats) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Of the views from `toward` [views, 3] the nearest to each direction [SETS, count]: cosine between them, index."""
+    views = toward.T.astype(np.float32)
+    cosines, nearest = np.empty(rays.directions.shape[:2], np.float32), np.empty(rays.directions.shape[:2], np.int32)
+    for number, of_set in enumerate(rays.directions):  # all at once would take hundreds of megabytes
+        of_views = of_set[:, :3] @ views
+        cosines[number], nearest[number] = of_views.max(-1), of_views.argmax(-1)
+    return cosines, nearest
+
+
+def sample_phases(count: int) -> Floats:
+    """[4, count] in [0, 1): how far into its first step a direction's samples begin, for a pattern of 2 x 2 samples."""
+    pattern = np.array([0.0, 0.5, 0.75, 0.25])
+    phases: Floats = (pattern[:, None] + np.arange(count) * GOLDEN_TURN) % 1.0
+    return phases
+
+
+def near_distances(rays: int, voxel_m: float, near_m: float) -> tuple[NDArray[np.float32], float]:
+    """First sample distances [4, rays] in metres, and the ratio between one and the next."""
+    begin_m = FIRST_VOXELS * voxel_m
+    ratio = max((near_m / begin_m) ** (1 / NEAR_STEPS), LEAST_RATIO)
+    return (begin_m * ratio ** sample_phases(rays)).astype(np.float32), ratio
+
+
+def near_reach_m(views: AuxiliaryViews, reach_m: float) -> float:
+    """Up to where the camera's own picture is looked into."""
+    return min(NEAR_PIXELS * views.pixel_m, reach_m)
+
+
+def depth_room(engine: Engine, camera: CameraModel) -> cl_array.Array:
+    """[h, w] float32 that `camera_depths` fills."""
+    return engine.workspace.array("camera_depths", (camera.height, camera.width), np.float32)
+
+
+def camera_depths(
+    engine: Engine, camera: CameraModel, volume_from_camera: Floats, surface: Surface, defines: dict[str, int]
+) -> tuple[cl_array.Array, cl_array.Array]:
+    """[h, w] float32 metres along the optical axis of the geometry buffer, 0 = no surface or one guessed from its
+    neighbours, negative where the sensor alone knows it; [1] int32: 1 if there is such a pixel."""
+    depths = depth_room(engine, camera)
+    any_unknown = engine.workspace.array("any_unknown", (1,), np.int32)
+    any_unknown.fill(np.int32(0))
+    engine.launch(
+        engine.kernel("image_space.cl", "measure_depths", **defines),
+        (camera.width, camera.height),
+        camera.width,
+        camera.height,
+        surface.positions,
+        surface.labels,
+        float16(inverse_rigid(volume_from_camera)),
+        depths,
+        any_unknown,
+    )
+    return depths, any_unknown
+
+
+def transfer_from_views(
+    engine: Engine,
+    camera: CameraModel,
+    volume_from_camera: Floats,
+    volume: Volume,
+    surface: Surface,
+    views: AuxiliaryViews,
+    view_of: NDArray[np.int32],
+    stride: int,
+    rays: Directions,
+    reach_m: float,
+    threshold: float,
+    turn: int = 0,
+) -> Transfer:
+    """The same for given views. view_of [SETS, count]: the view for each direction."""
+    cols, rows = camera.width // stride, camera.height // stride
+    result = room_for_transfer(engine, rows, cols, stride, rays, own_sets(engine, rows, cols, turn))
+    near_m = near_reach_m(views, reach_m)
+    starts, ratio = near_distances(rays.count, volume.voxel_m, near_m)
+    lift_m = LIFT_VOXELS * volume.voxel_m
+    defines = {"BANDS": result.bands, "MASK_WORDS": result.free_mask.shape[2], "LANES": engine.lanes}
+    depths, any_unknown = camera_depths(engine, camera, volume_from_camera, surface, defines)
+    normals = smooth_normals(engine, camera, surface, stride, volume.voxel_m, defines)
+    engine.launch(
+        engine.kernel("image_space.cl", "transfer_from_views", **defines),
+        (cols, rows),
+        cols,
+        rows,
+        stride,
+        camera.width,
+        camera.height,
+        surface.positions,
+        normals,
+        volume.voxel_m,
+        look_into_views(engine, camera, surface, normals, stride, views, view_of, rays, reach_m, lift_m, turn),
+        depths,
+        float16(inverse_rigid(volume_from_camera)),
+        intrinsics(camera),
+        rays.count,
+        first_set(turn),
+        rays.on_device(engine),
+        rays.basis_on_device(engine),
+        engine.workspace.upload("sample_starts", starts),
+        ratio,
+        NEAR_STEPS,
+        FURTHER_STEPS,
+        any_unknown,
+        near_m,
+        reach_m,
+        SLACK,
+        lift_m,
+        1.0 / threshold,
+        result.coefficients,
+        result.openness,
+        result.flatness,
+        result.free_mask,
+    )
+    return result
+
+
+def smooth_normals(
+    engine: Engine, camera: CameraModel, surface: Surface, stride: int, voxel_m: float, defines: dict[str, int]
+) -> cl_array.Array:
+    """[rows, cols] float4: the normals that samples stand for, volume space, w: flatness; 0 without surface."""
+    cols, rows = camera.width // stride, camera.height // stride
+    normals = engine.workspace.array("sample_normals", (rows, cols), cl_types.float4)
+    engine.launch(
+        engine.kernel("image_space.cl", "smooth_normals", **defines),
+        (cols, rows),
+        *window_arguments(camera, surface, stride),
+        voxel_m,
+        normals,
+    )
+    return normals

@@ -1,0 +1,97 @@
+"""Indirect light as it was photographed: what hidden directions send is the radiance of the surface they meet.
+
+Kernel: indirect.cl. Surfaces are taken as Lambertian, so the colour that the volume holds is what they send anywhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.opencl.engine import Engine
+from server.transfer.radiance_transfer import Directions, Transfer, own_sets
+from server.volume.raycast import Surface
+from server.volume.volume import Volume
+
+EVERY = 4
+"""Of how many hidden directions a sample follows one; its neighbours follow the others."""
+LEAST_COSINE = 0.05
+"""Of directions that count, as in cell_transfer.cl."""
+
+
+@dataclass(frozen=True)
+class Indirect:
+    """What surfaces of one frame send one another."""
+
+    hits: cl_array.Array
+    """[rows, cols] float4, see gather_hits."""
+    mean: NDArray[np.float64]
+    """[3] radiance: the mean of what was met, taken for surface that no picture shows."""
+
+
+def observe_indirect(
+    engine: Engine,
+    camera: CameraModel,
+    volume: Volume,
+    surface: Surface,
+    transfer: Transfer,
+    rays: Directions,
+    reach_m: float,
+) -> Indirect:
+    """What the surfaces that hide directions from `transfer`'s samples send."""
+    hits = gather_hits(engine, camera, volume, surface, transfer, rays, reach_m)
+    return Indirect(hits, mean_sent(engine, hits))
+
+
+def gather_hits(
+    engine: Engine,
+    camera: CameraModel,
+    volume: Volume,
+    surface: Surface,
+    transfer: Transfer,
+    rays: Directions,
+    reach_m: float,
+    every: int = EVERY,
+) -> cl_array.Array:
+    """[rows, cols] float4: over a sample's hidden directions that meet surface with a colour, the sum of cosine times
+    radiance (rgb) and of cosine (w), both times `every`."""
+    hits = engine.workspace.array("hits", (transfer.rows, transfer.cols), cl_types.float4)
+    words = transfer.free_mask.shape[2]
+    defines = {"MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": transfer.interleave}
+    engine.launch(
+        engine.kernel("indirect.cl", "gather_hits", **defines),
+        (transfer.cols, transfer.rows),
+        transfer.cols,
+        transfer.rows,
+        transfer.stride,
+        camera.width,
+        surface.positions,
+        surface.normals,
+        transfer.free_mask,
+        transfer.sets if transfer.sets is not None else own_sets(engine, transfer.rows, transfer.cols),
+        *volume.arguments(),
+        volume.colors,
+        rays.count,
+        rays.on_device(engine),
+        reach_m,
+        every,
+        LEAST_COSINE,
+        hits,
+    )
+    return hits
+
+
+def no_hits(engine: Engine, transfer: Transfer) -> cl_array.Array:
+    """The same where indirect light is left out."""
+    return engine.workspace.constant("no_hits", np.zeros((transfer.rows, transfer.cols), cl_types.float4))
+
+
+def mean_sent(engine: Engine, hits: cl_array.Array) -> NDArray[np.float64]:
+    """[3] mean radiance of what `hits` met; 0 where nothing was."""
+    total = engine.download(hits).view(np.float32).reshape(-1, 4).sum(axis=0, dtype=np.float64)
+    return np.asarray(total[:3] / total[3] if total[3] > 0 else np.zeros(3))

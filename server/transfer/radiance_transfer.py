@@ -1,0 +1,220 @@
+"""Diffuse shadowed radiance transfer by ray tracing the volume (thesis 5.1.2, eq. 5.2).
+
+Kernel: radiance_transfer.cl.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.maths.sh import GOLDEN_TURN, sh_basis, spherical_fibonacci
+from server.opencl.engine import Engine, KernelArgument
+from server.transfer.visibility_cache import VisibilityCaches, no_caches
+from server.transfer.visibility_state import VisibilityState
+from server.volume.raycast import Surface
+from server.volume.volume import Volume
+
+SETS_A_FRAME = 64
+"""Direction sets of one frame, interleaved over 8 x 8 samples, so that neighbours fill each other's gaps."""
+TURNS = 4
+"""So many frames may take turns with sets of their own: what error the lattices have left is then not always the same,
+and a light that is estimated from several frames is better off (tests/pipeline/test_presets.py)."""
+SETS = TURNS * SETS_A_FRAME
+"""Direction sets; a byte tells them apart."""
+_SEED = 1
+_DEALT = 16
+_WHOLE_TURNS = {1: 10, 2: 29, 4: 44, 8: 83}
+"""By the number of subsets: of 0 to 16 times that, one that leaves subsets, sets and the lattice of all sets even."""
+_WINDOW = 1 / 160  # half the window that a sample's normal is the mean of, in picture widths
+
+
+@dataclass(frozen=True)
+class Directions:
+    """Directions that visibility is tested along, with their basis functions."""
+
+    directions: NDArray[np.float32]
+    """[SETS, count, 4]: unit direction in world axes, solid angle in steradians."""
+    basis: NDArray[np.float32]
+    """[SETS, count, bands^2]."""
+    interleave: int = 1
+    """Subset i of a set is every `interleave`-th direction from i; each is as even as a set of its own size."""
+
+    @property
+    def count(self) -> int:
+        """Directions in one set."""
+        return int(self.directions.shape[1])
+
+    def on_device(self, engine: Engine) -> cl_array.Array:
+        """[SETS, count] float4: `directions`."""
+        values = self.directions.view(cl_types.float4)
+        return engine.workspace.constant(f"directions_{self.interleave}_{self.count}", values)
+
+    def basis_on_device(self, engine: Engine) -> cl_array.Array:
+        """[SETS, count, bands^2] float32: `basis`."""
+        name = f"direction_basis_{self.interleave}_{self.count}_{self.basis.shape[2]}"
+        return engine.workspace.constant(name, self.basis)
+
+
+@cache
+def direction_sets(count: int, bands: int, interleave: int = 1) -> Directions:
+    """SETS sets of `count` directions of equal solid angle: lattices, four a frame, each turned at random and dealt to
+    16 sets in turn; each set likewise dealt to `interleave` subsets. Raises KeyError unless that is 1, 2, 4 or 8.
+
+    A lattice advances by a sixteenth of a golden turn and of whole turns, so that every sixteenth point advances by a
+    golden turn: each set is a spherical Fibonacci lattice, and 16 together are an even, fine one; with k subsets 16 k
+    stands for 16. What error a lattice has left is the same wherever it is used, so blocks of samples take turns with
+    four of them.
+    """
+    generator = np.random.default_rng(_SEED)
+    advance = (GOLDEN_TURN + _WHOLE_TURNS[interleave]) / (_DEALT * interleave)
+    lattice = spherical_fibonacci(_DEALT * count, advance)
+    turns = [np.linalg.qr(generator.normal(size=(3, 3)))[0] for _ in range(SETS // _DEALT)]
+    turned = np.stack([(lattice @ turn)[k::_DEALT] for turn in turns for k in range(_DEALT)])
+    weighted = np.concatenate([turned, np.full((SETS, count, 1), 4 * np.pi / count)], -1)
+    return Directions(weighted.astype(np.float32), sh_basis(turned, bands).astype(np.float32), interleave)
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Radiance transfer on the device; sample i along an axis lies at pixel stride / 2 + i stride."""
+
+    stride: int
+    rows: int
+    cols: int
+    bands: int
+    coefficients: cl_array.Array
+    """[rows, cols, bands^2] float32; zeros where there is no surface."""
+    openness: cl_array.Array
+    """[rows, cols] float32: free share of the cosine-weighted sky, -1 where there is no surface."""
+    flatness: cl_array.Array
+    """[rows, cols] float32: share of the window around a sample that lies on its own smooth surface."""
+    free_mask: cl_array.Array
+    """[rows, cols, words] uint32: bit j set where direction j is above the surface and free."""
+    sets: cl_array.Array | None = None
+    """[rows, cols, interleave] uint8: direction j is that of set sets[j % interleave]; None: all are of the sample's
+    own set (direction_sets.clh)."""
+
+    @property
+    def interleave(self) -> int:
+        """Subsets of the directions."""
+        return 1 if self.sets is None else int(self.sets.shape[2])
+
+
+def transfer_radiance(
+    engine: Engine,
+    camera: CameraModel,
+    volume: Volume,
+    surface: Surface,
+    stride: int,
+    rays: Directions,
+    reach_m: float,
+    caches: VisibilityCaches | None = None,
+    state: VisibilityState | None = None,
+    turn: int = 0,
+    chosen: NDArray[np.int32] | None = None,
+) -> Transfer:
+    """Transfer of the real world alone at every `stride`-th pixel; visibility rays of at most `reach_m`.
+
+    `caches`: what earlier frames know, needed where `rays` are interleaved; this frame's visibility is added to it.
+    `state`: voxels that are known to be open, where no ray is traced. `turn`: of the direction sets, modulo TURNS.
+    `chosen` [k]: the only samples that are traced, row * cols + col; what the arrays hold of the others stays.
+    """
+    cols, rows = camera.width // stride, camera.height // stride
+    space = engine.workspace
+    sets = space.array(f"sets_{rows}x{cols}", (rows, cols, rays.interleave), np.uint8)
+    result = room_for_transfer(engine, rows, cols, stride, rays, sets)
+    words = result.free_mask.shape[2]
+    defines = {"BANDS": result.bands, "MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": rays.interleave}
+    if state is not None:
+        defines["HAS_STATE"] = 1
+    only: tuple[KernelArgument, ...] = ()
+    if chosen is not None:
+        defines["IS_CHOSEN"] = 1
+        only = len(chosen), space.upload(f"chosen_{rows}x{cols}", np.resize(chosen, rows * cols))
+    engine.launch(
+        engine.kernel("radiance_transfer.cl", "transfer_radiance", **defines),
+        (cols, rows) if chosen is None else (len(chosen),),
+        *window_arguments(camera, surface, stride),
+        surface.labels,
+        *volume.arguments(),
+        rays.count,
+        first_set(turn),
+        rays.on_device(engine),
+        rays.basis_on_device(engine),
+        reach_m,
+        *(caches.arguments() if caches else no_caches(engine)),
+        state.bits if state else space.array("unused_state", (1,), np.uint32),
+        result.coefficients,
+        result.openness,
+        result.flatness,
+        result.free_mask,
+        sets,
+        *only,
+    )
+    return result
+
+
+def room_for_transfer(
+    engine: Engine, rows: int, cols: int, stride: int, rays: Directions, sets: cl_array.Array
+) -> Transfer:
+    """The arrays of a transfer, their contents undefined, kept by their number of samples; `sets` as given."""
+    space, coefficients, size = engine.workspace, rays.basis.shape[2], f"{rows}x{cols}"
+    return Transfer(
+        stride,
+        rows,
+        cols,
+        round(coefficients**0.5),
+        space.array(f"transfer_{size}", (rows, cols, coefficients), np.float32),
+        space.array(f"openness_{size}", (rows, cols), np.float32),
+        space.array(f"flatness_{size}", (rows, cols), np.float32),
+        space.array(f"free_mask_{size}", (rows, cols, -(-rays.count // 32)), np.uint32),
+        sets,
+    )
+
+
+def window_arguments(camera: CameraModel, surface: Surface, stride: int) -> tuple[KernelArgument, ...]:
+    """Where samples lie, and the window that the normal of each is the mean of (smooth_normal.clh)."""
+    cols, rows = camera.width // stride, camera.height // stride
+    window_px = max(1, round(camera.width * _WINDOW))
+    return cols, rows, stride, camera.width, camera.height, window_px, surface.positions, surface.normals
+
+
+def first_set(turn: int) -> int:
+    """Of the sets that frames of that turn take."""
+    return SETS_A_FRAME * (turn % TURNS)
+
+
+def own_sets(engine: Engine, rows: int, cols: int, turn: int = 0) -> cl_array.Array:
+    """[rows, cols, 1] uint8: the set of each sample where nothing is taken from other frames (direction_sets.clh)."""
+    return engine.workspace.constant(f"own_sets_{turn % TURNS}_{rows}x{cols}", _sets_of(rows, cols, turn % TURNS))
+
+
+def sample_arguments(
+    engine: Engine, camera: CameraModel, surface: Surface, transfer: Transfer
+) -> tuple[KernelArgument, ...]:
+    """SAMPLE_PARAMETERS of real_shading.clh: the samples of real surface, and which of their directions are free."""
+    return (
+        transfer.cols,
+        transfer.rows,
+        transfer.stride,
+        camera.width,
+        surface.positions,
+        surface.normals,
+        transfer.openness,
+        transfer.free_mask,
+        transfer.sets if transfer.sets is not None else own_sets(engine, transfer.rows, transfer.cols),
+    )
+
+
+@cache
+def _sets_of(rows: int, cols: int, turn: int) -> NDArray[np.uint8]:
+    row, col = np.mgrid[:rows, :cols]
+    sets = first_set(turn) + ((row // 4 % 2) * 2 + col // 4 % 2) * _DEALT + row % 4 * 4 + col % 4
+    return np.asarray(sets[..., None], np.uint8)

@@ -1,0 +1,36 @@
+"""Depth pictures of real surface that visibility is looked up in (thesis 6.2.1, 7.3.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cl_array
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.transfer.auxiliary_views import AuxiliaryViews
+from server.volume.raycast import Surface
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RealDepthViews:
+    """Pictures of real surface that shading looks into."""
+
+    views: AuxiliaryViews
+    view_of: NDArray[np.int32]
+    """[SETS, count] the view that looks most nearly along each direction."""
+    camera: CameraModel
+    camera_from_volume: Floats
+    surface: Surface
+    """As the camera sees it."""
+    depths: cl_array.Array
+    """[h, w] float32: of `surface`, see `camera_depths` of image_space.py."""
+    near_m: float
+    """Up to where the camera's picture knows better than the views."""
+    ratio: float
+    """Between the distances of one sample in it and the next."""
+    threshold: float
+    """chi of eq. 6.3."""

@@ -1,0 +1,128 @@
+"""Where and how radiance transfer is sampled (thesis ch. 6): the accelerations, each a switch, and the presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.opencl.engine import Engine
+from server.transfer.auxiliary_views import VIEWS
+from server.transfer.image_space import ImageSpaceTransfer
+from server.transfer.radiance_transfer import TURNS, Directions, Transfer, direction_sets, transfer_radiance
+from server.transfer.real_depth_views import RealDepthViews
+from server.transfer.visibility_cache import VisibilityCaches
+from server.transfer.visibility_state import VisibilityState
+from server.volume.raycast import Surface
+from server.volume.volume import Volume
+
+_MOST_DIRECTIONS = 1024
+Upsampling = Literal["bilateral", "bicubic"]
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """The accelerations of thesis ch. 6 that a session uses."""
+
+    stride: int
+    """A1: every how many pixels transfer is sampled, for the light and for shading."""
+    interleave: int = 1
+    """A3, A4: a frame traces one of so many subsets of the directions, the others come from earlier frames."""
+    rays_per_frame: bool = False
+    """Whether a session's `rays` are those of a frame, so that a sample has `interleave` times as many."""
+    adaptive: bool = False
+    """A2: shading is sampled at every pixel where virtual objects make it change from pixel to pixel."""
+    upsampling: Upsampling = "bilateral"
+    """A5: how shading comes from samples to pixels; bicubic is the thesis's."""
+    visibility_state: bool = False
+    """A6: no rays where the volume is known to be open; pays where rays are short."""
+    turning: bool = True
+    """Frames take turns with direction sets, after one round of the subsets, so that what error they have left is not
+    always the same: light from several frames is nearer to the truth, shading of a still view is not quite still."""
+    image_space: bool = False
+    """A7, A8: visibility is looked up in depth pictures, not traced; A3, A4 and A6 are about rays, and do not apply."""
+    views: int = VIEWS
+    """Of these depth pictures, besides the camera's own."""
+
+    def __post_init__(self) -> None:
+        if self.image_space and (self.interleave > 1 or self.visibility_state):
+            raise ValueError("image-space visibility has no rays to interleave or to leave out")
+
+    def directions(self, rays: int) -> int:
+        """Of a sample, in a session of so many `rays`."""
+        return max(rays, min(rays * self.interleave, _MOST_DIRECTIONS)) if self.rays_per_frame else rays
+
+
+PRESETS = {
+    "rm": Sampling(stride=1),
+    "reg4": Sampling(stride=4),
+    "reg8": Sampling(stride=8),
+    "art1": Sampling(stride=1, interleave=4, turning=False),
+    "art4": Sampling(stride=4, interleave=4, rays_per_frame=True, adaptive=True),
+    "art8": Sampling(stride=8, interleave=4, rays_per_frame=True, adaptive=True),
+    "gr15": Sampling(stride=1, image_space=True),
+    "gr15fast": Sampling(stride=4, image_space=True),
+}
+"""Thesis 6.1.3.1 and 6.2.3; RM is its GR12, ART4 its GR14. The number is the spacing in the picture; ART traces a
+fourth of the directions a frame. In the thesis these are a fourth of RM's; ART4 and ART8 take as many as RM has, and so
+have four times as many in all: still several times faster, and their light is nearer to RM's."""
+
+
+class TransferSampler:
+    """Radiance transfer of one session, and what it remembers from frame to frame."""
+
+    def __init__(self, engine: Engine, camera: CameraModel, sampling: Sampling, rays: int, bands: int) -> None:
+        """`rays`: directions of a sample, over all its subsets; or of one subset, see `Sampling.rays_per_frame`."""
+        self._engine = engine
+        self._camera = camera
+        self.sampling = sampling
+        self.rays: Directions = direction_sets(sampling.directions(rays), bands, sampling.interleave)
+        self._caches = VisibilityCaches(engine, sampling.interleave) if sampling.interleave > 1 else None
+        self._state: VisibilityState | None = None
+        self._frame = -1
+        self._image_space = ImageSpaceTransfer(engine, self.rays, sampling.views) if sampling.image_space else None
+
+    @property
+    def looks(self) -> RealDepthViews | None:
+        """What the last transfer looked into; None where rays are traced."""
+        return self._image_space.looks if self._image_space else None
+
+    @property
+    def period(self) -> int:
+        """Frames after which a still view is sampled the same again; one of subsets needs as many for itself."""
+        return (TURNS if self.sampling.turning else 1) * self.sampling.interleave
+
+    def pass_frame(self) -> None:
+        """A frame that does without transfer has its turn all the same."""
+        self._frame += 1
+
+    def transfer(
+        self,
+        volume: Volume,
+        surface: Surface,
+        volume_from_camera: NDArray[np.float64],
+        up: NDArray[np.float64],
+        reach_m: float,
+    ) -> Transfer:
+        """Transfer of the real world alone at the samples; rays of at most `reach_m`; `up` unit, world axes."""
+        engine, camera, sampling = self._engine, self._camera, self.sampling
+        self._frame += 1
+        turn = self._frame // sampling.interleave if sampling.turning else 0  # subsets are most even in one set
+        if self._image_space:
+            return self._image_space.transfer(
+                camera, volume_from_camera, volume, surface, sampling.stride, reach_m, turn=turn
+            )
+        if self._caches:
+            self._caches.begin_frame(camera, volume_from_camera, sampling.stride, self.rays.count, reach_m)
+        if sampling.visibility_state:
+            self._state = self._state or VisibilityState(engine, volume, camera, up)
+            self._state.validate(volume_from_camera, reach_m)
+        result = transfer_radiance(
+            engine, camera, volume, surface, sampling.stride, self.rays, reach_m, self._caches, self._state, turn
+        )
+        if self._state:
+            self._state.learn(surface, camera, sampling.stride, result.openness)
+        return result

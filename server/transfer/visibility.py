@@ -1,0 +1,54 @@
+"""Visibility of the sky from samples of the surface (thesis 5.1.2) by itself. Kernel: visibility.cl."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+
+from protocol.frames import CameraModel
+from server.opencl.engine import Engine
+from server.transfer.radiance_transfer import Directions
+from server.volume.raycast import Surface
+from server.volume.volume import Volume
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """One bit a direction, [rows, cols, words] uint32, zeros where there is no surface."""
+
+    free: cl_array.Array
+    """Bit j: direction j lies above the surface, and no surface is met within the reach."""
+    blocked: cl_array.Array
+    """Bit j: direction j lies above the surface, and a surface is met."""
+
+
+def trace_visibility(
+    engine: Engine, camera: CameraModel, volume: Volume, surface: Surface, stride: int, rays: Directions, reach_m: float
+) -> Visibility:
+    """From every `stride`-th pixel, one voxel off the surface (fig. 7.5), along rays of at most `reach_m`.
+
+    Sample i along an axis lies at pixel stride / 2 + i stride. The arrays are reused by the next call.
+    """
+    cols, rows, words = camera.width // stride, camera.height // stride, -(-rays.count // 32)
+    space = engine.workspace
+    result = Visibility(*(space.array(f"visibility_{name}", (rows, cols, words), np.uint32) for name in "fb"))
+    engine.launch(
+        engine.kernel("visibility.cl", "trace_visibility", MASK_WORDS=words, LANES=engine.lanes),
+        (cols, rows),
+        cols,
+        rows,
+        stride,
+        camera.width,
+        surface.positions,
+        surface.normals,
+        *volume.arguments(),
+        rays.count,
+        space.constant("directions", rays.directions.view(cl_types.float4)),
+        reach_m,
+        result.free,
+        result.blocked,
+    )
+    return result

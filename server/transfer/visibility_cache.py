@@ -1,0 +1,75 @@
+"""Visibility that earlier frames have found (thesis 6.1.1, steps 2 and 3). Device side: include/visibility_cache.clh.
+
+The directions fall into k subsets, and a frame traces one of them: k frames hold them all. Each frame leaves its
+visibility in a layer that lies as its camera did; a later frame projects its samples into the k - 1 layers before it.
+Where none of them knows a subset, because the point was hidden, has moved or is new, it is traced at once, so that no
+sample ever has fewer directions than another.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.input.measure import intrinsics
+from server.maths.rigid import inverse_rigid
+from server.opencl.engine import Engine, KernelArgument
+
+
+class VisibilityCaches:
+    """The layers of one session's last frames, on the device."""
+
+    def __init__(self, engine: Engine, interleave: int) -> None:
+        self._engine = engine
+        self._interleave = interleave
+        self._cameras = np.zeros((interleave, 4, 4), np.float32)
+        self._asked: tuple[object, ...] = ()
+        self._known = 0
+        self._frame = -1
+        self._lens: np.generic | None = None
+
+    def forget(self) -> None:
+        """Take nothing from earlier frames."""
+        self._known = 0
+
+    def begin_frame(
+        self,
+        camera: CameraModel,
+        volume_from_camera: NDArray[np.float64],
+        stride: int,
+        count: int,
+        reach_m: float,
+    ) -> None:
+        """Open a layer for a frame seen from `volume_from_camera` [4, 4]; the oldest one's place is taken.
+
+        What was found for another camera, stride, number of directions or reach is forgotten.
+        """
+        asked = (camera.width, camera.height, stride, count, reach_m)
+        known = min(self._known + 1, self._interleave) if asked == self._asked else 1
+        self._asked, self._known, self._frame = asked, known, self._frame + 1
+        self._shape = (camera.height // stride, camera.width // stride, -(-count // 32))
+        self._lens = intrinsics(camera)
+        self._cameras[self._frame % self._interleave] = inverse_rigid(volume_from_camera)
+
+    def arguments(self) -> tuple[KernelArgument, ...]:
+        """What transfer_radiance of radiance_transfer.cl takes, in its order."""
+        space, k, (rows, cols, words) = self._engine.workspace, self._interleave, self._shape
+        return (
+            self._frame % k,
+            self._lens,
+            self._known - 1,
+            (self._frame - 1) % k,
+            space.upload("cache_cameras", self._cameras.reshape(k, 16).view(cl_types.float16)),
+            space.array("cache_points", (k, rows, cols), cl_types.float4),
+            space.array("cache_normals", (k, rows, cols), cl_types.float4),
+            space.array("cache_traced", (k, rows, cols), np.uint16),
+            space.array("cache_blocked", (k, rows, cols, words), np.uint32),
+        )
+
+
+def no_caches(engine: Engine) -> tuple[KernelArgument, ...]:
+    """The arguments where every frame traces every direction."""
+    unused = engine.workspace.array("unused", (1,), cl_types.float4)
+    return 0, np.zeros(1, cl_types.float4)[0], 0, 0, unused, unused, unused, unused, unused

@@ -1,0 +1,54 @@
+"""TSDF integration (KinectFusion; thesis 4.2.1): a depth picture folded into the volume. Kernel: integrate.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.input.measure import Measurement, intrinsics
+from server.maths.rigid import inverse_rigid
+from server.opencl.engine import Engine, float16, int4
+from server.volume.volume import Volume
+
+GREATEST_WEIGHT = 64.0
+"""Where the running mean's weight saturates: it then forgets with a time constant of as many frames."""
+
+
+def integrate(
+    engine: Engine,
+    volume: Volume,
+    camera: CameraModel,
+    volume_from_camera: NDArray[np.float64],
+    measurement: Measurement,
+) -> None:
+    """Fold a rectified picture into the bricks that are allocated."""
+    if not volume.allocated_bricks:
+        return
+    items = 64 if engine.lanes == 1 else 1  # a processor's core has a brick to itself
+    engine.launch(
+        engine.kernel("integrate.cl", "integrate", LANES=engine.lanes),
+        (items * volume.allocated_bricks,),
+        volume.allocated_bricks,
+        camera.width,
+        camera.height,
+        int4(*volume.bricks, 0),
+        volume.allocated_device,
+        volume.slots_device,
+        measurement.depth_m,
+        measurement.radiance,
+        intrinsics(camera),
+        float16(inverse_rigid(volume_from_camera)),
+        volume.voxel_m,
+        volume.truncation_m,
+        GREATEST_WEIGHT,
+        volume.frames,
+        volume.voxels,
+        volume.colors,
+        volume.solid,
+        volume.octets,
+        local=(items,),
+    )
+    volume.count_frame()
+    volume.note_picture(camera, volume_from_camera)
+    volume.summarize(all=False)

@@ -1,0 +1,87 @@
+"""What rays jump by: where the volume is solid, and how far apart that is. Kernels: volume.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl.array as cl_array
+from numpy.typing import NDArray
+
+from server.opencl.engine import Engine, int4
+from server.opencl.transfer import copy_beginning, fill_bytes
+from server.volume.brick_pool import BrickPool, rounded, upload_list
+
+GREATEST_GAP = 15
+_CELL_ROWS = 16
+_UNCHANGED = np.array([1 << 30] * 3 + [-(1 << 30)] * 3, np.int32)
+
+
+class RayTables:
+    """Solid cells and gaps of all bricks, [z, y, x]; see include/volume.clh."""
+
+    def __init__(self, engine: Engine, bricks: tuple[int, int, int]) -> None:
+        self._engine = engine
+        self.bricks = bricks
+        space, count = engine.workspace, bricks[0] * bricks[1] * bricks[2]
+        self.solid: cl_array.Array = space.array("brick_solid", bricks[::-1], np.uint64)
+        self.gaps: cl_array.Array = space.array("brick_gaps", (8 * count,), np.uint8)
+        self._occupied = space.array("brick_occupied", (count,), np.uint8)
+        self._inner = [space.array(f"gaps_{axis}", ((2 << axis) * count + 16,), np.uint8) for axis in range(2)]
+        self._changed = space.array("changed_bricks", (6,), np.int32)
+        for array, value in ((self.solid, 0), (self._occupied, 255)):  # 255: each differs from what it was
+            fill_bytes(engine.queue, array, value)
+
+    @property
+    def bytes_held(self) -> int:
+        """Device memory."""
+        return sum(a.nbytes for a in (self.solid, self.gaps, self._occupied, self._changed, *self._inner))
+
+    def find_solid(self, listed: cl_array.Array, count: int, slots: cl_array.Array, pool: BrickPool) -> None:
+        """Look through the voxels of the first `count` listed bricks."""
+        self._engine.launch(
+            self._engine.kernel("volume.cl", "find_solid"),
+            (_CELL_ROWS * count,),
+            count,
+            listed,
+            slots,
+            pool.voxels,
+            self.solid,
+            pool.octets,
+        )
+
+    def near_solid(self, indices: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """[n] whether there is a solid voxel in a brick, or within some 4 voxels of it, as far as is known."""
+        near = self._engine.workspace.array("bricks_near_solid", (rounded(len(indices)),), np.uint8)
+        listed = upload_list(self._engine, "idle_bricks", indices)
+        kernel = self._engine.kernel("volume.cl", "find_near_solid")
+        self._engine.launch(kernel, (len(indices),), len(indices), listed, int4(*self.bricks, 0), self.solid, near)
+        found: NDArray[np.bool_] = self._engine.download(near)[: len(indices)].view(np.bool_)
+        return found
+
+    def update(self) -> None:
+        """Renew the gaps around bricks that have become solid, or are no longer."""
+        engine, (x, y, z), bricks = self._engine, self.bricks, int4(*self.bricks, 0)
+        copy_beginning(engine.queue, self._changed, _UNCHANGED)
+        engine.launch(
+            engine.kernel("volume.cl", "gaps_along_x"),
+            (y, z),
+            bricks,
+            self.solid,
+            GREATEST_GAP,
+            self._occupied,
+            self._changed,
+            self._inner[0],
+            local=(16, 1),
+        )
+        for axis, (inner, outer) in enumerate(((self._inner[0], self._inner[1]), (self._inner[1], self.gaps)), start=1):
+            engine.launch(
+                engine.kernel("volume.cl", "gap_along_axis"),
+                (-(-x // 16), y, z * (2 << axis)),
+                bricks,
+                1 << axis,
+                inner,
+                axis,
+                GREATEST_GAP,
+                self._changed,
+                outer,
+                local=(1, 8, 8),
+            )

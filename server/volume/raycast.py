@@ -1,0 +1,85 @@
+"""Surface prediction (KinectFusion; thesis 4.2.1): what of the volume a camera sees. Kernel: raycast.cl."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.input.measure import GREATEST_DEPTH_M, intrinsics
+from server.maths.rigid import inverse_rigid
+from server.opencl.engine import Engine, float16, int4
+from server.volume.volume import Volume
+
+LABEL_NONE, LABEL_STATIC, LABEL_DYNAMIC, LABEL_FILLED = 0, 1, 2, 3
+
+_TILE = 8  # as in raycast.cl
+_FARTHEST = int(np.float32(np.inf).view(np.int32))
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Real geometry seen by the camera, on the device, [h, w]."""
+
+    positions: cl_array.Array
+    """float4: volume space metres, w = 1 where there is surface, else 0."""
+    normals: cl_array.Array
+    """float4: unit, world axes, towards the camera, w likewise."""
+    labels: cl_array.Array
+    """uint8: LABEL_NONE, LABEL_STATIC (from the volume), LABEL_DYNAMIC (from the sensor), LABEL_FILLED (from its
+    neighbours)."""
+
+
+def raycast(
+    engine: Engine, camera: CameraModel, volume_from_camera: NDArray[np.float64], volume: Volume, buffers: str = "model"
+) -> Surface:
+    """Surface of the volume alone; labels are not filled. `buffers` names the arrays, which the next call reuses."""
+    size, lanes = (camera.height, camera.width), engine.lanes
+    positions = engine.workspace.array(f"{buffers}_positions", size, cl_types.float4)
+    normals = engine.workspace.array(f"{buffers}_normals", size, cl_types.float4)
+    engine.launch(
+        engine.kernel("raycast.cl", "raycast", LANES=lanes),
+        (-(-camera.width // lanes), camera.height),
+        camera.width,
+        camera.height,
+        *volume.arguments(),
+        intrinsics(camera),
+        float16(volume_from_camera),
+        GREATEST_DEPTH_M,
+        *_ray_bounds(engine, camera, volume_from_camera, volume),
+        positions,
+        normals,
+    )
+    return Surface(positions, normals, engine.workspace.array(f"{buffers}_labels", size, np.uint8))
+
+
+def _ray_bounds(
+    engine: Engine, camera: CameraModel, volume_from_camera: NDArray[np.float64], volume: Volume
+) -> tuple[cl_array.Array, cl_array.Array]:
+    """Nearest and farthest depth [tile row, tile column] with a solid voxel, as bits of float metres."""
+    tiles = (-(-camera.height // _TILE), -(-camera.width // _TILE))
+    nearest = engine.workspace.array("rays_nearest", tiles, np.int32)
+    farthest = engine.workspace.array("rays_farthest", tiles, np.int32)
+    nearest.fill(np.int32(_FARTHEST))
+    farthest.fill(np.int32(0))
+    if volume.allocated_bricks:
+        engine.launch(
+            engine.kernel("raycast.cl", "bound_rays", LANES=engine.lanes),
+            (volume.allocated_bricks,),
+            volume.allocated_bricks,
+            camera.width,
+            camera.height,
+            int4(*volume.bricks, 0),
+            volume.allocated_device,
+            volume.solid,
+            volume.voxel_m,
+            intrinsics(camera),
+            float16(inverse_rigid(volume_from_camera)),
+            nearest,
+            farthest,
+        )
+    return nearest, farthest

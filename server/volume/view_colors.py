@@ -1,0 +1,30 @@
+"""A picture of what has been scanned, for somebody who has no camera. Kernel: view_colors.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+
+from protocol.frames import CameraModel
+from server.opencl.engine import Engine, int4
+from server.volume.raycast import Surface
+from server.volume.volume import Volume
+
+
+def view_colors(engine: Engine, camera: CameraModel, surface: Surface, volume: Volume) -> cl_array.Array:
+    """[h, w] float4: radiance that the volume has of the surface, in units of its first picture; w = 0 where none."""
+    radiance = engine.workspace.array("view_colors", (camera.height, camera.width), cl_types.float4)
+    engine.launch(
+        engine.kernel("view_colors.cl", "view_colors"),
+        (camera.width, camera.height),
+        camera.width,
+        camera.height,
+        int4(*volume.bricks, 0),
+        volume.slots_device,
+        volume.colors,
+        np.float32(volume.voxel_m),
+        surface.positions,
+        radiance,
+    )
+    return radiance

@@ -1,0 +1,135 @@
+"""When a view that stands still rests: what has to have settled, and what wakes it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from protocol.frames import CameraModel, RgbdFrame
+from server.culling.reason import ALLOWANCE, CullReason
+from server.light.continuation import NO_PLANES
+from server.opencl.engine import Engine
+from server.reuse.temporal_reuse import ECHO_FRAMES, NOISE, NOISY, RATE, ROUND, ROUNDING, SAME, SHARE, TemporalReuse
+from tests import lights
+
+CAMERA = CameraModel(width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
+SHAPE = (48, 64)
+FRAME = RgbdFrame(0, 0.0, np.full((*SHAPE, 3), 90, np.uint8), np.full(SHAPE, 900, np.uint16), np.eye(4), 1.0)
+LIGHT = lights.lobe_and_sky((0.3, 0.8, 0.4))
+PICTURE = np.full((*SHAPE, 3), 90, np.uint8)
+PLANES: Any = (np.ones((1, 4, 4), np.float32), np.ones((1, 4), np.int32), np.zeros(1, np.uint8))
+
+
+def noisy(index: int) -> RgbdFrame:
+    """FRAME with a sensor's noise."""
+    noise = np.random.default_rng(index)
+    color = np.rint(FRAME.color + noise.normal(0, 2.5, FRAME.color.shape)).astype(np.uint8)
+    depth = np.rint(FRAME.depth + noise.normal(0, 2.0, SHAPE)).astype(np.uint16)
+    return replace(FRAME, index=index, color=color, depth=depth)
+
+
+def fed(rest: TemporalReuse, frames: int, step: float = 0.0, **learnt: Any) -> CullReason | None:
+    """What is found after so many frames that are alike, whose light grows by the share `step` each."""
+    for index in range(frames):
+        if not rest.holds(replace(FRAME, index=index)):
+            rest.learn(LIGHT * (1 + index * step), learnt.get("planes", NO_PLANES), learnt.get("picture"))
+    return rest.omission
+
+
+def fed_noise(rest: TemporalReuse, frames: int, pictures: Any = lambda _index: PICTURE) -> CullReason | None:
+    """The same of frames that differ by noise."""
+    for index in range(frames):
+        if not rest.holds(noisy(index)):
+            rest.learn(LIGHT, NO_PLANES, pictures(index) if rest.is_checkpoint else None)
+    return rest.omission
+
+
+def test_it_rests_once_a_round_has_repeated(engine: Engine) -> None:
+    assert fed(TemporalReuse(engine, CAMERA), ROUND - 1) is None
+    assert fed(TemporalReuse(engine, CAMERA), ROUND) == CullReason(SAME, 0.0)
+    assert fed(TemporalReuse(engine, CAMERA), ROUND, picture=PICTURE) == CullReason(SAME, ROUNDING)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"color": FRAME.color + np.uint8(1)},
+        {"depth": FRAME.depth + np.uint16(9)},
+        {"exposure": 2.0},
+        {"world_from_camera": np.eye(4) + np.eye(4, k=3) * 1e-3},
+    ],
+)
+def test_what_is_new_is_looked_at(engine: Engine, change: dict[str, Any]) -> None:
+    rest = TemporalReuse(engine, CAMERA)
+    assert fed(rest, ROUND) is not None
+    assert rest.holds(FRAME)
+    assert not rest.holds(replace(FRAME, **change))
+    assert rest.omission is None
+    assert not rest.holds(FRAME)  # and so is what then follows
+
+
+def test_other_lamps_are_new(engine: Engine) -> None:
+    rest = TemporalReuse(engine, CAMERA)
+    assert fed(rest, ROUND) is not None
+    lamp: Any = object()
+    assert not rest.holds(FRAME, (lamp,))
+
+
+def test_a_light_that_still_moves_is_followed(engine: Engine) -> None:
+    slow, fast = 1e-5 * RATE, 1e-2 * RATE
+    assert fed(TemporalReuse(engine, CAMERA), ROUND, fast) is None
+    found = fed(TemporalReuse(engine, CAMERA), ROUND, slow, picture=PICTURE)
+    assert found is not None
+    assert ROUNDING < found.error_bound <= SHARE * ALLOWANCE
+    # A light that is ten steps off, everywhere alike, changes shadings by a hundred-thousandth, their ratios by two.
+    assert found.error_bound - ROUNDING == pytest.approx(2e-5 * 255 * 1.055 / 2.4, rel=0.02)
+
+
+def test_planes_that_come_are_news(engine: Engine) -> None:
+    rest = TemporalReuse(engine, CAMERA)
+    fed(rest, ROUND - 1)
+    rest.holds(FRAME)
+    rest.learn(LIGHT, PLANES, None)
+    assert rest.omission is None
+
+
+def test_it_rests_under_noise(engine: Engine) -> None:
+    assert fed_noise(TemporalReuse(engine, CAMERA), NOISY - 1) is None
+    assert fed_noise(TemporalReuse(engine, CAMERA), NOISY) == CullReason(NOISE, ALLOWANCE)
+
+
+def test_a_picture_that_has_not_settled_is_drawn_anew(engine: Engine) -> None:
+    """Two codes at one pixel in a hundred, between half the frames and all."""
+    spotted = PICTURE.copy()
+    spotted[::10, ::10] += 2
+    rest = TemporalReuse(engine, CAMERA)
+    assert fed_noise(rest, NOISY, lambda index: spotted if index + 1 == NOISY else PICTURE) is None
+
+
+def test_a_tracked_camera_with_objects_does_not_rest(engine: Engine) -> None:
+    assert fed_noise(TemporalReuse(engine, CAMERA, poses="track"), NOISY) is None
+    assert fed_noise(TemporalReuse(engine, CAMERA, poses="track"), NOISY, lambda _index: None) is not None
+
+
+def test_the_surface_is_renewed_when_twice_as_many_frames_were_seen(engine: Engine) -> None:
+    rest = TemporalReuse(engine, CAMERA)
+    fed_noise(rest, NOISY)
+    holds = [rest.holds(noisy(index)) for index in range(NOISY, 2 * NOISY + 2)]
+    assert holds == [index + 1 != 2 * NOISY for index in range(NOISY, 2 * NOISY + 2)]
+    assert rest.omission is not None
+
+
+def test_what_a_light_has_missed_is_said_afterwards(engine: Engine) -> None:
+    still, moving = TemporalReuse(engine, CAMERA), TemporalReuse(engine, CAMERA)
+    fed(still, ROUND)
+    fed(moving, ROUND, 1e-5 * RATE)
+    for rest in (still, moving):
+        rest.holds(replace(FRAME, exposure=2.0))
+    assert still.echo is None
+    assert moving.echo is not None
+    for _ in range(ECHO_FRAMES):
+        moving.learn(LIGHT, NO_PLANES, None)
+    assert moving.echo is None

@@ -10,8 +10,6 @@ import pyopencl as cl
 import cl_kernels
 
 KERNEL_FOLDER = Path(cl_kernels.__file__).parent
-KERNEL_FILES = {path.name: path for path in KERNEL_FOLDER.glob("*/*.cl")}
-"""Every file that can be built, by its name; names are unique over the folders."""
 _OPTIONS = ("-cl-std=CL1.2", "-Werror", "-cl-fp32-correctly-rounded-divide-sqrt")
 _PROLOGUE = """#ifdef __clang__
 #pragma clang diagnostic ignored "-Wpsabi"
@@ -58,11 +56,12 @@ class ProgramCache:
             return self._programs[key]
 
     def _build(self, file: str, defines: tuple[str, ...]) -> cl.Program:
-        source = f'{_PROLOGUE}#line 1 "{file}"\n' + KERNEL_FILES[file].read_text()
+        path = next(KERNEL_FOLDER.rglob(file))  # names are unique over the folders
+        source = f'{_PROLOGUE}#line 1 "{file}"\n' + path.read_text()
         options = [*self._options, "-I", str(KERNEL_FOLDER / "include"), *defines]
         try:
             program: cl.Program = cl.Program(self._context, source).build(options)
         except cl.RuntimeError as error:
-            path = KERNEL_FILES[file].relative_to(KERNEL_FOLDER.parent)
-            raise KernelBuildError(f"{path} with {' '.join(defines) or 'no defines'}: {error}") from error
+            place = f"cl_kernels/{path.relative_to(KERNEL_FOLDER)}"
+            raise KernelBuildError(f"{place} with {' '.join(defines) or 'no defines'}: {error}") from error
         return program

@@ -11,8 +11,8 @@ import numpy as np
 import trimesh
 
 from protocol.messages import Hello, Wishes
+from server.client_session import ClientSession
 from server.opencl.device import Device
-from server.pipeline import Pipeline
 from server.room.room import Room
 from server.scene.placement import Placement
 from server.service.room_store import RoomStore
@@ -28,13 +28,13 @@ BALL = shape_of(trimesh.creation.icosphere(1, 0.1))
 PLACE = Placement(position_m=(-0.9, 0.6, 1.0))
 
 
-def client_of(device: Device, room: Room, asked: Wishes, **said: Any) -> Pipeline:
+def client_of(device: Device, room: Room, asked: Wishes, **said: Any) -> ClientSession:
     """A pipeline of one more client of the room."""
     hello = Hello(client="test", camera=CAMERA, wishes=asked, room=room.name, **said)
-    return Pipeline(device, CAMERA, asked, room, hello)
+    return ClientSession(device, CAMERA, asked, room, hello)
 
 
-def scan(pipeline: Pipeline, steps: range) -> None:
+def scan(pipeline: ClientSession, steps: range) -> None:
     """Frames of the room from the usual way."""
     for step in steps:
         pipeline.process(frame_at(view_at(step), step, given=view_at(step)))

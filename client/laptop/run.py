@@ -15,9 +15,10 @@ from client.laptop.stopping import stop_on_interrupt
 from client.options import Capture
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import MeshFormat, Wishes
+from server.client_session import ClientSession
 from server.meshing.files import mesh_files
 from server.opencl.device import open_device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 
@@ -84,7 +85,7 @@ def process_frames(pipeline: Processor, frames: Iterable[RgbdFrame]) -> Iterator
         )
 
 
-def place_objects(pipeline: Pipeline, objects: tuple[ObjectFile, ...], note: Callable[[str], None]) -> None:
+def place_objects(pipeline: ClientSession, objects: tuple[ObjectFile, ...], note: Callable[[str], None]) -> None:
     """Put every object into the pipeline, named by `object_id`. Raises ObjectError, MeshError or RunError."""
     for number, item in enumerate(objects):
         format_, data = pack_mesh(item.path)
@@ -104,13 +105,13 @@ def object_id(number: int) -> str:
 
 def _open_pipeline(
     device_name: str | None, camera: CameraModel, wishes: Wishes, note: Callable[[str], None]
-) -> Pipeline:
+) -> ClientSession:
     device = open_device(device_name)
     if wishes.preset == "auto":
         from client.laptop.tune import ensure_front
 
         ensure_front(device, note)
     try:
-        return Pipeline(device, camera, wishes)
+        return ClientSession(device, camera, wishes)
     except ValueError as error:
         raise RunError(str(error)) from error

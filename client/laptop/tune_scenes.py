@@ -25,11 +25,12 @@ from client.laptop.synthetic.lights import disc_light
 from client.laptop.synthetic.source import SyntheticSource, open_synthetic
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.evaluation.e1 import LitFrame, moving_light, score, shaded_views
 from server.evaluation.environment import direction_error_deg
 from server.maths.sh import spherical_fibonacci
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.quality.costs import rows_of
 from server.quality.sampling_settings import SamplingSettings
 from server.shading.composite import srgb_codes
@@ -78,7 +79,7 @@ class Stage:
     def _results(self, device: Device, point: SamplingSettings, say: Say) -> list[FrameResult]:
         usual = _usual(self.source)
         wishes = structs.replace(point.wishes(usual), albedo="estimated", indirect="observed")
-        pipeline = Pipeline(device, self.source.camera, wishes)
+        pipeline = ClientSession(device, self.source.camera, wishes)
         found: list[FrameResult] = []
         try:
             with TemporaryDirectory() as folder:

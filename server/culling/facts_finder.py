@@ -1,4 +1,4 @@
-"""Gathers the facts of one session's frames (scene_facts.py): what is cheap to know before anything is drawn."""
+"""Gathers the facts of the frames of one session (scene_facts.py): what is cheap to know before anything is drawn."""
 
 from __future__ import annotations
 
@@ -7,84 +7,108 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from server.culling.influence_bound import UNKNOWN, InfluenceBound, MostSent, bound_influence
+from server.culling.influence_bound import NOWHERE, UNKNOWN, InfluenceBound, MostSent, bound_influence
 from server.culling.reason import ALLOWANCE
 from server.culling.rules import share_of_codes
-from server.culling.scene_facts import SceneFacts, gather_facts
-from server.effects.functions import View
-from server.geometry.geometry import GeometryFrame
+from server.culling.scene_facts import SPREAD, Brightness, SceneFacts, most_albedo, most_radiance, most_shading
+from server.frame_context import FrameContext
 from server.maths.direct_lights import split_light
-from server.maths.rigid import inverse_rigid
+from server.maths.microfacets import most_reflected
 from server.objects.rasterize import Placed, boxes_in_view
 from server.scene.colors import linear_from_srgb
-from server.shading.tone_mapping import Averages
+from server.shading.reflect import is_glossy
 from server.shading.traced_scene import DeviceLight
-from server.transfer.indirect import Indirect
-from server.transfer.radiance_transfer import Directions, Transfer
-from server.volume.volume import Volume
+from server.transfer.samples import TransferSamples
+
+Floats = NDArray[np.float64]
 
 ROUNDING = 1.01
 """By which the volume's colours may exceed what was put in: they have few bits."""
 
 
 class FactsFinder:
-    """One session's."""
+    """Remembers the brightest picture of a session."""
 
     def __init__(self, *, everything: bool) -> None:
-        """`everything`: what would be left out as needless is not asked for."""
+        """`everything`: nothing is culled by a bound, so bounds are not looked for."""
         self._everything = everything
         self._brightest = 0.0  # of the pictures so far, in units of the first
 
     def find(
         self,
-        view: View,
-        geometry: GeometryFrame,
-        volume: Volume,
-        rays: Directions,
-        transfer: Transfer | None,
-        indirect: Indirect | None,
+        context: FrameContext,
         objects: Sequence[Placed],
+        samples: TransferSamples,
         light: DeviceLight,
-        sh: NDArray[np.float64],
+        sh: Floats,
         shown: NDArray[np.uint8],
-        averages: Averages | None,
+        gain: float,
     ) -> SceneFacts:
         """Facts of a frame. sh: [bands^2, 3] of all of `light`, in the first picture's units; shown: [h, w, 3] sRGB."""
-        picture_most = float(linear_from_srgb(np.array(min(float(shown.max(initial=0)) + 0.5, 255.0) / 255.0)))
-        if not shown.any():
-            picture_most = 0.0
-        self._brightest = max(self._brightest, picture_most / geometry.exposure)
+        exposure, has_indirect = context.exposure, samples.indirect is not None
+        picture_most = _most_shown(shown)
+        self._brightest = max(self._brightest, picture_most / exposure)
+        whole = exposure * sh
+        rest = exposure * split_light(sh).rest if light.discs else whole
 
-        def measure(most: MostSent) -> InfluenceBound:
-            if self._everything or transfer is None:
-                return UNKNOWN
-            return bound_influence(
-                view.engine,
-                view.camera,
-                geometry.surface,
-                transfer,
-                volume,
-                rays,
-                view.reach_m,
-                light,
-                indirect,
-                objects,
-                most,
-                share_of_codes(ALLOWANCE),
-                view.sampling.upsampling,
-            )
+        real = np.full(3, ROUNDING * exposure * self._brightest) if has_indirect else np.zeros(3)
+        around = np.maximum(real, light.unseen)
+        arriving = np.maximum(most_radiance(whole), around)
+        shading = most_shading(rest) + sum((disc.irradiance for disc in light.discs), np.zeros(3)) + SPREAD * around
+        sent = shading * most_albedo(objects) if has_indirect else np.zeros(3)
 
-        return gather_facts(
-            objects,
-            boxes_in_view(view.camera, inverse_rigid(view.volume_from_camera), objects),
-            view.sampling,
-            view.smooth_edges,
-            light,
-            geometry.exposure * sh,
-            geometry.exposure * split_light(sh).rest if light.discs else geometry.exposure * sh,
-            indirect is not None,
-            picture_most,
-            ROUNDING * geometry.exposure * self._brightest,
-            averages,
-            measure,
+        boxes = boxes_in_view(context.camera, context.camera_from_volume, objects)
+        in_view = [thing for (thing, _), box in zip(objects, boxes, strict=True) if box is not None]
+        materials = [thing.tables.materials for thing in in_view]
+        is_lit = bool(objects) and bool(arriving.any() or sent.any())
+        return SceneFacts(
+            objects_in_view=len(in_view),
+            adaptive=context.sampling.adaptive,
+            indirect=has_indirect,
+            smooth_edges=context.smooth_edges,
+            glossy=any(is_glossy(table) for table in materials),
+            reflected=max((most_reflected(table, albedo=1.0) for table in materials), default=0.0),
+            gain=gain,
+            brightness=Brightness(
+                picture=picture_most,
+                arriving=float(arriving.max()),
+                shading=float(shading.max()),
+                object_sent=float(sent.max()),
+                real_sent=float(real.max()),
+            ),
+            reach=self._influence(context, objects, samples, light, MostSent(sent, real)) if is_lit else NOWHERE,
         )
+
+    def _influence(
+        self,
+        context: FrameContext,
+        objects: Sequence[Placed],
+        samples: TransferSamples,
+        light: DeviceLight,
+        most: MostSent,
+    ) -> InfluenceBound:
+        """Of the objects on real surface in view."""
+        if self._everything or samples.transfer is None:
+            return UNKNOWN
+        return bound_influence(
+            context.engine,
+            context.camera,
+            context.surface,
+            samples.transfer,
+            context.volume,
+            context.rays,
+            context.ray_length_m,
+            light,
+            samples.indirect,
+            objects,
+            most,
+            share_of_codes(ALLOWANCE),
+            context.sampling.upsampling,
+        )
+
+
+def _most_shown(shown: NDArray[np.uint8]) -> float:
+    """The greatest linear radiance that rounds to a code of the picture."""
+    if not shown.any():
+        return 0.0
+    return float(linear_from_srgb(np.array(min(float(shown.max(initial=0)) + 0.5, 255.0) / 255.0)))

@@ -49,41 +49,21 @@ def share_of_codes(bound: float) -> float:
     return float(1.0 - ((1.0 - bound / SHOWN + 0.055) / 1.055) ** 2.4)
 
 
-# ---- what cannot run, or was asked not to -------------------------------------------------------------------------
+# ---- reasons for which an input of the effects is absent -----------------------------------------------------------
 
+NO_OBJECT = CullReason("there is no virtual object", 0.0)
+NO_LIGHT = CullReason("no light has been found yet", SHOWN)
+NO_INDIRECT = CullReason("asked for: no indirect light", SHOWN)
+TRACED = CullReason("the preset traces rays through the volume", 0.0)
+SOFT = CullReason("the light is soft", 0.0)
+"""The whole light is in what rays bring: there is nothing to make a shadow map of."""
 
-def no_object(facts: SceneFacts) -> CullReason | None:
-    """Nothing there to run on."""
-    return None if facts.objects else CullReason("there is no virtual object", 0.0)
-
-
-def no_light(facts: SceneFacts) -> CullReason | None:
-    """Nothing is known to shade with."""
-    return None if facts.has_light else CullReason("no light has been found yet", SHOWN)
+# ---- what was switched off ---------------------------------------------------------------------------------------
 
 
 def no_indirect(facts: SceneFacts) -> CullReason | None:
     """A wish."""
-    return None if facts.indirect else CullReason("asked for: no indirect light", SHOWN)
-
-
-def traced(facts: SceneFacts) -> CullReason | None:
-    """Rays and depth pictures are two ways to one thing; a preset has one of them."""
-    return None if facts.image_space else CullReason("the preset traces rays through the volume", 0.0)
-
-
-def soft(facts: SceneFacts) -> CullReason | None:
-    """The whole light is in what rays bring: there is nothing that a shadow map could be of."""
-    return None if facts.sharp_lights else CullReason("the light is soft", 0.0)
-
-
-def not_matched(facts: SceneFacts) -> CullReason | None:
-    """A wish, or nothing to match."""
-    if facts.averages is None:
-        return CullReason("asked for: virtual things keep the light's own scale", SHOWN)
-    if not facts.averages.are_known:
-        return CullReason("the picture or its shading is empty or black: the light's own scale holds", SHOWN)
-    return None
+    return None if facts.indirect else NO_INDIRECT
 
 
 def hard_edges(facts: SceneFacts) -> CullReason | None:
@@ -101,9 +81,7 @@ def not_refined(facts: SceneFacts) -> CullReason | None:
 
 def out_of_view(facts: SceneFacts) -> CullReason | None:
     """The box of pixels that holds all of an object that is in view is empty: no pixel shows any of it."""
-    if facts.objects_in_view:
-        return None
-    return no_object(facts) or CullReason("no virtual object is in view", 0.0)
+    return None if facts.objects_in_view else CullReason("no virtual object is in view", 0.0)
 
 
 def unlit(facts: SceneFacts) -> CullReason | None:
@@ -130,28 +108,26 @@ def out_of_reach(facts: SceneFacts) -> CullReason | None:
     picture there is multiplied by it. Virtual surface gets light off real surface that is multiplied by the same; all
     that it gets is not below 0, so it changes by the same share, and by no more than gain b times what real surface
     sends."""
-    if not facts.objects:
-        return no_object(facts)
     if math.isinf(facts.reach.change):
         return None
     share = facts.reach.change * (1.0 + (facts.reach.bounced if facts.indirect else 0.0))
     return _if_bounded("virtual things hardly change the light of real surface in view", _codes_of_ratio(facts, share))
 
 
-def hardly_changed(_facts: SceneFacts) -> CullReason:
-    """A pixel of real surface is multiplied by R'/R; where it is no farther from 1 than `spared` lets it
-    (change_mask.cl), it is left as it is. Samples where bounced light can change R'/R by no more than `spared_bounces`
-    (bounce_real) are without: what virtual surface gets off them changes by as much. Both together are ELSEWHERE of the
-    brightest."""
+def faint_shadows(_facts: SceneFacts) -> CullReason:
+    """A pixel of real surface is multiplied by R'/R. Where that differs from 1 by no more than faint_pixel_share, the
+    pixel is left as it is (change_mask.cl). Samples where bounced light can change R'/R by no more than
+    faint_sample_share get none (bounce_real), and the light that they send to virtual surface changes by as much. Both
+    together are ELSEWHERE of the brightest pixel."""
     return CullReason("virtual things hardly change the rest of the picture", ELSEWHERE)
 
 
-def spared() -> float:
+def faint_pixel_share() -> float:
     """Of R'/R of a pixel."""
     return (1.0 - ELSEWHERE_BOUNCED) * share_of_codes(ELSEWHERE)
 
 
-def spared_bounces() -> float:
+def faint_sample_share() -> float:
     """Of R'/R of a sample."""
     return ELSEWHERE_BOUNCED * share_of_codes(ELSEWHERE)
 
@@ -194,5 +170,5 @@ def _codes_of_ratio(facts: SceneFacts, share: float) -> float:
 
 
 def _if_bounded(reason: str, bound: float, at_most: float = ALLOWANCE) -> CullReason | None:
-    """What is more than may change at all is no reason; ALLOWANCE - ELSEWHERE leaves hardly_changed its part."""
+    """What is more than may change at all is no reason; ALLOWANCE - ELSEWHERE leaves faint_shadows its part."""
     return CullReason(reason, bound) if bound <= at_most else None

@@ -4,85 +4,50 @@ from __future__ import annotations
 
 from typing import Literal
 
-from server.culling import rules as o
-from server.culling.reason import CullReason
+from server.culling import rules
 from server.culling.scene_facts import SceneFacts
-from server.effects.functions import (
-    add_objects,
-    bounce_real,
-    compose_layer,
-    composite,
-    cover,
-    direct_real,
-    direct_virtual,
-    find_reach,
-    light_objects,
-    light_samples,
-    look_around,
-    match_average,
-    mixture,
-    prepare_rays,
-    rasterize,
-    refine_real,
-    refine_virtual,
-    reflect,
-    shade_virtual,
-    shadow_everywhere,
-    shadow_map,
-    shadow_real,
-)
-from server.effects.plan import Effect
+from server.effects import functions as f
+from server.effects.plan import Approximation, Effect, EffectTable
+from server.effects.resources import FaintShadows
 
 Answer = Literal["picture", "layer", "light"]
 """What a frame is answered by: `wishes.answer`."""
 
-
-def _shades_virtual(facts: SceneFacts) -> CullReason | None:
-    return o.out_of_view(facts) or o.unlit(facts)
-
-
-EFFECTS: tuple[Effect[SceneFacts], ...] = (
-    Effect(rasterize, "virtual", o.no_object, o.out_of_view),
-    Effect(cover, "coverage", lambda f: o.no_object(f) or o.hard_edges(f), o.out_of_view),
-    Effect(look_around, "looks", lambda f: o.no_object(f) or o.traced(f)),
-    Effect(prepare_rays, "scene", lambda f: o.no_object(f) or o.no_light(f)),
-    Effect(shadow_map, "maps", lambda f: o.no_object(f) or o.no_light(f) or o.soft(f)),
-    Effect(light_objects, "glow", lambda f: o.no_object(f) or o.no_light(f) or o.no_indirect(f), o.dark_things),
-    Effect(add_objects, "changed_scene", lambda f: o.no_object(f) or o.no_light(f)),
-    Effect(reflect, "reflected", lambda f: o.no_object(f) or o.no_light(f), lambda f: _shades_virtual(f) or o.matt(f)),
-    Effect(shade_virtual, "occluded", lambda f: o.no_object(f) or o.no_light(f), _shades_virtual),
-    Effect(shadow_real, "ratio", lambda f: o.no_object(f) or o.no_light(f), o.out_of_reach),
-    Effect(light_samples, "samples", lambda f: o.no_object(f) or o.no_light(f) or o.no_indirect(f) or o.soft(f)),
-    Effect(
-        bounce_real,
-        "bounced",
-        lambda f: o.no_object(f) or o.no_light(f) or o.no_indirect(f),
-        lambda f: o.out_of_reach(f) or o.nothing_bounces(f),
-    ),
-    Effect(
-        refine_virtual,
-        "refined_occluded",
-        lambda f: o.no_object(f) or o.no_light(f) or o.not_refined(f),
-        _shades_virtual,
-    ),
-    Effect(
-        refine_real,
-        "refined_ratio",
-        lambda f: o.no_object(f) or o.no_light(f) or o.not_refined(f),
-        lambda f: o.out_of_reach(f) or o.no_rims(f),
-    ),
-    Effect(shadow_everywhere, "everywhere", needless=o.hardly_changed),
-    Effect(find_reach, "reached", lambda f: o.no_object(f) or o.no_light(f), o.out_of_reach),
-    Effect(direct_virtual, "lit_virtual", lambda f: o.no_object(f) or o.no_light(f) or o.soft(f), _shades_virtual),
-    Effect(direct_real, "whole_ratio", lambda f: o.no_object(f) or o.no_light(f) or o.soft(f), o.out_of_reach),
-    Effect(match_average, "gain", lambda f: o.no_object(f) or o.no_light(f) or o.not_matched(f), _shades_virtual),
-    Effect(composite, "picture", through=mixture),
-    Effect(compose_layer, "layer", through=mixture),
+FAINT_SHADOWS: Approximation[SceneFacts] = Approximation(
+    "faint_shadows",
+    exact=FaintShadows(0.0, 0.0),
+    coarse=FaintShadows(rules.faint_pixel_share(), rules.faint_sample_share()),
+    bound=rules.faint_shadows,
 )
-"""One writer a resource; what a frame wants is one of the last two."""
+
+EFFECTS: EffectTable[SceneFacts] = EffectTable(
+    (
+        Effect(f.rasterize, culled_by=(rules.out_of_view,)),
+        Effect(f.cover, disabled_by=(rules.hard_edges,), culled_by=(rules.out_of_view,)),
+        Effect(f.draw_depth_views),
+        Effect(f.prepare_rays),
+        Effect(f.shadow_map),
+        Effect(f.light_objects, disabled_by=(rules.no_indirect,), culled_by=(rules.dark_things,)),
+        Effect(f.light_samples, disabled_by=(rules.no_indirect,)),
+        Effect(f.add_objects),
+        Effect(f.reflect, culled_by=(rules.unlit, rules.matt)),
+        Effect(f.shade_virtual, culled_by=(rules.unlit,)),
+        Effect(f.shadow_real, culled_by=(rules.out_of_reach,)),
+        Effect(f.bounce_real, disabled_by=(rules.no_indirect,), culled_by=(rules.nothing_bounces,)),
+        Effect(f.refine_virtual, disabled_by=(rules.not_refined,), culled_by=(rules.unlit,)),
+        Effect(f.refine_real, disabled_by=(rules.not_refined,), culled_by=(rules.no_rims,)),
+        Effect(f.mark_changes),
+        Effect(f.direct_virtual, culled_by=(rules.unlit,)),
+        Effect(f.direct_real),
+    ),
+    (FAINT_SHADOWS,),
+)
+"""Everything that leads to PictureParts. A frame ends with one of the next two, or both."""
+
+COMPOSITE, COMPOSE_LAYER = "composite", "compose_layer"
 
 
-def effects_of(answer: Answer) -> tuple[Effect[SceneFacts], ...]:
-    """All but the one that another answer than this ends with."""
-    ends = {"picture": "layer", "layer": "picture"}
-    return tuple(effect for effect in EFFECTS if effect.writes != ends.get(answer))
+def effect_names(answer: Answer) -> tuple[str, ...]:
+    """Names of all effects that a frame with this answer can run, in the order of the table."""
+    end = COMPOSE_LAYER if answer == "layer" else COMPOSITE
+    return (*(effect.name for effect in EFFECTS.effects), end)

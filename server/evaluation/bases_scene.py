@@ -160,7 +160,7 @@ class LitScene:
         self.engine, self.lights, self._camera = Engine(device), lights, camera
         geometry = Geometry(self.engine, camera, wishes)
         for frame in frames:
-            geometry.update(frame)
+            geometry.scan(frame)
         if geometry.volume is None:
             raise ValueError("a scene of no frames shows nothing")
         self._volume = geometry.volume
@@ -213,7 +213,7 @@ class LitScene:
         return sum_tiles(self.engine, self._camera, radiance, view.surface, transfer, self._volume.voxel_m)
 
     def _view(self, geometry: Geometry, frame: RgbdFrame, number: int) -> View:
-        seen = geometry.update(frame).surface
+        seen = geometry.scan(frame).surface
         own = [
             self.engine.workspace.upload(f"view_{number}_{part}", self.engine.download(getattr(seen, part)))
             for part in ("positions", "normals", "labels")

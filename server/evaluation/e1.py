@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.evaluation.environment import direction_dot, direction_error_deg, environment_difference
 from server.geometry.geometry import Geometry
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.pipeline import Pipeline
 from server.quality.settings import WHOLE_ROOM_M
 from server.shading.composite import srgb_codes
 from server.transfer.radiance_transfer import Transfer, direction_sets, transfer_radiance
@@ -88,7 +88,7 @@ def shaded_views(
     geometry = Geometry(engine, camera, Wishes(volume_m=volume_m, voxel_m=voxel_m))
     directions = direction_sets(rays, 4)
     for frame in frames:
-        surface = geometry.update(frame).surface
+        surface = geometry.scan(frame).surface
         assert geometry.volume is not None
         transfer = transfer_radiance(engine, camera, geometry.volume, surface, 1, directions, WHOLE_ROOM_M)
         yield _view(engine, frame, transfer)
@@ -108,7 +108,7 @@ def moving_light(views: Iterable[ShadedView], light: Callable[[int], Floats]) ->
 
 def score(device: Device, camera: CameraModel, frames: Iterable[LitFrame], wishes: Wishes) -> Score:
     """Run the pipeline over `frames`. Raises ValueError for wishes that it cannot fulfil."""
-    pipeline = Pipeline(device, camera, wishes)
+    pipeline = ClientSession(device, camera, wishes)
     result = Score()
     for item in frames:
         answer = pipeline.process(item.frame)

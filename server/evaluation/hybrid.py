@@ -126,6 +126,6 @@ def run_geometry(
     try:
         geometry = Geometry(engine, source.camera, Wishes(volume_m=volume_m, voxel_m=voxel_m))
         for index in frames:
-            yield engine, index, geometry.update(source[index])
+            yield engine, index, geometry.scan(source[index])
     finally:
         engine.close()

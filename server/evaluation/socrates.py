@@ -95,7 +95,7 @@ def read_views(folder: Path, device: Device) -> list[BustView]:
     try:
         geometry = Geometry(engine, camera, Wishes(volume_m=_bounds(camera, frames), voxel_m=_VOXEL_M, poses="given"))
         for frame in frames * _PASSES:
-            geometry.update(frame)
+            geometry.scan(frame)
         return [_view(engine, camera, geometry, frame) for frame in frames]
     finally:
         engine.close()
@@ -227,7 +227,7 @@ def _bounds(camera: CameraModel, frames: list[RgbdFrame]) -> tuple[float, float,
 
 def _view(engine: Engine, camera: CameraModel, geometry: Geometry, frame: RgbdFrame) -> BustView:
     """The samples of one frame against the fused bust."""
-    now = geometry.update(frame)
+    now = geometry.scan(frame)
     assert geometry.volume is not None
     rays = direction_sets(_RAYS, BANDS)
     transfer = transfer_radiance(engine, camera, geometry.volume, now.model, _STRIDE, rays, _ROOM_M)

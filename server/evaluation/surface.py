@@ -87,7 +87,7 @@ def fused_views(
     views = []
     try:
         for frame, exact_m in frames:
-            result = geometry.update(frame)
+            result = geometry.scan(frame)
             if exact_m is not None:
                 inside = inside_bounds(camera, result.world_from_camera, exact_m, bounds_m, voxel_m)
                 views.append(SurfaceView(model_depth(engine, result), exact_m, inside))

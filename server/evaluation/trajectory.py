@@ -86,7 +86,7 @@ def consistency(
     """Fuse the first frames of `source` at `poses` (world_from_camera), then look at every `step`-th again."""
     geometry = Geometry(engine, source.camera, Wishes(voxel_m=voxel_m, volume_m=volume_m))
     for index, pose in enumerate(poses):
-        geometry.update(replace(source[index], world_from_camera=pose))
+        geometry.scan(replace(source[index], world_from_camera=pose))
         engine.queue.finish()
         engine.profile.forget()
     assert geometry.volume is not None
@@ -113,7 +113,7 @@ def track_source(
     geometry = Geometry(engine, source.camera, Wishes(poses=mode, voxel_m=voxel_m, volume_m=volume_m))
     track = Track([], [], [], [])
     for done, index in enumerate(frames):
-        result = geometry.update(source[index])
+        result = geometry.scan(source[index])
         engine.queue.finish()
         _, kernel_ms = engine.profile.collect()
         track.poses.append(result.world_from_camera)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +13,6 @@ from protocol.messages import Tracking, Wishes
 from server.geometry.merge import merge_depth
 from server.input.measure import GREATEST_DEPTH_M, Measurement, measure
 from server.opencl.engine import Engine
-from server.tracking.alignment import Alignment, Markers
 from server.tracking.camera_tracking import CameraTracking, PoseEstimate
 from server.tracking.exposure import ExposureTracking, scene_radiance
 from server.tracking.reconstruction import Reconstruction
@@ -50,19 +48,13 @@ class Geometry:
     """One camera's way into its volume. Owned by one thread."""
 
     def __init__(
-        self,
-        engine: Engine,
-        camera: CameraModel,
-        wishes: Wishes,
-        reconstruction: Reconstruction | None = None,
-        alignment: Alignment | None = None,
+        self, engine: Engine, camera: CameraModel, wishes: Wishes, reconstruction: Reconstruction | None = None
     ) -> None:
-        """`reconstruction`: what others scan too; None: one of its own. `alignment`: with theirs."""
+        """`reconstruction`: what others scan too; None: one of its own."""
         self._engine = engine
         self._camera = camera
         self._wishes = wishes
         self._reconstruction = reconstruction or Reconstruction(engine)
-        self._alignment = alignment or Alignment(engine, camera, self._reconstruction, Markers())
         self._tracking = CameraTracking(engine, camera, wishes.poses, self._reconstruction)
         self._exposure = ExposureTracking(engine, camera, "constant" if wishes.as_thesis else wishes.exposure)
         self._last: GeometryFrame | None = None
@@ -72,34 +64,45 @@ class Geometry:
         """None before the first frame."""
         return self._reconstruction.volume
 
-    def update(self, frame: RgbdFrame, holds: Callable[[RgbdFrame], bool] = lambda _frame: False) -> GeometryFrame:
-        """Measure, locate, fuse, predict, merge. Raises ValueError, one line, for a frame that is refused.
+    def scan(self, frame: RgbdFrame) -> GeometryFrame:
+        """All steps for one frame of a camera that scans alone. Raises ValueError for one that is refused."""
+        check_size(self._camera, frame)
+        volume = self.volume_for(frame)
+        with self._engine.profile.stage("input"):
+            measurement = measure(self._engine, self._camera, frame)
+        return self.update(frame, measurement, volume)
 
-        holds: whether a frame's geometry is that of the frame before; asked of every frame.
+    def volume_for(self, frame: RgbdFrame) -> Volume:
+        """The volume that a frame belongs into, made by the first one. frame: with its pose in the room's world.
+
+        Raises ValueError, one line, for a frame that is refused; nothing has changed then.
         """
-        engine, camera, stage = self._engine, self._camera, self._engine.profile.stage
-        self._check_size(frame)
-        guess = self._tracking.first_guess(self._alignment.in_room(frame))
-        volume = self._reconstruction.volume_for(self._wishes, camera, frame, guess)
+        guess = self._tracking.first_guess(frame)
+        return self._reconstruction.volume_for(self._wishes, self._camera, frame, guess)
 
-        with stage("input"):  # 5.1.1
-            measurement = measure(engine, camera, frame)
-            not_aligned = self._alignment.settle(frame, measurement)
-            frame = self._alignment.in_room(frame)
-            is_held = holds(frame)
-        if is_held and self._last is not None:
-            with stage("reconstruct"):
-                return self._held(self._last, frame, measurement, volume)
+    def keep(self, frame: RgbdFrame, measurement: Measurement, volume: Volume) -> GeometryFrame:
+        """The geometry of the frame before, for a still view. The frame is fused all the same: when the view changes,
+        the volume is to be what it would have become."""
+        assert self._last is not None
+        last = self._last
+        with self._engine.profile.stage("reconstruct"):
+            scene = scene_radiance(self._engine, measurement.radiance, last.exposure)
+            self._fuse(volume, last.volume_from_camera, Measurement(scene, measurement.depth_m), last.exposure)
+        notes = input_notes(self._camera, frame, volume)
+        return replace(last, measurement=measurement, scene_radiance=scene, notes=notes, is_held=True)
+
+    def update(
+        self, frame: RgbdFrame, measurement: Measurement, volume: Volume, unaligned: str | None = None
+    ) -> GeometryFrame:
+        """Locate, fuse, predict, merge. unaligned: why the frame does not belong into the room; None: it does."""
+        engine, camera, stage = self._engine, self._camera, self._engine.profile.stage
         with stage("reconstruct"):  # 4.2.1
-            if not_aligned is None:
-                located = self._tracking.locate(frame, measurement, volume)
-            else:
-                located = PoseEstimate(self._tracking.first_guess(frame), "lost", (not_aligned,))
+            located = self._locate(frame, measurement, volume, unaligned)
             volume_from_camera = volume.volume_from_world() @ located.world_from_camera
             place = volume_from_camera if located.fuse else None
             exposure, doubts = self._exposure.update(frame, measurement, volume, place)  # B3
             scene = scene_radiance(engine, measurement.radiance, exposure)
-            notes = (*located.notes, *doubts, *self._notes(frame, volume))
+            notes = (*located.notes, *doubts, *input_notes(camera, frame, volume))
             if self._last is not None and not located.fuse:
                 lost = replace(self._last, measurement=measurement, exposure=exposure, scene_radiance=scene)
                 return replace(lost, tracking=located.tracking, notes=notes)
@@ -126,12 +129,12 @@ class Geometry:
         self._last = result if located.fuse else None
         return result
 
-    def _held(self, last: GeometryFrame, frame: RgbdFrame, measurement: Measurement, volume: Volume) -> GeometryFrame:
-        """Only fused: when something happens, the volume is to be what it would have become."""
-        scene = scene_radiance(self._engine, measurement.radiance, last.exposure)
-        self._fuse(volume, last.volume_from_camera, Measurement(scene, measurement.depth_m), last.exposure)
-        notes = self._notes(frame, volume)
-        return replace(last, measurement=measurement, scene_radiance=scene, notes=notes, is_held=True)
+    def _locate(
+        self, frame: RgbdFrame, measurement: Measurement, volume: Volume, unaligned: str | None
+    ) -> PoseEstimate:
+        if unaligned is None:
+            return self._tracking.locate(frame, measurement, volume)
+        return PoseEstimate(self._tracking.first_guess(frame), "lost", (unaligned,))
 
     def _fuse(
         self, volume: Volume, volume_from_camera: NDArray[np.float64], measured: Measurement, exposure: float
@@ -140,26 +143,28 @@ class Geometry:
         integrate(self._engine, volume, self._camera, volume_from_camera, measured)
         self._reconstruction.count_exposure(exposure)
 
-    def _check_size(self, frame: RgbdFrame) -> None:
-        color, depth = self._camera, self._camera.depth_lens
-        if frame.color.shape != (color.height, color.width, 3) or frame.depth.shape != (depth.height, depth.width):
-            raise ValueError(
-                f"colour is {frame.color.shape[1]}x{frame.color.shape[0]}, depth {frame.depth.shape[1]}x"
-                f"{frame.depth.shape[0]}; the camera has {color.width}x{color.height} and {depth.width}x{depth.height}"
-            )
 
-    def _notes(self, frame: RgbdFrame, volume: Volume) -> tuple[str, ...]:
-        notes = []
-        if frame.has_depth and not any(
-            self._is_usable(depth).any() for depth in (frame.depth[::16, ::16], frame.depth)
-        ):  # mostly a few do
-            notes.append("the depth picture has no usable value: is the sensor covered?")
-        if volume.is_full:
-            notes.append("the volume's memory is full, new surface is not fused: give a larger --voxel")
-        return tuple(notes)
-
-    def _is_usable(self, depth: NDArray[np.uint16]) -> NDArray[np.bool_]:
-        usable: NDArray[np.bool_] = (
-            (depth > 0) & (depth != 65535) & (depth * self._camera.depth_scale_m <= GREATEST_DEPTH_M)
+def check_size(camera: CameraModel, frame: RgbdFrame) -> None:
+    """Raises ValueError, one line, for pictures that are not of the camera's size."""
+    depth = camera.depth_lens
+    if frame.color.shape != (camera.height, camera.width, 3) or frame.depth.shape != (depth.height, depth.width):
+        raise ValueError(
+            f"colour is {frame.color.shape[1]}x{frame.color.shape[0]}, depth {frame.depth.shape[1]}x"
+            f"{frame.depth.shape[0]}; the camera has {camera.width}x{camera.height} and {depth.width}x{depth.height}"
         )
-        return usable
+
+
+def input_notes(camera: CameraModel, frame: RgbdFrame, volume: Volume) -> tuple[str, ...]:
+    """What is wrong with a frame's depth, or with the room for it, one line each."""
+    notes = []
+    sparse = frame.depth[::16, ::16]  # mostly a few pixels say enough
+    if frame.has_depth and not any(_is_usable(camera, depth).any() for depth in (sparse, frame.depth)):
+        notes.append("the depth picture has no usable value: is the sensor covered?")
+    if volume.is_full:
+        notes.append("the volume's memory is full, new surface is not fused: give a larger --voxel")
+    return tuple(notes)
+
+
+def _is_usable(camera: CameraModel, depth: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    usable: NDArray[np.bool_] = (depth > 0) & (depth != 65535) & (depth * camera.depth_scale_m <= GREATEST_DEPTH_M)
+    return usable

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl.array as cl_array
 
-from protocol.frames import CameraModel
-from server.geometry.geometry import GeometryFrame
+from server.frame_context import FrameContext
 from server.light.continuation import LEAST_GAIN_KNOWN, NO_PLANES, Continuation, PlaneArrays
 from server.light.light_estimation import (
     LEAST_OPENNESS,
@@ -30,8 +29,7 @@ from server.maths.sh import LUMINANCE, sh_basis
 from server.opencl.engine import Engine
 from server.quality.settings import Settings
 from server.transfer.indirect import Indirect, no_hits
-from server.transfer.radiance_transfer import Directions, Transfer
-from server.volume.volume import Volume
+from server.transfer.samples import TransferSamples
 
 AS_SURE = 1.1
 """New frames tell the light as well as those before a restart did, if they leave at most so many times the doubt."""
@@ -115,26 +113,15 @@ class RoomLight:
         continuation = self._lobes.continuation
         return continuation.arrays() if continuation and not self._harmonics else NO_PLANES
 
-    def update(
-        self,
-        camera: CameraModel,
-        radiance: cl_array.Array,
-        depth_m: cl_array.Array,
-        geometry: GeometryFrame,
-        volume: Volume,
-        transfer: Transfer,
-        rays: Directions,
-        indirect: Indirect | None,
-    ) -> LightEstimate:
-        """The light with one more frame. radiance: [h, w] float4, depth_m [h, w], as in Measurement.
-
-        indirect: what surfaces send, None to leave it out.
-        """
-        engine, surface = self._engine, geometry.surface
+    def update(self, context: FrameContext, radiance: cl_array.Array, samples: TransferSamples) -> LightEstimate:
+        """The light with one more frame, whose samples have transfer. radiance: [h, w] float4 as in Measurement."""
+        engine, camera, surface, transfer = context.engine, context.camera, context.surface, samples.transfer
+        assert transfer is not None
+        voxel_m = context.volume.voxel_m
         if self._harmonics and self._given:
             return self._given
         if self._harmonics:
-            tiles = sum_tiles(engine, camera, radiance, surface, transfer, volume.voxel_m, self._least_openness)
+            tiles = sum_tiles(engine, camera, radiance, surface, transfer, voxel_m, self._least_openness)
             with engine.profile.host():
                 return self._colored(self._harmonics.update(tiles))
         steady, before = self._lobes.steady, self._lobes.estimate()
@@ -143,12 +130,12 @@ class RoomLight:
             surface,
             camera,
             transfer,
-            rays,
+            context.rays,
             observed,
-            indirect or Indirect(no_hits(engine, transfer), np.zeros(3)),
-            volume.voxel_m,
-            Shot(geometry.volume_from_camera, geometry.exposure),
-            depth_m,
+            samples.indirect or Indirect(no_hits(engine, transfer), np.zeros(3)),
+            voxel_m,
+            Shot(context.volume_from_camera, context.exposure),
+            context.measurement.depth_m,
         )
         if self._remembered and estimate is not before:
             has_changed = self._lobes.steady < steady

@@ -1,82 +1,63 @@
-"""What a still view needs again: arrays of earlier frames, copied to where later ones do not write."""
+"""What a still view needs again: values of earlier frames, in memory that later frames do not write.
+
+One cache for a session. A value is stored under the version of what it was made from; it is found only by the same.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar, cast
 
-import numpy as np
 import pyopencl.array as cl_array
-from numpy.typing import NDArray
 
-from protocol.messages import Plan
-from server.input.measure import Measurement
 from server.opencl.engine import Engine
 from server.opencl.transfer import copy_into
-from server.transfer.indirect import Indirect
-from server.transfer.radiance_transfer import Transfer
 
 T = TypeVar("T")
 
-LASTING = frozenset({"virtual", "coverage"})
-"""The same in every turn, and written where an object has moved only."""
-
 
 @dataclass(frozen=True)
-class TransferSamples:
-    """Transfer of one frame, and what its surfaces send one another."""
+class Version:
+    """What a cached value was made from."""
 
-    transfer: Transfer | None
-    """None: nothing asked for it."""
-    indirect: Indirect | None
+    view: int
+    """Counts the views: a still camera and scene are one view until the surface is taken anew."""
+    objects: int = 0
+    """Counts the changes of the virtual objects; 0 where the value does not depend on them."""
+    slot: int = 0
+    """Which of the direction sets that frames take turns with."""
 
 
-@dataclass(frozen=True)
-class CachedEffects:
-    """One turn's effects: what the picture is put together from, and the plan that made it."""
-
-    parts: Mapping[str, Any]
-    plan: Plan
+FIRST_VERSION = Version(0)
 
 
 class FrameCache:
-    """One session's. Frames take turns with direction sets, so there is one of each for every turn."""
+    """Keeps the values of the newest view only, so that memory is bounded by the number of slots."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
-        self.sampled: dict[int, TransferSamples] = {}
-        self.finished: dict[int, CachedEffects] = {}
-        self.old: tuple[NDArray[np.uint8], Measurement] | None = None
-        """What the camera saw when the view began to stand still: as sRGB, and as measured."""
+        self._kept: dict[tuple[type, int], tuple[Version, object]] = {}
 
-    def forget(self) -> None:
-        """The view is another."""
-        self.sampled.clear()
-        self.finished.clear()
-        self.old = None
+    def find(self, kind: type[T], version: Version) -> T | None:
+        """The value of a type that was kept under the same version."""
+        kept = self._kept.get((kind, version.slot))
+        return cast(T, kept[1]) if kept is not None and kept[0] == version else None
 
-    def keep_old(self, shown: NDArray[np.uint8], measurement: Measurement) -> tuple[NDArray[np.uint8], Measurement]:
-        """What was kept first of these."""
-        if self.old is None:
-            self.old = shown.copy(), copied(self._engine, measurement, "held_measurement")
-        return self.old
+    def keep(self, value: T, version: Version, lasting: frozenset[str] = frozenset()) -> T:
+        """Keep a copy in place of an older version of its slot; returns the copy.
 
-    def keep_sampled(self, turn: int, sampled: TransferSamples) -> None:
-        """Copy a turn's transfer, and what surfaces send."""
-        self.sampled[turn] = copied(self._engine, sampled, f"held_{turn}")
-
-    def keep_finished(self, turn: int, parts: Mapping[str, Any], plan: Plan) -> None:
-        """Copy what a turn's picture was put together from."""
-        kept = {
-            name: part if name in LASTING else copied(self._engine, part, f"held_{turn}_{name}")
-            for name, part in parts.items()
-        }
-        self.finished[turn] = CachedEffects(kept, plan)
+        `lasting`: names of fields, at any depth, that later frames of this version do not write: they need no copy.
+        """
+        kept = copied(self._engine, value, f"cached_{type(value).__name__}_{version.slot}", lasting)
+        self._kept[type(value), version.slot] = version, kept
+        return kept
 
 
-def copied(engine: Engine, value: T, name: str) -> T:
-    """`value` with every device array of it, of its fields and of theirs, in an array of its own under `name`."""
+def copied(engine: Engine, value: T, name: str, lasting: frozenset[str] = frozenset()) -> T:
+    """`value` with every device array of it, of its fields and of theirs, in an array of its own under `name`.
+
+    lasting: names of fields that are not copied.
+    """
     if isinstance(value, cl_array.Array):
         copy = engine.workspace.array(name, value.shape, value.dtype)
         copy_into(engine.queue, copy, 0, value)
@@ -84,6 +65,6 @@ def copied(engine: Engine, value: T, name: str) -> T:
     if isinstance(value, tuple):
         return tuple(copied(engine, item, f"{name}_{i}") for i, item in enumerate(value))  # type: ignore[return-value]
     if is_dataclass(value) and not isinstance(value, type):
-        changes = {f.name: copied(engine, getattr(value, f.name), f"{name}_{f.name}") for f in fields(value)}
-        return replace(value, **changes)
+        names = [field.name for field in fields(value) if field.name not in lasting]
+        return replace(value, **{n: copied(engine, getattr(value, n), f"{name}_{n}", lasting) for n in names})
     return value

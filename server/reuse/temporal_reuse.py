@@ -1,15 +1,15 @@
-"""When a frame can tell nothing new: the view stands still but for noise, and what is made of it has settled.
+"""Temporal reuse: what of earlier frames stands for this one, because the view stands still but for noise.
 
-Stillness (stillness.py) says how many frames have been alike. What is made of so many is made of their mean: in the
-volume, in the light's running mean and so in all that is drawn. What it has changed by since half as many is spread as
-what it has still to go: by the law of errors a mean of n differs from that of n / 2 by as much, on average, as it does
-from the mean of endlessly many. So what is virtual is put into what the camera saw at first, as it was then and as it
-is now, and the two are compared; frames that are compared sample the same directions. The light is compared alike.
+Change detection (change_detection.py) says how many frames have been alike. Volume, light and everything drawn from
+them are means over these frames. By the law of errors the mean of n frames differs from the mean of n / 2 about as much
+as from the mean of endlessly many. So a view has settled once its picture after n frames is the one after n / 2. Both
+are composed over the camera picture with which the view began, and sample the same directions. The light is compared in
+the same way.
 
-Where nothing at all differs from frame to frame, the light's steps say how far it can still go: an estimate moves the
-mean by no less than a tenth of what lies between them (AVERAGE of lobe_estimator.py; a memory that forgets a tenth a
-frame), so it lies no farther off than ten steps. If the radiance of no direction is off by more than the share e, no
-shading is, whatever hides of it, and R'/R of eq. 7.1 by no more than (1 + e) / (1 - e).
+Where frames are the same to the byte, the steps of the light say how far it can still go: an estimate moves the mean by
+no less than a tenth of what lies between them (AVERAGE of lobe_estimator.py; a memory that forgets a tenth a frame), so
+the light is at most ten steps from its end. If the radiance of no direction is off by more than the share e, no shading
+is, and R'/R of eq. 7.1 by no more than (1 + e) / (1 - e).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from server.maths.sh import sh_basis, spherical_fibonacci
 from server.objects.rasterize import Placed
 from server.opencl.engine import Engine
 from server.reuse.change_detection import ChangeDetection
-from server.reuse.frame_cache import FrameCache
+from server.reuse.frame_cache import FIRST_VERSION, Version
 from server.transfer.radiance_transfer import TURNS
 
 ROUND = 2 * TURNS
@@ -42,7 +42,7 @@ ROUND = 2 * TURNS
 NOISY = 2 * ROUND
 """The same where they are alike but for noise: the light's running mean is then of ten frames, not all."""
 MOST_FRAMES = 64
-"""After which it begins anew, if what is made of them has not settled."""
+"""After which a view that has not settled begins anew."""
 RATE = 1.0 - FORGETTING
 SHARE = 0.5
 """Of the allowance that a light may take which still moves though nothing else does."""
@@ -65,6 +65,55 @@ Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 
+@dataclass(frozen=True, eq=False)
+class SceneVersion:
+    """What pictures do not show and a view depends on. A change of any begins a new view."""
+
+    others: int = 0
+    """Counts the frames of other clients, and objects that came or went."""
+    losses: int = 0
+    """Counts the frames in which the camera was lost."""
+    sampling: int = 0
+    """Counts the changes of the sampling."""
+    lamps: tuple[Emitter, ...] = ()
+    """Lights inside the room; another tuple is a change."""
+
+    def is_same(self, other: SceneVersion) -> bool:
+        """Whether nothing has changed."""
+        counts, others = (self.others, self.losses, self.sampling), (other.others, other.losses, other.sampling)
+        return counts == others and self.lamps is other.lamps
+
+
+@dataclass(frozen=True)
+class ReuseDecision:
+    """What of earlier frames stands for one frame. Decided once, after its input was measured."""
+
+    reason: CullReason | None = None
+    """Why light, transfer and effects need not be found anew where they are cached; None: all are."""
+    keeps_geometry: bool = False
+    """Whether pose and surfaces of the frame before hold."""
+    version: Version = FIRST_VERSION
+    """Of what this frame caches or finds."""
+    is_checkpoint: bool = False
+    """Whether this frame's picture tells whether the view has settled."""
+    echo: CullReason | None = None
+    """What frames left out of the light, and still shows in this one."""
+
+    @property
+    def samples_version(self) -> Version:
+        """Of transfer, which does not depend on the virtual objects."""
+        return Version(self.version.view, 0, self.version.slot)
+
+    @property
+    def view_version(self) -> Version:
+        """Of what the camera saw when the view began."""
+        return Version(self.version.view)
+
+
+NO_REUSE = ReuseDecision()
+"""Where everything is to be simulated."""
+
+
 @dataclass(frozen=True)
 class _State:
     """What had been made of some frames."""
@@ -74,102 +123,94 @@ class _State:
 
 
 class TemporalReuse:
-    """One session's."""
+    """One session's. `decide` for each frame, then `observe` what was made of it."""
 
-    def __init__(self, engine: Engine, camera: CameraModel, *, poses: Poses = "given", period: int = TURNS) -> None:
-        """`period`: frames after which samples of a still view are the same again.
-
-        A pose that is tracked moves by parts of a pixel though the camera does not, and the edges of virtual things
-        with it: by more than may be seen. With objects such a view does not rest.
+    def __init__(self, engine: Engine, camera: CameraModel, *, poses: Poses = "given") -> None:
+        """A pose that is tracked moves by parts of a pixel though the camera does not, and the edges of virtual things
+        with it: by more than may be seen. With objects such a view never settles.
         """
         self._is_tracked = poses != "given"
-        self._still = ChangeDetection(engine, camera, poses_are_given=poses != "track")
-        self._period = period
-        self._lamps: tuple[Emitter, ...] = ()
+        self._changes = ChangeDetection(engine, camera, poses_are_given=poses != "track")
+        self._scene = SceneVersion()
         self._hiding = b""
         self._places: tuple[tuple[int, bytes], ...] = ()
-        self.held = FrameCache(engine)
+        self._view = self._objects = 0
         self._states: dict[int, _State] = {}
         self._lights: deque[Floats] = deque(maxlen=ROUND)
-        self.omission: CullReason | None = None
-        """Why the light has not to be found anew, nor transfer and effects once held; None while all has."""
-        self._since = 0
+        self._reason: CullReason | None = None
+        self._settled_after = 0
         self._echo_frames = 0
 
-    @property
-    def turn(self) -> int:
-        """Of the last frame, below the period: frames of one turn sample alike."""
-        return self._still.count % self._period
+    def decide(
+        self, frame: RgbdFrame, scene: SceneVersion, objects: Sequence[Placed] = (), *, period: int = TURNS
+    ) -> ReuseDecision:
+        """The decision for one frame. period: frames after which samples of a still view are the same again."""
+        if not scene.is_same(self._scene):
+            self._scene = scene
+            self._changes.forget()
+            self._begin_view()
+        if not self._changes.look(frame, learn=self._reason is None):
+            self._begin_view()
+        keeps_geometry = self._reason is not None and not self._renews()
+        self._note_places(objects)
+        count = self._changes.count
+        return ReuseDecision(
+            reason=self._reason,
+            keeps_geometry=keeps_geometry,
+            version=Version(self._view, self._objects, count % period),
+            is_checkpoint=self._reason is None and count % period == 0,
+            echo=CullReason(ECHO, ALLOWANCE) if self._echo_frames else None,
+        )
 
-    @property
-    def is_checkpoint(self) -> bool:
-        """Whether the frame that is to be learnt from counts: of it the picture is wanted."""
-        return self._still.count % self._period == 0
+    def observe(self, decision: ReuseDecision, sh: Floats, planes: PlaneArrays, picture: Picture | None) -> None:
+        """Learn from a frame that was made whole, whether the view has settled.
 
-    @property
-    def echo(self) -> CullReason | None:
-        """What frames at rest left out of a light that is found, and still shows in this one."""
-        return CullReason(ECHO, ALLOWANCE) if self._echo_frames else None
-
-    def forget(self) -> None:
-        """Something is new that pictures do not show: an object, a preset, a lost camera."""
-        self._still.forget()
-        self._begin()
-
-    def place(self, objects: Sequence[Placed]) -> None:
-        """Where objects are in this frame. What has moved is drawn anew; while the view settles, pictures of it at two
-        places cannot be compared. One that is new or gone has to be told by `forget`."""
-        places = tuple((id(thing), matrix.tobytes()) for thing, matrix in objects)
-        if places != self._places:
-            self._states.clear()
-            self.held.finished.clear()
-        self._places = places
-
-    def holds(self, frame: RgbdFrame, lamps: tuple[Emitter, ...] = ()) -> bool:
-        """Whether the last frame's geometry stands for this one's; with what it shows noticed."""
-        if lamps is not self._lamps:
-            self._lamps = lamps
-            self.forget()
-        if not self._still.look(frame, learn=self.omission is None):
-            self._begin()
-        if self.omission is None:
-            return False
-        return not self._renews()
-
-    def _renews(self) -> bool:
-        """Whether the surface is taken from the volume again, which has seen twice as many frames as when it was."""
-        count = self._still.count
-        if self._still.is_exact or count != 2 * self._since or count > MOST_FRAMES:
-            return False
-        self._since = count
-        self.held.forget()
-        return True
-
-    def learn(self, sh: Floats, planes: PlaneArrays, picture: Picture | None) -> None:
-        """What has been made of a frame before the view rests: the light [bands^2, 3], what is taken to hide it, and at
-        a checkpoint the picture, always of what the camera saw at the first; None where nothing is virtual."""
+        sh: the light [bands^2, 3]. planes: what is taken to hide it. picture: at a checkpoint, the virtual things over
+        what the camera saw when the view began; None where nothing is virtual.
+        """
+        if decision.reason is not None:
+            return
         self._lights.append(sh.copy())
         self._echo_frames = max(self._echo_frames - 1, 0)
-        count, hiding = self._still.count, b"".join(array.tobytes() for array in planes)
+        count, hiding = self._changes.count, b"".join(array.tobytes() for array in planes)
         if hiding != self._hiding:
             self._states.clear()
         self._hiding = hiding
-        if not self.is_checkpoint:
+        if not decision.is_checkpoint:
             return
         now = self._states[count] = _State(sh.copy(), picture)
         half = self._states.get(count // 2) if count % 2 == 0 else None
-        if count >= (ROUND if self._still.is_exact else NOISY) and len(self._lights) == ROUND and half is not None:
-            self.omission, self._since = self._found(half, now), count
-        if self.omission is None and count >= MOST_FRAMES:
-            self.forget()
+        least = ROUND if self._changes.is_exact else NOISY
+        if count >= least and len(self._lights) == ROUND and half is not None:
+            self._reason, self._settled_after = self._found(half, now), count
+        if self._reason is None and count >= MOST_FRAMES:
+            self._changes.forget()
+            self._begin_view()
 
-    def _begin(self) -> None:
-        if self.omission is not None and (np.array(self._lights) != self._lights[-1]).any():
+    def _begin_view(self) -> None:
+        if self._reason is not None and (np.array(self._lights) != self._lights[-1]).any():
             self._echo_frames = ECHO_FRAMES
         self._states.clear()
         self._lights.clear()
-        self.held.forget()
-        self.omission = None
+        self._view += 1
+        self._reason = None
+
+    def _renews(self) -> bool:
+        """Whether to take the surface from the volume again: it has seen twice as many frames as the last time."""
+        count = self._changes.count
+        if self._changes.is_exact or count != 2 * self._settled_after or count > MOST_FRAMES:
+            return False
+        self._settled_after = count
+        self._view += 1
+        return True
+
+    def _note_places(self, objects: Sequence[Placed]) -> None:
+        """Pictures of an object at two places cannot be compared, and one does not stand for the other."""
+        places = tuple((id(thing), matrix.tobytes()) for thing, matrix in objects)
+        if places != self._places:
+            self._states.clear()
+            self._objects += 1
+        self._places = places
 
     def _found(self, half: _State, now: _State) -> CullReason | None:
         """What may be left out from now on."""
@@ -178,18 +219,18 @@ class TemporalReuse:
         light = self._light_bound(half.sh, now.sh)
         if light is None:
             return None
-        reason = SAME if self._still.is_exact else NOISE
+        reason = SAME if self._changes.is_exact else NOISE
         if now.picture is None or half.picture is None:
             return CullReason(reason, 0.0)
         change = np.abs(now.picture.astype(np.int16) - half.picture).max(axis=-1)
-        if (change > 1).mean() > (0.0 if self._still.is_exact else OUTLIERS):
+        if (change > 1).mean() > (0.0 if self._changes.is_exact else OUTLIERS):
             return None
-        is_same = self._still.is_exact and not change.any()
+        is_same = self._changes.is_exact and not change.any()
         return CullReason(reason, light + ROUNDING if is_same else ALLOWANCE)
 
     def _light_bound(self, half: Floats, now: Floats) -> float | None:
         """Display units that white surface may still change by; None where that is too much."""
-        if self._still.is_exact:
+        if self._changes.is_exact:
             share = self._unsettled()
             bound = codes_of_share((1 + share) / (1 - share) - 1) if share < 1 else math.inf
             return bound if bound <= SHARE * ALLOWANCE else None

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
+from dataclasses import replace
 
+import numpy as np
 from msgspec import structs
+from numpy.typing import NDArray
 
 from protocol.messages import Wishes
 from server.light.lamp_finder import LampFinder
 from server.light.room_light import RoomLight
+from server.light.static_light import static_estimate
+from server.maths.sh import webxr_from_world
+from server.meshing.scene_mesh import SceneMesh, scene_mesh
+from server.meshing.surface import MeshingError
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.quality.sampling_settings import SamplingSettings
@@ -50,7 +58,7 @@ class Room:
         self.objects = RoomObjects(self.engine)
         self.markers = Markers()
         self.changes = 0
-        """Counts what a client that was here before cannot see in its own pictures: others' frames, objects."""
+        """Counts the frames of all clients, and objects that came or went."""
         self.key_digest: bytes | None = None
         """Of the key without which nobody gets in (rooms.py), empty for none; None until somebody has come."""
         self._wishes = wishes
@@ -71,6 +79,34 @@ class Room:
             for name in SHARED
             if getattr(wishes, name) != getattr(self._wishes, name)
         )
+
+    def begin(self, world_from_camera: NDArray[np.float64], bands: int) -> None:
+        """The first frame says what is up, unless the wishes do, and in which axes a light was given (S2)."""
+        if self.objects.has_begun:
+            return
+        up = np.array(self._wishes.up or -world_from_camera[:3, 1], np.float64)
+        up /= np.linalg.norm(up)
+        given = static_estimate(self._wishes, bands, webxr_from_world(up, world_from_camera[:3, 2]))
+        if given:
+            self.light.give(given)
+        self.objects.begin(up)
+
+    def scene_mesh(
+        self,
+        gltf_from_world: NDArray[np.float64] | None,
+        progress: Callable[[int, int], None] = lambda _done, _total: None,
+    ) -> SceneMesh:
+        """The surface fused so far as triangles. Takes the lock while the volume is copied.
+
+        gltf_from_world: [3, 3], None before the first frame. Raises MeshingError, one line, where there is no surface.
+        """
+        with self.lock:
+            volume, exposure = self.reconstruction.volume, self.reconstruction.usual_exposure
+            if volume is None or gltf_from_world is None:
+                raise MeshingError("there is no surface to mesh: no frame has been fused yet")
+            bricks = volume.download_bricks()
+        bricks = replace(bricks, colors=np.float32(exposure) * bricks.colors)
+        return scene_mesh(bricks, volume.voxel_m, volume.origin_world, gltf_from_world, progress)
 
     @property
     def device_bytes(self) -> int:

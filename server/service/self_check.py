@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from protocol.codec import one_line
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 
@@ -105,9 +106,9 @@ def triangle() -> Mesh:
     )
 
 
-def _processed(device: Device, wishes: Wishes, prepare: Callable[[Pipeline], object]) -> FrameResult:
+def _processed(device: Device, wishes: Wishes, prepare: Callable[[ClientSession], object]) -> FrameResult:
     """The second frame's result: the first one's volume is seen in it."""
-    pipeline = Pipeline(device, CAMERA, wishes)
+    pipeline = ClientSession(device, CAMERA, wishes)
     try:
         prepare(pipeline)
         pipeline.process(frame())
@@ -116,7 +117,7 @@ def _processed(device: Device, wishes: Wishes, prepare: Callable[[Pipeline], obj
         pipeline.close()
 
 
-def _place_triangle(pipeline: Pipeline) -> None:
+def _place_triangle(pipeline: ClientSession) -> None:
     pipeline.place_object("triangle", triangle(), Placement(position_m=(0.2, 0.1, 0.5)))
 
 

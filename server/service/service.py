@@ -36,8 +36,8 @@ from server.service.session import MAX_INFLIGHT, CaptureSession, LoopOutlet
 from server.service.worker import Workshop
 
 if TYPE_CHECKING:
+    from server.client_session import ClientSession
     from server.opencl.device import Device
-    from server.pipeline import Pipeline
     from server.room.room import Room
 
 SERVER_NAME = f"probeless {version('probeless')}"
@@ -46,7 +46,7 @@ NO_SESSION = "waiting"
 
 log = logging.getLogger(__name__)
 
-PipelineFactory = Callable[["Device", CameraModel, Wishes, "Room | None", Hello], "Pipeline"]
+PipelineFactory = Callable[["Device", CameraModel, Wishes, "Room | None", Hello], "ClientSession"]
 MeshLoader = Callable[[bytes, str], Mesh]
 WarmUp = Callable[["Device"], object]
 
@@ -129,7 +129,7 @@ class Service:
         return self.rooms.entered(name, hello.wishes, hello.room_key)
 
     @contextlib.contextmanager
-    def _opened_pipeline(self, hello: Hello) -> Iterator[Pipeline]:
+    def _opened_pipeline(self, hello: Hello) -> Iterator[ClientSession]:
         """Worker's thread: a client's pipeline, in its room if it names one."""
         with contextlib.ExitStack() as stack:
             room = None if hello.room is None else stack.enter_context(self._entered(hello.room, hello))
@@ -324,6 +324,6 @@ def _real_room(device: Device) -> RoomFactory:
 
 
 def _real_pipeline() -> PipelineFactory:
-    from server.pipeline import Pipeline  # loads OpenCL, which a service with another factory does not need
+    from server.client_session import ClientSession  # loads OpenCL, which a service with another factory does not need
 
-    return Pipeline
+    return ClientSession

@@ -9,9 +9,9 @@ from msgspec import structs
 
 from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.maths.directional_fit import directional_sh
 from server.opencl.device import Device
-from server.pipeline import Pipeline
 from server.scene.placement import Placement
 from server.service.self_check import CAMERA, check_answers, triangle
 
@@ -32,7 +32,7 @@ def warm_up(device: Device) -> None:
 
 
 def _run(device: Device, wishes: Wishes) -> None:
-    pipeline = Pipeline(device, CAMERA, wishes)
+    pipeline = ClientSession(device, CAMERA, wishes)
     pipeline.place_object("warm-up", triangle(), Placement(position_m=(0.0, 0.0, 0.8)))
     frame = RgbdFrame(
         index=0,

@@ -45,7 +45,8 @@ from server.service.rooms import RoomLocked
 from server.service.scheduler import Scheduler
 
 if TYPE_CHECKING:
-    from server.pipeline import FrameResult, Pipeline
+    from server.client_session import ClientSession
+    from server.pipeline import FrameResult
 
 KEPT_ACKNOWLEDGEMENTS = 256
 KEPT_ANSWERS = 4
@@ -78,7 +79,7 @@ class Outlet(Protocol):
 class Workshop:
     """What every worker of a service shares."""
 
-    opened_pipeline: Callable[[Hello], AbstractContextManager[Pipeline]]
+    opened_pipeline: Callable[[Hello], AbstractContextManager[ClientSession]]
     """The pipeline of a client, as long as it is there. Raises ValueError for wishes that cannot be met."""
     load_mesh: Callable[[bytes, str], Mesh]
     metrics: Metrics
@@ -130,7 +131,7 @@ class Worker:
             self._workshop.scheduler.leave(self._share)
             self._colors.close()
 
-    def _handle(self, pipeline: Pipeline, letter: Letter) -> None:
+    def _handle(self, pipeline: ClientSession, letter: Letter) -> None:
         if isinstance(letter.message, Frame):
             self._arrived_s = letter.arrived_s
             self._workshop.metrics.queue_age_ms.observe(letter.age_ms)
@@ -142,7 +143,7 @@ class Worker:
         else:
             self._outlet.send(self._done(pipeline, letter.message))
 
-    def _answer_moves(self, pipeline: Pipeline, moves: list[MoveObject]) -> None:
+    def _answer_moves(self, pipeline: ClientSession, moves: list[MoveObject]) -> None:
         """Moves that waited one behind the other: kept together, then acknowledged."""
         answers = [self._done(pipeline, move) for move in moves]
         if self._hello.room is not None:
@@ -150,7 +151,7 @@ class Worker:
         for answer in answers:
             self._outlet.send(answer)
 
-    def _done(self, pipeline: Pipeline, message: SceneControl) -> bytes:
+    def _done(self, pipeline: ClientSession, message: SceneControl) -> bytes:
         """Its acknowledgement; it is done once, however often it is sent."""
         done = self._acknowledged.get(message.request)
         if done is None:
@@ -165,7 +166,7 @@ class Worker:
                 self._acknowledged.popitem(last=False)
         return done
 
-    def _answer_frame(self, pipeline: Pipeline, frame: Frame) -> None:
+    def _answer_frame(self, pipeline: ClientSession, frame: Frame) -> None:
         known = next((answer for number, answer in self._answers if number == frame.frame), None)
         if known is not None:
             return self._send_answer(known)
@@ -187,14 +188,14 @@ class Worker:
         self._deliver(frame, result)
         return overhead.tell(self._workshop.metrics)
 
-    def _follow_pressure(self, pipeline: Pipeline) -> None:
+    def _follow_pressure(self, pipeline: ClientSession) -> None:
         """Sample more cheaply where too many share the device, and as asked for again when they are fewer."""
         scheduler, pressure = self._workshop.scheduler, self._pressure
         if pressure.observe(scheduler.busy, scheduler.period_s):
             with contextlib.suppress(ValueError):  # what cannot be chosen on this device is not: it stays as it is
                 pipeline.set_quality(*pressure.quality)
 
-    def _send_mesh(self, pipeline: Pipeline, request: int) -> None:
+    def _send_mesh(self, pipeline: ClientSession, request: int) -> None:
         try:
             parts = mesh_parts(request, mesh_files(pipeline.scene_mesh()))
         except ValueError as error:  # MeshingError is one
@@ -294,7 +295,9 @@ class _Overhead:
         metrics.overhead_cpu_ms.observe((self._cpu_s + time.thread_time()) * 1e3)
 
 
-def apply_control(pipeline: Pipeline, message: SceneControl, load_mesh: Callable[[bytes, str], Mesh]) -> Acknowledged:
+def apply_control(
+    pipeline: ClientSession, message: SceneControl, load_mesh: Callable[[bytes, str], Mesh]
+) -> Acknowledged:
     """Do what a control message asks; what cannot be done is said in the acknowledgement."""
     try:
         notes = _apply(pipeline, message, load_mesh)
@@ -303,7 +306,7 @@ def apply_control(pipeline: Pipeline, message: SceneControl, load_mesh: Callable
     return Acknowledged(request=message.request, notes=tuple(one_line(note) for note in notes))
 
 
-def _apply(pipeline: Pipeline, message: SceneControl, load_mesh: Callable[[bytes, str], Mesh]) -> tuple[str, ...]:
+def _apply(pipeline: ClientSession, message: SceneControl, load_mesh: Callable[[bytes, str], Mesh]) -> tuple[str, ...]:
     match message:
         case PlaceObject():
             return pipeline.place_object(message.object, load_mesh(message.data, message.format), _placement(message))

@@ -89,7 +89,7 @@ class DepthViews:
         )
 
 
-def look_around(engine: Engine, real: RealDepthViews, objects: Sequence[Placed]) -> DepthViews:
+def draw_depth_views(engine: Engine, real: RealDepthViews, objects: Sequence[Placed]) -> DepthViews:
     """The pictures of one frame; those of objects that are new are drawn."""
     held = _HELD.setdefault(engine, _ObjectViews())
     grids = [thing.grid for thing, _ in objects]

@@ -16,6 +16,7 @@ from protocol.messages import Hello, Marker
 from server.input.denoise import bilateral_depth
 from server.input.measure import Measurement
 from server.maths.rigid import inverse_rigid
+from server.maths.sh import webxr_from_world
 from server.opencl.engine import Engine
 from server.scene.placement import Placement
 from server.tracking.markers import find_marker
@@ -86,6 +87,8 @@ class Alignment:
         self._is_alone = asked is None or asked.room is None
         self.is_settled = self._is_alone
         """Whether the client's frames belong into the volume."""
+        self.webxr_from_client: Floats | None = None
+        """[3, 3] rotation into axes with up as +y and the first view as near to -z as it goes; None before a frame."""
 
     def in_room(self, frame: RgbdFrame) -> RgbdFrame:
         """The frame with its pose in the room's world; where it has none, by the marker if that says it."""
@@ -111,6 +114,17 @@ class Alignment:
     def client_from_room(self) -> Floats:
         """[4, 4] rigid."""
         return inverse_rigid(self.room_from_client)
+
+    @property
+    def webxr_from_room(self) -> Floats | None:
+        """[3, 3]; None before a frame."""
+        return None if self.webxr_from_client is None else self.webxr_from_client @ self.client_from_room[:3, :3]
+
+    def note_view(self, up: Floats, room_from_camera: Floats) -> None:
+        """Derive `webxr_from_client` from a view, until the client's place in the room is settled. up: [3] unit."""
+        if self.webxr_from_client is None or not self.is_settled:
+            turn = self.client_from_room[:3, :3]
+            self.webxr_from_client = webxr_from_world(turn @ up, turn @ room_from_camera[:3, 2])
 
     def in_client(self, room_from_camera: Floats) -> Floats:
         """A pose as the client has it."""

@@ -19,7 +19,8 @@ from client.laptop.source import Source
 from client.laptop.tune import tune
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Wishes
-from server.pipeline import FrameResult, Pipeline
+from server.client_session import ClientSession
+from server.pipeline import FrameResult
 from server.quality.operating_point_control import TOLERANCE
 from server.quality.pareto_front import ParetoFront, ParetoPoint, write_front
 from tests.bench.finished import ROOT, Part
@@ -152,7 +153,7 @@ def _driven(run: Run, source: Source, frames: int, wishes: Wishes) -> Driven:
 
 
 def _results(run: Run, source: Source, frames: int, wishes: Wishes) -> Iterator[FrameResult]:
-    pipeline = Pipeline(run.device, source.camera, wishes)
+    pipeline = ClientSession(run.device, source.camera, wishes)
     close: Callable[[], None] = pipeline.close
     try:
         for index in range(frames):

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from client.laptop.objects import ObjectFile
 from client.laptop.run import place_objects
+from server.client_session import ClientSession
 from server.evaluation.environment import direction_error_deg, environment_difference, irradiance_error
 from server.evaluation.flip import flip_map
 from server.evaluation.ssim import ssim_map
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.quality.sampling_settings import option_of
 from tests.bench.accuracy_scenes import Shot, SweptScene
 
@@ -58,7 +59,7 @@ class MeasuredPoint(Struct, frozen=True, kw_only=True):
 def measure_point(device: Device, scene: SweptScene, knob: str, settings: dict[str, Any], frames: int) -> MeasuredPoint:
     """Run a scene at one point. Raises ValueError for wishes that cannot be fulfilled."""
     wishes = structs.replace(scene.wishes, **settings)
-    pipeline = Pipeline(device, scene.camera, wishes)
+    pipeline = ClientSession(device, scene.camera, wishes)
     results: list[FrameResult] = []
     cpu_ms: list[float] = []
     shots = scene.shots(frames)

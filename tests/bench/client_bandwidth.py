@@ -16,9 +16,9 @@ from client.coding import Coding, frame_message, picture_bytes
 from client.laptop.source import Source, open_source
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import decode_color, decode_depth
+from server.client_session import ClientSession
 from server.evaluation.environment import direction_error_deg
 from server.opencl.device import Device
-from server.pipeline import Pipeline
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from server.scene.vase import vase_glb
@@ -145,7 +145,7 @@ def _over_the_wire(frame: RgbdFrame, camera: CameraModel, coding: Coding) -> Rgb
 def run_pipeline(device: Device, source: Source, frames: list[RgbdFrame]) -> list[Seen]:
     """Picture and light of each frame, with a vase where the first one looks."""
     wishes = msgspec.structs.replace(wishes_for(source, range(len(source))), preset="reg4")
-    pipeline = Pipeline(device, source.camera, wishes)
+    pipeline = ClientSession(device, source.camera, wishes)
     x, y, z = looked_at(source[0], source.camera.depth_scale_m).tolist()
     pipeline.place_object("vase", load_mesh(vase_glb(), "glb"), Placement(position_m=(x, y, z), scale=1.0, yaw_deg=0.0))
     try:

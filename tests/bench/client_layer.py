@@ -18,7 +18,8 @@ from client.laptop.source import Source
 from protocol.codec import encode
 from protocol.images import encode_color, encode_depth
 from protocol.messages import Frame
-from server.pipeline import FrameResult, Pipeline
+from server.client_session import ClientSession
+from server.pipeline import FrameResult
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from server.scene.vase import vase_glb
@@ -47,7 +48,7 @@ def layer_wire_part(run: Run, _out: Path) -> Part:
     source, count = kitchen(), run.of(QUICK_FRAMES, FRAMES)
     part = Part(sizes={"frames of layers on the wire": count})
     wishes = msgspec.structs.replace(wishes_for(source, range(len(source))), preset="reg4", answer="layer")
-    pipeline = Pipeline(run.device, source.camera, wishes)
+    pipeline = ClientSession(run.device, source.camera, wishes)
     x, y, z = looked_at(source[0], source.camera.depth_scale_m).tolist()
     pipeline.place_object("vase", load_mesh(vase_glb(), "glb"), Placement(position_m=(x, y, z), scale=1.0, yaw_deg=0.0))
     try:
@@ -63,7 +64,7 @@ def layer_wire_part(run: Run, _out: Path) -> Part:
     return part
 
 
-def _sizes(source: Source, index: int, pipeline: Pipeline) -> dict[str, float]:
+def _sizes(source: Source, index: int, pipeline: ClientSession) -> dict[str, float]:
     frame = source[index]
     result = pipeline.process(frame, watched=True)
     sent = Frame(

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from client.laptop.synthetic.source import SyntheticSource, open_synthetic
 from protocol.frames import CameraModel
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.evaluation.coverage import Estimate, coverage
 from server.evaluation.e1 import ALBEDO, ShadedView, shaded_views
 from server.maths.sh import lambert_transfer, sh_basis, spherical_fibonacci
 from server.opencl.device import Device
-from server.pipeline import Pipeline
 from tests.bench.finished import Part
 from tests.bench.light_runs import refusal, wishes_for
 from tests.bench.run import Run
@@ -99,7 +99,7 @@ def _estimate(
     frame = view.lit(light, albedo).frame
     noise = generator.normal(0, 255 * NOISE, frame.color.shape)
     noisy = replace(frame, color=np.rint(frame.color + noise).clip(0, 255).astype(np.uint8))
-    pipeline = Pipeline(device, camera, wishes)
+    pipeline = ClientSession(device, camera, wishes)
     found = pipeline.process(noisy).light
     pipeline.close()
     std = np.array([[np.inf if value is None else value for value in row] for row in found.sh_std], np.float64)

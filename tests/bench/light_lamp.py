@@ -71,7 +71,7 @@ def search(device: Device, spec: str) -> Search:
         geometry, random = Geometry(engine, source.camera, wishes), np.random.default_rng(1)
         views, near, all_light = [], 0.0, 0.0
         for index in FRAMES:
-            frame = geometry.update(source[index])
+            frame = geometry.scan(source[index])
             volume, radiance = geometry.volume, frame.measurement.radiance
             assert volume is not None
             seen, lamps_only = (

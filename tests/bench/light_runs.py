@@ -16,8 +16,9 @@ from client.laptop.source import Source
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import RgbdFrame
 from protocol.messages import Preset, Wishes
+from server.client_session import ClientSession
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.quality.settings import read_wishes
 
 PRESETS = ("rm", "reg4", "reg8", "art1", "art4", "art8", "gr15", "gr15fast")
@@ -63,7 +64,7 @@ def results_of(
     device: Device, source: Source, frames: Iterable[RgbdFrame], wishes: Wishes, objects: Iterable[Path] = ()
 ) -> list[FrameResult]:
     """Every frame's result; `objects` are in world coordinates. Raises ValueError for wishes it cannot fulfil."""
-    pipeline = Pipeline(device, source.camera, wishes)
+    pipeline = ClientSession(device, source.camera, wishes)
     place_objects(pipeline, tuple(ObjectFile(path, None) for path in objects), lambda _text: None)
     found = [pipeline.process(frame) for frame in frames]
     pipeline.close()

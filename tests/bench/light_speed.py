@@ -11,11 +11,11 @@ import numpy as np
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.geometry.geometry import Geometry
 from server.light.light_estimation import LightEstimator, sum_tiles
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.pipeline import Pipeline
 from server.quality.settings import WHOLE_ROOM_M
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
 from tests.bench.finished import Part
@@ -51,7 +51,7 @@ def _add_estimation(
     engine = Engine(device)
     geometry = Geometry(engine, camera, wishes)
     for frame in frames[:WARM_UP]:
-        seen = geometry.update(frame)
+        seen = geometry.scan(frame)
     volume = geometry.volume
     assert volume is not None
     rays = direction_sets(RAYS, BANDS)
@@ -87,13 +87,13 @@ def timed(engine: Engine, work: Callable[[], None], trials: int) -> tuple[list[f
 
 def _add_presets(part: Part, run: Run, camera: CameraModel, frames: list[RgbdFrame], wishes: Wishes) -> None:
     """Each frame goes to every preset before the next one does."""
-    pipelines: dict[str, Pipeline] = {}
+    pipelines: dict[str, ClientSession] = {}
     for preset in PRESETS:
         refused = refusal(at_preset(wishes, preset))
         if refused:
             part.leave_out(f"transfer + estimation, RM / {preset.upper()}", refused)
         else:
-            pipelines[preset] = Pipeline(run.device, camera, at_preset(wishes, preset))
+            pipelines[preset] = ClientSession(run.device, camera, at_preset(wishes, preset))
     spent: dict[str, list[float]] = {preset: [] for preset in pipelines}
     for index, frame in enumerate(frames):
         run.say(f"presets' times: frame {index + 1} of {len(frames)}")

@@ -21,8 +21,8 @@ import trimesh
 
 from client.laptop.source import open_source
 from server import rendering
+from server.client_session import ClientSession
 from server.effects.plan import Effect
-from server.pipeline import Pipeline
 from server.scene.mesh import Mesh, load_mesh
 from server.scene.placement import Placement
 from tests.bench.finished import Part
@@ -99,7 +99,7 @@ def _add(part: Part, run: Run, preset: str, size: str, triangles: int) -> None:
     run.say(row)
     light = tuple((float(r), float(g), float(b)) for r, g, b in source.truth(0).sh)  # type: ignore[attr-defined]
     frames = [source[i] for i in range(WARM_UP)]
-    pipeline = Pipeline(run.device, source.camera, msgspec.structs.replace(wishes, light=light))
+    pipeline = ClientSession(run.device, source.camera, msgspec.structs.replace(wishes, light=light))
     pipeline.place_object("object-0", torus(triangles), Placement(position_m=PLACE_M))
     clock = StageClock(pipeline._engine.queue)
     with clocked(pipeline, clock):
@@ -119,7 +119,7 @@ def _add(part: Part, run: Run, preset: str, size: str, triangles: int) -> None:
 
 
 @contextmanager
-def clocked(pipeline: Pipeline, clock: StageClock) -> Iterator[None]:
+def clocked(pipeline: ClientSession, clock: StageClock) -> Iterator[None]:
     """Times the effects and the stage of every frame that `pipeline` processes inside."""
     profile = pipeline._engine.profile
     stage = profile.stage

@@ -20,8 +20,9 @@ from client.laptop.synthetic.source import SyntheticSource, open_synthetic
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.scene.mesh import Mesh, load_mesh
 from server.scene.placement import Placement
 from server.scene.vase import vase_glb
@@ -57,10 +58,10 @@ def turn_by_turn(
     things: Sequence[Thing] = (),
 ) -> Iterator[tuple[RgbdFrame, dict[str, Answer]]]:
     """Each frame to every pipeline before the next one is, so that what else the machine does meets all alike."""
-    pipelines: dict[str, Pipeline] = {}
+    pipelines: dict[str, ClientSession] = {}
     try:
         for name, asked in wishes.items():
-            pipelines[name] = Pipeline(device, camera, asked)
+            pipelines[name] = ClientSession(device, camera, asked)
             for number, (mesh, placement) in enumerate(things):
                 pipelines[name].place_object(f"thing-{number}", mesh, placement)
         order = list(pipelines)
@@ -72,7 +73,7 @@ def turn_by_turn(
             pipeline.close()
 
 
-def _answer(device: Device, pipeline: Pipeline, frame: RgbdFrame) -> Answer:
+def _answer(device: Device, pipeline: ClientSession, frame: RgbdFrame) -> Answer:
     start = time.process_time()
     result = pipeline.process(frame)
     return Answer(result, (time.process_time() - start) * 1e3 / cores_of(device))

@@ -56,7 +56,7 @@ def visibility_part(run: Run) -> Part:
     try:
         geometry = Geometry(engine, source.camera, Wishes(volume_m=CUBE_M, voxel_m=VOXEL_M, poses="given"))
         for i in range(frames):
-            seen = geometry.update(source[i])
+            seen = geometry.scan(source[i])
         volume = geometry.volume
         assert volume is not None
         mesh = scene_mesh(volume.download_bricks(), VOXEL_M, volume.origin_world, np.eye(3))

@@ -64,7 +64,7 @@ def test_a_first_budget_measures_the_device(tmp_path: Path, capsys: pytest.Captu
 def test_without_a_front_the_server_says_what_to_do(device: Device) -> None:
     from client.laptop.synthetic.source import open_synthetic
     from protocol.messages import Wishes
-    from server.pipeline import Pipeline
+    from server.client_session import ClientSession
 
     with pytest.raises(ValueError, match="probeless tune"):
-        Pipeline(device, open_synthetic(TABLE).camera, Wishes(preset="auto", budget_ms=50.0))
+        ClientSession(device, open_synthetic(TABLE).camera, Wishes(preset="auto", budget_ms=50.0))

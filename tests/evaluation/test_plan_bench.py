@@ -14,12 +14,12 @@ from client.laptop.gallery.source import GallerySource
 from client.laptop.gallery.things import Thing
 from protocol.frames import RgbdFrame
 from protocol.messages import LeftOut, Plan
+from server.client_session import ClientSession
 from server.culling import facts_finder
 from server.culling.influence_bound import NOWHERE
 from server.culling.rules import ELSEWHERE, spared
 from server.effects import functions as effect_functions
 from server.opencl.device import Device
-from server.pipeline import Pipeline
 from server.reuse.temporal_reuse import NOISY
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
@@ -101,7 +101,7 @@ def test_what_is_placed_and_moved_before_a_resting_view_is_drawn(device: Device)
     source, pipelines = GallerySource("still-and-empty"), []
     ball = load_mesh(Thing(0.2, (0.0, 0.0, 0.0)).glb(), "glb")
     for plan in ("needed", "everything"):
-        pipeline = Pipeline(device, source.camera, wishes_of(source, plan=plan))
+        pipeline = ClientSession(device, source.camera, wishes_of(source, plan=plan))
         results = []
         for index in range(28):
             if index == 10:

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Light, Wishes
+from server.client_session import ClientSession
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.scene.placement import Placement
 from tests.analytic import look, look_at, room, sphere
 from tests.meshes import soup_of
@@ -37,16 +38,16 @@ PYRAMID = 0.25 * np.array(
 )
 
 Matrix = NDArray[np.float64]
-Open = Callable[..., Pipeline]
+Open = Callable[..., ClientSession]
 
 
 @pytest.fixture
 def open_pipeline(device: Device) -> Iterator[Open]:
     """Makes pipelines with one object that stands in the room, and closes them."""
-    made: list[Pipeline] = []
+    made: list[ClientSession] = []
 
-    def start(wishes: Wishes = WISHES, offset: Any = (0.0, 0.0, 0.0), camera: CameraModel = CAMERA) -> Pipeline:
-        made.append(Pipeline(device, camera, wishes))
+    def start(wishes: Wishes = WISHES, offset: Any = (0.0, 0.0, 0.0), camera: CameraModel = CAMERA) -> ClientSession:
+        made.append(ClientSession(device, camera, wishes))
         x, y, z = (float(value) for value in np.array([-0.2, 0.7, 1.1]) + offset)
         made[-1].place_object("pyramid", soup_of(PYRAMID), Placement(position_m=(x, y, z)))
         return made[-1]
@@ -94,7 +95,7 @@ def assert_sound(result: FrameResult) -> Light:
     return light
 
 
-def lit(pipeline: Pipeline, offset: Any = (0.0, 0.0, 0.0)) -> FrameResult:
+def lit(pipeline: ClientSession, offset: Any = (0.0, 0.0, 0.0)) -> FrameResult:
     """The result of some good frames."""
     for index, x in enumerate((0.0, 0.1, 0.2)):
         view = look_at((x, -0.2, 0.0), (0.1, 0.3, 1.2))

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from protocol.frames import RgbdFrame
+from server.client_session import ClientSession
 from server.geometry.geometry import Geometry, GeometryFrame
 from server.maths.registration import distance_between
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.pipeline import Pipeline
 from server.tracking.relocalize import GREATEST_COUNT, Keyframes, dissimilarity, thumbnail
 from tests.analytic import Floats, look, look_at, plane, sphere
 from tests.rooms import CAMERA, ROOM, VOXEL_M, frame_at, view_at, wishes
@@ -40,8 +40,8 @@ def geometry(engine: Engine) -> Geometry:
 
 
 @pytest.fixture
-def pipeline(device: Device) -> Iterator[Pipeline]:
-    pipeline = Pipeline(device, CAMERA, wishes("track"))
+def pipeline(device: Device) -> Iterator[ClientSession]:
+    pipeline = ClientSession(device, CAMERA, wishes("track"))
     yield pipeline
     pipeline.close()
 
@@ -49,7 +49,7 @@ def pipeline(device: Device) -> Iterator[Pipeline]:
 def walk(geometry: Geometry, steps: range) -> GeometryFrame:
     """The result of the last of these steps of the way; every one of them must be tracked."""
     for step in steps:
-        result = geometry.update(frame_at(view_at(step), step, given=view_at(0)))
+        result = geometry.scan(frame_at(view_at(step), step, given=view_at(0)))
         assert result.tracking == "tracked"
     return result
 
@@ -70,19 +70,19 @@ def test_bad_depth_is_lost_and_nothing_moves(geometry: Geometry, name: str) -> N
     last = walk(geometry, range(11))
     before = voxels(geometry)
     for index in range(3):
-        result = geometry.update(bad_frame(name, 50 + index))
+        result = geometry.scan(bad_frame(name, 50 + index))
         assert result.tracking == "lost"
         assert any(note.startswith("the camera is lost, nothing is fused: ") for note in result.notes)
         np.testing.assert_array_equal(result.world_from_camera, last.world_from_camera)
     assert voxels(geometry) == before
-    after = geometry.update(frame_at(view_at(11), 11))
+    after = geometry.scan(frame_at(view_at(11), 11))
     assert after.tracking == "tracked"
     assert distance_between(after.world_from_camera, view_at(11)) < 0.15 * VOXEL_M
 
 
 @pytest.mark.parametrize("name", BAD_DEPTH)
 def test_a_session_that_begins_with_bad_depth_begins_when_it_gets_better(geometry: Geometry, name: str) -> None:
-    first = geometry.update(bad_frame(name))
+    first = geometry.scan(bad_frame(name))
     if name == "a wall at 40 cm":  # nobody can know that this is no wall
         return
     assert first.tracking == "lost"
@@ -98,13 +98,13 @@ def test_a_camera_that_jumps_2_m_comes_back(geometry: Geometry) -> None:
     before = voxels(geometry)
     assert distance_between(AWAY, view_at(60)) > 1.9
     for index in range(3):
-        result = geometry.update(frame_at(AWAY, 100 + index))
+        result = geometry.scan(frame_at(AWAY, 100 + index))
         assert result.tracking == "lost"
     assert voxels(geometry) == before
     assert distance_between(view_at(60), view_at(28)) > 0.25
     for step in (28, 29, 60):
-        geometry.update(frame_at(AWAY, 100))
-        back = geometry.update(frame_at(view_at(step), 200 + step))
+        geometry.scan(frame_at(AWAY, 100))
+        back = geometry.scan(frame_at(view_at(step), 200 + step))
         assert back.tracking == "tracked"
         assert distance_between(back.world_from_camera, view_at(step)) < 0.3 * VOXEL_M
     walk(geometry, range(61, 64))
@@ -116,7 +116,7 @@ def test_another_room_is_not_taken_for_this_one(geometry: Geometry) -> None:
     elsewhere = [plane((0, 0, 1.2), (0.3, 0.2, -1)), sphere((0.2, 0.1, 0.8), 0.2), sphere((-0.3, 0.1, 0.9), 0.15)]
     for index in range(5):
         frame = frame_at(np.eye(4), 70 + index, scene=elsewhere)
-        assert geometry.update(frame).tracking == "lost"
+        assert geometry.scan(frame).tracking == "lost"
     assert voxels(geometry) == before
 
 
@@ -124,10 +124,10 @@ def test_a_plain_wall_does_not_end_being_lost(geometry: Geometry) -> None:
     """It fits any place along itself: no place can be known by it."""
     view = look_at((-0.9, -0.1, 2.0), (-0.9, -0.1, 2.5))
     walk(geometry, range(30))
-    geometry.update(frame_at(AWAY, 100))
+    geometry.scan(frame_at(AWAY, 100))
     assert (look(ROOM, CAMERA, view).depth_m > 0).all()
     for index in range(3):
-        assert geometry.update(frame_at(view, 101 + index)).tracking == "lost"
+        assert geometry.scan(frame_at(view, 101 + index)).tracking == "lost"
 
 
 def test_a_hand_over_a_third_of_the_picture_is_no_loss(geometry: Geometry) -> None:
@@ -136,12 +136,12 @@ def test_a_hand_over_a_third_of_the_picture_is_no_loss(geometry: Geometry) -> No
     hand = sphere(view[:3, 3] + 0.45 * view[:3, 2] + 0.1 * view[:3, 0], 0.145)
     frame = frame_at(view, 10, scene=[*ROOM, hand])
     assert (frame.depth != frame_at(view, 10).depth).mean() > 0.3
-    result = geometry.update(frame)
+    result = geometry.scan(frame)
     assert result.tracking == "tracked"
     assert distance_between(result.world_from_camera, view) < 0.2 * VOXEL_M
 
 
-def test_a_lost_frame_shows_the_cameras_picture_and_the_last_light(pipeline: Pipeline) -> None:
+def test_a_lost_frame_shows_the_cameras_picture_and_the_last_light(pipeline: ClientSession) -> None:
     for step in range(4):
         before = pipeline.process(frame_at(view_at(step), step, given=view_at(0)))
     frame = bad_frame("covered lens")
@@ -156,7 +156,7 @@ def test_a_lost_frame_shows_the_cameras_picture_and_the_last_light(pipeline: Pip
 
 
 @pytest.mark.parametrize("name", ["empty", "covered lens", "one pixel"])
-def test_a_stream_that_begins_lost_has_a_picture_and_no_light(pipeline: Pipeline, name: str) -> None:
+def test_a_stream_that_begins_lost_has_a_picture_and_no_light(pipeline: ClientSession, name: str) -> None:
     frame = bad_frame(name)
     result = pipeline.process(frame)
     assert result.tracking == "lost"
@@ -169,12 +169,12 @@ def test_a_stream_that_begins_lost_has_a_picture_and_no_light(pipeline: Pipeline
 def test_poses_that_are_none_are_refused_where_they_are_used(geometry: Geometry, engine: Engine) -> None:
     mirrored = np.diag([-1.0, 1, 1, 1])
     with pytest.raises(ValueError, match="not a rotation"):
-        geometry.update(frame_at(view_at(0), 0, given=mirrored))
+        geometry.scan(frame_at(view_at(0), 0, given=mirrored))
     walk(geometry, range(2))
-    geometry.update(frame_at(view_at(2), 2, given=mirrored))  # tracked: its pose is not asked for
+    geometry.scan(frame_at(view_at(2), 2, given=mirrored))  # tracked: its pose is not asked for
     refine = Geometry(engine, CAMERA, wishes("refine"))
     with pytest.raises(ValueError, match="--poses track"):
-        refine.update(frame_at(view_at(0), 0))
+        refine.scan(frame_at(view_at(0), 0))
 
 
 def test_thumbnails_know_a_place_again() -> None:

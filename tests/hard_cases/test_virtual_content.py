@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.opencl.device import Device
-from server.pipeline import Pipeline
 from server.scene.placement import Placement
 from tests.meshes import shape_of, soup_of
 
@@ -29,13 +29,13 @@ def frame(index: int) -> RgbdFrame:
 
 
 @pytest.fixture
-def pipeline(device: Device) -> Iterator[Pipeline]:
-    pipeline = Pipeline(device, CAMERA, WISHES)
+def pipeline(device: Device) -> Iterator[ClientSession]:
+    pipeline = ClientSession(device, CAMERA, WISHES)
     yield pipeline
     pipeline.close()
 
 
-def picture(pipeline: Pipeline, index: int) -> NDArray[np.uint8]:
+def picture(pipeline: ClientSession, index: int) -> NDArray[np.uint8]:
     result = pipeline.process(frame(index))
     assert result.color.shape == (48, 64, 3)
     assert result.color.dtype == np.uint8
@@ -82,7 +82,7 @@ HARD: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_session_lives(pipeline: Pipeline, name: str) -> None:
+def test_session_lives(pipeline: ClientSession, name: str) -> None:
     make, placement = HARD[name]
     pipeline.place_object("thing", make(), placement)
     with np.errstate(all="raise"):
@@ -93,7 +93,7 @@ def test_session_lives(pipeline: Pipeline, name: str) -> None:
 
 
 @pytest.mark.parametrize("when", ["before the first frame", "between frames"])
-def test_behind_the_camera_changes_nothing_and_comes_back(pipeline: Pipeline, when: str) -> None:
+def test_behind_the_camera_changes_nothing_and_comes_back(pipeline: ClientSession, when: str) -> None:
     box, behind = shape_of(BOX), Placement((0, 0.1, -0.9))
     if when == "between frames":
         picture(pipeline, 0)
@@ -110,7 +110,7 @@ def test_behind_the_camera_changes_nothing_and_comes_back(pipeline: Pipeline, wh
 @pytest.mark.parametrize(
     "placement", [Placement((0, 0, 1), scale=1e9), Placement((1e12, 0, 0)), Placement((0, 0, 1), scale=1e-9)]
 )
-def test_what_cannot_be_placed_is_refused_at_once(pipeline: Pipeline, when: str, placement: Placement) -> None:
+def test_what_cannot_be_placed_is_refused_at_once(pipeline: ClientSession, when: str, placement: Placement) -> None:
     """Not at the next frame, where it would stop the session."""
     if when == "between frames":
         picture(pipeline, 0)
@@ -123,7 +123,7 @@ def test_what_cannot_be_placed_is_refused_at_once(pipeline: Pipeline, when: str,
     assert (picture(pipeline, 1) != COLOR).any()
 
 
-def test_hundreds_that_move_every_frame(pipeline: Pipeline) -> None:
+def test_hundreds_that_move_every_frame(pipeline: ClientSession) -> None:
     rng, ball = np.random.default_rng(0), shape_of(trimesh.creation.icosphere(subdivisions=0))
 
     def somewhere() -> Placement:

@@ -15,6 +15,7 @@ from client.laptop.source import open_source
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import CameraModel
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.evaluation.environment import direction_error_deg
 from server.light.cell_transfer import PoolGrid, PoolWindow
 from server.light.continuation import (
@@ -35,7 +36,6 @@ from server.maths.lobes import CELLS, RIDGE, cell_directions, lobe_family
 from server.maths.planes import SIDES, STEPS_M, PlanePatch, find_planes
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.pipeline import Pipeline
 from tests.analytic import Floats
 from tests.data import data_folder
 from tests.maths.test_planes import FLOOR, WALL, corner
@@ -266,10 +266,10 @@ def test_the_light_of_a_room_seen_in_part(device: Device, name: str, bound_deg: 
     wishes = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), albedo=albedo, indirect="none", up=source.up)
     errors_deg = {}
     for continued in (True, False):
-        pipeline = Pipeline(device, source.camera, wishes)
+        pipeline = ClientSession(device, source.camera, wishes)
         model = LightModel(albedos=albedo == "estimated")
         light = LobeEstimator(pipeline._engine, 4, model, Continuation() if continued else None)
-        pipeline._room_light._harmonics, pipeline._room_light._lobes = None, light
+        pipeline._room.light._harmonics, pipeline._room.light._lobes = None, light
         for index in range(len(source)):
             sh = np.array(pipeline.process(source[index]).light.sh)
         errors_deg[continued] = direction_error_deg(sh, true)
@@ -286,10 +286,10 @@ def test_a_light_that_is_given_shows_the_room_too(device: Device) -> None:
     bounds = default_volume(source, range(len(source)))
     given = tuple(tuple(float(v) for v in row) for row in light)
     wishes = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), albedo="estimated", up=source.up, light=given)
-    pipeline = Pipeline(device, source.camera, wishes)
+    pipeline = ClientSession(device, source.camera, wishes)
     for index in range(3):
         found = pipeline.process(source[index]).light
-    shapes = pipeline._room_light.planes[0]
+    shapes = pipeline._room.light.planes[0]
     pipeline.close()
     np.testing.assert_array_equal(np.array(found.sh), light)
     assert len(shapes) >= 3

@@ -11,11 +11,11 @@ import pytest
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.opencl.buffers import Workspace
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.opencl.transfer import copy_into
-from server.pipeline import Pipeline
 from server.scene.placement import Placement
 from tests.analytic import look, plane, room
 from tests.meshes import soup_of
@@ -118,7 +118,7 @@ def test_a_steady_stream_allocates_nothing(device: Device, monkeypatch: pytest.M
     scene = [room((-0.9, -0.7, -0.5), (0.9, 0.7, 1.5)), plane((0, 0.4, 0), (0, -1, 0.1))]
     depth = np.rint(1000 * look(scene, camera, np.eye(4)).depth_m).astype(np.uint16)
     color = np.random.default_rng(0).integers(30, 220, (*depth.shape, 3)).astype(np.uint8)
-    pipeline = Pipeline(device, camera, Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.04))
+    pipeline = ClientSession(device, camera, Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.04))
     corners = [[[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0]], [[0, 0, 0], [0, 0.3, 0], [0, 0, 0.3]]]
     pipeline.place_object("thing", soup_of(corners), Placement(position_m=(0.0, 0.3, 0.9)))
     for index in range(95):

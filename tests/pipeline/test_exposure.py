@@ -12,11 +12,12 @@ from client.laptop.source import open_source
 from client.laptop.synthetic.source import SyntheticSource
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Light, Wishes
+from server.client_session import ClientSession
 from server.input.measure import linear_values
 from server.maths.sh import LUMINANCE
 from server.meshing.scene_mesh import SceneMesh
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.scene.placement import Placement
 from tests.analytic import Floats
 from tests.lights import degrees_between
@@ -65,7 +66,7 @@ class Taken:
 
 
 def taken(device: Device, source: SyntheticSource, with_pole: bool = False, **more: object) -> Taken:
-    pipeline = Pipeline(device, source.camera, wishes_for(source, **more))
+    pipeline = ClientSession(device, source.camera, wishes_for(source, **more))
     if with_pole:
         pipeline.place_object("pole", shape_of(trimesh.creation.box((0.1, 0.16, 0.1))), Placement((0.05, 0.0, 0.05)))
     result = Taken(source, [pipeline.process(source[index]) for index in FRAMES])
@@ -177,7 +178,7 @@ def test_a_given_light_is_that_of_the_first_frame(device: Device) -> None:
     """So it is brighter where the exposure is longer, by exactly that."""
     source = table("&exposure=steps")
     light = tuple(tuple(row) for row in source.light(0).sh.tolist())
-    pipeline = Pipeline(device, source.camera, wishes_for(source, light=light))
+    pipeline = ClientSession(device, source.camera, wishes_for(source, light=light))
     for index in (0, 16, 46):
         found = pipeline.process(source[index]).light
         np.testing.assert_allclose(found.sh, source.exposure(index) * source.light(0).sh, rtol=1e-9)
@@ -187,7 +188,7 @@ def test_a_given_light_is_that_of_the_first_frame(device: Device) -> None:
 
 def test_a_lost_camera_tells_the_light_in_the_frame_s_units(device: Device) -> None:
     source = table("&exposure=steps")
-    pipeline = Pipeline(device, source.camera, wishes_for(source, poses="track"))
+    pipeline = ClientSession(device, source.camera, wishes_for(source, poses="track"))
     for index in range(4):
         known = pipeline.process(source[index])
     assert known.tracking == "tracked"
@@ -202,7 +203,7 @@ def test_a_lost_camera_tells_the_light_in_the_frame_s_units(device: Device) -> N
 
 def test_what_cannot_be_an_exposure_is_told_in_the_frame_s_notes(device: Device) -> None:
     source = table("&exposure=walk")
-    pipeline = Pipeline(device, source.camera, wishes_for(source))
+    pipeline = ClientSession(device, source.camera, wishes_for(source))
     frames = [source[0], replace(source[1], exposure=float("nan")), source[2]]
     results = [pipeline.process(frame) for frame in frames]
     pipeline.close()
@@ -217,7 +218,7 @@ def test_a_light_that_turns_is_followed_as_if_no_exposure_were_looked_for(device
     assert isinstance(source, SyntheticSource)
     errors = {}
     for mode in ("auto", "constant"):
-        pipeline = Pipeline(device, source.camera, wishes_for(source, exposure=mode))
+        pipeline = ClientSession(device, source.camera, wishes_for(source, exposure=mode))
         errors[mode] = []
         for index in FRAMES:
             light = pipeline.process(source[index]).light
@@ -232,7 +233,7 @@ def test_a_light_that_jumps_is_followed_within_three_frames(device: Device) -> N
     """To the other side of the room: hardly a change of exposure, although every surface changes."""
     before, after = table(), open_source("synthetic:table?frames=60&size=160x120&light=5")
     assert isinstance(after, SyntheticSource)
-    pipeline = Pipeline(device, before.camera, wishes_for(before))
+    pipeline = ClientSession(device, before.camera, wishes_for(before))
     for index in range(15):
         source = before if index < 10 else after
         light = pipeline.process(replace(source[index], exposure=None)).light

@@ -18,13 +18,13 @@ from client.laptop.source import open_source
 from client.laptop.synthetic.lights import disc_light
 from protocol.frames import CameraModel
 from server import rendering
+from server.client_session import ClientSession
 from server.culling.reason import CullReason
 from server.maths.rigid import inverse_rigid
 from server.objects.rasterize import Placed, VirtualSurface
 from server.objects.virtual_object import VirtualObject
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.pipeline import Pipeline
 from server.scene.placement import Placement
 from server.shading.depth_views import look_around
 from server.shading.differential_rendering import shadow_real, shadow_virtual
@@ -211,7 +211,7 @@ def pictures(device: Device, source: str, preset: str, indirect: str, traced: bo
     opened = open_source(source)
     wishes = msgspec.structs.replace(at_preset(wishes_for(opened, range(1)), preset), indirect=indirect)
     light = tuple((float(r), float(g), float(b)) for r, g, b in opened.truth(0).sh)  # type: ignore[attr-defined]
-    pipeline = Pipeline(device, opened.camera, msgspec.structs.replace(wishes, light=light))
+    pipeline = ClientSession(device, opened.camera, msgspec.structs.replace(wishes, light=light))
     pipeline.place_object(
         "box", shape_of(trimesh.creation.box((0.5, 0.3, 0.4))), Placement(position_m=(-0.3, 0.0, 0.0))
     )

@@ -19,12 +19,12 @@ from client.laptop.synthetic.lights import ring_light
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.input.measure import measure
 from server.light.light_estimation import ASSUMED_ALBEDO
 from server.maths.sh import dominant_direction
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.pipeline import Pipeline
 from server.shading.composite import srgb_codes
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
 from server.volume.integrate import integrate
@@ -90,7 +90,7 @@ def path(device: Device) -> Path:
 def test_ring_of_eight_is_recovered_at_reg4(device: Device, path: Path, number: int, rays: int) -> None:
     light = ring_light(number).sh
     light = light * (0.8 / (ASSUMED_ALBEDO * max(shot.brightest(light) for shot in path.shots)))  # nothing clips
-    pipeline = Pipeline(device, path.camera, msgspec.structs.replace(path.wishes, rays=rays))
+    pipeline = ClientSession(device, path.camera, msgspec.structs.replace(path.wishes, rays=rays))
     for shot in path.shots:
         estimated = np.array(pipeline.process(shot.under(light)).light.sh)
     pipeline.close()

@@ -11,6 +11,7 @@ from client.laptop.synthetic.source import open_synthetic
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import CameraModel
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.light import lamp_finder
 from server.light.lamp_finder import FIRST_VIEWS, FRAMES_A_VIEW, STEPS_A_FRAME, LampFinder
 from server.light.near_samples import LOBES, PooledSamples
@@ -19,7 +20,7 @@ from server.maths.near_light import LONG_STEP, STEP, Found, Steps
 from server.maths.sh import LUMINANCE
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 
 FRAMES = range(0, 128, 2)
 """Three views, a search of 29 frames, and ten more for the sky to follow."""
@@ -30,7 +31,7 @@ def results_of(device: Device, spec: str, frames: range = FRAMES, **wishes: str)
     source = open_synthetic(f"synthetic:{spec}&size=160x120&frames=150")
     bounds = default_volume(source, range(len(source)))
     asked = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), up=source.up, **wishes)
-    pipeline = Pipeline(device, source.camera, asked)
+    pipeline = ClientSession(device, source.camera, asked)
     try:
         return [pipeline.process(replace(source[index], index=index)) for index in frames]
     finally:

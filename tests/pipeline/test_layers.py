@@ -13,9 +13,10 @@ from client.laptop.gallery.play import wishes_of
 from client.laptop.gallery.source import GallerySource
 from protocol.codec import encode
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.effects.table import EFFECTS
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from server.shading.layer import NEUTRAL, NOTHING
@@ -27,7 +28,7 @@ def played(
     device: Device, source: GallerySource, wishes: Wishes, frames: int, watched: Sequence[int] = ()
 ) -> list[FrameResult]:
     """The first frames' results; the scene's things in their first places. watched: frames that somebody else sees."""
-    pipeline = Pipeline(device, source.camera, wishes)
+    pipeline = ClientSession(device, source.camera, wishes)
     try:
         for number, thing in enumerate(source.scene.things):
             mesh = load_mesh(thing.glb(), "glb")
@@ -100,7 +101,7 @@ def test_of_nothing_virtual_there_is_a_layer_of_nothing(device: Device) -> None:
 def test_a_lost_camera_has_a_layer_of_nothing(device: Device) -> None:
     source = GallerySource("shadow-falls-in", width=80)
     wishes = msgspec.structs.replace(answered(wishes_of(source), "layer"), poses="track")
-    pipeline = Pipeline(device, source.camera, wishes)
+    pipeline = ClientSession(device, source.camera, wishes)
     first = pipeline.process(source[0])
     blind = replace(source[1], depth=np.zeros_like(source[1].depth), color=np.zeros_like(source[1].color))
     lost, watched = (pipeline.process(replace(blind, index=i), watched=i == 2) for i in (1, 2))

@@ -14,9 +14,9 @@ from client.laptop.synthetic.source import SyntheticSource
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.maths.sh import dominant_direction
 from server.opencl.device import Device
-from server.pipeline import Pipeline
 from tests.analytic import Floats, look, sphere
 
 FRAMES, FIRST = 18, 13
@@ -46,7 +46,9 @@ def with_ball(source: SyntheticSource, index: int, center: Floats, radius_m: flo
 def lights(device: Device, source: SyntheticSource, way: Way | None, radius_m: float, holes: bool = False) -> Floats:
     """[frames, 16, 3] from frame FIRST on, when the ball comes; without one if there is no `way`."""
     bounds = default_volume(source, range(FRAMES))
-    pipeline = Pipeline(device, source.camera, Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), preset="reg4"))
+    pipeline = ClientSession(
+        device, source.camera, Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), preset="reg4")
+    )
     found = []
     for index in range(FRAMES):
         has_ball = index >= FIRST and way is not None

@@ -14,8 +14,8 @@ from client.laptop.synthetic.lights import RING_SIZE
 from client.laptop.synthetic.source import SyntheticSource, open_synthetic
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Light, Wishes
+from server.client_session import ClientSession
 from server.opencl.device import Device
-from server.pipeline import Pipeline
 from tests.lights import degrees_between
 
 FRAMES = range(0, 90, 18)
@@ -32,7 +32,7 @@ def estimates(device: Device, source: SyntheticSource) -> list[Light]:
     """The light after each of FRAMES, with the volume that `run` would choose."""
     volume_m = default_volume(source, range(len(source)))
     wishes = Wishes(preset="reg4", volume_m=volume_m, voxel_m=default_voxel(volume_m), up=source.up)
-    pipeline = Pipeline(device, source.camera, wishes)
+    pipeline = ClientSession(device, source.camera, wishes)
     found = [pipeline.process(source[index]).light for index in FRAMES]
     pipeline.close()
     return found

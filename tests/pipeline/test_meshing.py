@@ -11,6 +11,7 @@ import trimesh
 
 from client.laptop.source import open_source
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.geometry.geometry import Geometry
 from server.meshing.chunks import CHUNK_BRICKS
 from server.meshing.files import mesh_files
@@ -24,7 +25,6 @@ from server.meshing.scene_mesh import (
 )
 from server.meshing.surface import GREATEST_STEP, MeshingError, VoxelMesh, extract_surface
 from server.opencl.engine import Engine
-from server.pipeline import Pipeline
 from server.scene.colors import linear_from_srgb
 from server.scene.mesh import load_mesh
 from server.volume.volume import BRICK, TRUNCATION_VOXELS, Bricks
@@ -213,7 +213,7 @@ def test_nothing_fused_is_one_clear_line(count: int) -> None:
 
 
 def test_a_pipeline_without_frames_has_no_mesh(device) -> None:
-    pipeline = Pipeline(device, CAMERA, Wishes())
+    pipeline = ClientSession(device, CAMERA, Wishes())
     with pytest.raises(MeshingError, match="no frame has been fused"):
         pipeline.scene_mesh()
     pipeline.close()
@@ -291,7 +291,7 @@ def test_a_rendered_room(engine: Engine) -> None:
     camera = source.camera
     geometry = Geometry(engine, camera, Wishes(volume_m=(-0.05, 0.05, 0.7, 2.15, 1.6, 2.1), voxel_m=0.01))
     for i in range(0, 100, 4):
-        geometry.update(source[i])
+        geometry.scan(source[i])
     volume = geometry.volume
     mesh = scene_mesh(volume.download_bricks(), volume.voxel_m, volume.origin_world, UPRIGHT)
     errors = np.concatenate([depth_errors(mesh, source[i]) for i in (2, 34, 66, 98)])

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from client.laptop.source import open_source
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.geometry.merge import merge_depth
 from server.input.measure import measure
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.pipeline import Pipeline
 from server.quality.settings import sampling_of
 from server.scene.placement import Placement
 from server.transfer.radiance_transfer import TURNS, direction_sets, transfer_radiance
@@ -123,7 +123,7 @@ def test_every_preset_runs_and_can_be_left(device: Device) -> None:
     source = open_source(SOURCE)
     bounds = default_volume(source, range(30))
     wishes = Wishes(preset="art4", volume_m=bounds, voxel_m=default_voxel(bounds), up=source.up)
-    pipeline = Pipeline(device, source.camera, wishes)
+    pipeline = ClientSession(device, source.camera, wishes)
     pipeline.place_object("a", shape_of(trimesh.creation.box((0.1, 0.1, 0.1))), Placement(position_m=(0.0, 0.0, 0.0)))
     for number, preset in enumerate([*PRESETS, "art4"]):
         pipeline.set_quality(preset)

@@ -14,9 +14,9 @@ from client.laptop.synthetic.source import SyntheticSource
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import RgbdFrame
 from protocol.messages import Light, Wishes
+from server.client_session import ClientSession
 from server.maths.sh import dominant_direction
 from server.opencl.device import Device
-from server.pipeline import Pipeline
 from server.shading.composite import srgb_codes
 from tests.analytic import Floats
 from tests.lights import degrees_between
@@ -60,7 +60,7 @@ def wishes_for(source: SyntheticSource, **more: object) -> Wishes:
 
 
 def lights(device: Device, source: SyntheticSource, frames: list[RgbdFrame], **more: object) -> list[Light]:
-    pipeline = Pipeline(device, source.camera, wishes_for(source, **more))
+    pipeline = ClientSession(device, source.camera, wishes_for(source, **more))
     found = [pipeline.process(frame).light for frame in frames]
     pipeline.close()
     return found
@@ -100,7 +100,7 @@ def test_presets_can_be_changed_on_the_way(
     device: Device, table: SyntheticSource, frames: list[RgbdFrame], other: str
 ) -> None:
     """Pools lie elsewhere then, and the window begins anew; coming back too."""
-    pipeline = Pipeline(device, table.camera, wishes_for(table, albedo="estimated", indirect="observed"))
+    pipeline = ClientSession(device, table.camera, wishes_for(table, albedo="estimated", indirect="observed"))
     for number, frame in enumerate(frames):
         pipeline.set_quality(other if number in (2, 3) else "reg4")
         light = pipeline.process(frame).light
@@ -110,7 +110,7 @@ def test_presets_can_be_changed_on_the_way(
 
 
 def test_a_black_picture_leaves_the_light(device: Device, table: SyntheticSource, frames: list[RgbdFrame]) -> None:
-    pipeline = Pipeline(device, table.camera, wishes_for(table, albedo="estimated", indirect="observed"))
+    pipeline = ClientSession(device, table.camera, wishes_for(table, albedo="estimated", indirect="observed"))
     for frame in frames[:2]:
         known = pipeline.process(frame).light
     nothing = replace(frames[2], color=np.zeros_like(frames[2].color))

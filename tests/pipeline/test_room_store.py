@@ -16,6 +16,7 @@ from msgspec import structs
 
 from protocol.frames import RgbdFrame
 from protocol.messages import Light, Marker
+from server.client_session import ClientSession
 from server.input.measure import GREATEST_DEPTH_M, measure
 from server.light.light_estimation import LightEstimate
 from server.light.lobe_estimator import KnownLight
@@ -23,7 +24,7 @@ from server.light.room_light import KnownRoomLight, RoomLight
 from server.maths.registration import distance_between
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.quality.settings import read_wishes
 from server.room.room import Room
 from server.scene.placement import Placement
@@ -151,7 +152,7 @@ def test_a_room_that_came_back_fuses_as_if_nothing_had_been(device: Device, room
 CORNER = structs.replace(corners.WISHES, exposure="constant")
 
 
-def show(client: Pipeline, parts: list[int], first: int, light: Floats = LIGHT) -> Light:
+def show(client: ClientSession, parts: list[int], first: int, light: Floats = LIGHT) -> Light:
     """The light after frames of these planes of a corner."""
     for index, part in enumerate(parts, start=first):
         result = client.process(corner_frame(part, index, light))
@@ -162,7 +163,7 @@ def show(client: Pipeline, parts: list[int], first: int, light: Floats = LIGHT) 
 def corner(device: Device) -> Iterator[Room]:
     """A room whose light two planes have told."""
     room = Room(device, CORNER, "corner")
-    assert show(Pipeline(device, corners.CAMERA, CORNER, room), [FLOOR, WALL] * 6, 0).valid
+    assert show(ClientSession(device, corners.CAMERA, CORNER, room), [FLOOR, WALL] * 6, 0).valid
     yield room
     room.close()
 
@@ -173,7 +174,7 @@ def test_the_light_that_was_told_holds_until_frames_say_better(device: Device, c
     store.save(corner)
     again = loaded(store, "corner", device)
     assert again.light.estimate().sh.tobytes() == told.sh.tobytes()
-    client = Pipeline(device, corners.CAMERA, CORNER, again)
+    client = ClientSession(device, corners.CAMERA, CORNER, again)
     first = show(client, [FLOOR], 12)
     np.testing.assert_array_equal(first.sh, told.sh)
     assert first.valid
@@ -194,7 +195,7 @@ def test_a_light_that_has_changed_is_found_in_a_room_that_came_back(
 ) -> None:
     store.save(corner)
     again = loaded(store, "corner", device)
-    client, turned = Pipeline(device, corners.CAMERA, CORNER, again), (0.8, 0.5, 0.0)
+    client, turned = ClientSession(device, corners.CAMERA, CORNER, again), (0.8, 0.5, 0.0)
     light = show(client, [FLOOR, WALL] * 8, 12, 0.3 * lobe_and_sky(turned))
     assert degrees_between(light.dominant_direction, turned) < 8
     again.close()

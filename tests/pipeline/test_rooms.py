@@ -14,10 +14,11 @@ from msgspec import structs
 
 from protocol.frames import RgbdFrame, Viewpoint
 from protocol.messages import Hello, Light, Marker
+from server.client_session import ClientSession
 from server.maths.registration import angle_between, distance_between
 from server.maths.rigid import inverse_rigid
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.room.room import Room
 from server.scene.placement import Placement
 from tests import corners
@@ -44,9 +45,9 @@ def room(device: Device) -> Iterator[Room]:
     room.close()
 
 
-def join(device: Device, room: Room, poses: str = "given", **said: object) -> Pipeline:
+def join(device: Device, room: Room, poses: str = "given", **said: object) -> ClientSession:
     asked = wishes(poses)
-    return Pipeline(
+    return ClientSession(
         device, CAMERA, asked, room, Hello(client="test", camera=CAMERA, wishes=asked, room="study", **said)
     )
 
@@ -63,7 +64,7 @@ def off(matrix: Floats, axis_angle: tuple[float, float, float], shift: tuple[flo
     return matrix @ error
 
 
-def scan(pipeline: Pipeline, steps: range, client_from_room: Floats | None = None) -> FrameResult:
+def scan(pipeline: ClientSession, steps: range, client_from_room: Floats | None = None) -> FrameResult:
     place = np.eye(4) if client_from_room is None else client_from_room
     for step in steps:
         result = pipeline.process(frame_at(view_at(step), step, given=place @ view_at(step)))
@@ -74,7 +75,7 @@ def lit(device: Device, parts: list[int], *, together: bool, **more: object) -> 
     """The light after frames of these planes, each by a client of its own, alone or in one room."""
     asked = structs.replace(corners.WISHES, **more)
     room = Room(device, asked, "corner") if together else None
-    pipelines = {part: Pipeline(device, corners.CAMERA, asked, room) for part in sorted(set(parts))}
+    pipelines = {part: ClientSession(device, corners.CAMERA, asked, room) for part in sorted(set(parts))}
     for index, part in enumerate(parts):
         result = pipelines[part].process(corner_frame(part, index, LIGHT))
     for pipeline in pipelines.values():
@@ -104,7 +105,7 @@ def test_cameras_of_several_sizes_add_to_one_light(device: Device) -> None:
     """The window of pools takes pictures that are cut otherwise."""
     small = structs.replace(corners.CAMERA, width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
     room = Room(device, corners.WISHES, "corner")
-    clients = [Pipeline(device, camera, corners.WISHES, room) for camera in (corners.CAMERA, small)]
+    clients = [ClientSession(device, camera, corners.WISHES, room) for camera in (corners.CAMERA, small)]
     for index in range(12):
         frame = corner_frame(index % 2, index, LIGHT)
         if index % 2:
@@ -120,8 +121,8 @@ def test_cameras_of_several_sizes_add_to_one_light(device: Device) -> None:
 def test_each_client_is_told_the_light_in_its_own_world(device: Device) -> None:
     room = Room(device, corners.WISHES, "corner")
     hello = Hello(client="test", camera=corners.CAMERA, room="corner", room_from_world=said(inverse_rigid(ELSEWHERE)))
-    first = Pipeline(device, corners.CAMERA, corners.WISHES, room)
-    second = Pipeline(device, corners.CAMERA, corners.WISHES, room, hello)
+    first = ClientSession(device, corners.CAMERA, corners.WISHES, room)
+    second = ClientSession(device, corners.CAMERA, corners.WISHES, room, hello)
     ups = [None, None]
     for index in range(12):
         frame = corner_frame(index % 2, index, LIGHT)
@@ -322,7 +323,7 @@ def test_wishes_that_are_one_for_all_are_the_first_clients_and_the_others_are_to
     scan(join(device, room), range(2))
     asked = structs.replace(wishes("given"), bands=3, albedo="estimated")
     hello = Hello(client="test", camera=CAMERA, wishes=asked, room="study", room_from_world=said(np.eye(4)))
-    result = scan(Pipeline(device, CAMERA, asked, room, hello), range(2, 3))
+    result = scan(ClientSession(device, CAMERA, asked, room, hello), range(2, 3))
     for name in ("bands", "albedo"):
         assert f"{name} is as the client that opened room 'study' asked" in result.notes
 
@@ -330,7 +331,7 @@ def test_wishes_that_are_one_for_all_are_the_first_clients_and_the_others_are_to
 def test_a_shared_volume_reaches_beyond_what_its_first_client_sees(device: Device) -> None:
     asked = structs.replace(wishes("given"), volume_m=None)
     room = Room(device, asked, "hall")
-    scan(Pipeline(device, CAMERA, asked, room), range(1))
+    scan(ClientSession(device, CAMERA, asked, room), range(1))
     volume = room.reconstruction.volume
     assert volume is not None
     size = volume.voxel_m * 8 * np.array(volume.bricks)

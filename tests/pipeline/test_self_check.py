@@ -9,8 +9,9 @@ import pytest
 from msgspec import structs
 
 from protocol.frames import RgbdFrame
+from server.client_session import ClientSession
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.service import self_check
 from server.service.self_check import (
     LEAST_OBJECT_PIXELS,
@@ -27,9 +28,9 @@ from server.service.self_check import (
 def results(device: Device) -> tuple[FrameResult, FrameResult]:
     """Of the frame without objects, and of the one with."""
     kept: list[FrameResult] = []
-    process = Pipeline.process
+    process = ClientSession.process
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Pipeline, "process", lambda self, frame: kept.append(process(self, frame)) or kept[-1])
+        patch.setattr(ClientSession, "process", lambda self, frame: kept.append(process(self, frame)) or kept[-1])
         check_answers(device)
     assert len(kept) == 4
     return kept[1], kept[3]
@@ -74,12 +75,12 @@ def test_an_object_that_is_not_there_or_has_a_wrong_colour_is_told(results: tupl
 
 
 def test_a_device_that_computes_what_is_wrong_is_told(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    process = Pipeline.process
+    process = ClientSession.process
 
-    def with_a_flat_ball(self: Pipeline, frame: RgbdFrame) -> FrameResult:
+    def with_a_flat_ball(self: ClientSession, frame: RgbdFrame) -> FrameResult:
         depth = np.where(frame.depth < 1500, 700 + (np.arange(64) * 6).astype(np.uint16), frame.depth)
         return process(self, replace(frame, depth=depth.astype(np.uint16)))
 
-    monkeypatch.setattr(Pipeline, "process", with_a_flat_ball)
+    monkeypatch.setattr(ClientSession, "process", with_a_flat_ball)
     with pytest.raises(CheckFailed, match="check 'light': its direction is"):
         check_answers(device)

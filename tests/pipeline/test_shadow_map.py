@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Preset, Wishes
 from server import rendering
+from server.client_session import ClientSession
 from server.input.measure import linear_values
 from server.maths.direct_lights import SplitLight, split_light
 from server.maths.directional_fit import directional_sh
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.scene.placement import Placement
 from tests import lights
 from tests.analytic import look, look_at, plane
@@ -66,7 +67,7 @@ def shown(
         edges="hard",
         light=tuple((float(r), float(g), float(b)) for r, g, b in light),
     )
-    pipeline = Pipeline(device, CAMERA, wishes)
+    pipeline = ClientSession(device, CAMERA, wishes)
     size, middle = PLATE.high - PLATE.low, (PLATE.high + PLATE.low) / 2
     place = Placement(position_m=(middle[0], PLATE.high[1], middle[2]))
     pipeline.place_object("plate", shape_of(trimesh.creation.box(size[[0, 2, 1]])), place)

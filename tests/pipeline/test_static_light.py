@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.maths.sh import rotate_sh, webxr_from_world
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.scene.placement import Placement
 from tests import lights
 from tests.analytic import look, look_at, plane
@@ -36,7 +37,7 @@ def shown(device: Device, light: NDArray[np.float64], axes: str) -> FrameResult:
     """The floor with a pole of 30 cm on it under `light` [n, 3]."""
     rows = tuple((float(r), float(g), float(b)) for r, g, b in light)
     wishes = Wishes(volume_m=BOUNDS, voxel_m=0.01, up=(0.0, -1.0, 0.0), light=rows, light_axes=axes)  # type: ignore[arg-type]
-    pipeline = Pipeline(device, CAMERA, wishes)
+    pipeline = ClientSession(device, CAMERA, wishes)
     pipeline.place_object("pole", shape_of(trimesh.creation.box((0.08, 0.3, 0.08))), Placement(position_m=POLE_M))
     result = pipeline.process(frame())
     pipeline.close()

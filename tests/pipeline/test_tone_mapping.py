@@ -11,10 +11,11 @@ import trimesh
 from numpy.typing import NDArray
 
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.input.measure import linear_values
 from server.maths.sh import LUMINANCE
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.scene.placement import Placement
 from tests import lights
 from tests.meshes import shape_of
@@ -28,7 +29,7 @@ def shown(device: Device, code: int, light: NDArray[np.float64] | None = LIGHT, 
     """An even floor of sRGB `code` with a pole on it."""
     given = None if light is None else tuple((float(r), float(g), float(b)) for r, g, b in light)
     wishes = Wishes(volume_m=BOUNDS, voxel_m=0.01, up=(0.0, -1.0, 0.0), light=given, edges="hard", **wished)
-    pipeline = Pipeline(device, CAMERA, wishes)
+    pipeline = ClientSession(device, CAMERA, wishes)
     pipeline.place_object("pole", shape_of(trimesh.creation.box((0.08, 0.3, 0.08))), Placement(position_m=POLE_M))
     result = pipeline.process(replace(frame(), color=np.full((CAMERA.height, CAMERA.width, 3), code, np.uint8)))
     pipeline.close()
@@ -93,7 +94,8 @@ def test_an_estimated_light_is_whitened_too(device: Device) -> None:
     """Of a floor of one colour, with deviations that are one for all channels."""
     color = np.full((CAMERA.height, CAMERA.width, 3), (180, 120, 90), np.uint8)
     pipelines = [
-        Pipeline(device, CAMERA, Wishes(volume_m=BOUNDS, voxel_m=0.01, light_color=c)) for c in ("estimated", "white")
+        ClientSession(device, CAMERA, Wishes(volume_m=BOUNDS, voxel_m=0.01, light_color=c))
+        for c in ("estimated", "white")
     ]
     tinted, white = (np.array(p.process(replace(frame(), color=color)).light.sh) for p in pipelines)
     assert tinted[0, 0] > 1.3 * tinted[0, 2]

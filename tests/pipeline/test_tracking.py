@@ -11,11 +11,11 @@ import pytest
 
 from client.laptop.source import open_source
 from client.laptop.volume import default_volume, default_voxel
+from server.client_session import ClientSession
 from server.evaluation.trajectory import ate_rmse_m, position_errors_m, track_source
 from server.geometry.geometry import Geometry
 from server.maths.registration import angle_between, distance_between, motion_of_twist
 from server.opencl.engine import Engine
-from server.pipeline import Pipeline
 from tests.analytic import Floats, plane
 from tests.data import data_folder
 from tests.rooms import BOUNDS, CAMERA, VOXEL_M, frame_at, view_at, wishes
@@ -33,7 +33,7 @@ def test_track_follows_without_poses(open_geometry: Open) -> None:
     geometry, truth, found = open_geometry("track"), [], []
     for index in range(60):
         view = view_at(index)
-        result = geometry.update(frame_at(view, index, given=view if index == 0 else np.eye(4)))
+        result = geometry.scan(frame_at(view, index, given=view if index == 0 else np.eye(4)))
         assert (result.tracking, result.notes) == ("tracked", ())
         truth.append(view)
         found.append(result.world_from_camera)
@@ -45,7 +45,7 @@ def test_track_follows_without_poses(open_geometry: Open) -> None:
 
 def test_tracking_starts_from_the_identity_without_any_pose(open_geometry: Open) -> None:
     geometry = open_geometry("track")
-    first = geometry.update(frame_at(view_at(0)))
+    first = geometry.scan(frame_at(view_at(0)))
     np.testing.assert_array_equal(first.world_from_camera, np.eye(4))
     assert first.tracking == "tracked"
 
@@ -55,7 +55,7 @@ def test_sensor_noise_does_not_lead_away(open_geometry: Open) -> None:
     for index in range(40):
         truth.append(view_at(index))
         frame = frame_at(truth[-1], index, noise_m=0.006, given=truth[0])
-        found.append(geometry.update(frame).world_from_camera)
+        found.append(geometry.scan(frame).world_from_camera)
     assert ate_rmse_m(found, truth) < 0.3 * VOXEL_M
 
 
@@ -65,7 +65,7 @@ def test_a_camera_that_stands_still_does_not_drift(open_geometry: Open, noise_m:
     geometry = open_geometry("track")
     view = view_at(5)
     frames = [frame_at(view, index, noise_m=noise_m, given=view) for index in range(20)]
-    found = [geometry.update(frames[index % 20]).world_from_camera for index in range(300)]
+    found = [geometry.scan(frames[index % 20]).world_from_camera for index in range(300)]
     assert max(distance_between(pose, found[40]) for pose in found[40:]) < bound_m
     assert distance_between(np.mean(found[-50:], axis=0), np.mean(found[40:90], axis=0)) < 5e-5
 
@@ -74,7 +74,7 @@ def test_given_poses_are_taken_as_they_are(open_geometry: Open) -> None:
     geometry = open_geometry("given")
     for index, step in enumerate((0, 30, 2)):
         wrong = view_at(step) @ motion_of_twist(np.array([0.05, 0, 0, 0.05, 0, 0]))
-        result = geometry.update(frame_at(view_at(step), index, given=wrong))
+        result = geometry.scan(frame_at(view_at(step), index, given=wrong))
         assert result.tracking == "given"
         np.testing.assert_allclose(result.world_from_camera, wrong, atol=1e-12)
 
@@ -84,7 +84,7 @@ def test_refine_corrects_a_client_that_drifts(open_geometry: Open) -> None:
     for index in range(40):
         truth.append(view_at(index))
         given.append(truth[-1] @ drift)
-        found.append(geometry.update(frame_at(truth[-1], index, given=given[-1])).world_from_camera)
+        found.append(geometry.scan(frame_at(truth[-1], index, given=given[-1])).world_from_camera)
         drift = drift @ motion_of_twist(np.array([0.001, -0.0005, 0.0008, 0.002, 0.0005, -0.001]))
     assert ate_rmse_m(given, truth) > 0.04
     assert ate_rmse_m(found, truth) < 0.15 * VOXEL_M
@@ -96,7 +96,7 @@ def test_refine_follows_motion_that_tracking_alone_cannot(open_geometry: Open) -
     outcomes = {}
     for mode in ("refine", "track"):
         geometry = open_geometry(mode)
-        results = [geometry.update(frame_at(view, index, given=view)) for index, view in enumerate(views)]
+        results = [geometry.scan(frame_at(view, index, given=view)) for index, view in enumerate(views)]
         outcomes[mode] = distance_between(results[-1].world_from_camera, views[-1])
         if mode == "refine":
             assert [result.tracking for result in results] == ["given", *["tracked"] * 4]
@@ -105,21 +105,21 @@ def test_refine_follows_motion_that_tracking_alone_cannot(open_geometry: Open) -
 
 def test_refine_takes_the_clients_motion_where_the_depth_does_not_fit(open_geometry: Open) -> None:
     geometry = open_geometry("refine")
-    geometry.update(frame_at(view_at(0), 0, given=view_at(0)))
+    geometry.scan(frame_at(view_at(0), 0, given=view_at(0)))
     covered = replace(frame_at(view_at(3), 1, given=view_at(3)), depth=np.zeros((120, 160), np.uint16))
-    result = geometry.update(covered)
+    result = geometry.scan(covered)
     assert result.tracking == "given"
     assert any("the client's motion is not corrected" in note for note in result.notes)
     np.testing.assert_allclose(result.world_from_camera, view_at(3), atol=1e-9)
-    assert geometry.update(frame_at(view_at(4), 2, given=view_at(4))).tracking == "tracked"
+    assert geometry.scan(frame_at(view_at(4), 2, given=view_at(4))).tracking == "tracked"
 
 
 @pytest.mark.parametrize(("mode", "words"), [("track", "left as it was"), ("refine", "taken from the client's pose")])
 def test_what_a_plane_does_not_fix_is_said(open_geometry: Open, mode: str, words: str) -> None:
     geometry, wall = open_geometry(mode), [plane((0, 0, 1.5), (0, 0, -1))]
     start, end = np.eye(4), motion_of_twist(np.array([0, 0, 0.01, 0.01, 0.004, 0.008]))
-    geometry.update(frame_at(start, 0, scene=wall, given=start))
-    result = geometry.update(frame_at(end, 1, scene=wall, given=end))
+    geometry.scan(frame_at(start, 0, scene=wall, given=start))
+    result = geometry.scan(frame_at(end, 1, scene=wall, given=end))
     note = next(note for note in result.notes if "does not fix" in note)
     assert "motion along (" in note
     assert "turning about (0.00, 0.00, 1.00)" in note
@@ -133,7 +133,7 @@ def test_the_pipeline_lights_a_tracked_stream(engine: Engine) -> None:
     """A tracked stream gives the light and the pictures that the same stream with true poses gives."""
     results = {}
     for mode in ("given", "track"):
-        pipeline = Pipeline(engine.device, CAMERA, wishes(mode))
+        pipeline = ClientSession(engine.device, CAMERA, wishes(mode))
         for index in range(4):
             result = pipeline.process(frame_at(view_at(index), index, given=view_at(index)))
         results[mode] = result

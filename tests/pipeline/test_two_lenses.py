@@ -26,7 +26,7 @@ def frame() -> RgbdFrame:
 
 def test_the_surface_is_where_the_scene_is(engine: Engine) -> None:
     wishes = Wishes(volume_m=(-1.7, -1.3, -0.6, 1.7, 1.3, 1.4), voxel_m=VOXEL_M)
-    result = Geometry(engine, CAMERA, wishes).update(frame())
+    result = Geometry(engine, CAMERA, wishes).scan(frame())
     positions = vectors(engine.download(result.surface.positions))
     truth = look(SCENE, CAMERA, WORLD_FROM_COLOR)
     volume_from_world = result.volume_from_camera @ np.linalg.inv(WORLD_FROM_COLOR)
@@ -59,6 +59,6 @@ def test_depth_of_the_colour_picture_s_size_is_refused(engine: Engine) -> None:
     geometry = Geometry(engine, CAMERA, Wishes())
     wrong = RgbdFrame(0, 0.0, frame().color, np.ones((CAMERA.height, CAMERA.width), np.uint16), WORLD_FROM_COLOR)
     with pytest.raises(ValueError, match="depth 160x120; the camera has 160x120 and 80x60"):
-        geometry.update(wrong)
+        geometry.scan(wrong)
     with pytest.raises(ValueError, match="depth 80x60; the camera has 160x120 and 160x120"):
-        Geometry(engine, replace(CAMERA, depth=None), Wishes()).update(frame())
+        Geometry(engine, replace(CAMERA, depth=None), Wishes()).scan(frame())

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from protocol.messages import Hello
+from server.client_session import ClientSession
 from server.opencl.device import Device
-from server.pipeline import Pipeline
 from server.room.room import Room
 from server.scene.placement import Placement
 from tests.kept_rooms import CUBE, scan
@@ -19,12 +19,12 @@ THERE, ELSEWHERE = Placement(position_m=(-0.9, 0.6, 1.0)), Placement(position_m=
 
 
 @pytest.fixture
-def clients(device: Device) -> Iterator[tuple[Pipeline, Pipeline]]:
+def clients(device: Device) -> Iterator[tuple[ClientSession, ClientSession]]:
     """One that has scanned, and one that has not been seen to fit yet."""
     asked = wishes("given")
     room = Room(device, asked, "study")
     hello = Hello(client="test", camera=CAMERA, wishes=asked, room="study")
-    pipelines = Pipeline(device, CAMERA, asked, room, hello), Pipeline(device, CAMERA, asked, room, hello)
+    pipelines = ClientSession(device, CAMERA, asked, room, hello), ClientSession(device, CAMERA, asked, room, hello)
     scan(pipelines[0], range(0, 12))
     yield pipelines
     for pipeline in pipelines:
@@ -32,12 +32,12 @@ def clients(device: Device) -> Iterator[tuple[Pipeline, Pipeline]]:
     room.close()
 
 
-def places(client: Pipeline) -> dict[str, list[float]]:
+def places(client: ClientSession) -> dict[str, list[float]]:
     """Of all objects of its room, the middle of each model's floor."""
     return {kept.object_id: np.asarray(kept.place)[:3, 3].round(3).tolist() for kept in client._room.objects.kept()}
 
 
-def test_an_object_that_waits_is_moved_and_removed(clients: tuple[Pipeline, Pipeline]) -> None:
+def test_an_object_that_waits_is_moved_and_removed(clients: tuple[ClientSession, ClientSession]) -> None:
     first, second = clients
     first.place_object("reference", CUBE, ELSEWHERE)
     for name in ("moved", "removed"):
@@ -54,7 +54,7 @@ def test_an_object_that_waits_is_moved_and_removed(clients: tuple[Pipeline, Pipe
     np.testing.assert_allclose(found["moved"], found["reference"], atol=0.02)
 
 
-def test_a_move_that_cannot_be_leaves_what_waits(clients: tuple[Pipeline, Pipeline]) -> None:
+def test_a_move_that_cannot_be_leaves_what_waits(clients: tuple[ClientSession, ClientSession]) -> None:
     _, second = clients
     second.place_object("cube", CUBE, THERE)
     with pytest.raises(ValueError, match="choose another scale"):

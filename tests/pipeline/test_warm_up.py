@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from server.client_session import ClientSession
 from server.maths.direct_lights import split_light
 from server.opencl.device import open_device
-from server.pipeline import Pipeline
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.service.warm_up import SHARP_LIGHT, warm_up
@@ -29,7 +29,7 @@ def test_later_sessions_compile_nothing(asked: dict[str, object]) -> None:
     device = open_device(None)
     warm_up(device)
     built = set(device.programs._programs)
-    pipeline = Pipeline(device, CAMERA, wishes("given", **asked))
+    pipeline = ClientSession(device, CAMERA, wishes("given", **asked))
     square = Mesh(
         vertices=np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0.3, 0.3, 0]], np.float32),
         triangles=np.array([[0, 1, 2], [1, 3, 2]], np.int32),

@@ -21,12 +21,13 @@ from scipy import ndimage
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.limits import MAX_SH_BANDS
 from protocol.messages import Preset, Wishes
+from server.client_session import ClientSession
 from server.geometry.merge import merge_depth
 from server.input.measure import measure
 from server.light.light_estimation import LEAST_FLATNESS
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.quality.settings import THESIS_REACH_M, WHOLE_ROOM_M
 from server.scene.placement import Placement
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
@@ -130,7 +131,7 @@ def test_far_object_changes_no_pixel(device: Device, preset: str) -> None:
     color = random.integers(60, 220, (CAMERA.height, CAMERA.width, 3), np.uint8)
     asked: Any = {"preset": preset, "plan": "everything"}
     wishes = Wishes(volume_m=BOUNDS, voxel_m=VOXEL_M, ray_length_m=2.0, **asked)
-    pipeline = Pipeline(device, CAMERA, wishes)
+    pipeline = ClientSession(device, CAMERA, wishes)
     pipeline.place_object(
         "far", shape_of(trimesh.creation.icosphere(radius=0.2)), Placement(position_m=(0.0, 5.0, -60.0))
     )
@@ -144,7 +145,7 @@ def test_far_object_changes_no_pixel(device: Device, preset: str) -> None:
 def test_white_scene_tells_the_even_sky(device: Device) -> None:
     """The furnace backwards: a picture that is the same everywhere is explained by an even sky."""
     code = 188  # linear 0.5029: white times the assumed albedo
-    pipeline = Pipeline(device, CAMERA, Wishes(volume_m=BOUNDS, voxel_m=VOXEL_M))
+    pipeline = ClientSession(device, CAMERA, Wishes(volume_m=BOUNDS, voxel_m=VOXEL_M))
     result: FrameResult | Any = None
     for frame in frames(BODIES["ball"], np.full((CAMERA.height, CAMERA.width, 3), code, np.uint8)):
         result = pipeline.process(replace(frame))

@@ -13,9 +13,9 @@ from client.laptop.output import FrameOutput, OutputWriter
 from client.laptop.stream import stream
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.meshing.files import mesh_files
 from server.opencl.device import Device
-from server.pipeline import Pipeline
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from server.service.serve import BackgroundServer
@@ -54,7 +54,7 @@ class Scene:
 
 def run_in_process(device: Device, scene: Scene, folder: Path) -> None:
     """The frames through the pipeline, without a network."""
-    pipeline = Pipeline(device, CAMERA, WISHES)
+    pipeline = ClientSession(device, CAMERA, WISHES)
     format_, data = pack_mesh(scene.item.path)
     placement = Placement(scene.item.position_m, scene.item.scale, scene.item.yaw_deg)
     pipeline.place_object("object-0", load_mesh(data, format_), placement)

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 from client.laptop.gallery.source import GallerySource
 from client.laptop.volume import default_volume
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 
@@ -31,9 +32,9 @@ def wishes_of(source: GallerySource, **others: object) -> Wishes:
     return Wishes(**asked)  # type: ignore[arg-type]
 
 
-def play(device: Device, source: GallerySource, wishes: Wishes) -> Iterator[tuple[Pipeline, FrameResult]]:
+def play(device: Device, source: GallerySource, wishes: Wishes) -> Iterator[tuple[ClientSession, FrameResult]]:
     """Every frame's result, and the pipeline that it is of, which is closed after the last."""
-    pipeline = Pipeline(device, source.camera, wishes)
+    pipeline = ClientSession(device, source.camera, wishes)
     try:
         for number, thing in enumerate(source.scene.things):
             mesh = load_mesh(thing.glb(), "glb")

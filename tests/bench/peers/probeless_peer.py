@@ -62,7 +62,7 @@ class GivenPoses:
     def process(self, frame: RgbdFrame, turn: Turn) -> None:
         self._stages.turn = turn
         self._stages.forget()
-        self._shown = self.geometry.update(frame)
+        self._shown = self.geometry.scan(frame)
 
     def depth(self, frame: RgbdFrame) -> NDArray[np.float32]:  # noqa: ARG002
         """Of the frame that was processed last: it must be this one."""
@@ -86,7 +86,7 @@ class Tracking:
     def process(self, frame: RgbdFrame, turn: Turn) -> None:
         self._tracking.turn = turn
         self._engine.profile.forget()
-        result = self._geometry.update(frame)
+        result = self._geometry.scan(frame)
         if result.tracking == "lost":
             raise RuntimeError(f"frame {frame.index}: {'; '.join(result.notes)}")
         turn.world_from_camera = result.world_from_camera

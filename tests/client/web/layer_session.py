@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from playwright.sync_api import Page
 
 from protocol.frames import RgbdFrame, Viewpoint
+from server.client_session import ClientSession
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.service.serve import BackgroundServer
@@ -43,7 +44,7 @@ class Seen:
 def watched_server(device: Device, seen: Seen) -> Iterator[BackgroundServer]:
     """The real service, which notes what comes."""
 
-    class Watched(Pipeline):
+    class Watched(ClientSession):
         def process(self, frame: RgbdFrame | Viewpoint, *, watched: bool = False) -> FrameResult:
             assert isinstance(frame, RgbdFrame)
             seen.frames.append(frame)

@@ -16,9 +16,9 @@ from playwright.sync_api import Page
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Hello, Light, Welcome, Wishes
+from server.client_session import ClientSession
 from server.maths.sh import lambert_transfer
 from server.opencl.device import Device
-from server.pipeline import Pipeline
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from server.service.serve import BackgroundServer
@@ -139,7 +139,7 @@ def our_picture(device: Device) -> NDArray[np.uint8]:
     wishes = Wishes(
         light=tuple(map(tuple, SH.tolist())), tone_mapping="light", edges="hard", up=(0.0, 1.0, 0.0), indirect="none"
     )
-    pipeline = Pipeline(device, CAMERA, wishes)
+    pipeline = ClientSession(device, CAMERA, wishes)
     ball = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS_M)
     ball.visual.vertex_colors = [255, 255, 255, 255]
     _ = ball.vertex_normals  # exported with it

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
+from server.client_session import ClientSession
 from server.opencl.device import Device
-from server.pipeline import Pipeline
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.service.serve import BackgroundServer
@@ -22,7 +22,7 @@ TOUCHED = (112.0, 69.0)
 """Pixel of the table that a finger points at."""
 
 
-class Watched(Pipeline):
+class Watched(ClientSession):
     """A real pipeline that tells what it was asked."""
 
     asked: list[tuple[str, Placement | None]]

@@ -13,7 +13,8 @@ from client.laptop.synthetic.source import SyntheticSource
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
-from server.pipeline import FrameResult, Pipeline
+from server.client_session import ClientSession
+from server.pipeline import FrameResult
 from server.scene.placement import Placement
 from tests.analytic import look_at
 from tests.hard_cases.catalogue import Family, Found, Trial, share_beyond
@@ -47,7 +48,7 @@ def _frames(code: int | None = None) -> list[RgbdFrame]:
 
 def _session(trial: Trial, frames: list[RgbdFrame], preset: str = "reg4") -> FrameResult:
     """The last frame's result, with one object in the room."""
-    pipeline = Pipeline(trial.device, CAMERA, replace(WISHES, preset=preset))
+    pipeline = ClientSession(trial.device, CAMERA, replace(WISHES, preset=preset))
     try:
         pipeline.place_object("pyramid", soup_of(PYRAMID), Placement(position_m=(-0.2, 0.7, 1.1)))
         for frame in frames:
@@ -70,7 +71,7 @@ def _table_light(trial: Trial, preset: str, saturated: slice | None = None) -> F
     source = _table()
     bounds = default_volume(source, range(len(source)))
     wishes = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), preset=preset)
-    pipeline = Pipeline(trial.device, source.camera, wishes)
+    pipeline = ClientSession(trial.device, source.camera, wishes)
     try:
         for frame in source:
             color = frame.color.copy()

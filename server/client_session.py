@@ -1,0 +1,130 @@
+"""One client of a room: its camera's pipeline, its objects, its place in the room, and how finely it samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from msgspec import structs
+
+from protocol.frames import CameraModel, RgbdFrame, Viewpoint
+from protocol.messages import Hello, Preset, Wishes
+from server.effects.renderer import RenderRequest
+from server.meshing.scene_mesh import SceneMesh
+from server.opencl.device import Device
+from server.opencl.engine import Engine
+from server.pipeline import FrameResult, Pipeline
+from server.quality.session_quality import SessionQuality
+from server.room.client_objects import ClientObjects
+from server.room.room import Room
+from server.room.viewpoint import imagined_frame
+from server.scene.mesh import Mesh
+from server.scene.placement import Placement
+from server.tracking.alignment import Alignment
+
+
+class ClientSession:
+    """Owned by one thread; what it shares with other clients is its room's."""
+
+    def __init__(
+        self,
+        device: Device,
+        camera: CameraModel,
+        wishes: Wishes,
+        room: Room | None = None,
+        hello: Hello | None = None,
+    ) -> None:
+        """`room`: None for one of its own. `hello`: what the client says of its world's place in the room.
+
+        Raises ValueError, one line, for wishes that cannot be met.
+        """
+        self._room = room or Room(device, wishes)
+        self._owns_room = room is None
+        self._differences = self._room.differences(wishes)
+        wishes = self._room.wishes_of(wishes)
+        self._answer = wishes.answer
+        self._quality = SessionQuality(device, wishes)
+        self._camera = camera
+        self._engine = Engine(device, beside=self._room.engine)
+        reconstruction = self._room.reconstruction
+        self._alignment = Alignment(self._engine, camera, reconstruction, self._room.markers, hello)
+        self._objects = ClientObjects(self._room, self._alignment)
+        self._pipeline = Pipeline(
+            self._engine, camera, wishes, self._quality.settings, self._room, self._alignment, self._objects
+        )
+        self._is_told_what_is_owed = False
+        self.device_name = device.name
+
+    def process(self, frame: RgbdFrame | Viewpoint, *, watched: bool = False) -> FrameResult:
+        """One frame through the pipeline. A viewpoint shows what others have scanned.
+
+        `watched`: somebody wants the picture, whatever the client wished to be answered by.
+
+        Raises ValueError with one line for a frame that is refused; the session's state is then as it was. Waits while
+        another client's frame is in the room.
+        """
+        with self._room.lock:
+            if isinstance(frame, Viewpoint):
+                volume, place = self._room.reconstruction.volume, self._alignment.room_from_client
+                frame = imagined_frame(self._engine, self._camera, volume, frame, place)
+            result = self._pipeline.process_frame(frame, RenderRequest(self._answer, watched))
+            plan = result.plan
+            if result.tracking != "lost":
+                point = self._quality.observe(result.timings, is_reused=result.is_reused)
+                self._pipeline.use(self._quality.settings)
+                plan = structs.replace(plan, point=point)
+            return replace(result, plan=plan, notes=(*result.notes, *self._differences, *self._owed_notes()))
+
+    def place_object(self, object_id: str, mesh: Mesh, placement: Placement) -> tuple[str, ...]:
+        """Put a mesh into the room, in place of one with the same id; returns notes. Raises ValueError."""
+        with self._room.lock:
+            return self._objects.place(object_id, mesh, placement)
+
+    def move_object(self, object_id: str, placement: Placement) -> None:
+        """Give an object another place. Raises KeyError if there is none of that id."""
+        with self._room.lock:
+            self._objects.move(object_id, placement)
+
+    def remove_object(self, object_id: str) -> None:
+        """Take an object away. Raises KeyError if there is none of that id."""
+        with self._room.lock:
+            self._objects.remove(object_id)
+
+    def set_quality(
+        self, preset: Preset, budget_ms: float | None = None, max_light_error_deg: float | None = None
+    ) -> None:
+        """Sample transfer in another way from the next frame on, or as a budget or a light error asks for.
+
+        Raises ValueError for a preset that does not exist, and where the device's front is not known.
+        """
+        with self._room.lock:
+            self._quality.request(preset, budget_ms, max_light_error_deg)
+            self._pipeline.use(self._quality.settings)
+
+    def scene_mesh(self, progress: Callable[[int, int], None] = lambda _done, _total: None) -> SceneMesh:
+        """The surface fused so far as triangles. Raises MeshingError, one line, where there is none."""
+        return self._room.scene_mesh(self._alignment.webxr_from_room, progress)
+
+    @property
+    def kernel_ms(self) -> dict[str, float]:
+        """Milliseconds of each kernel in the last frame."""
+        return self._pipeline.kernel_ms
+
+    @property
+    def device_bytes(self) -> int:
+        """Device memory of this session and its room: arrays and volume; what all sessions share is not counted."""
+        return self._engine.workspace.bytes_held + self._room.device_bytes
+
+    def close(self) -> None:
+        """Give the device's memory back, and the room's where it is this session's alone."""
+        with self._room.lock:
+            self._engine.close()
+        if self._owns_room:
+            self._room.close()
+
+    def _owed_notes(self) -> tuple[str, ...]:
+        """Once: the objects that were acknowledged before and stand nowhere."""
+        if self._is_told_what_is_owed:
+            return ()
+        self._is_told_what_is_owed = True
+        return self._room.objects.owed_notes(besides=set(self._objects.waiting))

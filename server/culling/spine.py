@@ -1,0 +1,45 @@
+"""What of the spine is left out of a frame: light estimation, and what a still view keeps."""
+
+from __future__ import annotations
+
+from server.culling.reason import CullReason
+
+GIVEN_LIGHT = CullReason("the light is given, and nothing else is learnt from the picture", 0.0)
+NO_DEPTH = CullReason("a client without depth adds nothing to the room's light", 0.0)
+LOST = CullReason("the camera is lost", 255.0)
+
+GEOMETRY_STAGES = ("locate", "raycast", "merge_depth")
+"""Of the geometry, what is not done where nothing has changed."""
+
+
+def spine_left_out(
+    reason: CullReason | None,
+    echo: CullReason | None,
+    *,
+    keeps_geometry: bool,
+    keeps_transfer: bool,
+    light_is_given: bool,
+    denoises: bool,
+    has_depth: bool,
+) -> dict[str, CullReason]:
+    """Stages of the spine that a frame does without, each with its reason.
+
+    reason: why a still view is kept; None where it is not. echo: what earlier frames left out of the light.
+    light_is_given: and nothing else would be learnt from the picture.
+    """
+    left_out: dict[str, CullReason] = {}
+    if not has_depth:
+        left_out["estimate_light"] = NO_DEPTH
+    if light_is_given:
+        left_out["estimate_light"] = GIVEN_LIGHT
+        if denoises:
+            left_out["denoise"] = GIVEN_LIGHT
+    if reason is not None:
+        left_out["estimate_light"] = reason
+        if keeps_geometry:
+            left_out |= dict.fromkeys(GEOMETRY_STAGES, reason)
+        if keeps_transfer:
+            left_out["transfer_radiance"] = reason
+    elif echo is not None:
+        left_out["light_of_still_frames"] = echo
+    return left_out

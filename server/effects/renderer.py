@@ -1,0 +1,282 @@
+"""The last part of a frame (thesis 7.1-7.2): its effects are planned and run, or taken from the cache."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from msgspec import structs
+from numpy.typing import NDArray
+
+from protocol.frames import RgbdFrame
+from protocol.messages import LeftOut, Plan
+from server.culling.facts_finder import FactsFinder
+from server.culling.reason import CullReason
+from server.culling.rules import NO_INDIRECT, NO_LIGHT, NO_OBJECT, SOFT, TRACED
+from server.culling.scene_facts import SceneFacts
+from server.effects.plan import Resource, make_plan
+from server.effects.resources import (
+    Gain,
+    KnownLight,
+    PictureParts,
+    ReturnedRadiance,
+    SharpLight,
+    VirtualObjects,
+)
+from server.effects.table import COMPOSE_LAYER, COMPOSITE, EFFECTS, FAINT_SHADOWS, Answer, effect_names
+from server.frame_context import FrameContext
+from server.input.measure import Measurement
+from server.light.continuation import PlaneArrays
+from server.maths.direct_lights import split_light
+from server.objects.rasterize import Placed
+from server.opencl.engine import Engine
+from server.quality.settings import Settings
+from server.reuse.frame_cache import FrameCache
+from server.reuse.temporal_reuse import ReuseDecision
+from server.shading.composite import CompositeInputs, composite, shown_picture
+from server.shading.layer import Layer, compose_layer
+from server.shading.tone_mapping import AverageMemory, measure_averages
+from server.shading.traced_scene import DeviceLight, take_discs, upload_light
+from server.transfer.indirect import Indirect
+from server.transfer.radiance_transfer import TURNS, Transfer
+from server.transfer.real_depth_views import RealDepthViews
+from server.transfer.samples import TransferSamples
+
+Picture = NDArray[np.uint8]
+
+LASTING = frozenset({"virtual", "coverage"})
+"""The same for all direction sets, and written only where an object has moved."""
+DRAWN_BY_CLIENT = CullReason("asked for: the client draws by itself", 0.0)
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """What is to be drawn of a frame."""
+
+    answer: Answer = "picture"
+    """What its client gets."""
+    watched: bool = False
+    """Whether somebody else is to see the picture."""
+
+    @property
+    def is_drawn(self) -> bool:
+        """Whether anything is drawn at all."""
+        return self.answer != "light" or self.watched
+
+    @property
+    def wants_picture(self) -> bool:
+        """Whether the composite is shown to anybody."""
+        return self.answer == "picture" or self.watched
+
+
+@dataclass(frozen=True)
+class SpineOutputs:
+    """What the spine found out about a frame, besides its FrameContext."""
+
+    frame: RgbdFrame
+    objects: list[Placed]
+    samples: TransferSamples
+    """Not read where nothing virtual is there."""
+    depth_views: RealDepthViews | None
+    """What visibility was looked up in; None where rays are traced."""
+    period: int
+    """Frames after which a still view is sampled the same again."""
+    sh: NDArray[np.float64]
+    """[bands^2, 3] the light, in the first picture's units."""
+    planes: PlaneArrays
+    """Surfaces taken to hide the light where the volume is empty."""
+    is_light_given: bool
+    left_out: Mapping[str, CullReason]
+    """What of the spine was left out."""
+
+
+@dataclass(frozen=True)
+class RenderResult:
+    """What was requested, the rest None."""
+
+    picture: Picture | None
+    layer: Layer | None
+    plan: Plan
+    reference: Picture | None = None
+    """At a checkpoint: the virtual things over what the camera saw when the view began."""
+
+
+@dataclass(frozen=True)
+class CachedEffects:
+    """The effects of a frame of a still view, for one direction set."""
+
+    parts: PictureParts
+    plan: Plan
+
+
+@dataclass(frozen=True)
+class FirstSight:
+    """What the camera saw when a view began."""
+
+    shown: Picture
+    measurement: Measurement
+
+
+class Renderer:
+    """One session's."""
+
+    def __init__(self, engine: Engine, cache: FrameCache, settings: Settings) -> None:
+        self._engine = engine
+        self._cache = cache
+        self._everything = settings.plan == "everything"
+        self._average_memory = AverageMemory()
+        self._facts = FactsFinder(everything=self._everything)
+
+    def render(
+        self,
+        context: FrameContext,
+        spine: SpineOutputs,
+        settings: Settings,
+        reuse: ReuseDecision,
+        request: RenderRequest,
+    ) -> RenderResult:
+        """What is requested of a frame, and the plan that says what was left out."""
+        if not request.is_drawn:
+            culled = {**spine.left_out, **dict.fromkeys(effect_names("picture"), DRAWN_BY_CLIENT)}
+            return RenderResult(None, None, Plan(run=(), left_out=_left_out(culled)))
+        shown = shown_picture(context.engine, context.camera, spine.frame.color, context.measurement.radiance)
+        cached = self._cache.find(CachedEffects, reuse.version) if reuse.reason is not None else None
+        if cached is not None and reuse.reason is not None:
+            plan = _reused(cached.plan, spine.left_out, reuse.reason)
+            return _composed(context, shown, cached.parts, plan, request)
+        parts, plan = self._run_effects(context, spine, settings, shown)
+        if reuse.reason is not None and spine.period <= TURNS:
+            self._cache.keep(CachedEffects(parts, plan), reuse.version, LASTING)
+        result = _composed(context, shown, parts, plan, request)
+        if reuse.is_checkpoint and request.answer != "light" and spine.objects:
+            return replace(result, reference=self._reference(context, shown, parts, reuse))
+        return result
+
+    def _run_effects(
+        self, context: FrameContext, spine: SpineOutputs, settings: Settings, shown: Picture
+    ) -> tuple[PictureParts, Plan]:
+        """What the picture is composed of, and the plan that made it."""
+        samples, rays = spine.samples, context.rays
+        light = upload_light(self._engine, spine.sh, rays, spine.planes, samples.indirect, context.exposure)
+        gain = self._gain(context, spine, settings, light)  # 7.1, H
+        if spine.objects:
+            light = take_discs(self._engine, light, split_light(spine.sh), rays, context.exposure)  # 7.2.3
+        facts = self._facts.find(context, spine.objects, samples, light, spine.sh, shown, gain)
+        given = _given(context, spine, light, facts)
+        effects = make_plan(EFFECTS, PictureParts, given, facts, everything=self._everything, stages=spine.left_out)
+        parts, plan = effects.execute(given), effects.described()
+        if parts.changed is not None:
+            share = float(self._engine.download(parts.changed).mean())
+            plan = _with_share(plan, share, has_sharp_shadows=bool(light.discs))
+        return parts, plan
+
+    def _gain(self, context: FrameContext, spine: SpineOutputs, settings: Settings, light: DeviceLight) -> float:
+        """By which virtual things are brighter than the light makes them, to match the averages of the picture."""
+        wished, transfer = settings.tone_mapping, spine.samples.transfer
+        keeps_scale = wished == "light" or (wished == "auto" and spine.is_light_given)
+        if not spine.objects or transfer is None or keeps_scale:
+            return 1.0
+        found = measure_averages(
+            self._engine,
+            context.camera,
+            context.measurement.radiance,
+            context.surface,
+            transfer,
+            context.volume,
+            context.rays,
+            light,
+            spine.samples.indirect,
+            context.ray_length_m,
+        )
+        return self._average_memory.update(found, context.exposure).gain
+
+    def _reference(self, context: FrameContext, shown: Picture, parts: PictureParts, reuse: ReuseDecision) -> Picture:
+        """The virtual things of this frame over what the camera saw when the view began."""
+        first = self._cache.find(FirstSight, reuse.view_version)
+        if first is None:
+            first = self._cache.keep(FirstSight(shown.copy(), context.measurement), reuse.view_version)
+        context = replace(context, measurement=first.measurement)
+        return composite(context.engine, first.shown, composite_inputs(context, parts))
+
+
+def _given(context: FrameContext, spine: SpineOutputs, light: DeviceLight, facts: SceneFacts) -> dict[Resource, object]:
+    """The resources that effects begin with; a reason in place of one that is absent."""
+    samples = spine.samples
+    return {
+        FrameContext: context,
+        DeviceLight: light,
+        VirtualObjects: spine.objects or NO_OBJECT,
+        KnownLight: light if spine.sh.any() else NO_LIGHT,
+        SharpLight: light if light.discs else SOFT,
+        RealDepthViews: spine.depth_views or TRACED,
+        Transfer: samples.transfer or NO_OBJECT,
+        Indirect: samples.indirect or NO_INDIRECT,
+        ReturnedRadiance: facts.returned,
+        Gain: facts.gain,
+    }
+
+
+def composite_inputs(context: FrameContext, parts: PictureParts) -> CompositeInputs:
+    """The arguments of the kernels that put the parts together, over the camera's picture of `context`."""
+    return CompositeInputs(
+        camera=context.camera,
+        volume_from_camera=context.volume_from_camera,
+        radiance=context.measurement.radiance,
+        surface=context.surface,
+        tolerance_m=context.volume.voxel_m,
+        light=parts.light,
+        virtual=parts.virtual,
+        occluded=parts.occluded,
+        ratio=parts.bounced or parts.ratio,
+        refined_occluded=parts.refined_occluded,
+        refined_ratio=parts.refined_ratio,
+        upsampling=context.sampling.upsampling,
+        coverage=parts.coverage,
+        reflected=parts.reflected,
+        gain=parts.gain,
+        direct_virtual=_direct_virtual(context, parts),
+        direct_ratio=parts.direct_ratio,
+        reached=parts.changed,
+    )
+
+
+def _direct_virtual(context: FrameContext, parts: PictureParts) -> cl_array.Array | None:
+    """What the discs of the light bring to virtual surface: zeros where this was left out."""
+    if parts.direct_virtual is not None or parts.virtual is None or not parts.light.discs:
+        return parts.direct_virtual
+    return context.engine.workspace.constant("unlit", np.zeros(context.surface.positions.shape, cl_types.float4))
+
+
+def _composed(
+    context: FrameContext, shown: Picture, parts: PictureParts, plan: Plan, request: RenderRequest
+) -> RenderResult:
+    """The picture, the layer, or both."""
+    engine, inputs = context.engine, composite_inputs(context, parts)
+    layer = compose_layer(engine, inputs) if request.answer == "layer" else None
+    picture = composite(engine, shown, inputs) if request.wants_picture else None
+    ends = [name for name, end in ((COMPOSE_LAYER, layer), (COMPOSITE, picture)) if end is not None]
+    return RenderResult(picture, layer, structs.replace(plan, run=(*plan.run, *ends)))
+
+
+def _reused(plan: Plan, left_out: Mapping[str, CullReason], reason: CullReason) -> Plan:
+    """The plan of a frame whose effects were made by an earlier one."""
+    held = _left_out(dict.fromkeys((*left_out, *plan.run), reason))
+    others = (left for left in plan.left_out if left.effect not in left_out)
+    return structs.replace(plan, run=(), left_out=(*held, *others))
+
+
+def _with_share(plan: Plan, share: float, *, has_sharp_shadows: bool) -> Plan:
+    """The plan as it turned out. share: of the picture's cells in which real surface changes."""
+    aside = ", sharp shadows aside" if has_sharp_shadows else ""
+    reason = f"virtual things change {100 * share:.0f} % of the picture{aside}, and hardly the rest"
+    said = (
+        structs.replace(left, reason=reason) if left.effect == FAINT_SHADOWS.name else left for left in plan.left_out
+    )
+    return structs.replace(plan, left_out=tuple(said))
+
+
+def _left_out(reasons: Mapping[str, CullReason]) -> tuple[LeftOut, ...]:
+    return tuple(LeftOut(effect=name, reason=why.reason, error_bound=why.error_bound) for name, why in reasons.items())

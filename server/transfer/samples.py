@@ -1,0 +1,91 @@
+"""The radiance transfer of one frame at its samples, and what their surroundings send (thesis 5.1.2, 7.3.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.opencl.engine import Engine
+from server.transfer.indirect import Indirect, observe_indirect
+from server.transfer.radiance_transfer import Directions, Transfer
+from server.transfer.real_depth_views import RealDepthViews
+from server.transfer.sampling import Sampling, TransferSampler
+from server.volume.raycast import Surface
+from server.volume.volume import Volume
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TransferSamples:
+    """Of one frame."""
+
+    transfer: Transfer | None
+    """None: nothing asked for it."""
+    indirect: Indirect | None
+    """None: not modelled."""
+
+
+NO_SAMPLES = TransferSamples(None, None)
+
+
+class SampledTransfer:
+    """Radiance transfer of one session, with what surfaces send to the samples."""
+
+    def __init__(self, engine: Engine, camera: CameraModel, sampling: Sampling, rays: int, bands: int) -> None:
+        self._engine = engine
+        self._camera = camera
+        self._bands = bands
+        self._sampler = TransferSampler(engine, camera, sampling, rays, bands)
+        self._mean_sent = np.zeros(3)
+
+    def use(self, sampling: Sampling, rays: int) -> None:
+        """Sample in another way from now on; what was traced before is forgotten."""
+        self._sampler = TransferSampler(self._engine, self._camera, sampling, rays, self._bands)
+
+    @property
+    def sampling(self) -> Sampling:
+        """As it is used now."""
+        return self._sampler.sampling
+
+    @property
+    def rays(self) -> Directions:
+        """Directions that visibility is tested along."""
+        return self._sampler.rays
+
+    @property
+    def depth_views(self) -> RealDepthViews | None:
+        """What the last transfer was looked up in; None where rays are traced."""
+        return self._sampler.looks
+
+    @property
+    def period(self) -> int:
+        """Frames after which a still view is sampled the same again."""
+        return self._sampler.period
+
+    def skip_frame(self) -> None:
+        """A frame without transfer counts in the sequence of direction sets all the same."""
+        self._sampler.pass_frame()
+
+    def sample(
+        self,
+        volume: Volume,
+        surface: Surface,
+        volume_from_camera: Floats,
+        up: Floats,
+        ray_length_m: float,
+        *,
+        with_indirect: bool,
+    ) -> TransferSamples:
+        """Transfer of the real world alone (eq. 5.2). up: [3] unit, world axes."""
+        transfer = self._sampler.transfer(volume, surface, volume_from_camera, up, ray_length_m)
+        if not with_indirect:
+            return TransferSamples(transfer, None)
+        rays = self._sampler.rays
+        sent = observe_indirect(self._engine, self._camera, volume, surface, transfer, rays, ray_length_m)
+        if sent.mean.any():  # where next to nothing is hidden, noise decides whether anything is met
+            self._mean_sent = sent.mean
+        return TransferSamples(transfer, replace(sent, mean=self._mean_sent))

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from types import NoneType, UnionType
-from typing import Any, Generic, TypeVar, get_args, get_type_hints
+from typing import Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from protocol.messages import LeftOut, Plan
 from server.culling.reason import ALLOWANCE, CullReason
@@ -254,7 +254,7 @@ def wanted_reads(wanted: type[Any]) -> tuple[Read, ...]:
 def _reads(hints: Mapping[str, Any]) -> tuple[Read, ...]:
     reads = []
     for name, hint in hints.items():
-        choices = get_args(hint) if isinstance(hint, UnionType) else (hint,)
+        choices = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
         resource = next(choice for choice in choices if choice is not NoneType)
         reads.append(Read(name, resource, NoneType in choices))
     return tuple(reads)

@@ -17,7 +17,7 @@ from server.reuse.temporal_reuse import ECHO, NOISE
 PURPOSES = {
     "rasterize": "draws the virtual objects",
     "cover": "finds how much of each pixel they cover, for smooth edges",
-    "look_around": "draws the depth pictures that visibility is looked up in",
+    "draw_depth_views": "draws the depth pictures that visibility is looked up in",
     "prepare_rays": "brings together what rays are traced through",
     "shadow_map": "draws the objects as the light's sharp parts see them",
     "light_objects": "lights the objects, for what they send to real things and to one another",
@@ -29,8 +29,7 @@ PURPOSES = {
     "shade_virtual": "shadows virtual things by real ones and by one another",
     "refine_virtual": "sharpens shadows on virtual things near their edges",
     "refine_real": "sharpens the rims of shadows on real things",
-    "shadow_everywhere": "shadows real things where that is hardly seen, too",
-    "find_reach": "finds the parts of the picture in which virtual things change real ones",
+    "mark_changes": "finds the parts of the picture in which virtual things change real ones",
     "direct_virtual": "lights virtual things by the light's sharp parts",
     "direct_real": "throws the sharp shadows of virtual things on real ones",
     "match_average": "makes virtual things as bright beside the picture as real ones",

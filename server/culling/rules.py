@@ -55,6 +55,8 @@ NO_OBJECT = CullReason("there is no virtual object", 0.0)
 NO_LIGHT = CullReason("no light has been found yet", SHOWN)
 NO_INDIRECT = CullReason("asked for: no indirect light", SHOWN)
 TRACED = CullReason("the preset traces rays through the volume", 0.0)
+OWN_SCALE = CullReason("asked for: virtual things keep the light's own scale", SHOWN)
+NOTHING_TO_MATCH = CullReason("the picture or its shading is empty or black: the light's own scale holds", SHOWN)
 SOFT = CullReason("the light is soft", 0.0)
 """The whole light is in what rays bring: there is nothing to make a shadow map of."""
 

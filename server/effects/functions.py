@@ -12,6 +12,7 @@ from server.effects.resources import (
     DirectReal,
     DirectVirtual,
     FaintShadows,
+    Gain,
     KnownLight,
     RefinedReal,
     RefinedVirtual,
@@ -31,6 +32,7 @@ from server.shading.depth_views import DepthViews
 from server.shading.differential_rendering import RealShadow
 from server.shading.reflect import reflect_surroundings
 from server.shading.shadow_map import DirectSamples, ShadowMaps
+from server.shading.tone_mapping import Averages
 from server.shading.traced_scene import Changed, TracedScene, trace_scene
 from server.shading.virtual_point_lights import VirtualPointLights, place_points
 from server.transfer.indirect import Indirect
@@ -198,6 +200,11 @@ def mark_changes(
         context.sampling.upsampling,
     )
     return ChangeMask(mask)
+
+
+def match_average(averages: Averages) -> Gain:
+    """How much brighter than the light's own scale virtual things are, to match the picture (7.1, H)."""
+    return Gain(averages.gain)
 
 
 def direct_virtual(context: FrameContext, virtual: VirtualSurface, maps: ShadowMaps) -> DirectVirtual:

@@ -116,8 +116,13 @@ class EffectPlan(Generic[T]):
         there = {resource: value for resource, value in given.items() if not isinstance(value, CullReason)}
         there |= self.chosen
         for effect in self.order:
-            there[effect.writes] = effect.run(**_arguments(effect.reads, there))
+            there[effect.writes] = run_effect(effect, _arguments(effect.reads, there))
         return self.wanted(**_arguments(wanted_reads(self.wanted), there))
+
+
+def run_effect(effect: Effect[Any], arguments: Mapping[str, Any]) -> object:
+    """The one place where effects are called: timers and test doubles attach here."""
+    return effect.run(**arguments)
 
 
 def make_plan(

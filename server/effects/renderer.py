@@ -15,11 +15,10 @@ from protocol.frames import RgbdFrame
 from protocol.messages import LeftOut, Plan
 from server.culling.facts_finder import FactsFinder
 from server.culling.reason import CullReason
-from server.culling.rules import NO_INDIRECT, NO_LIGHT, NO_OBJECT, SOFT, TRACED
+from server.culling.rules import NO_INDIRECT, NO_LIGHT, NO_OBJECT, NOTHING_TO_MATCH, OWN_SCALE, SOFT, TRACED
 from server.culling.scene_facts import SceneFacts
 from server.effects.plan import Resource, make_plan
 from server.effects.resources import (
-    Gain,
     KnownLight,
     PictureParts,
     ReturnedRadiance,
@@ -38,7 +37,7 @@ from server.reuse.frame_cache import FrameCache
 from server.reuse.temporal_reuse import ReuseDecision
 from server.shading.composite import CompositeInputs, composite, shown_picture
 from server.shading.layer import Layer, compose_layer
-from server.shading.tone_mapping import AverageMemory, measure_averages
+from server.shading.tone_mapping import AverageMemory, Averages, measure_averages
 from server.shading.traced_scene import DeviceLight, take_discs, upload_light
 from server.transfer.indirect import Indirect
 from server.transfer.radiance_transfer import TURNS, Transfer
@@ -161,11 +160,12 @@ class Renderer:
         """What the picture is composed of, and the plan that made it."""
         samples, rays = spine.samples, context.rays
         light = upload_light(self._engine, spine.sh, rays, spine.planes, samples.indirect, context.exposure)
-        gain = self._gain(context, spine, settings, light)  # 7.1, H
+        averages = self._averages(context, spine, settings, light)  # 7.1, H
         if spine.objects:
             light = take_discs(self._engine, light, split_light(spine.sh), rays, context.exposure)  # 7.2.3
+        gain = averages.gain if averages is not None else 1.0
         facts = self._facts.find(context, spine.objects, samples, light, spine.sh, shown, gain)
-        given = _given(context, spine, light, facts)
+        given = _given(context, spine, light, averages, facts)
         effects = make_plan(EFFECTS, PictureParts, given, facts, everything=self._everything, stages=spine.left_out)
         parts, plan = effects.execute(given), effects.described()
         if parts.changed is not None:
@@ -173,12 +173,14 @@ class Renderer:
             plan = _with_share(plan, share, has_sharp_shadows=bool(light.discs))
         return parts, plan
 
-    def _gain(self, context: FrameContext, spine: SpineOutputs, settings: Settings, light: DeviceLight) -> float:
-        """By which virtual things are brighter than the light makes them, to match the averages of the picture."""
+    def _averages(
+        self, context: FrameContext, spine: SpineOutputs, settings: Settings, light: DeviceLight
+    ) -> Averages | None:
+        """Mean luminances of the picture and of its shading; None where virtual things are not to match them."""
         wished, transfer = settings.tone_mapping, spine.samples.transfer
         keeps_scale = wished == "light" or (wished == "auto" and spine.is_light_given)
         if not spine.objects or transfer is None or keeps_scale:
-            return 1.0
+            return None
         found = measure_averages(
             self._engine,
             context.camera,
@@ -191,7 +193,7 @@ class Renderer:
             spine.samples.indirect,
             context.ray_length_m,
         )
-        return self._average_memory.update(found, context.exposure).gain
+        return self._average_memory.update(found, context.exposure)
 
     def _reference(self, context: FrameContext, shown: Picture, parts: PictureParts, reuse: ReuseDecision) -> Picture:
         """The virtual things of this frame over what the camera saw when the view began."""
@@ -202,7 +204,9 @@ class Renderer:
         return composite(context.engine, first.shown, composite_inputs(context, parts))
 
 
-def _given(context: FrameContext, spine: SpineOutputs, light: DeviceLight, facts: SceneFacts) -> dict[Resource, object]:
+def _given(
+    context: FrameContext, spine: SpineOutputs, light: DeviceLight, averages: Averages | None, facts: SceneFacts
+) -> dict[Resource, object]:
     """The resources that effects begin with; a reason in place of one that is absent."""
     samples = spine.samples
     return {
@@ -215,8 +219,14 @@ def _given(context: FrameContext, spine: SpineOutputs, light: DeviceLight, facts
         Transfer: samples.transfer or NO_OBJECT,
         Indirect: samples.indirect or NO_INDIRECT,
         ReturnedRadiance: facts.returned,
-        Gain: facts.gain,
+        Averages: _to_match(averages),
     }
+
+
+def _to_match(averages: Averages | None) -> Averages | CullReason:
+    if averages is None:
+        return OWN_SCALE
+    return averages if averages.are_known else NOTHING_TO_MATCH
 
 
 def composite_inputs(context: FrameContext, parts: PictureParts) -> CompositeInputs:
@@ -236,7 +246,7 @@ def composite_inputs(context: FrameContext, parts: PictureParts) -> CompositeInp
         upsampling=context.sampling.upsampling,
         coverage=parts.coverage,
         reflected=parts.reflected,
-        gain=parts.gain,
+        gain=1.0 if parts.gain is None else parts.gain,
         direct_virtual=_direct_virtual(context, parts),
         direct_ratio=parts.direct_ratio,
         reached=parts.changed,

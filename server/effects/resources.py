@@ -21,8 +21,6 @@ KnownLight = NewType("KnownLight", DeviceLight)
 """The light, once one has been found."""
 SharpLight = NewType("SharpLight", DeviceLight)
 """The light, where it has discs that need shadow maps."""
-Gain = NewType("Gain", float)
-"""By which virtual surface is brighter than the light makes it (7.1, H)."""
 ReturnedRadiance = NewType("ReturnedRadiance", float)
 """The most that the radiance of real surface can change by, in the picture's units: all of it can be hidden."""
 
@@ -39,6 +37,8 @@ class FaintShadows:
 
 # Written by effects. Arrays are [h, w] float4 on the device.
 
+Gain = NewType("Gain", float)
+"""By which virtual surface is brighter than the light makes it (7.1, H)."""
 Coverage = NewType("Coverage", cl_array.Array)
 """Of rasterize.py: how much of each pixel the objects cover."""
 ChangedScene = NewType("ChangedScene", TracedScene)
@@ -74,7 +74,8 @@ class PictureParts:
     refined_ratio: RefinedReal | None = None
     coverage: Coverage | None = None
     reflected: Reflected | None = None
-    gain: Gain = Gain(1.0)
+    gain: Gain | None = None
+    """None: the light's own scale."""
     direct_virtual: DirectVirtual | None = None
     direct_ratio: DirectReal | None = None
     changed: ChangeMask | None = None

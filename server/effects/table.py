@@ -39,6 +39,7 @@ EFFECTS: EffectTable[SceneFacts] = EffectTable(
         Effect(f.mark_changes),
         Effect(f.direct_virtual, culled_by=(rules.unlit,)),
         Effect(f.direct_real),
+        Effect(f.match_average, culled_by=(rules.out_of_view, rules.unlit)),
     ),
     (FAINT_SHADOWS,),
 )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from statistics import median
@@ -20,11 +20,12 @@ import pyopencl as cl
 import trimesh
 
 from client.laptop.source import open_source
-from server import rendering
 from server.client_session import ClientSession
+from server.effects import plan, renderer
 from server.effects.plan import Effect
 from server.scene.mesh import Mesh, load_mesh
 from server.scene.placement import Placement
+from server.shading.composite import composite
 from tests.bench.finished import Part
 from tests.bench.light_runs import at_preset, refusal, wishes_for
 from tests.bench.rendering_common import PRESETS
@@ -64,14 +65,15 @@ class StageClock:
         self.wall_ms[name].append((time.perf_counter() - wall) * 1e3)
         self.cpu_ms[name].append((time.process_time() - cpu) * 1e3)
 
-    def execute(self, order: Sequence[Effect[Any]], given: Mapping[str, Any], wanted: str) -> Any:
-        """As `server.effects.plan.execute`, with the time of each effect."""
-        resources = dict(given)
-        for effect in order:
-            reads = {name: resources[name] for name in effect.reads if name in resources}
-            with self.timed(effect.name):
-                resources[effect.writes] = effect.run(**reads)
-        return resources[wanted]
+    def run_effect(self, effect: Effect[Any], arguments: Mapping[str, Any]) -> object:
+        """As `server.effects.plan.run_effect`, with the time that it takes."""
+        with self.timed(effect.name):
+            return effect.run(**arguments)
+
+    def composite(self, *arguments: Any) -> Any:
+        """As `server.shading.composite.composite`, with the time that it takes."""
+        with self.timed("composite"):
+            return composite(*arguments)
 
 
 def speed_part(run: Run) -> Part:
@@ -133,7 +135,11 @@ def clocked(pipeline: ClientSession, clock: StageClock) -> Iterator[None]:
             else:
                 yield
 
-    with patch.object(profile, "stage", timed_stage), patch.object(rendering, "execute", clock.execute):
+    with (
+        patch.object(profile, "stage", timed_stage),
+        patch.object(plan, "run_effect", clock.run_effect),
+        patch.object(renderer, "composite", clock.composite),
+    ):
         yield
 
 

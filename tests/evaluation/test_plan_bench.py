@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
@@ -17,8 +18,10 @@ from protocol.messages import LeftOut, Plan
 from server.client_session import ClientSession
 from server.culling import facts_finder
 from server.culling.influence_bound import NOWHERE
-from server.culling.rules import ELSEWHERE, spared
-from server.effects import functions as effect_functions
+from server.culling.rules import ELSEWHERE, faint_pixel_share, faint_sample_share
+from server.effects import renderer
+from server.effects.resources import FaintShadows
+from server.effects.table import EFFECTS, FAINT_SHADOWS
 from server.opencl.device import Device
 from server.reuse.temporal_reuse import NOISY
 from server.scene.mesh import load_mesh
@@ -125,15 +128,17 @@ def test_what_is_placed_and_moved_before_a_resting_view_is_drawn(device: Device)
 
 def test_a_bound_that_is_wrong_is_seen(device: Device) -> None:
     """Where shadows are taken to reach nothing, they are missing."""
-    with patch.object(facts_finder, "measure_reach", lambda *_: NOWHERE):
+    with patch.object(facts_finder, "bound_influence", lambda *_: NOWHERE):
         found = differences(device, "soft-sky", frames=1)
     assert not holds(*found[0][:2])
     assert not found[0][2]
 
 
 def test_parts_of_the_picture_that_are_too_small_are_seen(device: Device) -> None:
-    """Where ten times as much is spared as is said, it shows beside a shadow."""
-    with patch.object(effect_functions, "spared", lambda: 10 * spared()):
+    """Where shadows ten times as strong as is said are left out, it shows beside a shadow."""
+    too_much = FaintShadows(10 * faint_pixel_share(), 10 * faint_sample_share())
+    table = replace(EFFECTS, approximations=(replace(FAINT_SHADOWS, coarse=too_much),))
+    with patch.object(renderer, "EFFECTS", table):
         found = differences(device, "soft-sky", frames=1)
     assert found[0][0] == ELSEWHERE
     assert not holds(*found[0][:2])

@@ -18,7 +18,7 @@ from server.objects.virtual_object import VirtualObject
 from server.opencl.engine import Engine
 from server.opencl.program import KERNEL_FOLDER
 from server.shading import depth_views as stage
-from server.shading.depth_views import DepthViews, ViewShape, look_around, view_axes
+from server.shading.depth_views import DepthViews, ViewShape, draw_depth_views, view_axes
 from server.shading.traced_scene import TracedScene, trace_scene, upload_light
 from server.transfer.auxiliary_views import ViewsAround
 from server.transfer.image_space import nearest_views
@@ -99,7 +99,7 @@ def looks_of(
     real = RealDepthViews(
         around.update(volume), nearest, CAMERA, camera_from_volume, surface, depths, near_m, RATIO, THRESHOLD
     )
-    return look_around(engine, real, objects), surface
+    return draw_depth_views(engine, real, objects), surface
 
 
 def far_away(engine: Engine) -> list[Placed]:

@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from server.effects import functions as effects
-from server.effects.functions import View, add_objects
 from server.light.continuation import NO_PLANES, Continuation, PlaneArrays
 from server.maths.direct_lights import DirectLight, SplitLight, split_light
 from server.maths.directional_fit import directional_sh
@@ -46,6 +45,7 @@ from tests.kernels.test_indirect import WALL as WALL_COLOR
 from tests.kernels.test_indirect import floor_beside_a_wall, wall_seen_from
 from tests.kernels.test_lanes import Narrow, Wide
 from tests.reference import shadow_map as twin
+from tests.scenes.contexts import context_of
 from tests.solids import SIDE_M, Ball, Box, Scene, ball, box, download4, fill_volume, float4, floor, hit, upload_surface
 from tests.tolerance import relative_tolerance
 
@@ -370,11 +370,11 @@ def test_an_umbra_keeps_what_surfaces_send(engine: Engine) -> None:
     indirect = observe_indirect(engine, camera, volume, surface, transfer, rays, FAR_M)
     rest = upload_light(engine, even, rays, indirect=indirect)
     split = take_discs(engine, rest, SplitLight(even, (light,)), rays)
-    objects, view = [placed(engine, bar)], View(engine, camera, np.eye(4), FAR_M)
+    objects, context = [placed(engine, bar)], context_of(engine, camera, surface, volume, rays, FAR_M)
     maps = draw_shadow_maps(engine, volume, split, objects, FAR_M)
     scene = trace_scene(engine, volume, split, rays, FAR_M, objects)
-    samples = effects.light_samples(view, surface, transfer, maps)
-    shadow = effects.shadow_real(view, surface, transfer, scene, indirect, None, maps, samples)
+    samples = effects.light_samples(context, transfer, maps)
+    shadow = effects.shadow_real(context, transfer, scene, indirect, None, maps, samples)
     parts = trace_real(engine, camera, surface, shadow, maps)
     pixels = download4(engine, light_real(engine, camera, surface, shadow, parts, maps)).astype(float)
     assert isinstance(shadow.whole, RealShadow)
@@ -520,9 +520,10 @@ def test_surfaces_send_what_the_whole_light_is_changed_to(engine: Engine) -> Non
     rays, camera = direction_sets(81, 4), camera_of(np.zeros((16, 16, 3)))
     traced = trace_scene(engine, scene.maps.volume, scene.maps.light, rays, FAR_M, [placed(engine, CRATE)])
     surface = upload_surface(engine, np.zeros((16, 16, 3)), np.zeros((16, 16, 3)), np.zeros((16, 16), bool))
-    whole, view = SampleGrid(4, samples), View(engine, camera, np.eye(4), FAR_M)
+    whole = SampleGrid(4, samples)
+    context = context_of(engine, camera, surface, scene.maps.volume, rays, FAR_M)
     for ratio, expected in ((RealShadow(4, samples, samples, whole), whole), (RealShadow(4, samples, samples), None)):
-        changed = add_objects(view, surface, traced, None, ratio).changed
+        changed = effects.add_objects(context, traced, None, ratio, None).changed
         assert changed is not None
         assert changed.ratio is (expected or ratio)
 

@@ -16,12 +16,11 @@ from server.input.measure import linear_values
 from server.maths.microfacets import most_reflected, reflected_share
 from server.maths.sh import lambert_transfer, sh_basis, spherical_fibonacci
 from server.shading.composite import srgb_codes
-from server.shading.tone_mapping import Averages
 
 LEVELS = np.linspace(0.0, 1.0, 1001)
 DARK = Brightness(picture=0.0, arriving=1e-5, shading=1e-5, object_sent=1e-6, real_sent=0.0)
 LIT = Brightness(picture=0.9, arriving=2.0, shading=1.0, object_sent=0.4, real_sent=0.9)
-FACTS = SceneFacts(objects=1, objects_in_view=1, has_light=True, indirect=True, brightness=LIT, reach=UNKNOWN)
+FACTS = SceneFacts(objects_in_view=1, indirect=True, brightness=LIT, reach=UNKNOWN)
 
 
 def test_codes_are_srgb() -> None:
@@ -67,7 +66,7 @@ def test_gloss_is_bounded_by_its_materials() -> None:
 
 @pytest.mark.parametrize("rule", [o.unlit, o.matt, o.out_of_reach, o.dark_things, o.nothing_bounces, o.no_rims])
 def test_what_is_not_known_is_not_left_out(rule: object) -> None:
-    facts = SceneFacts(objects=1, objects_in_view=1, has_light=True, indirect=True, glossy=True)
+    facts = SceneFacts(objects_in_view=1, indirect=True, glossy=True)
     assert rule(facts) is None  # type: ignore[operator]
 
 
@@ -76,7 +75,7 @@ def test_nothing_is_lit_in_the_dark() -> None:
     assert o.unlit(FACTS) is None
     assert o.unlit(dark).error_bound == pytest.approx(o.codes(1e-5))  # type: ignore[union-attr]
     assert o.matt(dark).error_bound == pytest.approx(o.codes(1e-5))  # type: ignore[union-attr]
-    bright = replace(dark, averages=Averages(0.5, 1e-3, 9))  # a gain of a thousand
+    bright = replace(dark, gain=1000.0)
     assert o.unlit(bright) is None
 
 
@@ -110,9 +109,9 @@ def test_rims_are_only_where_the_ratio_varies() -> None:
 
 def test_what_is_spared_elsewhere_is_shared_out() -> None:
     """Among what is left as it is, and light that bounces off it; no byte of a picture shows less than half a code."""
-    both = o.spared() + o.spared_bounces()
+    both = o.faint_pixel_share() + o.faint_sample_share()
     assert o.codes_of_share(both) == pytest.approx(o.ELSEWHERE)
-    assert o.hardly_changed(FACTS).error_bound == o.ELSEWHERE
+    assert o.faint_shadows(FACTS).error_bound == o.ELSEWHERE
     codes = np.arange(256)
     radiance = linear_values("srgb8").astype(float)
     for share in (1 - 0.99 * both, 1 + 0.99 * both):

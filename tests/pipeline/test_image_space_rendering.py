@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 from client.laptop.source import open_source
 from client.laptop.synthetic.lights import disc_light
 from protocol.frames import CameraModel
-from server import rendering
 from server.client_session import ClientSession
 from server.culling.reason import CullReason
+from server.effects import renderer
 from server.maths.rigid import inverse_rigid
 from server.objects.rasterize import Placed, VirtualSurface
 from server.objects.virtual_object import VirtualObject
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.scene.placement import Placement
-from server.shading.depth_views import look_around
+from server.shading.depth_views import draw_depth_views
 from server.shading.differential_rendering import shadow_real, shadow_virtual
 from server.shading.traced_scene import TracedScene, trace_scene, upload_light
 from server.transfer.auxiliary_views import ViewsAround
@@ -95,7 +95,7 @@ def stand(engine: Engine, scene: Scene, objects: list[Placed], side_m: float = 0
     )
     light = upload_light(engine, lights.uniform(), RAYS)
     traced = trace_scene(engine, volume, light, RAYS, FAR_M, objects)
-    return Stand(engine, replace(traced, looks=look_around(engine, real, objects)))
+    return Stand(engine, replace(traced, looks=draw_depth_views(engine, real, objects)))
 
 
 def around_point(middle: Floats, half_m: float) -> Floats:
@@ -216,13 +216,12 @@ def pictures(device: Device, source: str, preset: str, indirect: str, traced: bo
         "box", shape_of(trimesh.creation.box((0.5, 0.3, 0.4))), Placement(position_m=(-0.3, 0.0, 0.0))
     )
     pipeline.place_object("ball", shape_of(trimesh.creation.icosphere(4, 0.2)), Placement(position_m=(0.4, 0.0, 0.2)))
+    by_rays = (lambda _facts: CullReason("traced for comparison", 0.0),)
     effects = tuple(
-        replace(e, omitted=lambda _: CullReason("traced for comparison", 0.0))
-        if traced and e.name == "look_around"
-        else e
-        for e in rendering.EFFECTS
+        replace(e, disabled_by=by_rays) if traced and e.name == "draw_depth_views" else e
+        for e in renderer.EFFECTS.effects
     )
-    with patch.object(rendering, "EFFECTS", effects):
+    with patch.object(renderer, "EFFECTS", replace(renderer.EFFECTS, effects=effects)):
         result = pipeline.process(opened[0])
     pipeline.close()
     return result.color.astype(float), result.plan.run
@@ -234,7 +233,7 @@ def test_both_families_agree(device: Device, indirect: str) -> None:
     source = "synthetic:room?size=160x120"
     looked, run = pictures(device, source, "gr15fast", indirect, traced=False)
     traced, other_run = pictures(device, source, "gr15fast", indirect, traced=True)
-    assert set(run) - set(other_run) == {"look_around"}
+    assert set(run) - set(other_run) == {"draw_depth_views"}
     without = open_source(source)[0].color.astype(float)
     changed = (np.abs(traced - without) > 1).any(-1)
     assert changed.mean() > 0.05

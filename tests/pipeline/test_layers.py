@@ -14,7 +14,7 @@ from client.laptop.gallery.source import GallerySource
 from protocol.codec import encode
 from protocol.messages import Wishes
 from server.client_session import ClientSession
-from server.effects.table import EFFECTS
+from server.effects.table import effect_names
 from server.opencl.device import Device
 from server.pipeline import FrameResult
 from server.scene.mesh import load_mesh
@@ -66,7 +66,7 @@ def test_a_light_is_found_without_drawing(device: Device) -> None:
     assert first.layer is None
     assert first.plan.run == ()
     reasons = {left.effect: left.reason for left in first.plan.left_out}
-    assert {effect.name for effect in EFFECTS} <= reasons.keys()
+    assert {*effect_names("picture")} <= reasons.keys()
     assert "draws by itself" in reasons["composite"]
     assert first.timings.rendering < 1.0
     assert watched.color is not None
@@ -111,7 +111,7 @@ def test_a_lost_camera_has_a_layer_of_nothing(device: Device) -> None:
     assert lost.layer == watched.layer == NOTHING
     assert lost.color is None
     np.testing.assert_array_equal(watched.color, blind.color)
-    assert {left.effect for left in lost.plan.left_out} == {effect.name for effect in EFFECTS} - {"composite"}
+    assert {left.effect for left in lost.plan.left_out} == {*effect_names("layer")}
 
 
 def test_a_view_that_rests_keeps_its_layer(device: Device) -> None:

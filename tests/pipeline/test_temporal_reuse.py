@@ -12,12 +12,24 @@ from protocol.frames import CameraModel, RgbdFrame
 from server.culling.reason import ALLOWANCE, CullReason
 from server.light.continuation import NO_PLANES
 from server.opencl.engine import Engine
-from server.reuse.temporal_reuse import ECHO_FRAMES, NOISE, NOISY, RATE, ROUND, ROUNDING, SAME, SHARE, TemporalReuse
+from server.reuse.temporal_reuse import (
+    ECHO_FRAMES,
+    NOISE,
+    NOISY,
+    RATE,
+    ROUND,
+    ROUNDING,
+    SAME,
+    SHARE,
+    SceneVersion,
+    TemporalReuse,
+)
 from tests import lights
 
 CAMERA = CameraModel(width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
 SHAPE = (48, 64)
 FRAME = RgbdFrame(0, 0.0, np.full((*SHAPE, 3), 90, np.uint8), np.full(SHAPE, 900, np.uint16), np.eye(4), 1.0)
+SCENE = SceneVersion()
 LIGHT = lights.lobe_and_sky((0.3, 0.8, 0.4))
 PICTURE = np.full((*SHAPE, 3), 90, np.uint8)
 PLANES: Any = (np.ones((1, 4, 4), np.float32), np.ones((1, 4), np.int32), np.zeros(1, np.uint8))
@@ -31,20 +43,21 @@ def noisy(index: int) -> RgbdFrame:
     return replace(FRAME, index=index, color=color, depth=depth)
 
 
-def fed(rest: TemporalReuse, frames: int, step: float = 0.0, **learnt: Any) -> CullReason | None:
+def fed(reuse: TemporalReuse, frames: int, step: float = 0.0, **learnt: Any) -> CullReason | None:
     """What is found after so many frames that are alike, whose light grows by the share `step` each."""
     for index in range(frames):
-        if not rest.holds(replace(FRAME, index=index)):
-            rest.learn(LIGHT * (1 + index * step), learnt.get("planes", NO_PLANES), learnt.get("picture"))
-    return rest.omission
+        decision = reuse.decide(replace(FRAME, index=index), SCENE)
+        sh, planes = LIGHT * (1 + index * step), learnt.get("planes", NO_PLANES)
+        reuse.observe(decision, sh, planes, learnt.get("picture") if decision.is_checkpoint else None)
+    return reuse._reason
 
 
-def fed_noise(rest: TemporalReuse, frames: int, pictures: Any = lambda _index: PICTURE) -> CullReason | None:
+def fed_noise(reuse: TemporalReuse, frames: int, pictures: Any = lambda _index: PICTURE) -> CullReason | None:
     """The same of frames that differ by noise."""
     for index in range(frames):
-        if not rest.holds(noisy(index)):
-            rest.learn(LIGHT, NO_PLANES, pictures(index) if rest.is_checkpoint else None)
-    return rest.omission
+        decision = reuse.decide(noisy(index), SCENE)
+        reuse.observe(decision, LIGHT, NO_PLANES, pictures(index) if decision.is_checkpoint else None)
+    return reuse._reason
 
 
 def test_it_rests_once_a_round_has_repeated(engine: Engine) -> None:
@@ -63,19 +76,36 @@ def test_it_rests_once_a_round_has_repeated(engine: Engine) -> None:
     ],
 )
 def test_what_is_new_is_looked_at(engine: Engine, change: dict[str, Any]) -> None:
-    rest = TemporalReuse(engine, CAMERA)
-    assert fed(rest, ROUND) is not None
-    assert rest.holds(FRAME)
-    assert not rest.holds(replace(FRAME, **change))
-    assert rest.omission is None
-    assert not rest.holds(FRAME)  # and so is what then follows
+    reuse = TemporalReuse(engine, CAMERA)
+    assert fed(reuse, ROUND) is not None
+    before = reuse.decide(FRAME, SCENE)
+    assert before.keeps_geometry
+    changed = reuse.decide(replace(FRAME, **change), SCENE)
+    assert not changed.keeps_geometry
+    assert changed.reason is None
+    assert changed.version.view != before.version.view
+    assert not reuse.decide(FRAME, SCENE).keeps_geometry  # and so is what then follows
 
 
-def test_other_lamps_are_new(engine: Engine) -> None:
-    rest = TemporalReuse(engine, CAMERA)
-    assert fed(rest, ROUND) is not None
-    lamp: Any = object()
-    assert not rest.holds(FRAME, (lamp,))
+@pytest.mark.parametrize(
+    "scene",
+    [SceneVersion(others=1), SceneVersion(losses=1), SceneVersion(sampling=1), SceneVersion(lamps=(object(),))],  # type: ignore[arg-type]
+)
+def test_what_pictures_do_not_show_begins_a_view(engine: Engine, scene: SceneVersion) -> None:
+    reuse = TemporalReuse(engine, CAMERA)
+    assert fed(reuse, ROUND) is not None
+    assert not reuse.decide(FRAME, scene).keeps_geometry
+
+
+def test_an_object_that_moves_is_drawn_anew_in_a_view_that_holds(engine: Engine) -> None:
+    reuse, thing = TemporalReuse(engine, CAMERA), object()
+    objects: Any = [(thing, np.eye(4))]
+    assert fed(reuse, ROUND) is not None
+    first, same = (reuse.decide(FRAME, SCENE, objects) for _ in range(2))
+    moved = reuse.decide(FRAME, SCENE, [(thing, 2 * np.eye(4))])  # type: ignore[list-item]
+    assert first.version.objects == same.version.objects != moved.version.objects
+    assert moved.keeps_geometry
+    assert moved.samples_version.view == first.samples_version.view
 
 
 def test_a_light_that_still_moves_is_followed(engine: Engine) -> None:
@@ -89,11 +119,10 @@ def test_a_light_that_still_moves_is_followed(engine: Engine) -> None:
 
 
 def test_planes_that_come_are_news(engine: Engine) -> None:
-    rest = TemporalReuse(engine, CAMERA)
-    fed(rest, ROUND - 1)
-    rest.holds(FRAME)
-    rest.learn(LIGHT, PLANES, None)
-    assert rest.omission is None
+    reuse = TemporalReuse(engine, CAMERA)
+    fed(reuse, ROUND - 1)
+    reuse.observe(reuse.decide(FRAME, SCENE), LIGHT, PLANES, None)
+    assert reuse.decide(FRAME, SCENE).reason is None
 
 
 def test_it_rests_under_noise(engine: Engine) -> None:
@@ -105,8 +134,8 @@ def test_a_picture_that_has_not_settled_is_drawn_anew(engine: Engine) -> None:
     """Two codes at one pixel in a hundred, between half the frames and all."""
     spotted = PICTURE.copy()
     spotted[::10, ::10] += 2
-    rest = TemporalReuse(engine, CAMERA)
-    assert fed_noise(rest, NOISY, lambda index: spotted if index + 1 == NOISY else PICTURE) is None
+    reuse = TemporalReuse(engine, CAMERA)
+    assert fed_noise(reuse, NOISY, lambda index: spotted if index + 1 == NOISY else PICTURE) is None
 
 
 def test_a_tracked_camera_with_objects_does_not_rest(engine: Engine) -> None:
@@ -115,21 +144,22 @@ def test_a_tracked_camera_with_objects_does_not_rest(engine: Engine) -> None:
 
 
 def test_the_surface_is_renewed_when_twice_as_many_frames_were_seen(engine: Engine) -> None:
-    rest = TemporalReuse(engine, CAMERA)
-    fed_noise(rest, NOISY)
-    holds = [rest.holds(noisy(index)) for index in range(NOISY, 2 * NOISY + 2)]
-    assert holds == [index + 1 != 2 * NOISY for index in range(NOISY, 2 * NOISY + 2)]
-    assert rest.omission is not None
+    reuse = TemporalReuse(engine, CAMERA)
+    fed_noise(reuse, NOISY)
+    decisions = [reuse.decide(noisy(index), SCENE) for index in range(NOISY, 2 * NOISY + 2)]
+    kept = [decision.keeps_geometry for decision in decisions]
+    assert kept == [index + 1 != 2 * NOISY for index in range(NOISY, 2 * NOISY + 2)]
+    assert all(decision.reason is not None for decision in decisions)
 
 
 def test_what_a_light_has_missed_is_said_afterwards(engine: Engine) -> None:
     still, moving = TemporalReuse(engine, CAMERA), TemporalReuse(engine, CAMERA)
     fed(still, ROUND)
     fed(moving, ROUND, 1e-5 * RATE)
-    for rest in (still, moving):
-        rest.holds(replace(FRAME, exposure=2.0))
-    assert still.echo is None
-    assert moving.echo is not None
-    for _ in range(ECHO_FRAMES):
-        moving.learn(LIGHT, NO_PLANES, None)
-    assert moving.echo is None
+    bright = replace(FRAME, exposure=2.0)
+    assert still.decide(bright, SCENE).echo is None
+    assert moving.decide(bright, SCENE).echo is not None
+    for index in range(ECHO_FRAMES):
+        moved = replace(bright, index=index, exposure=3.0 + index)
+        moving.observe(moving.decide(moved, SCENE), LIGHT, NO_PLANES, None)
+    assert moving.decide(bright, SCENE).echo is None

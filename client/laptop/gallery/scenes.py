@@ -119,12 +119,12 @@ _NOISE: dict[str, Any] = {
     "noise_codes": 2.5,
     "depth_noise": 1.0,
     "settles": range(SETTLED, SETTLED_NOISY),
-    "hangs": frozenset({"bounce_real", "shadow_everywhere"}),
+    "hangs": frozenset({"bounce_real"}),
 }
 
 _DRAWN = {"rasterize", "cover", "composite"}
 _SHADED = _DRAWN | {"prepare_rays", "add_objects", "shade_virtual"}
-_STANDS = _SHADED | {"light_objects", "shadow_real", "find_reach"}
+_STANDS = _SHADED | {"light_objects", "shadow_real", "mark_changes"}
 _MAPPED = {"shadow_map", "light_samples", "direct_real"}
 
 
@@ -146,7 +146,7 @@ GALLERY: dict[str, GalleryScene] = {
         "a ball beside the picture, whose shadow the sun throws into it",
         _FLOOR,
         _SUN,
-        _always({"composite", "prepare_rays", "light_objects", "shadow_real", "find_reach", "bounce_real"}, _MAPPED),
+        _always({"composite", "prepare_rays", "light_objects", "shadow_real", "mark_changes", "bounce_real"}, _MAPPED),
         (Thing(0.3, (1.15, 0.35, 0.2)),),
     ),
     "floating": GalleryScene(
@@ -245,12 +245,7 @@ GALLERY: dict[str, GalleryScene] = {
         "a matt ball on a floor in the sun, before a camera that stands still",
         _FLOOR,
         _SUN,
-        lambda index: frozenset(
-            _STANDS
-            | _MAPPED
-            | {"direct_virtual", "bounce_real"}
-            | ({"shadow_everywhere"} if index >= SETTLED else set())
-        ),
+        _always(_STANDS, _MAPPED, {"direct_virtual", "bounce_real"}),
         (_BALL,),
         walk_m=0.0,
         frames=STILL_FRAMES,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -46,7 +45,10 @@ class Arena:
     """[512] float32: linear value of a texel's byte."""
 
 
-_LAST: WeakKeyDictionary[Engine, Arena] = WeakKeyDictionary()
+class _LastArena:
+    """The arena of an engine's frame before."""
+
+    arena: Arena | None = None
 
 
 def gather(engine: Engine, things: Sequence[VirtualObject]) -> Arena:
@@ -55,9 +57,10 @@ def gather(engine: Engine, things: Sequence[VirtualObject]) -> Arena:
     A single mesh is not copied: its own arrays are the arena's.
     """
     unique = tuple({id(thing): thing for thing in things}.values())
-    last = _LAST.get(engine)
+    kept = engine.state(_LastArena)
+    last = kept.arena
     if last is None or not _is_valid(engine, last) or [*map(id, last.things)] != [*map(id, unique)]:
-        last = _LAST[engine] = _gathered(engine, unique)
+        last = kept.arena = _gathered(engine, unique)
     return last
 
 

@@ -1,11 +1,10 @@
-"""Pictures that are one value all over but for a box, drawn anew each frame: what lies outside is not gone over."""
+"""Pictures that are one value outside of a box, drawn anew each frame: only the box and the last one are written."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import reduce
-from weakref import WeakKeyDictionary
 
 import pyopencl.array as cl_array
 
@@ -15,15 +14,22 @@ from server.opencl.engine import Engine
 EMPTY: PixelBox = (0, 0, 0, 0)
 
 
+class _DirtyRegions:
+    """By the name of each picture of an engine: its array, and the box outside of which it is one value."""
+
+    def __init__(self) -> None:
+        self.boxes: dict[str, tuple[cl_array.Array, PixelBox]] = {}
+
+
 @contextmanager
 def dirty_region(
     engine: Engine, name: str, array: cl_array.Array, box: PixelBox, whole: PixelBox
 ) -> Iterator[PixelBox]:
-    """The box to go over so that only `box` of `array` differs from what it is outside: that, and the last time's.
+    """The box to write so that only `box` of `array` differs from the value outside: that box and the one before it.
 
     name: of the workspace's array. whole: all of it, for its first time. Boxes are half-open, in whatever unit.
     """
-    held = _PAINTED.setdefault(engine, {})
+    held = engine.state(_DirtyRegions).boxes
     before = held.get(name)
     region = union(before[1], box) if before is not None and before[0] is array else whole
     held[name] = (array, region)  # so much may differ where this frame fails
@@ -46,6 +52,3 @@ def union(a: PixelBox, b: PixelBox) -> PixelBox:
 def is_empty(box: PixelBox) -> bool:
     """Whether nothing lies in it."""
     return box[0] >= box[2] or box[1] >= box[3]
-
-
-_PAINTED: WeakKeyDictionary[Engine, dict[str, tuple[cl_array.Array, PixelBox]]] = WeakKeyDictionary()

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import TYPE_CHECKING
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import pyopencl as cl
@@ -162,8 +161,10 @@ def object_table(engine: Engine, objects: Sequence[tuple[VirtualObject, Matrix]]
     )
 
 
-_POOLED: WeakKeyDictionary[Engine, tuple[cl_array.Array, ...]] = WeakKeyDictionary()
-"""The grids whose distances are in each engine's pool, in their order."""
+class _PooledGrids:
+    """The grids whose distances are in an engine's pool, in their order."""
+
+    grids: tuple[cl_array.Array, ...] = ()
 
 
 def _gather_distances(engine: Engine, grids: list[cl_array.Array]) -> tuple[cl_array.Array, dict[int, int]]:
@@ -176,10 +177,10 @@ def _gather_distances(engine: Engine, grids: list[cl_array.Array]) -> tuple[cl_a
     total = sum(grid.size for grid in unique)
     if total >= 1 << 31:
         raise ValueError(f"the objects' distance grids have {total} cells, more than 2^31: place fewer objects")
-    held, before = _POOLED.get(engine, ()), engine.workspace.find("object_distances")
+    pooled, before = engine.state(_PooledGrids), engine.workspace.find("object_distances")
     pool = engine.workspace.array("object_distances", (max(total, 1),), np.float32)
-    if pool is not before or [*map(id, held)] != [*map(id, unique)]:
+    if pool is not before or [*map(id, pooled.grids)] != [*map(id, unique)]:
         for grid in unique:
             copy_into(engine.queue, pool, 4 * starts[id(grid)], grid)
-        _POOLED[engine] = unique
+        pooled.grids = unique
     return pool, starts

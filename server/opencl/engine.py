@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import pyopencl as cl
@@ -15,6 +15,7 @@ from server.opencl.device import Device
 from server.opencl.profile import Profile
 from server.opencl.program import Define, define_options
 
+State = TypeVar("State")
 KernelArgument = cl_array.Array | np.generic | int | float | None
 
 
@@ -31,6 +32,7 @@ class Engine:
         self.profile: Profile = beside.profile if beside else Profile()
         self._kernels: dict[tuple[object, ...], cl.Kernel] = beside._kernels if beside else {}
         self._typed: dict[int, cl.Kernel] = beside._typed if beside else {}
+        self._states: dict[type[Any], Any] = {}
 
     @property
     def lanes(self) -> int:
@@ -66,6 +68,13 @@ class Engine:
         event = kernel(self.queue, rounded, local, *passed)
         self.profile.add_event(kernel.function_name, event)
 
+    def state(self, kind: type[State]) -> State:
+        """The one instance of `kind` that belongs to this engine, made on first use: what a stage keeps of the frame
+        before, beside its arrays in the workspace."""
+        if kind not in self._states:
+            self._states[kind] = kind()
+        return cast(State, self._states[kind])
+
     def download(self, array: cl_array.Array) -> NDArray[Any]:
         """Copy to the host; waits for everything queued before."""
         result: NDArray[Any] = array.get()
@@ -74,6 +83,7 @@ class Engine:
     def close(self) -> None:
         """Wait for the device and give its memory back."""
         self.queue.finish()
+        self._states.clear()
         self.workspace.release()
 
 

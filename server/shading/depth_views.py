@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -91,11 +90,11 @@ class DepthViews:
 
 def draw_depth_views(engine: Engine, real: RealDepthViews, objects: Sequence[Placed]) -> DepthViews:
     """The pictures of one frame; those of objects that are new are drawn."""
-    held = _HELD.setdefault(engine, _ObjectViews())
+    views = engine.state(_ObjectViews)
     grids = [thing.grid for thing, _ in objects]
-    slots = held.slots_of(engine, grids)
-    assert held.texels is not None
-    return DepthViews(real, held.shape, held.texels, engine.workspace.upload("object_slots", slots))
+    slots = views.slots_of(engine, grids)
+    assert views.texels is not None
+    return DepthViews(real, views.shape, views.texels, engine.workspace.upload("object_slots", slots))
 
 
 class _ObjectViews:
@@ -135,9 +134,6 @@ class _ObjectViews:
         if before is not None:
             copy_into(engine.queue, self.texels, 0, before)
         self._grids += [None] * (room - len(self._grids))
-
-
-_HELD: WeakKeyDictionary[Engine, _ObjectViews] = WeakKeyDictionary()
 
 
 def draw_object(engine: Engine, grid: DistanceGrid, shape: ViewShape, texels: cl_array.Array | None, slot: int) -> None:

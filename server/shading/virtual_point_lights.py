@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -90,19 +89,21 @@ class _Gathered:
     """[objects, 4]."""
 
 
-_GATHERED: WeakKeyDictionary[Engine, _Gathered] = WeakKeyDictionary()
-"""Of each engine's last objects: they move from frame to frame, but seldom change."""
+class _LastGathered:
+    """Of an engine's objects in the frame before: they move, but seldom change."""
+
+    points: _Gathered | None = None
 
 
 def _gather(engine: Engine, surfaces: tuple[SurfacePoints, ...]) -> _Gathered:
-    held = _GATHERED.get(engine)
-    if held is not None and [*map(id, held.surfaces)] == [*map(id, surfaces)]:
-        return held
+    last = engine.state(_LastGathered)
+    if last.points is not None and [*map(id, last.points.surfaces)] == [*map(id, surfaces)]:
+        return last.points
     counts, sizes = [len(s.points) for s in surfaces], [s.nearest[..., 0].size for s in surfaces]
     first, start = np.cumsum([0, *counts[:-1]]), np.cumsum([0, *sizes[:-1]])
     nearest = np.concatenate([s.nearest.ravel() for s in surfaces])
     shift = np.repeat(first, np.multiply(sizes, SIDES))
-    gathered = _Gathered(
+    last.points = _Gathered(
         surfaces,
         np.repeat(np.arange(len(surfaces)), counts),
         np.concatenate([s.points for s in surfaces]),
@@ -111,8 +112,7 @@ def _gather(engine: Engine, surfaces: tuple[SurfacePoints, ...]) -> _Gathered:
         np.where(nearest >= 0, nearest + shift, -1).astype(np.int32),
         np.column_stack([[s.nearest.shape[2::-1] for s in surfaces], start]).astype(np.int32),
     )
-    _GATHERED[engine] = gathered
-    return gathered
+    return last.points
 
 
 def place_points(engine: Engine, objects: Sequence[Placed]) -> PlacedPoints:

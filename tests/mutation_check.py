@@ -1,7 +1,7 @@
 """Do the tests see small faults? Changes one operator, constant or condition at a time and runs the tests of its stem.
 
-`python -m tests.mutation_check --seed 18 --count 30` draws changes from the kernels and from server/ and protocol/, each
-place as likely as any other, and applies each to a copy of the tree. The tests of its stem are the test files with the
+`python -m tests.mutation_check --seed 18 --count 30` draws changes from the kernels, server/ and protocol/, each place
+as likely as any other, and applies each to a copy of the tree. The tests of its stem are the test files with the
 stem in their name, or else those that import the module. A change that they do not see survives; `--whole` then runs
 `make test` on each survivor. Changes that do not compile are drawn again. Writes out/mutations.json.
 """
@@ -134,7 +134,7 @@ def all_mutations() -> list[Mutation]:
 
 
 def tests_of(path: str) -> list[str]:
-    """Test files with the stem in their name; where there are none, those that import the module, or a kernel's host."""
+    """Test files with the stem in their name, or else those that import the module, for a kernel its host."""
     stems = {Path(path).stem} | (
         {kernel.stem for kernel in _users(Path(path).name)} if path.endswith(".clh") else set()
     )
@@ -194,9 +194,8 @@ def main() -> None:
             if verdict is not None:
                 verdicts.append(verdict)
                 place = f"{mutation.path}:{mutation.line}"
-                print(
-                    f"{len(verdicts):3} {verdict.outcome:20} {place} {mutation.before} -> {mutation.after}  {verdict.by}"
-                )
+                change = f"{mutation.before} -> {mutation.after}"
+                print(f"{len(verdicts):3} {verdict.outcome:20} {place} {change}  {verdict.by}", flush=True)
     caught = sum(verdict.outcome != "survived" for verdict in verdicts)
     print(f"{caught} of {len(verdicts)} caught ({100 * caught / len(verdicts):.0f} %), out of {len(found)} places")
     (ROOT / "out").mkdir(exist_ok=True)

@@ -41,8 +41,9 @@ class ClientObjects:
         if object_id not in self._waiting:
             self._room.objects.move(object_id, self._alignment.placed(placement))
             return
-        mesh, _ = self._waiting.pop(object_id)
+        mesh, _ = self._waiting[object_id]
         check_size(mesh, placement)
+        del self._waiting[object_id]
         self._waiting[object_id] = mesh, placement
 
     def remove(self, object_id: str) -> None:

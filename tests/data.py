@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.absent import NO_DATA
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -13,5 +15,5 @@ def data_folder(name: str) -> Path:
     base = Path(os.environ.get("PROBELESS_DATA", ROOT.parent / "shared" / "data"))
     path = base / name
     if not path.exists():
-        pytest.skip(f"public data set {name} is not at {base} (set PROBELESS_DATA)")
+        pytest.skip(f"{NO_DATA} {name} is not at {base} (set PROBELESS_DATA)")
     return path

@@ -20,6 +20,7 @@ from client.laptop.oak import OakSource, open_oak  # noqa: E402
 from client.laptop.oak_frames import FrameReader  # noqa: E402
 from client.laptop.oak_nodes import Outputs, build_nodes, has_odometry, left_from_color  # noqa: E402
 from client.laptop.oak_pose import FLU_FROM_CAMERA, UP  # noqa: E402
+from tests.absent import NO_HARDWARE  # noqa: E402
 
 FPS = 30.0
 LENS = np.array([[60.0, 0, 31.0], [0, 61.0, 23.0], [0, 0, 1]])
@@ -165,7 +166,7 @@ def test_a_camera_that_goes_is_told(start) -> None:
 
 def test_without_a_camera_one_line_says_what_else_there_is(capfd) -> None:
     if dai.Device.getAllAvailableDevices():
-        pytest.skip("an OAK camera is connected")
+        pytest.skip(f"{NO_HARDWARE}an OAK camera is connected")
     with pytest.raises(SourceError, match=r"no OAK camera.*synthetic:table"):
         open_oak()
     assert capfd.readouterr() == ("", "")

@@ -1,8 +1,7 @@
-"""With Ray: a node is killed and its rooms come back. Opt-in: minutes, and gigabytes."""
+"""With Ray: a node is killed and its rooms come back."""
 
 import importlib.util
 import json
-import os
 import subprocess
 import sys
 
@@ -12,7 +11,7 @@ BACK_WITHIN_S = 30.0
 
 
 @pytest.mark.cluster
-@pytest.mark.skipif(os.environ.get("PROBELESS_CLUSTER") != "1", reason="starts Ray: set PROBELESS_CLUSTER=1")
+@pytest.mark.alone
 @pytest.mark.skipif(
     importlib.util.find_spec("ray") is None or importlib.util.find_spec("grpc") is None,
     reason="needs the extra cluster: make install-cluster",

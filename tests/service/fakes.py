@@ -16,7 +16,7 @@ from server.meshing.scene_mesh import SceneMesh
 from server.meshing.surface import MeshingError
 from server.shading.layer import Layer, LayerPart
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 CAMERA = CameraModel(width=48, height=32, fx=40.0, fy=41.0, cx=23.5, cy=15.5)
 POSE = np.array([[0, -1, 0, 0.125], [1, 0, 0, 0.1], [0, 0, 1, -2.5], [0, 0, 0, 1]], np.float64)
 

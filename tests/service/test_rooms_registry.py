@@ -11,7 +11,7 @@ import pytest
 from protocol.messages import Wishes
 from server.service.rooms import RoomLocked, Rooms, lock_of
 
-PATIENCE_S = 10.0
+PATIENCE_S = 60.0
 
 
 class House:

@@ -11,6 +11,7 @@ import pytest
 
 from server.service.serve import BackgroundServer, ServeError, listen, serve, url_of
 from server.service.service import Service
+from tests.absent import NO_HARDWARE
 from tests.data import ROOT
 from tests.service.fakes import FAKE_DEVICE, PATIENCE_S, fake_mesh
 from tests.service.wire import Wire
@@ -55,7 +56,7 @@ def test_url_of_all_addresses_is_one_that_opens() -> None:
 
 def test_ipv6_url_has_brackets() -> None:
     if not socket.has_ipv6:
-        pytest.skip("this machine has no IPv6")
+        pytest.skip(f"{NO_HARDWARE}no IPv6")
     with listen("::1", 0) as listener:
         assert url_of(listener) == f"http://[::1]:{listener.getsockname()[1]}"
 

@@ -55,7 +55,7 @@ def test_a_certificate_whose_time_is_nearly_over_is_made_again(tmp_path: Path, m
 
 def test_the_fingerprint_is_what_openssl_says(certificate: Certificate) -> None:
     if shutil.which("openssl") is None:
-        pytest.skip("this machine has no openssl")
+        pytest.skip("there is no openssl: apt-get install openssl")
     command = ["openssl", "x509", "-noout", "-fingerprint", "-sha256", "-in", certificate.certificate]
     said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert said.strip().endswith(certificate.fingerprint)

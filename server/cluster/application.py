@@ -12,8 +12,8 @@ from fastapi import FastAPI
 from ray import serve
 
 from server.cluster.ingress import Ingress, create_ingress_app
-from server.cluster.keeper import Keeper
-from server.cluster.ray_places import RayPlaces
+from server.cluster.ray_directory import RayRoomDirectory
+from server.cluster.room_supervisor import RoomSupervisor
 from server.cluster.settings import ClusterSettings, read_settings
 from server.service.authenticator import Authenticator, is_token
 
@@ -23,9 +23,9 @@ TOKEN = "PROBELESS_TOKEN"
 class IngressReplica:
     """One replica: its sockets."""
 
-    def __init__(self, settings: ClusterSettings, door: Authenticator, _keeper: object) -> None:
-        """`_keeper`: named here, so that Serve runs one."""
-        self._ingress = Ingress(RayPlaces(settings), door)
+    def __init__(self, settings: ClusterSettings, authenticator: Authenticator, _supervisor: object) -> None:
+        """`_supervisor`: named here, so that Serve runs one."""
+        self._ingress = Ingress(RayRoomDirectory(settings), authenticator)
 
     def __serve_build_asgi_app__(self) -> FastAPI:
         """Called by Serve."""
@@ -35,8 +35,12 @@ class IngressReplica:
 def build(args: dict[str, Any]) -> Any:
     """The application. Raises ValueError where a setting is wrong."""
     settings = read_settings(args)
-    keeper = serve.deployment(
-        Keeper, name="keeper", num_replicas=1, ray_actor_options={"num_cpus": 0.1}, graceful_shutdown_timeout_s=5.0
+    supervisor = serve.deployment(
+        RoomSupervisor,
+        name="room-supervisor",
+        num_replicas=1,
+        ray_actor_options={"num_cpus": 0.1},
+        graceful_shutdown_timeout_s=5.0,
     )
     ingress = serve.deployment(
         serve.ingress()(IngressReplica),
@@ -50,10 +54,10 @@ def build(args: dict[str, Any]) -> Any:
         ray_actor_options={"num_cpus": settings.ingress_cpus},
         graceful_shutdown_timeout_s=10.0,
     )
-    return ingress.bind(settings, door_from_environment(), keeper.bind(settings))
+    return ingress.bind(settings, authenticator_from_environment(), supervisor.bind(settings))
 
 
-def door_from_environment() -> Authenticator:
+def authenticator_from_environment() -> Authenticator:
     """Raises ValueError where no token is set, or one that cannot be one."""
     token = os.environ.get(TOKEN, "")
     if token == "none":

@@ -13,9 +13,9 @@ from urllib.parse import urlsplit
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from server.cluster.places import Address
+from server.cluster.node_warm_up import warm_up_node
+from server.cluster.room_directory import Address
 from server.cluster.settings import ClusterSettings
-from server.cluster.warmth import warm_up_node
 from server.service.authenticator import Authenticator, new_token
 from server.service.limits import DEFAULT_LIMITS, MIB, Limits
 from server.service.serve import BackgroundServer
@@ -47,7 +47,7 @@ class RoomHost:
         token = new_token()
         self._node = node
         self._service = service
-        self._server = BackgroundServer(service, host=address, door=Authenticator(token))
+        self._server = BackgroundServer(service, host=address, authenticator=Authenticator(token))
         self._address = Address(f"ws://{urlsplit(self._server.url).netloc}", token)
         self._last_client_s = time.monotonic()
         self._aged = (0.0, 0.0)

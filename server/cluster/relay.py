@@ -12,7 +12,7 @@ from websockets.protocol import State
 from websockets.typing import Subprotocol
 
 from protocol.limits import MAX_MESSAGE_BYTES, SUBPROTOCOL
-from server.cluster.places import Address
+from server.cluster.room_directory import Address
 from server.cluster.routing import outgoing
 from server.service.connection import GOING_AWAY, INTERNAL, LOST, NO_CODE, NORMAL, RESTART
 

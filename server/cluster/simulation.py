@@ -189,6 +189,6 @@ def _resized(nodes: list[Node], wanted: int, now_s: float, fleet: Fleet) -> list
     """More nodes at once, to be ready later; fewer only by those that are empty."""
     if len(nodes) < wanted:
         return nodes + [Node(now_s + fleet.start_s) for _ in range(wanted - len(nodes))]
-    surplus = len(nodes) - wanted
-    gone = [node for node in reversed(nodes) if not node.rooms][:surplus]
+    items_to_remove = len(nodes) - wanted
+    gone = [node for node in reversed(nodes) if not node.rooms][:items_to_remove]
     return [node for node in nodes if not any(node is one for one in gone)]

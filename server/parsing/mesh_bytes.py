@@ -15,7 +15,7 @@ from server.scene.mesh import Mesh
 
 MAX_NOTES = 1000
 MAX_MATERIALS = 20_000
-GREATEST_BYTES = 16 * MAX_TRIANGLES + 52 * MAX_VERTICES + 8 * MAX_KEPT_PIXELS + (64 << 20)
+MAX_PACKED_BYTES = 16 * MAX_TRIANGLES + 52 * MAX_VERTICES + 8 * MAX_KEPT_PIXELS + (64 << 20)
 
 
 class _Texture(Struct, array_like=True):

@@ -15,17 +15,17 @@ from protocol.codec import ProtocolError
 from protocol.colors import ColorReader
 from protocol.frames import CameraModel
 from protocol.limits import MAX_IMAGE_PIXELS
-from server.parsing.children import IS_POSSIBLE, ChildDied, Children, Work
-from server.parsing.mesh_bytes import GREATEST_BYTES, mesh_from_bytes
+from server.parsing.mesh_bytes import MAX_PACKED_BYTES, mesh_from_bytes
+from server.parsing.process_pool import IS_SUPPORTED, ChildDied, JobSpec, ProcessPool
 from server.scene.limits import MeshError
 from server.scene.mesh import Mesh, load_mesh
 
-MESH_WORK = Work("server.parsing.read_mesh:read_mesh", 4096, patience_s=30.0, greatest_answer=GREATEST_BYTES)
-PICTURE_WORK = Work(
+MESH_WORK = JobSpec("server.parsing.read_mesh:read_mesh", 4096, timeout_s=30.0, max_answer_bytes=MAX_PACKED_BYTES)
+PICTURE_WORK = JobSpec(
     "server.parsing.read_picture:read_picture",
     1024,
-    patience_s=5.0,
-    greatest_answer=4096,
+    timeout_s=5.0,
+    max_answer_bytes=4096,
     shared_bytes=3 * MAX_IMAGE_PIXELS,
 )
 VIDEO_WORK = replace(PICTURE_WORK, job="server.parsing.read_video:read_video")
@@ -39,23 +39,23 @@ class Parsers:
 
     def __init__(
         self,
-        mesh_work: Work = MESH_WORK,
-        picture_work: Work = PICTURE_WORK,
-        video_work: Work = VIDEO_WORK,
+        mesh_work: JobSpec = MESH_WORK,
+        picture_work: JobSpec = PICTURE_WORK,
+        video_work: JobSpec = VIDEO_WORK,
     ) -> None:
         self.on_death: Callable[[str], None] = lambda _kind: None
         """Called, by the thread that waits, with `mesh`, `picture` or `video` for each child that dies at work."""
-        self.meshes = Children(mesh_work, MESH_CHILDREN, lambda: self.on_death("mesh"))
-        self.pictures = Children(picture_work, PICTURE_CHILDREN, lambda: self.on_death("picture"))
+        self.meshes = ProcessPool(mesh_work, MESH_CHILDREN, lambda: self.on_death("mesh"))
+        self.pictures = ProcessPool(picture_work, PICTURE_CHILDREN, lambda: self.on_death("picture"))
         self._video_work = video_work
-        self._videos: set[Children] = set()
+        self._videos: set[ProcessPool] = set()
         """One child for each session that sends video."""
         self._changing = threading.Lock()
         self._has_stopped = False
 
     def start(self) -> None:
         """One child of each kind begins to load, without being waited for."""
-        if IS_POSSIBLE:
+        if IS_SUPPORTED:
             self.meshes.start_one()
             self.pictures.start_one()
 
@@ -71,7 +71,7 @@ class Parsers:
 
     def load_mesh(self, data: bytes, file_format: str) -> Mesh:
         """As server.scene.mesh.load_mesh. Raises MeshError, also where the file takes too much or kills its reader."""
-        if not IS_POSSIBLE:
+        if not IS_SUPPORTED:
             return load_mesh(data, file_format)
         try:
             answer = self.meshes.ask(file_format.encode() + b"\n" + data)
@@ -84,20 +84,20 @@ class Parsers:
 
     def color_reader(self, camera: CameraModel) -> ColorReader:
         """For one session's colour; to be closed."""
-        return ColorReader(camera, self._decompress, self._open_video) if IS_POSSIBLE else ColorReader(camera)
+        return ColorReader(camera, self._decompress, self._open_video) if IS_SUPPORTED else ColorReader(camera)
 
     def _decompress(self, data: bytes) -> NDArray[np.uint8]:
         return _picture_of(self.pictures, data)
 
     def _open_video(self) -> _Video:
-        children = Children(self._video_work, 1, lambda: self.on_death("video"))
+        children = ProcessPool(self._video_work, 1, lambda: self.on_death("video"))
         with self._changing:
             self._videos.add(children)
             if self._has_stopped:
                 children.stop()
         return _Video(children, self._forget)
 
-    def _forget(self, children: Children) -> None:
+    def _forget(self, children: ProcessPool) -> None:
         with self._changing:
             self._videos.discard(children)
 
@@ -105,7 +105,7 @@ class Parsers:
 class _Video:
     """A child of a session's own; one that dies is followed by one that knows nothing."""
 
-    def __init__(self, children: Children, on_close: Callable[[Children], None]) -> None:
+    def __init__(self, children: ProcessPool, on_close: Callable[[ProcessPool], None]) -> None:
         self._children, self._on_close = children, on_close
 
     def decode(self, data: bytes) -> NDArray[np.uint8]:
@@ -116,7 +116,7 @@ class _Video:
         self._children.stop()
 
 
-def _picture_of(children: Children, data: bytes) -> NDArray[np.uint8]:
+def _picture_of(children: ProcessPool, data: bytes) -> NDArray[np.uint8]:
     """Raises ProtocolError."""
     try:
         picture = children.ask(data, _shared_picture)

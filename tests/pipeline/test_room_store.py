@@ -35,9 +35,9 @@ from server.volume.volume import Volume
 from tests import corners
 from tests.analytic import Floats, look_at
 from tests.corners import FLOOR, WALL, corner_frame
-from tests.kept_rooms import BALL, CUBE, PLACE, client_of, print_of, scan, voxels_of
 from tests.lights import degrees_between, lobe_and_sky
 from tests.rooms import CAMERA, VOXEL_M, frame_at, view_at, wishes
+from tests.saved_rooms import BALL, CUBE, PLACE, client_of, print_of, scan, voxels_of
 
 TOWARDS = (0.5, 0.8, 0.0)
 LIGHT = 0.3 * lobe_and_sky(TOWARDS)
@@ -413,11 +413,11 @@ def test_names_stay_apart_and_inside_the_folder(device: Device, store: RoomStore
     assert len({folder_name(name) for name in NAMES}) == len(NAMES)
     assert {path.name for path in tmp_path.iterdir()} == {"rooms"}
     assert {path.name for path in (tmp_path / "rooms").iterdir()} == {folder_name(name) for name in NAMES}
-    store.forget("../../etc")
+    store.delete("../../etc")
     assert store.load("../../etc", device) is None
     assert "../../etc" not in store.names()
     assert len(store.names()) == len(NAMES) - 1
-    store.forget("never there")
+    store.delete("never there")
 
 
 def test_a_room_of_one_session_is_not_saved(device: Device, store: RoomStore) -> None:

@@ -25,9 +25,9 @@ from protocol.frames import CameraModel
 from protocol.images import decode_color, encode_color
 from protocol.messages import Acknowledged, Composite, Dropped, PlaceObject
 from server.objects.scene_objects import mesh_digest
-from server.parsing.children import ChildDied, Children
 from server.parsing.mesh_bytes import mesh_from_bytes, mesh_to_bytes
 from server.parsing.parsers import MESH_WORK, PICTURE_WORK, Parsers
+from server.parsing.process_pool import ChildDied, ProcessPool
 from server.scene.limits import MeshError
 from server.scene.materials import Beyond, Material, Texture
 from server.scene.mesh import Mesh, load_mesh
@@ -41,7 +41,7 @@ from tests.textured import write_glb
 
 STUBBORN_MESHES = replace(MESH_WORK, job="tests.service.jobs:read_mesh")
 STUBBORN_PICTURES = replace(PICTURE_WORK, job="tests.service.jobs:read_picture")
-IMPATIENT = replace(STUBBORN_MESHES, patience_s=0.2)
+IMPATIENT = replace(STUBBORN_MESHES, timeout_s=0.2)
 
 
 @pytest.fixture(scope="module")
@@ -213,7 +213,7 @@ def test_a_real_file_that_needs_too_much_memory_is_told() -> None:
     faces = np.zeros(len(vertices) // 3, np.dtype([("n", "u1"), ("v", "<i4", 3)]))
     faces["n"], faces["v"] = 3, np.arange(len(faces) * 3).reshape(-1, 3)
     data = header + vertices.tobytes() + faces.tobytes()
-    children = Children(MESH_WORK, 1)
+    children = ProcessPool(MESH_WORK, 1)
     assert len(mesh_from_bytes(children.ask(b"ply\n" + data)).triangles) > 90_000
     (pid,) = children.pids
     status = Path(f"/proc/{pid}/status").read_text().splitlines()
@@ -254,7 +254,7 @@ def test_a_reader_killed_while_idle_costs_nobody_a_mesh(stubborn: Parsers) -> No
 
 def test_a_reader_that_lies_is_not_believed(stubborn: Parsers) -> None:
     assert "is not one" in told(stubborn, b"lie")
-    talkative = Parsers(replace(STUBBORN_MESHES, greatest_answer=100_000))
+    talkative = Parsers(replace(STUBBORN_MESHES, max_answer_bytes=100_000))
     assert "more of it than may be" in told(talkative, b"talk")
     talkative.stop()
 
@@ -404,4 +404,4 @@ def _with_zeros(png: bytes) -> bytes:
 def test_a_child_that_cannot_be_started_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     with pytest.raises(ChildDied, match="could not be started"):
-        Children(MESH_WORK, 1).ask(b"")
+        ProcessPool(MESH_WORK, 1).ask(b"")

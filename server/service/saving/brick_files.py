@@ -13,7 +13,7 @@ import zstandard
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from server.service.saving.files import DamagedFile, read_parts, write_parts
+from server.service.saving.checksummed_files import DamagedFile, read_parts, write_parts
 from server.volume.brick_pool import BRICK_VOXELS
 from server.volume.brick_table import Indices
 

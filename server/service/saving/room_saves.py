@@ -12,11 +12,11 @@ from pathlib import Path
 
 from server.opencl.device import Device
 from server.room.room import Room
-from server.service.saving.files import DamagedFile
-from server.service.saving.moves import Moves, forget_moves, moves_since, read_moves, write_moves
-from server.service.saving.slot import Slot
+from server.service.saving.checksummed_files import DamagedFile
+from server.service.saving.placement_delta import PlacementDelta, delete_delta, delta_since, read_delta, write_delta
+from server.service.saving.room_state import VERSION, Header, state_to_bytes
+from server.service.saving.save_slot import SaveSlot
 from server.service.saving.snapshot import Snapshot, rebuilt, snapshot
-from server.service.saving.state import VERSION, Header, state_to_bytes
 
 SLOTS = ("0", "1")
 NOTE_USE_S = 60.0
@@ -43,7 +43,7 @@ class RoomSaves:
         self.name = name
         self.folder = folder
         self.lock = threading.Lock()
-        self._slots = [Slot(folder / slot) for slot in SLOTS]
+        self._slots = [SaveSlot(folder / slot) for slot in SLOTS]
         self._sequences: list[int] | None = None
         self._next = 0
         self._written: Snapshot | None = None
@@ -76,18 +76,18 @@ class RoomSaves:
         objects = taken.inventory
         return Header(VERSION, self.name, self._next, taken.state.key_digest, objects.revision, objects.owed)
 
-    def save_moves(self, room: Room) -> bool:
+    def save_placements(self, room: Room) -> bool:
         """Whether that was enough: nothing but places of objects has changed since the last save.
 
         Waits neither for a frame nor for a save.
         """
         with self._moves_lock:
             written, now = self._written, room.objects.inventory()
-            moves = moves_since(written.inventory, now) if written else None
+            moves = delta_since(written.inventory, now) if written else None
             if moves is None:
                 return False
             if moves.moved and self._moves_kept != now.revision:
-                write_moves(self.folder, moves)
+                write_delta(self.folder, moves)
                 self._moves_kept = now.revision
             return True
 
@@ -113,20 +113,20 @@ class RoomSaves:
                     return _with_moves(rebuilt(self.name, state, slot, device), header, moves)
             except DamagedFile as error:
                 sequences[number] = 0
-                log.warning("a save of room %r is set aside as %s: %s", self.name, slot.set_aside(), error)
-        forget_moves(self.folder)
+                log.warning("a save of room %r is set aside as %s: %s", self.name, slot.quarantine(), error)
+        delete_delta(self.folder)
         return None
 
-    def _moves_after(self, header: Header) -> Moves | None:
+    def _moves_after(self, header: Header) -> PlacementDelta | None:
         """Of the objects of that save. Raises OSError."""
         try:
-            moves = read_moves(self.folder)
+            moves = read_delta(self.folder)
         except DamagedFile as error:
             log.warning("objects of room %r are where they were some seconds before: %s", self.name, error)
             return None
         if moves is None or moves.follow(header.revision):
             return moves
-        forget_moves(self.folder)  # they are of a save that is not there any more
+        delete_delta(self.folder)  # they are of a save that is not there any more
         return None
 
     def key_digest(self) -> bytes | None:
@@ -148,7 +148,7 @@ class RoomSaves:
         return self._sequences
 
 
-def header_of(slot: Slot) -> Header | None:
+def header_of(slot: SaveSlot) -> Header | None:
     """None also where it is damaged."""
     try:
         return slot.header()
@@ -162,7 +162,7 @@ def _is_same(a: Snapshot, b: Snapshot) -> bool:
     return of_a == of_b and a.inventory.owed == b.inventory.owed and state_to_bytes(a.state) == state_to_bytes(b.state)
 
 
-def _with_moves(room: Room, header: Header, moves: Moves | None) -> Room:
+def _with_moves(room: Room, header: Header, moves: PlacementDelta | None) -> Room:
     """The room with its objects where they have been moved to since that save."""
     for moved in moves.moved if moves else ():
         room.objects.move_back(moved.object_id, moved.place)

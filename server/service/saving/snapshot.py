@@ -15,9 +15,9 @@ from server.room.room import Room
 from server.room.room_objects import Inventory, KeptObject
 from server.scene.placement import Placement
 from server.service.saving.brick_files import Batch, merged
-from server.service.saving.files import DamagedFile, read_parts
-from server.service.saving.slot import Slot
-from server.service.saving.state import KeptMarker, KeptVolume, RoomState
+from server.service.saving.checksummed_files import DamagedFile, read_parts
+from server.service.saving.room_state import RoomState, StoredMarker, StoredVolume
+from server.service.saving.save_slot import SaveSlot
 from server.volume.volume import Volume
 
 log = logging.getLogger(__name__)
@@ -43,7 +43,7 @@ class Snapshot:
         return self.inventory.objects
 
 
-def snapshot(room: Room, slot: Slot) -> Snapshot:
+def snapshot(room: Room, slot: SaveSlot) -> Snapshot:
     """The room now, its bricks as far as `slot` has not got them. Waits for the frame that is in the room."""
     with room.lock:
         start_s = time.perf_counter()
@@ -51,7 +51,7 @@ def snapshot(room: Room, slot: Slot) -> Snapshot:
         return replace(taken, lock_ms=1e3 * (time.perf_counter() - start_s))
 
 
-def snapshot_within(room: Room, slot: Slot) -> Snapshot:
+def snapshot_within(room: Room, slot: SaveSlot) -> Snapshot:
     """The same by whoever holds the room's lock."""
     volume = room.reconstruction.volume
     bricks = list(volume.copies(volume.changed_since(slot.change_of(volume)))) if volume else []
@@ -60,7 +60,7 @@ def snapshot_within(room: Room, slot: Slot) -> Snapshot:
         up=room.objects.up if room.objects.has_begun else None,
         volume=_kept(volume, room.reconstruction.exposure_logarithms) if volume else None,
         keyframes=tuple(room.reconstruction.keyframes.kept()),
-        markers=tuple(KeptMarker(*name, place) for name, place in room.markers.places().items()),
+        markers=tuple(StoredMarker(*name, place) for name, place in room.markers.places().items()),
         light=room.light.known(),
         lamps=room.lamps.found,
         key_digest=room.key_digest,
@@ -68,11 +68,11 @@ def snapshot_within(room: Room, slot: Slot) -> Snapshot:
     return Snapshot(state, room.objects.inventory(), volume, bricks, volume.changes if volume else 0)
 
 
-def _kept(volume: Volume, exposure_logarithms: float) -> KeptVolume:
-    return KeptVolume(volume.bounds_m, volume.voxel_m, volume.frames, exposure_logarithms, volume.places())
+def _kept(volume: Volume, exposure_logarithms: float) -> StoredVolume:
+    return StoredVolume(volume.bounds_m, volume.voxel_m, volume.frames, exposure_logarithms, volume.places())
 
 
-def rebuilt(name: str, state: RoomState, slot: Slot, device: Device) -> Room:
+def rebuilt(name: str, state: RoomState, slot: SaveSlot, device: Device) -> Room:
     """The room of which `state` was read from `slot`. Raises DamagedFile, OSError."""
     room = Room(device, state.wishes, name)
     room.key_digest = state.key_digest
@@ -91,7 +91,7 @@ def rebuilt(name: str, state: RoomState, slot: Slot, device: Device) -> Room:
     return room
 
 
-def _rebuild_volume(room: Room, kept: KeptVolume, slot: Slot) -> None:
+def _rebuild_volume(room: Room, kept: StoredVolume, slot: SaveSlot) -> None:
     volume = Volume(room.engine, kept.bounds_m, kept.voxel_m)
     if kept.places.size and not 0 <= int(kept.places.min()) <= int(kept.places.max()) < int(np.prod(volume.bricks)):
         raise DamagedFile(f"{slot.folder} names bricks beyond the volume")
@@ -101,7 +101,7 @@ def _rebuild_volume(room: Room, kept: KeptVolume, slot: Slot) -> None:
     slot.note_filled(volume)
 
 
-def _rebuild_objects(room: Room, state: RoomState, slot: Slot) -> None:
+def _rebuild_objects(room: Room, state: RoomState, slot: SaveSlot) -> None:
     if state.up is not None:
         room.objects.begin(state.up)
     for kept in state.objects:

@@ -23,7 +23,7 @@ _MOST_BYTES = 1 << 30
 FileName = Annotated[str, Meta(pattern="^[a-z0-9-]+$")]
 
 
-class KeptVolume(Struct, frozen=True, forbid_unknown_fields=True):
+class StoredVolume(Struct, frozen=True, forbid_unknown_fields=True):
     """A volume less its voxels."""
 
     bounds_m: tuple[float, float, float, float, float, float]
@@ -38,7 +38,7 @@ class KeptVolume(Struct, frozen=True, forbid_unknown_fields=True):
     """In all of them together."""
 
 
-class KeptMarker(Struct, frozen=True, forbid_unknown_fields=True):
+class StoredMarker(Struct, frozen=True, forbid_unknown_fields=True):
     """A marker that clients have seen."""
 
     dictionary: str
@@ -46,7 +46,7 @@ class KeptMarker(Struct, frozen=True, forbid_unknown_fields=True):
     room_from_marker: NDArray[np.float64]
 
 
-class KeptPlace(Struct, frozen=True, forbid_unknown_fields=True):
+class StoredObject(Struct, frozen=True, forbid_unknown_fields=True):
     """An object less its mesh; one of the two is there."""
 
     object_id: str
@@ -61,12 +61,12 @@ class RoomState(Struct, frozen=True, forbid_unknown_fields=True):
     wishes: Wishes
     """Of the client that opened it."""
     up: NDArray[np.float64] | None
-    volume: KeptVolume | None
+    volume: StoredVolume | None
     keyframes: tuple[Keyframe, ...]
-    markers: tuple[KeptMarker, ...]
+    markers: tuple[StoredMarker, ...]
     light: KnownRoomLight
     lamps: Found | None
-    objects: tuple[KeptPlace, ...] = ()
+    objects: tuple[StoredObject, ...] = ()
     key_digest: bytes | None = None
     """See Room."""
 

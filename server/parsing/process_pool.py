@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 from server.parsing.child import ANSWER, DONE, READY, REQUEST
 
-IS_POSSIBLE = hasattr(os, "memfd_create") and hasattr(fcntl, "F_ADD_SEALS")
+IS_SUPPORTED = hasattr(os, "memfd_create") and hasattr(fcntl, "F_ADD_SEALS")
 """Whether this system has what it takes."""
 PIPE_BYTES = 1 << 20
-LOADING_PATIENCE_S = 60.0
+LOADING_TIMEOUT_S = 60.0
 STOPPED = "was stopped: the server ends"
 
 
@@ -28,28 +28,28 @@ class ChildDied(Exception):
 
 
 @dataclass(frozen=True)
-class Work:
+class JobSpec:
     """What children of one kind do, and what each may take."""
 
     job: str
     """`module:function`, as server.parsing.child runs it."""
     memory_mib: int
     """Of address space."""
-    patience_s: float
+    timeout_s: float
     """For one request."""
-    greatest_answer: int
+    max_answer_bytes: int
     """Bytes."""
     shared_bytes: int = 0
     """Of memory that the child writes and the server reads."""
 
 
-class Child:
+class ChildProcess:
     """One process. Used by one thread at a time."""
 
-    def __init__(self, work: Work) -> None:
+    def __init__(self, work: JobSpec) -> None:
         self._work = work
         arguments = [sys.executable, "-P", "-m", "server.parsing.child", work.job]
-        arguments += [str(work.memory_mib), str(work.patience_s)]
+        arguments += [str(work.memory_mib), str(work.timeout_s)]
         self.shared: mmap.mmap | None = None
         self._is_ready = False
         descriptors: list[int] = []
@@ -84,12 +84,12 @@ class Child:
     def ask(self, request: bytes) -> bytearray:
         """The answer. Raises ValueError with the child's line, ChildDied; then it is dead."""
         if not self._is_ready:
-            self._is_ready = self._read(len(READY), time.monotonic() + LOADING_PATIENCE_S) == READY
-        deadline_s = time.monotonic() + self._work.patience_s
+            self._is_ready = self._read(len(READY), time.monotonic() + LOADING_TIMEOUT_S) == READY
+        deadline_s = time.monotonic() + self._work.timeout_s
         self._write(memoryview(REQUEST.pack(len(request))), deadline_s)
         self._write(memoryview(request), deadline_s)
         state, size = ANSWER.unpack(self._read(ANSWER.size, deadline_s))
-        if size > self._work.greatest_answer:
+        if size > self._work.max_answer_bytes:
             self.kill()
             raise ChildDied("was stopped: it made more of it than may be")
         body = self._read(size, deadline_s)
@@ -116,7 +116,7 @@ class Child:
             except BlockingIOError:
                 continue
             except BrokenPipeError:
-                self._bury()
+                self._raise_died()
 
     def _read(self, size: int, deadline_s: float) -> bytearray:
         data = bytearray(size)
@@ -128,7 +128,7 @@ class Child:
             except BlockingIOError:
                 continue
             if not count:
-                self._bury()
+                self._raise_died()
             rest = rest[count:]
         return data
 
@@ -138,9 +138,9 @@ class Child:
         left_s = deadline_s - time.monotonic()
         if left_s <= 0 or not poll.poll(left_s * 1e3):
             self.kill()
-            raise ChildDied(f"was stopped: it took more than {self._work.patience_s:g} s")
+            raise ChildDied(f"was stopped: it took more than {self._work.timeout_s:g} s")
 
-    def _bury(self) -> None:
+    def _raise_died(self) -> None:
         """Raises ChildDied with how it ended."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(1.0)
@@ -149,15 +149,15 @@ class Child:
         raise ChildDied("died on it" if code is None or code >= 0 else f"died on it (signal {-code})")
 
 
-class Children:
+class ProcessPool:
     """Of one kind, for any number of threads; the one that worked last works next, so that few are ever needed."""
 
-    def __init__(self, work: Work, most: int, on_death: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, work: JobSpec, most: int, on_death: Callable[[], None] = lambda: None) -> None:
         """Starts none of them yet. `on_death` is called, by the thread that asked, for each that dies at work."""
         self._work = work
         self._on_death = on_death
-        self._idle: queue.LifoQueue[Child | None] = queue.LifoQueue()
-        self._all: set[Child] = set()
+        self._idle: queue.LifoQueue[ChildProcess | None] = queue.LifoQueue()
+        self._all: set[ChildProcess] = set()
         self._stopped = False
         for _ in range(most):
             self._idle.put(None)
@@ -169,11 +169,11 @@ class Children:
 
     def start_one(self) -> None:
         """So that the first request need not wait for the child to load what it works with."""
-        with self._one():
+        with self._borrowed():
             pass
 
     @contextlib.contextmanager
-    def _one(self) -> Iterator[Child]:
+    def _borrowed(self) -> Iterator[ChildProcess]:
         child = self._idle.get()
         try:
             if self._stopped:
@@ -184,12 +184,12 @@ class Children:
         finally:
             self._idle.put(child)
 
-    def _replaced(self, child: Child | None) -> Child:
+    def _replaced(self, child: ChildProcess | None) -> ChildProcess:
         if child is not None:
             self._all.discard(child)
             child.kill()
         try:
-            new = Child(self._work)
+            new = ChildProcess(self._work)
         except OSError as error:
             raise ChildDied(f"could not be started ({error.strerror})") from error
         self._all.add(new)
@@ -200,7 +200,7 @@ class Children:
 
     def ask(self, request: bytes, take: Callable[[bytearray, mmap.mmap | None], object] | None = None) -> object:
         """The answer, or what `take` makes of it and of the shared memory. Raises ValueError, ChildDied."""
-        with self._one() as child:
+        with self._borrowed() as child:
             try:
                 answer = child.ask(request)
             except ChildDied:
@@ -214,7 +214,7 @@ class Children:
         for child in tuple(self._all):
             child.process.kill()
             child.process.wait()
-        idle: list[Child | None] = []
+        idle: list[ChildProcess | None] = []
         with contextlib.suppress(queue.Empty):
             while True:
                 idle.append(self._idle.get_nowait())

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from server.room.room_objects import Inventory, Place
 from server.scene.placement import Placement
-from server.service.saving.files import DamagedFile, check_file, read_parts, sync_folder, write_parts
-from server.service.saving.state import array_from_list, array_to_list
+from server.service.saving.checksummed_files import DamagedFile, check_file, read_parts, sync_folder, write_parts
+from server.service.saving.room_state import array_from_list, array_to_list
 
 VERSION = 1
 MOVES, PART = "moves", "moves.part"
 
 
-class Moved(Struct, frozen=True, forbid_unknown_fields=True):
+class MovedObject(Struct, frozen=True, forbid_unknown_fields=True):
     """One object; one of the two is there."""
 
     object_id: str
@@ -32,21 +32,21 @@ class Moved(Struct, frozen=True, forbid_unknown_fields=True):
         return self.world_from_model if self.world_from_model is not None else self.asked or Placement()
 
 
-class Moves(Struct, frozen=True, forbid_unknown_fields=True):
+class PlacementDelta(Struct, frozen=True, forbid_unknown_fields=True):
     """All objects that stand elsewhere than in the save whose revision is `since`."""
 
     version: int
     since: int
     revision: int
     """Of the objects when they stood so."""
-    moved: tuple[Moved, ...]
+    moved: tuple[MovedObject, ...]
 
     def follow(self, revision: int) -> bool:
         """Whether they belong to a save of that revision: it has the same objects, and stands no later."""
         return self.since <= revision <= self.revision
 
 
-def moves_since(saved: Inventory, now: Inventory) -> Moves | None:
+def delta_since(saved: Inventory, now: Inventory) -> PlacementDelta | None:
     """None where more than places has changed."""
     if saved.has_begun != now.has_begun or saved.owed != now.owed or len(saved.objects) != len(now.objects):
         return None
@@ -54,30 +54,30 @@ def moves_since(saved: Inventory, now: Inventory) -> Moves | None:
     if any(was.object_id != kept.object_id or was.mesh is not kept.mesh for was, kept in pairs):
         return None
     moved = tuple(_moved(kept.object_id, kept.place) for was, kept in pairs if was.place is not kept.place)
-    return Moves(VERSION, saved.revision, now.revision, moved)
+    return PlacementDelta(VERSION, saved.revision, now.revision, moved)
 
 
-def _moved(object_id: str, place: Place) -> Moved:
+def _moved(object_id: str, place: Place) -> MovedObject:
     if isinstance(place, Placement):
-        return Moved(object_id, asked=place)
-    return Moved(object_id, world_from_model=place)
+        return MovedObject(object_id, asked=place)
+    return MovedObject(object_id, world_from_model=place)
 
 
-def write_moves(folder: Path, moves: Moves) -> None:
+def write_delta(folder: Path, moves: PlacementDelta) -> None:
     """In the place of those that there are. Raises OSError, these then stay."""
     write_parts(folder / PART, [msgspec.msgpack.encode(moves, enc_hook=array_to_list)])
     os.replace(folder / PART, folder / MOVES)
     sync_folder(folder)
 
 
-def read_moves(folder: Path) -> Moves | None:
+def read_delta(folder: Path) -> PlacementDelta | None:
     """None where there are none. Raises DamagedFile, OSError."""
     path = folder / MOVES
     if not path.exists():
         return None
     check_file(path)
     try:
-        moves = msgspec.msgpack.decode(next(read_parts(path), b""), type=Moves, dec_hook=array_from_list)
+        moves = msgspec.msgpack.decode(next(read_parts(path), b""), type=PlacementDelta, dec_hook=array_from_list)
     except msgspec.MsgspecError as error:
         raise DamagedFile(f"{path} holds no moves: {error}") from error
     if moves.version != VERSION:
@@ -85,7 +85,7 @@ def read_moves(folder: Path) -> Moves | None:
     return moves
 
 
-def forget_moves(folder: Path) -> None:
+def delete_delta(folder: Path) -> None:
     """Raises OSError."""
     if (folder / MOVES).exists():
         (folder / MOVES).unlink()

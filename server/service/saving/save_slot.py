@@ -17,18 +17,18 @@ from server.parsing.mesh_bytes import mesh_to_bytes
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.service.saving.brick_files import Batch, merged, write_bricks
-from server.service.saving.files import DamagedFile, check_file, read_parts, sync_folder, write_parts
-from server.service.saving.state import (
+from server.service.saving.checksummed_files import DamagedFile, check_file, read_parts, sync_folder, write_parts
+from server.service.saving.retention import QUARANTINE_PREFIX
+from server.service.saving.room_state import (
     VERSION,
     FileName,
     Header,
-    KeptPlace,
-    KeptVolume,
     RoomState,
+    StoredObject,
+    StoredVolume,
     state_from_bytes,
     state_to_bytes,
 )
-from server.service.saving.upkeep import ASIDE
 from server.volume.volume import Volume
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ class _Work:
     size: int = 0
 
 
-class Slot:
+class SaveSlot:
     """Used by one thread at a time."""
 
     def __init__(self, folder: Path) -> None:
@@ -147,7 +147,7 @@ class Slot:
             raise
         self._bricks, self._meshes = work.bricks, work.meshes
         sync_folder(self.folder)
-        self._tidy({*(work.bricks.files if work.bricks else ()), *work.meshes})
+        self._remove_unnamed({*(work.bricks.files if work.bricks else ()), *work.meshes})
         return work.size
 
     def _write_files(self, work: _Work) -> None:
@@ -161,7 +161,7 @@ class Slot:
         work.new.append(self.folder / PART)
         work.size += write_parts(self.folder / PART, [msgspec.msgpack.encode(work.header), state_to_bytes(state)])
 
-    def _objects(self, work: _Work) -> Iterator[KeptPlace]:
+    def _objects(self, work: _Work) -> Iterator[StoredObject]:
         """The objects, their meshes written as far as they are not there."""
         names = {id(mesh): name for name, mesh in self._meshes.items()}
         for kept in work.taken.objects:
@@ -176,7 +176,7 @@ class Slot:
             work.meshes[name] = kept.mesh
             yield _place_of(kept, name)
 
-    def _written_bricks(self, work: _Work, volume: Volume, kept: KeptVolume) -> _Bricks:
+    def _written_bricks(self, work: _Work, volume: Volume, kept: StoredVolume) -> _Bricks:
         """The files, with one more of the bricks that have changed; or one of all."""
         known = self._bricks if self.change_of(volume) >= 0 else None
         files, count = (known.files, known.count) if known else ((), 0)
@@ -200,24 +200,24 @@ class Slot:
             for folder in self.folder.parents[:3]:
                 sync_folder(folder)
 
-    def _tidy(self, kept: set[FileName]) -> None:
+    def _remove_unnamed(self, kept: set[FileName]) -> None:
         """Remove what the save does not name: of earlier ones, and of those that were not finished."""
         _remove([path for path in self.folder.iterdir() if path.name not in kept and path.name != SAVE])
 
-    def set_aside(self) -> Path:
+    def quarantine(self) -> Path:
         """Give the folder another name, for a person to look at; the name. Raises OSError."""
         room = self.folder.parent
-        number = next(n for n in range(1, 1 << 30) if not (room / f"{ASIDE}{n}").exists())
-        os.replace(self.folder, room / f"{ASIDE}{number}")
+        number = next(n for n in range(1, 1 << 30) if not (room / f"{QUARANTINE_PREFIX}{n}").exists())
+        os.replace(self.folder, room / f"{QUARANTINE_PREFIX}{number}")
         sync_folder(room)
         self._bricks, self._meshes = None, {}
-        return room / f"{ASIDE}{number}"
+        return room / f"{QUARANTINE_PREFIX}{number}"
 
 
-def _place_of(kept: KeptObject, mesh: FileName) -> KeptPlace:
+def _place_of(kept: KeptObject, mesh: FileName) -> StoredObject:
     if isinstance(kept.place, Placement):
-        return KeptPlace(kept.object_id, mesh, asked=kept.place)
-    return KeptPlace(kept.object_id, mesh, world_from_model=kept.place)
+        return StoredObject(kept.object_id, mesh, asked=kept.place)
+    return StoredObject(kept.object_id, mesh, world_from_model=kept.place)
 
 
 def _remove(paths: Sequence[Path]) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-ASIDE = "set-aside-"
+QUARANTINE_PREFIX = "set-aside-"
 """Begins the name of a damaged save, in its room's folder."""
 IN_USE_S = 600.0
 """A room that was used so recently may be at work in another process."""
@@ -15,7 +15,7 @@ DAY_S = 86400.0
 
 
 @dataclass(frozen=True)
-class KeptLimits:
+class RetentionLimits:
     """Of all rooms in a folder; None: no limit."""
 
     space_bytes: int | None = None
@@ -24,7 +24,7 @@ class KeptLimits:
 
 
 @dataclass(frozen=True)
-class Kept:
+class StorageUsage:
     """What a folder holds."""
 
     rooms: int = 0
@@ -35,7 +35,7 @@ class Kept:
 
 
 @dataclass(frozen=True)
-class Piece:
+class StoredItem:
     """What is removed as one: a room, or a damaged save of one."""
 
     folder: Path
@@ -45,22 +45,22 @@ class Piece:
     is_room: bool
 
 
-def pieces_in(folder: Path, skipped: str) -> Iterator[Piece]:
+def stored_items(folder: Path, skipped: str) -> Iterator[StoredItem]:
     """Of all rooms in `folder`; names that begin with `skipped` are none. Raises OSError."""
     for room in folder.iterdir() if folder.exists() else ():
         if not room.is_dir() or room.name.startswith(skipped):
             continue
-        asides = [_piece(aside, is_room=False) for aside in room.glob(f"{ASIDE}*")]
+        asides = [_piece(aside, is_room=False) for aside in room.glob(f"{QUARANTINE_PREFIX}*")]
         yield from asides
         whole = _piece(room, is_room=True)
         own_bytes = whole.space_bytes - sum(aside.space_bytes for aside in asides)
         if own_bytes:
-            yield Piece(room, own_bytes, whole.used_s, is_room=True)
+            yield StoredItem(room, own_bytes, whole.used_s, is_room=True)
 
 
-def surplus(
-    pieces: list[Piece], limits: KeptLimits, now_s: float, in_use: Collection[Path]
-) -> Iterator[tuple[Piece, str]]:
+def items_to_remove(
+    pieces: list[StoredItem], limits: RetentionLimits, now_s: float, in_use: Collection[Path]
+) -> Iterator[tuple[StoredItem, str]]:
     """What is to be removed, with the reason in words: damaged saves first, then rooms, the oldest first."""
     free = [p for p in pieces if not (p.is_room and (p.folder in in_use or now_s - p.used_s < IN_USE_S))]
     total_bytes = sum(piece.space_bytes for piece in pieces)
@@ -75,12 +75,12 @@ def surplus(
         yield piece, why
 
 
-def _piece(folder: Path, *, is_room: bool) -> Piece:
+def _piece(folder: Path, *, is_room: bool) -> StoredItem:
     used_s, space_bytes = folder.stat().st_mtime, 0
     for path in folder.rglob("*"):
         with contextlib.suppress(FileNotFoundError):  # renewed meanwhile
             status = path.stat()
             space_bytes += 0 if path.is_dir() else status.st_size
-            if path.parent.parent == folder and ASIDE not in path.parent.name:
+            if path.parent.parent == folder and QUARANTINE_PREFIX not in path.parent.name:
                 used_s = max(used_s, status.st_mtime)
-    return Piece(folder, space_bytes, used_s, is_room)
+    return StoredItem(folder, space_bytes, used_s, is_room)

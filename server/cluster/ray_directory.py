@@ -11,9 +11,9 @@ from ray.actor import exit_actor
 from ray.exceptions import RayActorError
 
 from server.cluster.host import HostStatus, open_room_host
-from server.cluster.places import Address, NoPlace, NotYet
+from server.cluster.room_directory import Address, RoomNotReady, RoomUnavailable
 from server.cluster.settings import ClusterSettings
-from server.service.events import log_events
+from server.service.event_log import log_events
 
 NAMESPACE = "probeless"
 PREFIX = "room-"
@@ -44,20 +44,20 @@ class RoomActor:
         return True
 
 
-class RayPlaces:
+class RayRoomDirectory:
     """Of one process of the cluster."""
 
     def __init__(self, settings: ClusterSettings) -> None:
         self._settings = settings
 
     async def find(self, room_id: str, may_open: bool) -> Address:
-        """The room's host. Raises NotYet, NoPlace."""
+        """The room's host. Raises RoomNotReady, RoomUnavailable."""
         try:
             actor = await asyncio.to_thread(self._actor, room_id, may_open)
             async with asyncio.timeout(ANSWER_S):
                 address: Address = await actor.address.remote()
         except (RayActorError, TimeoutError) as error:
-            raise NotYet(str(error)) from error
+            raise RoomNotReady(str(error)) from error
         return address
 
     def _actor(self, room_id: str, may_open: bool) -> Any:
@@ -66,11 +66,11 @@ class RayPlaces:
             try:
                 return ray.get_actor(name, NAMESPACE)
             except ValueError as error:
-                raise NoPlace("there is no such session: it ended, or its room was closed") from error
+                raise RoomUnavailable("there is no such session: it ended, or its room was closed") from error
         most = self._settings.policy.most
         names = room_names()
         if name not in names and len(names) >= most:
-            raise NoPlace(f"the server is full: {most} rooms are open, which is the most: try again later")
+            raise RoomUnavailable(f"the server is full: {most} rooms are open, which is the most: try again later")
         return ray.remote(RoomActor).options(**actor_options(name, self._settings.place)).remote(self._settings)
 
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 
-class NoPlace(Exception):
+class RoomUnavailable(Exception):
     """There is no such room, or no place for one more; one line."""
 
 
-class NotYet(Exception):
+class RoomNotReady(Exception):
     """The room has no address at the moment: it is being opened, or moves. To be asked again."""
 
 
@@ -24,9 +24,9 @@ class Address:
     """That the host asks for."""
 
 
-class Places(Protocol):
+class RoomDirectory(Protocol):
     """The rooms of the cluster."""
 
     async def find(self, room_id: str, may_open: bool) -> Address:
-        """The room's host. Raises NotYet, NoPlace."""
+        """The room's host. Raises RoomNotReady, RoomUnavailable."""
         ...

@@ -18,8 +18,8 @@ from server.scene.placement import Placement
 from server.service.room_store import RoomStore, RoomStoreError, folder_name
 from server.service.saving.checksummed_files import read_parts, write_parts
 from tests.faulty_disk import FaultyDisk, PowerCut, full
+from tests.kept_rooms import CUBE, PLACE, client_of, found, print_of, scan
 from tests.rooms import wishes
-from tests.saved_rooms import CUBE, PLACE, client_of, found, print_of, scan
 
 PATIENCE_S = 20.0
 

@@ -15,8 +15,8 @@ from server.service.room_saver import RoomSaver
 from server.service.room_store import RoomStore
 from server.service.saving.room_saves import Saved
 from tests.faulty_disk import FaultyDisk, full
+from tests.kept_rooms import client_of, print_of, scan
 from tests.rooms import wishes
-from tests.saved_rooms import client_of, print_of, scan
 
 
 @pytest.fixture

@@ -35,9 +35,9 @@ from server.volume.volume import Volume
 from tests import corners
 from tests.analytic import Floats, look_at
 from tests.corners import FLOOR, WALL, corner_frame
+from tests.kept_rooms import BALL, CUBE, PLACE, client_of, print_of, scan, voxels_of
 from tests.lights import degrees_between, lobe_and_sky
 from tests.rooms import CAMERA, VOXEL_M, frame_at, view_at, wishes
-from tests.saved_rooms import BALL, CUBE, PLACE, client_of, print_of, scan, voxels_of
 
 TOWARDS = (0.5, 0.8, 0.0)
 LIGHT = 0.3 * lobe_and_sky(TOWARDS)

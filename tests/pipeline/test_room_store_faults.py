@@ -20,8 +20,8 @@ from server.service.room_store import RoomStore, RoomStoreError, folder_name
 from server.service.saving import room_state as states
 from server.service.saving import save_slot as slots
 from tests.faulty_disk import FaultyDisk, PowerCut, full
+from tests.kept_rooms import CUBE, PLACE, client_of, found, layout_of, print_of, scan
 from tests.rooms import wishes
-from tests.saved_rooms import CUBE, PLACE, client_of, found, layout_of, print_of, scan
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
-"""What Ray Serve runs: `import_path: server.cluster.application:build`, its `args` those of ClusterSettings.
+"""The Ray Serve application: `import_path: server.cluster.application:build`; `args` are the ClusterSettings.
 
-Clients' token is PROBELESS_TOKEN, as of `probeless serve`; it must be set, to `none` for everybody.
+The environment variable PROBELESS_TOKEN must hold the clients' token, or `none` to allow every client.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ TOKEN = "PROBELESS_TOKEN"
 
 
 class IngressReplica:
-    """One replica: its sockets."""
+    """One ingress replica."""
 
     def __init__(self, settings: ClusterSettings, authenticator: Authenticator, _supervisor: object) -> None:
-        """`_supervisor`: named here, so that Serve runs one."""
+        """`_supervisor`: an argument so that Serve deploys it."""
         self._ingress = Ingress(RayRoomDirectory(settings), authenticator)
 
     def __serve_build_asgi_app__(self) -> FastAPI:
@@ -33,7 +33,7 @@ class IngressReplica:
 
 
 def build(args: dict[str, Any]) -> Any:
-    """The application. Raises ValueError where a setting is wrong."""
+    """Build the application. Raises ValueError for an invalid setting."""
     settings = read_settings(args)
     supervisor = serve.deployment(
         RoomSupervisor,
@@ -58,7 +58,7 @@ def build(args: dict[str, Any]) -> Any:
 
 
 def authenticator_from_environment() -> Authenticator:
-    """Raises ValueError where no token is set, or one that cannot be one."""
+    """Raises ValueError if the token is missing or invalid."""
     token = os.environ.get(TOKEN, "")
     if token == "none":
         return Authenticator(None)

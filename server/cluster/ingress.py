@@ -1,4 +1,4 @@
-"""What a replica serves: the socket, relayed to its room's host; the page; health."""
+"""Ingress replica: relays each client's socket to its room's host; serves the web page and a health check."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from server.service.object_routes import add_objects
 
 RETRY_S = 0.25
 PATIENCE_S = 20.0
-"""For a room to have an address: to be opened, or to move."""
+"""Time limit for a room to be opened or moved."""
 
 log = logging.getLogger(__name__)
 
 
 class Ingress:
-    """Of one replica: any number of sockets, each of them one client's."""
+    """One replica with any number of client sockets."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class Ingress:
         self.clients = 0
 
     async def serve(self, websocket: WebSocket) -> None:
-        """One client, from its handshake to its end."""
+        """Serve one client from its handshake to its end."""
         connection = Connection(websocket, self._limits)
         if not await connection.accept():
             return
@@ -75,7 +75,7 @@ class Ingress:
             raise Refusal(POLICY, f"neither hello nor watch came within {self._limits.first_message_s:g} s") from late
 
     async def _host_of(self, route: Route) -> ClientConnection:
-        """A connection to the room's host, waiting for a room that is opened or moves. Raises Refusal."""
+        """Connect to the room's host; waits while the room is opened or moved. Raises Refusal."""
         try:
             async with asyncio.timeout(self._patience_s):
                 while True:

@@ -1,4 +1,4 @@
-"""Rooms as named actors of Ray: found by name, opened where a place is free, brought back when their node dies."""
+"""Rooms as named Ray actors: found by name, created where a place is free, restarted if their node fails."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 
 class RoomActor:
-    """A room's host as Ray runs it."""
+    """Ray actor around a `RoomHost`."""
 
     def __init__(self, settings: ClusterSettings) -> None:
         log_events("json")
@@ -37,7 +37,7 @@ class RoomActor:
         return self._host.status()
 
     def leave(self) -> bool:
-        """Of `RoomHost`; the actor ends with it, and its name is free again."""
+        """See `RoomHost`; the actor ends too, which frees its name."""
         if not self._host.leave():
             return False
         exit_actor()
@@ -45,7 +45,7 @@ class RoomActor:
 
 
 class RayRoomDirectory:
-    """Of one process of the cluster."""
+    """Room directory backed by Ray's actor registry."""
 
     def __init__(self, settings: ClusterSettings) -> None:
         self._settings = settings
@@ -75,7 +75,7 @@ class RayRoomDirectory:
 
 
 def actor_options(name: str, place: dict[str, float]) -> dict[str, Any]:
-    """Of a room's actor: it outlives who opened it, takes its place of a node, and is started anew for ever."""
+    """Actor options: detached from its creator, restarted without limit, with the resources of one place."""
     others = {kind: share for kind, share in place.items() if kind not in ("CPU", "GPU")}
     return {
         "name": name,
@@ -91,6 +91,6 @@ def actor_options(name: str, place: dict[str, float]) -> dict[str, Any]:
 
 
 def room_names() -> list[str]:
-    """Of all actors that are rooms, those that wait for a place included."""
+    """Names of all room actors, including those that wait for a place."""
     found = ray.util.list_named_actors(all_namespaces=True)
     return [one["name"] for one in found if one["namespace"] == NAMESPACE and one["name"].startswith(PREFIX)]

@@ -1,4 +1,4 @@
-"""Where rooms are: what the ingress asks, whoever answers it."""
+"""Interface through which the ingress finds the host of a room."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ from typing import Protocol
 
 
 class RoomUnavailable(Exception):
-    """There is no such room, or no place for one more; one line."""
+    """The room does not exist, or there is no place for a new one; one line."""
 
 
 class RoomNotReady(Exception):
-    """The room has no address at the moment: it is being opened, or moves. To be asked again."""
+    """The room has no address yet because it is being opened or moved. Try again."""
 
 
 @dataclass(frozen=True)
 class Address:
-    """Of a room's host."""
+    """Address of a room's host."""
 
     url: str
-    """As `ws://10.0.0.7:40123`, within the cluster."""
+    """For example `ws://10.0.0.7:40123`, within the cluster."""
     token: str
-    """That the host asks for."""
+    """Token of the host."""
 
 
 class RoomDirectory(Protocol):
-    """The rooms of the cluster."""
+    """Finds rooms of the cluster."""
 
     async def find(self, room_id: str, may_open: bool) -> Address:
         """The room's host. Raises RoomNotReady, RoomUnavailable."""

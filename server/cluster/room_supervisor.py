@@ -1,4 +1,4 @@
-"""Looks after the rooms of the cluster, every few seconds: closes those that nobody is in, asks for enough places."""
+"""Room supervisor: every few seconds closes empty rooms and requests capacity from the autoscaler."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 
 class RoomSupervisor:
-    """A deployment of Serve, one replica: Serve starts it anew where it fails."""
+    """A Serve deployment with one replica, which Serve restarts if it fails."""
 
     def __init__(self, settings: ClusterSettings) -> None:
         self._settings = settings
@@ -36,12 +36,12 @@ class RoomSupervisor:
         self._task = asyncio.get_running_loop().create_task(self._run())
 
     def check_health(self) -> None:
-        """Asked by Serve. Raises what ended the keeper."""
+        """Called by Serve. Raises the error that ended the supervisor."""
         if self._task.done():
             self._task.result()
 
     async def places(self) -> int:
-        """That were asked for last."""
+        """Number of places requested last."""
         return self._requested
 
     async def _run(self) -> None:
@@ -53,7 +53,7 @@ class RoomSupervisor:
             await asyncio.sleep(EVERY_S)
 
     async def _look_after(self, name: str) -> HostStatus | None:
-        """Its status; None of a room that waits for a place, moves, or has just been closed."""
+        """The room's status; None if it waits for a place, is moving, or was just closed."""
         with contextlib.suppress(RayError, ValueError, TimeoutError):
             async with asyncio.timeout(ANSWER_S):
                 actor: Any = await asyncio.to_thread(ray.get_actor, name, NAMESPACE)

@@ -1,4 +1,4 @@
-"""Where a room's objects have been moved to since its save: a small file, written before a move is acknowledged."""
+"""Object placements that have changed since a room's save: a small file, written before a move is acknowledged."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, field
 from numpy.typing import NDArray
 
 from server.room.room_objects import Inventory, Place
@@ -20,34 +20,34 @@ MOVES, PART = "moves", "moves.part"
 
 
 class MovedObject(Struct, frozen=True, forbid_unknown_fields=True):
-    """One object; one of the two is there."""
+    """One moved object. Exactly one of the two placements is set."""
 
     object_id: str
     world_from_model: NDArray[np.float64] | None = None
-    asked: Placement | None = None
+    placement: Placement | None = field(default=None, name="asked")
 
     @property
     def place(self) -> Place:
-        """Where it is."""
-        return self.world_from_model if self.world_from_model is not None else self.asked or Placement()
+        """The object's placement."""
+        return self.world_from_model if self.world_from_model is not None else self.placement or Placement()
 
 
 class PlacementDelta(Struct, frozen=True, forbid_unknown_fields=True):
-    """All objects that stand elsewhere than in the save whose revision is `since`."""
+    """All objects that have moved since the save with revision `since`."""
 
     version: int
     since: int
     revision: int
-    """Of the objects when they stood so."""
+    """Revision of the objects with these placements."""
     moved: tuple[MovedObject, ...]
 
-    def follow(self, revision: int) -> bool:
-        """Whether they belong to a save of that revision: it has the same objects, and stands no later."""
+    def applies_to(self, revision: int) -> bool:
+        """Whether the delta can be applied to a save of that revision: same objects, and not newer."""
         return self.since <= revision <= self.revision
 
 
 def delta_since(saved: Inventory, now: Inventory) -> PlacementDelta | None:
-    """None where more than places has changed."""
+    """The moves between two inventories; None if anything but placements has changed."""
     if saved.has_begun != now.has_begun or saved.owed != now.owed or len(saved.objects) != len(now.objects):
         return None
     pairs = list(zip(saved.objects, now.objects, strict=True))
@@ -59,19 +59,19 @@ def delta_since(saved: Inventory, now: Inventory) -> PlacementDelta | None:
 
 def _moved(object_id: str, place: Place) -> MovedObject:
     if isinstance(place, Placement):
-        return MovedObject(object_id, asked=place)
+        return MovedObject(object_id, placement=place)
     return MovedObject(object_id, world_from_model=place)
 
 
 def write_delta(folder: Path, moves: PlacementDelta) -> None:
-    """In the place of those that there are. Raises OSError, these then stay."""
+    """Replace the delta file atomically. Raises OSError; the previous file is then unchanged."""
     write_parts(folder / PART, [msgspec.msgpack.encode(moves, enc_hook=array_to_list)])
     os.replace(folder / PART, folder / MOVES)
     sync_folder(folder)
 
 
 def read_delta(folder: Path) -> PlacementDelta | None:
-    """None where there are none. Raises DamagedFile, OSError."""
+    """None if there is no delta file. Raises DamagedFile, OSError."""
     path = folder / MOVES
     if not path.exists():
         return None
@@ -86,6 +86,6 @@ def read_delta(folder: Path) -> PlacementDelta | None:
 
 
 def delete_delta(folder: Path) -> None:
-    """Raises OSError."""
+    """Delete the delta file if there is one. Raises OSError."""
     if (folder / MOVES).exists():
         (folder / MOVES).unlink()

@@ -1,4 +1,4 @@
-"""A room as it is at one moment, and a room made of what was kept of one."""
+"""Takes a snapshot of a room, and rebuilds a room from a saved state."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from server.opencl.device import Device
 from server.parsing.mesh_bytes import mesh_from_bytes
 from server.room.room import Room
-from server.room.room_objects import Inventory, KeptObject
+from server.room.room_objects import Inventory, ObjectRecord
 from server.scene.placement import Placement
 from server.service.saving.brick_files import Batch, merged
 from server.service.saving.checksummed_files import DamagedFile, read_parts
@@ -25,26 +25,26 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Snapshot:
-    """All of a room, of its bricks those that have changed."""
+    """State of a room at one moment, with the bricks that have changed since the slot's save."""
 
     state: RoomState
-    """Without the objects, and without the files of the volume."""
+    """Without objects and without the volume's file names."""
     inventory: Inventory
     volume: Volume | None
     bricks: list[Batch]
     change: int
-    """The volume's `changes` at that moment."""
+    """The volume's `changes` at that time."""
     lock_ms: float = 0.0
-    """For how long no frame could be worked on."""
+    """How long the room's lock was held."""
 
     @property
-    def objects(self) -> tuple[KeptObject, ...]:
-        """All of them."""
+    def objects(self) -> tuple[ObjectRecord, ...]:
+        """All virtual objects."""
         return self.inventory.objects
 
 
 def snapshot(room: Room, slot: SaveSlot) -> Snapshot:
-    """The room now, its bricks as far as `slot` has not got them. Waits for the frame that is in the room."""
+    """Snapshot of the room, with the bricks that `slot` does not have. Waits for the room's lock."""
     with room.lock:
         start_s = time.perf_counter()
         taken = snapshot_within(room, slot)
@@ -52,7 +52,7 @@ def snapshot(room: Room, slot: SaveSlot) -> Snapshot:
 
 
 def snapshot_within(room: Room, slot: SaveSlot) -> Snapshot:
-    """The same by whoever holds the room's lock."""
+    """As `snapshot`; the caller holds the room's lock."""
     volume = room.reconstruction.volume
     bricks = list(volume.copies(volume.changed_since(slot.change_of(volume)))) if volume else []
     state = RoomState(
@@ -73,7 +73,7 @@ def _kept(volume: Volume, exposure_logarithms: float) -> StoredVolume:
 
 
 def rebuilt(name: str, state: RoomState, slot: SaveSlot, device: Device) -> Room:
-    """The room of which `state` was read from `slot`. Raises DamagedFile, OSError."""
+    """Rebuild the room whose `state` was read from `slot`. Raises DamagedFile, OSError."""
     room = Room(device, state.wishes, name)
     room.key_digest = state.key_digest
     try:
@@ -105,10 +105,10 @@ def _rebuild_objects(room: Room, state: RoomState, slot: SaveSlot) -> None:
     if state.up is not None:
         room.objects.begin(state.up)
     for kept in state.objects:
-        place = kept.world_from_model if kept.world_from_model is not None else kept.asked or Placement()
+        place = kept.world_from_model if kept.world_from_model is not None else kept.placement or Placement()
         try:
             mesh = mesh_from_bytes(_only(read_parts(slot.folder / kept.mesh)))
-            room.objects.put_back(KeptObject(kept.object_id, mesh, place))
+            room.objects.put_back(ObjectRecord(kept.object_id, mesh, place))
         except ValueError as error:
             log.warning("object %r of room %r is not there any more: %s", kept.object_id, room.name, error)
 

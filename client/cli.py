@@ -198,15 +198,15 @@ def serve(
     """The server. It asks for a token, which the URL that it prints brings along."""
     from client.serving import (
         ServeOptions,
+        authenticator_of,
         certificate_of,
         data_folder,
-        door_of,
         leave_soon,
         limits_of,
         log_format_of,
         objects_folder,
     )
-    from server.service.events import log_events
+    from server.service.event_log import log_events
     from server.service.serve import serve as serve_forever
 
     options = ServeOptions(
@@ -223,11 +223,16 @@ def serve(
         data_gib=data_gib,
         data_days=data_days,
     )
-    limits, door, log_format = limits_of(options), door_of(options), log_format_of(log)
+    limits, authenticator, log_format = limits_of(options), authenticator_of(options), log_format_of(log)
     certificate = certificate_of(options)
     log_events(log_format)
     kept_in = data_folder(data)
-    others = {"limits": limits, "door": door, "certificate": certificate, "objects": objects_folder(objects)}
+    others = {
+        "limits": limits,
+        "authenticator": authenticator,
+        "certificate": certificate,
+        "objects": objects_folder(objects),
+    }
     status = serve_forever(host, port, device, data=kept_in, **others)
     leave_soon(status)
     return status

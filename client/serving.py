@@ -15,9 +15,9 @@ from platformdirs import user_data_path
 
 from client.laptop.errors import OptionError, RunError
 from server.service.authenticator import MAX_TOKEN_CHARS, Authenticator, is_loopback, is_token, new_token
-from server.service.events import LogFormat
+from server.service.event_log import LogFormat
 from server.service.limits import DEFAULT_LIMITS, GIB, MIB, Limits
-from server.service.saving.upkeep import DAY_S, KeptLimits
+from server.service.saving.retention import DAY_S, RetentionLimits
 from server.service.tls import Certificate, CertificateError, given_certificate, own_certificate
 
 NO_TOKEN = "none"
@@ -45,7 +45,7 @@ class ServeOptions:
     data_days: float | None = None
 
 
-def door_of(options: ServeOptions) -> Authenticator:
+def authenticator_of(options: ServeOptions) -> Authenticator:
     """Raises OptionError."""
     origins = frozenset(_origin(text) for text in options.allow_origin)
     if options.token == NO_TOKEN:
@@ -85,7 +85,7 @@ def limits_of(options: ServeOptions) -> Limits:
                 f"--volume-memory {options.volume_memory}: expected MiB, {LEAST_VOLUME_MIB} to {MOST_VOLUME_MIB}"
             )
         limits = replace(limits, volume_bytes=options.volume_memory * MIB)
-    limits = replace(limits, kept=_kept_limits(options))
+    limits = replace(limits, room_retention=_retention_limits(options))
     sessions = limits.sessions if options.sessions is None else options.sessions
     per_address = min(sessions, limits.sessions_per_address)
     if options.sessions_per_address is not None:
@@ -93,14 +93,14 @@ def limits_of(options: ServeOptions) -> Limits:
     return replace(limits, sessions=sessions, sessions_per_address=per_address)
 
 
-def _kept_limits(options: ServeOptions) -> KeptLimits:
+def _retention_limits(options: ServeOptions) -> RetentionLimits:
     """0 is no limit."""
-    kept = DEFAULT_LIMITS.kept
+    retention = DEFAULT_LIMITS.room_retention
     if options.data_gib is not None:
-        kept = replace(kept, space_bytes=int(options.data_gib * GIB) or None)
+        retention = replace(retention, space_bytes=int(options.data_gib * GIB) or None)
     if options.data_days is not None:
-        kept = replace(kept, age_s=options.data_days * DAY_S or None)
-    return kept
+        retention = replace(retention, age_s=options.data_days * DAY_S or None)
+    return retention
 
 
 def data_folder(text: str | None) -> Path | None:

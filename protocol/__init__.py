@@ -1,1 +1,1 @@
-"""The wire contract between thin clients and the server. Imports nothing else of the project."""
+"""The wire format between clients and the server. Imports nothing else of the project."""

@@ -1,4 +1,4 @@
-"""Bytes to messages and back: MessagePack, validated by type, size checked before anything is decoded."""
+"""Encodes and decodes messages: MessagePack with typed validation. The size is checked before decoding."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ _END_CHARS = 120
 
 
 class ProtocolError(ValueError):
-    """What was wrong with something received: one printable line, short enough for `Error.reason`."""
+    """Received data is invalid. The message is one printable line, short enough for `Error.reason`."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(one_line(reason))
 
 
 def one_line(text: str) -> str:
-    """`text` as one printable line of at most MAX_REASON_CHARS: it may quote what an attacker sent.
+    """`text` as one printable line of at most MAX_REASON_CHARS, since it may quote untrusted input.
 
-    What is too long loses its middle, since a field's name stands at the end.
+    Longer text is shortened in the middle, because the name of the field is at the end.
     """
     most = 4 * MAX_REASON_CHARS
     ends = text if len(text) <= most else text[: most // 2] + text[-most // 2 :]
@@ -40,19 +40,19 @@ _server_decoder: msgspec.msgpack.Decoder[ServerMessage] = msgspec.msgpack.Decode
 
 
 def encode(message: ClientMessage | ServerMessage) -> bytes:
-    """One message as MessagePack bytes. Raises ProtocolError if it is larger than the other side would accept."""
+    """Encode a message as MessagePack. Raises ProtocolError if it exceeds the size that the other side accepts."""
     data = _encoder.encode(message)
     _require_size(len(data))
     return data
 
 
 def decode_client(data: bytes | bytearray | memoryview) -> ClientMessage:
-    """The message a client sent. Raises ProtocolError, naming the field as `$.depth.width`."""
+    """Decode a client's message. Raises ProtocolError, naming the field as `$.depth.width`."""
     return _decode(_client_decoder, data)
 
 
 def decode_server(data: bytes | bytearray | memoryview) -> ServerMessage:
-    """The message a server sent. Raises ProtocolError, naming the field as `$.light.sh`."""
+    """Decode a server's message. Raises ProtocolError, naming the field as `$.light.sh`."""
     return _decode(_server_decoder, data)
 
 

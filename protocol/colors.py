@@ -1,4 +1,4 @@
-"""One session's colour, from payloads to arrays: pictures for themselves, and video, which needs those before."""
+"""Decodes one session's colour payloads to arrays: independent images, and video, which needs reference frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NO_VIDEO = "color.codec is h264, which needs PyAV to be read (make install-video
 
 
 def readable_codecs() -> tuple[ColorCodec, ...]:
-    """What frames' colour may have here."""
+    """Colour codecs that this installation can decode."""
     return ("jpeg", "png", "raw", "h264") if IS_POSSIBLE else ("jpeg", "png", "raw")
 
 
@@ -27,14 +27,14 @@ class Video(Protocol):
     """Decodes one session's video."""
 
     def decode(self, data: bytes) -> NDArray[np.uint8]:
-        """[h, w, 3] RGB of a picture that has been checked. Raises ProtocolError; what it knew is lost then."""
+        """[h, w, 3] RGB of a validated picture. Raises ProtocolError; the decoder's state is then lost."""
 
     def close(self) -> None:
-        """It is not needed any more."""
+        """Free the decoder."""
 
 
 class ColorReader:
-    """Used by one thread; told of every frame in order."""
+    """Not thread-safe. Must receive every frame in order."""
 
     def __init__(
         self,
@@ -42,8 +42,8 @@ class ColorReader:
         decompress: Callable[[bytes], NDArray[np.uint8]] = decode_picture,
         open_video: Callable[[], Video] | None = None,
     ) -> None:
-        """`decompress`: a JPEG or PNG whose header has been checked. `open_video`: when the first picture of it comes;
-        default: a decoder in this process.
+        """`decompress` decodes a JPEG or PNG whose header is validated. `open_video` creates the video decoder at the
+        first video picture (default: in this process).
         """
         self._camera = camera
         self._decompress = decompress
@@ -52,11 +52,11 @@ class ColorReader:
         self._order = VideoOrder()
 
     def decode(self, image: ColorImage) -> Color:
-        """As protocol.images.decode_color, of any codec. Raises ProtocolError."""
+        """As protocol.images.decode_color, for any codec. Raises ProtocolError."""
         return decode_color(image, self._camera, decompress=self._decompress, video=self._next_of_video)
 
     def close(self) -> None:
-        """No more frames come."""
+        """Close the video decoder, if any."""
         if self._video is not None:
             self._video.close()
 

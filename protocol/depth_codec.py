@@ -1,8 +1,9 @@
-"""Lossless depth: horizontal delta, zigzag, then a general compressor (layouts: README.md).
+"""Lossless depth compression: horizontal delta, zigzag, then a general compressor (layouts: README.md).
 
-Neighbouring depths differ by little, so the deltas are small, and zigzag makes small magnitudes small numbers. Byte
-planes separate what is nearly all zeros. Better: sensors know few distances, and neighbours differ by one or two
-*ranks* among them, which takes half a byte. All arithmetic is modulo 2**16: any picture survives bit for bit.
+Neighbouring depths are similar, so deltas are small, and zigzag maps small magnitudes to small numbers. Byte planes
+separate the high bytes, which are nearly all zero. Rank coding is smaller: a sensor produces few distinct values, and
+neighbours differ by one or two *ranks* among them, which takes half a byte. All arithmetic is modulo 2**16, so any
+image is restored bit for bit.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from protocol.codec import ProtocolError
 LEVEL = 1
 _COUNTS = struct.Struct("<II")
 _ESCAPE = 15
-"""Half a byte that says that the number is this or more, and stands elsewhere."""
+"""Escape value of half a byte: the number is this or larger and is stored separately."""
 
 
 def filter_depth(depth: NDArray[np.uint16]) -> bytes:
@@ -41,7 +42,7 @@ def unfilter_depth(planes: bytes, width: int, height: int) -> NDArray[np.uint16]
 
 
 def rank_depth(depth: NDArray[np.uint16]) -> bytes:
-    """[h, w] uint16 -> which values there are, and the zigzagged row deltas of their ranks, two in a byte."""
+    """[h, w] uint16 -> the set of values, and the zigzagged row deltas of their ranks, two in a byte."""
     is_there = np.zeros(1 << 16, bool)
     is_there[depth] = True
     values = np.flatnonzero(is_there)
@@ -55,7 +56,7 @@ def rank_depth(depth: NDArray[np.uint16]) -> bytes:
 
 
 def unrank_depth(data: bytes, width: int, height: int) -> NDArray[np.uint16]:
-    """Undo `rank_depth`. Raises ProtocolError for bytes that are not exactly such a picture of this size."""
+    """Undo `rank_depth`. Raises ProtocolError for bytes that are not exactly an encoded image of this size."""
     pair_bytes = -(-height // 2) * width
     if len(data) < _COUNTS.size:
         raise ProtocolError("depth.data is truncated: its counts are missing")
@@ -80,7 +81,7 @@ def unrank_depth(data: bytes, width: int, height: int) -> NDArray[np.uint16]:
 
 
 def most_rank_bytes(width: int, height: int) -> int:
-    """That `rank_depth` makes of a picture of this size at most."""
+    """Largest output of `rank_depth` for an image of this size, in bytes."""
     return _COUNTS.size + 2 * (1 << 16) + (-(-height // 2) + 2 * height) * width
 
 
@@ -119,9 +120,9 @@ def deflate(data: bytes) -> bytes:
 
 
 def inflate(data: bytes, size_bytes: int, least_bytes: int | None = None) -> bytes:
-    """Undo `deflate`. Raises ProtocolError unless exactly `size_bytes` come out and nothing is left over.
+    """Undo `deflate`. Raises ProtocolError unless the output has exactly `size_bytes` and no input is left over.
 
-    `least_bytes`: or any size from that up.
+    `least_bytes`: the output may have any size from this up to `size_bytes`.
     """
     decompressor = zlib.decompressobj(-zlib.MAX_WBITS)
     try:
@@ -142,10 +143,10 @@ def zstd_compress(data: bytes, level: int = LEVEL) -> bytes:
 def zstd_decompress(data: bytes, size_bytes: int, least_bytes: int | None = None) -> bytes:
     """Undo `zstd_compress`. Raises ProtocolError unless the frame declares and holds exactly `size_bytes`.
 
-    `least_bytes`: or any size from that up.
+    `least_bytes`: it may have any size from this up to `size_bytes`.
     """
     try:
-        # zstandard allocates what the header declares, whatever max_output_size says.
+        # zstandard allocates the size in the header, regardless of max_output_size.
         declared = zstandard.get_frame_parameters(data).content_size
         if not (size_bytes if least_bytes is None else least_bytes) <= declared <= size_bytes:
             raise ProtocolError(f"depth.data declares {_bytes(declared)}, its size needs {size_bytes} bytes")

@@ -1,4 +1,4 @@
-"""What a frame is, in memory: the camera model and one RGB-D frame, shared by sources, wire and pipeline."""
+"""Camera model and RGB-D frame in memory, shared by sources, wire format and pipeline."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
 Matrix4 = Annotated[tuple[float, ...], msgspec.Meta(min_length=16, max_length=16)]
 
 GREATEST_BASELINE_M = 2.0
-"""Between the lenses of one camera; more is taken for a translation in millimetres."""
+"""Largest distance between the lenses of one camera; a larger one is probably given in millimetres."""
 GREATEST_SHIFT_M = 1000.0
-"""Between the worlds of two clients in one room."""
+"""Largest distance between the world origins of two clients in one room."""
 _NEAR_ROTATION = 1e-3
 
 
 class DepthCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The depth picture's own lens, where it is another than the colour picture's; conventions as in `CameraModel`."""
+    """Lens of the depth image, if it differs from the colour lens; conventions as in `CameraModel`."""
 
     width: int
     height: int
@@ -46,7 +46,7 @@ class DepthCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class CameraModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Pinhole camera with polynomial distortion, of the colour picture, and of the depth picture unless `depth` is set.
+    """Pinhole camera with polynomial distortion, for the colour image, and for the depth image unless `depth` is set.
 
     A pixel centre lies at integer coordinates: `u = fx * x / z + cx`. Distortion is OpenCV's
     `(k1, k2, p1, p2, k3)` on normalised coordinates, all zero for a rectified camera.
@@ -77,12 +77,12 @@ class CameraModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     @property
     def depth_lens(self) -> CameraModel | DepthCamera:
-        """The lens that the depth picture was taken through: its size, intrinsics and distortion."""
+        """Lens of the depth image: size, intrinsics and distortion."""
         return self.depth or self
 
     @property
     def color_from_depth(self) -> NDArray[np.float64]:
-        """[4, 4] rigid, metres: from the axes of the depth picture's lens to those of the colour picture's."""
+        """[4, 4] rigid, metres: from the axes of the depth lens to those of the colour lens."""
         return np.array(self.depth.color_from_depth if self.depth else IDENTITY, np.float64).reshape(4, 4)
 
 
@@ -101,7 +101,7 @@ def _check_lens(owner: str, lens: CameraModel | DepthCamera) -> None:
 
 
 def check_rigid(owner: str, row_major: tuple[float, ...], greatest_shift_m: float = GREATEST_SHIFT_M) -> None:
-    """Raises ValueError, one line, where 16 row-major numbers are no rigid transform in metres."""
+    """Raises ValueError if 16 row-major numbers are not a rigid transform in metres."""
     if len(row_major) != 16 or not np.isfinite(row_major).all():
         raise ValueError(f"{owner} must be 16 finite numbers")
     matrix = np.array(row_major, np.float64).reshape(4, 4)
@@ -127,16 +127,16 @@ class RgbdFrame:
     depth: NDArray[np.uint16]
     """[height, width] of `CameraModel.depth_lens`, in units of `CameraModel.depth_scale_m`, 0 = no measurement."""
     world_from_camera: NDArray[np.float64] | None
-    """[4, 4] rigid, metres, OpenCV camera axes (x right, y down, z forward); None where the source has no pose."""
+    """[4, 4] rigid, metres, OpenCV camera axes (x right, y down, z forward); None if the source has no pose."""
     exposure: float | None = None
-    """Exposure time times gain of the colour picture, any unit that stays the same; None where it is not known."""
+    """Exposure time times gain of the colour image, in any constant unit; None if unknown."""
     has_depth: bool = True
-    """False: `depth` is empty for want of a sensor; what the room has scanned takes its place."""
+    """False: there is no depth sensor and `depth` is empty; the scanned room is used instead."""
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Where somebody without a camera looks from."""
+    """View of a client without a camera."""
 
     index: int
     timestamp_s: float

@@ -1,7 +1,7 @@
-"""What a picture of H.264 video says of itself (ITU-T H.264, Annex B), read before a decoder sees it.
+"""Validates H.264 pictures (ITU-T H.264, Annex B) before a decoder reads them.
 
-A picture is refused that is of another size than declared, of a kind that a camera's live video does not need
-(interlaced, more than 8 bits, B pictures), or that rests on a picture that was not read.
+A picture is refused if its size is not the declared one, if it uses a feature that live video does not need
+(interlacing, more than 8 bits, B pictures), or if its reference picture was not received.
 """
 
 from __future__ import annotations
@@ -20,38 +20,38 @@ MISSING = "color.data rests on a picture that was not read: send a key picture"
 _HIGH = 100
 _P, _I = 0, 2
 _REFERENCE = 0x60
-"""nal_ref_idc: others may rest on it."""
+"""nal_ref_idc: the picture may be a reference."""
 _START = re.compile(b"\x00\x00\x01")
 _HEADER_BYTES = 64
-"""Of a unit: what is looked at lies within."""
+"""Bytes of a unit that are read; all header fields lie within."""
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """What a sequence parameter set says (7.3.2.1.1)."""
+    """Fields of a sequence parameter set (7.3.2.1.1)."""
 
     width: int
     height: int
     frame_numbers: int
-    """frame_num counts from 0 to one less, and begins anew."""
+    """frame_num is modulo this number."""
 
 
 class VideoOrder:
-    """Of one stream: whether each picture can be decoded after those before it. Told of every picture, in order."""
+    """Checks for one stream whether each picture can be decoded. Must receive every picture in order."""
 
     def __init__(self) -> None:
         self._sequence: Sequence | None = None
         self._reference = 0
-        """frame_num of the last picture that others may rest on."""
+        """frame_num of the last reference picture."""
 
     def begin_anew(self) -> None:
-        """The decoder knows nothing any more: only a key picture can come next."""
+        """Reset after the decoder has lost its state: only a key picture is accepted next."""
         self._sequence = None
 
     def admit(self, data: bytes, width: int, height: int) -> bool:
-        """Check one picture of this size; whether it is a key picture. Raises ProtocolError for what is not to be read.
+        """Check one picture of this size and return whether it is a key picture. Raises ProtocolError.
 
-        After a picture that was refused only a key picture is admitted.
+        After a refused picture only a key picture is accepted.
         """
         try:
             return self._admit(data, (width, height))
@@ -99,12 +99,12 @@ def units_of(data: bytes) -> list[bytes]:
 
 
 def is_key_picture(data: bytes) -> bool:
-    """Whether decoding may begin with it."""
+    """Whether decoding may start with this picture."""
     return any(data[found.end()] & 31 == KEY_SLICE for found in _START.finditer(data, 0, len(data) - 1))
 
 
 def sequence_of(unit: bytes) -> Sequence:
-    """Of a sequence parameter set. Raises ProtocolError."""
+    """Parse a sequence parameter set. Raises ProtocolError."""
     bits = _Bits(unit)
     profile = bits.take(8)
     bits.take(16)  # constraints, level
@@ -126,7 +126,7 @@ def sequence_of(unit: bytes) -> Sequence:
 
 
 def _skip_order(bits: _Bits) -> None:
-    """How pictures are ordered for showing; here they are shown as they come."""
+    """Skip the picture order count fields; pictures are shown in the order received."""
     kind = bits.number(2)
     if kind == 0:
         bits.number(12)
@@ -146,7 +146,7 @@ def _only_sequence(units: list[bytes]) -> Sequence:
 
 
 def _frame_number(slices: list[bytes], sequence: Sequence, is_key: bool) -> int:
-    """frame_num of the one picture that these slices are. Raises ProtocolError where they are not one."""
+    """frame_num of the picture to which the slices belong. Raises ProtocolError if they are not of one picture."""
     if not slices:
         raise ProtocolError("color.data holds no picture")
     numbers, begun = set(), -1
@@ -172,14 +172,14 @@ class _Bits:
         self._value, self._left = int.from_bytes(payload, "big"), 8 * len(payload)
 
     def take(self, count: int) -> int:
-        """An unsigned number of so many bits."""
+        """Unsigned integer of the given number of bits."""
         self._left -= count
         if self._left < 0:
             raise ProtocolError("color.data has a truncated H.264 header")
         return self._value >> self._left & ((1 << count) - 1)
 
     def number(self, most: int = 1 << 31) -> int:
-        """An unsigned Exp-Golomb number; of a signed one, its code."""
+        """Unsigned Exp-Golomb number; for a signed one, its code."""
         zeros = 0
         while not self.take(1):
             zeros += 1

@@ -1,4 +1,4 @@
-"""Colour and depth pictures between arrays and their payloads on the wire; everything is checked before decoding."""
+"""Converts colour and depth images between arrays and wire payloads. Payloads are validated before decoding."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from protocol.messages import ColorCodec, ColorImage, DepthCodec, DepthImage, Pa
 from protocol.picture_headers import jpeg_size, png_size
 
 StillCodec = Literal["jpeg", "png", "raw"]
-"""Of pictures that are read by themselves."""
+"""Codecs of independent images."""
 Color = NDArray[np.uint8] | NDArray[np.uint16]
 
 DEFAULT_DEPTH_CODEC: DepthCodec = "zstd-delta"
 DEPTH_CODECS: tuple[DepthCodec, ...] = get_args(DepthCodec)
 DEFAULT_JPEG_QUALITY = 90
 REDUCIBLE = ("jpeg", "h264")
-"""Codecs of colour that may be sent smaller than the camera's."""
+"""Colour codecs whose images may be smaller than the camera's."""
 
 _COLOR_DTYPE: dict[ColorEncoding, str] = {"srgb8": "u1", "linear16": "<u2"}
 # An EXIF orientation must not turn a picture whose size has been checked.
@@ -46,7 +46,7 @@ def encode_color(
 ) -> ColorImage:
     """[h, w, 3] RGB -> payload. uint8 sRGB (`srgb8`), or uint16 linear (`linear16`, codec `raw` only).
 
-    `quality` is JPEG's, 0 to 100. Raises ValueError where dtype, encoding and codec do not go together.
+    `quality` is JPEG's, 0 to 100. Raises ValueError if dtype, encoding and codec do not match.
     """
     dtype = np.uint8 if encoding == "srgb8" else np.uint16
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != dtype:
@@ -66,11 +66,11 @@ def decode_color(
 ) -> Color:
     """Payload -> [h, w, 3] RGB, uint8 (`srgb8`) or uint16 (`linear16`), of exactly the camera's size.
 
-    A JPEG or video of a half or a quarter of the camera's width and height, rounded up, is enlarged to it. `encoding`
-    is what the reader expects: None means the camera's own; a composite is always `srgb8`. `decompress` decodes a JPEG
-    or PNG whose header has been checked (default: `decode_picture`), `video` checks and decodes a picture of H.264,
-    which rests on those before it: without it none is read.
-    Raises ProtocolError, before anything is allocated, for a picture that is not what it declares.
+    A JPEG or video image of a half or a quarter of the camera's size, rounded up, is enlarged. `encoding` is the
+    expected one: None means the camera's; a composite is always `srgb8`. `decompress` decodes a JPEG or PNG whose
+    header is validated (default: `decode_picture`). `video` validates and decodes an H.264 picture; without it H.264 is
+    refused.
+    Raises ProtocolError, before anything is allocated, for an image that does not match its declaration.
     """
     expected = encoding or camera.color_encoding
     if image.encoding != expected:
@@ -87,12 +87,12 @@ def decode_color(
 
 
 def reduced_sizes(camera: CameraModel) -> tuple[tuple[int, int], ...]:
-    """Width and height of a colour picture sent at a half and at a quarter of the camera's, rounded up."""
+    """Width and height of a colour image at a half and at a quarter of the camera's size, rounded up."""
     return tuple((-(-camera.width // divisor), -(-camera.height // divisor)) for divisor in (2, 4))
 
 
 def decode_picture(data: bytes) -> NDArray[np.uint8]:
-    """A JPEG or PNG -> [h, w, 3] RGB. Raises ProtocolError. Its header must have been checked."""
+    """A JPEG or PNG with validated header -> [h, w, 3] RGB. Raises ProtocolError."""
     try:
         rgb = cv2.imdecode(np.frombuffer(data, np.uint8), _READ_RGB)
     except cv2.error as error:
@@ -111,7 +111,7 @@ def encode_depth(
 ) -> DepthImage:
     """[h, w] uint16, 0 = no measurement -> payload, bit-exact. Raises ValueError for another shape or dtype.
 
-    `level` is zstd's: higher takes fewer bytes and more time. `rounded_per_m`: what was done to `depth` before.
+    `level` is zstd's: higher takes fewer bytes and more time. `rounded_per_m`: rounding applied to `depth` before.
     """
     if depth.ndim != 2 or depth.dtype != np.uint16:
         raise ValueError(f"depth must be [h, w] uint16, is {depth.shape} {depth.dtype}")
@@ -133,7 +133,7 @@ def encode_depth(
 def decode_depth(image: DepthImage, camera: CameraModel) -> NDArray[np.uint16]:
     """Payload -> [h, w] uint16 in units of `camera.depth_scale_m`, 0 = no measurement, of `camera.depth_lens`'s size.
 
-    Raises ProtocolError, before anything is allocated, for a picture that is not what it declares.
+    Raises ProtocolError, before anything is allocated, for an image that does not match its declaration.
     """
     _require_size("depth", image, camera.depth_lens)
     if image.codec == "raw":
@@ -157,7 +157,7 @@ def _require_size(field: str, image: Payload, lens: CameraModel | DepthCamera) -
 
 
 def _raw(field: str, image: Payload, dtype: str, channels: int) -> NDArray[Any]:
-    """The bytes as a writable native array of `dtype`, after checking that there are as many as declared."""
+    """The bytes as a writable native array of `dtype`, after checking that their number is the declared one."""
     expected = image.width * image.height * channels * np.dtype(dtype).itemsize
     if len(image.data) != expected:
         raise ProtocolError(f"{field}.data has {len(image.data)} bytes, {image.width}x{image.height} needs {expected}")
@@ -167,7 +167,7 @@ def _raw(field: str, image: Payload, dtype: str, channels: int) -> NDArray[Any]:
 def _compress_color(rgb: Color, codec: StillCodec, encoding: ColorEncoding, quality: int) -> bytes:
     if codec == "raw":
         return rgb.astype(_COLOR_DTYPE[encoding]).tobytes()
-    # OpenCV's own choice for PNG takes half the time of its level 1, and gives no more bytes.
+    # OpenCV's default PNG settings take half the time of level 1 and give no more bytes.
     options = (cv2.IMWRITE_JPEG_QUALITY, quality) if codec == "jpeg" else ()
     done, buffer = cv2.imencode(f".{codec}", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
     if not done:
@@ -186,7 +186,7 @@ def _of_video(image: ColorImage, video: Callable[[ColorImage], NDArray[np.uint8]
 
 
 def _decompress_color(image: ColorImage, decompress: Callable[[bytes], NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Decode a JPEG or PNG whose own header has been compared with what the payload declares."""
+    """Decode a JPEG or PNG after comparing its header with the payload's declaration."""
     size = (jpeg_size if image.codec == "jpeg" else png_size)(image.data)
     if size != (image.width, image.height):
         found = f"color.data is a picture of {size[0]}x{size[1]}"

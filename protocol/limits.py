@@ -1,4 +1,4 @@
-"""Limits of the wire, checked before anything is allocated."""
+"""Limits of the wire format, checked before anything is allocated."""
 
 PROTOCOL_VERSION = 1
 SUBPROTOCOL = f"probeless-v{PROTOCOL_VERSION}"

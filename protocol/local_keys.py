@@ -1,6 +1,6 @@
-"""What a server leaves for programs of its user on its machine, so that they get in without being told its token.
+"""Key files through which programs of the same user on the same machine find a server's token.
 
-One file a port, readable by the user alone, in the user's state directory; PROBELESS_KEYS names another folder.
+One file per port, readable by the user only, in the user's state directory. PROBELESS_KEYS sets another folder.
 """
 
 from __future__ import annotations
@@ -16,40 +16,40 @@ from platformdirs import user_state_path
 
 
 class LocalKey(Struct, frozen=True, kw_only=True):
-    """How to get into the server that listens on a port of this machine."""
+    """Credentials for the server that listens on a port of this machine."""
 
     token: str | None
     fingerprint: str | None = None
-    """SHA-256 of its certificate, where it speaks TLS."""
+    """SHA-256 fingerprint of its certificate, if it uses TLS."""
     pid: int
 
 
 def key_path(port: int) -> Path:
-    """Where the key of a port is left."""
+    """Path of the key file of a port."""
     folder = os.environ.get("PROBELESS_KEYS")
     return (Path(folder) if folder else user_state_path("probeless") / "keys") / f"{port}.json"
 
 
 @contextlib.contextmanager
 def key_left(port: int, key: LocalKey) -> Iterator[None]:
-    """Leave the key while the context lasts. Raises OSError where it cannot be written."""
+    """Context in which the key file exists. Raises OSError if it cannot be written."""
     path = key_path(port)
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     beside = path.with_suffix(f".{os.getpid()}")
     beside.unlink(missing_ok=True)
-    # Made for the user alone from the first byte on; a link that somebody laid there is not followed.
+    # Created with the final permissions; symbolic links are not followed.
     with open(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
         file.write(msgspec.json.encode(key))
     beside.replace(path)
     try:
         yield
     finally:
-        if find_key(port) == key:  # not one that a later server left
+        if find_key(port) == key:  # do not delete the file of a later server
             path.unlink(missing_ok=True)
 
 
 def find_key(port: int) -> LocalKey | None:
-    """The key of the server on a port of this machine; None where this user was left none, or its server is dead."""
+    """The key of the server on a port of this machine; None if there is none or the server is dead."""
     try:
         with key_path(port).open("rb") as file:
             if not _is_private(os.fstat(file.fileno())):
@@ -65,12 +65,12 @@ def _is_private(status: os.stat_result) -> bool:
 
 
 def _lives(pid: int) -> bool:
-    if os.name != "posix":  # elsewhere os.kill would end it
+    if os.name != "posix":  # on Windows os.kill would end the process
         return True
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:  # another user's by now
+    except PermissionError:  # the process id now belongs to another user
         return False
     return True

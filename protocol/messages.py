@@ -1,4 +1,4 @@
-"""Every message of the wire, as frozen typed structs: one tagged union per direction.
+"""All messages of the wire format as frozen typed structs: one tagged union per direction.
 
 MessagePack maps, tag field `type`. Matrices are row-major lists of 16 floats named `world_from_*`, metres.
 SH are radiance coefficients in the real orthonormal basis without Condon-Shortley phase, index l(l+1)+m, world axes.
@@ -60,7 +60,7 @@ def _require_finite(owner: str, **fields: object) -> None:
 
 
 class Payload(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """An encoded picture: declared size first, so that it is checked before the bytes are touched."""
+    """An encoded image. The declared size comes first, so that it is checked before the data is decoded."""
 
     width: Side
     height: Side
@@ -74,7 +74,7 @@ class Payload(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 class ColorImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Colour: `jpeg` and `png` are sRGB 8-bit; `raw` is interleaved RGB, little endian, in `encoding`.
 
-    `h264`, of frames only and where `welcome.codecs` has it: the next picture of a session's video.
+    `h264`, in frames only and if listed in `welcome.codecs`: the next picture of the session's video.
     """
 
     codec: ColorCodec
@@ -85,12 +85,12 @@ class DepthImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True,
     """uint16 depth, lossless.
 
     `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd.
-    `zranks` and `zstd-ranks`: the same of the values' ranks, two in a byte.
+    `zranks` and `zstd-ranks`: the same for the values' ranks, two in a byte.
     """
 
     codec: DepthCodec
     rounded_per_m: Annotated[float, Meta(gt=0, le=1)] | None = None
-    """What the sender changed before: each depth z (metres) by at most this times z^2; None: nothing."""
+    """Rounding by the sender: each depth z (metres) was changed by at most this times z^2; None: no rounding."""
 
 
 BudgetMs = Annotated[float, Meta(gt=0, le=60000)]
@@ -98,26 +98,26 @@ LightErrorDeg = Annotated[float, Meta(gt=0, le=180)]
 
 
 class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a capturing client asks of its session; the command line's options of the same names."""
+    """Options of a capturing client's session; the command line has options of the same names."""
 
     preset: Preset = "reg4"
-    """`auto`: the server chooses where and how transfer is sampled, and the rays, from what its device was measured to
-    take and to err (`probeless tune`)."""
+    """`auto`: the server chooses sampling and rays from the times and errors measured on its device (`probeless
+    tune`)."""
     budget_ms: BudgetMs | None = None
-    """Of `auto`: a frame shall take no longer."""
+    """With `auto`: time limit of a frame."""
     max_light_error_deg: LightErrorDeg | None = None
-    """Of `auto`: the fastest point whose dominant direction errs by no more, where the device was measured."""
+    """With `auto`: choose the fastest point whose error of the dominant direction was measured to be no larger."""
     rays: Annotated[int, Meta(ge=4, le=1024)] = 81
     stride: Annotated[int, Meta(ge=1, le=16)] | None = None
-    """A1: every how many pixels transfer is sampled; None, as of the four below: what the preset says."""
+    """A1: distance between transfer samples in pixels. None here and in the next four fields: the preset's value."""
     interleave: Literal[1, 2, 4, 8] | None = None
-    """A3, A4: a frame traces one of so many subsets of the directions; of presets that trace rays."""
+    """A3, A4: number of subsets of the directions, of which a frame traces one; only for presets that trace rays."""
     upsampling: Literal["bilateral", "bicubic"] | None = None
     """A5."""
     visibility_state: bool | None = None
-    """A6: no rays where the volume is known to be open; of presets that trace rays."""
+    """A6: skip rays where the volume is known to be open; only for presets that trace rays."""
     auxiliary_views: Annotated[int, Meta(ge=16, le=4096)] | None = None
-    """R5, A7: depth pictures from all around that visibility is looked up in; of GR15 and GR15FAST."""
+    """R5, A7: depth views around the scene in which visibility is looked up; only for GR15 and GR15FAST."""
     smooth_depth: bool = True
     """G3: D''', the median of the merged depth; without it, D'' is the last."""
     ray_length_m: Annotated[float, Meta(ge=0, le=1000)] | None = None
@@ -127,40 +127,41 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     indirect: Literal["none", "observed"] = "none"
     as_thesis: bool = False
     denoise: Literal["none", "bilateral", "tv_l1"] = "none"
-    """Of the lightness that the light is estimated from; the composite keeps the camera's picture."""
+    """Denoising of the lightness used for light estimation; the composite keeps the camera's image."""
     denoise_iterations: Annotated[int, Meta(ge=1, le=1000)] = 20
-    """Of TV-L1."""
+    """Iterations of TV-L1."""
     poses: Poses = "given"
     volume_m: tuple[float, float, float, float, float, float] | None = None
-    """x0, y0, z0, x1, y1, z1 in world metres; None: what the first frame sees."""
+    """x0, y0, z0, x1, y1, z1 in world metres; None: the view of the first frame."""
     voxel_m: Annotated[float, Meta(gt=0, le=1)] | None = None
     up: Vector3 | None = None
     """World direction; None: the first camera's -y."""
     light: tuple[Rgb, ...] | None = None
     """Radiance SH to render with instead of an estimate: 1, 4, 9 ... coefficients; None: estimate one."""
     light_axes: Literal["world", "webxr"] = "world"
-    """Of `light`; `webxr`: up as +y and the first camera's view near -z."""
+    """Axes of `light`; `webxr`: up as +y and the first camera's view near -z."""
     lamps: Literal["auto", "on", "off"] = "auto"
-    """Whether lights inside the room are looked for; `auto`: where distant light does not explain what is seen."""
+    """Whether to search for lights inside the room; `auto`: only if distant light does not explain the image."""
     exposure: Literal["auto", "constant"] = "auto"
-    """`auto`: of each frame as it says, estimated where it does not say; `constant`: the same for all frames."""
+    """`auto`: the frame's exposure if given, else estimated; `constant`: the same for all frames."""
     edges: Literal["smooth", "hard"] = "smooth"
-    """Of virtual things: by how much of a pixel they cover, or by its middle, as in pictures that are point samples."""
+    """Edges of virtual objects: by pixel coverage, or by the pixel centre, for images that are point samples."""
     tone_mapping: Literal["auto", "light", "average"] = "auto"
-    """What virtual things' brightness rests on: the light's scale, or the averages of the picture and of its shading;
-    `auto`: the scale of a light that is given, the averages under one that is estimated."""
+    """Brightness of virtual objects follows the light's scale, or the averages of the image and its shading; `auto`:
+    the scale for a given light, the averages for an estimated one."""
     light_color: Literal["estimated", "white"] = "estimated"
-    """`white`: as the thesis assumes, the light's luminance without its colours."""
+    """`white`: only the light's luminance, as the thesis assumes."""
     robustness: tuple[Robustness, ...] = ("openness", "memory", "outliers")
-    """Measures that light estimation takes (thesis 5.2, 5.4): samples that see little sky are left out; weights by how
-    common a normal is (`normals_printed`: as eq. 5.7 has them); earlier frames count; what fits badly counts less."""
+    """Robustness measures of light estimation (thesis 5.2, 5.4): `openness` skips samples that see little sky,
+    `normals` weights by frequency of normals (`normals_printed`: as in eq. 5.7), `memory` uses earlier frames,
+    `outliers` reduces the weight of bad fits."""
     plan: Literal["needed", "everything"] = "needed"
-    """`everything`: what would hardly be seen is simulated too, to check the bounds of leaving it out."""
+    """`everything`: also run effects whose change would be invisible, to check the bounds of culling."""
     answer: Literal["picture", "layer", "light"] = "picture"
-    """`layer`: what is virtual comes apart from the camera's picture, for clients that put it over their newest one;
-    `light`: a frame is answered by its light alone, for clients that draw virtual things themselves."""
+    """`layer`: virtual content separate from the camera's image, for clients that compose it with their newest image.
+    `light`: only the light, for clients that render virtual objects themselves."""
     lossless: bool = False
-    """Answers carry PNG pictures, and every frame is answered in order instead of latest-wins."""
+    """Answers use PNG, and every frame is answered in order instead of latest-wins."""
 
     def __post_init__(self) -> None:
         _require_finite(
@@ -178,23 +179,23 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Message(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="type"):
-    """Base of everything on the socket."""
+    """Base of all messages."""
 
 
 # ---- client to server --------------------------------------------------------------------------------------------
 
 
 class Marker(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A square fiducial marker that all clients of a room may see."""
+    """A square fiducial marker that the clients of a room may detect."""
 
     id: Annotated[int, Meta(ge=0, le=999)]
     side_m: Annotated[float, Meta(gt=0.005, le=5)]
-    """Of the black square."""
+    """Side of the black square."""
     dictionary: Dictionary = "4x4_50"
 
 
 class Hello(Message, frozen=True, kw_only=True, omit_defaults=True, tag="hello"):
-    """First message of a client that captures."""
+    """First message of a capturing client."""
 
     client: Name
     camera: CameraModel
@@ -202,17 +203,17 @@ class Hello(Message, frozen=True, kw_only=True, omit_defaults=True, tag="hello")
     room: Name | None = None
     """Clients of one room share volume, light and objects; None: a room of its own."""
     room_key: Key | None = None
-    """Of the room: who opens it sets it, the others have to know it."""
+    """Key of the room: set by the client that opens it, required from the others."""
     room_from_world: Matrix4 | None = None
-    """Where this client's world lies in the room's, which is that of the client that came first; rigid.
+    """Rigid transform from this client's world to the room's, which is the world of its first client.
 
-    None: not known, to be found by `marker`, else by what the room has seen."""
+    None: unknown; found by `marker` or by relocalisation in the scanned room."""
     marker: Marker | None = None
-    """By which the client's world is laid on the room's, once both have seen it."""
+    """Marker that aligns the client's world with the room's once it has been detected in both."""
     keep_s: Annotated[float, Meta(ge=0, le=300)] = 0.0
-    """How long the session waits for this client when its connection is lost without a bye; 0: it ends with it."""
+    """How long the session survives a connection that is lost without a bye; 0: not at all."""
     resume: Name | None = None
-    """`welcome.key` of a session that waits: it goes on as it was, and nothing else of this message counts."""
+    """`welcome.key` of a session to resume. It continues unchanged; all other fields of this message are ignored."""
 
     def __post_init__(self) -> None:
         if self.room_from_world is not None:
@@ -222,14 +223,14 @@ class Hello(Message, frozen=True, kw_only=True, omit_defaults=True, tag="hello")
 
 
 class Watch(Message, frozen=True, kw_only=True, omit_defaults=True, tag="watch"):
-    """First message of a client that only looks: it receives what the capturing session produces."""
+    """First message of a watching client, which receives the output of a capturing session."""
 
     session: Name | None = None
-    """None: the session that is streaming, now or next."""
+    """None: the session that is streaming, or the next one to start."""
     room: Name | None = None
-    """Of `session: None`: only those of this room."""
+    """With `session: None`: only sessions of this room."""
     room_key: Key | None = None
-    """Without it, nothing is seen of rooms that have one."""
+    """Required to watch a room that has a key."""
 
 
 class Frame(Message, frozen=True, kw_only=True, omit_defaults=True, tag="frame"):
@@ -239,13 +240,13 @@ class Frame(Message, frozen=True, kw_only=True, omit_defaults=True, tag="frame")
     timestamp_s: float
     world_from_camera: Matrix4 | None
     color: ColorImage | None = None
-    """None, with a pose and no depth: of somebody who only looks at a room that others scan."""
+    """None, with a pose and no depth: the view of a client without a camera, in a room that others scan."""
     depth: DepthImage | None = None
-    """None: of a camera without a depth sensor, in a room that others scan."""
+    """None: a camera without a depth sensor, in a room that others scan."""
     exposure: float | None = None
-    """Exposure time times gain of the colour picture, in any unit that stays the same for the session; None: unknown.
+    """Exposure time times gain of the colour image, in any unit that is constant during the session; None: unknown.
 
-    What cannot be one (not finite, not above 0) is told in the composite's notes and taken as None.
+    An invalid value (not finite, not above 0) is reported in the answer's notes and treated as None.
     """
 
     def __post_init__(self) -> None:
@@ -255,7 +256,7 @@ class Frame(Message, frozen=True, kw_only=True, omit_defaults=True, tag="frame")
 
 
 class PlaceObject(Message, frozen=True, kw_only=True, tag="place_object"):
-    """Put a virtual object into the session; acknowledged."""
+    """Place a virtual object; acknowledged."""
 
     request: Index
     object: Name
@@ -271,7 +272,7 @@ class PlaceObject(Message, frozen=True, kw_only=True, tag="place_object"):
 
 
 class MoveObject(Message, frozen=True, kw_only=True, tag="move_object"):
-    """Move an object that is there; acknowledged."""
+    """Move an existing object; acknowledged."""
 
     request: Index
     object: Name
@@ -284,14 +285,14 @@ class MoveObject(Message, frozen=True, kw_only=True, tag="move_object"):
 
 
 class RemoveObject(Message, frozen=True, kw_only=True, tag="remove_object"):
-    """Take an object away; acknowledged."""
+    """Remove an object; acknowledged."""
 
     request: Index
     object: Name
 
 
 class Quality(Message, frozen=True, kw_only=True, tag="quality"):
-    """Change the preset of the running session, or the budget by which it is chosen; acknowledged."""
+    """Change the preset of the running session, or the budget or error limit that chooses it; acknowledged."""
 
     request: Index
     preset: Preset
@@ -303,13 +304,13 @@ class Quality(Message, frozen=True, kw_only=True, tag="quality"):
 
 
 class RequestMesh(Message, frozen=True, kw_only=True, tag="request_mesh"):
-    """Ask for the surface fused so far, as files; answered by the parts of each and then acknowledged."""
+    """Request the scanned surface as mesh files; answered by mesh parts and then acknowledged."""
 
     request: Index
 
 
 class Bye(Message, frozen=True, kw_only=True, tag="bye"):
-    """Either side says it is leaving, and why."""
+    """Either side is leaving, with the reason."""
 
     reason: Reason = ""
 
@@ -324,21 +325,21 @@ class Welcome(Message, frozen=True, kw_only=True, omit_defaults=True, tag="welco
     server: Name
     device: str
     max_inflight: int
-    """Frames the client may have unanswered."""
+    """Number of frames that the client may have unanswered."""
     key: str | None = None
-    """By which the session is resumed (`hello.resume`), where the client asked for it to be kept. A secret."""
+    """Secret key to resume the session (`hello.resume`), if the client set `keep_s`."""
     resumed: bool = False
-    """Frames that were sent before are not answered any more, unless the session is lossless; requests are, if they
-    are sent again."""
+    """True after a resume. Earlier frames are not answered any more, unless the session is lossless. Requests are
+    answered if they are sent again."""
     room: Name | None = None
     codecs: tuple[ColorCodec, ...] = ("jpeg", "png", "raw")
-    """That frames' colour may have."""
+    """Colour codecs that frames may use."""
     depth_codecs: tuple[DepthCodec, ...] = ("raw", "zdelta", "zstd-delta")
-    """That their depth may have."""
+    """Depth codecs that frames may use."""
 
 
 class LeftOut(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """An effect that did not run, why, and what leaving it out can change at most, in display units (1 is 1/255)."""
+    """An effect that did not run, the reason, and a bound on the change, in display units (1 is 1/255)."""
 
     effect: str
     reason: str
@@ -346,24 +347,24 @@ class LeftOut(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class OperatingPoint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Where and how finely a frame was sampled, and why."""
+    """How a frame was sampled, and why."""
 
     settings: str
-    """As options of the command line."""
+    """As the command line's options."""
     reason: str
     expected_ms: float | None = None
-    """What a frame was expected to take; of points that were chosen, like the next."""
+    """Expected time of a frame; like the next field, only for points that the server chose."""
     light_error_deg: float | None = None
-    """Error of the dominant direction where the device was measured."""
+    """Error of the dominant direction that was measured on the device."""
 
 
 class Plan(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which effects ran for a frame, in order, which did not, and how finely it was sampled."""
+    """Effects that ran for a frame, in order, those that were left out, and how the frame was sampled."""
 
     run: tuple[str, ...]
     left_out: tuple[LeftOut, ...]
     point: OperatingPoint | None = None
-    """None: a camera that is lost samples nothing."""
+    """None if tracking is lost: nothing was sampled."""
 
 
 class Timings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -380,33 +381,33 @@ class Timings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class DirectedLight(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One of the lights that the room's light is made of, besides an even sky."""
+    """One directional component of the room's light, in addition to uniform light."""
 
     direction: Vector3
     """World, unit, towards the light."""
     irradiance: Rgb
-    """Radiance of a white surface that faces it, lit by it alone."""
+    """Radiance of a white surface that faces it and receives no other light."""
     spread_deg: float
     """Standard deviation along either axis; 0 for light from one direction."""
 
 
 class Lamp(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A light inside the room that shines evenly all around."""
+    """A light inside the room that emits equally in all directions."""
 
     position_m: Vector3
     """World."""
     position_std_m: Vector3
-    """One standard deviation along the world's axes."""
+    """One standard deviation along each world axis."""
     intensity: Rgb
-    """Radiant intensity: radiance of the light's units times m^2; d metres away it adds intensity / (pi d^2) to a white
-    surface that faces it."""
+    """Radiant intensity in units of radiance times m^2. At a distance of d metres it adds intensity / (pi d^2) to the
+    radiance of a white surface that faces it."""
     intensity_std: Rgb
     share: float
-    """Of the light (luminance) that the surfaces seen receive."""
+    """Share of the luminance that visible surfaces receive."""
 
 
 class Light(Message, frozen=True, kw_only=True, tag="light"):
-    """The room's light as one frame left it; the fields of a line of `light.jsonl`."""
+    """The estimate of the room's light after one frame; the fields of a line of `light.jsonl`."""
 
     frame: Index
     timestamp_s: float
@@ -419,24 +420,24 @@ class Light(Message, frozen=True, kw_only=True, tag="light"):
     sh_webxr: tuple[float, ...]
     """27 floats, RGB-interleaved C00 C1-1 C10 C11 ..., in axes with up as +y and the first camera's view near -z."""
     dominant_direction: Vector3
-    """World, unit, towards the light, from l = 1 of Rec. 709 luminance; (0, 0, 0) where there is none."""
+    """World, unit, towards the light, from l = 1 of Rec. 709 luminance; (0, 0, 0) if there is none."""
     dominant_intensity: float
     dominant_lights: tuple[DirectedLight, ...] = ()
-    """Each of the lights, strongest first, where there is more than an even sky."""
+    """Directional components, strongest first; empty if the light is uniform."""
     lamps: tuple[Lamp, ...] = ()
-    """Lights inside the room, strongest first; their light is not part of `sh`."""
+    """Lights inside the room, strongest first; not included in `sh`."""
     exposure: float = 1.0
-    """Of this frame relative to the session's first. All radiance here is in units of this frame's picture: over
-    `exposure` it is in those of the first one's, which a room under steady light keeps."""
+    """Exposure of this frame relative to the session's first. All radiance here is in units of this frame's image.
+    Divided by `exposure` it is in units of the first image, and constant under constant light."""
     up: Vector3 | None = None
-    """World, unit: along it objects stand, as whoever opened the room asked."""
+    """World, unit: the up direction, along which objects stand."""
     condition: float | None
-    """Condition number of the unregularised normal equations; null when infinite."""
+    """Condition number of the unregularised normal equations; null if infinite."""
     valid: bool
 
 
 class Drawn(Message, frozen=True, kw_only=True):
-    """What comes with the picture, or the layer, of one frame."""
+    """Fields common to composite and layer."""
 
     frame: Index
     timestamp_s: float
@@ -445,71 +446,71 @@ class Drawn(Message, frozen=True, kw_only=True):
     timings: Timings
     plan: Plan
     notes: tuple[str, ...] = ()
-    """What was wrong with this frame's input, one line each."""
+    """Problems with this frame's input, one line each."""
     waited_ms: float = 0.0
-    """From when the frame had arrived until the device began with it: unread, decoded, waiting for its turn."""
+    """Time from the frame's arrival until its processing began: in the queue, decoding, waiting for the device."""
 
 
 class Composite(Drawn, frozen=True, kw_only=True, tag="composite"):
-    """The finished picture of one frame."""
+    """The composite image of one frame."""
 
     color: ColorImage
 
 
 class LayerPatch(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A part of the camera's picture, and how far away each of its pixels is."""
+    """A rectangle of the camera's image with the depth of each pixel."""
 
     x: Annotated[int, Meta(ge=0, lt=MAX_IMAGE_SIDE_PX)]
-    """Column of the camera's picture in which the part begins."""
+    """Column of the camera's image at which the rectangle begins."""
     y: Annotated[int, Meta(ge=0, lt=MAX_IMAGE_SIDE_PX)]
     color: ColorImage
     """PNG."""
     depth: DepthImage
-    """Of the same size, along the camera's z; 0: the pixel says nothing."""
+    """Same size, along the camera's z; 0: the pixel is empty."""
 
 
 class Layer(Drawn, frozen=True, kw_only=True, tag="layer"):
-    """What is virtual in one frame (`wishes.answer`), to be put over a camera picture p, of this frame or a later one.
+    """Virtual content of one frame (`wishes.answer`), to be composed with a camera image p of this or a later frame.
 
     All linear: picture = coverage * virtual + (1 - coverage) * ratio * p (thesis 7.2.1).
     """
 
     virtual: LayerPatch | None
-    """Colour of four channels: sRGB, not multiplied by coverage, which is the fourth, 255 for all of a pixel.
+    """Four channels: sRGB, not premultiplied, and coverage (255: the whole pixel).
 
-    None: nothing is seen of it."""
+    None: no virtual object is visible."""
     ratio: LayerPatch | None
-    """Colour of three channels: 128 times the root of what real surface is multiplied by.
+    """Three channels: 128 times the square root of the factor on real surfaces.
 
-    None: real surface stays as it is."""
+    None: real surfaces are unchanged."""
     depth_scale_m: Annotated[float, Meta(gt=0, le=1)]
-    """Metres of a unit of depth."""
+    """Metres per unit of depth."""
 
 
 class Dropped(Message, frozen=True, kw_only=True, tag="dropped"):
-    """This frame was replaced by a newer one before it was read, or refused; nothing else comes for it."""
+    """The frame was replaced by a newer one before it was read, or was refused. It gets no other answer."""
 
     frame: Index
     reason: Reason
 
 
 class MeshPart(Message, frozen=True, kw_only=True, tag="mesh_part"):
-    """A piece of a file of the scene's mesh; the pieces of a file come in order, one file after the other.
+    """Part of a mesh file. The parts of a file come in order, one file after the other.
 
-    PLY: world axes, metres. GLB: a node turns the world into glTF's axes, +y up. Vertex colours are sRGB.
+    PLY: world axes, metres. GLB: a node rotates the world to glTF's axes, +y up. Vertex colours are sRGB.
     """
 
     request: Index
     format: MeshFormat
     size_bytes: Annotated[int, Meta(ge=1, le=MAX_SCENE_MESH_BYTES)]
-    """Of the whole file."""
+    """Size of the whole file."""
     offset: Index
-    """Of this piece's first byte in the file."""
+    """Offset of this part in the file."""
     data: Annotated[bytes, Meta(min_length=1, max_length=MAX_MESH_PART_BYTES)]
 
 
 class Acknowledged(Message, frozen=True, kw_only=True, tag="acknowledged"):
-    """A control message was applied, or refused with its error."""
+    """A control message was applied, or refused with `error`."""
 
     request: Index
     error: Reason | None = None
@@ -517,7 +518,7 @@ class Acknowledged(Message, frozen=True, kw_only=True, tag="acknowledged"):
 
 
 class Error(Message, frozen=True, kw_only=True, tag="error"):
-    """Something the client sent is wrong; `fatal` when the server closes the socket after it."""
+    """The client sent something invalid; `fatal` if the server closes the connection."""
 
     reason: Reason
     fatal: bool

@@ -1,7 +1,7 @@
-"""What a JPEG or PNG says of itself, read before a decoder may allocate or loop for it.
+"""Validates JPEG and PNG headers before a decoder reads the image.
 
-A picture is refused here if it is truncated, carries anything a plain 8-bit picture does not need (animation,
-compressed text, hundreds of scans: each a way to make a small message expensive), or cannot be told the size of.
+An image is refused if it is truncated, if its size cannot be determined, or if it contains anything that a plain 8-bit
+image does not need (animation, compressed text, hundreds of scans), which could make a small message expensive.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Recordings: what a client sent (or received), one MessagePack message after another in a file."""
+"""Recordings: the messages that a client sent or received, as consecutive MessagePack messages in a file."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def write_message(file: BinaryIO, message: AnyMessage) -> None:
 
 
 def read_messages(path: Path, report: Callable[[str], None]) -> Iterator[AnyMessage]:
-    """Every whole message of a recording, one at a time; the file is never in memory as a whole.
+    """Iterate over the complete messages of a recording, without loading the whole file.
 
-    A recording that ends inside a message (the recorder was interrupted) is told to `report` in one line, after its
-    whole messages have been yielded. Raises ProtocolError, with the position, for bytes that are no message.
+    If the recording ends inside a message (the recorder was interrupted), `report` is called with one line after the
+    last complete message. Raises ProtocolError with the position for invalid bytes.
     """
     with path.open("rb") as file:
         unpacker = msgpack.Unpacker(file, max_buffer_size=MAX_MESSAGE_BYTES)

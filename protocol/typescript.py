@@ -1,4 +1,4 @@
-"""TypeScript definitions from the Python ones: `python -m protocol.typescript` rewrites the browser's protocol.ts.
+"""Generates TypeScript definitions from the Python messages: `python -m protocol.typescript` rewrites protocol.ts.
 
 Interfaces with a literal `type` tag, so that `switch (message.type)` over the unions is checked for completeness.
 A field with a default may be left out of what a client sends; the server always writes every field.
@@ -41,7 +41,7 @@ def _constants() -> Iterator[str]:
 
 
 def _structs(classes: tuple[type, ...]) -> list[type]:
-    """`classes` and every struct their fields hold, in the order of first mention, the mentioned ones first."""
+    """`classes` and all structs used in their fields, each after the structs that it uses."""
     found: dict[type, None] = {}
 
     def visit(node: types.Type) -> None:

@@ -1,4 +1,4 @@
-"""H.264 pictures to RGB, through PyAV (FFmpeg) where it is installed; it has been checked by protocol.h264."""
+"""Decodes H.264 pictures to RGB with PyAV (FFmpeg), if installed. They are validated by protocol.h264 before."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from protocol.codec import ProtocolError
 IS_POSSIBLE = find_spec("av") is not None
 """Whether PyAV is installed."""
 OPTIONS = {"flags": "low_delay", "err_detect": "explode"}
-"""Each picture comes out at once; a damaged one is an error, not an invention."""
+"""Output each picture at once; report damaged pictures as errors instead of concealing them."""
 
 
 class VideoDecoder:
-    """Of one stream; used by one thread."""
+    """Decoder of one stream. Not thread-safe."""
 
     def __init__(self) -> None:
-        """Raises ImportError without PyAV."""
+        """Raises ImportError if PyAV is missing."""
         import av
         from av.video.reformatter import ColorRange, Colorspace
 
@@ -33,7 +33,7 @@ class VideoDecoder:
         self._limited = ColorRange.MPEG
 
     def decode(self, data: bytes) -> NDArray[np.uint8]:
-        """One picture -> [h, w, 3] sRGB. Raises ProtocolError; then the next one must be a key picture."""
+        """One picture -> [h, w, 3] sRGB. Raises ProtocolError; the next one must then be a key picture."""
         try:
             pictures = self._decoder.decode(self._av.Packet(data))
         except self._av.FFmpegError as error:
@@ -43,7 +43,7 @@ class VideoDecoder:
         return np.asarray(pictures[0].to_ndarray(format="rgb24", **self._color_of(pictures[0])), np.uint8)
 
     def _color_of(self, picture: Any) -> dict[str, Any]:
-        """Matrix and range as the stream says them; what it does not say is as in JPEG."""
+        """Set colour matrix and range to those of the stream; the default is that of JPEG."""
         said = dict(self._unsaid)
         if picture.colorspace in self._matrices:
             said["src_colorspace"] = self._matrices[picture.colorspace]

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-MODULES = ("server.service.saving.files", "server.service.saving.slot", "server.service.room_store")
+MODULES = ("server.service.saving.checksummed_files", "server.service.saving.save_slot", "server.service.room_store")
 
 
 class PowerCut(BaseException):

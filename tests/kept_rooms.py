@@ -16,9 +16,9 @@ from server.opencl.device import Device
 from server.room.room import Room
 from server.scene.placement import Placement
 from server.service.room_store import RoomStore
-from server.service.saving.slot import Slot
+from server.service.saving.room_state import state_to_bytes
+from server.service.saving.save_slot import SaveSlot
 from server.service.saving.snapshot import snapshot_within
-from server.service.saving.state import state_to_bytes
 from server.volume.volume import Volume
 from tests.meshes import shape_of
 from tests.rooms import CAMERA, frame_at, view_at
@@ -51,7 +51,7 @@ def voxels_of(volume: Volume) -> dict[int, bytes]:
 
 def print_of(room: Room) -> tuple[str, ...]:
     """Of everything in it: rooms of the same print are the same, bit for bit. For whoever holds the room's lock."""
-    taken = snapshot_within(room, Slot(Path()))
+    taken = snapshot_within(room, SaveSlot(Path()))
     voxels = hashlib.blake2b()
     for place, data in sorted(voxels_of(room.reconstruction.volume).items() if room.reconstruction.volume else ()):
         voxels.update(f"{place}".encode() + data)

@@ -38,8 +38,8 @@ def run_demo(out: Path, device_name: str | None, keep: bool, port: int = 0) -> N
 
     Raises ServeError, ClientError or UserError, each with one line.
     """
-    service, door = open_service(device_name), Authenticator(new_token())
-    with _prepared(FRAMES) as demo, BackgroundServer(service, port=port, door=door) as server:
+    service, authenticator = open_service(device_name), Authenticator(new_token())
+    with _prepared(FRAMES) as demo, BackgroundServer(service, port=port, authenticator=authenticator) as server:
         say(f"watch it at {server.way_in}")
         done = _stream(demo, server.way_in, out)
         say(f"{done.answered} frames in {done.seconds:.1f} s, pictures in {out / 'frames'}")

@@ -1,6 +1,6 @@
-"""Beyond one machine, on Ray Serve (extra `cluster`): replicas hold the sockets, each room is a process of its own.
+"""Several machines with Ray Serve (extra `cluster`): ingress replicas hold the sockets; each room is a process.
 
-`application` is what Serve runs: `ingress` (ASGI) finds the room of a client's first message through `places` and
-relays bytes (`relay`); `host` is a room's process, an ordinary service; `keeper` closes rooms that nobody is in and
-asks the cluster for as many places as `capacity` says. `simulation` plays a day against that.
+Serve runs `application`. `ingress` (ASGI) finds the room of a client's first message in the `room_directory` and relays
+messages (`relay`). `host` is a room's process, an ordinary service. `room_supervisor` closes empty rooms and requests
+capacity according to `capacity`, which `simulation` evaluates over a day.
 """

@@ -1,6 +1,6 @@
-"""What Ray Serve runs: `import_path: server.cluster.application:build`, its `args` those of ClusterSettings.
+"""The Ray Serve application: `import_path: server.cluster.application:build`; `args` are the ClusterSettings.
 
-Clients' token is PROBELESS_TOKEN, as of `probeless serve`; it must be set, to `none` for everybody.
+The environment variable PROBELESS_TOKEN must hold the clients' token, or `none` to allow every client.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from fastapi import FastAPI
 from ray import serve
 
 from server.cluster.ingress import Ingress, create_ingress_app
-from server.cluster.keeper import Keeper
-from server.cluster.ray_places import RayPlaces
+from server.cluster.ray_directory import RayRoomDirectory
+from server.cluster.room_supervisor import RoomSupervisor
 from server.cluster.settings import ClusterSettings, read_settings
 from server.service.authenticator import Authenticator, is_token
 
@@ -21,11 +21,11 @@ TOKEN = "PROBELESS_TOKEN"
 
 
 class IngressReplica:
-    """One replica: its sockets."""
+    """One ingress replica."""
 
-    def __init__(self, settings: ClusterSettings, door: Authenticator, _keeper: object) -> None:
-        """`_keeper`: named here, so that Serve runs one."""
-        self._ingress = Ingress(RayPlaces(settings), door)
+    def __init__(self, settings: ClusterSettings, authenticator: Authenticator, _supervisor: object) -> None:
+        """`_supervisor`: an argument so that Serve deploys it."""
+        self._ingress = Ingress(RayRoomDirectory(settings), authenticator)
 
     def __serve_build_asgi_app__(self) -> FastAPI:
         """Called by Serve."""
@@ -33,10 +33,14 @@ class IngressReplica:
 
 
 def build(args: dict[str, Any]) -> Any:
-    """The application. Raises ValueError where a setting is wrong."""
+    """Build the application. Raises ValueError for an invalid setting."""
     settings = read_settings(args)
-    keeper = serve.deployment(
-        Keeper, name="keeper", num_replicas=1, ray_actor_options={"num_cpus": 0.1}, graceful_shutdown_timeout_s=5.0
+    supervisor = serve.deployment(
+        RoomSupervisor,
+        name="room-supervisor",
+        num_replicas=1,
+        ray_actor_options={"num_cpus": 0.1},
+        graceful_shutdown_timeout_s=5.0,
     )
     ingress = serve.deployment(
         serve.ingress()(IngressReplica),
@@ -50,11 +54,11 @@ def build(args: dict[str, Any]) -> Any:
         ray_actor_options={"num_cpus": settings.ingress_cpus},
         graceful_shutdown_timeout_s=10.0,
     )
-    return ingress.bind(settings, door_from_environment(), keeper.bind(settings))
+    return ingress.bind(settings, authenticator_from_environment(), supervisor.bind(settings))
 
 
-def door_from_environment() -> Authenticator:
-    """Raises ValueError where no token is set, or one that cannot be one."""
+def authenticator_from_environment() -> Authenticator:
+    """Raises ValueError if the token is missing or invalid."""
     token = os.environ.get(TOKEN, "")
     if token == "none":
         return Authenticator(None)

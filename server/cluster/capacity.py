@@ -1,4 +1,4 @@
-"""How many places for rooms the cluster should have. Pure: the keeper and the simulation ask the same."""
+"""Autoscaling policy: how many rooms the cluster should have places for. Shared by supervisor and simulation."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The autoscaler's settings."""
 
     spare: Annotated[int, Meta(ge=0)] = 2
-    """Places kept free, so that a room need not wait for a machine to start."""
+    """Places kept free, so that a new room does not wait for a machine to start."""
     spare_share: Annotated[float, Meta(ge=0, le=4)] = 0.1
-    """The same as a share of the rooms that are open, where that is more."""
+    """The same as a share of the open rooms; the larger of the two counts."""
     queue_age_s: Annotated[float, Meta(gt=0)] = 0.25
-    """Of frames, in the mean over all rooms; when it is longer, nodes hold too many rooms."""
+    """Mean queue age of frames over all rooms above which nodes are considered overloaded."""
     most_relief: Annotated[float, Meta(ge=1, le=4)] = 1.5
-    """By how much at most a queue age beyond that adds places: rooms that are open stay where they are."""
+    """Limit on the factor by which overload increases the places. Open rooms are not moved."""
     shrink_after_s: Annotated[float, Meta(ge=0)] = 600.0
-    """Places are given back when they have not been wanted for so long."""
+    """Places are released after they have not been needed for this time."""
     most: Annotated[int, Meta(ge=1)] = 64
-    """Places that are asked for, whatever comes."""
+    """Upper limit on the places requested."""
 
 
 class Capacity:
-    """Up at once, down after a while."""
+    """Scales up at once and down after a delay."""
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
         self._needs: deque[tuple[float, int]] = deque()
-        """When and how many places were needed, only those that no later one reaches."""
+        """(time, places needed), decreasing in places: a sliding-window maximum."""
 
     def wanted(self, now_s: float, rooms: int, queue_age_s: float) -> int:
-        """Places in all, those that are taken included. `rooms`: open or being opened. Times must not go back."""
+        """Total places, including used ones. `rooms`: open or being opened. `now_s` must not decrease."""
         need = places_needed(self._policy, rooms, queue_age_s)
         while self._needs and self._needs[-1][1] <= need:
             self._needs.pop()
@@ -46,7 +46,7 @@ class Capacity:
 
 
 def places_needed(policy: Policy, rooms: int, queue_age_s: float) -> int:
-    """At this moment."""
+    """Places needed now."""
     relief = min(max(queue_age_s / policy.queue_age_s, 1.0), policy.most_relief)
     spare = max(policy.spare, math.ceil(policy.spare_share * rooms))
     return min(math.ceil(rooms * relief) + spare, policy.most)

@@ -1,6 +1,6 @@
-"""The process of one room: an ordinary service on its node's device, reached by the ingress over the cluster's network.
+"""The process of one room: an ordinary service on its node's device, which the ingress connects to.
 
-A Ray actor. When its node dies Ray starts it anew on another one, where the service loads the room as it was saved.
+It runs as a Ray actor. If its node fails, Ray restarts it on another one, where the service loads the saved room.
 """
 
 from __future__ import annotations
@@ -13,51 +13,51 @@ from urllib.parse import urlsplit
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from server.cluster.places import Address
+from server.cluster.node_warm_up import warm_up_node
+from server.cluster.room_directory import Address
 from server.cluster.settings import ClusterSettings
-from server.cluster.warmth import warm_up_node
 from server.service.authenticator import Authenticator, new_token
 from server.service.limits import DEFAULT_LIMITS, MIB, Limits
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 
 FOR_ALL = 1 << 30
-"""Of limits by address, which the ingress would fill alone."""
+"""Limit per address; effectively none, since all clients come from the ingress's addresses."""
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class HostStatus:
-    """What the keeper wants to know."""
+    """Status for the room supervisor."""
 
     clients: int
     idle_s: float
-    """Since the last client."""
+    """Time since the last client left."""
     queue_age_s: float
-    """Of frames since the status before, in the mean; 0 where there was none."""
+    """Mean queue age of frames since the previous status; 0 without frames."""
     node: str
-    """Its id in the cluster."""
+    """Node id in the cluster."""
 
 
 class RoomHost:
-    """One room's, or one session's that named no room. Methods are called by Ray, one after the other."""
+    """Host of one room, or of one session without a room name. Ray calls its methods one at a time."""
 
     def __init__(self, service: Service, address: str, node: str = "") -> None:
-        """`address`: of its machine within the cluster; `node`: its id there."""
+        """`address`: of the machine in the cluster's network. `node`: its id."""
         token = new_token()
         self._node = node
         self._service = service
-        self._server = BackgroundServer(service, host=address, door=Authenticator(token))
+        self._server = BackgroundServer(service, host=address, authenticator=Authenticator(token))
         self._address = Address(f"ws://{urlsplit(self._server.url).netloc}", token)
         self._last_client_s = time.monotonic()
         self._aged = (0.0, 0.0)
 
     def address(self) -> Address:
-        """Where clients are relayed to."""
+        """Address for the ingress."""
         return self._address
 
     def status(self) -> HostStatus:
-        """Asked every few seconds."""
+        """Current status; polled every few seconds."""
         values = {
             sample.name: sample.value
             for family in text_string_to_metric_families(self._service.metrics.render().decode())
@@ -73,7 +73,7 @@ class RoomHost:
         return HostStatus(clients, now_s - self._last_client_s, age_s / frames if frames else 0.0, self._node)
 
     def leave(self) -> bool:
-        """Save the room and end its service, unless somebody has come; whether it has ended."""
+        """Save the room and stop its service, unless a client is connected. Returns whether it stopped."""
         if self.status().clients:
             return False
         self._server.stop()
@@ -81,7 +81,7 @@ class RoomHost:
 
 
 def open_room_host(settings: ClusterSettings) -> RoomHost:
-    """On this node's device. Raises ServeError, DeviceError."""
+    """Create a host on this node's device. Raises ServeError, DeviceError."""
     import ray
 
     from server.opencl.device import open_device
@@ -97,7 +97,7 @@ def open_room_host(settings: ClusterSettings) -> RoomHost:
 
 
 def limits_of(settings: ClusterSettings) -> Limits:
-    """Of one host: all of its clients come from the ingress's addresses."""
+    """Limits of one host, without limits per address: all clients come from the ingress's addresses."""
     return replace(
         DEFAULT_LIMITS,
         sessions=settings.sessions_per_room,

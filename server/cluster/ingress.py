@@ -1,4 +1,4 @@
-"""What a replica serves: the socket, relayed to its room's host; the page; health."""
+"""Ingress replica: relays each client's socket to its room's host; serves the web page and a health check."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import InvalidHandshake
 
 from protocol.messages import ClientMessage
-from server.cluster.places import NoPlace, NotYet, Places
 from server.cluster.relay import open_host, relay
+from server.cluster.room_directory import RoomDirectory, RoomNotReady, RoomUnavailable
 from server.cluster.routing import Route, route_of
 from server.service.app import PAGE_FOLDER, STREAM_PATH
 from server.service.authenticator import Authenticator
@@ -23,33 +23,37 @@ from server.service.limits import DEFAULT_LIMITS, Limits
 from server.service.object_library import ObjectLibrary
 from server.service.object_routes import add_objects
 
-ASK_AGAIN_S = 0.25
+RETRY_S = 0.25
 PATIENCE_S = 20.0
-"""For a room to have an address: to be opened, or to move."""
+"""Time limit for a room to be opened or moved."""
 
 log = logging.getLogger(__name__)
 
 
 class Ingress:
-    """Of one replica: any number of sockets, each of them one client's."""
+    """One replica with any number of client sockets."""
 
     def __init__(
-        self, places: Places, door: Authenticator, limits: Limits = DEFAULT_LIMITS, patience_s: float = PATIENCE_S
+        self,
+        directory: RoomDirectory,
+        authenticator: Authenticator,
+        limits: Limits = DEFAULT_LIMITS,
+        patience_s: float = PATIENCE_S,
     ) -> None:
-        self._places = places
-        self.door = door
+        self._directory = directory
+        self.authenticator = authenticator
         self._limits = limits
         self._patience_s = patience_s
         self.clients = 0
 
     async def serve(self, websocket: WebSocket) -> None:
-        """One client, from its handshake to its end."""
+        """Serve one client from its handshake to its end."""
         connection = Connection(websocket, self._limits)
         if not await connection.accept():
             return
         self.clients += 1
         try:
-            if (refusal := self.door.refusal(websocket)) is not None:
+            if (refusal := self.authenticator.refusal(websocket)) is not None:
                 raise refusal
             route = route_of(await self._first_message(connection))
             async with await self._host_of(route) as host:
@@ -71,18 +75,18 @@ class Ingress:
             raise Refusal(POLICY, f"neither hello nor watch came within {self._limits.first_message_s:g} s") from late
 
     async def _host_of(self, route: Route) -> ClientConnection:
-        """A connection to the room's host, waiting for a room that is opened or moves. Raises Refusal."""
+        """Connect to the room's host; waits while the room is opened or moved. Raises Refusal."""
         try:
             async with asyncio.timeout(self._patience_s):
                 while True:
                     try:
-                        return await open_host(await self._places.find(route.room_id, route.may_open))
-                    except (NotYet, OSError, InvalidHandshake) as why:  # TimeoutError is an OSError
+                        return await open_host(await self._directory.find(route.room_id, route.may_open))
+                    except (RoomNotReady, OSError, InvalidHandshake) as why:  # TimeoutError is an OSError
                         log.debug("room %s has no host yet: %s", route.room_id, why)
-                    await asyncio.sleep(ASK_AGAIN_S)
+                    await asyncio.sleep(RETRY_S)
         except TimeoutError as late:
             raise Refusal(TRY_LATER, "no machine has a place for this room yet: try again in a minute") from late
-        except NoPlace as none:
+        except RoomUnavailable as none:
             raise Refusal(TRY_LATER if route.may_open else GONE, str(none)) from none
 
 
@@ -98,7 +102,7 @@ def create_ingress_app(ingress: Ingress, page_folder: Path = PAGE_FOLDER) -> Fas
     async def healthz() -> JSONResponse:
         return JSONResponse({"ready": True, "clients": ingress.clients})
 
-    add_objects(app, ObjectLibrary(), ingress.door)
+    add_objects(app, ObjectLibrary(), ingress.authenticator)
     if (page_folder / "index.html").is_file():
         app.mount("/", StaticFiles(directory=page_folder, html=True))
     return app

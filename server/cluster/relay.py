@@ -1,4 +1,4 @@
-"""Bytes of one client to its room's host and back, endings included."""
+"""Relays messages and close codes between one client and its room's host."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from websockets.protocol import State
 from websockets.typing import Subprotocol
 
 from protocol.limits import MAX_MESSAGE_BYTES, SUBPROTOCOL
-from server.cluster.places import Address
+from server.cluster.room_directory import Address
 from server.cluster.routing import outgoing
 from server.service.connection import GOING_AWAY, INTERNAL, LOST, NO_CODE, NORMAL, RESTART
 
 STREAM_PATH = "/v1/stream"
 OPEN_PATIENCE_S = 5.0
 PING_S, PING_PATIENCE_S = 5.0, 10.0
-"""A machine that has gone without a word is given up after both."""
+"""A host that does not answer is given up after the sum of both."""
 MOVED = "the machine of this room has gone, the room moves to another one: come again"
 
 
 async def open_host(address: Address) -> ClientConnection:
-    """Raises OSError, TimeoutError, websockets' InvalidHandshake."""
+    """Connect to a host. Raises OSError, TimeoutError, websockets' InvalidHandshake."""
     return await connect(
         address.url + STREAM_PATH,
         additional_headers={"Authorization": f"Bearer {address.token}"},
@@ -40,7 +40,7 @@ async def open_host(address: Address) -> ClientConnection:
 
 
 async def relay(client: WebSocket, host: ClientConnection, room_id: str) -> None:
-    """Until either of them has ended, and then the other one likewise."""
+    """Relay until either side closes, then close the other side."""
     up = asyncio.create_task(_client_to_host(client, host))
     down = asyncio.create_task(_host_to_client(client, host, room_id))
     try:
@@ -50,7 +50,7 @@ async def relay(client: WebSocket, host: ClientConnection, room_id: str) -> None
             task.cancel()
         ended = await asyncio.gather(up, down, return_exceptions=True)
     if host.state is not State.CLOSED:
-        host.transport.abort()  # without a close frame: to the host its client is lost, not gone
+        host.transport.abort()  # no close frame: the host must see a lost connection, which can be resumed
     for error in ended:
         if isinstance(error, Exception):
             raise error
@@ -61,13 +61,13 @@ async def _client_to_host(client: WebSocket, host: ClientConnection) -> None:
         event = await client.receive()
         if event["type"] == "websocket.disconnect":
             code = event.get("code", LOST)
-            if code in (NORMAL, GOING_AWAY):  # NO_CODE is what uvicorn says of a connection that broke, too
+            if code in (NORMAL, GOING_AWAY):  # uvicorn reports NO_CODE for broken connections too
                 await host.close(code)
             return
         data = event.get("bytes")
         if data is not None and len(data) > MAX_MESSAGE_BYTES:
-            data = data[: MAX_MESSAGE_BYTES + 1]  # enough for the host to refuse it
-        with contextlib.suppress(ConnectionClosed):  # the other direction ends it, with the reason
+            data = data[: MAX_MESSAGE_BYTES + 1]  # still too large, so that the host refuses it
+        with contextlib.suppress(ConnectionClosed):  # the other direction closes with the reason
             await host.send(event["text"] if data is None else data)
 
 
@@ -80,7 +80,7 @@ async def _host_to_client(client: WebSocket, host: ClientConnection, room_id: st
         code, reason = (RESTART, MOVED) if closed.rcvd is None else (closed.rcvd.code, closed.rcvd.reason)
         if closed.rcvd is not None and code in (NO_CODE, LOST):
             code = INTERNAL
-        with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # the client was faster
+        with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # the client has closed already
             await client.close(code, reason)
     except (RuntimeError, WebSocketDisconnect):
-        pass  # the client has gone, which the other direction hears of too
+        pass  # the client has left; the other direction handles it

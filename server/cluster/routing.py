@@ -1,7 +1,7 @@
-"""Which room a client belongs to, read from its first message; and names that carry that on to its next connection.
+"""Routes a client to its room by its first message.
 
-A room's host is an ordinary service that knows nothing of the others: what it calls a session or a key is made unique
-by the room's id in front, on the way out, and is told apart again on the way in.
+A room's host is an ordinary service, so its session names and keys are unique only within the room. The ingress
+prefixes them with the room's id in outgoing messages and removes the prefix from incoming ones.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from server.service.connection import GONE, POLICY, Refusal
 ID_BYTES = 8
 _OWN = re.compile(rf"([0-9a-f]{{{2 * ID_BYTES}}})\.(.+)")
 SMALL_BYTES = 4096
-"""A welcome is smaller."""
+"""Upper bound on the size of a welcome."""
 
 
 @dataclass(frozen=True)
 class Route:
-    """Where a client goes, and what it says there first."""
+    """A client's room, and the first message to send to its host."""
 
     room_id: str
     first: bytes
     may_open: bool
-    """Whether the room is opened where it is not: not for those who come back to a session."""
+    """Whether the room may be opened. False for clients that return to a session."""
 
 
 class _Tag(msgspec.Struct):
@@ -39,12 +39,12 @@ class _Tag(msgspec.Struct):
 
 
 def room_id_of(name: str) -> str:
-    """Of a room with a name: the same for everybody who names it."""
+    """Room id: a digest of its name."""
     return hashlib.blake2b(name.encode("utf-8", "surrogatepass"), digest_size=ID_BYTES).hexdigest()
 
 
 def route_of(first: ClientMessage | None) -> Route:
-    """Raises Refusal for a first message that leads nowhere."""
+    """Route of a first message. Raises Refusal if it names no room."""
     match first:
         case Hello(resume=str(key)):
             room_id, own = _split(key, Refusal(GONE, "there is no session of that key: it ended"))
@@ -65,7 +65,7 @@ def route_of(first: ClientMessage | None) -> Route:
 
 
 def outgoing(data: bytes, room_id: str) -> bytes:
-    """A host's message as clients get it: names in a welcome are made unique, all else stays as it is."""
+    """A host's message for the client: session and key in a welcome get the room's prefix; others are unchanged."""
     if len(data) > SMALL_BYTES or msgspec.msgpack.decode(data, type=_Tag).type != "welcome":
         return data
     welcome = decode_server(data)

@@ -1,4 +1,4 @@
-"""What an operator says of the cluster; `args` of the application in Serve's configuration."""
+"""Cluster settings: `args` of the application in Serve's configuration."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ Share = Annotated[float, Meta(gt=0)]
 
 
 class ClusterSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Fields of the same names."""
+    """Settings by field name."""
 
     data: str
-    """Folder that rooms are kept in; every node sees the same one."""
+    """Folder of saved rooms; must be shared by all nodes."""
     device: str | None = None
-    """A part of the name of the OpenCL device that hosts take; None: the best that they find."""
+    """Part of the name of the OpenCL device that hosts use; None: the best available one."""
     place: dict[str, Share] = msgspec.field(default_factory=lambda: {"CPU": 1.0, "room": 1.0})
-    """What one room takes of its node, in Ray's names; `room` counts the places of a node."""
+    """Ray resources that one room takes; `room` counts the places of a node."""
     sessions_per_room: Annotated[int, Meta(ge=1)] = 16
     volume_mib: Annotated[int, Meta(ge=16)] = 512
-    """Device memory of one volume."""
+    """Device memory for one volume."""
     close_after_s: Annotated[float, Meta(ge=0)] = 60.0
-    """A room that nobody has been in for so long is saved and gives its place back."""
+    """A room that has been empty for this time is saved and closed."""
     policy: Policy = Policy()
     ingress_replicas: Annotated[int, Meta(ge=1)] = 1
-    """At least."""
+    """Minimum number of replicas."""
     most_ingress_replicas: Annotated[int, Meta(ge=1)] = 8
     sockets_per_replica: Annotated[int, Meta(ge=1)] = 32
-    """Aimed at; a replica takes twice as many while others start."""
+    """Target; a replica accepts up to twice as many while others start."""
     ingress_cpus: Annotated[float, Meta(ge=0)] = 0.5
 
 
 def read_settings(args: dict[str, Any]) -> ClusterSettings:
-    """Raises ValueError naming the field."""
+    """Raises ValueError that names the invalid field."""
     try:
         return msgspec.convert(args, ClusterSettings)
     except msgspec.ValidationError as error:

@@ -1,9 +1,8 @@
-"""A day's load played against the autoscaler's settings: who waits, what it costs. Pure, seconds for a day.
+"""Simulates one day of load for given autoscaler settings: waiting times and cost. Takes seconds.
 
-Rooms arrive as a Poisson process whose rate follows the hour and stay for exponential times; nodes take a while to
-start and leave when they are empty and more than what is wanted; a room goes to the node that holds fewest of them, and
-stays there. Each room asks for its own share of a node's device; where a node's rooms ask for more than there is, their
-frames age.
+Rooms arrive as a Poisson process with an hourly rate and stay for exponentially distributed times. Nodes take a while
+to start, and are released when they are empty and not needed. A room is placed on the node with the fewest rooms and
+stays there. Each room needs a share of the node's device; if the shares exceed the device, frames age.
 """
 
 from __future__ import annotations
@@ -22,23 +21,23 @@ from server.cluster.capacity import Capacity, Policy
 
 DAY_S = 86400.0
 TICK_S = 10.0
-"""Between two looks of the keeper at the whole."""
+"""Interval between the supervisor's decisions."""
 HOURS = (2, 1, 1, 1, 1, 2, 4, 8, 14, 20, 22, 24, 26, 24, 24, 26, 32, 44, 66, 88, 100, 82, 42, 12)
-"""Rooms that open in each hour, as parts of the busiest one's: an assumption, of a service that is used after work."""
+"""Arrival rate in each hour, in percent of the busiest hour. Assumes a service that is used after work."""
 
 
 @dataclass(frozen=True)
 class Load:
-    """Of one day."""
+    """Load of one day."""
 
     busiest_per_hour: float = 120.0
-    """Rooms that open in the busiest hour."""
+    """Rooms that arrive in the busiest hour."""
     stay_s: float = 1200.0
-    """Mean."""
+    """Mean duration of a room."""
     share: float = 0.2
-    """Of a node's device that a room asks for, in the mean."""
+    """Mean share of a node's device that a room needs."""
     spread: float = 0.5
-    """Standard deviation of the logarithm of that."""
+    """Standard deviation of its logarithm."""
     seed: int = 1
 
 
@@ -47,13 +46,13 @@ class Fleet:
     """The machines."""
 
     places: int = 4
-    """Rooms that a node takes."""
+    """Rooms per node."""
     start_s: float = 150.0
-    """From asking for a node to its first room."""
+    """Time from requesting a node to its first room."""
     patience_s: float = 20.0
-    """For which a client waits for its room."""
+    """Time that a client waits for its room."""
     frame_s: float = 0.1
-    """Age of frames where a node has time for all."""
+    """Age of frames on a node that is not overloaded."""
 
 
 @dataclass
@@ -62,48 +61,48 @@ class Node:
 
     ready_s: float
     rooms: dict[int, float] = field(default_factory=dict)
-    """Share of the device that each asks for."""
+    """Device share of each room by number."""
 
     def age_s(self, frame_s: float) -> float:
-        """Of its frames when they are taken."""
+        """Age of its frames when they are processed."""
         return frame_s * max(1.0, sum(self.rooms.values()))
 
 
 @dataclass(frozen=True)
 class Day:
-    """What came out; the series have a value a tick."""
+    """Result; the series have one value per tick."""
 
     rooms: int
-    """That came."""
+    """Rooms that arrived."""
     refused: int
-    """After their patience."""
+    """Rooms refused after `Fleet.patience_s`."""
     waited_s: tuple[float, ...]
-    """Of each that was let in."""
+    """Waiting time of each admitted room."""
     node_hours: float
     open_rooms: NDArray[np.int64]
     places: NDArray[np.int64]
     wanted: NDArray[np.int64]
     aged_share: float
-    """Of all time that rooms were open, with frames older than the policy's."""
+    """Share of all open-room time with frames older than the policy's limit."""
 
     @property
     def refused_share(self) -> float:
-        """Of all that came."""
+        """Share of all rooms that arrived."""
         return self.refused / max(self.rooms, 1)
 
     @property
     def used_share(self) -> float:
-        """Of all places that were there, over the day."""
+        """Share of the available places that were used, over the day."""
         return float(self.open_rooms.sum() / max(self.places.sum(), 1))
 
     def cost_per_thousand(self, price_per_node_hour: float, sessions_per_room: float) -> float:
-        """Of sessions, in the price's currency."""
+        """Cost per 1000 sessions, in the price's currency."""
         sessions = (self.rooms - self.refused) * sessions_per_room
         return 1000 * price_per_node_hour * self.node_hours / sessions
 
 
 def arrivals(load: Load) -> Iterator[tuple[float, float, float]]:
-    """When each room comes, how long it stays and what it asks for; in order of time."""
+    """(arrival time, duration, device share) of each room, in order of arrival."""
     random = np.random.default_rng(load.seed)
     now_s = 0.0
     while (now_s := now_s + random.exponential(3600 / load.busiest_per_hour)) < DAY_S:
@@ -113,7 +112,7 @@ def arrivals(load: Load) -> Iterator[tuple[float, float, float]]:
 
 
 def simulate(policy: Policy, load: Load, fleet: Fleet) -> Day:
-    """Play a day from midnight, beginning with as many nodes as an empty cluster wants."""
+    """Simulate a day from midnight, starting with the nodes that an empty cluster needs."""
     cluster = _Cluster(policy, fleet)
     coming = deque(arrivals(load))
     total = len(coming)
@@ -136,7 +135,7 @@ def simulate(policy: Policy, load: Load, fleet: Fleet) -> Day:
 
 
 class _Cluster:
-    """While the day goes on."""
+    """Simulation state."""
 
     def __init__(self, policy: Policy, fleet: Fleet) -> None:
         self._policy, self._fleet = policy, fleet
@@ -145,12 +144,12 @@ class _Cluster:
         self._leaving: list[tuple[float, int, Node]] = []
         self._numbers = count()
         self.waiting: list[tuple[float, float, float]] = []
-        """As they arrive."""
+        """Rooms that wait for a place, as from `arrivals`."""
         self.waited_s: list[float] = []
         self.refused = 0
 
     def tick(self, now_s: float) -> tuple[int, int, int, int, int]:
-        """Rooms that are open, places ready, places wanted, nodes paid for, rooms whose frames are too old."""
+        """Open rooms, ready places, wanted places, paid nodes, rooms whose frames are too old."""
         while self._leaving and self._leaving[0][0] <= now_s:
             _, number, node = heapq.heappop(self._leaving)
             del node.rooms[number]
@@ -165,14 +164,14 @@ class _Cluster:
         return rooms, places, wanted, len(self._nodes), aged
 
     def _settled(self, room: tuple[float, float, float], now_s: float) -> bool:
-        """Whether it has found a place, or waits no longer."""
+        """Whether the room has found a place or has stopped waiting."""
         came_s, stay_s, share = room
         free = [node for node in self._nodes if node.ready_s <= now_s and len(node.rooms) < self._fleet.places]
         if free:
             node, number = min(free, key=lambda one: len(one.rooms)), next(self._numbers)
             node.rooms[number] = share
             heapq.heappush(self._leaving, (now_s + stay_s, number, node))
-            # One that comes between two ticks and finds a place at the next has not waited.
+            # A room that finds a place at the first tick after its arrival has not waited.
             self.waited_s.append(now_s - came_s if now_s - came_s >= TICK_S else 0.0)
             return True
         if now_s - came_s < self._fleet.patience_s:
@@ -186,9 +185,9 @@ def _nodes_for(places: int, fleet: Fleet) -> int:
 
 
 def _resized(nodes: list[Node], wanted: int, now_s: float, fleet: Fleet) -> list[Node]:
-    """More nodes at once, to be ready later; fewer only by those that are empty."""
+    """Add nodes, which become ready later, or remove empty ones."""
     if len(nodes) < wanted:
         return nodes + [Node(now_s + fleet.start_s) for _ in range(wanted - len(nodes))]
-    surplus = len(nodes) - wanted
-    gone = [node for node in reversed(nodes) if not node.rooms][:surplus]
+    items_to_remove = len(nodes) - wanted
+    gone = [node for node in reversed(nodes) if not node.rooms][:items_to_remove]
     return [node for node in nodes if not any(node is one for one in gone)]

@@ -1,1 +1,1 @@
-"""Meshes and pictures of strangers, read in processes of their own that may die without taking the server along."""
+"""Decoding of untrusted meshes and images in child processes, whose crash does not affect the server."""

@@ -1,8 +1,8 @@
-"""The child: `python -m server.parsing.child MODULE:FUNCTION MIB SECONDS [FD]` answers requests until its input ends.
+"""Child process: `python -m server.parsing.child MODULE:FUNCTION MIB SECONDS [FD]` answers requests until input ends.
 
-Once it has loaded what it works with it says so with one byte. A request is 8 bytes of length and a body; an answer
-1 byte (0: done, 1: refused with one line), 8 bytes of length and a body. The function turns a body into an answer's;
-ValueError refuses. FD: memory that it shares with the server.
+It writes one byte when it is ready. A request is an 8-byte length and a body. An answer is a status byte (0: done,
+1: refused, with one line), an 8-byte length and a body. The function maps a request body to an answer body; ValueError
+refuses the request. FD: memory shared with the server.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _shared: list[mmap.mmap] = []
 
 
 def shared_memory() -> mmap.mmap:
-    """What the server sees too; in a child that was given some."""
+    """Memory shared with the server. Only in a child that was started with FD."""
     return _shared[0]
 
 
 def main(arguments: list[str]) -> None:
-    """Load the job, limit what it may take, answer."""
+    """Load the function, set resource limits, answer requests."""
     module, _, function = arguments[0].partition(":")
     job: Job = getattr(importlib.import_module(module), function)
     if len(arguments) > 3:
@@ -45,7 +45,7 @@ def main(arguments: list[str]) -> None:
 
 
 def limit(memory_mib: int) -> None:
-    """No more address space than that, no files, no processes; where the system knows such limits."""
+    """Limit address space; forbid writing files and starting processes. Skips limits that the system does not have."""
     with contextlib.suppress(ImportError):
         import resource
 
@@ -56,7 +56,7 @@ def limit(memory_mib: int) -> None:
 
 
 def answer_all(job: Job, requests: BinaryIO, answers: BinaryIO, seconds: float) -> None:
-    """One answer to each request, in order. The kernel ends a child whose server is no longer there to do so."""
+    """Answer requests in order. An alarm ends a child that hangs after its server has died."""
     while len(head := requests.read(REQUEST.size)) == REQUEST.size:
         body = requests.read(*REQUEST.unpack(head))
         signal.setitimer(signal.ITIMER_REAL, 2 * seconds)
@@ -77,8 +77,8 @@ def _answer(job: Job, body: bytes) -> tuple[int, bytes]:
 
 
 if __name__ == "__main__":
-    from server.parsing.child import main  # the module that jobs import, not a second one of it
+    from server.parsing.child import main  # use the module instance that jobs import, not `__main__`
 
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what decoders mutter about strangers' bytes is no news
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # decoders' messages about invalid input are not useful
     main(sys.argv[1:])

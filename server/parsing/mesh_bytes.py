@@ -1,4 +1,4 @@
-"""A mesh as bytes, and back with every number checked: who wrote them read a stranger's file."""
+"""Encodes a mesh for transfer from a child process, and decodes it with full validation: the child is not trusted."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from server.scene.mesh import Mesh
 
 MAX_NOTES = 1000
 MAX_MATERIALS = 20_000
-GREATEST_BYTES = 16 * MAX_TRIANGLES + 52 * MAX_VERTICES + 8 * MAX_KEPT_PIXELS + (64 << 20)
+MAX_PACKED_BYTES = 16 * MAX_TRIANGLES + 52 * MAX_VERTICES + 8 * MAX_KEPT_PIXELS + (64 << 20)
 
 
 class _Texture(Struct, array_like=True):
@@ -49,7 +49,7 @@ class _Mesh(Struct, array_like=True):
 
 
 def mesh_to_bytes(mesh: Mesh) -> bytes:
-    """Everything of it; a texture that several materials share once."""
+    """Encode a mesh. A texture that several materials share is written once."""
     textures = list(dict.fromkeys(t for m in mesh.materials for t in (m.color_texture, m.surface_texture) if t))
     numbers = {texture: k for k, texture in enumerate(textures)}
     packed = _Mesh(
@@ -77,7 +77,7 @@ def mesh_to_bytes(mesh: Mesh) -> bytes:
 
 
 def mesh_from_bytes(data: bytes | bytearray) -> Mesh:
-    """The mesh. Raises MeshError for bytes that are not exactly one within the limits."""
+    """Decode and validate a mesh. Raises MeshError for invalid data or exceeded limits."""
     try:
         packed = msgspec.msgpack.decode(data, type=_Mesh)
         return _unpacked(packed)
@@ -160,7 +160,7 @@ def _raw(array: NDArray[Any]) -> memoryview:
 
 
 def _rows(name: str, data: memoryview, dtype: type, columns: int, count: int | None = None) -> NDArray[Any]:
-    """[n, columns], an own copy. Raises MeshError where the bytes are not that many."""
+    """[n, columns] as a copy. Raises MeshError if the number of bytes does not match."""
     size = np.dtype(dtype).itemsize * columns
     _require(data.nbytes % size == 0 and count in (None, data.nbytes // size), f"{name} has {data.nbytes} bytes")
     return np.frombuffer(data, dtype).reshape(-1, columns).copy()

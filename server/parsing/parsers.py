@@ -1,4 +1,4 @@
-"""Reading meshes and pictures in children, with the same results and errors as in this process."""
+"""Decodes meshes and images in child processes, with the same results and errors as in this process."""
 
 from __future__ import annotations
 
@@ -15,47 +15,47 @@ from protocol.codec import ProtocolError
 from protocol.colors import ColorReader
 from protocol.frames import CameraModel
 from protocol.limits import MAX_IMAGE_PIXELS
-from server.parsing.children import IS_POSSIBLE, ChildDied, Children, Work
-from server.parsing.mesh_bytes import GREATEST_BYTES, mesh_from_bytes
+from server.parsing.mesh_bytes import MAX_PACKED_BYTES, mesh_from_bytes
+from server.parsing.process_pool import IS_SUPPORTED, ChildDied, JobSpec, ProcessPool
 from server.scene.limits import MeshError
 from server.scene.mesh import Mesh, load_mesh
 
-MESH_WORK = Work("server.parsing.read_mesh:read_mesh", 4096, patience_s=30.0, greatest_answer=GREATEST_BYTES)
-PICTURE_WORK = Work(
+MESH_JOB = JobSpec("server.parsing.read_mesh:read_mesh", 4096, timeout_s=30.0, max_answer_bytes=MAX_PACKED_BYTES)
+PICTURE_JOB = JobSpec(
     "server.parsing.read_picture:read_picture",
     1024,
-    patience_s=5.0,
-    greatest_answer=4096,
+    timeout_s=5.0,
+    max_answer_bytes=4096,
     shared_bytes=3 * MAX_IMAGE_PIXELS,
 )
-VIDEO_WORK = replace(PICTURE_WORK, job="server.parsing.read_video:read_video")
+VIDEO_JOB = replace(PICTURE_JOB, job="server.parsing.read_video:read_video")
 _SIZE = struct.Struct("<II")
 MESH_CHILDREN, PICTURE_CHILDREN = 2, 2
-"""So that a file that takes long keeps nobody else waiting."""
+"""Two each, so that a slow file does not block other sessions."""
 
 
 class Parsers:
-    """Of one service. Methods are for its workers' threads; where the system lacks what it takes, they read here."""
+    """Parsers of one service, called from worker threads. On unsupported systems they decode in this process."""
 
     def __init__(
         self,
-        mesh_work: Work = MESH_WORK,
-        picture_work: Work = PICTURE_WORK,
-        video_work: Work = VIDEO_WORK,
+        mesh_spec: JobSpec = MESH_JOB,
+        picture_spec: JobSpec = PICTURE_JOB,
+        video_spec: JobSpec = VIDEO_JOB,
     ) -> None:
         self.on_death: Callable[[str], None] = lambda _kind: None
-        """Called, by the thread that waits, with `mesh`, `picture` or `video` for each child that dies at work."""
-        self.meshes = Children(mesh_work, MESH_CHILDREN, lambda: self.on_death("mesh"))
-        self.pictures = Children(picture_work, PICTURE_CHILDREN, lambda: self.on_death("picture"))
-        self._video_work = video_work
-        self._videos: set[Children] = set()
-        """One child for each session that sends video."""
+        """Called in the waiting thread with `mesh`, `picture` or `video` when a child dies during a request."""
+        self.meshes = ProcessPool(mesh_spec, MESH_CHILDREN, lambda: self.on_death("mesh"))
+        self.pictures = ProcessPool(picture_spec, PICTURE_CHILDREN, lambda: self.on_death("picture"))
+        self._video_spec = video_spec
+        self._videos: set[ProcessPool] = set()
+        """One child per session that sends video."""
         self._changing = threading.Lock()
         self._has_stopped = False
 
     def start(self) -> None:
-        """One child of each kind begins to load, without being waited for."""
-        if IS_POSSIBLE:
+        """Start loading one child of each kind in the background."""
+        if IS_SUPPORTED:
             self.meshes.start_one()
             self.pictures.start_one()
 
@@ -70,8 +70,8 @@ class Parsers:
             video.stop()
 
     def load_mesh(self, data: bytes, file_format: str) -> Mesh:
-        """As server.scene.mesh.load_mesh. Raises MeshError, also where the file takes too much or kills its reader."""
-        if not IS_POSSIBLE:
+        """As server.scene.mesh.load_mesh. Raises MeshError, also if the child runs out of resources or dies."""
+        if not IS_SUPPORTED:
             return load_mesh(data, file_format)
         try:
             answer = self.meshes.ask(file_format.encode() + b"\n" + data)
@@ -83,29 +83,29 @@ class Parsers:
         return mesh_from_bytes(answer)
 
     def color_reader(self, camera: CameraModel) -> ColorReader:
-        """For one session's colour; to be closed."""
-        return ColorReader(camera, self._decompress, self._open_video) if IS_POSSIBLE else ColorReader(camera)
+        """Colour decoder of one session; must be closed."""
+        return ColorReader(camera, self._decompress, self._open_video) if IS_SUPPORTED else ColorReader(camera)
 
     def _decompress(self, data: bytes) -> NDArray[np.uint8]:
         return _picture_of(self.pictures, data)
 
     def _open_video(self) -> _Video:
-        children = Children(self._video_work, 1, lambda: self.on_death("video"))
+        children = ProcessPool(self._video_spec, 1, lambda: self.on_death("video"))
         with self._changing:
             self._videos.add(children)
             if self._has_stopped:
                 children.stop()
         return _Video(children, self._forget)
 
-    def _forget(self, children: Children) -> None:
+    def _forget(self, children: ProcessPool) -> None:
         with self._changing:
             self._videos.discard(children)
 
 
 class _Video:
-    """A child of a session's own; one that dies is followed by one that knows nothing."""
+    """Video decoder child of one session. After a crash, a new child starts without reference frames."""
 
-    def __init__(self, children: Children, on_close: Callable[[Children], None]) -> None:
+    def __init__(self, children: ProcessPool, on_close: Callable[[ProcessPool], None]) -> None:
         self._children, self._on_close = children, on_close
 
     def decode(self, data: bytes) -> NDArray[np.uint8]:
@@ -116,7 +116,7 @@ class _Video:
         self._children.stop()
 
 
-def _picture_of(children: Children, data: bytes) -> NDArray[np.uint8]:
+def _picture_of(children: ProcessPool, data: bytes) -> NDArray[np.uint8]:
     """Raises ProtocolError."""
     try:
         picture = children.ask(data, _shared_picture)
@@ -129,7 +129,7 @@ def _picture_of(children: Children, data: bytes) -> NDArray[np.uint8]:
 
 
 def _shared_picture(answer: bytearray, memory: mmap.mmap | None) -> NDArray[np.uint8]:
-    """[h, w, 3], an own copy. Raises ValueError for a size that cannot be."""
+    """[h, w, 3] as a copy. Raises ValueError for an invalid size."""
     assert memory is not None
     if len(answer) != _SIZE.size:
         raise ValueError("color.data: its reader said no size")

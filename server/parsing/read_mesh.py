@@ -1,4 +1,4 @@
-"""What a child that reads meshes does."""
+"""Job of mesh children."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a child that reads pictures does."""
+"""Job of image children."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from server.parsing.child import shared_memory
 
 SIZE = struct.Struct("<II")
 
-cv2.setNumThreads(1)  # a child may start no threads
+cv2.setNumThreads(1)  # children must not start threads
 
 
 def read_picture(request: bytes) -> bytes:
@@ -22,7 +22,7 @@ def read_picture(request: bytes) -> bytes:
 
 
 def share(rgb: NDArray[np.uint8]) -> bytes:
-    """Put [h, w, 3] into the shared memory; its height and width. Raises ValueError for what is too large."""
+    """Copy [h, w, 3] to the shared memory and return height and width. Raises ValueError if it is too large."""
     memory = shared_memory()
     if rgb.nbytes > len(memory):
         raise ValueError("color.data is a larger picture than may be")

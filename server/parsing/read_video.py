@@ -1,4 +1,4 @@
-"""What a child that reads one session's video does: its decoder remembers the pictures before."""
+"""Job of video children: decodes one session's video. The decoder keeps reference frames between requests."""
 
 from __future__ import annotations
 

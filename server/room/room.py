@@ -1,4 +1,4 @@
-"""A room: what the clients in it share. One volume, one light, one set of virtual objects, one world (G4, B6)."""
+"""A room: the state that its clients share. One volume, one light, one set of virtual objects, one world (G4, B6)."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ SHARED = (
     "lamps",
     "robustness",
 )
-"""Wishes that are one for all clients of a room: those of the client that opened it."""
+"""Wishes that all clients of a room share: the values of the client that opened it."""
 
 
 class Room:
-    """Whoever works on it holds its `lock`: one frame at a time, of whichever client."""
+    """The caller must hold `lock` while using the room. One frame at a time, from any client."""
 
     def __init__(self, device: Device, wishes: Wishes, name: str | None = None) -> None:
         """`wishes`: of the client that opens it. `name`: None for the room of one session alone."""
@@ -60,20 +60,20 @@ class Room:
         self.changes = 0
         """Counts the frames of all clients, and objects that came or went."""
         self.key_digest: bytes | None = None
-        """Of the key without which nobody gets in (rooms.py), empty for none; None until somebody has come."""
+        """Digest of the room's key (room_registry.py); empty without a key, None until the first client enters."""
         self._wishes = wishes
 
     @property
     def wishes(self) -> Wishes:
-        """Those of the client that opened it."""
+        """Wishes of the client that opened the room."""
         return self._wishes
 
     def wishes_of(self, wishes: Wishes) -> Wishes:
-        """A client's wishes, with those of the room where these are one for all."""
+        """A client's wishes, with the shared ones replaced by the room's."""
         return structs.replace(wishes, **{name: getattr(self._wishes, name) for name in SHARED})
 
     def differences(self, wishes: Wishes) -> tuple[str, ...]:
-        """One line for each wish of a client that the room does not grant."""
+        """One line for each wish of a client that the room overrides."""
         return tuple(
             f"{name.removesuffix('_m').replace('_', '-')} is as the client that opened room {self.name!r} asked"
             for name in SHARED
@@ -110,11 +110,11 @@ class Room:
 
     @property
     def device_bytes(self) -> int:
-        """Device memory of what is shared."""
+        """Device memory of the shared state, in bytes."""
         volume = self.reconstruction.volume
         return self.engine.workspace.bytes_held + (volume.device_bytes if volume else 0)
 
     def close(self) -> None:
-        """Give the device's memory back."""
+        """Free the device memory."""
         self.objects.clear()
         self.engine.close()

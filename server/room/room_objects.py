@@ -1,4 +1,4 @@
-"""The virtual objects of one room: those that are asked for before the first frame wait for it to say what is up."""
+"""The virtual objects of one room. Objects placed before the first frame wait until the up direction is known."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from server.scene.mesh import Mesh
 from server.scene.placement import Placement, check_size
 
 Place = NDArray[np.float64] | Placement
-"""world_from_model [4, 4]; where it is not known yet what is up, what was asked for."""
+"""world_from_model [4, 4], or the requested placement while the up direction is unknown."""
 
 MOST_OWED = 256
 
 
 @dataclass(frozen=True)
-class KeptObject:
-    """What an object is made of anew."""
+class ObjectRecord:
+    """What is needed to recreate an object."""
 
     object_id: str
     mesh: Mesh
@@ -34,19 +34,19 @@ class KeptObject:
 
 @dataclass(frozen=True)
 class Inventory:
-    """All that is kept of a room's objects, at one moment."""
+    """All objects of a room at one moment."""
 
     revision: int
-    """Grows with every change."""
-    objects: tuple[KeptObject, ...]
-    """Those that wait too, in the order in which they came."""
+    """Increases with every change."""
+    objects: tuple[ObjectRecord, ...]
+    """Includes waiting objects, in order of placement."""
     has_begun: bool
     owed: tuple[str, ...]
-    """Names of objects that were acknowledged and stand nowhere yet."""
+    """Names of objects that were acknowledged but are not placed yet, since their client is not aligned."""
 
 
 class RoomObjects:
-    """Placed, moved and removed by their ids, at any time, by whoever holds the room's lock."""
+    """Objects are placed, moved and removed by id. The caller holds the room's lock, except for `inventory`."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
@@ -55,21 +55,21 @@ class RoomObjects:
         self._owed: dict[str, None] = {}
         self._revision = 0
         self._changing = threading.Lock()
-        """The inventory is taken by those too who do not hold the room's lock."""
+        """Guards against `inventory`, which is called without the room's lock."""
 
     @property
     def has_begun(self) -> bool:
-        """Whether it is known what is up."""
+        """Whether the up direction is known."""
         return self._objects is not None
 
     @property
     def up(self) -> NDArray[np.float64]:
-        """Unit, world; once it has begun."""
+        """Unit vector in world axes; only after `begin`."""
         assert self._objects is not None
         return self._objects.up
 
     def begin(self, up: NDArray[np.float64]) -> None:
-        """Place what has waited. up: unit, world."""
+        """Place the waiting objects. up: unit vector in world axes."""
         with self._change():
             self._objects = SceneObjects(self._engine, up)
             for object_id, mesh, placement in self._waiting:
@@ -77,21 +77,21 @@ class RoomObjects:
             self._waiting.clear()
 
     def inventory(self) -> Inventory:
-        """For any thread."""
+        """Snapshot of all objects. Thread-safe."""
         with self._changing:
             standing = self._objects.entries() if self._objects else {}
             objects = (
-                *(KeptObject(name, entry.mesh, entry.world_from_model) for name, entry in standing.items()),
-                *(KeptObject(name, mesh, placement) for name, mesh, placement in self._waiting),
+                *(ObjectRecord(name, entry.mesh, entry.world_from_model) for name, entry in standing.items()),
+                *(ObjectRecord(name, mesh, placement) for name, mesh, placement in self._waiting),
             )
             return Inventory(self._revision, objects, self._objects is not None, tuple(self._owed))
 
-    def kept(self) -> list[KeptObject]:
-        """All objects, those that wait too, in the order in which they came."""
+    def kept(self) -> list[ObjectRecord]:
+        """All objects, including waiting ones, in order of placement."""
         return list(self.inventory().objects)
 
-    def put_back(self, kept: KeptObject) -> None:
-        """Make one of the `kept` anew, after `begin` where it stood. Raises ValueError, one line."""
+    def put_back(self, kept: ObjectRecord) -> None:
+        """Recreate an object from a record, after `begin` if its pose was known. Raises ValueError."""
         if isinstance(kept.place, Placement):
             self.place(kept.object_id, kept.mesh, kept.place)
         else:
@@ -100,7 +100,7 @@ class RoomObjects:
                 self._objects.put(kept.object_id, kept.mesh, kept.place)
 
     def move_back(self, object_id: str, place: Place) -> None:
-        """Give one that was put back the place that it was moved to later; where it is not there, nothing."""
+        """Apply a later move to a recreated object. Does nothing if the object is missing."""
         known = {kept.object_id: kept.place for kept in self.kept()}
         if type(known.get(object_id)) is not type(place):
             return
@@ -112,11 +112,11 @@ class RoomObjects:
                 self._objects.move_to(object_id, place)
 
     def resume(self, revision: int, owed: tuple[str, ...]) -> None:
-        """These hold after all has been put back."""
+        """Restore revision and owed names after all objects were recreated."""
         self._revision, self._owed = revision, dict.fromkeys(owed)
 
     def place(self, object_id: str, mesh: Mesh, placement: Placement) -> None:
-        """Put a mesh into the scene, in the place of one with the same id. Raises ValueError."""
+        """Place a mesh; replaces an object with the same id. Raises ValueError."""
         with self._change():
             if self._objects is None:
                 others = [w for w in self._waiting if w[0] != object_id]
@@ -128,7 +128,7 @@ class RoomObjects:
             self._owed.pop(object_id, None)
 
     def move(self, object_id: str, placement: Placement) -> None:
-        """Give an object another place. Raises KeyError if there is none of that id."""
+        """Move an object. Raises KeyError for an unknown id."""
         with self._change():
             if self._objects is not None:
                 self._objects.move(object_id, placement)
@@ -138,7 +138,7 @@ class RoomObjects:
             self._waiting[index] = (object_id, self._waiting[index][1], placement)
 
     def remove(self, object_id: str) -> None:
-        """Take an object away, or what is owed. Raises KeyError if there is none of that id."""
+        """Remove an object, placed or owed. Raises KeyError for an unknown id."""
         with self._change():
             is_owed = object_id in self._owed
             self._owed.pop(object_id, None)
@@ -150,19 +150,19 @@ class RoomObjects:
                 del self._waiting[self._waiting_index(object_id)]
 
     def owe(self, object_id: str) -> None:
-        """One has been acknowledged that cannot be placed yet, since its client does not know where it is."""
+        """Note an acknowledged object that cannot be placed yet, since its client is not aligned with the room."""
         with self._change():
             self._owed[object_id] = None
             while len(self._owed) > MOST_OWED:
                 del self._owed[next(iter(self._owed))]
 
     def forgive(self, object_id: str) -> None:
-        """It is not wanted any more."""
+        """Remove an owed object: it is no longer wanted."""
         with self._change():
             self._owed.pop(object_id, None)
 
     def owed_notes(self, besides: set[str]) -> tuple[str, ...]:
-        """One line where there are any that were acknowledged and stand nowhere, the names `besides` left out."""
+        """A note that lists owed objects other than `besides`, if there are any."""
         names = [repr(name) for name in self._owed if name not in besides]
         if not names:
             return ()
@@ -174,12 +174,12 @@ class RoomObjects:
         )
 
     def placed(self, volume_from_world: NDArray[np.float64]) -> list[Placed]:
-        """Each object with its volume_from_model; once it has begun."""
+        """All objects with their volume_from_model; only after `begin`."""
         assert self._objects is not None
         return self._objects.placed(volume_from_world)
 
     def clear(self) -> None:
-        """Take all objects away."""
+        """Remove all objects."""
         if self._objects is not None:
             self._objects.clear()
 

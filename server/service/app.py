@@ -1,4 +1,4 @@
-"""The routes: the socket, the page, objects, health and metrics. Plain ASGI; all of it hangs on one service."""
+"""HTTP and WebSocket routes of one service: stream, web page, objects, health and metrics."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ PAGE_FOLDER = Path(__file__).resolve().parents[2] / "client" / "web" / "dist"
 def create_app(
     service: Service,
     page_folder: Path = PAGE_FOLDER,
-    door: Authenticator | None = None,
+    authenticator: Authenticator | None = None,
     library: ObjectLibrary | None = None,
 ) -> FastAPI:
-    """The ASGI application around `service`, which it starts and stops; `page_folder` holds index.html.
+    """The ASGI application that starts, serves and stops `service`. `page_folder` holds index.html.
 
-    `door`: who may come in; None: everybody. `library`: of objects to place; None: the vase alone.
+    `authenticator`: None lets every client in. `library`: objects that clients may place; None offers the vase only.
     """
-    door = door or Authenticator()
+    authenticator = authenticator or Authenticator()
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -40,23 +40,23 @@ def create_app(
         service.stop()
 
     app = FastAPI(lifespan=lifespan, openapi_url=None)
-    _add_stream(app, service, door)
+    _add_stream(app, service, authenticator)
     _add_health(app, service)
-    _add_metrics(app, service, door)
-    add_objects(app, library or ObjectLibrary(), door)
+    _add_metrics(app, service, authenticator)
+    add_objects(app, library or ObjectLibrary(), authenticator)
     _add_page(app, page_folder)
     return app
 
 
-def _add_stream(app: FastAPI, service: Service, door: Authenticator) -> None:
+def _add_stream(app: FastAPI, service: Service, authenticator: Authenticator) -> None:
     @app.websocket(STREAM_PATH)
     async def stream(websocket: WebSocket) -> None:
         connection = Connection(websocket, service.limits, service.note_refusal)
         if not await connection.accept():
             return
         try:
-            with service.guests.connected(connection.address):
-                if (refusal := door.refusal(websocket)) is not None:
+            with service.connection_limits.connected(connection.address):
+                if (refusal := authenticator.refusal(websocket)) is not None:
                     raise refusal
                 await service.serve(connection)
         except Refusal as refused:
@@ -73,9 +73,9 @@ def _add_health(app: FastAPI, service: Service) -> None:
     @app.get("/healthz", responses={503: {"description": "Not ready: what is missing is in the answer"}})
     async def healthz() -> JSONResponse:
         state = {"ready": service.ready, "device": service.device_name, "sessions": service.sessions}
-        if service.kept is not None:
-            state["kept_rooms"], state["kept_bytes"] = service.kept.rooms, service.kept.space_bytes
-        if service.departure.has_begun:
+        if service.storage is not None:
+            state["kept_rooms"], state["kept_bytes"] = service.storage.rooms, service.storage.space_bytes
+        if service.shutdown.is_draining:
             state["draining"] = True
         if service.failure is not None:
             state["failure"] = service.failure
@@ -84,10 +84,10 @@ def _add_health(app: FastAPI, service: Service) -> None:
         return JSONResponse(state, status_code=200 if service.ready else 503)
 
 
-def _add_metrics(app: FastAPI, service: Service, door: Authenticator) -> None:
+def _add_metrics(app: FastAPI, service: Service, authenticator: Authenticator) -> None:
     @app.get("/metrics", response_class=PlainTextResponse, responses={401: {"description": "No token"}})
     async def metrics(request: Request) -> Response:
-        if not door.shows_metrics_to(request):
+        if not authenticator.shows_metrics_to(request):
             return PlainTextResponse(f"The token is missing or wrong: {WHERE_IT_IS}.\n", status_code=401)
         return Response(service.metrics.render(), media_type=CONTENT_TYPE_LATEST)
 

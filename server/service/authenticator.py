@@ -1,4 +1,4 @@
-"""Who may come in: whoever has the token; and from a browser, only pages of the server's own address."""
+"""Authentication: clients need the token, and browser pages must come from the server's own address."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ WHERE_IT_IS = "use the URL that the server printed at its start, which ends in ?
 
 
 def new_token() -> str:
-    """192 random bits, as they stand in a URL."""
+    """192 random bits, URL-safe."""
     return secrets.token_urlsafe(24)
 
 
 def is_token(text: str) -> bool:
-    """Whether it can be one: it must pass through a header."""
+    """Whether `text` is a valid token: printable ASCII without spaces, so that it fits in a header."""
     return 0 < len(text) <= MAX_TOKEN_CHARS and text.isascii() and text.isprintable() and " " not in text
 
 
 @dataclass(frozen=True)
 class Authenticator:
-    """What the server asks of whoever connects. The one without a token asks nothing of programs."""
+    """Checks the token and the origin of each request. Without a token, only the origin is checked."""
 
     token: str | None = None
     origins: frozenset[str] = frozenset()
-    """Of pages elsewhere that may use this server, as `https://host:port`."""
+    """Origins of other sites whose pages may use this server, as `https://host:port`."""
 
     @property
     def query(self) -> str:
-        """What the URL that lets a browser in ends with."""
+        """Query string with the token, for the URL that a browser opens."""
         return "" if self.token is None else f"/?token={quote(self.token, safe='')}"
 
     def refusal(self, request: HTTPConnection) -> Refusal | None:
-        """Why this client must stay outside; None: it may come in."""
+        """Why the request is refused; None if it is allowed."""
         origin = request.headers.get("origin")
         if origin is not None and not self._is_ours(origin, request.headers.get("host", "")):
             return Refusal(FORBIDDEN, f"pages of {origin[:60]} may not use this server: see serve --allow-origin")
@@ -51,34 +51,34 @@ class Authenticator:
         return Refusal(UNAUTHORIZED, f"the token is {'missing' if given is None else 'wrong'}: {WHERE_IT_IS}")
 
     def fits(self, given: str | None) -> bool:
-        """Whether this is the token, in a time that does not tell how much of it is right."""
+        """Whether `given` is the token. Compares in constant time."""
         if self.token is None or given is None:
             return False
         return hmac.compare_digest(given.encode(), self.token.encode())
 
     def shows_metrics_to(self, request: HTTPConnection) -> bool:
-        """To whoever has the token, and to this machine."""
+        """Metrics are shown to clients with the token and to this machine."""
         address = "" if request.client is None else request.client.host
         return self.token is None or is_loopback(address) or self.fits(given_token(request))
 
     def _is_ours(self, origin: str, host: str) -> bool:
-        """Whether a page of `origin` came from this server, which it asked for as `host`, or is allowed by name."""
+        """Whether `origin` is this server (reached as `host`) or one of the allowed origins."""
         if origin in self.origins:
             return True
         if urlsplit(origin).netloc.lower() != host.lower():
             return False
-        # A name that an attacker lets point here makes the two equal; with a token that gains nothing.
+        # DNS rebinding makes the two equal. The token protects against it; without one, only own names are accepted.
         return self.token is not None or _is_address_or_own_name(urlsplit(f"//{host}").hostname or "")
 
 
 def given_token(request: HTTPConnection) -> str | None:
-    """What the client says is the token: in the header, or in the URL, as a browser's WebSocket must."""
+    """The token in the request: from the Authorization header or, for a browser's WebSocket, from the URL."""
     scheme, _, token = request.headers.get("authorization", "").partition(" ")
     return token.strip() if scheme.lower() == "bearer" else request.query_params.get("token")
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address or name is this machine's own, reachable from nowhere else."""
+    """Whether an address or name is a loopback one, reachable from this machine only."""
     if host.lower().rstrip(".") == "localhost":
         return True
     address = _address(host)

@@ -1,4 +1,4 @@
-"""From one capturing session to everybody who watches it; a slow watcher misses pictures and slows nobody."""
+"""Sends a capturing session's pictures to its watchers. A slow watcher misses pictures and delays nobody."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from server.service.connection import POLICY, BadMessage, Connection, Refusal
 
 
 class Watcher:
-    """One watching client's slot: per kind of news only the latest is kept until it is taken."""
+    """Pending messages of one watching client: only the latest of each kind is kept."""
 
     def __init__(self, session: str | None, room: str | None = None, lock: bytes = b"") -> None:
-        """`room`: of any session, only those in it. `lock`: of the key that the client has (rooms.py)."""
+        """`session` None follows any session (in `room`, if given). `lock`: digest of the client's room key."""
         self.follows_any = session is None
         self.room = room
         self.lock = lock
@@ -26,23 +26,23 @@ class Watcher:
         self._changed = asyncio.Event()
 
     def post(self, kind: str, messages: tuple[bytes, ...]) -> None:
-        """Put encoded messages there; unread ones of the same kind are replaced."""
+        """Queue encoded messages; unread ones of the same kind are replaced."""
         self._news[kind] = messages
         self._changed.set()
 
     def attach(self, session: str | None, welcome: bytes) -> None:
-        """From now on this session's pictures are meant for it, and what is left of another's is not."""
+        """Follow `session` from now on and drop pending pictures of another one."""
         self.session = session
         self._news.pop("pictures", None)
         self.post("welcome", (welcome,))
 
     def end(self) -> None:
-        """The session it named is over."""
+        """Mark the watched session as ended."""
         self._ended = True
         self._changed.set()
 
     async def take(self) -> tuple[bytes, ...]:
-        """The unread messages, waiting for some; empty once the session it named is over."""
+        """Wait for unread messages and return them; empty once the watched session has ended."""
         await self._changed.wait()
         self._changed.clear()
         messages = tuple(message for group in self._news.values() for message in group)
@@ -58,7 +58,7 @@ class _Place(NamedTuple):
 
 
 class Broadcast:
-    """Which watcher sees which session. Everything but `is_watched` is for the event loop's thread."""
+    """Maps watchers to sessions. All methods except `is_watched` must be called on the event loop."""
 
     def __init__(self) -> None:
         self._welcomes: dict[str, bytes] = {}
@@ -67,11 +67,11 @@ class Broadcast:
         self._watched: frozenset[str | None] = frozenset()
 
     def is_watched(self, session: str) -> bool:
-        """Whether pictures of this session have a taker; may be called by any thread."""
+        """Whether anybody watches this session. Thread-safe."""
         return session in self._watched
 
     def open_session(self, name: str, welcome: bytes, room: str | None = None, lock: bytes = b"") -> None:
-        """From now on the session can be watched, by those who have the room's key; `welcome` greets them."""
+        """Let clients with the room's key watch the session. Each first receives `welcome`."""
         self._welcomes[name], self._places[name] = welcome, _Place(room, lock)
         for watcher in self._watchers:
             if watcher.session is None and self._shows(name, watcher):
@@ -79,7 +79,7 @@ class Broadcast:
         self._note_watched()
 
     def close_session(self, name: str) -> None:
-        """The session is over: watchers that follow any session go to the newest one left, the others end."""
+        """End the session. Watchers of any session move on to the newest one left; the others end."""
         if self._welcomes.pop(name, None) is None:
             return
         del self._places[name]
@@ -92,9 +92,10 @@ class Broadcast:
     def watcher(
         self, session: str | None, waiting: bytes, room: str | None = None, lock: bytes = b""
     ) -> Iterator[Watcher]:
-        """A watcher of the named session, or of the newest (in `room`); `waiting` greets it where there is none yet.
+        """A watcher of the named session, or of the newest one (in `room`).
 
-        Raises Refusal for the name of no session that this client may see.
+        It first receives `waiting` if there is no session yet. Raises Refusal if `session` does not exist or may not
+        be seen with this key.
         """
         watcher = Watcher(session, room, lock)
         seen = [name for name in self._welcomes if self._shows(name, watcher)]
@@ -113,7 +114,7 @@ class Broadcast:
             self._note_watched()
 
     def publish(self, session: str, messages: tuple[bytes, ...]) -> None:
-        """Give the session's watchers one frame's encoded light and composite."""
+        """Send one frame's encoded light and composite to the session's watchers."""
         for watcher in self._watchers:
             if watcher.session == session:
                 watcher.post("pictures", messages)
@@ -122,7 +123,7 @@ class Broadcast:
         return next((name for name in reversed(self._welcomes) if self._shows(name, watcher)), None)
 
     def _shows(self, name: str, watcher: Watcher) -> bool:
-        """Whether a watcher of any session may see this one."""
+        """Whether the watcher may see this session: same room, and the room's key fits."""
         place = self._places[name]
         has_key = not place.lock or compare_digest(place.lock, watcher.lock)
         return has_key and watcher.room in (None, place.room)
@@ -141,7 +142,7 @@ class Broadcast:
 
 
 async def serve_watcher(connection: Connection, watcher: Watcher) -> None:
-    """Send a watcher its news until it leaves or its session is over. Raises Refusal or ClientGone."""
+    """Send messages to a watcher until it leaves or its session ends. Raises Refusal, ClientGone."""
     forward = asyncio.create_task(_forward(connection, watcher))
     listen = asyncio.create_task(_until_it_leaves(connection))
     try:

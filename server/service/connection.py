@@ -1,4 +1,4 @@
-"""One client's socket: typed messages in, bytes out, and every ending with a code and a reason."""
+"""One client's WebSocket: typed messages in, bytes out. Every close has a code and a reason."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from protocol.codec import ProtocolError, decode_client, encode, one_line
 from protocol.limits import SUBPROTOCOL, SUBPROTOCOL_PREFIX
 from protocol.messages import Acknowledged, Bye, ClientMessage, Dropped, Error, Index, ServerMessage
 from server.service.limits import DEFAULT_LIMITS, Limits
-from server.service.pace import Pace
+from server.service.rate_limiter import RateLimiter
 
 NORMAL, PROTOCOL, UNSUPPORTED, INVALID, POLICY, INTERNAL, TRY_LATER = 1000, 1002, 1003, 1007, 1008, 1011, 1013
 RESTART, GOING_AWAY, NO_CODE, LOST = 1012, 1001, 1005, 1006
@@ -36,11 +36,11 @@ class Refusal(Exception):
 
 
 class ClientGone(Exception):
-    """The client has left, or reads nothing any more; nothing can be sent to it."""
+    """The client has disconnected or has stopped reading; nothing can be sent to it."""
 
 
 class BadMessage(Exception):
-    """A message of known purpose with a wrong field; `answer` tells the client, and the session goes on."""
+    """A message of a known type with an invalid field. The client gets `answer` and the session continues."""
 
     def __init__(self, answer: Dropped | Acknowledged) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ class BadMessage(Exception):
 
 
 class Connection:
-    """A WebSocket of this protocol, used on the event loop only."""
+    """A WebSocket that speaks this protocol. Must be used on the event loop."""
 
     def __init__(
         self,
@@ -56,29 +56,29 @@ class Connection:
         limits: Limits = DEFAULT_LIMITS,
         on_refusal: Callable[[Refusal], None] = lambda _refusal: None,
     ) -> None:
-        """`on_refusal` is called when the client is refused, before it is told."""
+        """`on_refusal` is called before a refused client receives the error."""
         self.address = "" if websocket.client is None else websocket.client.host
         self._websocket = websocket
         self._on_refusal = on_refusal
-        self._pace = Pace(limits)
-        self._told_of_pace = False
+        self._rate_limiter = RateLimiter(limits)
+        self._notified_of_rate = False
         self._closed = False
         self.is_lost = False
-        """Whether the client went without closing its socket."""
+        """Whether the connection broke without a close frame from the client."""
 
     async def accept(self) -> bool:
-        """Shake hands. A client of another version is told which one is spoken here, and False is returned."""
+        """Complete the handshake. False for a client of another protocol version, after an error that names ours."""
         offered: list[str] = self._websocket.scope["subprotocols"]
         if SUBPROTOCOL in offered:
             await self._websocket.accept(SUBPROTOCOL)
             return True
-        # A browser shows a close reason only of a connection that selected one of the subprotocols it had offered.
+        # A browser shows the close reason only if the server selected one of the offered subprotocols.
         await self._websocket.accept(offered[0] if offered else None)
         await self.close(PROTOCOL, _wrong_version(offered))
         return False
 
     async def receive(self) -> ClientMessage | None:
-        """The next message, or None once the client has left. Raises BadMessage, or Refusal if it must go."""
+        """The next message, or None once the client has left. Raises BadMessage, or Refusal to end the connection."""
         event = await self._websocket.receive()
         if event["type"] == "websocket.disconnect":
             self._closed = True
@@ -87,22 +87,22 @@ class Connection:
         data = event.get("bytes")
         if data is None:
             raise Refusal(UNSUPPORTED, "a text message was received; every message is binary MessagePack")
-        await self._keep_pace(len(data))
+        await self._limit_rate(len(data))
         try:
             return decode_client(data)
         except ProtocolError as error:
             raise _judge(data, str(error)) from error
 
-    async def _keep_pace(self, size_bytes: int) -> None:
-        """Wait, or raise Refusal, where the client sends more than it may."""
-        if self._pace.is_flooded_by_one_more():
-            raise Refusal(POLICY, self._pace.flooded)
-        pause_s = self._pace.pause_s(size_bytes)
+    async def _limit_rate(self, size_bytes: int) -> None:
+        """Enforce the rate limits: sleep for too many bytes, raise Refusal for too many messages."""
+        if self._rate_limiter.exceeds_message_rate():
+            raise Refusal(POLICY, self._rate_limiter.message_rate_error)
+        pause_s = self._rate_limiter.pause_s(size_bytes)
         if pause_s <= 0:
             return
-        if not self._told_of_pace:
-            self._told_of_pace = True
-            await self.send_message(Error(reason=self._pace.slowed, fatal=False))
+        if not self._notified_of_rate:
+            self._notified_of_rate = True
+            await self.send_message(Error(reason=self._rate_limiter.byte_rate_notice, fatal=False))
         await asyncio.sleep(pause_s)
 
     async def send(self, data: bytes) -> None:
@@ -121,7 +121,7 @@ class Connection:
         await self.send(encode(message))
 
     async def refuse(self, refusal: Refusal) -> None:
-        """Tell the client why in an error message and in the close frame, and close."""
+        """Close with the reason, both in an error message and in the close frame."""
         self._on_refusal(refusal)
         with contextlib.suppress(ClientGone, TimeoutError):
             async with asyncio.timeout(CLOSE_PATIENCE_S):
@@ -129,14 +129,14 @@ class Connection:
         await self.close(refusal.code, refusal.reason)
 
     async def dismiss(self, code: int, reason: str) -> None:
-        """Say bye to a client that did nothing wrong, and close."""
+        """Send bye and close; for a client that did nothing wrong."""
         with contextlib.suppress(ClientGone, TimeoutError):
             async with asyncio.timeout(CLOSE_PATIENCE_S):
                 await self.send_message(Bye(reason=reason))
         await self.close(code, reason)
 
     async def close(self, code: int = NORMAL, reason: str = "") -> None:
-        """Close once; a client that has left already is fine."""
+        """Close the connection. Does nothing if it is closed already."""
         if self._closed:
             return
         self._closed = True
@@ -146,7 +146,7 @@ class Connection:
 
 
 def _cut(reason: str) -> str:
-    """As much of `reason` as a close frame holds."""
+    """`reason`, cut to the size of a close frame."""
     return reason.encode()[:MAX_CLOSE_REASON_BYTES].decode(errors="ignore")
 
 
@@ -156,7 +156,7 @@ def _wrong_version(offered: list[str]) -> str:
 
 
 class _Envelope(msgspec.Struct):
-    """What can be read of a message with a wrong field."""
+    """The fields that identify a message whose other fields are invalid."""
 
     type: str
     frame: Index | None = None
@@ -164,7 +164,7 @@ class _Envelope(msgspec.Struct):
 
 
 def _judge(data: bytes, reason: str) -> Refusal | BadMessage:
-    """A message that can be answered in kind is only answered; anything else ends the connection."""
+    """An invalid frame or control message is answered; any other invalid message ends the connection."""
     try:
         envelope = msgspec.msgpack.decode(data, type=_Envelope)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):

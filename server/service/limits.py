@@ -1,45 +1,42 @@
-"""How much of the service one client may have: every limit that is no fact of the wire, in one place.
-
-Of the wire: `protocol.limits`. Of virtual objects: `server.scene.limits`.
-"""
+"""Limits of the service. Limits of the wire format: `protocol.limits`; of virtual objects: `server.scene.limits`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from server.service.saving.upkeep import DAY_S, KeptLimits
+from server.service.saving.retention import DAY_S, RetentionLimits
 
 MIB, GIB = 1 << 20, 1 << 30
-KEPT = KeptLimits(space_bytes=16 * GIB, age_s=180 * DAY_S)
+ROOM_RETENTION = RetentionLimits(space_bytes=16 * GIB, age_s=180 * DAY_S)
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Of one service."""
+    """Limits of one service."""
 
     sessions: int = 16
-    """That capture."""
+    """Capturing sessions at a time."""
     sessions_per_address: int = 8
-    """Of them from one address (IPv6: one network of 64 bits)."""
+    """Capturing sessions from one address (IPv6: one /64 network)."""
     watchers: int = 64
     connections_per_address: int = 64
-    """Of any kind."""
+    """Connections of any kind."""
     first_message_s: float = 30.0
-    """Until hello or watch has come."""
+    """Timeout for hello or watch."""
     messages_per_s: float = 500.0
-    """Of one connection, over the long run."""
-    messages_at_once: float = 2000.0
-    """What may be saved up."""
+    """Sustained message rate of one connection."""
+    messages_burst: float = 2000.0
+    """Token bucket size: messages that may arrive in one burst."""
     bytes_per_s: float = 128.0 * MIB
-    bytes_at_once: float = 512.0 * MIB
-    wanted_period_s: float = 0.25
-    """Between two frames of sessions that share the device: when it is longer, they sample more cheaply."""
-    longest_period_s: float = 3.0
-    """The same at which nobody new is taken in."""
+    bytes_burst: float = 512.0 * MIB
+    target_period_s: float = 0.25
+    """Time between two frames of a session. If it is longer, sessions that share the device sample more cheaply."""
+    max_period_s: float = 3.0
+    """Time between two frames above which new sessions are refused."""
     volume_bytes: int = 512 * MIB
-    """Device memory of one session's volume."""
-    kept: KeptLimits = KEPT
-    """Of the rooms on disk."""
+    """Device memory for one session's volume."""
+    room_retention: RetentionLimits = ROOM_RETENTION
+    """Limits for rooms on disk."""
 
 
 DEFAULT_LIMITS = Limits()

@@ -1,4 +1,4 @@
-"""The scene's mesh as the wire carries it: files cut into pieces that fit a message."""
+"""Splits the scene's mesh files into parts that fit a message."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from protocol.messages import MeshFormat, MeshPart
 
 
 def mesh_parts(request: int, files: Mapping[MeshFormat, bytes]) -> Iterator[MeshPart]:
-    """The pieces of all files, in order. Raises ValueError, one line, before the first where a file is too large."""
+    """The parts of all files, in order. Raises ValueError before the first part if a file is too large."""
     for format_, data in files.items():
         if len(data) > MAX_SCENE_MESH_BYTES:
             raise ValueError(

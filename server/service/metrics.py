@@ -1,4 +1,4 @@
-"""What the service counts and times, for Prometheus; one registry per service."""
+"""Prometheus metrics of one service, in a registry of its own."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, gene
 from protocol.messages import Timings
 
 if TYPE_CHECKING:
-    from server.service.kept_rooms import KeptRooms
+    from server.service.room_persistence import RoomPersistence
 
 BUCKETS_MS = (0.5, 1, 2, 5, 10, 20, 35, 50, 75, 100, 150, 250, 500, 1000, 2500, 5000)
 STAGES = Timings.__struct_fields__
 
 
 class Metrics:
-    """Every row of `/metrics`. Prometheus's types are thread-safe, so workers write here directly."""
+    """All metrics of `/metrics`. Prometheus types are thread-safe, so workers update them directly."""
 
     def __init__(self) -> None:
         self._registry = CollectorRegistry()
@@ -59,24 +59,27 @@ class Metrics:
     def _histogram(self, name: str, help_text: str, labels: tuple[str, ...] = ()) -> Histogram:
         return Histogram(f"probeless_{name}", help_text, labels, buckets=BUCKETS_MS, registry=self._registry)
 
-    def watch_rooms(self, count: Callable[[], int], keeping: KeptRooms | None) -> None:
-        """Have rows of rooms; of those on disk where they are kept."""
+    def add_room_gauges(self, count: Callable[[], int], persistence: RoomPersistence | None) -> None:
+        """Add metrics of open rooms and, with `persistence`, of rooms on disk."""
         self._rooms.set_function(lambda: float(count()))
-        if keeping is not None:
+        if persistence is not None:
             rows: dict[str, tuple[str, Callable[[], float]]] = {
-                "kept_rooms": ("Rooms on disk", lambda: keeping.kept.rooms),
-                "kept_bytes": ("Bytes that rooms take on disk", lambda: keeping.kept.space_bytes),
-                "kept_removed": ("Rooms and damaged saves removed for age or space", lambda: keeping.kept.removed),
-                "unsaved_rooms": ("Rooms whose last save failed", lambda: keeping.unsaved),
+                "kept_rooms": ("Rooms on disk", lambda: persistence.storage.rooms),
+                "kept_bytes": ("Bytes that rooms take on disk", lambda: persistence.storage.space_bytes),
+                "kept_removed": (
+                    "Rooms and damaged saves removed for age or space",
+                    lambda: persistence.storage.removed,
+                ),
+                "unsaved_rooms": ("Rooms whose last save failed", lambda: persistence.unsaved),
             }
             for name, (help_text, value) in rows.items():
                 Gauge(f"probeless_{name}", help_text, registry=self._registry).set_function(value)
 
     def observe_stages(self, timings: Timings) -> None:
-        """Add one frame's timings to the histograms of the stages."""
+        """Add one frame's timings to the stage histograms."""
         for stage in STAGES:
             self.stage_ms.labels(stage).observe(getattr(timings, stage))
 
     def render(self) -> bytes:
-        """All rows in Prometheus's text format."""
+        """All metrics in Prometheus's text format."""
         return generate_latest(self._registry)

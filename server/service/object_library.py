@@ -1,7 +1,7 @@
-"""Objects that a server offers its clients: the model files of one folder, and a vase of its own.
+"""Objects that a server offers to its clients: the model files of one folder and a built-in vase.
 
-The folder is read anew whenever somebody asks, so that what is put there is there. Names are those of the listing and
-nothing else: a name that leads elsewhere is none of them.
+The folder is read on each request, so that new files appear at once. Only names of the listing are served; a path that
+leads out of the folder never matches one.
 """
 
 from __future__ import annotations
@@ -19,47 +19,47 @@ from server.scene.vase import vase_glb
 Format = Literal["glb", "obj", "ply", "stl"]
 FORMATS = get_args(Format)
 MAX_OBJECTS = 1000
-"""Of the folder, by name; the rest is not offered."""
+"""Files of the folder that are offered: the first ones by name."""
 MEDIA_TYPES = {"glb": "model/gltf-binary", "obj": "model/obj", "ply": "application/octet-stream", "stl": "model/stl"}
 
 
 class NoObject(LookupError):
-    """There is no object of that name; one line."""
+    """No object has this name; the message is one line."""
 
 
 @dataclass(frozen=True)
 class Offered:
-    """One object of the library."""
+    """Listing entry of one object."""
 
     name: str
-    """With its format, as the file's."""
+    """File name with extension."""
     format: Format
     size_bytes: int
 
 
 @dataclass(frozen=True)
 class ObjectFile:
-    """An object's bytes."""
+    """Content of an object."""
 
     data: bytes
     media_type: str
 
     @property
     def etag(self) -> str:
-        """Another one whenever the bytes are others."""
+        """Digest of the content, for HTTP caching."""
         return f'"{hashlib.sha256(self.data).hexdigest()[:32]}"'
 
 
 class ObjectLibrary:
-    """Used from any thread."""
+    """Thread-safe."""
 
     def __init__(self, folder: Path | None = None) -> None:
-        """`folder`: None for the vase alone."""
+        """`folder`: None offers only the vase."""
         self._folder = None if folder is None else folder.resolve()
         self._own: dict[str, Callable[[], bytes]] = {"vase.glb": cache(vase_glb)}
 
     def listing(self) -> list[Offered]:
-        """By name. Files that are no models, and those larger than a message takes, are left out."""
+        """All objects, sorted by name. Files of other types and files too large for a message are skipped."""
         own = [Offered(name, _format(name), len(make())) for name, make in self._own.items()]
         found = [
             Offered(path.name, _format(path.name), size)
@@ -69,7 +69,7 @@ class ObjectLibrary:
         return sorted([*own, *sorted(found, key=_name)[:MAX_OBJECTS]], key=_name)
 
     def read(self, name: str) -> ObjectFile:
-        """Raises NoObject."""
+        """The object's content. Raises NoObject."""
         if name in self._own:
             return ObjectFile(self._own[name](), MEDIA_TYPES[_format(name)])
         path = next((path for path in self._files() if path.name == name), None)
@@ -80,18 +80,18 @@ class ObjectLibrary:
                 if len(data) <= MAX_MESH_BYTES:
                     return ObjectFile(data, MEDIA_TYPES[_format(name)])
         except OSError:
-            pass  # it was taken away just now, or may not be read: as if it were not there
+            pass  # removed meanwhile or not readable: treated as absent
         raise NoObject("there is no such object on this server: GET /v1/objects lists those that are")
 
     def _files(self) -> list[Path]:
-        """Regular files of the folder that are called like models; links are followed within it."""
+        """Regular files of the folder with a model's extension. Links are followed only within the folder."""
         folder = self._folder
         if folder is None:
             return []
         try:
             entries = list(folder.iterdir())
         except OSError:
-            return []  # the folder was taken away
+            return []  # the folder was removed
         models = [entry for entry in entries if entry.suffix[1:].lower() in FORMATS and not entry.name.startswith(".")]
         return [entry for entry in models if entry.is_file() and entry.resolve().is_relative_to(folder)]
 

@@ -1,4 +1,4 @@
-"""The library of objects over HTTP: `GET /v1/objects` lists it, `GET /v1/objects/{name}` is one of its files."""
+"""Object library over HTTP: `GET /v1/objects` lists the objects, `GET /v1/objects/{name}` returns a file."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ FILES: dict[int | str, dict[str, Any]] = {
 }
 
 
-def add_objects(app: FastAPI, library: ObjectLibrary, door: Authenticator) -> None:
-    """Whoever may open the stream may have the objects; in threads, since files are read."""
+def add_objects(app: FastAPI, library: ObjectLibrary, authenticator: Authenticator) -> None:
+    """Add the routes, with the same access rules as the stream. Handlers are synchronous, so they run in threads."""
 
     @app.get(OBJECTS_PATH, responses=REFUSED)
     def listing(request: Request) -> Response:
-        return _refusal(door, request) or JSONResponse(
+        return _refusal(authenticator, request) or JSONResponse(
             {"objects": [asdict(offered) for offered in library.listing()]}, headers=_headers(request)
         )
 
     @app.get(OBJECTS_PATH + "/{name}", response_class=Response, responses=REFUSED | FILES)
     def one(request: Request, name: str) -> Response:
-        if (refusal := _refusal(door, request)) is not None:
+        if (refusal := _refusal(authenticator, request)) is not None:
             return refusal
         try:
             found = library.read(name)
@@ -48,8 +48,8 @@ def add_objects(app: FastAPI, library: ObjectLibrary, door: Authenticator) -> No
         return Response(found.data, media_type=found.media_type, headers=headers)
 
 
-def _refusal(door: Authenticator, request: Request) -> Response | None:
-    refusal = door.refusal(request)
+def _refusal(authenticator: Authenticator, request: Request) -> Response | None:
+    refusal = authenticator.refusal(request)
     if refusal is None:
         return None
     status = 401 if refusal.code == UNAUTHORIZED else 403
@@ -57,7 +57,7 @@ def _refusal(door: Authenticator, request: Request) -> Response | None:
 
 
 def _headers(request: Request) -> dict[str, str]:
-    """Kept by whoever asked, and asked for again each time; for pages of origins that the door has let pass."""
+    """Cacheable with revalidation; readable by pages of allowed origins."""
     headers = {"cache-control": "private, no-cache", "vary": "origin", "x-content-type-options": "nosniff"}
     origin = request.headers.get("origin")
     return headers if origin is None else headers | {"access-control-allow-origin": origin}

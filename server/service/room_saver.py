@@ -1,4 +1,4 @@
-"""Rooms are saved every few seconds, in a thread of their own, while frames go on."""
+"""Background thread that saves open rooms every few seconds without stopping their frames."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from server.service.room_store import RoomStore, RoomStoreError
 from server.service.saving.room_saves import Saved
 
 EVERY_S = 2.0
-"""Between saves: with the time that one takes, what a crash may cost."""
-TIDY_EVERY_S = 60.0
+"""Time between saves. A crash loses at most this time plus the duration of a save."""
+LIMITS_EVERY_S = 60.0
 
 log = logging.getLogger(__name__)
 
 
 class RoomSaver:
-    """Of one service. A room that cannot be saved is told once, goes on in memory, and is tried again."""
+    """Saver of one service. A failed save is logged once; the room stays in memory and the save is retried."""
 
     def __init__(
         self,
@@ -27,13 +27,13 @@ class RoomSaver:
         rooms: Callable[[], Iterable[Room]],
         every_s: float = EVERY_S,
         on_saved: Callable[[Room, Saved], None] = lambda _room, _saved: None,
-        tidy: Callable[[], None] = lambda: None,
+        enforce_limits: Callable[[], None] = lambda: None,
     ) -> None:
-        """`rooms`: those that are open, asked from the saver's thread each time; `on_saved` is called there too.
+        """`rooms` returns the open rooms, `on_saved` is called after each save; both in the saver's thread.
 
-        `tidy`: called there at first and every minute; may raise RoomStoreError.
+        `enforce_limits`: called there at the start and every minute; may raise RoomStoreError.
         """
-        self._tidy = tidy
+        self._enforce_limits = enforce_limits
         self._store = store
         self._rooms = rooms
         self._every_s = every_s
@@ -41,33 +41,33 @@ class RoomSaver:
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="probeless-room-saver", daemon=True)
         self.problems: dict[str, str] = {}
-        """By room, one line each: why its last save failed."""
+        """Reason why the last save failed, one line per room name."""
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Save all rooms once more and end; returns when they are on the disk, or could not be written."""
+        """Save all rooms a last time and end the thread; blocks until that is done or has failed."""
         self._stopped.set()
         if self._thread.is_alive():
             self._thread.join()
         self.save_all()
 
     def save_all(self) -> None:
-        """Save all rooms now."""
+        """Save all open rooms now."""
         for room in self._rooms():
             self.save(room)
 
     def save(self, room: Room) -> bool:
-        """Save one room now, as before it is closed; whether that went well. It must stay open meanwhile."""
-        return room.name is None or self._is_done(room.name, lambda: self._on_saved(room, self._store.save(room)))
+        """Save one room now; the caller keeps it open. Returns whether the save succeeded."""
+        return room.name is None or self._try(room.name, lambda: self._on_saved(room, self._store.save(room)))
 
-    def save_moves(self, room: Room) -> bool:
-        """Likewise where its objects have been moved to, before that is acknowledged."""
-        return room.name is None or self._is_done(room.name, lambda: self._store.save_moves(room))
+    def save_placements(self, room: Room) -> bool:
+        """Save only object placements, before moves are acknowledged. Returns whether the save succeeded."""
+        return room.name is None or self._try(room.name, lambda: self._store.save_placements(room))
 
-    def _is_done(self, name: str, work: Callable[[], None]) -> bool:
+    def _try(self, name: str, work: Callable[[], None]) -> bool:
         try:
             work()
         except RoomStoreError as error:
@@ -84,10 +84,10 @@ class RoomSaver:
         while not self._stopped.wait(self._every_s):
             try:
                 self.save_all()
-                if time.monotonic() - tidied_s > TIDY_EVERY_S:
+                if time.monotonic() - tidied_s > LIMITS_EVERY_S:
                     tidied_s = time.monotonic()
-                    self._tidy()
+                    self._enforce_limits()
             except RoomStoreError as error:
                 log.warning("%s", error)
-            except Exception:  # a fault of ours: the other rooms and the next time shall not suffer from it
+            except Exception:  # a bug must not stop later saves or those of other rooms
                 log.exception("rooms could not be saved")

@@ -1,8 +1,7 @@
-"""Rooms kept on disk, each in a folder of its own: saved while they are at work, loaded after a crash or a restart.
+"""Rooms on disk, one folder each: saved while in use, loaded after a restart or a crash.
 
-A room's saves go in turn to two slots, each whole in itself; of the two the newer one that is undamaged counts, with
-its objects where they have been moved to since. Writing a save goes on outside of the room's lock: under it only what
-has changed is copied.
+Saves alternate between two slots, each complete in itself. The newest undamaged slot is loaded, and object moves
+written since are applied to it. Only copying the changes needs the room's lock; files are written without it.
 """
 
 from __future__ import annotations
@@ -22,24 +21,24 @@ import pyopencl as cl
 
 from server.opencl.device import Device
 from server.room.room import Room
-from server.service.saving.files import DamagedFile, sync_folder
+from server.service.saving.checksummed_files import DamagedFile, sync_folder
+from server.service.saving.retention import RetentionLimits, StorageUsage, StoredItem, items_to_remove, stored_items
 from server.service.saving.room_saves import SLOTS, RoomSaves, Saved, header_of
-from server.service.saving.slot import Slot
-from server.service.saving.upkeep import Kept, KeptLimits, Piece, pieces_in, surplus
+from server.service.saving.save_slot import SaveSlot
 
-FORGOTTEN = ".forgotten-"
-"""Begins the name of a folder that is about to be deleted, and of no room's."""
+DELETED = ".forgotten-"
+"""Name prefix of folders that are being deleted. No room's folder begins with it."""
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 
 class RoomStoreError(Exception):
-    """One line: which room could not be saved, loaded or forgotten, and why. The room in memory is as it was."""
+    """A room could not be saved, loaded or deleted; one line. The room in memory is unchanged."""
 
 
 class RoomStore:
-    """Rooms in one folder. Methods are for any thread; saves of one room come one after the other."""
+    """All rooms in one folder. Thread-safe; saves of one room are serialized."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -48,86 +47,86 @@ class RoomStore:
         self._removed = 0
 
     def save(self, room: Room) -> Saved:
-        """Write what has changed of a room. Raises RoomStoreError; the saves that there are then stay."""
+        """Write the changes of a room. Raises RoomStoreError; existing saves are then unchanged."""
         if room.name is None:
             raise ValueError("a room without a name is of one session alone: it is not saved")
         saves = self._saves(room.name)
         with saves.lock:
-            return _or_told(f"room {room.name!r} was not saved, it goes on in memory", lambda: saves.save(room))
+            return _or_store_error(f"room {room.name!r} was not saved, it goes on in memory", lambda: saves.save(room))
 
-    def save_moves(self, room: Room) -> None:
-        """Write where objects have been moved to; all where more has changed. Raises RoomStoreError, as `save` does."""
+    def save_placements(self, room: Room) -> None:
+        """Write only object placements, or a full save if more has changed. Raises RoomStoreError."""
         if room.name is None:
             raise ValueError("a room without a name is of one session alone: it is not saved")
         saves = self._saves(room.name)
         what = f"what was moved in room {room.name!r} was not saved, it goes on in memory"
-        if not _or_told(what, lambda: saves.save_moves(room)):
+        if not _or_store_error(what, lambda: saves.save_placements(room)):
             self.save(room)
 
     def key_digest(self, name: str) -> bytes | None:
-        """Of the room's key as it was saved; None where there is no save, or none that is whole and says it.
+        """Digest of a saved room's key; None if there is no undamaged save with one.
 
-        Reads little, and keeps nothing of the room in memory. For rooms that are not open. Raises RoomStoreError.
+        Reads only headers. For rooms that are not open. Raises RoomStoreError.
         """
         saves = RoomSaves(name, self._folder / folder_name(name))
-        return _or_told(f"room {name!r} was not loaded", saves.key_digest)
+        return _or_store_error(f"room {name!r} was not loaded", saves.key_digest)
 
     def load(self, name: str, device: Device) -> Room | None:
-        """The room as it was saved last, or before where that save is damaged; None where there is none.
+        """The room from its newest undamaged save; None if there is none.
 
-        Damaged saves are set aside, each told in one line of the log. Raises RoomStoreError.
+        Damaged saves are set aside under another name and logged. Raises RoomStoreError.
         """
         saves = self._saves(name)
         with saves.lock:
-            return _or_told(f"room {name!r} was not loaded", lambda: saves.load(device))
+            return _or_store_error(f"room {name!r} was not loaded", lambda: saves.load(device))
 
     def names(self) -> tuple[str, ...]:
-        """Of all rooms that have a save, in order. Raises RoomStoreError."""
-        return _or_told("rooms were not listed", lambda: tuple(sorted(set(self._names()))))
+        """Sorted names of all saved rooms. Raises RoomStoreError."""
+        return _or_store_error("rooms were not listed", lambda: tuple(sorted(set(self._names()))))
 
-    def forget(self, name: str) -> None:
-        """Delete a room's saves, those set aside too. Raises RoomStoreError."""
+    def delete(self, name: str) -> None:
+        """Delete all saves of a room, including damaged ones. Raises RoomStoreError."""
         saves = self._saves(name)
         with saves.lock, self._lock:
-            _or_told(f"room {name!r} was not deleted", lambda: self._delete(saves.folder))
+            _or_store_error(f"room {name!r} was not deleted", lambda: self._delete(saves.folder))
             self._rooms.pop(name, None)
 
     def release(self, name: str) -> None:
-        """Keep nothing in memory of a room that has been closed. Its saves stay."""
+        """Free the memory held for a closed room. Its saves stay."""
         saves = self._saves(name)
         with saves.lock, self._lock:
             saves.note_used()
             self._rooms.pop(name, None)
 
-    def tidy(self, limits: KeptLimits, now_s: float | None = None) -> Kept:
-        """Delete what exceeds `limits`, each told in one line of the log; what is left.
+    def enforce_limits(self, limits: RetentionLimits, now_s: float | None = None) -> StorageUsage:
+        """Delete saves beyond `limits`, with one log line each. Returns the remaining disk usage.
 
-        `now_s`: since 1970. Of rooms that have not been released nothing goes but damaged saves. Raises RoomStoreError.
+        `now_s`: Unix time. Of rooms in use, only damaged saves are deleted. Raises RoomStoreError.
         """
-        return _or_told(
-            "rooms were not tidied up", lambda: self._tidied(limits, time.time() if now_s is None else now_s)
+        return _or_store_error(
+            "rooms were not tidied up", lambda: self._enforce_limits(limits, time.time() if now_s is None else now_s)
         )
 
-    def _tidied(self, limits: KeptLimits, now_s: float) -> Kept:
+    def _enforce_limits(self, limits: RetentionLimits, now_s: float) -> StorageUsage:
         with self._lock:
             in_use = {saves.folder for saves in self._rooms.values()}
-        left = list(pieces_in(self._folder, FORGOTTEN))
-        for piece, why in list(surplus(left, limits, now_s, in_use)):
+        left = list(stored_items(self._folder, DELETED))
+        for piece, why in list(items_to_remove(left, limits, now_s, in_use)):
             name = self._name_of(piece)
             with self._lock:
                 if piece.is_room and any(saves.folder == piece.folder for saves in self._rooms.values()):
-                    continue  # somebody has come
+                    continue  # a client has entered meanwhile
                 self._delete(piece.folder)
             left.remove(piece)
             self._removed += 1
             log.warning("%s is removed from the disk: %s", name, why)
         rooms = sum(piece.is_room for piece in left)
-        return Kept(rooms, sum(piece.space_bytes for piece in left), self._removed)
+        return StorageUsage(rooms, sum(piece.space_bytes for piece in left), self._removed)
 
-    def _name_of(self, piece: Piece) -> str:
-        """For people."""
+    def _name_of(self, piece: StoredItem) -> str:
+        """Readable name for the log."""
         room = piece.folder if piece.is_room else piece.folder.parent
-        name = next((repr(h.name) for slot in SLOTS if (h := header_of(Slot(room / slot)))), room.name)
+        name = next((repr(h.name) for slot in SLOTS if (h := header_of(SaveSlot(room / slot)))), room.name)
         return f"room {name}" if piece.is_room else f"a damaged save of room {name}, {piece.folder.name},"
 
     def _saves(self, name: str) -> RoomSaves:
@@ -139,29 +138,29 @@ class RoomStore:
             return
         for folder in self._folder.iterdir():
             for slot in SLOTS:
-                header = header_of(Slot(folder / slot))
+                header = header_of(SaveSlot(folder / slot))
                 if header is not None and folder_name(header.name) == folder.name:
                     yield header.name
 
     def _delete(self, folder: Path) -> None:
         self._clear()
         if folder.exists():
-            os.replace(folder, self._folder / f"{FORGOTTEN}{folder.name}")
+            os.replace(folder, self._folder / f"{DELETED}{folder.name}")
             sync_folder(self._folder)
         self._clear()
 
     def _clear(self) -> None:
-        for gone in self._folder.glob(f"{FORGOTTEN}*"):
+        for gone in self._folder.glob(f"{DELETED}*"):
             shutil.rmtree(gone)
 
 
 def folder_name(name: str) -> str:
-    """Of a room's folder: its plain letters, for people, and a digest that tells it from all others."""
+    """Folder name of a room: its letters and digits for readability, and a digest for uniqueness."""
     plain = re.sub("[^a-z0-9]+", "-", name.lower()).strip("-")[:40]
     return f"{plain or 'room'}-{hashlib.blake2b(name.encode('utf-8', 'surrogatepass'), digest_size=12).hexdigest()}"
 
 
-def _or_told(what: str, work: Callable[[], T]) -> T:
+def _or_store_error(what: str, work: Callable[[], T]) -> T:
     try:
         return work()
     except OSError as error:

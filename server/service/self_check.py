@@ -1,4 +1,4 @@
-"""Whether a device computes what it should: small frames whose answers are known, held against stated bounds."""
+"""Self-check of a device: processes small synthetic frames and compares the results with known values."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ ALBEDO, AMBIENT = 0.5, 0.3
 
 TOWARDS_LIGHT = np.array([0.5, -0.5, -0.7]) / np.linalg.norm([0.5, -0.5, -0.7])
 LIGHT_BOUND_DEG = 10.0
-"""Found within 2 degrees, from any side; a wrong normal, ray or solve is tens of degrees off."""
+"""A correct device finds the direction within 2 degrees; a wrong normal, ray or solver is tens of degrees off."""
 EVEN_SKY = ((float(np.sqrt(4 * np.pi)),) * 3,)
-"""Radiance 1 from everywhere: under it a surface that nothing hides shows its own colour (the white furnace)."""
+"""Radiance 1 from all directions. An unoccluded surface then shows its own colour (white furnace test)."""
 OBJECT_BOUND, LEAST_OBJECT_PIXELS = 6, 8
 
 
 class CheckFailed(Exception):
-    """An answer that is wrong; `check` is the name of what was checked."""
+    """A result is wrong; `check` is the name of the check."""
 
     def __init__(self, check: str, found: str) -> None:
         super().__init__(one_line(f"check {check!r}: {found}"))
@@ -38,7 +38,7 @@ class CheckFailed(Exception):
 
 
 def check_answers(device: Device) -> None:
-    """Raises CheckFailed for the first answer that is out of its bounds."""
+    """Run all checks. Raises CheckFailed at the first result out of bounds."""
     plain = Wishes(volume_m=VOLUME_M, voxel_m=VOXEL_M, as_thesis=True, ray_length_m=0.1, bands=2)
     result = _processed(device, plain, lambda _pipeline: None)
     check_picture(result)
@@ -48,7 +48,7 @@ def check_answers(device: Device) -> None:
 
 
 def check_picture(result: FrameResult) -> None:
-    """Where nothing is virtual the picture is the camera's, byte for byte."""
+    """Without virtual objects the output is the camera's image, byte for byte."""
     assert result.color is not None
     wrong = int((result.color != frame().color).any(axis=2).sum())
     if wrong:
@@ -56,7 +56,7 @@ def check_picture(result: FrameResult) -> None:
 
 
 def check_light(result: FrameResult) -> None:
-    """The light that shaded the ball is found again."""
+    """The estimated light direction is that which shaded the ball."""
     found = np.array(result.light.dominant_direction)
     if not np.isfinite([value for row in result.light.sh for value in row]).all():
         raise CheckFailed("light", "the light is not finite")
@@ -66,7 +66,7 @@ def check_light(result: FrameResult) -> None:
 
 
 def check_object(result: FrameResult) -> None:
-    """Under an even sky a virtual triangle shows its own colour."""
+    """Under uniform light a virtual triangle shows its own colour."""
     assert result.color is not None
     picture, own = frame().color.astype(int), int(_srgb(np.array(ALBEDO)))
     shown = np.abs(result.color.astype(int) - own).max(axis=2) <= OBJECT_BOUND
@@ -76,7 +76,7 @@ def check_object(result: FrameResult) -> None:
 
 
 def frame(index: int = 0) -> RgbdFrame:
-    """A matt ball before a matt wall, under an even sky and a distant lamp, without shadows."""
+    """A diffuse ball in front of a diffuse wall, lit by uniform ambient light and a distant lamp, without shadows."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     ray = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
     center = np.array(BALL_M)
@@ -96,7 +96,7 @@ def frame(index: int = 0) -> RgbdFrame:
 
 
 def triangle() -> Mesh:
-    """Of 10 cm, upright."""
+    """Right triangle with legs of 10 cm."""
     return Mesh(
         vertices=np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], np.float32),
         triangles=np.array([[0, 1, 2]], np.int32),
@@ -106,9 +106,9 @@ def triangle() -> Mesh:
     )
 
 
-def _processed(device: Device, wishes: Wishes, prepare: Callable[[ClientSession], object]) -> FrameResult:
-    """The second frame's result: the first one's volume is seen in it."""
-    pipeline = ClientSession(device, CAMERA, wishes)
+def _processed(device: Device, wishes: Wishes, prepare: Callable[[Pipeline], object]) -> FrameResult:
+    """Result of the second frame, which sees the volume that the first one filled."""
+    pipeline = Pipeline(device, CAMERA, wishes)
     try:
         prepare(pipeline)
         pipeline.process(frame())
@@ -122,6 +122,6 @@ def _place_triangle(pipeline: ClientSession) -> None:
 
 
 def _srgb(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """IEC 61966-2-1, 8 bits."""
+    """Linear values in [0, 1] -> 8-bit sRGB (IEC 61966-2-1)."""
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return np.round(255 * encoded).astype(np.uint8)

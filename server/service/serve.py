@@ -1,4 +1,4 @@
-"""Running the service: in the foreground for the command line, or in a thread for the demo and the tests."""
+"""Runs the service: in the foreground for the command line, or in a thread for the demo and the tests."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from protocol.local_keys import LocalKey, key_left
 from server.service.app import create_app
 from server.service.authenticator import Authenticator, is_loopback, new_token
 from server.service.limits import DEFAULT_LIMITS, Limits
-from server.service.linger import LingeringWebSocket
+from server.service.lingering_close import LingeringCloseWebSocket
 from server.service.object_library import ObjectLibrary
 from server.service.service import Service
 from server.service.tls import Certificate
@@ -33,17 +33,17 @@ if TYPE_CHECKING:
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8080
 STOP_PATIENCE_S = 10
-"""From the signal to the end of the process."""
+"""Time limit from the signal to the end of the process."""
 DRAIN_PATIENCE_S = 7
-"""Of it, for sessions to end and rooms to be saved."""
+"""Part of it in which sessions end and rooms are saved."""
 EVERYWHERE = ("0.0.0.0", "::", "")
-OPEN_DOOR = Authenticator()
+NO_AUTHENTICATION = Authenticator()
 
 log = logging.getLogger(__name__)
 
 
 class ServeError(Exception):
-    """The server cannot start; one line that says why and what to do."""
+    """The server cannot start; one line with the reason and a remedy."""
 
 
 def serve(
@@ -52,17 +52,17 @@ def serve(
     device_name: str | None = None,
     *,
     limits: Limits = DEFAULT_LIMITS,
-    door: Authenticator | None = None,
+    authenticator: Authenticator | None = None,
     certificate: Certificate | None = None,
     data: Path | None = None,
     objects: Path | None = None,
     say: Callable[[str], None] | None = None,
 ) -> int:
-    """Serve until interrupted; the exit status. `say` is given each line for the user (default: standard output).
+    """Serve until interrupted and return the exit status. `say` receives each line for the user (default: stdout).
 
-    `door` None: a new token is asked for. `certificate` None: no TLS. `data`: folder that rooms are kept in.
-    `objects`: folder of models that clients may place; None: a vase alone.
-    A port in use, a missing device or kernels that do not build end in one line on standard error and status 1.
+    `authenticator` None: a new token is required. `certificate` None: no TLS. `data`: folder in which rooms are saved.
+    `objects`: folder of models that clients may place; None: only the vase.
+    A port in use, a missing device or kernels that do not build print one line on standard error and return 1.
     """
     say = say or _print_line
     try:
@@ -70,7 +70,7 @@ def serve(
         with listener:
             service = open_service(device_name, limits=limits, data=data)
             library = ObjectLibrary(objects)
-            return serve_on(listener, service, say, door or Authenticator(new_token()), certificate, library)
+            return serve_on(listener, service, say, authenticator or Authenticator(new_token()), certificate, library)
     except ServeError as error:
         sys.stderr.write(f"probeless: {error}\n")
         return 1
@@ -79,7 +79,7 @@ def serve(
 def open_service(
     device_name: str | None = None, *, limits: Limits = DEFAULT_LIMITS, data: Path | None = None
 ) -> Service:
-    """The real service on the device whose name contains `device_name`. Raises ServeError."""
+    """A service on the device whose name contains `device_name`. Raises ServeError."""
     from server.opencl.device import DeviceError, open_device
 
     try:
@@ -91,7 +91,7 @@ def open_service(
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A listening socket; port 0 takes a free one. Raises ServeError for a port in use or a host that is not here."""
+    """A listening socket; port 0 takes a free one. Raises ServeError if the port is in use or the host is not local."""
     if not 0 <= port <= 65535:
         raise ServeError(f"there is no port {port}: choose --port from 1 to 65535")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -105,7 +105,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def url_of(listener: socket.socket, certificate: Certificate | None = None, everywhere: str = "localhost") -> str:
-    """The address a browser on this machine opens; of a server on all addresses, with `everywhere` as its host."""
+    """URL for a browser on this machine. If the server listens on all addresses, the host is `everywhere`."""
     host, port = listener.getsockname()[:2]
     if host in EVERYWHERE:
         host = everywhere
@@ -117,17 +117,17 @@ def serve_on(
     listener: socket.socket,
     service: Service,
     say: Callable[[str], None],
-    door: Authenticator = OPEN_DOOR,
+    authenticator: Authenticator = NO_AUTHENTICATION,
     certificate: Certificate | None = None,
     library: ObjectLibrary | None = None,
 ) -> int:
-    """Serve a service until interrupted; the exit status. Raises ServeError if its warm-up fails."""
-    server = _server(service, door, certificate, library)
-    with _key_left(listener, door, certificate) as is_left:
+    """Serve until interrupted and return the exit status. Raises ServeError if the warm-up fails."""
+    server = _server(service, authenticator, certificate, library)
+    with _key_left(listener, authenticator, certificate) as is_left:
 
         def on_prepared() -> None:
             if service.failure is None:
-                for line in _ways_in(listener, door, certificate, is_left):
+                for line in _ways_in(listener, authenticator, certificate, is_left):
                     say(line)
             else:
                 server.should_exit = True
@@ -137,7 +137,7 @@ def serve_on(
         try:
             with _ended_like_interrupted():
                 server.run(sockets=[listener])
-        except KeyboardInterrupt:  # uvicorn raises it again after it has shut down in order
+        except KeyboardInterrupt:  # uvicorn raises it again after its shutdown
             say("stopped")
     if service.failure is not None:
         raise ServeError(service.failure)
@@ -146,9 +146,9 @@ def serve_on(
 
 @contextlib.contextmanager
 def _ended_like_interrupted() -> Iterator[None]:
-    """What uvicorn raises again when it has shut down is KeyboardInterrupt.
+    """Make SIGTERM and SIGINT raise KeyboardInterrupt after uvicorn's shutdown.
 
-    SIGTERM would be the end at once, and SIGINT nothing where a shell in the background has it ignored.
+    By default SIGTERM would end the process at once, and a background shell makes its children ignore SIGINT.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -165,15 +165,17 @@ def _ended_like_interrupted() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _ways_in(listener: socket.socket, door: Authenticator, certificate: Certificate | None, is_left: bool) -> list[str]:
-    """What the user opens and runs, here and on other machines."""
+def _ways_in(
+    listener: socket.socket, authenticator: Authenticator, certificate: Certificate | None, is_left: bool
+) -> list[str]:
+    """Lines that say how to connect from this and from other machines."""
     host, url = listener.getsockname()[0], url_of(listener, certificate)
     pin = "" if certificate is None else f" --tls-fingerprint {certificate.fingerprint}"
     everywhere = host in EVERYWHERE
-    own = url if is_left and (everywhere or is_loopback(host)) else f"{url}{door.query}{pin}"
-    lines = [f"ready: open {url}{door.query} or run: probeless stream SOURCE --server {own}"]
+    own = url if is_left and (everywhere or is_loopback(host)) else f"{url}{authenticator.query}{pin}"
+    lines = [f"ready: open {url}{authenticator.query} or run: probeless stream SOURCE --server {own}"]
     if everywhere:
-        there = url_of(listener, certificate, socket.gethostname()) + door.query
+        there = url_of(listener, certificate, socket.gethostname()) + authenticator.query
         lines.append(f"on other machines: open {there} or run: probeless stream SOURCE --server {there}{pin}")
     if certificate is not None:
         lines.append(f"SHA-256 of its certificate: {certificate.fingerprint}")
@@ -181,13 +183,13 @@ def _ways_in(listener: socket.socket, door: Authenticator, certificate: Certific
 
 
 @contextlib.contextmanager
-def _key_left(listener: socket.socket, door: Authenticator, certificate: Certificate | None) -> Iterator[bool]:
-    """While it lasts, programs of this user on this machine find the token; whether they do."""
-    if door.token is None and certificate is None:
-        yield True  # there is nothing to find
+def _key_left(listener: socket.socket, authenticator: Authenticator, certificate: Certificate | None) -> Iterator[bool]:
+    """Context in which this user's programs on this machine find the token; yields whether it could be stored."""
+    if authenticator.token is None and certificate is None:
+        yield True  # no token is needed
         return
     fingerprint = None if certificate is None else certificate.fingerprint
-    key = LocalKey(token=door.token, fingerprint=fingerprint, pid=os.getpid())
+    key = LocalKey(token=authenticator.token, fingerprint=fingerprint, pid=os.getpid())
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(key_left(listener.getsockname()[1], key))
@@ -199,25 +201,25 @@ def _key_left(listener: socket.socket, door: Authenticator, certificate: Certifi
 
 
 class BackgroundServer:
-    """A server in a thread of this process (port 0: a free one); also a context manager that stops it."""
+    """A server in a thread of this process (port 0: a free port). A context manager that stops it on exit."""
 
     def __init__(
         self,
         service: Service,
         host: str = DEFAULT_HOST,
         port: int = 0,
-        door: Authenticator = OPEN_DOOR,
+        authenticator: Authenticator = NO_AUTHENTICATION,
         certificate: Certificate | None = None,
         library: ObjectLibrary | None = None,
     ) -> None:
-        """Start and wait until it accepts connections. Raises ServeError."""
+        """Start the server and wait until it accepts connections. Raises ServeError."""
         self._listener = listen(host, port)
         self.url = url_of(self._listener, certificate)
-        self.way_in = f"{self.url}{door.query}"
-        """What a browser opens."""
+        self.way_in = f"{self.url}{authenticator.query}"
+        """URL with the token, for a browser."""
         self.service = service
-        self._server = _server(service, door, certificate, library)
-        self._key = _key_left(self._listener, door, certificate)
+        self._server = _server(service, authenticator, certificate, library)
+        self._key = _key_left(self._listener, authenticator, certificate)
         self._key.__enter__()
         self._thread = threading.Thread(target=self._run, name="probeless-server", daemon=True)
         self._thread.start()
@@ -234,7 +236,7 @@ class BackgroundServer:
             self._server.accepting.set()
 
     def stop(self) -> None:
-        """End every connection (close code 1012) and wait until the server has stopped."""
+        """Close all connections (code 1012) and wait until the server has stopped."""
         self._server.should_exit = True
         self._thread.join()
 
@@ -246,7 +248,7 @@ class BackgroundServer:
 
 
 class _Server(uvicorn.Server):
-    """A uvicorn server that says when it accepts connections, and leaves in order."""
+    """uvicorn server that signals when it accepts connections and shuts down gracefully."""
 
     def __init__(self, config: uvicorn.Config, service: Service) -> None:
         super().__init__(config)
@@ -254,8 +256,8 @@ class _Server(uvicorn.Server):
         self._service = service
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Let the service take its leave while whoever comes is still told, then close."""
-        await self._service.departure.drain(DRAIN_PATIENCE_S)
+        """Drain the service while new clients still get an answer, then close."""
+        await self._service.shutdown.drain(DRAIN_PATIENCE_S)
         await super().shutdown(sockets)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -264,16 +266,16 @@ class _Server(uvicorn.Server):
 
 
 def _server(
-    service: Service, door: Authenticator, certificate: Certificate | None, library: ObjectLibrary | None
+    service: Service, authenticator: Authenticator, certificate: Certificate | None, library: ObjectLibrary | None
 ) -> _Server:
     config = uvicorn.Config(
-        create_app(service, door=door, library=library),
+        create_app(service, authenticator=authenticator, library=library),
         ssl_certfile=None if certificate is None else certificate.certificate,
         ssl_keyfile=None if certificate is None else certificate.key,
         log_level="warning",
         access_log=False,
-        ws=LingeringWebSocket,
-        ws_per_message_deflate=False,  # costs 10 ms a message and gains nothing on compressed pictures
+        ws=LingeringCloseWebSocket,
+        ws_per_message_deflate=False,  # costs 10 ms a message; images are compressed already
         ws_max_size=MAX_MESSAGE_BYTES,
         ws_max_queue=2,
         log_config=None,

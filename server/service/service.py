@@ -1,4 +1,4 @@
-"""The service: one device, its capturing sessions and watchers, its metrics. An app is made around one of these."""
+"""The service: one device with its capturing sessions, watchers and metrics. `app` adds the routes."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from server.parsing.parsers import Parsers
 from server.scene.mesh import Mesh
 from server.service.broadcast import Broadcast, serve_watcher
 from server.service.connection import GONE, INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
-from server.service.departure import Departure
-from server.service.events import about
-from server.service.guests import Guests
-from server.service.kept_rooms import KeptRooms
+from server.service.connection_limits import ConnectionLimits
+from server.service.event_log import about
+from server.service.graceful_shutdown import GracefulShutdown
 from server.service.limits import DEFAULT_LIMITS, Limits
 from server.service.metrics import Metrics
-from server.service.rooms import RoomFactory, Rooms, lock_of
-from server.service.saving.upkeep import Kept
+from server.service.room_persistence import RoomPersistence
+from server.service.room_registry import RoomFactory, RoomRegistry, key_digest_of
+from server.service.saving.retention import StorageUsage
 from server.service.scheduler import Scheduler
-from server.service.session import MAX_INFLIGHT, CaptureSession, LoopOutlet
-from server.service.worker import Workshop
+from server.service.session import MAX_INFLIGHT, CaptureSession, EventLoopOutbox
+from server.service.worker import WorkerContext
 
 if TYPE_CHECKING:
     from server.client_session import ClientSession
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 SERVER_NAME = f"probeless {version('probeless')}"
 NO_SESSION = "waiting"
-"""The session in the welcome of a watcher for which there is no capturing session yet."""
+"""Session name in a watcher's welcome while there is no capturing session."""
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ WarmUp = Callable[["Device"], object]
 
 
 class Service:
-    """Serves any number of connections on one event loop. `start` and `stop` are called by the app."""
+    """Serves all connections on one event loop. The app calls `start` and `stop`."""
 
     def __init__(
         self,
@@ -65,29 +65,29 @@ class Service:
         warm_up: WarmUp | None = None,
         max_sessions: int | None = None,
         limits: Limits = DEFAULT_LIMITS,
-        at_once: int = 1,
+        concurrent_frames: int = 1,
         data: Path | None = None,
     ) -> None:
-        """`pipeline_factory`, `room_factory` (default: the real ones) and `mesh_loader` (default: the parsers') are
-        called in workers' threads. `parsers` read what strangers send, in processes of their own. `at_once`: frames
-        that the device works on side by side. `data`: folder that rooms are kept in; None: they end with their clients.
+        """`pipeline_factory`, `room_factory` and `mesh_loader` (default: the real ones) are called in worker threads.
+        `parsers` decode untrusted input in child processes. `concurrent_frames`: frames that may run on the device at
+        the same time. `data`: folder in which rooms are saved; None: a room is lost when its last client leaves.
 
-        `warm_up` is called once before the first session, in a thread too; None: there is nothing to wait for.
-        `max_sessions` takes the place of the limits' own.
+        `warm_up` is called once in a thread before the first session; None: no warm-up. `max_sessions` overrides
+        `limits.sessions`.
         """
         self.device_name = device.name
         self.metrics = Metrics()
         self.failure: str | None = None
-        """One line, where the warm-up failed: the service will never be ready."""
+        """Why the warm-up failed, one line. The service is then never ready."""
         self.failed_check: str | None = None
-        """Its name, where it failed since an answer was wrong."""
-        self.departure = Departure()
+        """Name of the failed check, if the self-check found a wrong result."""
+        self.shutdown = GracefulShutdown()
         self.on_prepared: Callable[[], None] = lambda: None
-        """Called on the event loop when the warm-up has ended, well or not."""
+        """Called on the event loop when the warm-up has ended, also after a failure."""
         self._device = device
         self._warm_up = warm_up
         self.limits = limits if max_sessions is None else replace(limits, sessions=max_sessions)
-        self.guests = Guests(self.limits)
+        self.connection_limits = ConnectionLimits(self.limits)
         self._broadcast = Broadcast()
         self._session_numbers = count(1)
         self._sessions = 0
@@ -98,69 +98,71 @@ class Service:
         self._parsers.on_death = self._note_parser_death
         self.metrics.ready.set_function(lambda: float(self.ready))
         self.metrics.device_memory.set_function(lambda: float(device.memory.bytes_held))
-        self._kept: dict[str, CaptureSession] = {}
-        """Sessions that outlive their connection, by their keys."""
-        self.departure.on_begin.append(self._give_up_waiting)
-        self._scheduler = Scheduler(at_once)
+        self._resumable_sessions: dict[str, CaptureSession] = {}
+        """Sessions that survive a lost connection, by their keys."""
+        self.shutdown.begin_hooks.append(self._stop_waiting_for_clients)
+        self._scheduler = Scheduler(concurrent_frames)
         self._factory = pipeline_factory or _real_pipeline()
-        self._keeping = KeptRooms(data, device, self.limits.kept) if data is not None else None
-        if self._keeping is not None:
-            self.rooms = Rooms(self._keeping.open_room, self._keeping.keep, self._keeping.key_digest)
+        self._persistence = RoomPersistence(data, device, self.limits.room_retention) if data is not None else None
+        if self._persistence is not None:
+            self.rooms = RoomRegistry(
+                self._persistence.open_room, self._persistence.save_and_release, self._persistence.key_digest
+            )
         else:
-            self.rooms = Rooms(room_factory or _real_room(device))
-        self.metrics.watch_rooms(lambda: self.rooms.count, self._keeping)
-        self._workshop = Workshop(
-            opened_pipeline=self._opened_pipeline,
+            self.rooms = RoomRegistry(room_factory or _real_room(device))
+        self.metrics.add_room_gauges(lambda: self.rooms.count, self._persistence)
+        self._worker_context = WorkerContext(
+            open_pipeline=self._open_pipeline,
             scheduler=self._scheduler,
-            wanted_period_s=self.limits.wanted_period_s,
+            target_period_s=self.limits.target_period_s,
             load_mesh=mesh_loader or self._parsers.load_mesh,
             color_reader=self._parsers.color_reader,
             metrics=self.metrics,
-            keep_room=self._keeping.keep_now if self._keeping else lambda _name: None,
-            keep_moves=self._keeping.keep_moves if self._keeping else lambda _name: None,
+            save_room=self._persistence.save_now if self._persistence else lambda _name: None,
+            save_placements=self._persistence.save_placements if self._persistence else lambda _name: None,
         )
         self._preparing: asyncio.Task[None] | None = None
 
-    async def _stop_keeping(self) -> None:
-        assert self._keeping is not None
-        await asyncio.to_thread(self._keeping.stop)
+    async def _stop_persistence(self) -> None:
+        assert self._persistence is not None
+        await asyncio.to_thread(self._persistence.stop)
 
-    def _entered(self, name: str, hello: Hello) -> contextlib.AbstractContextManager[Room]:
+    def _enter_room(self, name: str, hello: Hello) -> contextlib.AbstractContextManager[Room]:
         return self.rooms.entered(name, hello.wishes, hello.room_key)
 
     @contextlib.contextmanager
-    def _opened_pipeline(self, hello: Hello) -> Iterator[ClientSession]:
-        """Worker's thread: a client's pipeline, in its room if it names one."""
+    def _open_pipeline(self, hello: Hello) -> Iterator[Pipeline]:
+        """Worker thread: context with the client's pipeline, in its room if it names one."""
         with contextlib.ExitStack() as stack:
-            room = None if hello.room is None else stack.enter_context(self._entered(hello.room, hello))
+            room = None if hello.room is None else stack.enter_context(self._enter_room(hello.room, hello))
             pipeline = self._factory(self._device, hello.camera, hello.wishes, room, hello)
             stack.callback(pipeline.close)
             yield pipeline
 
     @property
     def ready(self) -> bool:
-        """The kernels are warm, a test frame came out right, and clients are welcome."""
-        return self._prepared.is_set() and self.failure is None and not self.departure.has_begun
+        """True once kernels are compiled and the self-check has passed, until shutdown begins."""
+        return self._prepared.is_set() and self.failure is None and not self.shutdown.is_draining
 
     @property
     def sessions(self) -> int:
-        """Capturing sessions now."""
+        """Number of capturing sessions."""
         return self._sessions
 
     @property
-    def kept(self) -> Kept | None:
-        """What the folder of rooms held when it was last looked through; None: nothing is kept."""
-        return self._keeping.kept if self._keeping else None
+    def storage(self) -> StorageUsage | None:
+        """Disk usage of saved rooms at the last check; None: rooms are not saved."""
+        return self._persistence.storage if self._persistence else None
 
     def start(self) -> None:
-        """Begin to warm up, without waiting for it. Needs the running event loop that will serve."""
+        """Start the warm-up in the background. Must be called on the event loop that will serve."""
         self._preparing = asyncio.create_task(self._prepare())
-        if self._keeping is not None:
-            self._keeping.start(self.rooms)
-            self.departure.saving.append(self._stop_keeping)
+        if self._persistence is not None:
+            self._persistence.start(self.rooms)
+            self.shutdown.save_hooks.append(self._stop_persistence)
 
     def stop(self) -> None:
-        """Let the threads go; sessions have ended by now."""
+        """Release threads and processes. All sessions have ended before."""
         if self._preparing is not None:
             self._preparing.cancel()
         self._threads.shutdown(wait=False, cancel_futures=True)
@@ -171,7 +173,7 @@ class Service:
             try:
                 self._parsers.start()
                 await asyncio.get_running_loop().run_in_executor(self._threads, self._warm_up, self._device)
-            except Exception as error:  # told to whoever asks: `failure`, /healthz, every client
+            except Exception as error:  # reported by `failure`, /healthz and to every client
                 log.exception("the warm-up failed")
                 self.failure = one_line(f"the warm-up on {self.device_name} failed: {error}")
                 self.failed_check = getattr(error, "check", None)
@@ -185,14 +187,14 @@ class Service:
         log.warning("a parser died", extra={"kind": kind})
 
     def note_refusal(self, refusal: Refusal) -> None:
-        """Count and log a client that is sent away."""
+        """Count and log a refused client."""
         self.metrics.refused.labels(str(refusal.code)).inc()
         log.info("client refused", extra={"code": refusal.code, "reason": refusal.reason})
 
     async def serve(self, connection: Connection) -> None:
-        """One client, from its first message to its end."""
+        """Serve one client from its first message to its end."""
         try:
-            with self.departure.present(connection):
+            with self.shutdown.registered(connection):
                 await self._serve_first_message(connection)
         except Refusal as refusal:
             await connection.refuse(refusal)
@@ -224,7 +226,7 @@ class Service:
                 raise Refusal(POLICY, f"the first message must be hello or watch, not {type(first).__name__.lower()}")
 
     async def _capture(self, connection: Connection, hello: Hello) -> None:
-        with self.guests.capturing(connection.address), self._counted_session() as name:
+        with self.connection_limits.capturing(connection.address), self._counted_session() as name:
             await self._until_ready()
             key = secrets.token_urlsafe(24) if hello.keep_s > 0 else None
             welcome = Welcome(
@@ -237,12 +239,14 @@ class Service:
                 codecs=readable_codecs(),
                 depth_codecs=DEPTH_CODECS,
             )
-            lock = lock_of(hello.room_key)
-            outlet = LoopOutlet(welcome, connection, self._broadcast, is_kept=key is not None, lock=lock)
+            key_digest = key_digest_of(hello.room_key)
+            outbox = EventLoopOutbox(
+                welcome, connection, self._broadcast, is_resumable=key is not None, key_digest=key_digest
+            )
             size = f"{hello.camera.width}x{hello.camera.height}"
             with about(session=name, address=connection.address):
                 log.info("session opened", extra={"client": hello.client, "picture": size})
-                session = CaptureSession(connection, hello, self._workshop, outlet)
+                session = CaptureSession(connection, hello, self._worker_context, outbox)
                 with self._resumable(key, session):
                     await session.run(self._threads)
                 log.info("session closed")
@@ -250,30 +254,30 @@ class Service:
     @contextlib.contextmanager
     def _resumable(self, key: str | None, session: CaptureSession) -> Iterator[None]:
         if key is not None:
-            self._kept[key] = session
+            self._resumable_sessions[key] = session
         try:
             yield
         finally:
-            self._kept.pop(key or "", None)
+            self._resumable_sessions.pop(key or "", None)
 
-    def _give_up_waiting(self) -> None:
-        for session in tuple(self._kept.values()):
-            session.give_up()
+    def _stop_waiting_for_clients(self) -> None:
+        for session in tuple(self._resumable_sessions.values()):
+            session.stop_waiting()
 
     async def _resume(self, connection: Connection, key: str) -> None:
-        session = self._kept.get(key)
+        session = self._resumable_sessions.get(key)
         if session is None:
             raise Refusal(GONE, "there is no session of that key: it ended, or the server was started anew")
         await session.resume(connection)
 
     def _admit(self) -> None:
-        """Raises Refusal where the device has no time for one more."""
+        """Admission control: raises Refusal if the device has no time for another session."""
         period_s, busy = self._scheduler.period_s(newcomers=1), self._scheduler.busy
-        if busy and period_s > self.limits.longest_period_s:
+        if busy and period_s > self.limits.max_period_s:
             raise Refusal(
                 TRY_LATER,
                 f"the server is full: {busy} sessions share its device, and with one more each would get a frame every "
-                f"{period_s:.1f} s, more than {self.limits.longest_period_s:g} s: try again later",
+                f"{period_s:.1f} s, more than {self.limits.max_period_s:g} s: try again later",
             )
 
     async def _until_ready(self) -> None:
@@ -297,7 +301,9 @@ class Service:
         waiting = Welcome(session=NO_SESSION, server=SERVER_NAME, device=self.device_name, max_inflight=MAX_INFLIGHT)
         with (
             self._counted_watcher(),
-            self._broadcast.watcher(watch.session, encode(waiting), watch.room, lock_of(watch.room_key)) as watcher,
+            self._broadcast.watcher(
+                watch.session, encode(waiting), watch.room, key_digest_of(watch.room_key)
+            ) as watcher,
         ):
             await serve_watcher(connection, watcher)
 

@@ -1,4 +1,4 @@
-"""One capturing client: the event loop reads its socket into a mailbox, one thread works on it and answers."""
+"""One capturing client: the event loop reads its socket into a mailbox; one worker thread processes and answers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from protocol.messages import Bye, ClientMessage, Dropped, Error, Frame, Hello, 
 from server.service.broadcast import Broadcast
 from server.service.connection import GONE, INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
 from server.service.mailbox import Mailbox
-from server.service.worker import Worker, Workshop
+from server.service.worker import Worker, WorkerContext
 
 MAX_INFLIGHT = 2
 FAR_TOO_MANY_INFLIGHT = 4 * MAX_INFLIGHT
@@ -22,21 +22,30 @@ FAR_TOO_MANY_INFLIGHT = 4 * MAX_INFLIGHT
 log = logging.getLogger(__name__)
 
 
-class LoopOutlet:
-    """A worker's way out: hands its bytes to the event loop and waits until the socket has taken them.
+class EventLoopOutbox:
+    """Passes a worker's messages to the event loop and waits until the socket has accepted them.
 
-    While the client's connection is lost, what is sent is lost too; the session says what has to be sent again.
+    While the client's connection is lost, messages are discarded; the client repeats unanswered requests on resume.
     """
 
     def __init__(
-        self, welcome: Welcome, connection: Connection, broadcast: Broadcast, *, is_kept: bool, lock: bytes = b""
+        self,
+        welcome: Welcome,
+        connection: Connection,
+        broadcast: Broadcast,
+        *,
+        is_resumable: bool,
+        key_digest: bytes = b"",
     ) -> None:
-        """`welcome`: but for the device. `is_kept`: a lost connection does not end the session. `lock`: of its room."""
-        self._lock = lock
+        """`welcome`: without the device. `is_resumable`: the session survives a lost connection.
+
+        `key_digest`: of the room's key.
+        """
+        self._key_digest = key_digest
         self._welcome = welcome
         self._connection: Connection | None = connection
         self._broadcast = broadcast
-        self._is_kept = is_kept
+        self._is_resumable = is_resumable
         self._loop = asyncio.get_running_loop()
         self._sending: Future[None] | None = None
         self._closed = False
@@ -44,22 +53,22 @@ class LoopOutlet:
 
     @property
     def session(self) -> str:
-        """Its name."""
+        """The session's name."""
         return self._welcome.session
 
     def greet(self, device_name: str) -> None:
-        """Worker's thread: welcome the client and let others watch it. Raises ClientGone."""
+        """Worker thread: welcome the client and allow watchers. Raises ClientGone."""
         self._welcome = structs.replace(self._welcome, device=device_name)
-        shown = structs.replace(self._welcome, key=None)  # the key is nobody else's business
+        shown = structs.replace(self._welcome, key=None)  # watchers must not be able to resume the session
         self._loop.call_soon_threadsafe(self._open_to_watchers, encode(shown))
         self.send(encode(self._welcome))
 
     def _open_to_watchers(self, welcome: bytes) -> None:
         if not self._closed:
-            self._broadcast.open_session(self.session, welcome, self._welcome.room, self._lock)
+            self._broadcast.open_session(self.session, welcome, self._welcome.room, self._key_digest)
 
     def send(self, data: bytes) -> None:
-        """Worker's thread: send to the capturing client. Raises ClientGone where that ends the session."""
+        """Worker thread: send to the capturing client. Raises ClientGone if its loss ends the session."""
         if self._closed:
             raise ClientGone
         connection = self._connection
@@ -69,7 +78,7 @@ class LoopOutlet:
         try:
             self._sending.result()
         except (CancelledError, ClientGone) as error:
-            if self._closed or not self._is_kept:
+            if self._closed or not self._is_resumable:
                 raise ClientGone from error
 
     async def _send_timed(self, connection: Connection, data: bytes) -> None:
@@ -80,25 +89,25 @@ class LoopOutlet:
             self.waited_s += self._loop.time() - began
 
     def is_watched(self) -> bool:
-        """Worker's thread: whether somebody watches this session."""
+        """Worker thread: whether anybody watches this session."""
         return self._broadcast.is_watched(self.session)
 
     def publish(self, messages: tuple[bytes, ...]) -> None:
-        """Worker's thread: give the watchers their copy, without waiting."""
+        """Worker thread: send to the watchers, without waiting."""
         self._loop.call_soon_threadsafe(self._broadcast.publish, self.session, messages)
 
     def detach(self) -> None:
-        """Event loop's thread: the connection is lost, and a worker that is sending is let go."""
+        """Event loop: the connection is lost; a worker that is sending is released."""
         self._connection = None
         self._let_go()
 
     async def attach(self, connection: Connection) -> None:
-        """Event loop's thread: the client is back. Raises ClientGone if it is not."""
+        """Event loop: use the client's new connection. Raises ClientGone if it is lost too."""
         await connection.send(encode(structs.replace(self._welcome, resumed=True)))
         self._connection = connection
 
     def close(self) -> None:
-        """Event loop's thread: nothing more can be sent, and a worker that is sending is let go."""
+        """Event loop: end the session; a worker that is sending is released."""
         self._closed = True
         self._broadcast.close_session(self.session)
         self._let_go()
@@ -109,26 +118,26 @@ class LoopOutlet:
 
 
 class CaptureSession:
-    """From a client's hello to its end, whoever ends it; its connection may be lost in between."""
+    """One capturing session, from hello to its end. It may survive lost connections."""
 
-    def __init__(self, connection: Connection, hello: Hello, workshop: Workshop, outlet: LoopOutlet) -> None:
+    def __init__(self, connection: Connection, hello: Hello, context: WorkerContext, outbox: EventLoopOutbox) -> None:
         self._connection = connection
         self._keep_s = hello.keep_s
-        self._metrics = workshop.metrics
-        self._outlet = outlet
+        self._metrics = context.metrics
+        self._outbox = outbox
         self._loop = asyncio.get_running_loop()
-        self._room = asyncio.Event()
+        self._mailbox_has_space = asyncio.Event()
         self._told_of_window = False
         self._mailbox = Mailbox(None if hello.wishes.lossless else MAX_INFLIGHT, self._wake_reader)
-        self._worker = Worker(workshop, hello, self._mailbox, outlet)
+        self._worker = Worker(context, hello, self._mailbox, outbox)
         self._returned: asyncio.Future[Connection] | None = None
-        """While the connection is lost: the one by which the client comes back."""
+        """Set while the connection is lost; its result is the client's new connection."""
         self._has_ended = False
         self._done_with: dict[Connection, asyncio.Event] = {}
-        """Connections that resumed this session, and whether it has no more use for them."""
+        """Connections that resumed this session; the event is set when a connection is no longer needed."""
 
     async def run(self, threads: Executor) -> None:
-        """Serve the client until it leaves, must leave, or the worker fails. Returns when the worker has ended."""
+        """Serve the client until it leaves, is refused, or the worker fails. Returns when the worker has ended."""
         work = self._loop.run_in_executor(threads, self._worker.run)
         read = asyncio.create_task(self._read())
         try:
@@ -143,7 +152,7 @@ class CaptureSession:
         finally:
             self._has_ended = True
             self._mailbox.close()
-            self._outlet.close()
+            self._outbox.close()
             read.cancel()
             await asyncio.wait((work, read))
             for done in self._done_with.values():
@@ -151,9 +160,9 @@ class CaptureSession:
         _report(other)
 
     async def resume(self, connection: Connection) -> None:
-        """Go on with a client that is back by another connection. Returns when that is not needed any more.
+        """Continue the session on a new connection. Returns when that connection is no longer needed.
 
-        Where the old connection has not been found lost yet, it is now. Raises Refusal where the session is ending.
+        The old connection is closed if its loss was not detected yet. Raises Refusal if the session is ending.
         """
         self._done_with[connection] = asyncio.Event()
         if self._returned is None or self._returned.done():
@@ -166,23 +175,23 @@ class CaptureSession:
         self._returned.set_result(connection)
         await self._done_with[connection].wait()
 
-    def give_up(self) -> None:
-        """Wait no more for a client that is away, now or later."""
+    def stop_waiting(self) -> None:
+        """Stop waiting for the client to reconnect, now and later."""
         self._keep_s = 0.0
         if self._returned is not None:
             self._returned.cancel()
 
     def _is_lost(self, read: asyncio.Task[None]) -> bool:
-        """Whether the reader has ended by a connection that broke, which this session outlives."""
+        """Whether the reader ended because of a lost connection that this session survives."""
         if self._keep_s <= 0 or read.cancelled():
             return False
         error = read.exception()
         return isinstance(error, ClientGone) or (error is None and self._connection.is_lost)
 
     async def _wait_for_return(self, work: asyncio.Future[None]) -> bool:
-        """Whether the client is back."""
+        """Wait for the client to reconnect. Returns whether it did."""
         log.info("connection lost, session kept", extra={"seconds": self._keep_s})
-        self._outlet.detach()
+        self._outbox.detach()
         if self._connection in self._done_with:
             self._done_with[self._connection].set()
         self._returned = self._loop.create_future()
@@ -195,15 +204,15 @@ class CaptureSession:
         if work.done():
             return False
         with contextlib.suppress(ClientGone):  # lost again: the reader says so
-            await self._outlet.attach(self._connection)
+            await self._outbox.attach(self._connection)
         log.info("session resumed")
         return True
 
     def _wake_reader(self) -> None:
-        self._loop.call_soon_threadsafe(self._room.set)
+        self._loop.call_soon_threadsafe(self._mailbox_has_space.set)
 
     async def _end(self, ended: asyncio.Future[None]) -> None:
-        """Close the socket with what the reader or the worker ended with."""
+        """Close the socket according to the result of the reader or the worker, whichever ended first."""
         try:
             ended.result()
             await self._connection.close()
@@ -216,7 +225,7 @@ class CaptureSession:
             await self._connection.refuse(_told(error))
 
     async def _read(self) -> None:
-        """Post what the client sends until it leaves; stops reading while too much is unread."""
+        """Post the client's messages until it leaves. Pauses while too much is unread."""
         connection = self._connection
         while True:
             try:
@@ -234,8 +243,8 @@ class CaptureSession:
         if isinstance(message, Hello | Watch | Bye):
             raise Refusal(POLICY, f"{type(message).__name__.lower()} was received in a session that captures already")
         while not self._mailbox.has_room():
-            self._room.clear()
-            await self._room.wait()
+            self._mailbox_has_space.clear()
+            await self._mailbox_has_space.wait()
         receipt = self._mailbox.post(message)
         if receipt.replaced is not None:
             await self._say_replaced(receipt.replaced)
@@ -253,7 +262,7 @@ class CaptureSession:
 
 
 def _told(error: Exception) -> Refusal:
-    """What a client is told of a fault that is not its own."""
+    """Refusal for a server error."""
     if type(error).__name__ == "MemoryError":  # OpenCL's or Python's; OpenCL is not loaded where no pipeline needs it
         return Refusal(
             TRY_LATER,
@@ -264,7 +273,7 @@ def _told(error: Exception) -> Refusal:
 
 
 def _report(other: asyncio.Future[None]) -> None:
-    """Log what the second of reader and worker to end was stopped by, unless that was the first one's ending."""
+    """Log an error of the task (reader or worker) that ended second."""
     if other.cancelled():
         return
     error = other.exception()

@@ -1,4 +1,4 @@
-"""The server's certificate: a given one, or one that it made for itself and keeps."""
+"""TLS certificates: a given one, or a self-signed one that is created once and stored."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from pathlib import Path
 from platformdirs import user_data_path
 
 LIFETIME = timedelta(days=800)
-"""Phones take no longer ones."""
+"""iOS rejects certificates with a longer lifetime."""
 RENEWED_BEFORE = timedelta(days=7)
 NOWHERE = ("192.0.2.1", 9)
-"""An address of no machine (RFC 5737); nothing is sent to it."""
+"""Documentation address (RFC 5737), used to find the outgoing interface; nothing is sent."""
 
 
 class CertificateError(Exception):
-    """A certificate that cannot be used; one line."""
+    """The certificate cannot be used; one line."""
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """Files in PEM, and the SHA-256 of the certificate as programs show it: AB:CD:..."""
+    """PEM files, and the SHA-256 fingerprint of the certificate in the form AB:CD:..."""
 
     certificate: Path
     key: Path
@@ -35,7 +35,7 @@ class Certificate:
 
 
 def given_certificate(certificate: Path, key: Path) -> Certificate:
-    """A certificate (with its chain) and its key, tried. Raises CertificateError."""
+    """Load and check a certificate (with its chain) and its key. Raises CertificateError."""
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, password=lambda: "")
         return Certificate(certificate, key, fingerprint_of(certificate))
@@ -47,7 +47,7 @@ def given_certificate(certificate: Path, key: Path) -> Certificate:
 
 
 def own_certificate(folder: Path | None = None) -> Certificate:
-    """The one made earlier, or a new one where there is none or its time is nearly over. Raises CertificateError."""
+    """The stored self-signed certificate; a new one if there is none or it expires soon. Raises CertificateError."""
     folder = folder or user_data_path("probeless") / "tls"
     certificate, key = folder / "certificate.pem", folder / "key.pem"
     try:
@@ -76,7 +76,7 @@ def _lasts(certificate: Path) -> bool:
 
 
 def _make(certificate: Path, key: Path) -> None:
-    """Write a key, and a certificate of its own for every name and address by which this machine is known."""
+    """Write a key and a self-signed certificate for all names and addresses of this machine."""
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -111,7 +111,7 @@ def _make(certificate: Path, key: Path) -> None:
 
 
 def _write_privately(path: Path, data: bytes) -> None:
-    """For the user alone, whole or not at all."""
+    """Write a file atomically, readable by this user only."""
     beside = path.with_suffix(f".{os.getpid()}")
     beside.unlink(missing_ok=True)
     with open(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
@@ -120,14 +120,14 @@ def _write_privately(path: Path, data: bytes) -> None:
 
 
 def host_names() -> list[str]:
-    """Of this machine, as others may know it."""
+    """Names of this machine, as others may use them."""
     own = socket.gethostname().lower()
     found = ["localhost", own, f"{own.partition('.')[0]}.local", socket.getfqdn().lower()]
     return [name for name in dict.fromkeys(found) if name.isascii() and len(name) <= 253 and _is_name(name)]
 
 
 def local_addresses() -> list[str]:
-    """Of this machine, IPv4 and IPv6, without zones."""
+    """IPv4 and IPv6 addresses of this machine, without zones."""
     found = {"127.0.0.1", "::1"}
     with contextlib.suppress(OSError):
         found |= {str(entry[4][0]).partition("%")[0] for entry in socket.getaddrinfo(socket.gethostname(), None)}

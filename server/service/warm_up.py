@@ -1,4 +1,4 @@
-"""Before the first session: every kernel is compiled, by small frames through the spine, and their answers checked."""
+"""Warm-up before the first session: compiles all kernels by processing small frames, then runs the self-check."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ SHARP_LIGHT = tuple((float(r), float(g), float(b)) for r, g, b in _LAMP)
 
 
 def warm_up(device: Device) -> None:
-    """One object under a light that is found, and under a sharp one that is given, in both families of presets.
+    """Process an object under estimated light and under a given sharp light, with both families of presets.
 
-    Raises CheckFailed where the device then computes what is wrong.
+    Raises CheckFailed if the self-check finds a wrong result.
     """
     wishes = Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.02, answer="layer")
     _run(device, wishes)

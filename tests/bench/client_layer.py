@@ -23,7 +23,7 @@ from server.pipeline import FrameResult
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from server.scene.vase import vase_glb
-from server.service.answers import JPEG_QUALITY, layer_message
+from server.service.result_encoding import JPEG_QUALITY, layer_message
 from tests.bench.client_bandwidth import FPS, kitchen
 from tests.bench.client_browser import PATIENCE_MS, WEB, chromium
 from tests.bench.finished import Part

@@ -37,7 +37,7 @@ class FullDisk(Injected):
 
     def __init__(self) -> None:
         super().__init__()
-        from server.service.saving import files
+        from server.service.saving import checksummed_files as files
 
         fails = self.fails
 

@@ -102,14 +102,16 @@ def side_by_side_part(run: Run, out: Path) -> Part:
     rates: dict[int, list[float]] = {1: [], 2: []}
     rounds, seconds = run.of(1, 3), run.of(12, 60)
     for number in range(rounds):
-        for at_once in rates if number % 2 == 0 else reversed(rates):
+        for concurrent_frames in rates if number % 2 == 0 else reversed(rates):
             options = ("--data", "none", "--sessions-per-address", str(STREAMING))
-            with serving(out / f"at_once_{at_once}.log", *options, unusual=Unusual(at_once=at_once)) as served:
+            with serving(
+                out / f"at_once_{concurrent_frames}.log", *options, unusual=Unusual(concurrent_frames=concurrent_frames)
+            ) as served:
                 load = asyncio.run(loaded(served, seconds, run.say, watching=0, asking=False, settled=5))
-            rates[at_once].append(sum(load.frames.values()) / load.seconds)
-    for at_once, found in rates.items():
+            rates[concurrent_frames].append(sum(load.frames.values()) / load.seconds)
+    for concurrent_frames, found in rates.items():
         part.add(
-            f"{STREAMING} sessions, {at_once} frame{'s' * (at_once > 1)} on the device at once",
+            f"{STREAMING} sessions, {concurrent_frames} frame{'s' * (concurrent_frames > 1)} on the device at once",
             sum(found) / len(found),
             "frames/s",
         )

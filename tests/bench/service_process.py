@@ -1,7 +1,7 @@
 """A server in a process of its own, as in the field: started, looked at from outside, killed.
 
 Run as a module it is `probeless serve` with what no user is to have: frames side by side, and a device or a disk that
-fails. `python -m tests.bench.service_process '{"at_once": 2}' [OPTIONS OF serve]`; see `Unusual`.
+fails. `python -m tests.bench.service_process '{"concurrent_frames": 2}' [OPTIONS OF serve]`; see `Unusual`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ PROGRAM = str(Path(sys.executable).parent / "probeless")
 class Unusual:
     """What `probeless serve` has no option for."""
 
-    at_once: int = 1
+    concurrent_frames: int = 1
     fault: str = ""
     """One of `service_injected.INJECTED`: it fails from the signal `BEGIN` to `END`."""
 
@@ -167,7 +167,7 @@ def _serve_unusually(unusual: Unusual, arguments: list[str]) -> None:
 
     class Service(service.Service):
         def __init__(self, *given: Any, **more: Any) -> None:
-            super().__init__(*given, **{"at_once": unusual.at_once} | more)
+            super().__init__(*given, **{"concurrent_frames": unusual.concurrent_frames} | more)
 
     with patch("server.service.serve.Service", Service):
         if unusual.fault:

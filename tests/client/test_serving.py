@@ -7,31 +7,33 @@ from pathlib import Path
 import pytest
 
 from client.laptop.errors import OptionError
-from client.serving import ServeOptions, certificate_of, door_of, limits_of, objects_folder
+from client.serving import ServeOptions, authenticator_of, certificate_of, limits_of, objects_folder
 
 
 def test_a_token_is_made_unless_one_is_given() -> None:
-    made = {door_of(ServeOptions(host="127.0.0.1")).token for _ in range(2)}
+    made = {authenticator_of(ServeOptions(host="127.0.0.1")).token for _ in range(2)}
     assert len(made) == 2
     assert None not in made
-    assert door_of(ServeOptions(host="0.0.0.0", token="x")).token == "x"
+    assert authenticator_of(ServeOptions(host="0.0.0.0", token="x")).token == "x"
 
 
 def test_no_token_must_be_said_twice_where_others_reach_it() -> None:
     for host in ("127.0.0.1", "localhost", "::1"):
-        assert door_of(ServeOptions(host=host, token="none")).token is None
+        assert authenticator_of(ServeOptions(host=host, token="none")).token is None
     for host in ("0.0.0.0", "::", "192.0.2.1", "room.example"):
         with pytest.raises(OptionError, match=f"reaches {host}"):
-            door_of(ServeOptions(host=host, token="none"))
-        assert door_of(ServeOptions(host=host, token="none", insecure=True)).token is None
+            authenticator_of(ServeOptions(host=host, token="none"))
+        assert authenticator_of(ServeOptions(host=host, token="none", insecure=True)).token is None
 
 
 def test_origins_are_as_a_browser_writes_them() -> None:
-    door = door_of(ServeOptions(host="127.0.0.1", allow_origin=("https://App.example/", "http://room:8080")))
-    assert door.origins == {"https://app.example", "http://room:8080"}
+    authenticator = authenticator_of(
+        ServeOptions(host="127.0.0.1", allow_origin=("https://App.example/", "http://room:8080"))
+    )
+    assert authenticator.origins == {"https://app.example", "http://room:8080"}
     for wrong in ("app.example", "https://", "https://app.example/path", "ws://app.example", "*"):
         with pytest.raises(OptionError, match="--allow-origin"):
-            door_of(ServeOptions(host="127.0.0.1", allow_origin=(wrong,)))
+            authenticator_of(ServeOptions(host="127.0.0.1", allow_origin=(wrong,)))
 
 
 def test_limits() -> None:
@@ -55,9 +57,9 @@ def test_a_folder_of_objects_must_be_one(tmp_path: Path) -> None:
 
 
 def test_limits_of_rooms_on_disk() -> None:
-    usual = limits_of(ServeOptions("localhost")).kept
+    usual = limits_of(ServeOptions("localhost")).room_retention
     assert (usual.space_bytes, usual.age_s) == (16 << 30, 180 * 86400)
-    other = limits_of(ServeOptions("localhost", data_gib=0.5, data_days=2)).kept
+    other = limits_of(ServeOptions("localhost", data_gib=0.5, data_days=2)).room_retention
     assert (other.space_bytes, other.age_s) == (1 << 29, 2 * 86400)
-    none = limits_of(ServeOptions("localhost", data_gib=0, data_days=0)).kept
+    none = limits_of(ServeOptions("localhost", data_gib=0, data_days=0)).room_retention
     assert (none.space_bytes, none.age_s) == (None, None)

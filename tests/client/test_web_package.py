@@ -81,7 +81,7 @@ def program(sources: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def server(device: Device) -> Iterator[BackgroundServer]:
-    with BackgroundServer(Service(device), door=Authenticator(TOKEN)) as server:
+    with BackgroundServer(Service(device), authenticator=Authenticator(TOKEN)) as server:
         yield server
 
 

@@ -11,7 +11,7 @@ import uvicorn
 
 from server.cluster.host import RoomHost
 from server.cluster.ingress import Ingress, create_ingress_app
-from server.cluster.places import Address, NoPlace, NotYet
+from server.cluster.room_directory import Address, RoomNotReady, RoomUnavailable
 from server.service.authenticator import Authenticator
 from server.service.serve import listen, url_of
 from server.service.service import Service
@@ -33,12 +33,12 @@ class TownPlaces:
 
     async def find(self, room_id: str, may_open: bool) -> Address:
         if room_id in self.moving:
-            raise NotYet(room_id)
+            raise RoomNotReady(room_id)
         if room_id not in self.hosts:
             if not may_open:
-                raise NoPlace("there is no such session")
+                raise RoomUnavailable("there is no such session")
             if not self.free:
-                raise NotYet("no place is free")
+                raise RoomNotReady("no place is free")
             self.free -= 1
             self.open(room_id)
         return self.hosts[room_id].address()

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from server.cluster.capacity import Capacity, Policy, places_needed
+from server.cluster.node_warm_up import warm_up_node
 from server.cluster.settings import read_settings
-from server.cluster.warmth import warm_up_node
 from tests.service.fakes import FAKE_DEVICE
 
 

@@ -419,11 +419,11 @@ def test_names_stay_apart_and_inside_the_folder(device: Device, store: RoomStore
     assert len({folder_name(name) for name in NAMES}) == len(NAMES)
     assert {path.name for path in tmp_path.iterdir()} == {"rooms"}
     assert {path.name for path in (tmp_path / "rooms").iterdir()} == {folder_name(name) for name in NAMES}
-    store.forget("../../etc")
+    store.delete("../../etc")
     assert store.load("../../etc", device) is None
     assert "../../etc" not in store.names()
     assert len(store.names()) == len(NAMES) - 1
-    store.forget("never there")
+    store.delete("never there")
 
 
 def test_a_room_of_one_session_is_not_saved(device: Device, store: RoomStore) -> None:

@@ -17,8 +17,8 @@ from server.opencl.device import Device
 from server.room.room import Room
 from server.scene.placement import Placement
 from server.service.room_store import RoomStore, RoomStoreError, folder_name
-from server.service.saving import slot as slots
-from server.service.saving import state as states
+from server.service.saving import room_state as states
+from server.service.saving import save_slot as slots
 from tests.faulty_disk import FaultyDisk, PowerCut, full
 from tests.kept_rooms import CUBE, PLACE, client_of, found, layout_of, print_of, scan
 from tests.rooms import wishes
@@ -88,7 +88,7 @@ def test_after_a_power_cut_at_any_step_of_a_save_the_last_whole_one_is_there(
             disk.cut()
         disk.fails_at = 0
         for number in ("0", "1"):
-            slots.Slot(folder / folder_name("study") / number).read()  # both saves are whole
+            slots.SaveSlot(folder / folder_name("study") / number).read()  # both saves are whole
         seen.append(prints.index(found(folder, device)))
         if step % 8 == 1:
             RoomStore(folder).save(room)

@@ -33,7 +33,9 @@ def start_server(lab: Lab) -> Iterator[StartServer]:
     servers: list[BackgroundServer] = []
 
     def start(**options: object) -> BackgroundServer:
-        at_the_door = {name: options.pop(name) for name in ("door", "certificate", "library") if name in options}
+        at_the_door = {
+            name: options.pop(name) for name in ("authenticator", "certificate", "library") if name in options
+        }
         service = Service(FAKE_DEVICE, **{"pipeline_factory": lab.build, "mesh_loader": fake_mesh} | options)
         servers.append(BackgroundServer(service, **at_the_door))
         return servers[-1]

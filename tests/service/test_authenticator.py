@@ -24,7 +24,7 @@ TOKEN = "a+b/c=d&e?f%20"  # what a URL must quote
 @pytest.fixture
 def locked(start_server) -> BackgroundServer:
     """A server that asks for TOKEN."""
-    return start_server(door=Authenticator(TOKEN))
+    return start_server(authenticator=Authenticator(TOKEN))
 
 
 def refused(url: str, path: str = "/v1/stream", **options: str) -> tuple[int, str]:
@@ -94,7 +94,7 @@ def test_the_laptop_client_takes_url_option_and_what_is_left_for_it(locked, monk
 
 
 def test_the_key_is_for_the_user_alone_and_goes_with_the_server(start_server) -> None:
-    server = start_server(door=Authenticator(TOKEN))
+    server = start_server(authenticator=Authenticator(TOKEN))
     path = key_path(int(server.url.rpartition(":")[2]))
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
@@ -128,7 +128,7 @@ def test_a_later_servers_key_is_left_alone() -> None:
 def test_a_key_that_cannot_be_left_stops_nobody(start_server, tmp_path: Path, monkeypatch, caplog) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("PROBELESS_KEYS", str(tmp_path / "file" / "keys"))
-    server = start_server(door=Authenticator(TOKEN))
+    server = start_server(authenticator=Authenticator(TOKEN))
     assert connected(server.way_in) == "a fake device"
     assert "must be given the token" in caplog.text
 
@@ -146,7 +146,7 @@ def test_pages_of_elsewhere_are_refused_even_with_the_token(locked) -> None:
 
 
 def test_an_allowed_origin_may_come_from_elsewhere(start_server) -> None:
-    server = start_server(door=Authenticator(TOKEN, frozenset({"https://app.example"})))
+    server = start_server(authenticator=Authenticator(TOKEN, frozenset({"https://app.example"})))
     bearer = {"Authorization": f"Bearer {TOKEN}"}
     wire = Wire(server.url, Origin="https://app.example", **bearer)
     assert wire.greet().session
@@ -164,12 +164,12 @@ def test_without_a_token_a_name_that_was_pointed_here_is_no_own_address(server) 
         wire.hang_up()
 
 
-def get(path: str, door: Authenticator, client: str, lab, **headers: str) -> httpx.Response:
+def get(path: str, authenticator: Authenticator, client: str, lab, **headers: str) -> httpx.Response:
     """A request of `client`, an address, to the app itself."""
     service = Service(FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh)
 
     async def ask() -> httpx.Response:
-        transport = httpx.ASGITransport(create_app(service, door=door), client=(client, 1))
+        transport = httpx.ASGITransport(create_app(service, authenticator=authenticator), client=(client, 1))
         async with httpx.AsyncClient(transport=transport, base_url="http://test") as http:
             return await http.get(path, headers=headers)
 
@@ -177,14 +177,14 @@ def get(path: str, door: Authenticator, client: str, lab, **headers: str) -> htt
 
 
 def test_metrics_are_for_this_machine_and_whoever_has_the_token(lab) -> None:
-    door = Authenticator(TOKEN)
-    strange = get("/metrics", door, "192.0.2.7", lab)
+    authenticator = Authenticator(TOKEN)
+    strange = get("/metrics", authenticator, "192.0.2.7", lab)
     assert strange.status_code == 401
     assert strange.text.count("\n") == 1
     assert "?token=" in strange.text
-    assert get("/metrics", door, "192.0.2.7", lab, Authorization=f"Bearer {TOKEN}").status_code == 200
-    assert get(f"/metrics?{httpx.QueryParams(token=TOKEN)}", door, "192.0.2.7", lab).status_code == 200
-    assert get("/metrics", door, "127.0.0.1", lab).status_code == 200
+    assert get("/metrics", authenticator, "192.0.2.7", lab, Authorization=f"Bearer {TOKEN}").status_code == 200
+    assert get(f"/metrics?{httpx.QueryParams(token=TOKEN)}", authenticator, "192.0.2.7", lab).status_code == 200
+    assert get("/metrics", authenticator, "127.0.0.1", lab).status_code == 200
     assert get("/metrics", Authenticator(), "192.0.2.7", lab).status_code == 200
 
 

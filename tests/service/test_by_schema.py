@@ -22,7 +22,7 @@ def test_every_answer_is_described(server) -> None:
 
 
 def test_refusals_are_described() -> None:
-    with BackgroundServer(Service(FAKE_DEVICE), door=Authenticator("secret")) as guarded:
+    with BackgroundServer(Service(FAKE_DEVICE), authenticator=Authenticator("secret")) as guarded:
         url = guarded.url.partition("?")[0].rstrip("/")
         found = requests_by_schema(create_app(Service(FAKE_DEVICE)), url, EXAMPLES)
     assert not found.wrong

@@ -106,7 +106,7 @@ def test_control_messages_are_never_dropped_and_precede_later_frames(dial, lab) 
 
 def test_reading_stops_while_too_much_is_unread_and_goes_on_later(dial, lab, monkeypatch) -> None:
     lab.hold = True
-    monkeypatch.setattr(mailbox, "MAX_WAITING_LETTERS", 4)
+    monkeypatch.setattr(mailbox, "MAX_QUEUED_MESSAGES", 4)
     unread: list[int] = []
     post = mailbox.Mailbox.post
 

@@ -21,7 +21,7 @@ from client.layers import NEUTRAL, decode_layer, put_over
 from protocol.images import encode_depth
 from protocol.messages import Bye, Composite, Dropped, Layer, Light, Wishes
 from server.opencl.device import Device
-from server.service.answers import STEPS_PER_M
+from server.service.result_encoding import STEPS_PER_M
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 from server.shading import layer as of_server

@@ -4,9 +4,9 @@ import pytest
 
 from protocol.codec import encode
 from protocol.messages import Acknowledged, Composite, Error, Hello, Quality, Welcome
-from server.service.guests import network_of
+from server.service.connection_limits import network_of
 from server.service.limits import Limits
-from server.service.pace import Allowance, Pace
+from server.service.rate_limiter import RateLimiter, TokenBucket
 from tests.service.fakes import CAMERA, frame_message
 from tests.service.wire import Wire
 
@@ -22,27 +22,27 @@ class Clock:
 
 def test_an_allowance_fills_up_with_time_and_no_further() -> None:
     clock = Clock()
-    allowance = Allowance(per_s=10, at_once=20, clock=clock)
-    assert allowance.spend(20) == 0
-    assert allowance.spend(5) == pytest.approx(0.5)
+    bucket = TokenBucket(rate_per_s=10, burst=20, clock=clock)
+    assert bucket.spend(20) == 0
+    assert bucket.spend(5) == pytest.approx(0.5)
     clock.now_s = 1.0
-    assert allowance.spend(5) == 0
+    assert bucket.spend(5) == 0
     clock.now_s = 1000.0
-    assert allowance.spend(20) == 0
-    assert allowance.spend(1) == pytest.approx(0.1)
+    assert bucket.spend(20) == 0
+    assert bucket.spend(1) == pytest.approx(0.1)
 
 
 def test_a_camera_at_90_hertz_is_never_over_its_pace() -> None:
     clock = Clock()
-    pace = Pace(Limits(), clock)
+    limiter = RateLimiter(Limits(), clock)
     for _ in range(90 * 600):
         clock.now_s += 1 / 90
-        assert not pace.is_flooded_by_one_more()
-        assert pace.pause_s(1_400_000) == 0
+        assert not limiter.exceeds_message_rate()
+        assert limiter.pause_s(1_400_000) == 0
 
 
 def test_a_flood_of_messages_ends_its_connection_only(start_server) -> None:
-    server = start_server(limits=Limits(messages_per_s=1, messages_at_once=50))
+    server = start_server(limits=Limits(messages_per_s=1, messages_burst=50))
     good, bad = Wire(server.url), Wire(server.url)
     good.greet()
     bad.greet()
@@ -61,7 +61,7 @@ def test_a_flood_of_messages_ends_its_connection_only(start_server) -> None:
 def test_too_many_bytes_are_read_more_slowly_and_none_is_lost(start_server) -> None:
     frame = frame_message(0)
     size = len(encode(frame))
-    server = start_server(limits=Limits(bytes_per_s=20.0 * size, bytes_at_once=2.0 * size))
+    server = start_server(limits=Limits(bytes_per_s=20.0 * size, bytes_burst=2.0 * size))
     wire = Wire(server.url)
     wire.greet(lossless=True)
     for _ in range(6):

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from protocol.messages import Frame, MoveObject, PlaceObject, Quality
-from server.service.mailbox import MAX_WAITING_BYTES, MAX_WAITING_LETTERS, Mailbox
+from server.service.mailbox import MAX_QUEUED_BYTES, MAX_QUEUED_MESSAGES, Mailbox
 from tests.service.fakes import PATIENCE_S, frame_message
 
 
@@ -97,7 +97,7 @@ def test_close_lets_a_waiting_reader_go_and_forgets_letters() -> None:
 
 def test_room_is_bounded_by_count_and_by_bytes() -> None:
     mailbox = Mailbox(2)
-    for request in range(MAX_WAITING_LETTERS):
+    for request in range(MAX_QUEUED_MESSAGES):
         assert mailbox.has_room()
         mailbox.post(quality(request))
     assert not mailbox.has_room()
@@ -106,7 +106,7 @@ def test_room_is_bounded_by_count_and_by_bytes() -> None:
 
     mailbox = Mailbox(2)
     mesh = PlaceObject(request=0, object="a", format="glb", data=bytes(12 << 20))
-    for _ in range(MAX_WAITING_BYTES // (12 << 20)):
+    for _ in range(MAX_QUEUED_BYTES // (12 << 20)):
         assert mailbox.has_room()
         mailbox.post(mesh)
     assert not mailbox.has_room()
@@ -115,7 +115,7 @@ def test_room_is_bounded_by_count_and_by_bytes() -> None:
 def test_replaced_frames_leave_no_bytes_behind() -> None:
     mailbox = Mailbox(2)
     frame = frame_message(0)
-    for _ in range(2 * MAX_WAITING_BYTES // len(frame.color.data)):
+    for _ in range(2 * MAX_QUEUED_BYTES // len(frame.color.data)):
         mailbox.post(frame)
     assert mailbox.has_room()
 
@@ -135,9 +135,9 @@ def test_two_threads_lose_no_control_message_and_end_with_the_newest_frame(windo
     frame = frame_message(0)
 
     def read() -> None:
-        while (letter := mailbox.take()) is not None and letter.message != quality(999):
-            taken.append(letter.message)
-            if isinstance(letter.message, Frame):
+        while (queued := mailbox.take()) is not None and queued.message != quality(999):
+            taken.append(queued.message)
+            if isinstance(queued.message, Frame):
                 mailbox.note_answered()
 
     reader = threading.Thread(target=read)
@@ -167,8 +167,8 @@ def test_more_of_a_kind_is_taken_only_as_far_as_it_is_next() -> None:
     for message in (*moves[:3], quality(3), moves[3]):
         mailbox.post(message)
     assert mailbox.take().message is moves[0]
-    assert mailbox.take_more(MoveObject) == moves[1:3]
-    assert mailbox.take_more(MoveObject) == []
+    assert mailbox.take_while(MoveObject) == moves[1:3]
+    assert mailbox.take_while(MoveObject) == []
     assert drain(mailbox, 2) == [quality(3), moves[3]]
-    assert mailbox.take_more(MoveObject) == []  # and waits for none
+    assert mailbox.take_while(MoveObject) == []  # and waits for none
     assert len(taken) == 4

@@ -37,7 +37,9 @@ def folder(tmp_path: Path) -> Path:
 @pytest.fixture
 def ask(start_server, folder: Path):
     """GET a path of a server with that folder."""
-    server = start_server(library=ObjectLibrary(folder), door=Authenticator(TOKEN, frozenset({"https://app.example"})))
+    server = start_server(
+        library=ObjectLibrary(folder), authenticator=Authenticator(TOKEN, frozenset({"https://app.example"}))
+    )
 
     def get(path: str, headers: dict[str, str] | None = None, token: str | None = TOKEN) -> httpx.Response:
         headers = (headers or {}) | ({} if token is None else {"Authorization": f"Bearer {token}"})

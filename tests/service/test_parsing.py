@@ -25,9 +25,9 @@ from protocol.frames import CameraModel
 from protocol.images import decode_color, encode_color
 from protocol.messages import Acknowledged, Composite, Dropped, PlaceObject
 from server.objects.scene_objects import mesh_digest
-from server.parsing.children import ChildDied, Children
 from server.parsing.mesh_bytes import mesh_from_bytes, mesh_to_bytes
-from server.parsing.parsers import MESH_WORK, PICTURE_WORK, Parsers
+from server.parsing.parsers import MESH_JOB, PICTURE_JOB, Parsers
+from server.parsing.process_pool import ChildDied, ProcessPool
 from server.scene.limits import MeshError
 from server.scene.materials import Beyond, Material, Texture
 from server.scene.mesh import Mesh, load_mesh
@@ -39,9 +39,9 @@ from tests.service.test_http import rows
 from tests.service.wire import Wire
 from tests.textured import write_glb
 
-STUBBORN_MESHES = replace(MESH_WORK, job="tests.service.jobs:read_mesh")
-STUBBORN_PICTURES = replace(PICTURE_WORK, job="tests.service.jobs:read_picture")
-IMPATIENT = replace(STUBBORN_MESHES, patience_s=0.2)
+STUBBORN_MESHES = replace(MESH_JOB, job="tests.service.jobs:read_mesh")
+STUBBORN_PICTURES = replace(PICTURE_JOB, job="tests.service.jobs:read_picture")
+IMPATIENT = replace(STUBBORN_MESHES, timeout_s=0.2)
 
 
 @pytest.fixture(scope="module")
@@ -213,13 +213,13 @@ def test_a_real_file_that_needs_too_much_memory_is_told() -> None:
     faces = np.zeros(len(vertices) // 3, np.dtype([("n", "u1"), ("v", "<i4", 3)]))
     faces["n"], faces["v"] = 3, np.arange(len(faces) * 3).reshape(-1, 3)
     data = header + vertices.tobytes() + faces.tobytes()
-    children = Children(MESH_WORK, 1)
+    children = ProcessPool(MESH_JOB, 1)
     assert len(mesh_from_bytes(children.ask(b"ply\n" + data)).triangles) > 90_000
     (pid,) = children.pids
     status = Path(f"/proc/{pid}/status").read_text().splitlines()
     children.stop()
     loaded_mib = int(next(line for line in status if line.startswith("VmSize")).split()[1]) >> 10
-    tight = Parsers(replace(MESH_WORK, memory_mib=max(64, loaded_mib - 200)))
+    tight = Parsers(replace(MESH_JOB, memory_mib=max(64, loaded_mib - 200)))
     try:
         with pytest.raises(MeshError, match=r"memory|Memory|allocate|died"):
             tight.load_mesh(data, "ply")
@@ -254,7 +254,7 @@ def test_a_reader_killed_while_idle_costs_nobody_a_mesh(stubborn: Parsers) -> No
 
 def test_a_reader_that_lies_is_not_believed(stubborn: Parsers) -> None:
     assert "is not one" in told(stubborn, b"lie")
-    talkative = Parsers(replace(STUBBORN_MESHES, greatest_answer=100_000))
+    talkative = Parsers(replace(STUBBORN_MESHES, max_answer_bytes=100_000))
     assert "more of it than may be" in told(talkative, b"talk")
     talkative.stop()
 
@@ -376,7 +376,7 @@ def test_a_mesh_that_kills_its_reader_over_the_socket(start_server: Callable) ->
 
 
 def test_a_picture_that_kills_its_reader_over_the_socket(start_server: Callable) -> None:
-    server = start_server(mesh_loader=fake_mesh, parsers=Parsers(picture_work=STUBBORN_PICTURES))
+    server = start_server(mesh_loader=fake_mesh, parsers=Parsers(picture_spec=STUBBORN_PICTURES))
     wire = Wire(server.url)
     wire.greet()
     deadly = encode_color(np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8), "png")
@@ -404,4 +404,4 @@ def _with_zeros(png: bytes) -> bytes:
 def test_a_child_that_cannot_be_started_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     with pytest.raises(ChildDied, match="could not be started"):
-        Children(MESH_WORK, 1).ask(b"")
+        ProcessPool(MESH_JOB, 1).ask(b"")

@@ -72,7 +72,7 @@ def test_clients_of_a_room_get_equal_shares_and_what_is_asked_between_waits_for_
         share = scheduler.join("study")
 
         def frame() -> None:
-            with scheduler.turn(share), room.lock:
+            with scheduler.acquire(share), room.lock:
                 busy(FRAME_S)
                 had[client] += 1
 

@@ -25,7 +25,7 @@ from tests.rooms import CAMERA, frame_at, view_at, wishes
 from tests.service import fakes
 from tests.service.wire import Wire
 
-PATIENT = Limits(longest_period_s=3600.0)
+PATIENT = Limits(max_period_s=3600.0)
 """Nobody is sent away since this machine is busy."""
 
 
@@ -111,7 +111,7 @@ def test_watchers_of_a_room_see_only_that(real_server: BackgroundServer) -> None
 
 
 def test_a_client_too_many_is_told_that_the_server_is_full(start_server, lab) -> None:
-    server = start_server(limits=Limits(longest_period_s=0.05))
+    server = start_server(limits=Limits(max_period_s=0.05))
     first = Wire(server.url)
     first.greet()
     lab.hold = True
@@ -134,7 +134,7 @@ def test_a_client_too_many_is_told_that_the_server_is_full(start_server, lab) ->
 
 
 def test_sessions_that_share_a_device_step_down_and_are_told(start_server, lab) -> None:
-    server = start_server(limits=Limits(wanted_period_s=0.0))
+    server = start_server(limits=Limits(target_period_s=0.0))
     wires = [Wire(server.url) for _ in range(2)]
     for wire in wires:
         wire.greet(preset="rm")

@@ -8,8 +8,8 @@ from collections import Counter
 import pytest
 
 from protocol.messages import Wishes
-from server.service.pressure import CALM_FRAMES, DOWN_FRAMES, Pressure, Quality
-from server.service.scheduler import AWAY_S, CREDIT_S, Scheduler, Share
+from server.service.load_shedding import FRAMES_BEFORE_CHEAPER, FRAMES_BEFORE_FINER, LoadShedding, SamplingRequest
+from server.service.scheduler import AWAY_S, CREDIT_S, Scheduler, SessionShare
 
 
 class Clock:
@@ -25,9 +25,11 @@ class Clock:
 class Device:
     """Sessions that always have a frame, served as the scheduler says; no threads, so nothing depends on their luck."""
 
-    def __init__(self, costs: dict[str, float], rooms: dict[str, str] | None = None, at_once: int = 1) -> None:
+    def __init__(
+        self, costs: dict[str, float], rooms: dict[str, str] | None = None, concurrent_frames: int = 1
+    ) -> None:
         self.clock = Clock()
-        self.scheduler = Scheduler(at_once, self.clock)
+        self.scheduler = Scheduler(concurrent_frames, self.clock)
         self.costs = costs
         self.shares = {name: self.scheduler.join((rooms or {}).get(name)) for name in costs}
         self.frames: Counter[str] = Counter()
@@ -39,8 +41,8 @@ class Device:
         while self.clock.now < end:
             for share in waiting:
                 if share not in self.scheduler._waiting:
-                    least = self.scheduler._least_had(share, share.had_s)
-                    share.had_s = max(share.had_s, least - CREDIT_S)
+                    least = self.scheduler._least_used_s(share, share.used_s)
+                    share.used_s = max(share.used_s, least - CREDIT_S)
                     self.scheduler._waiting.append(share)
             chosen = self.scheduler._next()
             assert chosen is not None
@@ -104,16 +106,16 @@ def test_first_frames_in_which_kernels_are_loaded_foretell_nothing() -> None:
     assert device.scheduler.period_s() == pytest.approx(0.24)
 
 
-def run_in_threads(scheduler: Scheduler, shares: list[Share], turns: int) -> tuple[int, int]:
+def run_in_threads(scheduler: Scheduler, shares: list[SessionShare], turns: int) -> tuple[int, int]:
     """The most frames at once, in all and of one room."""
-    working: list[Share] = []
+    working: list[SessionShare] = []
     most, most_of_room = 0, 0
     lock = threading.Lock()
 
-    def work(share: Share) -> None:
+    def work(share: SessionShare) -> None:
         nonlocal most, most_of_room
         for _ in range(turns):
-            with scheduler.turn(share) as waited_s:
+            with scheduler.acquire(share) as waited_s:
                 assert waited_s >= 0
                 with lock:
                     working.append(share)
@@ -138,7 +140,7 @@ def test_one_frame_at_a_time() -> None:
 
 
 def test_frames_of_one_room_never_meet_while_others_do() -> None:
-    scheduler = Scheduler(at_once=2)
+    scheduler = Scheduler(concurrent_frames=2)
     shares = [scheduler.join(room) for room in ("a", "a", "a", "b", "b", "c")]
     most, most_of_room = run_in_threads(scheduler, shares, 25)
     assert most == 2
@@ -148,43 +150,43 @@ def test_frames_of_one_room_never_meet_while_others_do() -> None:
 def test_a_frame_that_fails_gives_the_device_back() -> None:
     scheduler = Scheduler()
     share = scheduler.join()
-    with pytest.raises(RuntimeError), scheduler.turn(share):
+    with pytest.raises(RuntimeError), scheduler.acquire(share):
         raise RuntimeError("a kernel")
-    with scheduler.turn(share):
+    with scheduler.acquire(share):
         pass
     scheduler.leave(share)
 
 
-def observe(pressure: Pressure, frames: int, sharing: int, period_s: float) -> list[str]:
-    return [pressure.quality.preset for _ in range(frames) if pressure.observe(sharing, lambda: period_s)]
+def observe(shedding: LoadShedding, frames: int, sharing: int, period_s: float) -> list[str]:
+    return [shedding.granted.preset for _ in range(frames) if shedding.observe(sharing, lambda: period_s)]
 
 
 def test_quality_steps_down_under_load_and_back_when_it_eases() -> None:
-    pressure = Pressure(Wishes(preset="rm"), 0.25)
-    assert observe(pressure, 3 * DOWN_FRAMES, 8, 1.0) == ["art1", "reg4", "gr15fast"]
-    assert observe(pressure, 40, 8, 1.0) == []  # there is nothing cheaper
-    assert observe(pressure, CALM_FRAMES, 8, 0.2) == []  # neither too much, nor room for more
-    assert observe(pressure, 2 * CALM_FRAMES, 2, 0.05) == ["reg4", "art1"]
-    assert observe(pressure, CALM_FRAMES, 1, 0.05) == ["rm"]
+    shedding = LoadShedding(Wishes(preset="rm"), 0.25)
+    assert observe(shedding, 3 * FRAMES_BEFORE_CHEAPER, 8, 1.0) == ["art1", "reg4", "gr15fast"]
+    assert observe(shedding, 40, 8, 1.0) == []  # there is nothing cheaper
+    assert observe(shedding, FRAMES_BEFORE_FINER, 8, 0.2) == []  # neither too much, nor room for more
+    assert observe(shedding, 2 * FRAMES_BEFORE_FINER, 2, 0.05) == ["reg4", "art1"]
+    assert observe(shedding, FRAMES_BEFORE_FINER, 1, 0.05) == ["rm"]
 
 
 def test_alone_a_session_gets_what_it_asked_for() -> None:
-    assert observe(Pressure(Wishes(preset="rm"), 0.25), 100, 1, 3.0) == []
+    assert observe(LoadShedding(Wishes(preset="rm"), 0.25), 100, 1, 3.0) == []
 
 
 def test_lossless_sessions_are_left_alone() -> None:
-    assert observe(Pressure(Wishes(preset="rm", lossless=True), 0.25), 100, 8, 3.0) == []
+    assert observe(LoadShedding(Wishes(preset="rm", lossless=True), 0.25), 100, 8, 3.0) == []
 
 
 def test_what_is_asked_for_later_counts_from_then_on() -> None:
-    pressure = Pressure(Wishes(preset="rm"), 0.25)
-    observe(pressure, DOWN_FRAMES, 8, 1.0)
-    pressure.ask(Quality("reg4", None, None))
-    assert pressure.quality.preset == "reg4"
-    assert observe(pressure, DOWN_FRAMES, 8, 1.0) == ["gr15fast"]
+    shedding = LoadShedding(Wishes(preset="rm"), 0.25)
+    observe(shedding, FRAMES_BEFORE_CHEAPER, 8, 1.0)
+    shedding.request(SamplingRequest("reg4", None, None))
+    assert shedding.granted.preset == "reg4"
+    assert observe(shedding, FRAMES_BEFORE_CHEAPER, 8, 1.0) == ["gr15fast"]
 
 
 def test_budgets_shrink_instead_of_presets() -> None:
-    pressure = Pressure(Wishes(preset="auto", budget_ms=300.0), 0.25)
-    observe(pressure, DOWN_FRAMES, 8, 1.0)
-    assert pressure.quality == Quality("auto", pytest.approx(180.0), None)
+    shedding = LoadShedding(Wishes(preset="auto", budget_ms=300.0), 0.25)
+    observe(shedding, FRAMES_BEFORE_CHEAPER, 8, 1.0)
+    assert shedding.granted == SamplingRequest("auto", pytest.approx(180.0), None)

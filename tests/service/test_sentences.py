@@ -10,7 +10,7 @@ import pytest
 from client.client import Access, ClientError, RoomPlace, StreamClient
 from protocol.messages import Hello
 from server.service.authenticator import Authenticator
-from server.service.departure import DRAINING, GOODBYE
+from server.service.graceful_shutdown import DRAINING, GOODBYE
 from tests.service.draining import draining
 from tests.service.fakes import CAMERA, PATIENCE_S
 from tests.service.wire import Wire
@@ -55,7 +55,7 @@ def test_a_server_of_another_version(start_server, monkeypatch) -> None:
 )
 def test_a_wrong_token(start_server, access: Access | None, word: str, monkeypatch) -> None:
     monkeypatch.setattr("client.access.find_key", lambda _port: None)  # as on another machine
-    assert told(start_server(door=Authenticator("a-token")).url, access=access) == (
+    assert told(start_server(authenticator=Authenticator("a-token")).url, access=access) == (
         f"the token is {word}: use the URL that the server printed at its start, which ends in ?token=..."
     )
 

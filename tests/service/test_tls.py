@@ -30,7 +30,7 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> Certificate:
 
 @pytest.fixture
 def secure(start_server, certificate: Certificate) -> BackgroundServer:
-    return start_server(door=Authenticator(TOKEN), certificate=certificate)
+    return start_server(authenticator=Authenticator(TOKEN), certificate=certificate)
 
 
 def test_the_certificate_is_made_once_for_the_user_alone(tmp_path: Path) -> None:

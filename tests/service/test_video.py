@@ -26,7 +26,7 @@ from protocol.colors import ColorReader
 from protocol.h264 import is_key_picture
 from protocol.messages import Composite, Dropped, Frame, Hello, Welcome
 from protocol.recording import read_messages, write_message
-from server.parsing.parsers import VIDEO_WORK, Parsers
+from server.parsing.parsers import VIDEO_JOB, Parsers
 from tests.service.fakes import CAMERA, PATIENCE_S, REFUSE_MM, Lab, rgbd_frame
 from tests.service.proxy import impaired
 from tests.service.test_http import rows
@@ -173,7 +173,7 @@ def test_readers_start_no_threads_and_have_limits(parsers: Parsers) -> None:
     (children,) = parsers._videos
     assert len(list(Path(f"/proc/{children.pids[0]}/task").iterdir())) == 1
     limits = Path(f"/proc/{children.pids[0]}/limits").read_text()
-    assert str(VIDEO_WORK.memory_mib << 20) in limits
+    assert str(VIDEO_JOB.memory_mib << 20) in limits
     reader.close()
     assert not parsers._videos
 

@@ -13,7 +13,7 @@ export const MAX_NAME_CHARS = 64;
 export const MAX_REASON_CHARS = 400;
 export const MAX_SH_BANDS = 6;
 
-/** The depth picture's own lens, where it is another than the colour picture's; conventions as in `CameraModel`. */
+/** Lens of the depth image, if it differs from the colour lens; conventions as in `CameraModel`. */
 export interface DepthCamera {
   width: number;
   height: number;
@@ -27,7 +27,7 @@ export interface DepthCamera {
 }
 
 /**
- * Pinhole camera with polynomial distortion, of the colour picture, and of the depth picture unless `depth` is set.
+ * Pinhole camera with polynomial distortion, for the colour image, and for the depth image unless `depth` is set.
  *
  * A pixel centre lies at integer coordinates: `u = fx * x / z + cx`. Distortion is OpenCV's
  * `(k1, k2, p1, p2, k3)` on normalised coordinates, all zero for a rectified camera.
@@ -47,27 +47,27 @@ export interface CameraModel {
   depth?: DepthCamera | null;
 }
 
-/** What a capturing client asks of its session; the command line's options of the same names. */
+/** Options of a capturing client's session; the command line has options of the same names. */
 export interface Wishes {
   /**
-   * `auto`: the server chooses where and how transfer is sampled, and the rays, from what its device was measured to
-   * take and to err (`probeless tune`).
+   * `auto`: the server chooses sampling and rays from the times and errors measured on its device (`probeless
+   * tune`).
    */
   preset?: "art1" | "art4" | "art8" | "auto" | "gr15" | "gr15fast" | "reg4" | "reg8" | "rm";
-  /** Of `auto`: a frame shall take no longer. */
+  /** With `auto`: time limit of a frame. */
   budget_ms?: number | null;
-  /** Of `auto`: the fastest point whose dominant direction errs by no more, where the device was measured. */
+  /** With `auto`: choose the fastest point whose error of the dominant direction was measured to be no larger. */
   max_light_error_deg?: number | null;
   rays?: number;
-  /** A1: every how many pixels transfer is sampled; null, as of the four below: what the preset says. */
+  /** A1: distance between transfer samples in pixels. null here and in the next four fields: the preset's value. */
   stride?: number | null;
-  /** A3, A4: a frame traces one of so many subsets of the directions; of presets that trace rays. */
+  /** A3, A4: number of subsets of the directions, of which a frame traces one; only for presets that trace rays. */
   interleave?: 1 | 2 | 4 | 8 | null;
   /** A5. */
   upsampling?: "bicubic" | "bilateral" | null;
-  /** A6: no rays where the volume is known to be open; of presets that trace rays. */
+  /** A6: skip rays where the volume is known to be open; only for presets that trace rays. */
   visibility_state?: boolean | null;
-  /** R5, A7: depth pictures from all around that visibility is looked up in; of GR15 and GR15FAST. */
+  /** R5, A7: depth views around the scene in which visibility is looked up; only for GR15 and GR15FAST. */
   auxiliary_views?: number | null;
   /** G3: D''', the median of the merged depth; without it, D'' is the last. */
   smooth_depth?: boolean;
@@ -77,58 +77,59 @@ export interface Wishes {
   albedo?: "constant" | "estimated";
   indirect?: "none" | "observed";
   as_thesis?: boolean;
-  /** Of the lightness that the light is estimated from; the composite keeps the camera's picture. */
+  /** Denoising of the lightness used for light estimation; the composite keeps the camera's image. */
   denoise?: "bilateral" | "none" | "tv_l1";
-  /** Of TV-L1. */
+  /** Iterations of TV-L1. */
   denoise_iterations?: number;
   poses?: "given" | "refine" | "track";
-  /** x0, y0, z0, x1, y1, z1 in world metres; null: what the first frame sees. */
+  /** x0, y0, z0, x1, y1, z1 in world metres; null: the view of the first frame. */
   volume_m?: [number, number, number, number, number, number] | null;
   voxel_m?: number | null;
   /** World direction; null: the first camera's -y. */
   up?: [number, number, number] | null;
   /** Radiance SH to render with instead of an estimate: 1, 4, 9 ... coefficients; null: estimate one. */
   light?: Array<[number, number, number]> | null;
-  /** Of `light`; `webxr`: up as +y and the first camera's view near -z. */
+  /** Axes of `light`; `webxr`: up as +y and the first camera's view near -z. */
   light_axes?: "webxr" | "world";
-  /** Whether lights inside the room are looked for; `auto`: where distant light does not explain what is seen. */
+  /** Whether to search for lights inside the room; `auto`: only if distant light does not explain the image. */
   lamps?: "auto" | "off" | "on";
-  /** `auto`: of each frame as it says, estimated where it does not say; `constant`: the same for all frames. */
+  /** `auto`: the frame's exposure if given, else estimated; `constant`: the same for all frames. */
   exposure?: "auto" | "constant";
-  /** Of virtual things: by how much of a pixel they cover, or by its middle, as in pictures that are point samples. */
+  /** Edges of virtual objects: by pixel coverage, or by the pixel centre, for images that are point samples. */
   edges?: "hard" | "smooth";
   /**
-   * What virtual things' brightness rests on: the light's scale, or the averages of the picture and of its shading;
-   * `auto`: the scale of a light that is given, the averages under one that is estimated.
+   * Brightness of virtual objects follows the light's scale, or the averages of the image and its shading; `auto`:
+   * the scale for a given light, the averages for an estimated one.
    */
   tone_mapping?: "auto" | "average" | "light";
-  /** `white`: as the thesis assumes, the light's luminance without its colours. */
+  /** `white`: only the light's luminance, as the thesis assumes. */
   light_color?: "estimated" | "white";
   /**
-   * Measures that light estimation takes (thesis 5.2, 5.4): samples that see little sky are left out; weights by how
-   * common a normal is (`normals_printed`: as eq. 5.7 has them); earlier frames count; what fits badly counts less.
+   * Robustness measures of light estimation (thesis 5.2, 5.4): `openness` skips samples that see little sky,
+   * `normals` weights by frequency of normals (`normals_printed`: as in eq. 5.7), `memory` uses earlier frames,
+   * `outliers` reduces the weight of bad fits.
    */
   robustness?: Array<"memory" | "normals" | "normals_printed" | "openness" | "outliers">;
-  /** `everything`: what would hardly be seen is simulated too, to check the bounds of leaving it out. */
+  /** `everything`: also run effects whose change would be invisible, to check the bounds of culling. */
   plan?: "everything" | "needed";
   /**
-   * `layer`: what is virtual comes apart from the camera's picture, for clients that put it over their newest one;
-   * `light`: a frame is answered by its light alone, for clients that draw virtual things themselves.
+   * `layer`: virtual content separate from the camera's image, for clients that compose it with their newest image.
+   * `light`: only the light, for clients that render virtual objects themselves.
    */
   answer?: "layer" | "light" | "picture";
-  /** Answers carry PNG pictures, and every frame is answered in order instead of latest-wins. */
+  /** Answers use PNG, and every frame is answered in order instead of latest-wins. */
   lossless?: boolean;
 }
 
-/** A square fiducial marker that all clients of a room may see. */
+/** A square fiducial marker that the clients of a room may detect. */
 export interface Marker {
   id: number;
-  /** Of the black square. */
+  /** Side of the black square. */
   side_m: number;
   dictionary?: "4x4_50" | "5x5_100" | "6x6_250" | "7x7_1000" | "apriltag_36h11";
 }
 
-/** First message of a client that captures. */
+/** First message of a capturing client. */
 export interface Hello {
   type: "hello";
   client: string;
@@ -136,37 +137,37 @@ export interface Hello {
   wishes?: Wishes;
   /** Clients of one room share volume, light and objects; null: a room of its own. */
   room?: string | null;
-  /** Of the room: who opens it sets it, the others have to know it. */
+  /** Key of the room: set by the client that opens it, required from the others. */
   room_key?: string | null;
   /**
-   * Where this client's world lies in the room's, which is that of the client that came first; rigid.
+   * Rigid transform from this client's world to the room's, which is the world of its first client.
    *
-   * null: not known, to be found by `marker`, else by what the room has seen.
+   * null: unknown; found by `marker` or by relocalisation in the scanned room.
    */
   room_from_world?: Array<number> | null;
-  /** By which the client's world is laid on the room's, once both have seen it. */
+  /** Marker that aligns the client's world with the room's once it has been detected in both. */
   marker?: Marker | null;
-  /** How long the session waits for this client when its connection is lost without a bye; 0: it ends with it. */
+  /** How long the session survives a connection that is lost without a bye; 0: not at all. */
   keep_s?: number;
-  /** `welcome.key` of a session that waits: it goes on as it was, and nothing else of this message counts. */
+  /** `welcome.key` of a session to resume. It continues unchanged; all other fields of this message are ignored. */
   resume?: string | null;
 }
 
-/** First message of a client that only looks: it receives what the capturing session produces. */
+/** First message of a watching client, which receives the output of a capturing session. */
 export interface Watch {
   type: "watch";
-  /** null: the session that is streaming, now or next. */
+  /** null: the session that is streaming, or the next one to start. */
   session?: string | null;
-  /** Of `session: null`: only those of this room. */
+  /** With `session: null`: only sessions of this room. */
   room?: string | null;
-  /** Without it, nothing is seen of rooms that have one. */
+  /** Required to watch a room that has a key. */
   room_key?: string | null;
 }
 
 /**
  * Colour: `jpeg` and `png` are sRGB 8-bit; `raw` is interleaved RGB, little endian, in `encoding`.
  *
- * `h264`, of frames only and where `welcome.codecs` has it: the next picture of a session's video.
+ * `h264`, in frames only and if listed in `welcome.codecs`: the next picture of the session's video.
  */
 export interface ColorImage {
   width: number;
@@ -180,14 +181,14 @@ export interface ColorImage {
  * uint16 depth, lossless.
  *
  * `zdelta` and `zstd-delta`: horizontal delta, zigzag, byte planes, then raw deflate / zstd.
- * `zranks` and `zstd-ranks`: the same of the values' ranks, two in a byte.
+ * `zranks` and `zstd-ranks`: the same for the values' ranks, two in a byte.
  */
 export interface DepthImage {
   width: number;
   height: number;
   data: Uint8Array;
   codec: "raw" | "zdelta" | "zranks" | "zstd-delta" | "zstd-ranks";
-  /** What the sender changed before: each depth z (metres) by at most this times z^2; null: nothing. */
+  /** Rounding by the sender: each depth z (metres) was changed by at most this times z^2; null: no rounding. */
   rounded_per_m?: number | null;
 }
 
@@ -197,19 +198,19 @@ export interface Frame {
   frame: number;
   timestamp_s: number;
   world_from_camera: Array<number> | null;
-  /** null, with a pose and no depth: of somebody who only looks at a room that others scan. */
+  /** null, with a pose and no depth: the view of a client without a camera, in a room that others scan. */
   color?: ColorImage | null;
-  /** null: of a camera without a depth sensor, in a room that others scan. */
+  /** null: a camera without a depth sensor, in a room that others scan. */
   depth?: DepthImage | null;
   /**
-   * Exposure time times gain of the colour picture, in any unit that stays the same for the session; null: unknown.
+   * Exposure time times gain of the colour image, in any unit that is constant during the session; null: unknown.
    *
-   * What cannot be one (not finite, not above 0) is told in the composite's notes and taken as null.
+   * An invalid value (not finite, not above 0) is reported in the answer's notes and treated as null.
    */
   exposure?: number | null;
 }
 
-/** Put a virtual object into the session; acknowledged. */
+/** Place a virtual object; acknowledged. */
 export interface PlaceObject {
   type: "place_object";
   request: number;
@@ -222,7 +223,7 @@ export interface PlaceObject {
   yaw_deg?: number;
 }
 
-/** Move an object that is there; acknowledged. */
+/** Move an existing object; acknowledged. */
 export interface MoveObject {
   type: "move_object";
   request: number;
@@ -232,14 +233,14 @@ export interface MoveObject {
   yaw_deg?: number;
 }
 
-/** Take an object away; acknowledged. */
+/** Remove an object; acknowledged. */
 export interface RemoveObject {
   type: "remove_object";
   request: number;
   object: string;
 }
 
-/** Change the preset of the running session, or the budget by which it is chosen; acknowledged. */
+/** Change the preset of the running session, or the budget or error limit that chooses it; acknowledged. */
 export interface Quality {
   type: "quality";
   request: number;
@@ -248,13 +249,13 @@ export interface Quality {
   max_light_error_deg?: number | null;
 }
 
-/** Ask for the surface fused so far, as files; answered by the parts of each and then acknowledged. */
+/** Request the scanned surface as mesh files; answered by mesh parts and then acknowledged. */
 export interface RequestMesh {
   type: "request_mesh";
   request: number;
 }
 
-/** Either side says it is leaving, and why. */
+/** Either side is leaving, with the reason. */
 export interface Bye {
   type: "bye";
   reason?: string;
@@ -266,19 +267,19 @@ export interface Welcome {
   session: string;
   server: string;
   device: string;
-  /** Frames the client may have unanswered. */
+  /** Number of frames that the client may have unanswered. */
   max_inflight: number;
-  /** By which the session is resumed (`hello.resume`), where the client asked for it to be kept. A secret. */
+  /** Secret key to resume the session (`hello.resume`), if the client set `keep_s`. */
   key: string | null;
   /**
-   * Frames that were sent before are not answered any more, unless the session is lossless; requests are, if they
-   * are sent again.
+   * True after a resume. Earlier frames are not answered any more, unless the session is lossless. Requests are
+   * answered if they are sent again.
    */
   resumed: boolean;
   room: string | null;
-  /** That frames' colour may have. */
+  /** Colour codecs that frames may use. */
   codecs: Array<"h264" | "jpeg" | "png" | "raw">;
-  /** That their depth may have. */
+  /** Depth codecs that frames may use. */
   depth_codecs: Array<"raw" | "zdelta" | "zranks" | "zstd-delta" | "zstd-ranks">;
 }
 
@@ -294,33 +295,33 @@ export interface Timings {
   total: number;
 }
 
-/** An effect that did not run, why, and what leaving it out can change at most, in display units (1 is 1/255). */
+/** An effect that did not run, the reason, and a bound on the change, in display units (1 is 1/255). */
 export interface LeftOut {
   effect: string;
   reason: string;
   error_bound: number | null;
 }
 
-/** Where and how finely a frame was sampled, and why. */
+/** How a frame was sampled, and why. */
 export interface OperatingPoint {
-  /** As options of the command line. */
+  /** As the command line's options. */
   settings: string;
   reason: string;
-  /** What a frame was expected to take; of points that were chosen, like the next. */
+  /** Expected time of a frame; like the next field, only for points that the server chose. */
   expected_ms: number | null;
-  /** Error of the dominant direction where the device was measured. */
+  /** Error of the dominant direction that was measured on the device. */
   light_error_deg: number | null;
 }
 
-/** Which effects ran for a frame, in order, which did not, and how finely it was sampled. */
+/** Effects that ran for a frame, in order, those that were left out, and how the frame was sampled. */
 export interface Plan {
   run: Array<string>;
   left_out: Array<LeftOut>;
-  /** null: a camera that is lost samples nothing. */
+  /** null if tracking is lost: nothing was sampled. */
   point: OperatingPoint | null;
 }
 
-/** The finished picture of one frame. */
+/** The composite image of one frame. */
 export interface Composite {
   type: "composite";
   frame: number;
@@ -329,26 +330,26 @@ export interface Composite {
   tracking: "given" | "lost" | "tracked";
   timings: Timings;
   plan: Plan;
-  /** What was wrong with this frame's input, one line each. */
+  /** Problems with this frame's input, one line each. */
   notes: Array<string>;
-  /** From when the frame had arrived until the device began with it: unread, decoded, waiting for its turn. */
+  /** Time from the frame's arrival until its processing began: in the queue, decoding, waiting for the device. */
   waited_ms: number;
   color: ColorImage;
 }
 
-/** A part of the camera's picture, and how far away each of its pixels is. */
+/** A rectangle of the camera's image with the depth of each pixel. */
 export interface LayerPatch {
-  /** Column of the camera's picture in which the part begins. */
+  /** Column of the camera's image at which the rectangle begins. */
   x: number;
   y: number;
   /** PNG. */
   color: ColorImage;
-  /** Of the same size, along the camera's z; 0: the pixel says nothing. */
+  /** Same size, along the camera's z; 0: the pixel is empty. */
   depth: DepthImage;
 }
 
 /**
- * What is virtual in one frame (`wishes.answer`), to be put over a camera picture p, of this frame or a later one.
+ * Virtual content of one frame (`wishes.answer`), to be composed with a camera image p of this or a later frame.
  *
  * All linear: picture = coverage * virtual + (1 - coverage) * ratio * p (thesis 7.2.1).
  */
@@ -360,53 +361,53 @@ export interface Layer {
   tracking: "given" | "lost" | "tracked";
   timings: Timings;
   plan: Plan;
-  /** What was wrong with this frame's input, one line each. */
+  /** Problems with this frame's input, one line each. */
   notes: Array<string>;
-  /** From when the frame had arrived until the device began with it: unread, decoded, waiting for its turn. */
+  /** Time from the frame's arrival until its processing began: in the queue, decoding, waiting for the device. */
   waited_ms: number;
   /**
-   * Colour of four channels: sRGB, not multiplied by coverage, which is the fourth, 255 for all of a pixel.
+   * Four channels: sRGB, not premultiplied, and coverage (255: the whole pixel).
    *
-   * null: nothing is seen of it.
+   * null: no virtual object is visible.
    */
   virtual: LayerPatch | null;
   /**
-   * Colour of three channels: 128 times the root of what real surface is multiplied by.
+   * Three channels: 128 times the square root of the factor on real surfaces.
    *
-   * null: real surface stays as it is.
+   * null: real surfaces are unchanged.
    */
   ratio: LayerPatch | null;
-  /** Metres of a unit of depth. */
+  /** Metres per unit of depth. */
   depth_scale_m: number;
 }
 
-/** One of the lights that the room's light is made of, besides an even sky. */
+/** One directional component of the room's light, in addition to uniform light. */
 export interface DirectedLight {
   /** World, unit, towards the light. */
   direction: [number, number, number];
-  /** Radiance of a white surface that faces it, lit by it alone. */
+  /** Radiance of a white surface that faces it and receives no other light. */
   irradiance: [number, number, number];
   /** Standard deviation along either axis; 0 for light from one direction. */
   spread_deg: number;
 }
 
-/** A light inside the room that shines evenly all around. */
+/** A light inside the room that emits equally in all directions. */
 export interface Lamp {
   /** World. */
   position_m: [number, number, number];
-  /** One standard deviation along the world's axes. */
+  /** One standard deviation along each world axis. */
   position_std_m: [number, number, number];
   /**
-   * Radiant intensity: radiance of the light's units times m^2; d metres away it adds intensity / (pi d^2) to a white
-   * surface that faces it.
+   * Radiant intensity in units of radiance times m^2. At a distance of d metres it adds intensity / (pi d^2) to the
+   * radiance of a white surface that faces it.
    */
   intensity: [number, number, number];
   intensity_std: [number, number, number];
-  /** Of the light (luminance) that the surfaces seen receive. */
+  /** Share of the luminance that visible surfaces receive. */
   share: number;
 }
 
-/** The room's light as one frame left it; the fields of a line of `light.jsonl`. */
+/** The estimate of the room's light after one frame; the fields of a line of `light.jsonl`. */
 export interface Light {
   type: "light";
   frame: number;
@@ -419,26 +420,26 @@ export interface Light {
   sh_std: Array<[number | null, number | null, number | null]>;
   /** 27 floats, RGB-interleaved C00 C1-1 C10 C11 ..., in axes with up as +y and the first camera's view near -z. */
   sh_webxr: Array<number>;
-  /** World, unit, towards the light, from l = 1 of Rec. 709 luminance; (0, 0, 0) where there is none. */
+  /** World, unit, towards the light, from l = 1 of Rec. 709 luminance; (0, 0, 0) if there is none. */
   dominant_direction: [number, number, number];
   dominant_intensity: number;
-  /** Each of the lights, strongest first, where there is more than an even sky. */
+  /** Directional components, strongest first; empty if the light is uniform. */
   dominant_lights: Array<DirectedLight>;
-  /** Lights inside the room, strongest first; their light is not part of `sh`. */
+  /** Lights inside the room, strongest first; not included in `sh`. */
   lamps: Array<Lamp>;
   /**
-   * Of this frame relative to the session's first. All radiance here is in units of this frame's picture: over
-   * `exposure` it is in those of the first one's, which a room under steady light keeps.
+   * Exposure of this frame relative to the session's first. All radiance here is in units of this frame's image.
+   * Divided by `exposure` it is in units of the first image, and constant under constant light.
    */
   exposure: number;
-  /** World, unit: along it objects stand, as whoever opened the room asked. */
+  /** World, unit: the up direction, along which objects stand. */
   up: [number, number, number] | null;
-  /** Condition number of the unregularised normal equations; null when infinite. */
+  /** Condition number of the unregularised normal equations; null if infinite. */
   condition: number | null;
   valid: boolean;
 }
 
-/** This frame was replaced by a newer one before it was read, or refused; nothing else comes for it. */
+/** The frame was replaced by a newer one before it was read, or was refused. It gets no other answer. */
 export interface Dropped {
   type: "dropped";
   frame: number;
@@ -446,22 +447,22 @@ export interface Dropped {
 }
 
 /**
- * A piece of a file of the scene's mesh; the pieces of a file come in order, one file after the other.
+ * Part of a mesh file. The parts of a file come in order, one file after the other.
  *
- * PLY: world axes, metres. GLB: a node turns the world into glTF's axes, +y up. Vertex colours are sRGB.
+ * PLY: world axes, metres. GLB: a node rotates the world to glTF's axes, +y up. Vertex colours are sRGB.
  */
 export interface MeshPart {
   type: "mesh_part";
   request: number;
   format: "glb" | "ply";
-  /** Of the whole file. */
+  /** Size of the whole file. */
   size_bytes: number;
-  /** Of this piece's first byte in the file. */
+  /** Offset of this part in the file. */
   offset: number;
   data: Uint8Array;
 }
 
-/** A control message was applied, or refused with its error. */
+/** A control message was applied, or refused with `error`. */
 export interface Acknowledged {
   type: "acknowledged";
   request: number;
@@ -469,7 +470,7 @@ export interface Acknowledged {
   notes: Array<string>;
 }
 
-/** Something the client sent is wrong; `fatal` when the server closes the socket after it. */
+/** The client sent something invalid; `fatal` if the server closes the connection. */
 export interface Error {
   type: "error";
   reason: string;

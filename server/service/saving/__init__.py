@@ -1,1 +1,1 @@
-"""Rooms on disk: what of a room is kept, how it is written so that a crash at any moment leaves the last whole save."""
+"""Rooms on disk: which state is saved, and how, so that a crash at any moment leaves the last complete save."""

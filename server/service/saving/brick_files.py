@@ -1,4 +1,4 @@
-"""Bricks of a volume in files: a first one of all, later ones of those that have changed since."""
+"""Brick files of a volume: the first holds all bricks, later ones those that have changed since."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ import zstandard
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from server.service.saving.files import DamagedFile, read_parts, write_parts
+from server.service.saving.checksummed_files import DamagedFile, read_parts, write_parts
 from server.volume.brick_pool import BRICK_VOXELS
 from server.volume.brick_table import Indices
 
 Batch = tuple[Indices, NDArray[Any], NDArray[np.uint32]]
-"""Places [k], voxels [k, 512] float2 (tsdf, weight), colours [k, 512]."""
+"""Brick indices [k], voxels [k, 512] float2 (tsdf, weight), colours [k, 512]."""
 
-_LEVEL = 1  # zstd: a gigabyte a second
-_MOST = 1 << 16  # bricks of a batch
+_LEVEL = 1  # zstd; about 1 GB/s
+_MOST = 1 << 16  # bricks per batch
 
 
 class _Batch(Struct, array_like=True):
@@ -31,7 +31,7 @@ class _Batch(Struct, array_like=True):
 
 
 def write_bricks(path: Path, batches: Iterable[Batch]) -> int:
-    """Write a file of bricks; its bytes. Raises OSError."""
+    """Write a brick file and return its size in bytes. Raises OSError."""
     return write_parts(
         path,
         (msgspec.msgpack.encode(_Batch(*map(_packed, batch))) for batch in batches),
@@ -51,7 +51,7 @@ def read_bricks(path: Path) -> Iterator[Batch]:
 
 
 def merged(paths: list[Path], live: Indices) -> Iterator[Batch]:
-    """Each of the bricks `live` once, as the last of the files has it. Raises DamagedFile, also where it is in none."""
+    """The newest version of each brick in `live`. Raises DamagedFile, also if a brick is in none of the files."""
     last: dict[int, int] = {}
     for number, path in enumerate(paths):
         for part in read_parts(path):

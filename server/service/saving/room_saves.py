@@ -1,4 +1,4 @@
-"""The saves of one room: two slots in turn, and where objects have been moved to since."""
+"""The saves of one room: two alternating slots and a placement delta."""
 
 from __future__ import annotations
 
@@ -12,51 +12,51 @@ from pathlib import Path
 
 from server.opencl.device import Device
 from server.room.room import Room
-from server.service.saving.files import DamagedFile
-from server.service.saving.moves import Moves, forget_moves, moves_since, read_moves, write_moves
-from server.service.saving.slot import Slot
+from server.service.saving.checksummed_files import DamagedFile
+from server.service.saving.placement_delta import PlacementDelta, delete_delta, delta_since, read_delta, write_delta
+from server.service.saving.room_state import VERSION, Header, state_to_bytes
+from server.service.saving.save_slot import SaveSlot
 from server.service.saving.snapshot import Snapshot, rebuilt, snapshot
-from server.service.saving.state import VERSION, Header, state_to_bytes
 
 SLOTS = ("0", "1")
 NOTE_USE_S = 60.0
-"""Between two times that the disk is told that a room is in use."""
+"""Interval between updates of the folder's time stamp while the room is in use."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Saved:
-    """What a save took."""
+    """Cost of a save."""
 
     written_bytes: int
-    """0 where nothing had changed."""
+    """0 if nothing had changed."""
     bricks: int
     lock_ms: float
-    """For how long no frame could be worked on."""
+    """How long the room's lock was held, in which no frame could be processed."""
 
 
 class RoomSaves:
-    """Of one room."""
+    """Saves of one room."""
 
     def __init__(self, name: str, folder: Path) -> None:
         self.name = name
         self.folder = folder
         self.lock = threading.Lock()
-        self._slots = [Slot(folder / slot) for slot in SLOTS]
+        self._slots = [SaveSlot(folder / slot) for slot in SLOTS]
         self._sequences: list[int] | None = None
         self._next = 0
         self._written: Snapshot | None = None
-        """Last, without what is large."""
-        self._moves_lock = threading.Lock()
-        self._moves_kept = -1
-        """Revision of the objects whose places are on the disk."""
+        """Last snapshot written, without bricks."""
+        self._delta_lock = threading.Lock()
+        self._delta_revision = -1
+        """Revision of the objects whose placements are on disk."""
         self._noted_s = float("-inf")
 
     def note_used(self) -> None:
-        """So that it is not taken for a room that nobody needs."""
+        """Update the folder's time stamp, which retention uses."""
         self._noted_s = time.monotonic()
-        with contextlib.suppress(OSError):  # there may be nothing on the disk
+        with contextlib.suppress(OSError):  # the room may not have been saved yet
             os.utime(self.folder)
 
     def save(self, room: Room) -> Saved:
@@ -76,23 +76,23 @@ class RoomSaves:
         objects = taken.inventory
         return Header(VERSION, self.name, self._next, taken.state.key_digest, objects.revision, objects.owed)
 
-    def save_moves(self, room: Room) -> bool:
-        """Whether that was enough: nothing but places of objects has changed since the last save.
+    def save_placements(self, room: Room) -> bool:
+        """Save placements only. False if other things have changed since the last save, so that a full one is needed.
 
-        Waits neither for a frame nor for a save.
+        Does not wait for a frame or for a running save.
         """
-        with self._moves_lock:
+        with self._delta_lock:
             written, now = self._written, room.objects.inventory()
-            moves = moves_since(written.inventory, now) if written else None
-            if moves is None:
+            delta = delta_since(written.inventory, now) if written else None
+            if delta is None:
                 return False
-            if moves.moved and self._moves_kept != now.revision:
-                write_moves(self.folder, moves)
-                self._moves_kept = now.revision
+            if delta.moved and self._delta_revision != now.revision:
+                write_delta(self.folder, delta)
+                self._delta_revision = now.revision
             return True
 
     def _has_all(self, room: Room) -> bool:
-        """Whether the newest save is of the room as it is."""
+        """Whether the newest save is up to date."""
         sequences, volume = self._known_sequences(), room.reconstruction.volume
         newest = self._slots[sequences.index(max(sequences))]
         if self._written is None or (volume and newest.change_of(volume) != volume.changes):
@@ -109,24 +109,24 @@ class RoomSaves:
             try:
                 header = slot.header()
                 if header is not None:
-                    state, moves = slot.read(), self._moves_after(header)
-                    return _with_moves(rebuilt(self.name, state, slot, device), header, moves)
+                    state, delta = slot.read(), self._delta_after(header)
+                    return _with_delta(rebuilt(self.name, state, slot, device), header, delta)
             except DamagedFile as error:
                 sequences[number] = 0
-                log.warning("a save of room %r is set aside as %s: %s", self.name, slot.set_aside(), error)
-        forget_moves(self.folder)
+                log.warning("a save of room %r is set aside as %s: %s", self.name, slot.quarantine(), error)
+        delete_delta(self.folder)
         return None
 
-    def _moves_after(self, header: Header) -> Moves | None:
-        """Of the objects of that save. Raises OSError."""
+    def _delta_after(self, header: Header) -> PlacementDelta | None:
+        """The placement delta that applies to this save. Raises OSError."""
         try:
-            moves = read_moves(self.folder)
+            delta = read_delta(self.folder)
         except DamagedFile as error:
             log.warning("objects of room %r are where they were some seconds before: %s", self.name, error)
             return None
-        if moves is None or moves.follow(header.revision):
-            return moves
-        forget_moves(self.folder)  # they are of a save that is not there any more
+        if delta is None or delta.applies_to(header.revision):
+            return delta
+        delete_delta(self.folder)  # they are of a save that is not there any more
         return None
 
     def key_digest(self) -> bytes | None:
@@ -136,11 +136,11 @@ class RoomSaves:
                 if sequences[number]:
                     return self._slots[number].key_digest()
             except DamagedFile:
-                continue  # told when it is loaded
+                continue  # logged when the room is loaded
         return None
 
     def _known_sequences(self) -> list[int]:
-        """Of each slot's save, 0 where there is none."""
+        """Sequence number of each slot's save; 0 if there is none."""
         if self._sequences is None:
             headers = [header_of(slot) for slot in self._slots]
             self._sequences = [header.sequence if header else 0 for header in headers]
@@ -148,8 +148,8 @@ class RoomSaves:
         return self._sequences
 
 
-def header_of(slot: Slot) -> Header | None:
-    """None also where it is damaged."""
+def header_of(slot: SaveSlot) -> Header | None:
+    """The slot's header; None if there is no save or it is damaged."""
     try:
         return slot.header()
     except DamagedFile:
@@ -157,14 +157,14 @@ def header_of(slot: Slot) -> Header | None:
 
 
 def _is_same(a: Snapshot, b: Snapshot) -> bool:
-    """Whether nothing but voxels has changed between two snapshots of one room."""
+    """Whether two snapshots of one room are equal except for voxels."""
     of_a, of_b = ([(kept.object_id, id(kept.mesh), id(kept.place)) for kept in taken.objects] for taken in (a, b))
     return of_a == of_b and a.inventory.owed == b.inventory.owed and state_to_bytes(a.state) == state_to_bytes(b.state)
 
 
-def _with_moves(room: Room, header: Header, moves: Moves | None) -> Room:
-    """The room with its objects where they have been moved to since that save."""
-    for moved in moves.moved if moves else ():
+def _with_delta(room: Room, header: Header, delta: PlacementDelta | None) -> Room:
+    """Apply the placement delta to a loaded room."""
+    for moved in delta.moved if delta else ():
         room.objects.move_back(moved.object_id, moved.place)
-    room.objects.resume(moves.revision if moves else header.revision, header.owed)
+    room.objects.resume(delta.revision if delta else header.revision, header.owed)
     return room

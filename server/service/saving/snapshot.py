@@ -1,4 +1,4 @@
-"""A room as it is at one moment, and a room made of what was kept of one."""
+"""Takes a snapshot of a room, and rebuilds a room from a saved state."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy as np
 from server.opencl.device import Device
 from server.parsing.mesh_bytes import mesh_from_bytes
 from server.room.room import Room
-from server.room.room_objects import Inventory, KeptObject
+from server.room.room_objects import Inventory, ObjectRecord
 from server.scene.placement import Placement
 from server.service.saving.brick_files import Batch, merged
-from server.service.saving.files import DamagedFile, read_parts
-from server.service.saving.slot import Slot
-from server.service.saving.state import KeptMarker, KeptVolume, RoomState
+from server.service.saving.checksummed_files import DamagedFile, read_parts
+from server.service.saving.room_state import RoomState, StoredMarker, StoredVolume
+from server.service.saving.save_slot import SaveSlot
 from server.volume.volume import Volume
 
 log = logging.getLogger(__name__)
@@ -25,34 +25,34 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Snapshot:
-    """All of a room, of its bricks those that have changed."""
+    """State of a room at one moment, with the bricks that have changed since the slot's save."""
 
     state: RoomState
-    """Without the objects, and without the files of the volume."""
+    """Without objects and without the volume's file names."""
     inventory: Inventory
     volume: Volume | None
     bricks: list[Batch]
     change: int
-    """The volume's `changes` at that moment."""
+    """The volume's `changes` at that time."""
     lock_ms: float = 0.0
-    """For how long no frame could be worked on."""
+    """How long the room's lock was held."""
 
     @property
-    def objects(self) -> tuple[KeptObject, ...]:
-        """All of them."""
+    def objects(self) -> tuple[ObjectRecord, ...]:
+        """All virtual objects."""
         return self.inventory.objects
 
 
-def snapshot(room: Room, slot: Slot) -> Snapshot:
-    """The room now, its bricks as far as `slot` has not got them. Waits for the frame that is in the room."""
+def snapshot(room: Room, slot: SaveSlot) -> Snapshot:
+    """Snapshot of the room, with the bricks that `slot` does not have. Waits for the room's lock."""
     with room.lock:
         start_s = time.perf_counter()
         taken = snapshot_within(room, slot)
         return replace(taken, lock_ms=1e3 * (time.perf_counter() - start_s))
 
 
-def snapshot_within(room: Room, slot: Slot) -> Snapshot:
-    """The same by whoever holds the room's lock."""
+def snapshot_within(room: Room, slot: SaveSlot) -> Snapshot:
+    """As `snapshot`; the caller holds the room's lock."""
     volume = room.reconstruction.volume
     bricks = list(volume.copies(volume.changed_since(slot.change_of(volume)))) if volume else []
     state = RoomState(
@@ -60,7 +60,7 @@ def snapshot_within(room: Room, slot: Slot) -> Snapshot:
         up=room.objects.up if room.objects.has_begun else None,
         volume=_kept(volume, room.reconstruction.exposure_logarithms) if volume else None,
         keyframes=tuple(room.reconstruction.keyframes.kept()),
-        markers=tuple(KeptMarker(*name, place) for name, place in room.markers.places().items()),
+        markers=tuple(StoredMarker(*name, place) for name, place in room.markers.places().items()),
         light=room.light.known(),
         lamps=room.lamps.found,
         key_digest=room.key_digest,
@@ -68,12 +68,12 @@ def snapshot_within(room: Room, slot: Slot) -> Snapshot:
     return Snapshot(state, room.objects.inventory(), volume, bricks, volume.changes if volume else 0)
 
 
-def _kept(volume: Volume, exposure_logarithms: float) -> KeptVolume:
-    return KeptVolume(volume.bounds_m, volume.voxel_m, volume.frames, exposure_logarithms, volume.places())
+def _kept(volume: Volume, exposure_logarithms: float) -> StoredVolume:
+    return StoredVolume(volume.bounds_m, volume.voxel_m, volume.frames, exposure_logarithms, volume.places())
 
 
-def rebuilt(name: str, state: RoomState, slot: Slot, device: Device) -> Room:
-    """The room of which `state` was read from `slot`. Raises DamagedFile, OSError."""
+def rebuilt(name: str, state: RoomState, slot: SaveSlot, device: Device) -> Room:
+    """Rebuild the room whose `state` was read from `slot`. Raises DamagedFile, OSError."""
     room = Room(device, state.wishes, name)
     room.key_digest = state.key_digest
     try:
@@ -91,7 +91,7 @@ def rebuilt(name: str, state: RoomState, slot: Slot, device: Device) -> Room:
     return room
 
 
-def _rebuild_volume(room: Room, kept: KeptVolume, slot: Slot) -> None:
+def _rebuild_volume(room: Room, kept: StoredVolume, slot: SaveSlot) -> None:
     volume = Volume(room.engine, kept.bounds_m, kept.voxel_m)
     if kept.places.size and not 0 <= int(kept.places.min()) <= int(kept.places.max()) < int(np.prod(volume.bricks)):
         raise DamagedFile(f"{slot.folder} names bricks beyond the volume")
@@ -101,14 +101,14 @@ def _rebuild_volume(room: Room, kept: KeptVolume, slot: Slot) -> None:
     slot.note_filled(volume)
 
 
-def _rebuild_objects(room: Room, state: RoomState, slot: Slot) -> None:
+def _rebuild_objects(room: Room, state: RoomState, slot: SaveSlot) -> None:
     if state.up is not None:
         room.objects.begin(state.up)
     for kept in state.objects:
-        place = kept.world_from_model if kept.world_from_model is not None else kept.asked or Placement()
+        place = kept.world_from_model if kept.world_from_model is not None else kept.placement or Placement()
         try:
             mesh = mesh_from_bytes(_only(read_parts(slot.folder / kept.mesh)))
-            room.objects.put_back(KeptObject(kept.object_id, mesh, place))
+            room.objects.put_back(ObjectRecord(kept.object_id, mesh, place))
         except ValueError as error:
             log.warning("object %r of room %r is not there any more: %s", kept.object_id, room.name, error)
 

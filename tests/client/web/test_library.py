@@ -37,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
 @pytest.fixture
 def server(lab: Lab, folder: Path) -> Iterator[BackgroundServer]:
     service = Service(FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh)
-    with BackgroundServer(service, door=Authenticator("a-token"), library=ObjectLibrary(folder)) as server:
+    with BackgroundServer(service, authenticator=Authenticator("a-token"), library=ObjectLibrary(folder)) as server:
         yield server
 
 

@@ -11,8 +11,8 @@ from playwright.sync_api import Page
 from protocol.limits import SUBPROTOCOL
 from protocol.messages import Hello
 from server.service.authenticator import Authenticator
-from server.service.departure import DRAINING, GOODBYE
-from server.service.rooms import lock_of
+from server.service.graceful_shutdown import DRAINING, GOODBYE
+from server.service.room_registry import key_digest_of
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
@@ -38,11 +38,13 @@ def start(lab: Lab) -> Iterator[StartServer]:
     """Start a server with fake pipelines; keywords go to the service, but for `door` and `port`."""
     servers: list[BackgroundServer] = []
 
-    def start_one(door: Authenticator | None = None, port: int = 0, **options: object) -> BackgroundServer:
+    def start_one(authenticator: Authenticator | None = None, port: int = 0, **options: object) -> BackgroundServer:
         room = SimpleNamespace(close=lambda: None, key_digest=None)
         factories = {"pipeline_factory": lab.build, "mesh_loader": fake_mesh, "room_factory": lambda *_: room}
         servers.append(
-            BackgroundServer(Service(FAKE_DEVICE, **factories | options), port=port, door=door or Authenticator())
+            BackgroundServer(
+                Service(FAKE_DEVICE, **factories | options), port=port, authenticator=authenticator or Authenticator()
+            )
         )
         return servers[-1]
 
@@ -139,7 +141,7 @@ def test_a_server_of_another_version(start: StartServer, open_page: OpenPage, mo
 
 @pytest.mark.parametrize(("query", "word"), [("", "missing"), ("/?token=another", "wrong")])
 def test_a_wrong_token(start: StartServer, open_page: OpenPage, query: str, word: str) -> None:
-    page = open_page(start(door=Authenticator("a-token")).url + query)
+    page = open_page(start(authenticator=Authenticator("a-token")).url + query)
     assert state(page) == (
         f"Refused: the token is {word}: use the URL that the server printed at its start, which ends in ?token=..."
     )
@@ -151,7 +153,7 @@ def test_a_room_with_another_key(start: StartServer, open_page: OpenPage) -> Non
     wire = Wire(server.url)
     wire.say(Hello(client="test", camera=fakes.CAMERA, room="kitchen", room_key="right"))
     wire.hear()
-    assert room.key_digest == lock_of("right")
+    assert room.key_digest == key_digest_of("right")
     page = open_page(f"{server.url}/?room=kitchen&key=wrong", device())
     wait_for_text(page, "#state", "waiting for a session of room “kitchen” with that key")
     start_capture(page)

@@ -1,4 +1,4 @@
-"""Looks after the rooms of the cluster, every few seconds: closes those that nobody is in, asks for enough places."""
+"""Room supervisor: every few seconds closes empty rooms and requests capacity from the autoscaler."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ray.util.metrics import Gauge
 
 from server.cluster.capacity import Capacity
 from server.cluster.host import HostStatus
-from server.cluster.ray_places import NAMESPACE, room_names
+from server.cluster.ray_directory import NAMESPACE, room_names
 from server.cluster.settings import ClusterSettings
 
 EVERY_S = 2.0
@@ -23,37 +23,37 @@ ANSWER_S = 5.0
 log = logging.getLogger(__name__)
 
 
-class Keeper:
-    """A deployment of Serve, one replica: Serve starts it anew where it fails."""
+class RoomSupervisor:
+    """A Serve deployment with one replica, which Serve restarts if it fails."""
 
     def __init__(self, settings: ClusterSettings) -> None:
         self._settings = settings
         self._capacity = Capacity(settings.policy)
-        self._asked = 0
+        self._requested = 0
         self._rooms = Gauge("probeless_rooms", "Rooms that are open or wait for a place")
         self._places = Gauge("probeless_places_wanted", "Places for rooms that the cluster is asked for")
         self._age = Gauge("probeless_queue_age_seconds", "Age of frames when they are taken, mean over the rooms")
         self._task = asyncio.get_running_loop().create_task(self._run())
 
     def check_health(self) -> None:
-        """Asked by Serve. Raises what ended the keeper."""
+        """Called by Serve. Raises the error that ended the supervisor."""
         if self._task.done():
             self._task.result()
 
     async def places(self) -> int:
-        """That were asked for last."""
-        return self._asked
+        """Number of places requested last."""
+        return self._requested
 
     async def _run(self) -> None:
         while True:
             names = await asyncio.to_thread(room_names)
             found = await asyncio.gather(*(self._look_after(name) for name in names))
             ages = [status.queue_age_s for status in found if status is not None and status.queue_age_s > 0]
-            await self._ask_for_places(len(names), sum(ages) / len(ages) if ages else 0.0)
+            await self._request_places(len(names), sum(ages) / len(ages) if ages else 0.0)
             await asyncio.sleep(EVERY_S)
 
     async def _look_after(self, name: str) -> HostStatus | None:
-        """Its status; None of a room that waits for a place, moves, or has just been closed."""
+        """The room's status; None if it waits for a place, is moving, or was just closed."""
         with contextlib.suppress(RayError, ValueError, TimeoutError):
             async with asyncio.timeout(ANSWER_S):
                 actor: Any = await asyncio.to_thread(ray.get_actor, name, NAMESPACE)
@@ -65,11 +65,11 @@ class Keeper:
                 return status
         return None
 
-    async def _ask_for_places(self, rooms: int, queue_age_s: float) -> None:
+    async def _request_places(self, rooms: int, queue_age_s: float) -> None:
         wanted = self._capacity.wanted(time.monotonic(), rooms, queue_age_s)
         self._rooms.set(rooms)
         self._places.set(wanted)
         self._age.set(queue_age_s)
-        if wanted != self._asked:
+        if wanted != self._requested:
             await asyncio.to_thread(request_resources, bundles=[dict(self._settings.place)] * wanted)
-            self._asked = wanted
+            self._requested = wanted

@@ -1,4 +1,4 @@
-"""What the server writes of what happens: one line an event, as JSON for programs or as text for people."""
+"""Server log: one line per event, as JSON for programs or as text for people."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STAGE_NOTE = "in stage "
 
 @contextlib.contextmanager
 def about(**facts: object) -> Iterator[None]:
-    """Events of this task while it lasts are about these: `session`, `room`, `address` ..."""
+    """Add fields such as `session`, `room` or `address` to all events of this task within the context."""
     token = _about.set({**(_about.get() or {}), **facts})
     try:
         yield
@@ -30,7 +30,7 @@ def about(**facts: object) -> Iterator[None]:
 
 
 def log_events(log_format: LogFormat) -> None:
-    """From now on write events to standard error, those of information too."""
+    """Log to standard error, from level INFO."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines() if log_format == "json" else TextLines())
     root = logging.getLogger()
@@ -39,10 +39,10 @@ def log_events(log_format: LogFormat) -> None:
 
 
 class JsonLines(logging.Formatter):
-    """One JSON object a line: time, level, event, where from, what it is about, and of an error what, where and how."""
+    """One JSON object per line: time, level, event, logger, context fields and, for errors, stage and traceback."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The line, with nothing in it that ends a line."""
+        """The line; line breaks are escaped."""
         fields: dict[str, Any] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
@@ -59,10 +59,10 @@ class JsonLines(logging.Formatter):
 
 
 class TextLines(logging.Formatter):
-    """Time, level, event, what it is about; an error's traceback below."""
+    """Time, level, event and context fields; an error's traceback follows."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The line, and the lines of a traceback."""
+        """The line, followed by a traceback if there is one."""
         time = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
         facts = "".join(f" {name}={value}" for name, value in facts_of(record).items())
         line = " ".join(f"{time} {record.levelname.lower()}: {record.getMessage()}{facts}".splitlines())
@@ -70,12 +70,12 @@ class TextLines(logging.Formatter):
 
 
 def facts_of(record: logging.LogRecord) -> dict[str, object]:
-    """What a record is about: of its task, and what was given as `extra`."""
+    """Context fields of the record: those of its task and those passed as `extra`."""
     extra = {name: value for name, value in vars(record).items() if name not in _KNOWN}
     return {**(_about.get() or {}), **extra}
 
 
 def stage_of(error: BaseException) -> dict[str, object]:
-    """The innermost stage of the pipeline that an error came from."""
+    """The innermost pipeline stage in which an error was raised."""
     notes = [note for note in getattr(error, "__notes__", []) if note.startswith(STAGE_NOTE)]
     return {"stage": notes[0].removeprefix(STAGE_NOTE)} if notes else {}

@@ -1,4 +1,4 @@
-"""What of the rooms on disk is too much: what nobody has used for long, and the oldest where they take too much."""
+"""Retention of saved rooms: unused rooms expire, and the oldest are deleted when all take too much space."""
 
 from __future__ import annotations
 
@@ -7,61 +7,61 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-ASIDE = "set-aside-"
-"""Begins the name of a damaged save, in its room's folder."""
+QUARANTINE_PREFIX = "set-aside-"
+"""Name prefix of damaged saves in their room's folder."""
 IN_USE_S = 600.0
-"""A room that was used so recently may be at work in another process."""
+"""A room used more recently may be open in another process."""
 DAY_S = 86400.0
 
 
 @dataclass(frozen=True)
-class KeptLimits:
-    """Of all rooms in a folder; None: no limit."""
+class RetentionLimits:
+    """Limits for all rooms in a folder; None: no limit."""
 
     space_bytes: int | None = None
     age_s: float | None = None
-    """Since somebody was in a room."""
+    """Time since a client was in the room."""
 
 
 @dataclass(frozen=True)
-class Kept:
-    """What a folder holds."""
+class StorageUsage:
+    """Disk usage of the folder."""
 
     rooms: int = 0
     space_bytes: int = 0
-    """Damaged saves that were set aside are counted too."""
+    """Includes damaged saves."""
     removed: int = 0
-    """Of it, until now."""
+    """Number of deleted items since the start."""
 
 
 @dataclass(frozen=True)
-class Piece:
-    """What is removed as one: a room, or a damaged save of one."""
+class StoredItem:
+    """A unit of deletion: a room, or one damaged save of a room."""
 
     folder: Path
     space_bytes: int
     used_s: float
-    """When, in seconds since 1970."""
+    """Unix time of the last use."""
     is_room: bool
 
 
-def pieces_in(folder: Path, skipped: str) -> Iterator[Piece]:
-    """Of all rooms in `folder`; names that begin with `skipped` are none. Raises OSError."""
+def stored_items(folder: Path, skipped: str) -> Iterator[StoredItem]:
+    """Items of all rooms in `folder`, except names that begin with `skipped`. Raises OSError."""
     for room in folder.iterdir() if folder.exists() else ():
         if not room.is_dir() or room.name.startswith(skipped):
             continue
-        asides = [_piece(aside, is_room=False) for aside in room.glob(f"{ASIDE}*")]
+        asides = [_piece(aside, is_room=False) for aside in room.glob(f"{QUARANTINE_PREFIX}*")]
         yield from asides
         whole = _piece(room, is_room=True)
         own_bytes = whole.space_bytes - sum(aside.space_bytes for aside in asides)
         if own_bytes:
-            yield Piece(room, own_bytes, whole.used_s, is_room=True)
+            yield StoredItem(room, own_bytes, whole.used_s, is_room=True)
 
 
-def surplus(
-    pieces: list[Piece], limits: KeptLimits, now_s: float, in_use: Collection[Path]
-) -> Iterator[tuple[Piece, str]]:
-    """What is to be removed, with the reason in words: damaged saves first, then rooms, the oldest first."""
+def items_to_remove(
+    pieces: list[StoredItem], limits: RetentionLimits, now_s: float, in_use: Collection[Path]
+) -> Iterator[tuple[StoredItem, str]]:
+    """Items to delete, each with the reason: damaged saves first, then rooms, oldest first."""
     free = [p for p in pieces if not (p.is_room and (p.folder in in_use or now_s - p.used_s < IN_USE_S))]
     total_bytes = sum(piece.space_bytes for piece in pieces)
     for piece in sorted(free, key=lambda piece: (piece.is_room, piece.used_s)):
@@ -75,12 +75,12 @@ def surplus(
         yield piece, why
 
 
-def _piece(folder: Path, *, is_room: bool) -> Piece:
+def _piece(folder: Path, *, is_room: bool) -> StoredItem:
     used_s, space_bytes = folder.stat().st_mtime, 0
     for path in folder.rglob("*"):
-        with contextlib.suppress(FileNotFoundError):  # renewed meanwhile
+        with contextlib.suppress(FileNotFoundError):  # replaced by a newer save meanwhile
             status = path.stat()
             space_bytes += 0 if path.is_dir() else status.st_size
-            if path.parent.parent == folder and ASIDE not in path.parent.name:
+            if path.parent.parent == folder and QUARANTINE_PREFIX not in path.parent.name:
                 used_s = max(used_s, status.st_mtime)
-    return Piece(folder, space_bytes, used_s, is_room)
+    return StoredItem(folder, space_bytes, used_s, is_room)

@@ -1,8 +1,8 @@
-"""A WebSocket that lets a client read why it was cut off.
+"""Lingering close for WebSockets, so that a client can read why it was disconnected.
 
-A message over the size limit, or one that breaks the WebSocket protocol, fails while the client is still sending. If
-the server closed at once, the unread rest would make the kernel reset the connection, and the close frame with its
-code and reason would be lost. So what still comes is read and thrown away until the client has fallen silent.
+A message that is too large or breaks the WebSocket protocol fails while the client is still sending. If the server
+closed at once, the kernel would reset the connection because of the unread data, and the close frame with its code
+and reason would be lost. Remaining data is therefore read and discarded until the client stops sending.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 SILENCE_S = 0.5
 
 
-class LingeringWebSocket(WebSocketsSansIOProtocol):
-    """uvicorn's WebSocket, but for the end of a connection whose client broke the protocol."""
+class LingeringCloseWebSocket(WebSocketsSansIOProtocol):
+    """uvicorn's WebSocket with a lingering close after protocol errors."""
 
     _silence: TimerHandle | None = None
 
     def data_received(self, data: bytes) -> None:
-        """Handle what came, or throw it away once the connection has failed."""
+        """Handle received data; discard it once the connection has failed."""
         if self._silence is None:
             super().data_received(data)
         else:
             self._await_silence()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Say that it was lost: uvicorn's own code is that of a close frame without one. The first word counts."""
+        """Report code 1006 (connection lost); uvicorn would report 1005. The first event in the queue counts."""
         self.queue.put_nowait({"type": "websocket.disconnect", "code": 1006})
         super().connection_lost(exc)
 
     def handle_parser_exception(self) -> None:
-        """Send the close frame, tell the app, and close when the client is silent or `close_timeout` is over."""
+        """Send the close frame, notify the app, and close when the client is silent or after `close_timeout`."""
         assert self.conn.close_sent is not None
         sent = self.conn.close_sent
         self.queue.put_nowait({"type": "websocket.disconnect", "code": sent.code, "reason": sent.reason})

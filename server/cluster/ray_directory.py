@@ -1,4 +1,4 @@
-"""Rooms as named actors of Ray: found by name, opened where a place is free, brought back when their node dies."""
+"""Rooms as named Ray actors: found by name, created where a place is free, restarted if their node fails."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from ray.actor import exit_actor
 from ray.exceptions import RayActorError
 
 from server.cluster.host import HostStatus, open_room_host
-from server.cluster.places import Address, NoPlace, NotYet
+from server.cluster.room_directory import Address, RoomNotReady, RoomUnavailable
 from server.cluster.settings import ClusterSettings
-from server.service.events import log_events
+from server.service.event_log import log_events
 
 NAMESPACE = "probeless"
 PREFIX = "room-"
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 
 class RoomActor:
-    """A room's host as Ray runs it."""
+    """Ray actor around a `RoomHost`."""
 
     def __init__(self, settings: ClusterSettings) -> None:
         log_events("json")
@@ -37,27 +37,27 @@ class RoomActor:
         return self._host.status()
 
     def leave(self) -> bool:
-        """Of `RoomHost`; the actor ends with it, and its name is free again."""
+        """See `RoomHost`; the actor ends too, which frees its name."""
         if not self._host.leave():
             return False
         exit_actor()
         return True
 
 
-class RayPlaces:
-    """Of one process of the cluster."""
+class RayRoomDirectory:
+    """Room directory backed by Ray's actor registry."""
 
     def __init__(self, settings: ClusterSettings) -> None:
         self._settings = settings
 
     async def find(self, room_id: str, may_open: bool) -> Address:
-        """The room's host. Raises NotYet, NoPlace."""
+        """The room's host. Raises RoomNotReady, RoomUnavailable."""
         try:
             actor = await asyncio.to_thread(self._actor, room_id, may_open)
             async with asyncio.timeout(ANSWER_S):
                 address: Address = await actor.address.remote()
         except (RayActorError, TimeoutError) as error:
-            raise NotYet(str(error)) from error
+            raise RoomNotReady(str(error)) from error
         return address
 
     def _actor(self, room_id: str, may_open: bool) -> Any:
@@ -66,16 +66,16 @@ class RayPlaces:
             try:
                 return ray.get_actor(name, NAMESPACE)
             except ValueError as error:
-                raise NoPlace("there is no such session: it ended, or its room was closed") from error
+                raise RoomUnavailable("there is no such session: it ended, or its room was closed") from error
         most = self._settings.policy.most
         names = room_names()
         if name not in names and len(names) >= most:
-            raise NoPlace(f"the server is full: {most} rooms are open, which is the most: try again later")
+            raise RoomUnavailable(f"the server is full: {most} rooms are open, which is the most: try again later")
         return ray.remote(RoomActor).options(**actor_options(name, self._settings.place)).remote(self._settings)
 
 
 def actor_options(name: str, place: dict[str, float]) -> dict[str, Any]:
-    """Of a room's actor: it outlives who opened it, takes its place of a node, and is started anew for ever."""
+    """Actor options: detached from its creator, restarted without limit, with the resources of one place."""
     others = {kind: share for kind, share in place.items() if kind not in ("CPU", "GPU")}
     return {
         "name": name,
@@ -91,6 +91,6 @@ def actor_options(name: str, place: dict[str, float]) -> dict[str, Any]:
 
 
 def room_names() -> list[str]:
-    """Of all actors that are rooms, those that wait for a place included."""
+    """Names of all room actors, including those that wait for a place."""
     found = ray.util.list_named_actors(all_namespaces=True)
     return [one["name"] for one in found if one["namespace"] == NAMESPACE and one["name"].startswith(PREFIX)]

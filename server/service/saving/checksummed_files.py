@@ -1,4 +1,4 @@
-"""Files that are whole or known not to be: parts with their lengths, and a digest of all of it at the end."""
+"""Files with a checksum: length-prefixed parts, and a digest of everything at the end."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _CHUNK = 1 << 20
 
 
 class DamagedFile(Exception):
-    """One line: which file, and what is wrong with it."""
+    """A file is incomplete or was altered; one line."""
 
 
 def write_parts(path: Path, parts: Iterable[bytes]) -> int:
-    """Write a file of `parts`, onto the disk itself; its bytes. Raises OSError; nothing of the file is left then."""
+    """Write `parts` to a file, fsync it, and return its size in bytes. Raises OSError; the file is then removed."""
     try:
         return _write(path, parts)
     except OSError:
@@ -59,9 +59,9 @@ def _write_all(file: int, data: bytes) -> int:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make sure that the names in `folder` are on the disk. Raises OSError."""
+    """fsync a folder, so that renames and new files in it are durable. Raises OSError."""
     if os.name == "nt":
-        return  # a folder cannot be opened there, and names are written with the files
+        return  # Windows cannot open folders; names are written with the files
     file = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(file)
@@ -70,7 +70,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def check_file(path: Path) -> None:
-    """Raises DamagedFile where the file is not exactly as it was written, OSError where it cannot be read."""
+    """Verify the checksum. Raises DamagedFile, or OSError if the file cannot be read."""
     digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
     try:
         with path.open("rb") as file:
@@ -88,7 +88,7 @@ def check_file(path: Path) -> None:
 
 
 def read_parts(path: Path) -> Iterator[bytes]:
-    """The parts, one after the other, the digest not compared. Raises DamagedFile, OSError."""
+    """Iterate over the parts without verifying the digest. Raises DamagedFile, OSError."""
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise DamagedFile(f"{path} is not of this program, or of another version of it")
@@ -100,5 +100,5 @@ def read_parts(path: Path) -> Iterator[bytes]:
 
 
 def _length(data: bytes) -> int:
-    """-1 where there is none."""
+    """-1 if there are too few bytes."""
     return int(_LENGTH.unpack(data)[0]) if len(data) == _LENGTH.size else -1

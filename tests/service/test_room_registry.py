@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from protocol.messages import Wishes
-from server.service.rooms import RoomLocked, Rooms, lock_of
+from server.service.room_registry import RoomRegistry, WrongRoomKey, key_digest_of
 
 PATIENCE_S = 60.0
 
@@ -25,7 +25,7 @@ class House:
         self.slow.set()
         self.digests: dict[str, bytes] = {}
         """Of rooms that were left."""
-        self.rooms = Rooms(self.open, lambda room: self.kept.append(room.name), self.digests.get)
+        self.rooms = RoomRegistry(self.open, lambda room: self.kept.append(room.name), self.digests.get)
 
     def open(self, _wishes: Wishes, name: str) -> SimpleNamespace:
         assert name != "slow" or self.slow.wait(PATIENCE_S)
@@ -70,7 +70,7 @@ def test_a_room_that_opens_slowly_holds_up_nobody_else(house: House) -> None:
     slow.start()
     with house.rooms.entered("other", Wishes()):
         assert house.opened == ["other"]
-        assert [room.name for room in house.rooms.visited()] == ["other"]
+        assert [room.name for room in house.rooms.open_rooms()] == ["other"]
     house.slow.set()
     assert inside.wait(PATIENCE_S)
     slow.join(PATIENCE_S)
@@ -78,7 +78,7 @@ def test_a_room_that_opens_slowly_holds_up_nobody_else(house: House) -> None:
 
 def test_a_room_that_is_visited_stays_open_until_then(house: House) -> None:
     with house.rooms.entered("a", Wishes()):
-        visits = house.rooms.visited()
+        visits = house.rooms.open_rooms()
         assert next(visits).name == "a"
     assert not house.closed
     assert list(visits) == []
@@ -107,18 +107,18 @@ def test_many_that_come_and_go_never_meet_two_rooms_of_one_name(house: House) ->
 def test_whoever_opens_a_room_sets_its_key(house: House) -> None:
     with house.rooms.entered("a", Wishes(), "k3y"):
         for key in (None, "", "K3y"):
-            with pytest.raises(RoomLocked, match="has a key of its own"), house.rooms.entered("a", Wishes(), key):
+            with pytest.raises(WrongRoomKey, match="has a key of its own"), house.rooms.entered("a", Wishes(), key):
                 pass
         with house.rooms.entered("a", Wishes(), "k3y"):
             pass
-    assert lock_of(None) == b""
-    assert b"k3y" not in lock_of("k3y")
+    assert key_digest_of(None) == b""
+    assert b"k3y" not in key_digest_of("k3y")
 
 
 def test_a_room_that_was_left_is_not_opened_for_a_wrong_key(house: House) -> None:
-    house.digests["a"] = lock_of("k3y")
+    house.digests["a"] = key_digest_of("k3y")
     for key in (None, "guess"):
-        with pytest.raises(RoomLocked, match="has a key of its own"), house.rooms.entered("a", Wishes(), key):
+        with pytest.raises(WrongRoomKey, match="has a key of its own"), house.rooms.entered("a", Wishes(), key):
             pass
     assert (house.opened, house.rooms.count) == ([], 0)
     with house.rooms.entered("a", Wishes(), "k3y"):
@@ -129,5 +129,5 @@ def test_nothing_is_kept_of_rooms_that_were_left(house: House) -> None:
     for name in ("a", "b", "broken"):
         with contextlib.suppress(ValueError), house.rooms.entered(name, Wishes()):
             pass
-    assert not house.rooms._doors
-    assert not house.rooms._guests
+    assert not house.rooms._opening_locks
+    assert not house.rooms._clients

@@ -1,4 +1,4 @@
-"""Rooms that outlive their clients and the server: opened as they were saved, saved while they are at work."""
+"""Persistent rooms: loaded from disk when opened, saved in the background while in use and when closed."""
 
 from __future__ import annotations
 
@@ -7,49 +7,49 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from protocol.messages import Wishes
-from server.service.saving.upkeep import Kept, KeptLimits
+from server.service.saving.retention import RetentionLimits, StorageUsage
 
 if TYPE_CHECKING:
     from server.opencl.device import Device
     from server.room.room import Room
+    from server.service.room_registry import RoomRegistry
     from server.service.room_saver import RoomSaver
     from server.service.room_store import RoomStore
-    from server.service.rooms import Rooms
 
 log = logging.getLogger(__name__)
 
 
-class KeptRooms:
-    """Of one service. `open_room`, `key_digest` and `keep` are for its `Rooms`, in whatever thread."""
+class RoomPersistence:
+    """Persistence for one service, used by its `RoomRegistry`. Thread-safe."""
 
-    def __init__(self, folder: Path, device: Device, limits: KeptLimits | None = None) -> None:
-        """Nothing is read or written yet."""
+    def __init__(self, folder: Path, device: Device, limits: RetentionLimits | None = None) -> None:
+        """Reads and writes nothing yet."""
         self._folder = folder
         self._device = device
-        self._limits = limits or KeptLimits()
+        self._limits = limits or RetentionLimits()
         self._store: RoomStore | None = None
         self._saver: RoomSaver | None = None
-        self._rooms: Rooms | None = None
-        self._is_told_of_space = False
-        self.kept = Kept()
-        """What the folder held when it was last looked through."""
+        self._rooms: RoomRegistry | None = None
+        self._has_warned_of_space = False
+        self.storage = StorageUsage()
+        """Disk usage at the last check."""
 
-    def start(self, rooms: Rooms) -> None:
-        """Begin to save those of `rooms` that are open, every few seconds, and to keep the folder within its limits."""
+    def start(self, rooms: RoomRegistry) -> None:
+        """Start to save the open `rooms` every few seconds and to keep the folder within its limits."""
         from server.service.room_saver import RoomSaver  # loads OpenCL, which a service without rooms does not need
         from server.service.room_store import RoomStore
 
         self._rooms, self._store = rooms, RoomStore(self._folder)
-        self._saver = RoomSaver(self._store, rooms.visited, tidy=self.tidy)
+        self._saver = RoomSaver(self._store, rooms.open_rooms, enforce_limits=self.enforce_limits)
         self._saver.start()
 
     @property
     def unsaved(self) -> int:
-        """Rooms whose last save failed."""
+        """Number of rooms whose last save failed."""
         return len(self._saver.problems) if self._saver else 0
 
     def key_digest(self, name: str) -> bytes | None:
-        """Of the key that a room was left with, read before all else. Raises ValueError, one line."""
+        """Digest of a saved room's key, read without loading the room. Raises ValueError."""
         from server.service.room_store import RoomStoreError
 
         assert self._store is not None
@@ -59,7 +59,7 @@ class KeptRooms:
             raise ValueError(str(error)) from error
 
     def open_room(self, wishes: Wishes, name: str) -> Room:
-        """The room as it was left, else a new one. Raises ValueError, one line, where what was left cannot be read."""
+        """Load the saved room, or create a new one. Raises ValueError if the save cannot be read."""
         from server.room.room import Room
         from server.service.room_store import RoomStoreError
 
@@ -72,19 +72,19 @@ class KeptRooms:
                 raise ValueError(str(error)) from error
             raise
 
-    def keep_now(self, name: str) -> None:
-        """Save a room before what was done in it is acknowledged; by whoever is in it."""
-        room = self._rooms.named(name) if self._rooms else None
+    def save_now(self, name: str) -> None:
+        """Save a room before a change is acknowledged. The caller must be in the room."""
+        room = self._rooms.get(name) if self._rooms else None
         if room is not None and self._saver is not None:
             self._saver.save(room)
 
-    def keep_moves(self, name: str) -> None:
-        """Likewise where its objects have been moved to."""
-        room = self._rooms.named(name) if self._rooms else None
+    def save_placements(self, name: str) -> None:
+        """Save only object placements before moves are acknowledged. The caller must be in the room."""
+        room = self._rooms.get(name) if self._rooms else None
         if room is not None and self._saver is not None:
-            self._saver.save_moves(room)
+            self._saver.save_placements(room)
 
-    def keep(self, room: Room) -> None:
+    def save_and_release(self, room: Room) -> None:
         """Save a room that is about to close."""
         assert self._saver is not None
         assert self._store is not None
@@ -92,17 +92,17 @@ class KeptRooms:
         self._saver.save(room)
         self._store.release(room.name)
 
-    def tidy(self) -> None:
-        """Remove what exceeds the limits, and count what is left. Raises RoomStoreError."""
+    def enforce_limits(self) -> None:
+        """Delete rooms beyond the limits and update `storage`. Raises RoomStoreError."""
         assert self._store is not None
-        self.kept = self._store.tidy(self._limits)
+        self.storage = self._store.enforce_limits(self._limits)
         most = self._limits.space_bytes
-        is_too_much = most is not None and self.kept.space_bytes > most
-        if is_too_much and not self._is_told_of_space:
+        is_too_much = most is not None and self.storage.space_bytes > most
+        if is_too_much and not self._has_warned_of_space:
             log.warning("rooms take more space than they may, and all of them are in use")
-        self._is_told_of_space = is_too_much
+        self._has_warned_of_space = is_too_much
 
     def stop(self) -> None:
-        """Save what is open once more."""
+        """Save all open rooms a last time."""
         if self._saver is not None:
             self._saver.stop()

@@ -1,6 +1,6 @@
-"""A node is warmed up once, by its first host; later ones find its kernels built and its answers checked.
+"""Warms up a node once: the first host compiles the kernels and runs the self-check, later hosts skip both.
 
-A room that moves is back sooner by the seconds that this takes a process.
+This saves several seconds when a room moves to another node.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from server.opencl.device import Device
 
 GOOD_FOR_S = 3600.0
-"""Then the next host checks the device's answers again."""
+"""After this time the next host runs the self-check again."""
 
 
 def warm_up_node(device: Device, warm_up: Callable[[Device], object], folder: Path | None = None) -> bool:
-    """Warm up where nobody has for a while on this node, with this device and program; whether that was so.
+    """Warm up unless this node has done so recently with this device and version. Returns whether it ran.
 
-    Raises what `warm_up` raises; then the next one tries again.
+    Raises what `warm_up` raises; the next host then tries again.
     """
     stamp = (folder or user_cache_path("probeless") / "warm") / _name(device)
     if _age_s(stamp) < GOOD_FOR_S:

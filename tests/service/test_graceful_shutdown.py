@@ -11,7 +11,7 @@ import threading
 import httpx
 
 from protocol.messages import Bye, Composite, Error
-from server.service.departure import DRAINING, GOODBYE, Departure
+from server.service.graceful_shutdown import DRAINING, GOODBYE, GracefulShutdown
 from server.service.serve import BackgroundServer
 from tests.data import ROOT
 from tests.service.fakes import PATIENCE_S, frame_message
@@ -75,7 +75,7 @@ def test_what_must_not_be_lost_is_saved_after_the_sessions(start_server, lab) ->
     async def fail() -> None:
         raise OSError("disk full")
 
-    server.service.departure.saving += [fail, save_one]
+    server.service.shutdown.save_hooks += [fail, save_one]
     wire = Wire(server.url)
     wire.greet()
     wire.say(frame_message(0))
@@ -86,7 +86,7 @@ def test_what_must_not_be_lost_is_saved_after_the_sessions(start_server, lab) ->
 
 
 def test_saving_that_takes_too_long_is_given_up_and_told(caplog) -> None:
-    departure = Departure()
+    shutdown = GracefulShutdown()
     cancelled: list[bool] = []
 
     async def hang() -> None:
@@ -98,11 +98,11 @@ def test_saving_that_takes_too_long_is_given_up_and_told(caplog) -> None:
     async def fail() -> None:
         raise OSError("disk full")
 
-    departure.saving += [hang, fail]
+    shutdown.save_hooks += [hang, fail]
 
     async def drain() -> None:
-        await departure.drain(0.05)
-        await departure.drain(0.05)  # once is enough
+        await shutdown.drain(0.05)
+        await shutdown.drain(0.05)  # once is enough
         await asyncio.sleep(0)
 
     asyncio.run(asyncio.wait_for(drain(), PATIENCE_S))

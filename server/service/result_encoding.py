@@ -1,4 +1,4 @@
-"""What a frame is answered by, as it is sent; of layers, depth with little loss (protocol/README.md, "Layers")."""
+"""Encodes a frame's result as the message that answers it. Layer depth is slightly lossy (protocol/README.md)."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ Codec = Literal["zdelta", "zstd-delta"]
 
 JPEG_QUALITY = 90
 STEPS_PER_M = 400
-"""Depth is rounded to steps of its inverse, of which so many make up 1/m: half a step moves what a lens of 525 px
-sees by 0.07 px where the camera moves by 10 cm, however far away it is. Finer differences are mostly noise."""
+"""Inverse depth is rounded to 1/400 per metre. Half a step shifts a pixel by 0.07 px at any distance (focal length
+525 px, camera moved by 10 cm). Finer differences are mostly noise."""
 _FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 _BGR_FROM = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
 
 
 def composite_message(frame: Frame, result: FrameResult, plan: Plan, *, lossless: bool) -> Composite:
-    """The answer to `frame`; PNG where it is to be lossless."""
+    """The composite for `frame`, as PNG if `lossless`, else as JPEG."""
     assert result.color is not None
     color = encode_color(result.color, "png" if lossless else "jpeg", quality=JPEG_QUALITY)
     return Composite(color=color, **_drawn(frame, result, plan))
 
 
 def layer_message(frame: Frame, result: FrameResult, plan: Plan) -> Layer:
-    """The answer to `frame`. A browser has no Zstandard: who sends depth by it is taken to read it, nobody else."""
+    """The layer for `frame`. Depth uses Zstandard only if the client sent Zstandard: browsers cannot decode it."""
     layer = result.layer
     assert layer is not None
     reads_zstd = frame.depth is not None and frame.depth.codec.startswith("zstd")
@@ -48,7 +48,7 @@ def layer_message(frame: Frame, result: FrameResult, plan: Plan) -> Layer:
 
 
 def _drawn(frame: Frame, result: FrameResult, plan: Plan) -> dict[str, Any]:
-    """What both say of a frame."""
+    """Fields that composite and layer share."""
     return {
         "frame": frame.frame,
         "timestamp_s": frame.timestamp_s,
@@ -61,7 +61,7 @@ def _drawn(frame: Frame, result: FrameResult, plan: Plan) -> dict[str, Any]:
 
 
 def _patch(part: LayerPart | None, codec: Codec, depth_scale_m: float) -> LayerPatch | None:
-    """A part of a layer; the same bytes for the same part."""
+    """One part of a layer. Deterministic: equal parts give equal bytes."""
     if part is None:
         return None
     height, width = part.depth.shape
@@ -72,7 +72,7 @@ def _patch(part: LayerPart | None, codec: Codec, depth_scale_m: float) -> LayerP
 
 @lru_cache(maxsize=4)
 def _rounded(scale_m: float) -> NDArray[np.uint16]:
-    """[65536] each depth, to whole steps of its inverse; 0 stays."""
+    """[65536] lookup table: depth rounded to whole steps of inverse depth. 0 (no depth) stays 0."""
     units = STEPS_PER_M / scale_m
     depth = np.arange(1, 65536)
     steps = np.maximum(np.rint(units / depth), 1)

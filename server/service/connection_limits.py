@@ -1,4 +1,4 @@
-"""How many connections and sessions each client address has, so that one client cannot take them all."""
+"""Limits on connections and sessions per client address, so that one client cannot take them all."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from server.service.connection import TRY_LATER, Refusal
 from server.service.limits import Limits
 
 
-class Guests:
-    """For the event loop's thread."""
+class ConnectionLimits:
+    """Counters per address. Must be used on the event loop."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
@@ -21,13 +21,13 @@ class Guests:
 
     @contextlib.contextmanager
     def connected(self, address: str) -> Iterator[None]:
-        """While it lasts the address has one more connection. Raises Refusal."""
+        """Count one connection for the duration of the context. Raises Refusal at the limit."""
         with _counted(self._connections, address, self._limits.connections_per_address, "connections"):
             yield
 
     @contextlib.contextmanager
     def capturing(self, address: str) -> Iterator[None]:
-        """While it lasts the address has one more session. Raises Refusal."""
+        """Count one session for the duration of the context. Raises Refusal at the limit."""
         with _counted(self._sessions, address, self._limits.sessions_per_address, "sessions"):
             yield
 
@@ -47,7 +47,7 @@ def _counted(counts: Counter[str], address: str, most: int, what: str) -> Iterat
 
 
 def network_of(address: str) -> str:
-    """Who an address stands for: itself, or in IPv6 its network, since one client has 2^64 of them."""
+    """The unit that is counted: an IPv4 address, or an IPv6 /64 network (one client owns all 2^64 addresses of it)."""
     try:
         found = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:

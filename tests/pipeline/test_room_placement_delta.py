@@ -16,7 +16,7 @@ from server.opencl.device import Device
 from server.room.room import Room
 from server.scene.placement import Placement
 from server.service.room_store import RoomStore, RoomStoreError, folder_name
-from server.service.saving.files import read_parts, write_parts
+from server.service.saving.checksummed_files import read_parts, write_parts
 from tests.faulty_disk import FaultyDisk, PowerCut, full
 from tests.kept_rooms import CUBE, PLACE, client_of, found, print_of, scan
 from tests.rooms import wishes
@@ -61,7 +61,7 @@ def test_a_move_is_found_and_nothing_else_is_written(
     before = written(tmp_path)
     for x_m in (0.1, 0.2):
         moved = move(room, x_m)
-        store.save_moves(room)
+        store.save_placements(room)
         assert found(tmp_path, device) == moved
     assert written(tmp_path) == before
     assert (tmp_path / folder_name("study") / "moves").stat().st_size < 2000
@@ -69,13 +69,13 @@ def test_a_move_is_found_and_nothing_else_is_written(
 
 def test_moves_go_on_from_where_they_were_found(device: Device, room: Room, store: RoomStore, tmp_path: Path) -> None:
     move(room, 0.1)
-    store.save_moves(room)
+    store.save_placements(room)
     again, later = RoomStore(tmp_path), None
     for x_m in (0.2, 0.3, 0.4):  # each by a server that was started anew
         later = again.load("study", device)
         assert later is not None
         moved = move(later, x_m)
-        again.save_moves(later)
+        again.save_placements(later)
         later.close()
         again = RoomStore(tmp_path)
         assert found(tmp_path, device) == moved
@@ -83,7 +83,7 @@ def test_moves_go_on_from_where_they_were_found(device: Device, room: Room, stor
 
 def test_a_save_that_comes_later_is_what_counts(device: Device, room: Room, store: RoomStore, tmp_path: Path) -> None:
     move(room, 0.1)
-    store.save_moves(room)
+    store.save_placements(room)
     later = move(room, 0.2)  # not acknowledged, but in the save
     store.save(room)
     assert found(tmp_path, device) == later
@@ -92,11 +92,11 @@ def test_a_save_that_comes_later_is_what_counts(device: Device, room: Room, stor
 def test_what_is_more_than_a_move_is_saved_whole(device: Device, room: Room, store: RoomStore, tmp_path: Path) -> None:
     room.objects.place("cube", replace(CUBE, notes=("another",)), PLACE)
     placed = move(room, 0.3)
-    store.save_moves(room)
+    store.save_placements(room)
     assert found(tmp_path, device) == placed
     room.objects.remove("other")
     removed = move(room, 0.4)
-    store.save_moves(room)
+    store.save_placements(room)
     assert found(tmp_path, device) == removed
 
 
@@ -104,7 +104,7 @@ def test_a_move_waits_neither_for_a_frame_nor_for_a_save(room: Room, store: Room
     move(room, 0.1)
     saves = store._saves("study")
     with room.lock, saves.lock:
-        saving = threading.Thread(target=store.save_moves, args=(room,))
+        saving = threading.Thread(target=store.save_placements, args=(room,))
         saving.start()
         saving.join(PATIENCE_S)
         assert not saving.is_alive()
@@ -114,7 +114,7 @@ def test_moves_before_the_first_save_of_a_room_are_kept(device: Device, tmp_path
     room = Room(device, wishes("given"), "study")
     room.objects.place("cube", CUBE, PLACE)
     moved = move(room, 0.1)
-    RoomStore(tmp_path).save_moves(room)
+    RoomStore(tmp_path).save_placements(room)
     assert found(tmp_path, device) == moved
     room.close()
 
@@ -126,7 +126,7 @@ def test_moves_of_a_save_that_is_damaged_are_not_those_of_the_one_before(
     room.objects.place("cube", replace(CUBE, notes=("another",)), PLACE)
     store.save(room)
     move(room, 0.3)
-    store.save_moves(room)
+    store.save_placements(room)
     newest = tmp_path / folder_name("study") / "1" / "save"
     newest.write_bytes(newest.read_bytes()[:-1])
     assert found(tmp_path, device) == before
@@ -150,11 +150,11 @@ def test_after_a_power_cut_the_object_is_where_it_was_or_where_it_was_moved_to(
         store = RoomStore(folder)
         store.save(room)
         prints = [move(room, 0.1 + step)]
-        store.save_moves(room)
+        store.save_placements(room)
         prints.append(move(room, 0.5 + step))
         disk.fail_at(step, PowerCut())
         try:
-            store.save_moves(room)
+            store.save_placements(room)
             was_cut = False
         except PowerCut:
             disk.cut()
@@ -175,10 +175,10 @@ def test_a_full_disk_is_told_and_tried_again(
     before, moved = print_of(room), move(room, 0.1)
     disk.fail_at(2, full())
     with pytest.raises(RoomStoreError, match="moved in room 'study' was not saved, it goes on in memory: No space"):
-        store.save_moves(room)
+        store.save_placements(room)
     disk.fails_at = 0
     assert found(tmp_path, device) == before
-    store.save_moves(room)
+    store.save_placements(room)
     assert found(tmp_path, device) == moved
 
 
@@ -187,7 +187,7 @@ def test_damaged_moves_are_told_and_the_save_counts(
 ) -> None:
     before = print_of(room)
     move(room, 0.1)
-    store.save_moves(room)
+    store.save_placements(room)
     path = tmp_path / folder_name("study") / "moves"
     path.write_bytes(path.read_bytes()[:-3])
     with caplog.at_level(logging.WARNING):
@@ -195,7 +195,7 @@ def test_damaged_moves_are_told_and_the_save_counts(
     (record,) = caplog.records
     assert record.getMessage().startswith("objects of room 'study' are where they were some seconds before: ")
     moved = move(room, 0.2)
-    store.save_moves(room)
+    store.save_placements(room)
     assert found(tmp_path, device) == moved
 
 
@@ -218,7 +218,7 @@ def test_a_room_that_was_saved_by_the_version_before_is_loaded(device: Device, r
     loaded = again.load("study", device)
     assert loaded is not None
     moved = move(loaded, 0.4)
-    again.save_moves(loaded)
+    again.save_placements(loaded)
     loaded.close()
     assert found(tmp_path, device) == moved
 

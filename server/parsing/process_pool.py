@@ -1,4 +1,4 @@
-"""The server's side: a few children that each do one job at a time, and are replaced when they die or take too long."""
+"""Process pool: children that process one request at a time and are replaced when they die or exceed a limit."""
 
 from __future__ import annotations
 
@@ -16,46 +16,46 @@ from dataclasses import dataclass
 
 from server.parsing.child import ANSWER, DONE, READY, REQUEST
 
-IS_POSSIBLE = hasattr(os, "memfd_create") and hasattr(fcntl, "F_ADD_SEALS")
-"""Whether this system has what it takes."""
+IS_SUPPORTED = hasattr(os, "memfd_create") and hasattr(fcntl, "F_ADD_SEALS")
+"""Whether this system supports sealed shared memory."""
 PIPE_BYTES = 1 << 20
-LOADING_PATIENCE_S = 60.0
+LOADING_TIMEOUT_S = 60.0
 STOPPED = "was stopped: the server ends"
 
 
 class ChildDied(Exception):
-    """The child ended, or was ended, in the middle of a request; what happened, as the rest of a sentence."""
+    """The child died or was killed during a request. The message completes a sentence such as "the reader ..."."""
 
 
 @dataclass(frozen=True)
-class Work:
-    """What children of one kind do, and what each may take."""
+class JobSpec:
+    """Job and resource limits of one kind of child."""
 
     job: str
-    """`module:function`, as server.parsing.child runs it."""
+    """`module:function`, see server.parsing.child."""
     memory_mib: int
-    """Of address space."""
-    patience_s: float
-    """For one request."""
-    greatest_answer: int
-    """Bytes."""
+    """Address space limit."""
+    timeout_s: float
+    """Time limit for one request."""
+    max_answer_bytes: int
+    """Largest answer in bytes."""
     shared_bytes: int = 0
-    """Of memory that the child writes and the server reads."""
+    """Size of the memory that the child writes and the server reads."""
 
 
-class Child:
-    """One process. Used by one thread at a time."""
+class ChildProcess:
+    """One process. Not thread-safe."""
 
-    def __init__(self, work: Work) -> None:
-        self._work = work
-        arguments = [sys.executable, "-P", "-m", "server.parsing.child", work.job]
-        arguments += [str(work.memory_mib), str(work.patience_s)]
+    def __init__(self, spec: JobSpec) -> None:
+        self._spec = spec
+        arguments = [sys.executable, "-P", "-m", "server.parsing.child", spec.job]
+        arguments += [str(spec.memory_mib), str(spec.timeout_s)]
         self.shared: mmap.mmap | None = None
         self._is_ready = False
         descriptors: list[int] = []
-        if work.shared_bytes:
-            descriptors.append(_sealed_memory(work.shared_bytes))
-            self.shared = mmap.mmap(descriptors[0], work.shared_bytes, prot=mmap.PROT_READ)
+        if spec.shared_bytes:
+            descriptors.append(_sealed_memory(spec.shared_bytes))
+            self.shared = mmap.mmap(descriptors[0], spec.shared_bytes, prot=mmap.PROT_READ)
             arguments.append(str(descriptors[0]))
         self.process = subprocess.Popen(
             arguments,
@@ -64,32 +64,32 @@ class Child:
             bufsize=0,
             pass_fds=descriptors,
             env=_environment(),
-            start_new_session=True,  # Ctrl-C is for the server
+            start_new_session=True,  # Ctrl-C must reach only the server
         )
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self._requests, self._answers = self.process.stdin.fileno(), self.process.stdout.fileno()
         for pipe in (self._requests, self._answers):
             os.set_blocking(pipe, False)
-            with contextlib.suppress(OSError):  # a user's pipes may be limited together
+            with contextlib.suppress(OSError):  # the per-user limit on pipe memory may be reached
                 fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         for descriptor in descriptors:
             os.close(descriptor)
 
     @property
     def is_alive(self) -> bool:
-        """Whether it can be asked."""
+        """Whether the process is running."""
         return self.process.poll() is None
 
     def ask(self, request: bytes) -> bytearray:
-        """The answer. Raises ValueError with the child's line, ChildDied; then it is dead."""
+        """Send a request and wait for the answer. Raises ValueError with the child's line, or ChildDied."""
         if not self._is_ready:
-            self._is_ready = self._read(len(READY), time.monotonic() + LOADING_PATIENCE_S) == READY
-        deadline_s = time.monotonic() + self._work.patience_s
+            self._is_ready = self._read(len(READY), time.monotonic() + LOADING_TIMEOUT_S) == READY
+        deadline_s = time.monotonic() + self._spec.timeout_s
         self._write(memoryview(REQUEST.pack(len(request))), deadline_s)
         self._write(memoryview(request), deadline_s)
         state, size = ANSWER.unpack(self._read(ANSWER.size, deadline_s))
-        if size > self._work.greatest_answer:
+        if size > self._spec.max_answer_bytes:
             self.kill()
             raise ChildDied("was stopped: it made more of it than may be")
         body = self._read(size, deadline_s)
@@ -98,7 +98,7 @@ class Child:
         return body
 
     def kill(self) -> None:
-        """End it now; its memory and pipes are given back."""
+        """Kill the process and free its memory and pipes."""
         self.process.kill()
         self.process.wait()
         for pipe in (self.process.stdin, self.process.stdout):
@@ -116,7 +116,7 @@ class Child:
             except BlockingIOError:
                 continue
             except BrokenPipeError:
-                self._bury()
+                self._raise_died()
 
     def _read(self, size: int, deadline_s: float) -> bytearray:
         data = bytearray(size)
@@ -128,7 +128,7 @@ class Child:
             except BlockingIOError:
                 continue
             if not count:
-                self._bury()
+                self._raise_died()
             rest = rest[count:]
         return data
 
@@ -138,10 +138,10 @@ class Child:
         left_s = deadline_s - time.monotonic()
         if left_s <= 0 or not poll.poll(left_s * 1e3):
             self.kill()
-            raise ChildDied(f"was stopped: it took more than {self._work.patience_s:g} s")
+            raise ChildDied(f"was stopped: it took more than {self._spec.timeout_s:g} s")
 
-    def _bury(self) -> None:
-        """Raises ChildDied with how it ended."""
+    def _raise_died(self) -> None:
+        """Raise ChildDied with the exit status."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(1.0)
         code = self.process.returncode
@@ -149,31 +149,31 @@ class Child:
         raise ChildDied("died on it" if code is None or code >= 0 else f"died on it (signal {-code})")
 
 
-class Children:
-    """Of one kind, for any number of threads; the one that worked last works next, so that few are ever needed."""
+class ProcessPool:
+    """Pool of one kind of child. Thread-safe. Last in, first out, so that few processes are started."""
 
-    def __init__(self, work: Work, most: int, on_death: Callable[[], None] = lambda: None) -> None:
-        """Starts none of them yet. `on_death` is called, by the thread that asked, for each that dies at work."""
-        self._work = work
+    def __init__(self, spec: JobSpec, most: int, on_death: Callable[[], None] = lambda: None) -> None:
+        """Starts no process yet. `on_death` is called in the requesting thread when a child dies."""
+        self._spec = spec
         self._on_death = on_death
-        self._idle: queue.LifoQueue[Child | None] = queue.LifoQueue()
-        self._all: set[Child] = set()
+        self._idle: queue.LifoQueue[ChildProcess | None] = queue.LifoQueue()
+        self._all: set[ChildProcess] = set()
         self._stopped = False
         for _ in range(most):
             self._idle.put(None)
 
     @property
     def pids(self) -> list[int]:
-        """Of those that live."""
+        """Process ids of running children."""
         return [child.process.pid for child in tuple(self._all) if child.is_alive]
 
     def start_one(self) -> None:
-        """So that the first request need not wait for the child to load what it works with."""
-        with self._one():
+        """Start a child, so that the first request does not wait for it to load."""
+        with self._borrowed():
             pass
 
     @contextlib.contextmanager
-    def _one(self) -> Iterator[Child]:
+    def _borrowed(self) -> Iterator[ChildProcess]:
         child = self._idle.get()
         try:
             if self._stopped:
@@ -184,12 +184,12 @@ class Children:
         finally:
             self._idle.put(child)
 
-    def _replaced(self, child: Child | None) -> Child:
+    def _replaced(self, child: ChildProcess | None) -> ChildProcess:
         if child is not None:
             self._all.discard(child)
             child.kill()
         try:
-            new = Child(self._work)
+            new = ChildProcess(self._spec)
         except OSError as error:
             raise ChildDied(f"could not be started ({error.strerror})") from error
         self._all.add(new)
@@ -199,8 +199,8 @@ class Children:
         return new
 
     def ask(self, request: bytes, take: Callable[[bytearray, mmap.mmap | None], object] | None = None) -> object:
-        """The answer, or what `take` makes of it and of the shared memory. Raises ValueError, ChildDied."""
-        with self._one() as child:
+        """The answer, or the result of `take(answer, shared memory)`. Raises ValueError, ChildDied."""
+        with self._borrowed() as child:
             try:
                 answer = child.ask(request)
             except ChildDied:
@@ -209,12 +209,12 @@ class Children:
             return answer if take is None else take(answer, child.shared)
 
     def stop(self) -> None:
-        """End them all, also those at work: whoever waits for one is told that it died."""
+        """Kill all children. Requests in progress raise ChildDied."""
         self._stopped = True
         for child in tuple(self._all):
             child.process.kill()
             child.process.wait()
-        idle: list[Child | None] = []
+        idle: list[ChildProcess | None] = []
         with contextlib.suppress(queue.Empty):
             while True:
                 idle.append(self._idle.get_nowait())
@@ -225,7 +225,7 @@ class Children:
 
 
 def _sealed_memory(size: int) -> int:
-    """A descriptor of memory that a child cannot make smaller under the server's eyes."""
+    """Descriptor of shared memory that the child cannot shrink or grow."""
     descriptor = os.memfd_create("probeless", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     os.ftruncate(descriptor, size)
     fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
@@ -233,9 +233,9 @@ def _sealed_memory(size: int) -> int:
 
 
 def _environment() -> dict[str, str]:
-    """What Python needs, and nothing that a stranger's file should meet, such as a token."""
+    """Minimal environment for the child, without secrets such as the token."""
     kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH", "LANG", "TMPDIR") if name in os.environ}
     threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
-    # A picture's memory is kept for the next one: to get it anew from the system takes as long as to decode.
+    # Keep freed image memory in the process: allocating it again from the system takes as long as decoding.
     memory = {"MALLOC_MMAP_THRESHOLD_": str(64 << 20), "MALLOC_TRIM_THRESHOLD_": str(128 << 20)}
     return {**kept, **threads, **memory, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}

@@ -1,4 +1,4 @@
-"""What is kept of a room beside its voxels and meshes, as typed structs, and those as bytes."""
+"""Saved state of a room without voxels and meshes: typed structs and their encoding."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Any, get_args, get_origin
 import msgspec
 import numpy as np
 import zstandard
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
 from numpy.typing import NDArray
 
 from protocol.messages import Wishes
@@ -17,81 +17,81 @@ from server.scene.placement import Placement
 from server.tracking.relocalize import Keyframe
 
 VERSION = 1
-"""Of all that is written. A change of any of these types, or of those that they are made of, is another version."""
+"""Format version. Increase it when any of these types, or a type that they contain, changes."""
 _MOST_BYTES = 1 << 30
 
 FileName = Annotated[str, Meta(pattern="^[a-z0-9-]+$")]
 
 
-class KeptVolume(Struct, frozen=True, forbid_unknown_fields=True):
-    """A volume less its voxels."""
+class StoredVolume(Struct, frozen=True, forbid_unknown_fields=True):
+    """A volume without its voxels."""
 
     bounds_m: tuple[float, float, float, float, float, float]
     voxel_m: float
     frames: int
     exposure_logarithms: float
     places: NDArray[np.int32]
-    """[n] its bricks."""
+    """[n] indices of its bricks."""
     files: tuple[FileName, ...] = ()
-    """Of its voxels; a later one holds what has changed."""
+    """Brick files in order; later ones override earlier ones."""
     bricks_in_files: int = 0
-    """In all of them together."""
+    """Total number of bricks in all files."""
 
 
-class KeptMarker(Struct, frozen=True, forbid_unknown_fields=True):
-    """A marker that clients have seen."""
+class StoredMarker(Struct, frozen=True, forbid_unknown_fields=True):
+    """A marker that a client has detected."""
 
     dictionary: str
     number: int
     room_from_marker: NDArray[np.float64]
 
 
-class KeptPlace(Struct, frozen=True, forbid_unknown_fields=True):
-    """An object less its mesh; one of the two is there."""
+class StoredObject(Struct, frozen=True, forbid_unknown_fields=True):
+    """An object without its mesh. Exactly one of the two placements is set."""
 
     object_id: str
     mesh: FileName
     world_from_model: NDArray[np.float64] | None = None
-    asked: Placement | None = None
+    placement: Placement | None = field(default=None, name="asked")
 
 
 class RoomState(Struct, frozen=True, forbid_unknown_fields=True):
-    """One room."""
+    """State of one room."""
 
     wishes: Wishes
-    """Of the client that opened it."""
+    """Wishes of the client that opened it."""
     up: NDArray[np.float64] | None
-    volume: KeptVolume | None
+    volume: StoredVolume | None
     keyframes: tuple[Keyframe, ...]
-    markers: tuple[KeptMarker, ...]
+    markers: tuple[StoredMarker, ...]
     light: KnownRoomLight
     lamps: Found | None
-    objects: tuple[KeptPlace, ...] = ()
+    objects: tuple[StoredObject, ...] = ()
     key_digest: bytes | None = None
     """See Room."""
 
 
 class Header(Struct, frozen=True):
-    """What every version begins a save with."""
+    """Begin of a save, the same in every format version."""
 
     version: int
     name: str
     sequence: int
-    """Grows from save to save of a room."""
+    """Increases with each save of a room."""
     key_digest: bytes | None = None
-    """The state's, to be compared before all else is read; earlier programs left it out."""
+    """Same as in the state; read first to check the key. Earlier programs did not write it."""
     revision: int = 0
-    """Of the objects (see Inventory), by which moves are told that came after."""
+    """Revision of the objects (see Inventory), which decides whether a placement delta applies."""
     owed: tuple[str, ...] = ()
 
 
 def state_to_bytes(state: RoomState) -> bytes:
-    """Packed."""
+    """Encode with MessagePack and Zstandard."""
     return zstandard.ZstdCompressor(level=1).compress(msgspec.msgpack.encode(state, enc_hook=array_to_list))
 
 
 def state_from_bytes(data: bytes) -> RoomState:
-    """Raises ValueError, one line, for what is none."""
+    """Decode; raises ValueError for invalid data."""
     try:
         if zstandard.frame_content_size(data) > _MOST_BYTES:
             raise ValueError("it is larger than any room")
@@ -102,7 +102,7 @@ def state_from_bytes(data: bytes) -> RoomState:
 
 
 def array_to_list(value: Any) -> Any:
-    """For msgspec's `enc_hook`."""
+    """`enc_hook` for msgspec."""
     if isinstance(value, np.ndarray):
         return [value.dtype.str, value.shape, np.ascontiguousarray(value).tobytes()]
     if isinstance(value, np.generic):
@@ -110,11 +110,11 @@ def array_to_list(value: Any) -> Any:
     raise NotImplementedError(f"a {type(value).__name__} is not kept")
 
 
-def array_from_list(asked: Any, value: Any) -> Any:
-    """For msgspec's `dec_hook`: an own copy. Raises ValueError for another type than `asked`, an NDArray's."""
-    if get_origin(asked) is not np.ndarray:
-        raise NotImplementedError(f"a {asked} is not kept")
-    kind = np.dtype(get_args(get_args(asked)[1])[0])
+def array_from_list(expected: Any, value: Any) -> Any:
+    """`dec_hook` for msgspec; returns a copy. Raises ValueError if the dtype is not the one of `expected`."""
+    if get_origin(expected) is not np.ndarray:
+        raise NotImplementedError(f"a {expected} is not kept")
+    kind = np.dtype(get_args(get_args(expected)[1])[0])
     name, shape, data = value
     if name != kind.str:
         raise ValueError(f"numbers of type {name} where {kind.str} belong")

@@ -1,4 +1,4 @@
-"""One of the two folders that saves of a room go to in turn: whole in itself, renewed without ever being half new."""
+"""One of the two folders to which saves of a room alternate. A save is complete in itself and replaced atomically."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ from server.parsing.mesh_bytes import mesh_to_bytes
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.service.saving.brick_files import Batch, merged, write_bricks
-from server.service.saving.files import DamagedFile, check_file, read_parts, sync_folder, write_parts
-from server.service.saving.state import (
+from server.service.saving.checksummed_files import DamagedFile, check_file, read_parts, sync_folder, write_parts
+from server.service.saving.retention import QUARANTINE_PREFIX
+from server.service.saving.room_state import (
     VERSION,
     FileName,
     Header,
-    KeptPlace,
-    KeptVolume,
     RoomState,
+    StoredObject,
+    StoredVolume,
     state_from_bytes,
     state_to_bytes,
 )
-from server.service.saving.upkeep import ASIDE
 from server.volume.volume import Volume
 
 if TYPE_CHECKING:
-    from server.room.room_objects import KeptObject
+    from server.room.room_objects import ObjectRecord
     from server.service.saving.snapshot import Snapshot
 
 SAVE, PART = "save", "save.part"
-"""What a save is read by; it names all other files."""
+"""The index file, which names all other files of a save."""
 SPARE_BRICKS = 1024
-"""Files of bricks become one where they hold twice those that there are, and so many more."""
+"""Brick files are merged when they hold more than twice the live bricks plus this number."""
 
 
 @dataclass(frozen=True)
 class _Bricks:
-    """What files of bricks hold: a volume as it was when its `changes` was `change`."""
+    """Content of the brick files: a volume in the state in which its `changes` was `change`."""
 
     volume: ref[Volume]
     change: int
     files: tuple[FileName, ...]
     count: int
-    """In all files, also those that later ones have anew."""
+    """Bricks in all files, including outdated versions."""
 
 
 @dataclass
@@ -59,38 +59,38 @@ class _Work:
     header: Header
     taken: Snapshot
     new: list[Path] = field(default_factory=list)
-    """Files that are to go where it fails."""
+    """New files, deleted if the save fails."""
     bricks: _Bricks | None = None
     meshes: dict[FileName, Mesh | None] = field(default_factory=dict)
     size: int = 0
 
 
-class Slot:
-    """Used by one thread at a time."""
+class SaveSlot:
+    """Not thread-safe."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._bricks: _Bricks | None = None
         self._meshes: dict[FileName, Mesh | None] = {}
-        """Files known to be whole, by the mesh that they were written of."""
+        """Mesh files known to be complete, and the mesh each was written from."""
         self._read: tuple[tuple[FileName, ...], int] = ((), 0)
 
     def paths(self, files: Iterable[FileName]) -> list[Path]:
-        """Of files in it."""
+        """Paths of files in this slot."""
         return [self.folder / name for name in files]
 
     def change_of(self, volume: Volume) -> int:
-        """The volume's `changes` that the files have it at; -1 where they hold another or none."""
+        """The volume's `changes` at the time of the save; -1 if the files hold another volume or none."""
         known = self._bricks
         return known.change if known and known.volume() is volume else -1
 
     def note_filled(self, volume: Volume) -> None:
-        """Say that `volume` has been filled from what was read."""
+        """Note that `volume` was filled from the files that were read."""
         files, count = self._read
         self._bricks = _Bricks(ref(volume), volume.changes, files, count)
 
     def header(self) -> Header | None:
-        """What the save says first, unchecked; None where there is none. Raises DamagedFile, OSError."""
+        """The save's header, without verifying the checksum; None if there is no save. Raises DamagedFile, OSError."""
         path = self.folder / SAVE
         if not path.exists():
             return None
@@ -100,7 +100,7 @@ class Slot:
             raise DamagedFile(f"{path} is no save: {error}") from error
 
     def key_digest(self) -> bytes | None:
-        """Of the room's key, by the save alone; None where that does not say. Raises DamagedFile, OSError."""
+        """Digest of the room's key from this save, if it has one. Raises DamagedFile, OSError."""
         check_file(self.folder / SAVE)
         header = self.header()
         if header is not None and header.key_digest is not None:
@@ -108,7 +108,7 @@ class Slot:
         return self._state().key_digest
 
     def read(self) -> RoomState:
-        """The save, after all its files have been compared with their checksums. Raises DamagedFile, OSError."""
+        """Read the save after verifying all its files. Raises DamagedFile, OSError."""
         check_file(self.folder / SAVE)
         state = self._state()
         meshes: dict[FileName, Mesh | None] = dict.fromkeys(kept.mesh for kept in state.objects)
@@ -130,9 +130,10 @@ class Slot:
             raise DamagedFile(f"{path} is no save: {error}") from error
 
     def write(self, header: Header, taken: Snapshot) -> int:
-        """Make the save that of `taken`; bytes written. Raises OSError, the save is then as it was, or durable soon.
+        """Write the snapshot and return the number of bytes. Raises OSError; the previous save is then still valid, or
+        the new one is complete but not yet synced.
 
-        Raises DamagedFile where earlier files have changed on the disk: all is then written next time.
+        Raises DamagedFile if earlier files were altered on disk; the next save then writes all bricks.
         """
         self._make_folder()
         work = _Work(header, taken)
@@ -147,11 +148,11 @@ class Slot:
             raise
         self._bricks, self._meshes = work.bricks, work.meshes
         sync_folder(self.folder)
-        self._tidy({*(work.bricks.files if work.bricks else ()), *work.meshes})
+        self._remove_unnamed({*(work.bricks.files if work.bricks else ()), *work.meshes})
         return work.size
 
     def _write_files(self, work: _Work) -> None:
-        """All but the last step, which makes it the save."""
+        """Write all files. The final rename, which makes them the current save, is not done here."""
         state = work.taken.state
         state = structs.replace(state, objects=tuple(self._objects(work)))
         if state.volume and work.taken.volume:
@@ -161,8 +162,8 @@ class Slot:
         work.new.append(self.folder / PART)
         work.size += write_parts(self.folder / PART, [msgspec.msgpack.encode(work.header), state_to_bytes(state)])
 
-    def _objects(self, work: _Work) -> Iterator[KeptPlace]:
-        """The objects, their meshes written as far as they are not there."""
+    def _objects(self, work: _Work) -> Iterator[StoredObject]:
+        """Entries of the objects; writes meshes that are not on disk yet."""
         names = {id(mesh): name for name, mesh in self._meshes.items()}
         for kept in work.taken.objects:
             name = names.get(id(kept.mesh))
@@ -174,10 +175,10 @@ class Slot:
                     work.size += write_parts(self.folder / name, [data])
                 names[id(kept.mesh)] = name
             work.meshes[name] = kept.mesh
-            yield _place_of(kept, name)
+            yield _stored_object(kept, name)
 
-    def _written_bricks(self, work: _Work, volume: Volume, kept: KeptVolume) -> _Bricks:
-        """The files, with one more of the bricks that have changed; or one of all."""
+    def _written_bricks(self, work: _Work, volume: Volume, kept: StoredVolume) -> _Bricks:
+        """The brick files with one more for changed bricks, or a single merged one."""
         known = self._bricks if self.change_of(volume) >= 0 else None
         files, count = (known.files, known.count) if known else ((), 0)
         sequence, bricks = work.header.sequence, work.taken.bricks
@@ -200,24 +201,24 @@ class Slot:
             for folder in self.folder.parents[:3]:
                 sync_folder(folder)
 
-    def _tidy(self, kept: set[FileName]) -> None:
-        """Remove what the save does not name: of earlier ones, and of those that were not finished."""
+    def _remove_unnamed(self, kept: set[FileName]) -> None:
+        """Delete files that the save does not name: those of earlier and of unfinished saves."""
         _remove([path for path in self.folder.iterdir() if path.name not in kept and path.name != SAVE])
 
-    def set_aside(self) -> Path:
-        """Give the folder another name, for a person to look at; the name. Raises OSError."""
+    def quarantine(self) -> Path:
+        """Rename the damaged folder so that it can be inspected. Returns the new path. Raises OSError."""
         room = self.folder.parent
-        number = next(n for n in range(1, 1 << 30) if not (room / f"{ASIDE}{n}").exists())
-        os.replace(self.folder, room / f"{ASIDE}{number}")
+        number = next(n for n in range(1, 1 << 30) if not (room / f"{QUARANTINE_PREFIX}{n}").exists())
+        os.replace(self.folder, room / f"{QUARANTINE_PREFIX}{number}")
         sync_folder(room)
         self._bricks, self._meshes = None, {}
-        return room / f"{ASIDE}{number}"
+        return room / f"{QUARANTINE_PREFIX}{number}"
 
 
-def _place_of(kept: KeptObject, mesh: FileName) -> KeptPlace:
+def _stored_object(kept: ObjectRecord, mesh: FileName) -> StoredObject:
     if isinstance(kept.place, Placement):
-        return KeptPlace(kept.object_id, mesh, asked=kept.place)
-    return KeptPlace(kept.object_id, mesh, world_from_model=kept.place)
+        return StoredObject(kept.object_id, mesh, placement=kept.place)
+    return StoredObject(kept.object_id, mesh, world_from_model=kept.place)
 
 
 def _remove(paths: Sequence[Path]) -> None:

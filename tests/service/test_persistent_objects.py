@@ -32,7 +32,7 @@ from server.service.room_store import RoomStore
 from server.service.scheduler import Scheduler
 from server.service.serve import BackgroundServer
 from server.service.service import Service
-from server.service.worker import Worker, Workshop
+from server.service.worker import Worker, WorkerContext
 from tests.rooms import CAMERA, frame_at, view_at, wishes
 from tests.service import fakes
 from tests.service.fakes import PATIENCE_S, FakePipeline, Lab, fake_mesh, frame_message
@@ -186,7 +186,7 @@ def test_once_its_client_is_aligned_nothing_is_owed(server: BackgroundServer, fo
 
 
 class Inbox:
-    """An outlet that notes what has been kept when something is sent."""
+    """An outbox that notes what has been kept when something is sent."""
 
     waited_s = 0.0
 
@@ -215,16 +215,16 @@ def test_moves_that_wait_behind_a_frame_are_kept_together() -> None:
     """Each is done and acknowledged; the disk is waited for once."""
     lab, inbox = Lab(hold=True), Inbox()
     pipeline = FakePipeline(lab)
-    workshop = Workshop(
-        opened_pipeline=lambda _hello: contextlib.nullcontext(pipeline),
+    context = WorkerContext(
+        open_pipeline=lambda _hello: contextlib.nullcontext(pipeline),
         load_mesh=fake_mesh,
         metrics=Metrics(),
         scheduler=Scheduler(),
-        keep_moves=lambda _name: inbox.kept.append(len(lab.log)),
+        save_placements=lambda _name: inbox.kept.append(len(lab.log)),
     )
     mailbox = Mailbox(2)
     hello = Hello(client="test", camera=fakes.CAMERA, wishes=Wishes(answer="light"), room="study")
-    worker = Worker(workshop, hello, mailbox, inbox)
+    worker = Worker(context, hello, mailbox, inbox)
     working = threading.Thread(target=worker.run)
     working.start()
     mailbox.post(PlaceObject(request=0, object="vase", format="ply", data=b"mesh", position_m=(0, 0, 1)))

@@ -106,9 +106,9 @@ def triangle() -> Mesh:
     )
 
 
-def _processed(device: Device, wishes: Wishes, prepare: Callable[[Pipeline], object]) -> FrameResult:
+def _processed(device: Device, wishes: Wishes, prepare: Callable[[ClientSession], object]) -> FrameResult:
     """Result of the second frame, which sees the volume that the first one filled."""
-    pipeline = Pipeline(device, CAMERA, wishes)
+    pipeline = ClientSession(device, CAMERA, wishes)
     try:
         prepare(pipeline)
         pipeline.process(frame())

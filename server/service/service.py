@@ -131,7 +131,7 @@ class Service:
         return self.rooms.entered(name, hello.wishes, hello.room_key)
 
     @contextlib.contextmanager
-    def _open_pipeline(self, hello: Hello) -> Iterator[Pipeline]:
+    def _open_pipeline(self, hello: Hello) -> Iterator[ClientSession]:
         """Worker thread: context with the client's pipeline, in its room if it names one."""
         with contextlib.ExitStack() as stack:
             room = None if hello.room is None else stack.enter_context(self._enter_room(hello.room, hello))

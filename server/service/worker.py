@@ -78,7 +78,7 @@ class Outbox(Protocol):
 class WorkerContext:
     """What all workers of a service share."""
 
-    open_pipeline: Callable[[Hello], AbstractContextManager[Pipeline]]
+    open_pipeline: Callable[[Hello], AbstractContextManager[ClientSession]]
     """Context with a client's pipeline. Raises ValueError for wishes that cannot be met."""
     load_mesh: Callable[[bytes, str], Mesh]
     metrics: Metrics
@@ -130,7 +130,7 @@ class Worker:
             self._context.scheduler.leave(self._share)
             self._colors.close()
 
-    def _handle(self, pipeline: Pipeline, queued: QueuedMessage) -> None:
+    def _handle(self, pipeline: ClientSession, queued: QueuedMessage) -> None:
         if isinstance(queued.message, Frame):
             self._arrived_s = queued.arrived_s
             self._context.metrics.queue_age_ms.observe(queued.age_ms)
@@ -142,7 +142,7 @@ class Worker:
         else:
             self._outbox.send(self._acknowledge(pipeline, queued.message))
 
-    def _handle_moves(self, pipeline: Pipeline, moves: list[MoveObject]) -> None:
+    def _handle_moves(self, pipeline: ClientSession, moves: list[MoveObject]) -> None:
         """Apply consecutive moves, save them together, then acknowledge each."""
         answers = [self._acknowledge(pipeline, move) for move in moves]
         if self._hello.room is not None:
@@ -150,7 +150,7 @@ class Worker:
         for answer in answers:
             self._outbox.send(answer)
 
-    def _acknowledge(self, pipeline: Pipeline, message: SceneControl) -> bytes:
+    def _acknowledge(self, pipeline: ClientSession, message: SceneControl) -> bytes:
         """Apply a request and return its acknowledgement. A repeated request is not applied again."""
         done = self._acknowledged.get(message.request)
         if done is None:
@@ -189,7 +189,7 @@ class Worker:
         self._deliver(frame, result)
         return overhead.record(self._context.metrics)
 
-    def _adapt_sampling(self, pipeline: Pipeline) -> None:
+    def _adapt_sampling(self, pipeline: ClientSession) -> None:
         """Apply the load-shedding step: cheaper sampling under load, the requested sampling otherwise."""
         scheduler, load_shedding = self._context.scheduler, self._load_shedding
         if load_shedding.observe(scheduler.busy, scheduler.period_s):
@@ -295,7 +295,9 @@ class _Overhead:
         metrics.overhead_cpu_ms.observe((self._cpu_s + time.thread_time()) * 1e3)
 
 
-def apply_control(pipeline: Pipeline, message: SceneControl, load_mesh: Callable[[bytes, str], Mesh]) -> Acknowledged:
+def apply_control(
+    pipeline: ClientSession, message: SceneControl, load_mesh: Callable[[bytes, str], Mesh]
+) -> Acknowledged:
     """Apply a control message. An error is reported in the acknowledgement."""
     try:
         notes = _apply(pipeline, message, load_mesh)

@@ -19,8 +19,8 @@ from protocol.messages import Light, Wishes
 from server.opencl.device import Device
 from server.pipeline import FrameResult, Pipeline
 from server.scene.placement import Placement
-from tests.analytic import look, look_at, room, sphere
-from tests.meshes import soup_of
+from tests.scenes.analytic import look, look_at, room, sphere
+from tests.scenes.meshes import soup_of
 
 CAMERA = CameraModel(width=96, height=72, fx=80.0, fy=80.0, cx=48.0, cy=36.0)
 BOUNDS = (-1.2, -1.0, -0.5, 1.2, 1.0, 2.1)

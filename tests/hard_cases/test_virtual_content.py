@@ -15,7 +15,7 @@ from protocol.messages import Wishes
 from server.opencl.device import Device
 from server.pipeline import Pipeline
 from server.scene.placement import Placement
-from tests.meshes import shape_of, soup_of
+from tests.scenes.meshes import shape_of, soup_of
 
 CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
 WISHES = Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.02, poses="given", up=(0.0, -1.0, 0.0))

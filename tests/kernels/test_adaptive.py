@@ -20,11 +20,11 @@ from server.shading.traced_scene import trace_scene, upload_light
 from server.transfer.radiance_transfer import Directions, direction_sets, transfer_radiance
 from server.transfer.sample_grid import SampleGrid
 from server.volume.raycast import LABEL_STATIC, Surface, raycast
-from tests.analytic import look_at
-from tests.meshes import shape_of
 from tests.reference import adaptive as twin
 from tests.reference.composite import Buffer, Samples, upsample
-from tests.solids import SCENES, download4, fill_volume, float4
+from tests.scenes.analytic import look_at
+from tests.scenes.meshes import shape_of
+from tests.scenes.solids import SCENES, download4, fill_volume, float4
 
 VOXEL_M = 0.01
 CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)

@@ -17,9 +17,9 @@ from server.opencl.engine import Engine
 from server.transfer.indirect import Indirect
 from server.transfer.radiance_transfer import Directions, Transfer, direction_sets, own_sets
 from server.volume.raycast import Surface
-from tests.analytic import Floats
 from tests.reference import cell_transfer as twin
-from tests.solids import float4
+from tests.scenes.analytic import Floats
+from tests.scenes.solids import float4
 
 VOXEL_M = 0.01
 HALF_CELL = float(np.sqrt(CELL_SR / np.pi))

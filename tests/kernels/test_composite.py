@@ -22,11 +22,11 @@ from server.transfer.radiance_transfer import direction_sets
 from server.transfer.sample_grid import SampleGrid
 from server.transfer.sampling import Upsampling
 from server.volume.raycast import Surface
-from tests import lights
-from tests.meshes import pose, shape_of
 from tests.reference import composite as twin
 from tests.reference.composite import Buffer, Samples
-from tests.solids import download4, float4, upload_surface
+from tests.scenes import lights
+from tests.scenes.meshes import pose, shape_of
+from tests.scenes.solids import download4, float4, upload_surface
 
 HEIGHT, WIDTH = 44, 60
 CAMERA = CameraModel(width=WIDTH, height=HEIGHT, fx=60.0, fy=60.0, cx=29.5, cy=21.5)

@@ -15,8 +15,8 @@ from server.input import denoise
 from server.input.measure import Measurement
 from server.opencl.engine import Engine
 from tests.reference import denoise as twin
-from tests.tolerance import relative_tolerance
-from tests.volumes import vectors
+from tests.scenes.tolerance import relative_tolerance
+from tests.scenes.volumes import vectors
 
 SIZES = [(8, 8), (16, 9), (23, 41), (97, 71), (160, 130)]
 METHODS = ["bilateral", "tv_l1"]

@@ -26,14 +26,26 @@ from server.transfer.radiance_transfer import Directions, direction_sets
 from server.transfer.real_depth_views import RealDepthViews
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
-from tests import lights
-from tests.analytic import look_at, pixel_rays
 from tests.kernels.test_image_space import host_views
-from tests.lights import random_directions
-from tests.meshes import pose, shape_of
 from tests.reference import depth_views as twin
-from tests.solids import SCENES, Box, Scene, ball, box, fill_volume, float4, floor, hit, normal_at, upload_surface
-from tests.volumes import vectors
+from tests.scenes import lights
+from tests.scenes.analytic import look_at, pixel_rays
+from tests.scenes.lights import random_directions
+from tests.scenes.meshes import pose, shape_of
+from tests.scenes.solids import (
+    SCENES,
+    Box,
+    Scene,
+    ball,
+    box,
+    fill_volume,
+    float4,
+    floor,
+    hit,
+    normal_at,
+    upload_surface,
+)
+from tests.scenes.volumes import vectors
 
 VOXEL_M = 0.02
 ROOM_M = 1000.0

@@ -27,13 +27,13 @@ from server.shading.traced_scene import trace_scene, upload_light
 from server.transfer.indirect import Indirect
 from server.transfer.radiance_transfer import Directions, direction_sets, transfer_radiance
 from server.transfer.sample_grid import SampleGrid
-from tests import lights
-from tests.meshes import pose, shape_of
 from tests.reference import differential_rendering as twin
 from tests.reference import planes as planes_twin
 from tests.reference.sh import open_transfer, sh_basis
-from tests.solids import Ball, Box, Scene, ball, box, download4, fill_volume, float4, floor, hit, upload_surface
-from tests.tolerance import relative_tolerance
+from tests.scenes import lights
+from tests.scenes.meshes import pose, shape_of
+from tests.scenes.solids import Ball, Box, Scene, ball, box, download4, fill_volume, float4, floor, hit, upload_surface
+from tests.scenes.tolerance import relative_tolerance
 
 VOXEL_M = 0.01
 FAR_M = 1000.0

@@ -23,10 +23,10 @@ from server.tracking.exposure import (
     scene_radiance,
 )
 from server.volume.volume import Volume
-from tests.analytic import look, look_at, room, sphere
 from tests.reference import exposure as twin
-from tests.tolerance import relative_tolerance
-from tests.volumes import dense_colors, dense_voxels, fuse, upload_depth, upload_measurement, vectors
+from tests.scenes.analytic import look, look_at, room, sphere
+from tests.scenes.tolerance import relative_tolerance
+from tests.scenes.volumes import dense_colors, dense_voxels, fuse, upload_depth, upload_measurement, vectors
 
 Floats = NDArray[np.float64]
 

@@ -26,12 +26,12 @@ from server.transfer.image_space import ImageSpaceTransfer, near_distances, near
 from server.transfer.radiance_transfer import Directions, Transfer, direction_sets
 from server.volume.raycast import LABEL_DYNAMIC, LABEL_FILLED, LABEL_NONE, LABEL_STATIC, Surface
 from server.volume.volume import Volume
-from tests.analytic import look_at, pixel_rays
-from tests.lights import random_directions, unit
 from tests.reference import image_space as twin
-from tests.solids import SCENES, Scene, Solid, fill_volume, hit, normal_at, solid_voxels, upload_surface
-from tests.tolerance import relative_tolerance
-from tests.volumes import vectors
+from tests.scenes.analytic import look_at, pixel_rays
+from tests.scenes.lights import random_directions, unit
+from tests.scenes.solids import SCENES, Scene, Solid, fill_volume, hit, normal_at, solid_voxels, upload_surface
+from tests.scenes.tolerance import relative_tolerance
+from tests.scenes.volumes import vectors
 
 VOXEL_M = 0.02
 ROOM_M = 1000.0

@@ -18,11 +18,11 @@ from server.transfer.radiance_transfer import SETS, Directions, Transfer, direct
 from server.volume.brick_table import AWAY_SLOT
 from server.volume.raycast import Surface
 from server.volume.volume import BRICK, Volume
-from tests.analytic import Floats
 from tests.kernels.test_lanes import Narrow, Wide
-from tests.lights import random_directions
 from tests.reference import indirect as twin
-from tests.solids import (
+from tests.scenes.analytic import Floats
+from tests.scenes.lights import random_directions
+from tests.scenes.solids import (
     SCENES,
     SIDE_M,
     Scene,
@@ -35,7 +35,7 @@ from tests.solids import (
     solid_voxels,
     upload_surface,
 )
-from tests.volumes import fill, in_bricks
+from tests.scenes.volumes import fill, in_bricks
 
 VOXEL_M = 0.01
 ROOM_M = 1000.0

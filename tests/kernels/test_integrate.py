@@ -12,11 +12,11 @@ from protocol.frames import CameraModel
 from server.opencl.engine import Engine
 from server.volume.integrate import GREATEST_WEIGHT, integrate
 from server.volume.volume import Volume
-from tests.analytic import look, look_at, plane, room, sphere
 from tests.reference.integrate import integrate as twin
 from tests.reference.integrate import integrate_color, project, voxel_centers
-from tests.tolerance import relative_tolerance
-from tests.volumes import dense_colors, dense_voxels, fuse, upload_measurement
+from tests.scenes.analytic import look, look_at, plane, room, sphere
+from tests.scenes.tolerance import relative_tolerance
+from tests.scenes.volumes import dense_colors, dense_voxels, fuse, upload_measurement
 
 CAMERA = CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.313, cy=36.127)
 BOUNDS = (-1.0, -1.0, 0.0, 1.0, 1.0, 2.4)

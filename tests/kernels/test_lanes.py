@@ -10,8 +10,8 @@ from protocol.frames import CameraModel
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
-from tests.analytic import look, look_at, room, sphere
-from tests.volumes import cast, fuse
+from tests.scenes.analytic import look, look_at, room, sphere
+from tests.scenes.volumes import cast, fuse
 
 CAMERA = CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.313, cy=36.127)
 SCENE = [room((-0.9, -0.9, -0.3), (0.95, 0.9, 2.2)), sphere((0.1, 0.2, 1.2), 0.4)]

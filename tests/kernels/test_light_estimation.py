@@ -28,12 +28,12 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.transfer.radiance_transfer import Transfer
 from server.volume.raycast import LABEL_DYNAMIC, LABEL_NONE, LABEL_STATIC, Surface
-from tests import lights
-from tests.lights import degrees_between, random_directions
 from tests.reference import light_estimation as twin
 from tests.reference.sh import open_transfer
-from tests.solids import download4, float4
-from tests.tolerance import relative_tolerance
+from tests.scenes import lights
+from tests.scenes.lights import degrees_between, random_directions
+from tests.scenes.solids import download4, float4
+from tests.scenes.tolerance import relative_tolerance
 
 VOXEL_M = 0.01
 TOWARD = (0.4, 0.7, -0.5)

@@ -17,9 +17,9 @@ from server.maths.sh import LUMINANCE, spherical_fibonacci
 from server.opencl.engine import Engine
 from server.transfer.indirect import Indirect, mean_sent
 from server.transfer.radiance_transfer import direction_sets
-from tests.analytic import Floats
 from tests.kernels.test_cell_transfer import Samples
-from tests.lights import degrees_between
+from tests.scenes.analytic import Floats
+from tests.scenes.lights import degrees_between
 
 GRID = PoolGrid(2, 40, 50)
 TINT = np.array([1.0, 0.8, 0.6])

@@ -16,8 +16,8 @@ from server.input.measure import GREATEST_DEPTH_M, linear_values
 from server.input.measure import measure as measure_stage
 from server.opencl.engine import Engine
 from tests.reference import measure as twin
-from tests.tolerance import relative_tolerance
-from tests.volumes import vectors
+from tests.scenes.tolerance import relative_tolerance
+from tests.scenes.volumes import vectors
 
 PLAIN = CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.3, cy=36.1)
 BARREL = (-0.31, 0.12, 0.0011, -0.0007, -0.02)

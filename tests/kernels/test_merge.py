@@ -16,10 +16,10 @@ from server.geometry.merge import STILL_WEIGHT, TRUSTED_WEIGHT, merge_depth
 from server.opencl.engine import Engine
 from server.volume.raycast import LABEL_DYNAMIC, LABEL_FILLED, LABEL_NONE, LABEL_STATIC, Surface
 from server.volume.volume import Volume
-from tests.analytic import look, look_at, pixel_rays, plane, quantised, room, sphere
 from tests.reference import merge as twin
-from tests.tolerance import relative_tolerance
-from tests.volumes import fill, upload_measurement, vectors
+from tests.scenes.analytic import look, look_at, pixel_rays, plane, quantised, room, sphere
+from tests.scenes.tolerance import relative_tolerance
+from tests.scenes.volumes import fill, upload_measurement, vectors
 
 CAMERA = CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.313, cy=36.127)
 VOXEL_M = 0.05

@@ -26,10 +26,21 @@ from server.opencl.engine import Engine
 from server.transfer.radiance_transfer import direction_sets
 from server.volume.raycast import LABEL_DYNAMIC
 from tests.kernels.test_light_estimation import random_frame
-from tests.lights import random_directions
 from tests.reference import near_light as twin
-from tests.solids import SCENES, Scene, ball, distance, download4, fill_volume, float4, hit, points_on, upload_surface
-from tests.tolerance import relative_tolerance
+from tests.scenes.lights import random_directions
+from tests.scenes.solids import (
+    SCENES,
+    Scene,
+    ball,
+    distance,
+    download4,
+    fill_volume,
+    float4,
+    hit,
+    points_on,
+    upload_surface,
+)
+from tests.scenes.tolerance import relative_tolerance
 
 VOXEL_M = 0.01
 SOLID_M = 1.31 * VOXEL_M

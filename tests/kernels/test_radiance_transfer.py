@@ -14,11 +14,11 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.transfer.radiance_transfer import SETS, direction_sets, transfer_radiance
 from server.volume.volume import Volume
-from tests.lights import random_directions, unit
 from tests.reference import radiance_transfer as twin
 from tests.reference.sh import open_transfer
 from tests.reference.visibility import trace_volume
-from tests.solids import (
+from tests.scenes.lights import random_directions, unit
+from tests.scenes.solids import (
     SCENES,
     SIDE_M,
     HalfSpace,
@@ -31,8 +31,8 @@ from tests.solids import (
     solid_voxels,
     upload_surface,
 )
-from tests.tolerance import relative_tolerance
-from tests.volumes import fill
+from tests.scenes.tolerance import relative_tolerance
+from tests.scenes.volumes import fill
 
 VOXEL_M = 0.01
 ROOM_M = 1000.0

@@ -20,8 +20,8 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.scene.mesh import Mesh
 from tests.data import data_folder
-from tests.meshes import mesh_file, mesh_of, pose, public_mesh, shape_of, soup_of
 from tests.reference import rasterize as twin
+from tests.scenes.meshes import mesh_file, mesh_of, pose, public_mesh, shape_of, soup_of
 
 CAMERA = CameraModel(width=157, height=101, fx=120.0, fy=118.0, cx=80.3, cy=49.1)
 EYE = np.eye(4)

@@ -11,11 +11,11 @@ from protocol.frames import CameraModel
 from server.opencl.engine import Engine
 from server.volume.raycast import GREATEST_DEPTH_M
 from server.volume.volume import Volume
-from tests.analytic import Shape, Truth, look, look_at, pixel_rays, plane, quantised, room, sphere
 from tests.reference.integrate import voxel_centers
 from tests.reference.raycast import raycast as twin
 from tests.reference.raycast import trilinear
-from tests.volumes import cast, dense_voxels, fill, fuse
+from tests.scenes.analytic import Shape, Truth, look, look_at, pixel_rays, plane, quantised, room, sphere
+from tests.scenes.volumes import cast, dense_voxels, fill, fuse
 
 CAMERA = CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.313, cy=36.127)
 SMALL = CameraModel(width=51, height=37, fx=41.0, fy=42.0, cx=24.313, cy=18.627)

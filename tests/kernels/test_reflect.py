@@ -16,14 +16,14 @@ from server.shading.reflect import LEAST_GLOSS, is_glossy, reflect_surroundings
 from server.shading.traced_scene import trace_scene, upload_light
 from server.transfer.indirect import Indirect
 from server.transfer.radiance_transfer import direction_sets
-from tests import lights
-from tests.analytic import Floats
 from tests.kernels.test_indirect import paint
 from tests.kernels.test_indirect import shape_of as voxels_of
 from tests.kernels.test_lanes import Narrow, Wide
 from tests.reference import reflect as twin
-from tests.solids import Scene, box, download4, fill_volume, float4, floor
-from tests.tolerance import relative_tolerance
+from tests.scenes import lights
+from tests.scenes.analytic import Floats
+from tests.scenes.solids import Scene, box, download4, fill_volume, float4, floor
+from tests.scenes.tolerance import relative_tolerance
 
 VOXEL_M, ROOM_M = 0.01, 1000.0
 FAR_BELOW: Scene = (floor(-0.5),)

@@ -15,10 +15,20 @@ from protocol.frames import CameraModel, RgbdFrame
 from server.input.measure import GREATEST_DEPTH_M, measure
 from server.input.register import rays_of, register_depth
 from server.opencl.engine import Engine
-from tests.analytic import look, plane
-from tests.lenses import BALL, CAMERA, LENS, ROOM, WORLD_FROM_COLOR, is_seen_by_both, moved, opencv_rays, seen_by_depth
 from tests.reference import register as twin
-from tests.tolerance import relative_tolerance
+from tests.scenes.analytic import look, plane
+from tests.scenes.lenses import (
+    BALL,
+    CAMERA,
+    LENS,
+    ROOM,
+    WORLD_FROM_COLOR,
+    is_seen_by_both,
+    moved,
+    opencv_rays,
+    seen_by_depth,
+)
+from tests.scenes.tolerance import relative_tolerance
 
 FLIPS = 5e-3
 """Share of pixels that float32 may put on the other side of a triangle's edge."""

@@ -10,9 +10,9 @@ from server.maths import sh
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.opencl.program import KERNEL_FOLDER
-from tests.lights import random_directions, unit
 from tests.reference.sh import lambert_bands, sh_basis
-from tests.tolerance import relative_tolerance
+from tests.scenes.lights import random_directions, unit
+from tests.scenes.tolerance import relative_tolerance
 
 SOURCE = """
 #include "sh.clh"

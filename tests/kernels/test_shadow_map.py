@@ -39,15 +39,28 @@ from server.shading.virtual_point_lights import place_points
 from server.transfer.indirect import observe_indirect
 from server.transfer.radiance_transfer import Directions, direction_sets, transfer_radiance
 from server.transfer.sample_grid import SampleGrid
-from tests import lights
 from tests.kernels import test_reflect
 from tests.kernels.test_differential_rendering import camera_of, placed
 from tests.kernels.test_indirect import WALL as WALL_COLOR
 from tests.kernels.test_indirect import floor_beside_a_wall, wall_seen_from
 from tests.kernels.test_lanes import Narrow, Wide
 from tests.reference import shadow_map as twin
-from tests.solids import SIDE_M, Ball, Box, Scene, ball, box, download4, fill_volume, float4, floor, hit, upload_surface
-from tests.tolerance import relative_tolerance
+from tests.scenes import lights
+from tests.scenes.solids import (
+    SIDE_M,
+    Ball,
+    Box,
+    Scene,
+    ball,
+    box,
+    download4,
+    fill_volume,
+    float4,
+    floor,
+    hit,
+    upload_surface,
+)
+from tests.scenes.tolerance import relative_tolerance
 
 VOXEL_M, FAR_M = 0.01, 1000.0
 UP = np.array([0.0, 1.0, 0.0])

@@ -20,8 +20,8 @@ from server.scene.colors import linear_from_srgb
 from server.scene.materials import Beyond, Material, Texture
 from server.scene.mesh import Mesh
 from server.scene.mipmaps import CHANNEL_VALUES, decoded, encoded, material_tables, mip_chain, shrunk
-from tests.meshes import mesh_of, pose
 from tests.reference import textures as twin
+from tests.scenes.meshes import mesh_of, pose
 
 SOURCE = """
 #include "textures.clh"

@@ -14,12 +14,12 @@ from server.shading.traced_scene import upload_light
 from server.transfer.indirect import Indirect
 from server.transfer.radiance_transfer import Transfer, direction_sets
 from server.volume.volume import Volume
-from tests import lights
-from tests.analytic import Floats
 from tests.reference import tone_mapping as twin
 from tests.reference.sh import open_transfer
-from tests.solids import float4, upload_surface
-from tests.tolerance import relative_tolerance
+from tests.scenes import lights
+from tests.scenes.analytic import Floats
+from tests.scenes.solids import float4, upload_surface
+from tests.scenes.tolerance import relative_tolerance
 
 STRIDE, ROWS, COLS, RAYS = 2, 13, 17, 81
 LIGHT = lights.lobe_and_sky((0.3, 0.8, 0.4))

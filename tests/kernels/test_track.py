@@ -23,10 +23,10 @@ from server.tracking.track import (
 )
 from server.volume.raycast import Surface, raycast
 from server.volume.volume import Volume
-from tests.analytic import Floats, Shape, look, look_at, plane, room, sphere
 from tests.reference import track as twin
-from tests.tolerance import relative_tolerance
-from tests.volumes import fuse, upload_depth, vectors
+from tests.scenes.analytic import Floats, Shape, look, look_at, plane, room, sphere
+from tests.scenes.tolerance import relative_tolerance
+from tests.scenes.volumes import fuse, upload_depth, vectors
 
 CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
 BOUNDS = (-1.2, -1.0, -0.5, 1.2, 1.0, 2.1)

@@ -32,15 +32,27 @@ from server.shading.virtual_point_lights import place_points
 from server.transfer.indirect import Indirect, gather_hits, no_hits, observe_indirect
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
 from server.volume.raycast import LABEL_STATIC, Surface, raycast
-from tests import lights
-from tests.analytic import Floats, look_at
 from tests.kernels.test_differential_rendering import buffer, camera_of, floor_points
 from tests.kernels.test_indirect import paint
 from tests.kernels.test_indirect import shape_of as voxels_of
 from tests.kernels.test_lanes import Narrow, Wide
-from tests.meshes import pose, shape_of
-from tests.solids import SCENES, SIDE_M, Box, Scene, box, download4, fill_volume, float4, floor, hit, upload_surface
-from tests.tolerance import relative_tolerance
+from tests.scenes import lights
+from tests.scenes.analytic import Floats, look_at
+from tests.scenes.meshes import pose, shape_of
+from tests.scenes.solids import (
+    SCENES,
+    SIDE_M,
+    Box,
+    Scene,
+    box,
+    download4,
+    fill_volume,
+    float4,
+    floor,
+    hit,
+    upload_surface,
+)
+from tests.scenes.tolerance import relative_tolerance
 
 VOXEL_M, ROOM_M = 0.01, 1000.0
 FLOOR: Scene = (floor(),)

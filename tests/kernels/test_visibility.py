@@ -16,11 +16,11 @@ from server.transfer.visibility import trace_visibility
 from server.volume.brick_table import AWAY_SLOT
 from server.volume.volume import BRICK, Volume
 from tests.kernels.test_lanes import Narrow, Wide
-from tests.lights import random_directions
 from tests.reference import visibility as twin
 from tests.reference.radiance_transfer import direction_set
-from tests.solids import SCENES, SIDE_M, fill_volume, float4, points_on, solid_voxels, upload_surface
-from tests.volumes import fill, vectors
+from tests.scenes.lights import random_directions
+from tests.scenes.solids import SCENES, SIDE_M, fill_volume, float4, points_on, solid_voxels, upload_surface
+from tests.scenes.volumes import fill, vectors
 
 VOXEL_M = 0.01
 ROOM_M = 1000.0

@@ -10,8 +10,8 @@ from server.maths.direct_lights import LEAST_GAIN, LEAST_REST, split_light
 from server.maths.directional_fit import directional_sh
 from server.maths.dominant import dominant_lights
 from server.maths.sh import lambert_transfer, sh_basis
-from tests import lights
-from tests.lights import degrees_between, random_directions
+from tests.scenes import lights
+from tests.scenes.lights import degrees_between, random_directions
 
 Floats = NDArray[np.float64]
 TOWARD = lights.unit([[0.3, -0.8, 0.5], [-0.7, -0.6, -0.4]])

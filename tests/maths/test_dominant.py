@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from server.maths.directional_fit import directional_sh
 from server.maths.dominant import dominant_lights, radiance_intensity
 from server.maths.sh import LAMBERT_BANDS, band_of, dominant_direction, dominant_intensity, lambert_transfer
-from tests import lights
-from tests.lights import degrees_between, random_directions, unit
 from tests.reference.sh import sh_basis, sphere_rule
+from tests.scenes import lights
+from tests.scenes.lights import degrees_between, random_directions, unit
 
 Floats = NDArray[np.float64]
 

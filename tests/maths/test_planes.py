@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from server.maths.planes import CELL_M, STEPS_M, PlanePatch, find_planes
-from tests.analytic import Floats
 from tests.reference.planes import beyond
+from tests.scenes.analytic import Floats
 
 WALL, FLOOR = np.array([0.0, 0.0, -1.0]), np.array([0.0, -1.0, 0.0])
 

@@ -22,10 +22,10 @@ from server.evaluation.noise import plane_normals
 from server.evaluation.rooms import CAMERA as VGA
 from server.opencl.device import Device
 from server.volume.raycast import LABEL_DYNAMIC, LABEL_STATIC
-from tests.analytic import Shape, Truth, look, pixel_rays, sphere
 from tests.bench.hand import hand_volume
 from tests.data import data_folder
-from tests.rooms import BOUNDS, ROOM, VOXEL_M, view_at
+from tests.scenes.analytic import Shape, Truth, look, pixel_rays, sphere
+from tests.scenes.rooms import BOUNDS, ROOM, VOXEL_M, view_at
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]

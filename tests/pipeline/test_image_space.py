@@ -24,11 +24,11 @@ from server.transfer.sampling import PRESETS
 from server.volume.integrate import integrate
 from server.volume.raycast import LABEL_STATIC, Surface, raycast
 from server.volume.volume import Volume
-from tests.analytic import look_at, pixel_rays, plane, sphere
-from tests.lights import degrees_between, random_directions, uniform, unit
 from tests.pipeline.test_white_furnace import CAMERA, VIEWS
 from tests.pipeline.test_white_furnace import reconstruct as reconstruct_body
-from tests.solids import HalfSpace, ball, fill_volume, float4, normal_at, upload_surface
+from tests.scenes.analytic import look_at, pixel_rays, plane, sphere
+from tests.scenes.lights import degrees_between, random_directions, uniform, unit
+from tests.scenes.solids import HalfSpace, ball, fill_volume, float4, normal_at, upload_surface
 
 ROOM_M = 1000.0
 RAYS = direction_sets(81, 4)

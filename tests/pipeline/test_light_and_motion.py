@@ -17,7 +17,7 @@ from protocol.messages import Wishes
 from server.maths.sh import dominant_direction
 from server.opencl.device import Device
 from server.pipeline import Pipeline
-from tests.analytic import Floats, look, sphere
+from tests.scenes.analytic import Floats, look, sphere
 
 FRAMES, FIRST = 18, 13
 RED = (230, 25, 25)

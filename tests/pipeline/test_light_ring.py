@@ -16,7 +16,7 @@ from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Light, Wishes
 from server.opencl.device import Device
 from server.pipeline import Pipeline
-from tests.lights import degrees_between
+from tests.scenes.lights import degrees_between
 
 FRAMES = range(0, 90, 18)
 """Half of the path: 70 degrees around the table."""

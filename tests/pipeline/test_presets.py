@@ -25,7 +25,7 @@ from server.transfer.sampling import PRESETS, Sampling, TransferSampler
 from server.volume.integrate import integrate
 from server.volume.raycast import raycast
 from server.volume.volume import Volume
-from tests.meshes import shape_of
+from tests.scenes.meshes import shape_of
 
 SOURCE = "synthetic:table?light=1&frames=30&size=160x120"
 ROOM_M = 1000.0

@@ -18,8 +18,8 @@ from server.maths.sh import dominant_direction
 from server.opencl.device import Device
 from server.pipeline import Pipeline
 from server.shading.composite import srgb_codes
-from tests.analytic import Floats
-from tests.lights import degrees_between
+from tests.scenes.analytic import Floats
+from tests.scenes.lights import degrees_between
 
 BLACK = 0.12
 """Of what the rest sends back."""

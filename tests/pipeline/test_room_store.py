@@ -32,12 +32,12 @@ from server.service.saving.brick_files import merged, read_bricks, write_bricks
 from server.volume.integrate import integrate
 from server.volume.raycast import raycast
 from server.volume.volume import Volume
-from tests import corners
-from tests.analytic import Floats, look_at
-from tests.corners import FLOOR, WALL, corner_frame
-from tests.kept_rooms import BALL, CUBE, PLACE, client_of, print_of, scan, voxels_of
-from tests.lights import degrees_between, lobe_and_sky
-from tests.rooms import CAMERA, VOXEL_M, frame_at, view_at, wishes
+from tests.scenes import corners
+from tests.scenes.analytic import Floats, look_at
+from tests.scenes.corners import FLOOR, WALL, corner_frame
+from tests.scenes.kept_rooms import BALL, CUBE, PLACE, client_of, print_of, scan, voxels_of
+from tests.scenes.lights import degrees_between, lobe_and_sky
+from tests.scenes.rooms import CAMERA, VOXEL_M, frame_at, view_at, wishes
 
 TOWARDS = (0.5, 0.8, 0.0)
 LIGHT = 0.3 * lobe_and_sky(TOWARDS)

@@ -18,11 +18,11 @@ from server.maths.directional_fit import directional_sh
 from server.opencl.device import Device
 from server.pipeline import FrameResult, Pipeline
 from server.scene.placement import Placement
-from tests import lights
-from tests.analytic import look, look_at, plane
-from tests.meshes import shape_of
 from tests.reference.shadow_map import irradiance
-from tests.solids import Scene, box, hit
+from tests.scenes import lights
+from tests.scenes.analytic import look, look_at, plane
+from tests.scenes.meshes import shape_of
+from tests.scenes.solids import Scene, box, hit
 
 CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
 BOUNDS = (-0.8, -0.6, 0.5, 0.8, 0.4, 2.1)

@@ -13,10 +13,10 @@ from server.maths.sh import rotate_sh, webxr_from_world
 from server.opencl.device import Device
 from server.pipeline import FrameResult, Pipeline
 from server.scene.placement import Placement
-from tests import lights
-from tests.analytic import look, look_at, plane
-from tests.lights import degrees_between
-from tests.meshes import shape_of
+from tests.scenes import lights
+from tests.scenes.analytic import look, look_at, plane
+from tests.scenes.lights import degrees_between
+from tests.scenes.meshes import shape_of
 
 CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
 BOUNDS = (-0.8, -0.3, 0.5, 0.8, 0.4, 2.1)

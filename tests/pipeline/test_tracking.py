@@ -16,9 +16,9 @@ from server.geometry.geometry import Geometry
 from server.maths.registration import angle_between, distance_between, motion_of_twist
 from server.opencl.engine import Engine
 from server.pipeline import Pipeline
-from tests.analytic import Floats, plane
 from tests.data import data_folder
-from tests.rooms import BOUNDS, CAMERA, VOXEL_M, frame_at, view_at, wishes
+from tests.scenes.analytic import Floats, plane
+from tests.scenes.rooms import BOUNDS, CAMERA, VOXEL_M, frame_at, view_at, wishes
 
 Open = Callable[[str], Geometry]
 

@@ -11,7 +11,7 @@ from server.pipeline import Pipeline
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.service.warm_up import SHARP_LIGHT, warm_up
-from tests.rooms import CAMERA, frame_at, view_at, wishes
+from tests.scenes.rooms import CAMERA, frame_at, view_at, wishes
 
 
 @pytest.mark.parametrize(

@@ -34,10 +34,10 @@ from server.transfer.sampling import PRESETS
 from server.volume.integrate import integrate
 from server.volume.raycast import LABEL_STATIC, Surface, raycast
 from server.volume.volume import Volume
-from tests.analytic import Shape, look, look_at, plane, sphere
-from tests.lights import random_directions, uniform
-from tests.meshes import shape_of
-from tests.solids import HalfSpace, ball, fill_volume, points_on, upload_surface
+from tests.scenes.analytic import Shape, look, look_at, plane, sphere
+from tests.scenes.lights import random_directions, uniform
+from tests.scenes.meshes import shape_of
+from tests.scenes.solids import HalfSpace, ball, fill_volume, points_on, upload_surface
 
 STRIDES = {name: PRESETS[name].stride for name in ("rm", "reg4", "reg8")}
 """Presets that differ in what one frame traces; the others add what earlier frames found."""

@@ -17,7 +17,7 @@ from server.volume.raycast import Surface, raycast
 from server.volume.volume import Volume
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial
 from tests.hard_cases.test_bad_depth import BOUNDS, CAMERA, frame_of, good_depth
-from tests.volumes import vectors
+from tests.scenes.volumes import vectors
 
 GROUPS = Family("work-groups")
 _VOXEL_M = 0.06

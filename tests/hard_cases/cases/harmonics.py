@@ -12,9 +12,9 @@ from server.opencl.program import KERNEL_FOLDER
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial
 from tests.kernels.test_composite import NONE_TAKEN, WALL, buffer, camera_picture, compose, plane
 from tests.kernels.test_sh import AXES, NEAR_POLES, SOURCE
-from tests.lights import random_directions, unit
 from tests.reference.composite import srgb_codes
 from tests.reference.sh import open_transfer, sh_basis
+from tests.scenes.lights import random_directions, unit
 
 HARMONICS = Family("spherical harmonics")
 _SUN = unit([0.3, -0.8, -0.5])

@@ -6,7 +6,6 @@ import numpy as np
 
 from server.objects.rasterize import NEAR_M
 from server.shading.tone_mapping import AverageMemory, Averages
-from tests import lights
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial, share_beyond
 from tests.kernels import test_rasterize
 from tests.kernels.test_composite import LIGHT as COMPOSITE_LIGHT
@@ -21,11 +20,12 @@ from tests.kernels.test_composite import (
 from tests.kernels.test_differential_rendering import LIGHT, PLATE, shade_floor
 from tests.kernels.test_rasterize import EXACT, EYE, FLIPS, SOUPS, at_pixels, draw, random_soup, triangulated_grid
 from tests.kernels.test_tone_mapping import Case as ToneCase
-from tests.meshes import pose, soup_of
 from tests.reference import rasterize as raster_twin
 from tests.reference.composite import srgb_codes
 from tests.reference.sh import open_transfer
-from tests.solids import box
+from tests.scenes import lights
+from tests.scenes.meshes import pose, soup_of
+from tests.scenes.solids import box
 
 SHADOWS, RASTER = Family("differential rendering"), Family("rasteriser")
 

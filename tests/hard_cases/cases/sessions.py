@@ -15,7 +15,6 @@ from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
 from server.pipeline import FrameResult, Pipeline
 from server.scene.placement import Placement
-from tests.analytic import look_at
 from tests.hard_cases.catalogue import Family, Found, Trial, share_beyond
 from tests.hard_cases.test_bad_depth import (
     BAD_DEPTH,
@@ -27,8 +26,9 @@ from tests.hard_cases.test_bad_depth import (
     frame_of,
     good_depth,
 )
-from tests.lights import unit
-from tests.meshes import soup_of
+from tests.scenes.analytic import look_at
+from tests.scenes.lights import unit
+from tests.scenes.meshes import soup_of
 
 SESSIONS = Family("sessions")
 _TABLE = "synthetic:table?light=1&frames=12&size=160x120"

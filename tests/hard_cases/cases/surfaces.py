@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from server.light.near_light import Emitters
 from server.volume.integrate import GREATEST_WEIGHT, integrate
 from server.volume.volume import Volume
-from tests.analytic import look, look_at
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial, share_beyond
 from tests.kernels import test_raycast
 from tests.kernels.test_integrate import CAMERA
@@ -16,8 +15,9 @@ from tests.kernels.test_near_light import samples_of
 from tests.kernels.test_radiance_transfer import trace
 from tests.reference.integrate import voxel_centers
 from tests.reference.sh import open_transfer
-from tests.solids import SCENES, fill_volume, normal_at
-from tests.volumes import cast, dense_voxels, fill, fuse, upload_measurement
+from tests.scenes.analytic import look, look_at
+from tests.scenes.solids import SCENES, fill_volume, normal_at
+from tests.scenes.volumes import cast, dense_voxels, fill, fuse, upload_measurement
 
 TRANSFER, VOLUME = Family("transfer"), Family("volume")
 VOXEL_M = 0.01

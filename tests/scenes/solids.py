@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from server.opencl.engine import Engine
 from server.volume.raycast import LABEL_NONE, LABEL_STATIC, Surface
 from server.volume.volume import BRICK, Volume
-from tests.volumes import fill, vectors
+from tests.scenes.volumes import fill, vectors
 
 Floats = NDArray[np.float64]
 

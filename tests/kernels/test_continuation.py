@@ -37,9 +37,9 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import Pipeline
 from tests.data import data_folder
-from tests.maths.test_planes import FLOOR, WALL, corner
 from tests.reference.planes import beyond, looked_through
 from tests.scenes.analytic import Floats
+from tests.scenes.plane_patches import FLOOR, WALL, corner
 
 CAMERA = CameraModel(width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
 

@@ -26,10 +26,10 @@ from server.transfer.radiance_transfer import Directions, direction_sets
 from server.transfer.real_depth_views import RealDepthViews
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
-from tests.kernels.test_image_space import host_views
 from tests.reference import depth_views as twin
 from tests.scenes import lights
 from tests.scenes.analytic import look_at, pixel_rays
+from tests.scenes.depth_view_scene import host_views
 from tests.scenes.lights import random_directions
 from tests.scenes.meshes import pose, shape_of
 from tests.scenes.solids import (

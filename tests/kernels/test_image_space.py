@@ -28,6 +28,7 @@ from server.volume.raycast import LABEL_DYNAMIC, LABEL_FILLED, LABEL_NONE, LABEL
 from server.volume.volume import Volume
 from tests.reference import image_space as twin
 from tests.scenes.analytic import look_at, pixel_rays
+from tests.scenes.depth_view_scene import host_views
 from tests.scenes.lights import random_directions, unit
 from tests.scenes.solids import SCENES, Scene, Solid, fill_volume, hit, normal_at, solid_voxels, upload_surface
 from tests.scenes.tolerance import relative_tolerance
@@ -75,13 +76,6 @@ def look(engine: Engine, scene: Scene, holes: float = 0.0, hand: Solid | None = 
     known = tuple(solid for solid in scene if solid is not hand)
     host = [vectors(engine.download(a)).astype(np.float64) for a in (surface.positions, surface.normals)]
     return Looked(fill_volume(engine, known, VOXEL_M), surface, *host, labels)
-
-
-def host_views(engine: Engine, views: AuxiliaryViews) -> twin.Views:
-    drawn = len(views.toward)
-    axes = vectors(engine.download(views.axes)[:drawn]).astype(np.float64)[..., :3]
-    depths = engine.download(views.depths)[:drawn].astype(np.float64)
-    return twin.Views(axes, depths, views.center, views.distance_m, views.per_pixel)
 
 
 def visible_bits(engine: Engine, transfer: Transfer, count: int) -> NDArray[np.bool_]:

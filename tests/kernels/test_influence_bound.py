@@ -17,11 +17,11 @@ from server.shading.traced_scene import DeviceLight, trace_scene, upload_light
 from server.transfer.indirect import Indirect
 from server.transfer.radiance_transfer import Transfer, direction_sets, own_sets
 from server.volume.volume import Volume
-from tests.kernels.test_differential_rendering import placed
 from tests.reference import influence_bound as twin
 from tests.reference.sh import open_transfer
 from tests.scenes import lights
 from tests.scenes.analytic import Floats
+from tests.scenes.shaded_floor import placed
 from tests.scenes.solids import box, download4, float4, upload_surface
 from tests.scenes.tolerance import relative_tolerance
 

@@ -15,10 +15,10 @@ from server.volume.volume import Volume
 from tests.reference.integrate import integrate as twin
 from tests.reference.integrate import integrate_color, project, voxel_centers
 from tests.scenes.analytic import look, look_at, plane, room, sphere
+from tests.scenes.fused_scenes import CAMERA
 from tests.scenes.tolerance import relative_tolerance
 from tests.scenes.volumes import dense_colors, dense_voxels, fuse, upload_measurement
 
-CAMERA = CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.313, cy=36.127)
 BOUNDS = (-1.0, -1.0, 0.0, 1.0, 1.0, 2.4)
 VOXEL_M = 0.04
 SCENE = [room((-0.9, -0.9, -0.3), (0.95, 0.9, 2.2)), sphere((0.1, 0.2, 1.2), 0.4)]

@@ -12,11 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from server.effects import functions as effects
 from server.effects.functions import View, add_objects
-from server.light.continuation import NO_PLANES, Continuation, PlaneArrays
+from server.light.continuation import NO_PLANES, PlaneArrays
 from server.maths.direct_lights import DirectLight, SplitLight, split_light
 from server.maths.directional_fit import directional_sh
 from server.maths.disc_places import disc_places, ray_places, search_places
-from server.maths.planes import PlanePatch
 from server.objects.rasterize import VirtualSurface
 from server.opencl.device import Device
 from server.opencl.engine import Engine
@@ -39,13 +38,13 @@ from server.shading.virtual_point_lights import place_points
 from server.transfer.indirect import observe_indirect
 from server.transfer.radiance_transfer import Directions, direction_sets, transfer_radiance
 from server.transfer.sample_grid import SampleGrid
-from tests.kernels import test_reflect
-from tests.kernels.test_differential_rendering import camera_of, placed
-from tests.kernels.test_indirect import WALL as WALL_COLOR
-from tests.kernels.test_indirect import floor_beside_a_wall, wall_seen_from
-from tests.kernels.test_lanes import Narrow, Wide
 from tests.reference import shadow_map as twin
-from tests.scenes import lights
+from tests.scenes import glossy_surface, lights
+from tests.scenes.lanes import KINDS, Narrow, Wide
+from tests.scenes.painted_walls import WALL as WALL_COLOR
+from tests.scenes.painted_walls import floor_beside_a_wall, wall_seen_from
+from tests.scenes.plane_patches import continued_wall
+from tests.scenes.shaded_floor import camera_of, placed
 from tests.scenes.solids import (
     SIDE_M,
     Ball,
@@ -69,7 +68,6 @@ FLOOR: Scene = (floor(FLOOR_Y),)
 CRATE = box((0.38, 0.1, 0.4), (0.54, 0.26, 0.52))
 TOWARD = lights.unit((0.5, 0.8, 0.15))
 BEHIND = lights.unit((-0.3, 0.6, 0.6))
-KINDS = pytest.mark.parametrize("kind", [Narrow, Wide])
 
 Floats = NDArray[np.float64]
 
@@ -334,17 +332,7 @@ def test_real_surface_that_a_virtual_one_touches_does_not_hide_the_disc(engine: 
 
 def test_a_plane_that_goes_on_hides_the_disc(engine: Engine) -> None:
     """As the wall would that it is taken to be, of which the volume knows nothing."""
-    patch = PlanePatch(
-        normal=np.array([1.0, 0, 0]),
-        offset_m=0.9,
-        across=np.array([0.0, 0, 1]),
-        along=np.array([0.0, 1, 0]),
-        corner=np.zeros(2),
-        empty=np.zeros((40, 40), np.bool_),
-        seen=np.array([[0.0, 0], [0.8, 0.8]]),
-    )
-    continuation = Continuation()
-    continuation.planes, continuation._boxes = [patch], [patch.box]
+    continuation = continued_wall(0.9)
     light = disc(6.0, (1.0, 0.5, 0.0))
     points = floor_points(200) - [0.1, 0, 0]
     hidden, past = lit(engine, light, planes=continuation.arrays()).floor(points)
@@ -511,9 +499,9 @@ def test_mirrors_show_all_of_the_light(engine: Engine) -> None:
     def split_upload(engine: Engine, sh: Floats, rays: Directions, **rest: Any) -> DeviceLight:
         return take_discs(engine, upload_light(engine, sh, rays, **rest), split_light(sh), rays)
 
-    whole, _ = test_reflect.reflect(engine, *test_reflect.surfaces(), light=light)
-    with patch.object(test_reflect, "upload_light", split_upload):
-        split, _ = test_reflect.reflect(engine, *test_reflect.surfaces(), light=light)
+    whole, _ = glossy_surface.reflect(engine, *glossy_surface.surfaces(), light=light)
+    with patch.object(glossy_surface, "upload_light", split_upload):
+        split, _ = glossy_surface.reflect(engine, *glossy_surface.surfaces(), light=light)
     np.testing.assert_array_equal(split, whole)
     assert split.max() > 0.5
 

@@ -24,9 +24,9 @@ from server.transfer.sampling import PRESETS
 from server.volume.integrate import integrate
 from server.volume.raycast import LABEL_STATIC, Surface, raycast
 from server.volume.volume import Volume
-from tests.pipeline.test_white_furnace import CAMERA, VIEWS
-from tests.pipeline.test_white_furnace import reconstruct as reconstruct_body
 from tests.scenes.analytic import look_at, pixel_rays, plane, sphere
+from tests.scenes.furnace import CAMERA, VIEWS
+from tests.scenes.furnace import reconstruct as reconstruct_body
 from tests.scenes.lights import degrees_between, random_directions, uniform, unit
 from tests.scenes.solids import HalfSpace, ball, fill_volume, float4, normal_at, upload_surface
 

@@ -16,8 +16,8 @@ from server.maths.sh import LUMINANCE
 from server.opencl.device import Device
 from server.pipeline import FrameResult, Pipeline
 from server.scene.placement import Placement
-from tests.pipeline.test_static_light import BOUNDS, CAMERA, POLE_M, frame
 from tests.scenes import lights
+from tests.scenes.lit_pole import BOUNDS, CAMERA, POLE_M, frame
 from tests.scenes.meshes import shape_of
 
 LIGHT = 0.3 * lights.lobe_and_sky((0.5, -0.8, -0.3))

@@ -17,8 +17,7 @@ from server.volume.brick_table import AWAY_SLOT, BRICK
 from server.volume.integrate import integrate
 from server.volume.raycast import raycast
 from server.volume.volume import Volume
-
-Floats = NDArray[np.float64]
+from tests.scenes.analytic import Floats
 
 
 def vectors(array: NDArray[Any]) -> NDArray[np.float32]:

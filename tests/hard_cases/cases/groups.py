@@ -16,7 +16,7 @@ from server.volume.integrate import integrate
 from server.volume.raycast import Surface, raycast
 from server.volume.volume import Volume
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial
-from tests.hard_cases.test_bad_depth import BOUNDS, CAMERA, frame_of, good_depth
+from tests.scenes.bad_depth import BOUNDS, CAMERA, frame_of, good_depth
 from tests.scenes.volumes import vectors
 
 GROUPS = Family("work-groups")

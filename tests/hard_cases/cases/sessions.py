@@ -16,17 +16,8 @@ from protocol.messages import Wishes
 from server.pipeline import FrameResult, Pipeline
 from server.scene.placement import Placement
 from tests.hard_cases.catalogue import Family, Found, Trial, share_beyond
-from tests.hard_cases.test_bad_depth import (
-    BAD_DEPTH,
-    CAMERA,
-    PYRAMID,
-    SIZE,
-    WISHES,
-    assert_sound,
-    frame_of,
-    good_depth,
-)
 from tests.scenes.analytic import look_at
+from tests.scenes.bad_depth import BAD_DEPTH, CAMERA, PYRAMID, SIZE, WISHES, assert_sound, frame_of, good_depth
 from tests.scenes.lights import unit
 from tests.scenes.meshes import soup_of
 

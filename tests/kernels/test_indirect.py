@@ -68,9 +68,9 @@ class Case:
 
     def __init__(self, engine: Engine, name: str, rows: int, rays: Directions) -> None:
         """`name`: of a scene, or "scattered": solid voxel by voxel, samples anywhere."""
-        random, count = np.random.default_rng(16), 16 * rows
+        random, count = np.random.default_rng(15), 16 * rows
         if name == "scattered":
-            self.volume, self.solid = scattered(engine, 0.005, VOXEL_M)
+            self.volume, self.solid = scattered(engine, 0.005, VOXEL_M, random)
             points, normals = random.uniform(0.0, SIDE_M, (count, 3)), random_directions(count, 16)
         else:
             self.volume = fill_volume(engine, SCENES[name], VOXEL_M)

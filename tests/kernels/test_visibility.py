@@ -83,7 +83,7 @@ def assert_boxes(
 @pytest.mark.parametrize("share", [0.0, 0.0003, 0.01])
 @pytest.mark.parametrize("reach", [0.5, 3.7, 12.8, 16.0])
 def test_boxes_of_scattered_voxels_are_the_twins(device: Device, engine: Engine, share: float, reach: float) -> None:
-    volume, solid = scattered(engine, share, VOXEL_M)
+    volume, solid = scattered(engine, share, VOXEL_M, np.random.default_rng(15))
     normals = random_directions(60, 4)
     normals[:6] = np.concatenate([np.eye(3), -np.eye(3)])
     normals[6:12] = normals[:6] - 1e-10  # as good as along an axis, and falling along the others
@@ -98,7 +98,7 @@ def test_boxes_of_scattered_voxels_are_the_twins(device: Device, engine: Engine,
 
 def released(engine: Engine) -> tuple[Volume, Bools]:
     """Scattered voxels whose bricks are all away, and what is known of them: cells of 2x2x2 voxels, [z, y, x]."""
-    volume, solid = scattered(engine, 0.0003, VOXEL_M)
+    volume, solid = scattered(engine, 0.0003, VOXEL_M, np.random.default_rng(15))
     volume.slots_device.set(np.full_like(engine.download(volume.slots_device), AWAY_SLOT), engine.queue)
     cells = solid.reshape(*(n for size in solid.shape for n in (size // 2, 2))).any((1, 3, 5))
     return volume, cells.repeat(2, 0).repeat(2, 1).repeat(2, 2)
@@ -139,7 +139,7 @@ def visibility_of(
 def test_rays_are_the_twins(device: Device, kind: type[Engine], name: str, reach_m: float, rays: int) -> None:
     engine = kind(device)
     if name == "scattered":
-        volume, solid = scattered(engine, 0.0005, VOXEL_M)
+        volume, solid = scattered(engine, 0.0005, VOXEL_M, np.random.default_rng(15))
         points, normals = np.random.default_rng(6).uniform(-0.1, 1.06, (512, 3)), random_directions(512, 16)
     else:
         volume = fill_volume(engine, SCENES[name], VOXEL_M)
@@ -176,7 +176,7 @@ def test_rays_meet_cells_of_released_bricks(device: Device, kind: type[Engine]) 
 
 def test_rays_without_length_are_free(engine: Engine) -> None:
     """Even where they begin in a solid voxel."""
-    volume, _ = scattered(engine, 0.5, VOXEL_M)
+    volume, _ = scattered(engine, 0.5, VOXEL_M, np.random.default_rng(15))
     points = np.random.default_rng(7).uniform(0, SIDE_M, (64, 3))
     free, blocked, _, _ = visibility_of(engine, volume, points, random_directions(64, 8), 81, 0.0)
     assert not blocked.any()

@@ -195,10 +195,12 @@ def solid_voxels(scene: Scene, volume: Volume) -> NDArray[np.bool_]:
     return (signed_m < 0) & (signed_m > -volume.truncation_m)
 
 
-def scattered(engine: Engine, share: float, voxel_m: float) -> tuple[Volume, NDArray[np.bool_]]:
+def scattered(
+    engine: Engine, share: float, voxel_m: float, random: np.random.Generator
+) -> tuple[Volume, NDArray[np.bool_]]:
     """A volume in which a share of the voxels is solid, each alone and at random: [z, y, x] which."""
     volume = Volume(engine, (0.0, 0.0, 0.0, SIDE_M, SIDE_M, SIDE_M), voxel_m)
-    solid = np.random.default_rng(15).random([BRICK * n for n in volume.bricks[::-1]]) < share
+    solid = random.random([BRICK * n for n in volume.bricks[::-1]]) < share
     fill(engine, volume, np.where(solid, -0.5, 1.0), np.ones(solid.shape))
     return volume, solid
 

@@ -8,13 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
-from server.geometry.merge import merge_depth
-from server.input.measure import measure
 from server.opencl.engine import Engine
-from server.volume.integrate import integrate
-from server.volume.raycast import Surface, raycast
+from server.volume.raycast import Surface
 from server.volume.volume import Volume
 from tests.scenes.analytic import Shape, look, look_at
+from tests.scenes.volumes import fuse_frame, merged_surface
 
 CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
 BOUNDS = (-0.8, -0.8, 0.5, 0.8, 0.8, 2.1)
@@ -33,11 +31,5 @@ def reconstruct(engine: Engine, body: Shape) -> tuple[Volume, Surface]:
     volume = Volume(engine, BOUNDS, VOXEL_M)
     grey = np.full((CAMERA.height, CAMERA.width, 3), 188, np.uint8)
     for frame in frames(body, grey):
-        assert frame.world_from_camera is not None
-        pose = volume.volume_from_world() @ frame.world_from_camera
-        measured = measure(engine, CAMERA, frame)
-        volume.allocate(CAMERA, pose, measured.depth_m)
-        integrate(engine, volume, CAMERA, pose, measured)
-        model = raycast(engine, CAMERA, pose, volume)
-        surface = merge_depth(engine, CAMERA, pose, measured, model, volume)
-    return volume, surface
+        pose, measured = fuse_frame(engine, volume, CAMERA, frame)
+    return volume, merged_surface(engine, volume, CAMERA, pose, measured)

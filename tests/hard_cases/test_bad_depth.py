@@ -97,8 +97,9 @@ def test_bad_depth_in_between(open_pipeline: Open, name: str) -> None:
         assert_sound(results[-1])
     if name in ("empty", "saturated", "beyond 10 m", "one pixel"):
         bad, good = (np.array(result.light.dominant_direction) for result in results)
-        assert np.degrees(np.arccos(np.clip(bad @ good, -1, 1))) < 15  # seen: 11
-        assert (np.abs(results[0].color.astype(int) - results[1].color) > 8).mean() < 0.02
+        # Three frames from the side are in the one light and not in the other. Seen: 10.1.
+        assert np.degrees(np.arccos(np.clip(bad @ good, -1, 1))) < 11
+        assert (np.abs(results[0].color.astype(int) - results[1].color) > 8).mean() < 0.001  # seen: 0.0003
 
 
 @pytest.mark.parametrize("name", ["empty", "saturated", "beyond 10 m"])

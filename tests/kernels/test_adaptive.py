@@ -79,7 +79,7 @@ def test_real_surface_loses_what_samples_at_every_pixel_lose(engine: Engine) -> 
     for y, x in np.argwhere(listed)[::23]:
         mean = upsample(Samples(1, shaded), surface, int(x), int(y), VOXEL_M)[:3]
         expected = (1 - ratio[y, x, :3]) * shaded[y, x, :3]
-        np.testing.assert_allclose((1 - refined[y, x, :3]) * mean, expected, atol=2e-3)
+        np.testing.assert_allclose((1 - refined[y, x, :3]) * mean, expected, atol=1e-5)  # seen: 1e-7, rounding
 
 
 def test_refined_rims_are_nearer_to_every_pixel(engine: Engine) -> None:
@@ -146,7 +146,7 @@ def test_subsets_of_directions_are_the_whole_on_average(engine: Engine) -> None:
     apart = (some - every)[listed][:, :3]
     assert listed.sum() > 100
     assert 0.001 < np.sqrt((apart**2).mean()) < 0.06
-    assert np.abs(apart.mean(axis=0)).max() < 0.01
+    assert np.abs(apart.mean(axis=0)).max() < 0.002  # seen: 0.0005
 
 
 @pytest.mark.parametrize("stride", [1, 4, 8])

@@ -223,7 +223,7 @@ def test_shading_is_the_twins_wherever_objects_are(device: Device, engine: Engin
         )
     assert 0.02 < (1 - openness).min() < 0.2 < (1 - openness).max()
     close = np.abs(found[..., :3] - expected).max(axis=-1) < 20 * relative_tolerance(device) * expected.max()
-    assert close.mean() > 0.98  # a direction that meets the plane's border just so counts or not
+    assert close.mean() > 0.99  # seen: all; a direction that meets the plane's border just so counts or not
 
 
 # ---- shadows on virtual surfaces ---------------------------------------------------------------------------------

@@ -101,7 +101,7 @@ def test_views_see_the_first_solid_voxel(engine: Engine, name: str) -> None:
         # Steps of less than a voxel miss corners that a line only clips, and go on to what is behind.
         assert (found[expected == 0] == 0).all()
         agree = np.abs(found - expected) < 0.05 * VOXEL_M
-        assert agree.mean() > 0.97
+        assert agree.mean() > 0.99  # seen: all
         assert (found - expected)[~agree & (found > 0)].min(initial=0) > -1e-3
         assert (found > 0).mean() > 0.05
 
@@ -124,7 +124,7 @@ def test_transfer_is_the_twins(
     # Where a position falls on the brink of a pixel, float32 may take the other one: one direction of a sample differs.
     tolerance = 20 * relative_tolerance(device)
     agree = (np.abs(found - transfer) < tolerance).all(-1)
-    assert agree.mean() > 0.95
+    assert agree.mean() > 0.99  # seen: all
     assert np.abs(found - transfer).max() < 0.05
     np.testing.assert_allclose(engine.download(result.openness)[agree], openness[agree], atol=tolerance)
     clear = np.abs(visible - 0.5) > 1e-3

@@ -130,7 +130,8 @@ def test_each_ray_meets_the_twins_voxel(device: Device, kind: type[Engine], name
     met = expected[..., 3] > 0
     assert met.sum() > 30
     assert not met.all()
-    assert same[~met].mean() > 0.98  # steps go a hundredth of a voxel beyond what is empty and miss clipped corners
+    # Steps go a hundredth of a voxel beyond what is empty and miss clipped corners. Seen: 0.998.
+    assert same[~met].mean() > 0.99
     assert same[met].mean() > 0.93
     engine.close()
 
@@ -183,7 +184,7 @@ def test_a_wall_sends_its_colour_to_the_floor(
     pools = window.pool(0, grid, surface, camera, transfer, rays, observed, Indirect(hits, np.zeros(3)), VOXEL_M)
     sent = np.average(pools.sent, axis=0, weights=pools.weights)
     np.testing.assert_allclose(sent, shape * np.array(WALL), rtol=0.1)
-    assert np.average(pools.unseen, weights=pools.weights) < (0.01 if every == 1 else 0.06)  # of all that is hidden
+    assert np.average(pools.unseen, weights=pools.weights) < 0.005  # of all that is hidden; seen: 0.0017
     engine.close()
 
 
@@ -210,7 +211,7 @@ def test_what_has_no_colour_is_not_seen(device: Device, kind: type[Engine]) -> N
         sent.append(np.average(pools.sent, axis=0, weights=pools.weights))
         unseen.append(np.average(pools.unseen, weights=pools.weights))
     hidden = wall_seen_from(0.21, SIDE_M, SIDE_M - 0.1)
-    assert unseen[0] < 0.01
+    assert unseen[0] < 1e-4  # seen: 1e-6
     assert unseen[1] == pytest.approx(hidden / 2, rel=0.1)
     np.testing.assert_allclose(sent[1], sent[0] / 2 + 9.0 * hidden / 2, rtol=0.1)
     engine.close()

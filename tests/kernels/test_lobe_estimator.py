@@ -35,7 +35,7 @@ def test_a_coloured_light_is_found(engine: Engine) -> None:
     view, light = View.of(), sun()
     estimate = Run(engine, 4).add(view, view.under(light))
     true = cells_to_sh(4) @ light
-    assert error_deg(estimate.sh, light) < 0.5
+    assert error_deg(estimate.sh, light) < 0.1  # seen: 0.01, of noise of a percent
     np.testing.assert_allclose(estimate.sh[:4], true[:4], atol=0.01 * np.abs(true).max())
     assert estimate.valid
     assert estimate.std is not None
@@ -73,9 +73,9 @@ def test_pools_that_do_not_fit_do_not_turn_the_light(engine: Engine) -> None:
     for outliers in (True, False):
         model = LightModel(albedos=False, outliers=outliers)
         errors[outliers] = error_deg(Run(engine, 4, model).add(view, pools).sh, light)
-    assert errors[True] < 1.0
+    assert errors[True] < 1.0  # seen: 0.66
     assert errors[False] > 5.0
-    assert error_deg(Run(engine, 4).add(view, pools).sh, light) < 1.0
+    assert error_deg(Run(engine, 4).add(view, pools).sh, light) < 0.2  # seen: 0.05 at most
 
 
 # ---- albedos -----------------------------------------------------------------------------------------------------
@@ -87,7 +87,7 @@ def test_black_and_white_surfaces_do_not_turn_the_light(engine: Engine, dark: fl
     light, (view, black) = sun(), halves(0, 0.65, dark, bright)
     pools = view.under(light)
     run, constant = Run(engine, 4), Run(engine, 4, CONSTANT)
-    assert error_deg(run.add(view, pools).sh, light) < 1.0
+    assert error_deg(run.add(view, pools).sh, light) < 0.2  # seen: 0.05 at most
     assert error_deg(constant.add(view, pools).sh, light) > 5.0
     found = run.lightness[~black].mean() / run.lightness[black].mean()
     assert found == pytest.approx(bright / dark, rel=0.15)
@@ -101,7 +101,7 @@ def test_chequered_surface_of_one_colour_is_told_apart_by_lightness(engine: Engi
     tile = np.random.default_rng(3).integers(0, len(levels), GRID.count)
     view.albedo = np.array(levels)[tile][:, None] * np.array([1.0, 0.7, 0.4])
     pools, run = view.under(light), Run(engine, 4)
-    assert error_deg(run.add(view, pools).sh, light) < 1.0
+    assert error_deg(run.add(view, pools).sh, light) < 0.2  # seen: 0.05 at most
     assert run.materials == len(levels)
     found = np.array([run.lightness[tile == k].mean() for k in range(len(levels))])
     np.testing.assert_allclose(found / found[0], np.array(levels) / levels[0], rtol=0.05)
@@ -147,7 +147,7 @@ def test_coloured_light_on_white_surfaces_stays_coloured(engine: Engine) -> None
     found = Run(engine, 4).add(view, view.under(light)).sh
     true = cells_to_sh(4) @ light
     np.testing.assert_allclose(found[:4], true[:4], atol=0.02 * true[0].max())
-    assert error_deg(found, light) < 1.0
+    assert error_deg(found, light) < 0.1  # seen: 0.013
     redder = [sh[3, 0] - sh[3, 2] for sh in (found, true)]
     assert redder[0] == pytest.approx(redder[1], rel=0.3)
 
@@ -174,8 +174,9 @@ def test_light_that_surfaces_send_tells_the_mean_albedo(engine: Engine, albedo: 
     pools, run = view.under(light), Run(engine, 4)
     estimate = run.add(view, pools)
     assert run.mean_albedo == pytest.approx(albedo, abs=0.1)
-    assert error_deg(estimate.sh, light) < 3.0
-    np.testing.assert_allclose(estimate.sh[0], (cells_to_sh(4) @ light)[0], rtol=0.3)
+    assert error_deg(estimate.sh, light) < 0.3  # seen: 0.08
+    # The albedo is known to 0.1. Seen: 0.027.
+    np.testing.assert_allclose(estimate.sh[0], (cells_to_sh(4) @ light)[0], rtol=0.1)
     left_out = Run(engine, 4).add(view, replace(pools, sent=np.zeros_like(pools.sent)))
     assert error_deg(left_out.sh, light) > 4.0
 
@@ -191,7 +192,7 @@ def test_light_that_surfaces_send_each_other_is_explained(engine: Engine, albedo
         view.sent = hidden * (view.albedo * (view.transfer @ light + view.sent))[met].mean(axis=1)
     pools, run = view.under(light), Run(engine, 4)
     estimate = run.add(view, pools)
-    assert error_deg(estimate.sh, light) < 3.0
+    assert error_deg(estimate.sh, light) < 0.3  # seen: 0.08
     share = (run.mean_albedo - ASSUMED_ALBEDO) / (albedo - ASSUMED_ALBEDO)
     assert 0.25 < share < 1.1
 
@@ -208,7 +209,7 @@ def test_a_light_that_jumps_is_followed_within_three_frames(engine: Engine, mode
     for seed in range(3):
         view = View.of(seed=20 + seed)
         estimate = run.add(view, view.under(after, seed=seed))
-    assert error_deg(estimate.sh, after) < 3.0
+    assert error_deg(estimate.sh, after) < 0.1  # seen: 0.02
 
 
 def steady_errors(engine: Engine, model: LightModel, frames: int = 12) -> Floats:

@@ -123,7 +123,7 @@ def test_visibility_is_the_twins(engine: Engine, name: str, reach_m: float) -> N
     free = traced.free[above]
     # Samples less than a voxel apart miss corners that a ray only clips; what they find, is there.
     missed = (free & ~exact).mean()
-    assert missed < 0.005
+    assert missed < 0.001  # seen: 0.0001
     assert (
         ~free & exact
     ).mean() < 1e-3  # float32 origins within 1e-6 of a voxel's face, and the last sample at `reach`

@@ -73,11 +73,11 @@ def compare_with_twin(engine: Engine, volume: Volume, camera: CameraModel, view:
     assert (hit & ~expected).mean() < 15e-3
     both = hit & expected & smooth
     error = np.abs(depth - expected_depth)[both] / volume.voxel_m
-    assert np.median(error) < 2e-3
-    assert np.percentile(error, 99) < 0.15
+    assert np.median(error) < 1e-4  # seen: 2e-6
+    assert np.percentile(error, 99) < 0.01  # seen: 0.0016
     turned = degrees_between(normal, normals)[both]
-    assert np.median(turned) < 0.05
-    assert np.percentile(turned, 99) < 1.5
+    assert np.median(turned) < 0.02  # seen: 0.003
+    assert np.percentile(turned, 99) < 0.6  # seen: 0.22
     np.testing.assert_allclose(np.linalg.norm(normal[hit], axis=-1), 1, atol=1e-6)
 
 
@@ -133,9 +133,9 @@ def test_surface_is_where_it_is(engine: Engine, name: str, step_m: float) -> Non
     assert inner.mean() > 0.2
     assert hit[inner].all()
     error = np.abs(depth - truth.depth_m)[inner] / VOXEL_M
-    assert np.median(error) < 0.1
+    assert np.median(error) < 0.03  # seen: 0.009
     assert np.percentile(error, 99) < 0.5
-    assert np.median(degrees_between(normal, truth.normals)[inner]) < 1.0
+    assert np.median(degrees_between(normal, truth.normals)[inner]) < 0.6  # seen: 0.32
     facing = (normal * (pixel_rays(CAMERA) @ new[:3, :3].T)).sum(-1)
     assert (facing[hit] < 0).all()
 

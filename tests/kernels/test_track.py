@@ -154,7 +154,7 @@ def test_the_gradient_is_the_derivative_of_the_error(engine: Engine) -> None:
     noise = (1.0, 1e6, 10.0)
     base = twin.sum_equations(view, depth, *(2 * [level_intrinsics(CAMERA, 0)]), np.eye(4), *noise)
     got = device_sums(engine, view, depth, CAMERA, np.eye(4), noise)
-    np.testing.assert_allclose(got[21:27], base[21:27], atol=1e-3)
+    np.testing.assert_allclose(got[21:27], base[21:27], atol=1e-4)
     step = 1e-3
     for axis in range(3, 6):
         shifted = motion_of_twist(step * np.eye(6)[axis])
@@ -206,19 +206,19 @@ def test_what_a_scene_does_not_fix_is_left_as_guessed(engine: Engine, name: str,
     change = expected @ inverse_rigid(found.volume_from_camera)
     if count == 1:
         axis = np.array([1.0, 0, 0]) if name == "two planes" else np.array([-0.6, 0, 1]) / np.sqrt(1.36)
-        np.testing.assert_allclose(np.abs(found.free[0]), [0, 0, 0, *np.abs(axis)], atol=0.05)
-        assert angle_between(found.volume_from_camera, expected) < np.radians(0.1)
+        np.testing.assert_allclose(np.abs(found.free[0]), [0, 0, 0, *np.abs(axis)], atol=0.005)  # seen: 0.001
+        assert angle_between(found.volume_from_camera, expected) < np.radians(0.02)  # seen: 0.007
         off, held = ((found.volume_from_camera - pose)[:3, 3] for pose in (expected, scene.pose))
-        assert np.linalg.norm(off - (off @ axis) * axis) < 0.1 * VOXEL_M
+        assert np.linalg.norm(off - (off @ axis) * axis) < 0.02 * VOXEL_M  # seen: 0.004
         assert abs(held @ axis) < 1e-3 < abs((expected - scene.pose)[:3, 3] @ axis)
     if name == "sphere":
         center = np.array([0.1, 0.2, 1.3, 1]) - [*scene.volume.origin_world, 0]
         np.testing.assert_allclose((change @ center)[:3], center[:3], atol=0.1 * VOXEL_M)
     if name == "plane":
         normal = np.array([0.2, 0.1, -1.0]) / np.linalg.norm([0.2, 0.1, -1.0])
-        np.testing.assert_allclose(change[:3, :3] @ normal, normal, atol=np.radians(0.1))
+        np.testing.assert_allclose(change[:3, :3] @ normal, normal, atol=np.radians(0.01))  # seen: 0.0025
         across = np.cross(normal, [1, 0, 0])
-        assert abs((found.volume_from_camera - scene.pose)[:3, 3] @ across) < 1e-3
+        assert abs((found.volume_from_camera - scene.pose)[:3, 3] @ across) < 1e-5  # seen: 1e-6
 
 
 def test_pictures_that_do_not_meet(engine: Engine) -> None:

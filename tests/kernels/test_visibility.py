@@ -153,7 +153,7 @@ def test_rays_are_the_twins(device: Device, kind: type[Engine], name: str, reach
     traced = free | blocked
     exact = twin.trace_volume(solid, VOXEL_M, origins[traced], directions[traced], reach_m)
     # Steps go a hundredth of a voxel beyond what is empty and miss clipped corners; what they find, is there.
-    assert (free[traced] & ~exact).mean() < 0.005
+    assert (free[traced] & ~exact).mean() < 0.001  # seen: 0.0003
     assert name != "scattered" or (free[traced] & ~exact).sum() < 0.04 * (~exact).sum()
     assert (blocked[traced] & exact).mean() < 1e-3  # origins in float32, and the last sample at `reach_m`
     assert reach_m == 0.1 or (~exact).mean() > 0.01

@@ -146,7 +146,7 @@ def test_moving_view_takes_what_the_twin_takes(engine: Engine, stride: int) -> N
             agree = (frame["traced"][here] == ~found).all(1)
             agree &= (frame["sets"][here] == np.where(found, sets, own[:, None])).all(1)
             # float32: a sample may fall to either of two cells, or on either side of a limit
-            assert agree.mean() > 0.995
+            assert agree.mean() > 0.999  # seen: 0.9998
             taken = found[:, np.arange(COUNT) % interleave]
             above = above_of(frame["sets"][here], normals)
             free = above & ~np.where(taken, blocked, frame["blocked"][here])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from unittest.mock import patch
 
 import numpy as np
@@ -81,6 +82,7 @@ def ratio_of(result: FrameResult) -> Floats:
     return np.asarray(linear[result.color[..., 1]] / linear[GREY])
 
 
+@cache
 def exact_ratio(spread_deg: float) -> tuple[Floats, NDArray[np.bool_]]:
     """[h, w] of a floor in the open under the sky and a disc of the lobe's spread; and where the floor is seen."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]

@@ -27,6 +27,7 @@ from server.transfer.radiance_transfer import Directions, Transfer, direction_se
 from server.volume.raycast import LABEL_DYNAMIC, LABEL_FILLED, LABEL_NONE, LABEL_STATIC, Surface
 from server.volume.volume import Volume
 from tests.reference import image_space as twin
+from tests.reference.visibility import first_solid
 from tests.scenes.analytic import look_at, pixel_rays
 from tests.scenes.depth_view_scene import host_views
 from tests.scenes.lights import random_directions, unit
@@ -96,7 +97,9 @@ def test_views_see_the_first_solid_voxel(engine: Engine, name: str) -> None:
     for view in (7, 24):
         lines = views.lines(view)[::3, ::3].reshape(-1, 3)
         length = np.linalg.norm(lines, axis=-1)
-        expected = twin.first_solid(solid, VOXEL_M, views.eye(view), lines / length[:, None]) / length
+        eyes = np.broadcast_to(views.eye(view), lines.shape)
+        met = first_solid(solid, VOXEL_M, eyes, lines / length[:, None])
+        expected = np.where(np.isfinite(met), met / length, 0.0)
         found = views.depths[view, ::3, ::3].ravel()
         # Steps of less than a voxel miss corners that a line only clips, and go on to what is behind.
         assert (found[expected == 0] == 0).all()

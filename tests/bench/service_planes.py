@@ -1,4 +1,4 @@
-"""Two clients that each see one plane (tests/corners.py), over the real socket: alone, and together in one room."""
+"""Two clients that each see one plane (corners.py), over the real socket: alone, and together in one room."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from client.client import Answer, RoomPlace, StreamClient
 from protocol.frames import IDENTITY
 from protocol.messages import Light
-from tests import corners
 from tests.bench.finished import Part
 from tests.bench.run import Run
 from tests.bench.service_process import serving
-from tests.corners import FLOOR, WALL, corner_frame
-from tests.lights import degrees_between, lobe_and_sky
+from tests.scenes import corners
+from tests.scenes.corners import FLOOR, WALL, corner_frame
+from tests.scenes.lights import degrees_between, lobe_and_sky
 
 TOWARDS = (0.5, 0.8, 0.0)
 LIGHT = 0.3 * lobe_and_sky(TOWARDS)

@@ -15,9 +15,9 @@ from client.options import CaptureOptions, prepare
 from protocol.messages import Wishes
 from server.light.static_light import static_estimate
 from server.maths.sh import dominant_direction, webxr_from_world
-from tests import lights
 from tests.client import folders
-from tests.lights import degrees_between
+from tests.scenes import lights
+from tests.scenes.lights import degrees_between
 
 LIGHT = lights.lobe_and_sky((0.3, 0.8, -0.2))
 WEBXR = webxr_from_world(np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0]))

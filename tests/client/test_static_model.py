@@ -31,8 +31,8 @@ from client.laptop.point_cloud import CloudFusion, PointCloud, depth_noise_m, pi
 from client.laptop.source import open_source
 from client.laptop.static_model import StaticModel, model_of_fusion
 from protocol.frames import IDENTITY, CameraModel, DepthCamera, RgbdFrame
-from tests.analytic import Shape, look, look_at, plane, room, sphere
 from tests.data import data_folder
+from tests.scenes.analytic import Shape, look, look_at, plane, room, sphere
 
 CAMERA = CameraModel(width=160, height=120, fx=130.0, fy=130.0, cx=79.5, cy=59.5, depth_scale_m=0.0001)
 CELL_M = 0.02

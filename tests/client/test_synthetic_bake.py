@@ -95,9 +95,10 @@ def test_half_the_sky_behind_a_wall() -> None:
 
 @pytest.mark.parametrize(
     ("spec", "median", "most"),
-    [("table?light=1", 0.001, 0.02), ("table?light=4", 0.001, 0.03), ("room?light=1&texture=0", 0.005, 0.04)],
+    [("table?light=1", 0.0005, 0.01), ("table?light=4", 0.001, 0.012), ("room?light=1&texture=0", 0.005, 0.035)],
 )
 def test_shading_against_brute_force(spec: str, median: float, most: float) -> None:
+    """Seen: 0.0002, 0.0007, 0.0036 in the median, and 0.006, 0.007, 0.025 at 99 %."""
     source = open_synthetic(f"synthetic:{spec}&size=160x120")
     errors = np.concatenate([errors_at_pixels(source, index, 100) for index in (0, 25, 50)])
     assert np.median(errors) < median
@@ -107,11 +108,11 @@ def test_shading_against_brute_force(spec: str, median: float, most: float) -> N
 def test_shading_under_and_on_the_hand_against_brute_force() -> None:
     source = open_synthetic("synthetic:hand?size=160x120")
     still = np.concatenate([errors_at_pixels(source, index, 60) for index in (20, 30)])
-    assert np.median(still) < 0.005
-    assert np.percentile(still, 99) < 0.04
+    assert np.median(still) < 0.003  # seen: 0.0019
+    assert np.percentile(still, 99) < 0.02  # seen: 0.0146
     skin = np.concatenate([errors_at_pixels(source, index, 40, dynamic=True) for index in (20, 30)])
-    assert np.median(skin) < 0.005
-    assert np.percentile(skin, 90) < 0.04  # fingers and palm grow out of each other: many places touch
+    assert np.median(skin) < 0.001  # seen: 0.0006
+    assert np.percentile(skin, 90) < 0.03  # seen: 0.022; fingers grow out of the palm: many places touch
 
 
 def test_unoccluded_points_are_exact() -> None:
@@ -122,7 +123,7 @@ def test_unoccluded_points_are_exact() -> None:
     seen = truth.visible.ravel()
     assert (arriving[seen] <= clear[seen] + 1e-6).all()  # shadows only ever take away
     exact = np.abs(arriving - clear)[seen].max(axis=1) < 1e-6
-    assert exact.mean() > 0.02
+    assert exact.mean() > 0.06  # seen: 0.085 of all that is seen has nothing above its horizon
 
 
 def test_interpolation_is_exact_for_what_is_linear() -> None:

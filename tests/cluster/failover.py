@@ -48,7 +48,7 @@ from server.cluster.application import build  # noqa: E402
 from server.cluster.ray_directory import NAMESPACE, PREFIX  # noqa: E402
 from server.cluster.routing import room_id_of  # noqa: E402
 from server.scene.vase import vase_glb  # noqa: E402
-from tests.rooms import CAMERA, frame_at, view_at, wishes  # noqa: E402
+from tests.scenes.rooms import CAMERA, frame_at, view_at, wishes  # noqa: E402
 
 
 @dataclass

@@ -36,8 +36,8 @@ from server.light.light_estimation import TileSums, prior_precision
 from server.maths.sh import LUMINANCE, spherical_fibonacci
 from server.opencl.device import Device
 from server.transfer.radiance_transfer import direction_sets
-from tests.lights import degrees_between, random_directions, unit
 from tests.reference.sh import lambert_bands, open_transfer, sh_basis, sphere_rule
+from tests.scenes.lights import degrees_between, random_directions, unit
 
 Floats = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from server.evaluation.coverage import Estimate, coverage
-from tests.lights import lobe_and_sky, random_directions
+from tests.scenes.lights import lobe_and_sky, random_directions
 
 SPREAD = 0.01
 

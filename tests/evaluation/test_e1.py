@@ -14,7 +14,7 @@ from protocol.messages import Wishes
 from server.evaluation.e1 import ALBEDO, BACKGROUND, ShadedView, lag_of, moving_light, score, shaded_views
 from server.opencl.device import Device
 from tests.bench.light_e1 import FRAMES, SEQUENCES, Thing, WithThings, light_of
-from tests.lights import degrees_between, lobe_and_sky, uniform
+from tests.scenes.lights import degrees_between, lobe_and_sky, uniform
 
 COUNT = 3
 

@@ -18,8 +18,8 @@ from server.evaluation.environment import (
     relative_rmse,
 )
 from server.maths.sh import rotate_sh, webxr_from_world
-from tests.lights import Floats, lobe, lobe_and_sky, uniform
 from tests.reference.sh import open_transfer, sphere_rule
+from tests.scenes.lights import Floats, lobe, lobe_and_sky, uniform
 
 
 def turned(light: Floats, degrees: float) -> Floats:

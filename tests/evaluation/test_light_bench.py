@@ -26,7 +26,7 @@ from tests.bench.light_runs import Exposed, at_preset, refusal, wishes_for
 from tests.bench.light_speed import WARM_UP, errors_beside, timed
 from tests.bench.page import figures, write_page
 from tests.bench.run import Run
-from tests.lights import lobe, lobe_and_sky
+from tests.scenes.lights import lobe, lobe_and_sky
 
 UP, VIEW = np.array([0.0, 1, 0]), np.array([0.0, 0, -1])
 

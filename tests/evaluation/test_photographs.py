@@ -29,9 +29,9 @@ from server.evaluation.socrates import (
     without_effects,
 )
 from server.maths.sh import lambert_transfer
-from tests import lights
 from tests.data import data_folder
-from tests.lights import degrees_between, random_directions, unit
+from tests.scenes import lights
+from tests.scenes.lights import degrees_between, random_directions, unit
 
 Floats = NDArray[np.float64]
 LIGHTS = unit(np.random.default_rng(0).normal(size=(8, 3)) * [0.4, 0.4, 0.1] + [0, 0.2, 0.9])

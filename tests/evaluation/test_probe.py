@@ -17,9 +17,9 @@ from server.evaluation.probe import (
     passive_probe,
     sphere_pixels,
 )
-from tests import lights
-from tests.lights import degrees_between
 from tests.reference.sh import lambert_bands, sh_basis
+from tests.scenes import lights
+from tests.scenes.lights import degrees_between
 
 CAMERA = CameraModel(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
 SPHERE = Sphere(np.array([0.05, -0.02, 0.6]), 0.1)

@@ -59,7 +59,7 @@ from tests.bench.rendering_turning import (
 )
 from tests.bench.run import Run
 from tests.data import data_folder
-from tests.lights import lobe_and_sky, uniform
+from tests.scenes.lights import lobe_and_sky, uniform
 
 SHAPE = (130, 220)
 SILENT: Callable[[str], None] = lambda _text: None  # noqa: E731

@@ -49,7 +49,7 @@ from tests.bench.thesis_probe import PRESETS as PROBED
 from tests.bench.thesis_runs import WARM_UP, load_picture, medians, save_picture, turn_by_turn
 from tests.bench.thesis_tables import Table, table_6_1, table_6_2, table_6_3
 from tests.evaluation.made_up import picture, presets_details, speed_details
-from tests.lights import lobe_and_sky
+from tests.scenes.lights import lobe_and_sky
 
 pytest.importorskip("matplotlib", reason="matplotlib is not installed: make install-bench")
 

@@ -15,8 +15,8 @@ from server.maths.registration import distance_between
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.tracking.relocalize import GREATEST_COUNT, Keyframes, dissimilarity, thumbnail
-from tests.analytic import Floats, look, look_at, plane, sphere
-from tests.rooms import CAMERA, ROOM, VOXEL_M, frame_at, view_at, wishes
+from tests.scenes.analytic import Floats, look, look_at, plane, sphere
+from tests.scenes.rooms import CAMERA, ROOM, VOXEL_M, frame_at, view_at, wishes
 
 SIZE = (CAMERA.height, CAMERA.width)
 AWAY = look_at((1.1, 0.0, 0.5), (1.6, 0.5, -0.4))

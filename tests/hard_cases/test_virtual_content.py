@@ -15,7 +15,7 @@ from protocol.messages import Wishes
 from server.client_session import ClientSession
 from server.opencl.device import Device
 from server.scene.placement import Placement
-from tests.meshes import shape_of, soup_of
+from tests.scenes.meshes import shape_of, soup_of
 
 CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
 WISHES = Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.02, poses="given", up=(0.0, -1.0, 0.0))
@@ -93,7 +93,8 @@ def test_session_lives(pipeline: ClientSession, name: str) -> None:
 
 
 @pytest.mark.parametrize("when", ["before the first frame", "between frames"])
-def test_behind_the_camera_changes_nothing_and_comes_back(pipeline: ClientSession, when: str) -> None:
+def test_behind_the_camera_it_only_shades_the_wall_and_it_comes_back(pipeline: Pipeline, when: str) -> None:
+    """A box of 20 cm, 1.9 m from the wall, takes 1/280 of its light, more where the light comes from there."""
     box, behind = shape_of(BOX), Placement((0, 0.1, -0.9))
     if when == "between frames":
         picture(pipeline, 0)
@@ -102,8 +103,11 @@ def test_behind_the_camera_changes_nothing_and_comes_back(pipeline: ClientSessio
     pipeline.move_object("box", Placement((0, 0.1, 0.7)))
     after = picture(pipeline, 2)
     assert (after != COLOR).any(axis=-1).mean() > 0.1
-    assert (before != COLOR).any(axis=-1).mean() < 0.5  # it may cast a shadow, no more
-    assert np.abs(before.astype(int) - COLOR).mean() < np.abs(after.astype(int) - COLOR).mean()
+    darker = COLOR.astype(int) - before
+    assert darker.min() == 0
+    assert darker.max() <= 2
+    assert darker.mean() < 0.25  # seen: 0.11 and 0.16
+    assert np.abs(after.astype(int) - COLOR).mean() > 5  # seen: 7.4
 
 
 @pytest.mark.parametrize("when", ["before the first frame", "between frames"])

@@ -20,11 +20,11 @@ from server.shading.traced_scene import trace_scene, upload_light
 from server.transfer.radiance_transfer import Directions, direction_sets, transfer_radiance
 from server.transfer.sample_grid import SampleGrid
 from server.volume.raycast import LABEL_STATIC, Surface, raycast
-from tests.analytic import look_at
-from tests.meshes import shape_of
 from tests.reference import adaptive as twin
 from tests.reference.composite import Buffer, Samples, upsample
-from tests.solids import SCENES, download4, fill_volume, float4
+from tests.scenes.analytic import look_at
+from tests.scenes.meshes import shape_of
+from tests.scenes.solids import SCENES, download4, fill_volume, float4
 
 VOXEL_M = 0.01
 CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
@@ -79,7 +79,7 @@ def test_real_surface_loses_what_samples_at_every_pixel_lose(engine: Engine) -> 
     for y, x in np.argwhere(listed)[::23]:
         mean = upsample(Samples(1, shaded), surface, int(x), int(y), VOXEL_M)[:3]
         expected = (1 - ratio[y, x, :3]) * shaded[y, x, :3]
-        np.testing.assert_allclose((1 - refined[y, x, :3]) * mean, expected, atol=2e-3)
+        np.testing.assert_allclose((1 - refined[y, x, :3]) * mean, expected, atol=1e-5)  # seen: 1e-7, rounding
 
 
 def test_refined_rims_are_nearer_to_every_pixel(engine: Engine) -> None:
@@ -146,7 +146,7 @@ def test_subsets_of_directions_are_the_whole_on_average(engine: Engine) -> None:
     apart = (some - every)[listed][:, :3]
     assert listed.sum() > 100
     assert 0.001 < np.sqrt((apart**2).mean()) < 0.06
-    assert np.abs(apart.mean(axis=0)).max() < 0.01
+    assert np.abs(apart.mean(axis=0)).max() < 0.002  # seen: 0.0005
 
 
 @pytest.mark.parametrize("stride", [1, 4, 8])

@@ -14,7 +14,7 @@ from server.opencl.engine import Engine
 from server.volume.brick_pool import BRICK_VOXELS, BrickPool
 from server.volume.brick_table import AWAY_SLOT, NO_SLOT
 from tests.reference import brick_pool as twin
-from tests.volumes import vectors
+from tests.scenes.volumes import vectors
 
 SLOTS = 70
 

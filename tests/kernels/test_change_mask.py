@@ -14,7 +14,7 @@ from server.transfer.sampling import Upsampling
 from tests.reference import change_mask as twin
 from tests.reference import composite as pixels
 from tests.reference.composite import Buffer, Floats, Samples, cells_of
-from tests.solids import float4, upload_surface
+from tests.scenes.solids import float4, upload_surface
 
 HEIGHT, WIDTH = 44, 60
 CAMERA = CameraModel(width=WIDTH, height=HEIGHT, fx=60.0, fy=60.0, cx=29.5, cy=21.5)

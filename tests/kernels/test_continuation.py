@@ -36,10 +36,11 @@ from server.maths.lobes import CELLS, RIDGE, cell_directions, lobe_family
 from server.maths.planes import SIDES, STEPS_M, PlanePatch, find_planes
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from tests.analytic import Floats
+from server.pipeline import Pipeline
 from tests.data import data_folder
-from tests.maths.test_planes import FLOOR, WALL, corner
 from tests.reference.planes import beyond, looked_through
+from tests.scenes.analytic import Floats
+from tests.scenes.plane_patches import FLOOR, WALL, corner
 
 CAMERA = CameraModel(width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
 
@@ -254,9 +255,7 @@ def test_what_cameras_looked_through_is_what_the_twin_says() -> None:
 
 
 @pytest.mark.data
-@pytest.mark.parametrize(
-    ("name", "bound_deg", "gain"), [("key_white_direct", 15.0, 1.2), ("key_tex_direct", 25.0, 0.7)]
-)
+@pytest.mark.parametrize(("name", "bound_deg", "gain"), [("key_white_direct", 8.0, 3.0), ("key_tex_direct", 8.0, 2.0)])
 def test_the_light_of_a_room_seen_in_part(device: Device, name: str, bound_deg: float, gain: float) -> None:
     """mitsuba_room: what no picture shows of its walls lets light through unless it is continued."""
     source = open_source(str(data_folder("mitsuba_room") / name))
@@ -275,7 +274,7 @@ def test_the_light_of_a_room_seen_in_part(device: Device, name: str, bound_deg: 
         errors_deg[continued] = direction_error_deg(sh, true)
         pipeline.close()
     assert errors_deg[True] < bound_deg
-    assert gain * errors_deg[True] < errors_deg[False]  # seen: 2 to 4 of 25, and 3 to 10 of 18 degrees
+    assert gain * errors_deg[True] < errors_deg[False]  # seen: 2.1 of 24.7, and 1.7 of 14.5 degrees
 
 
 @pytest.mark.data

@@ -15,8 +15,8 @@ from server.input import denoise
 from server.input.measure import Measurement
 from server.opencl.engine import Engine
 from tests.reference import denoise as twin
-from tests.tolerance import relative_tolerance
-from tests.volumes import vectors
+from tests.scenes.tolerance import relative_tolerance
+from tests.scenes.volumes import vectors
 
 SIZES = [(8, 8), (16, 9), (23, 41), (97, 71), (160, 130)]
 METHODS = ["bilateral", "tv_l1"]
@@ -84,7 +84,7 @@ def test_lightness_is_opencvs(engine: Engine) -> None:
     lab = cv2.cvtColor(values[..., :3], cv2.COLOR_LRGB2Lab)[..., 0] / 100
     usable = values[..., 3] > 0
     found = engine.download(denoise.measure_lightness(engine, radiance_of(engine, values)))
-    assert np.abs(found - lab)[usable].max() < 2e-3  # OpenCV's is from tables
+    assert np.abs(found - lab)[usable].max() < 3e-4  # OpenCV's is from tables; seen: 8e-5
     assert (found[~usable] == -1).all()
 
 
@@ -141,8 +141,8 @@ def test_tv_l1_removes_specks_and_keeps_edges(engine: Engine) -> None:
     image[:, 24:] = 0.8
     specks = np.random.default_rng(4).random(image.shape) < 0.05
     found = engine.download(denoise.tv_l1(engine, upload(engine, np.where(specks, 0.4, image)), 200, 1.0))
-    assert np.abs(found - image).mean() < 1e-3
-    assert np.percentile(np.abs(found - image), 99) < 0.05
+    assert np.abs(found - image).mean() < 5e-4  # seen: 1.3e-4
+    assert np.percentile(np.abs(found - image), 99) < 1e-4  # seen: 1e-8
 
 
 @pytest.mark.parametrize("strips", [True, False])
@@ -176,7 +176,7 @@ def test_bilateral_keeps_an_edge_exactly_and_halves_noise(engine: Engine) -> Non
         np.testing.assert_allclose(found, exact, rtol=1e-6)
     noisy = exact + rng.normal(0, 0.002, exact.shape)
     found = engine.download(denoise.bilateral_depth(engine, upload(engine, noisy)))
-    assert np.abs(found - exact).max() < 0.01
+    assert np.abs(found - exact).max() < 0.004  # seen: 0.0014, of noise of 0.002
     assert (found - exact).std() < 0.5 * (noisy - exact).std()
 
 
@@ -227,7 +227,7 @@ def test_denoised_radiance(engine: Engine, method: Any) -> None:
     assert off.mean() < 0.5 * was_off.mean()
     inner = np.zeros_like(usable)
     inner[30:, 4:36] = True
-    assert np.abs(found[..., 0].mean(where=inner) - 0.2) < 0.004  # no bias
+    assert np.abs(found[..., 0].mean(where=inner) - 0.2) < 0.0015  # no bias; seen: 0.0004
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -26,14 +26,26 @@ from server.transfer.radiance_transfer import Directions, direction_sets
 from server.transfer.real_depth_views import RealDepthViews
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
-from tests import lights
-from tests.analytic import look_at, pixel_rays
-from tests.kernels.test_image_space import host_views
-from tests.lights import random_directions
-from tests.meshes import pose, shape_of
 from tests.reference import depth_views as twin
-from tests.solids import SCENES, Box, Scene, ball, box, fill_volume, float4, floor, hit, normal_at, upload_surface
-from tests.volumes import vectors
+from tests.scenes import lights
+from tests.scenes.analytic import look_at, pixel_rays
+from tests.scenes.depth_view_scene import host_views
+from tests.scenes.lights import random_directions
+from tests.scenes.meshes import pose, shape_of
+from tests.scenes.solids import (
+    SCENES,
+    Box,
+    Scene,
+    ball,
+    box,
+    fill_volume,
+    float4,
+    floor,
+    hit,
+    normal_at,
+    upload_surface,
+)
+from tests.scenes.volumes import vectors
 
 VOXEL_M = 0.02
 ROOM_M = 1000.0
@@ -228,7 +240,7 @@ def test_look_is_the_twins(engine: Engine, lift: float) -> None:
     assert sure.mean() > 0.9
     assert (found.blocked != meets)[sure].mean() < 2e-3  # directions on the brink between two views
     both = sure & found.blocked & meets
-    assert np.median(np.abs(found.object_m[both] - met[both] * cell_m)) < 1e-4
+    assert np.median(np.abs(found.object_m[both] - met[both] * cell_m)) < 1e-6  # seen: 3e-8
     assert 0.1 < meets.mean() < 0.9
 
 
@@ -258,7 +270,7 @@ def test_nearest_of_many_objects_blocks(engine: Engine) -> None:
     assert (np.abs(found.object_m - exact)[both] < 0.15).mean() > 0.98
     few = scene_of(engine, volume, objects[:5], looks_of(engine, volume, objects[:5])[0])
     least = np.isfinite(hit(balls[:5], points, w))
-    assert (probe(engine, few, points, w).blocked != least)[outside].mean() < 0.03
+    assert (probe(engine, few, points, w).blocked != least)[outside].mean() < 0.02  # seen: 0.006
 
 
 def test_own_surface_does_not_block_a_ball(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,13 +12,13 @@ from protocol.frames import CameraModel
 from server.opencl.engine import Engine
 from server.volume.integrate import GREATEST_WEIGHT, integrate
 from server.volume.volume import Volume
-from tests.analytic import look, look_at, plane, room, sphere
 from tests.reference.integrate import integrate as twin
 from tests.reference.integrate import integrate_color, project, voxel_centers
-from tests.tolerance import relative_tolerance
-from tests.volumes import dense_colors, dense_voxels, fuse, upload_measurement
+from tests.scenes.analytic import look, look_at, plane, room, sphere
+from tests.scenes.fused_scenes import CAMERA
+from tests.scenes.tolerance import relative_tolerance
+from tests.scenes.volumes import dense_colors, dense_voxels, fuse, upload_measurement
 
-CAMERA = CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.313, cy=36.127)
 BOUNDS = (-1.0, -1.0, 0.0, 1.0, 1.0, 2.4)
 VOXEL_M = 0.04
 SCENE = [room((-0.9, -0.9, -0.3), (0.95, 0.9, 2.2)), sphere((0.1, 0.2, 1.2), 0.4)]
@@ -110,7 +110,7 @@ def test_color_matches_twin(engine: Engine) -> None:
     # A step of the root each frame; a dark mean after a bright look loses a step of the brighter root.
     assert np.quantile(error, 0.999) < 3
     assert error.mean() < 1
-    assert np.abs((np.sqrt(found) - np.sqrt(color))[same].mean(0)).max() < 2e-4  # rounding is unbiased
+    assert np.abs((np.sqrt(found) - np.sqrt(color))[same].mean(0)).max() < 5e-5  # rounding is unbiased; seen: 1e-5
 
 
 @pytest.mark.parametrize(("before", "after"), [(0.25, 0.252), (0.25, 0.248), (0.01, 0.0104)])
@@ -164,9 +164,11 @@ def test_a_bound_only_raises_a_color(engine: Engine) -> None:
     assert np.abs(look(0.36, AT_LEAST) - 0.6).max() < 1.5 * step  # nothing else is known
     assert np.abs(look(0.36, 1.0) - 0.6).max() < 2.5 * step
     assert np.abs(look(0.04, AT_LEAST) - 0.6).max() < 3.5 * step
-    assert np.abs(look(0.04, 1.0).mean() - np.sqrt(0.36 + (0.04 - 0.36) / 4)) < step
+    assert (
+        np.abs(look(0.04, 1.0).mean() - np.sqrt(0.36 + (0.04 - 0.36) / 4)) < 0.1 * step
+    )  # dithered: the mean is exact; seen: 0.001
     raised = look(0.81, AT_LEAST).mean()
-    assert np.abs(raised - np.sqrt(0.28 + (0.81 - 0.28) / 5)) < step
+    assert np.abs(raised - np.sqrt(0.28 + (0.81 - 0.28) / 5)) < 0.1 * step
 
 
 def test_leaves_alone_what_it_does_not_see(engine: Engine) -> None:

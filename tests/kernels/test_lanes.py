@@ -10,28 +10,13 @@ from protocol.frames import CameraModel
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
-from tests.analytic import look, look_at, room, sphere
-from tests.volumes import cast, fuse
+from tests.scenes.analytic import look, look_at, room, sphere
+from tests.scenes.fused_scenes import CAMERA
+from tests.scenes.lanes import Narrow, Wide
+from tests.scenes.volumes import cast, fuse
 
-CAMERA = CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.313, cy=36.127)
 SCENE = [room((-0.9, -0.9, -0.3), (0.95, 0.9, 2.2)), sphere((0.1, 0.2, 1.2), 0.4)]
 VIEWS = [np.eye(4), look_at((0.4, -0.3, -0.2), (-0.2, 0.2, 1.4)), look_at((0.3, 0.2, 0.1), (-0.3, -0.2, 1.9))]
-
-
-class Narrow(Engine):
-    """Runs kernels as on a GPU."""
-
-    @property
-    def lanes(self) -> int:
-        return 1
-
-
-class Wide(Engine):
-    """Runs kernels as on a processor."""
-
-    @property
-    def lanes(self) -> int:
-        return 8
 
 
 def reconstruct(engine: Engine) -> tuple[Volume, tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]]:

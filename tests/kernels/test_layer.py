@@ -11,7 +11,8 @@ import pytest
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.shading.layer import DEPTH_SCALE_M, NEUTRAL, NOTHING, Layer, LayerPart, compose_layer
-from tests.kernels.test_composite import (
+from tests.reference import composite as twin
+from tests.scenes.composite_scene import (
     HEIGHT,
     LIGHT,
     NONE_TAKEN,
@@ -28,8 +29,7 @@ from tests.kernels.test_composite import (
     plane,
     samples,
 )
-from tests.kernels.test_lanes import Narrow, Wide
-from tests.reference import composite as twin
+from tests.scenes.lanes import KINDS
 
 CAMERA_FROM_VOLUME = np.linalg.inv(VOLUME_FROM_CAMERA)
 
@@ -70,7 +70,7 @@ def hard_scene() -> tuple[Codes, tuple[Any, ...], Floats]:
     return shown, (radiance, real, virtual, occluded, ratio), inverse_depths
 
 
-@pytest.mark.parametrize("kind", [Narrow, Wide])
+@KINDS
 @pytest.mark.parametrize("is_smooth", [True, False])
 def test_layer_is_the_twins(device: Device, is_smooth: bool, kind: type[Engine]) -> None:
     engine = kind(device)

@@ -21,7 +21,7 @@ from server.light.light_model import (
 from server.maths.lobes import RIDGE
 from server.maths.sh import LUMINANCE
 from server.maths.surfaces import Albedos
-from tests.analytic import Floats
+from tests.scenes.analytic import Floats
 
 POOLS, LOBES = 700, 9
 

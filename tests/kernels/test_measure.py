@@ -8,18 +8,15 @@ import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from protocol.frames import CameraModel, RgbdFrame
+from protocol.frames import CameraModel
 from server.input.measure import GREATEST_DEPTH_M, linear_values
-from server.input.measure import measure as measure_stage
 from server.opencl.engine import Engine
 from tests.reference import measure as twin
-from tests.tolerance import relative_tolerance
-from tests.volumes import vectors
+from tests.scenes.raw_frames import PLAIN, frame_of, measured, random_frame
+from tests.scenes.tolerance import relative_tolerance
 
-PLAIN = CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.3, cy=36.1)
 BARREL = (-0.31, 0.12, 0.0011, -0.0007, -0.02)
 PINCUSHION = (0.21, 0.05, -0.002, 0.0015, 0.01)
 DISTORTIONS = {"none": (0.0,) * 5, "barrel": BARREL, "pincushion": PINCUSHION}
@@ -29,29 +26,6 @@ FLIPS = 5e-3
 
 def camera_of(distortion: str, encoding: Any, **changes: Any) -> CameraModel:
     return replace(PLAIN, distortion=DISTORTIONS[distortion], color_encoding=encoding, **changes)
-
-
-def random_frame(camera: CameraModel, seed: int) -> RgbdFrame:
-    """Codes over the whole range, smooth enough that marks change over areas; depth with every special value."""
-    rng = np.random.default_rng(seed)
-    size = (camera.height, camera.width)
-    top = 255 if camera.color_encoding == "srgb8" else 65535
-    coarse = rng.uniform(-0.3, 1.3, (9, 9, 3))
-    color = np.clip(cv2.resize(coarse, size[::-1], interpolation=cv2.INTER_CUBIC), 0, 1) * top
-    depth = rng.integers(0, 12_000, size)
-    depth[rng.random(size) < 0.1] = 0
-    depth[rng.random(size) < 0.1] = 65535
-    return frame_of(np.rint(color), depth, camera)
-
-
-def frame_of(color: NDArray[Any], depth: NDArray[Any], camera: CameraModel) -> RgbdFrame:
-    code = np.uint8 if camera.color_encoding == "srgb8" else np.uint16
-    return RgbdFrame(0, 0.0, color.astype(code), depth.astype(np.uint16), None)
-
-
-def measured(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> tuple[NDArray[Any], NDArray[Any]]:
-    result = measure_stage(engine, camera, frame)
-    return vectors(engine.download(result.radiance)), engine.download(result.depth_m)
 
 
 @pytest.mark.parametrize("encoding", ["srgb8", "linear16"])

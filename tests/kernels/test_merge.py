@@ -16,10 +16,10 @@ from server.geometry.merge import STILL_WEIGHT, TRUSTED_WEIGHT, merge_depth
 from server.opencl.engine import Engine
 from server.volume.raycast import LABEL_DYNAMIC, LABEL_FILLED, LABEL_NONE, LABEL_STATIC, Surface
 from server.volume.volume import Volume
-from tests.analytic import look, look_at, pixel_rays, plane, quantised, room, sphere
 from tests.reference import merge as twin
-from tests.tolerance import relative_tolerance
-from tests.volumes import fill, upload_measurement, vectors
+from tests.scenes.analytic import look, look_at, pixel_rays, plane, quantised, room, sphere
+from tests.scenes.tolerance import relative_tolerance
+from tests.scenes.volumes import fill, upload_measurement, vectors
 
 CAMERA = CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.313, cy=36.127)
 VOXEL_M = 0.05
@@ -143,7 +143,7 @@ def test_matches_twin(engine: Engine, size: tuple[int, int]) -> None:
     # A slope is made of differences of inverse depths over 8 pixels, some hundredth of them: 100 times their rounding.
     turned = np.abs(merged.normals - expected[1]).max(axis=-1) > 100 * rounding
     assert (turned & same).mean() <= FLIPS
-    assert (merged.normals[merged.labels == LABEL_DYNAMIC][:, 3] > 0).mean() > 0.9
+    assert (merged.normals[merged.labels == LABEL_DYNAMIC][:, 3] > 0).mean() > 0.99  # seen: all
 
 
 # ---- D', the cases of eq. 4.3 ------------------------------------------------------------------------------------
@@ -192,7 +192,7 @@ def test_where_they_disagree_the_sensor_is_taken(engine: Engine, shift: float) -
     merged = merge(engine, FLAT, positions, normals)
     assert (merged.labels == LABEL_DYNAMIC).all()
     np.testing.assert_allclose(merged.positions, surface_from(FLAT)[0], atol=1e-5)
-    np.testing.assert_allclose(merged.normals[..., :3], np.broadcast_to(-VIEW[:3, 2], (*FLAT.shape, 3)), atol=1e-3)
+    np.testing.assert_allclose(merged.normals[..., :3], np.broadcast_to(-VIEW[:3, 2], (*FLAT.shape, 3)), atol=1e-6)
 
 
 def test_where_the_sensor_is_blind_the_volume_is_kept(engine: Engine) -> None:
@@ -221,7 +221,7 @@ def test_a_hand_before_a_wall(engine: Engine) -> None:
     merged = merge(engine, BEFORE_WALL, *surface_from(FLAT), radiance=BRIGHT_HAND)
     np.testing.assert_array_equal(merged.labels == LABEL_DYNAMIC, HAND)
     np.testing.assert_allclose(merged.positions, surface_from(BEFORE_WALL)[0], atol=1e-5)
-    np.testing.assert_allclose(merged.normals[HAND][:, :3], np.broadcast_to(-VIEW[:3, 2], (900, 3)), atol=1e-3)
+    np.testing.assert_allclose(merged.normals[HAND][:, :3], np.broadcast_to(-VIEW[:3, 2], (900, 3)), atol=1e-6)
 
 
 def test_a_thing_that_was_taken_away_is_gone(engine: Engine) -> None:

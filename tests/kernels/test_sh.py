@@ -10,23 +10,10 @@ from server.maths import sh
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.opencl.program import KERNEL_FOLDER
-from tests.lights import random_directions, unit
 from tests.reference.sh import lambert_bands, sh_basis
-from tests.tolerance import relative_tolerance
-
-SOURCE = """
-#include "sh.clh"
-kernel void evaluate(const int count, const global float *directions, global float *basis, global float *lambert) {
-    const int i = get_global_id(0);
-    if (i >= count) return;
-    float y[COEFFICIENTS];
-    sh_basis(vload3(i, directions), y);
-    for (int c = 0; c < COEFFICIENTS; c++) basis[i * COEFFICIENTS + c] = y[c];
-    if (i < BANDS) lambert[i] = lambert_band(i);
-}
-"""
-AXES = np.concatenate([np.eye(3), -np.eye(3)])
-NEAR_POLES = unit([[1e-9, 0, 1], [0, -1e-7, 1], [1e-4, 1e-4, -1], [0, 1e-3, -1]])
+from tests.scenes.lights import random_directions
+from tests.scenes.sh_kernel import AXES, NEAR_POLES, SOURCE
+from tests.scenes.tolerance import relative_tolerance
 
 
 @pytest.mark.parametrize("bands", range(2, 7))

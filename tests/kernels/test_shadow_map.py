@@ -11,11 +11,11 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from server.effects import functions as effects
-from server.light.continuation import NO_PLANES, Continuation, PlaneArrays
+from server.effects.functions import View, add_objects
+from server.light.continuation import NO_PLANES, PlaneArrays
 from server.maths.direct_lights import DirectLight, SplitLight, split_light
 from server.maths.directional_fit import directional_sh
 from server.maths.disc_places import disc_places, ray_places, search_places
-from server.maths.planes import PlanePatch
 from server.objects.rasterize import VirtualSurface
 from server.opencl.device import Device
 from server.opencl.engine import Engine
@@ -38,25 +38,38 @@ from server.shading.virtual_point_lights import place_points
 from server.transfer.indirect import observe_indirect
 from server.transfer.radiance_transfer import Directions, direction_sets, transfer_radiance
 from server.transfer.sample_grid import SampleGrid
-from tests import lights
-from tests.kernels import test_reflect
-from tests.kernels.test_differential_rendering import camera_of, placed
-from tests.kernels.test_indirect import WALL as WALL_COLOR
-from tests.kernels.test_indirect import floor_beside_a_wall, wall_seen_from
-from tests.kernels.test_lanes import Narrow, Wide
 from tests.reference import shadow_map as twin
-from tests.scenes.contexts import context_of
-from tests.solids import SIDE_M, Ball, Box, Scene, ball, box, download4, fill_volume, float4, floor, hit, upload_surface
-from tests.tolerance import relative_tolerance
+from tests.scenes import glossy_surface, lights
+from tests.scenes.lanes import KINDS, Narrow, Wide
+from tests.scenes.painted_walls import WALL as WALL_COLOR
+from tests.scenes.painted_walls import floor_beside_a_wall, wall_seen_from
+from tests.scenes.plane_patches import continued_wall
+from tests.scenes.shaded_floor import camera_of, placed
+from tests.scenes.solids import (
+    SIDE_M,
+    Ball,
+    Box,
+    Scene,
+    ball,
+    box,
+    download4,
+    fill_volume,
+    float4,
+    floor,
+    hit,
+    upload_surface,
+)
+from tests.scenes.tolerance import relative_tolerance
 
 VOXEL_M, FAR_M = 0.01, 1000.0
 UP = np.array([0.0, 1.0, 0.0])
 FLOOR_Y = 0.1
 FLOOR: Scene = (floor(FLOOR_Y),)
 CRATE = box((0.38, 0.1, 0.4), (0.54, 0.26, 0.52))
+FLIPS = 0.01
+"""Share of points that may differ from the twin: a look-up on the border of two texels takes either. Seen: none."""
 TOWARD = lights.unit((0.5, 0.8, 0.15))
 BEHIND = lights.unit((-0.3, 0.6, 0.6))
-KINDS = pytest.mark.parametrize("kind", [Narrow, Wide])
 
 Floats = NDArray[np.float64]
 
@@ -166,7 +179,7 @@ def test_pyramid_and_free_parts_are_the_twins(device: Device, kind: type[Engine]
     np.testing.assert_allclose(without, np.tile(opens @ colors, (len(points), 1)), rtol=relative_tolerance(device))
     error = np.abs(found - (free * opens) @ colors).max(axis=1)
     assert 0.2 < (free < 1).any(axis=1).mean() < 0.9
-    assert (error > 1e-4).mean() < 0.03  # a look-up on the border of two texels takes either
+    assert (error > 1e-4).mean() < FLIPS
     assert error.max() < 0.15
 
 
@@ -182,7 +195,7 @@ def test_virtual_surface_is_the_twins(engine: Engine) -> None:
     expected = (free * reference.open_part(normals.reshape(-1, 3))).reshape(10, 22)
     expected[0, 0] = 0  # not covered
     error = np.abs(found - expected[..., None]).max(axis=-1)
-    assert (error > 1e-4).mean() < 0.03
+    assert (error > 1e-4).mean() < FLIPS
     assert error.max() < 0.15
     assert 0.2 < (expected > 0).mean() < 0.8
 
@@ -224,7 +237,7 @@ def test_penumbra_widens_with_distance(engine: Engine) -> None:
         shares = found / without
         ends = [[x[np.argmax(s > level)] for level in (0.1, 0.9)] for s in (shares, true)]
         widths.append(ends[0][1] - ends[0][0])
-        assert abs(np.mean(ends[0]) - np.mean(ends[1])) < 0.004
+        assert abs(np.mean(ends[0]) - np.mean(ends[1])) < 0.0015  # seen: 0.0004; points are 0.0008 m apart
         assert widths[-1] == pytest.approx(ends[1][1] - ends[1][0], rel=0.2)
     assert widths[1] == pytest.approx(2 * widths[0], rel=0.15)
 
@@ -260,8 +273,8 @@ def test_ball_does_not_shade_itself(engine: Engine, half_angle_deg: float) -> No
     found = lit(engine, light, solids=(Ball(center, radius),)).virtual(center + radius * normals, normals)[..., 0]
     expected = np.array([exact(np.zeros((1, 3)), light, (), n)[0] for n in normals.reshape(-1, 3)]).reshape(30, 30)
     expected[0, 0] = 0
-    assert np.abs(found - expected).max() < 0.05
-    assert np.abs(found - expected).mean() < 0.004
+    assert np.abs(found - expected).max() < 0.01  # seen: 0.0024
+    assert np.abs(found - expected).mean() < 0.001  # seen: 0.0002
 
 
 def test_faces_that_face_the_light_are_lit(engine: Engine) -> None:
@@ -270,7 +283,7 @@ def test_faces_that_face_the_light_are_lit(engine: Engine) -> None:
     points = np.stack([x, np.full_like(x, 0.26), z], -1)
     light = disc(5.0, UP)
     found = lit(engine, light).virtual(points, np.broadcast_to(UP, points.shape))[..., 0].ravel()[1:]
-    np.testing.assert_allclose(found, exact(points[0, :1], light, ())[0], rtol=0.005)
+    np.testing.assert_allclose(found, exact(points[0, :1], light, ())[0], rtol=1e-5)  # seen: 3e-7
 
 
 def test_one_object_shades_another(engine: Engine) -> None:
@@ -297,17 +310,19 @@ def test_nothing_is_darkened_twice(device: Device, kind: type[Engine]) -> None:
     """A wall's shadow over the box's: where the wall hides the disc, the box takes nothing; virtual things are dark."""
     engine, light = kind(device), disc(6.0, (0.9, 0.5, 0.0))
     scene = lit(engine, light, scene=(*FLOOR, WALL))
-    points = floor_points(400, around=0.15) - [0.1, 0, 0]
+    points = floor_points(800, around=0.4)
+    points = points[WALL.distance(points) > 3 * VOXEL_M]
     without, found = (a[:, 0] for a in scene.floor(points))
     real = exact(points, light, (WALL,), lift_m=VOXEL_M)
     hidden = exact(points, light, (WALL.grown(-2 * VOXEL_M),), lift_m=VOXEL_M) == 0
-    assert hidden.mean() > 0.3
+    assert 0.5 < hidden.mean() < 0.8
+    assert (real > 0.4).mean() > 0.1
     np.testing.assert_array_equal(found[hidden], without[hidden])
     assert without[hidden].max() == 0
-    assert np.sqrt(np.mean((without - real) ** 2)) < 0.08  # 8 rays, voxels taken whole
+    assert np.sqrt(np.mean((without - real) ** 2)) < 0.03  # seen: 0.016, of 8 rays, voxels taken whole
     assert (found <= without).all()
     top = np.stack(np.meshgrid(np.linspace(0.39, 0.53, 8), [0.26], np.linspace(0.41, 0.51, 8), indexing="ij"), -1)[:, 0]
-    assert scene.virtual(top, np.broadcast_to(UP, top.shape)).max() < 0.02
+    assert scene.virtual(top, np.broadcast_to(UP, top.shape)).max() == 0
 
 
 def test_real_surface_that_a_virtual_one_touches_does_not_hide_the_disc(engine: Engine) -> None:
@@ -316,22 +331,12 @@ def test_real_surface_that_a_virtual_one_touches_does_not_hide_the_disc(engine: 
     points = np.full((8, 16, 3), (0.622, 0.26, 0.0))
     points[..., 2] = np.linspace(0.4, 0.52, 128).reshape(8, 16)
     found = lit(engine, light, scene=(*FLOOR, WALL)).virtual(points, np.broadcast_to(UP, points.shape))[..., 0]
-    np.testing.assert_allclose(found.ravel()[1:], exact(points[0, :1], light, ())[0], rtol=0.02)
+    np.testing.assert_allclose(found.ravel()[1:], exact(points[0, :1], light, ())[0], rtol=2e-4)  # seen: 4e-5
 
 
 def test_a_plane_that_goes_on_hides_the_disc(engine: Engine) -> None:
     """As the wall would that it is taken to be, of which the volume knows nothing."""
-    patch = PlanePatch(
-        normal=np.array([1.0, 0, 0]),
-        offset_m=0.9,
-        across=np.array([0.0, 0, 1]),
-        along=np.array([0.0, 1, 0]),
-        corner=np.zeros(2),
-        empty=np.zeros((40, 40), np.bool_),
-        seen=np.array([[0.0, 0], [0.8, 0.8]]),
-    )
-    continuation = Continuation()
-    continuation.planes, continuation._boxes = [patch], [patch.box]
+    continuation = continued_wall(0.9)
     light = disc(6.0, (1.0, 0.5, 0.0))
     points = floor_points(200) - [0.1, 0, 0]
     hidden, past = lit(engine, light, planes=continuation.arrays()).floor(points)
@@ -345,7 +350,7 @@ def test_a_plane_that_goes_on_hides_the_disc(engine: Engine) -> None:
 def test_rays_are_as_long_as_they_are_said_to_be(engine: Engine) -> None:
     scene = lit(engine, disc(6.0, (0.9, 0.5, 0.0)), scene=(*FLOOR, WALL), reach_m=0.05)
     points = floor_points(100, around=0.05) - [0.2, 0, 0]
-    np.testing.assert_allclose(scene.floor(points)[0], exact(points[:1], disc(6.0, (0.9, 0.5, 0.0)), ())[0], rtol=0.01)
+    np.testing.assert_allclose(scene.floor(points)[0], exact(points[:1], disc(6.0, (0.9, 0.5, 0.0)), ())[0], rtol=3e-4)
 
 
 # ---- both parts of the light together ----------------------------------------------------------------------------
@@ -410,7 +415,7 @@ def test_mixed_ratios_are_the_twins_and_come_apart_again(device: Device, engine:
     assert (expected <= np.maximum(ratio, 1) + 1e-6).all()
     apart = without_direct(engine, whole, shadow, samples, maps)
     bright = (rest > 0.05) & (ratio * rest + lit_part > 1.01 * maps.least)
-    np.testing.assert_allclose(download4(engine, apart.values)[..., :3][bright], ratio[bright], atol=2e-4)
+    np.testing.assert_allclose(download4(engine, apart.values)[..., :3][bright], ratio[bright], atol=1e-5)
     assert apart.whole is whole
 
 
@@ -487,7 +492,7 @@ def test_points_on_objects_send_what_the_disc_brings_them(engine: Engine) -> Non
     expected = [exact(p[None], light, (CRATE, plate), n, lift_m=1e-4)[0] for p, n in zip(places, normals, strict=True)]
     expected = np.array(expected)[:, None] * points.colors * light.irradiance
     assert expected.max() > 0.3
-    assert np.sqrt(np.mean((sent - expected) ** 2)) < 0.03
+    assert np.sqrt(np.mean((sent - expected) ** 2)) < 0.015  # seen: 0.007, of at most 8 texels a look
 
 
 def test_mirrors_show_all_of_the_light(engine: Engine) -> None:
@@ -498,9 +503,9 @@ def test_mirrors_show_all_of_the_light(engine: Engine) -> None:
     def split_upload(engine: Engine, sh: Floats, rays: Directions, **rest: Any) -> DeviceLight:
         return take_discs(engine, upload_light(engine, sh, rays, **rest), split_light(sh), rays)
 
-    whole, _ = test_reflect.reflect(engine, *test_reflect.surfaces(), light=light)
-    with patch.object(test_reflect, "upload_light", split_upload):
-        split, _ = test_reflect.reflect(engine, *test_reflect.surfaces(), light=light)
+    whole, _ = glossy_surface.reflect(engine, *glossy_surface.surfaces(), light=light)
+    with patch.object(glossy_surface, "upload_light", split_upload):
+        split, _ = glossy_surface.reflect(engine, *glossy_surface.surfaces(), light=light)
     np.testing.assert_array_equal(split, whole)
     assert split.max() > 0.5
 

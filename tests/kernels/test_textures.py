@@ -20,8 +20,8 @@ from server.scene.colors import linear_from_srgb
 from server.scene.materials import Beyond, Material, Texture
 from server.scene.mesh import Mesh
 from server.scene.mipmaps import CHANNEL_VALUES, decoded, encoded, material_tables, mip_chain, shrunk
-from tests.meshes import mesh_of, pose
 from tests.reference import textures as twin
+from tests.scenes.meshes import mesh_of, pose
 
 SOURCE = """
 #include "textures.clh"
@@ -137,9 +137,9 @@ def test_samples_match_twin(sample: Any, size: tuple[int, int], probes: int, bey
     expected = twin.sample_texture(levels_of(image), uv, du, dv, beyond, probes)
     error = np.abs(found - expected).max(axis=1)
     # uv of size 4 in float32, times the steepest slope between texels: 128 of them to a unit.
-    assert np.percentile(error, 99.5) < 1e-3
+    assert np.percentile(error, 99.5) < 1e-4  # seen: 6e-6
     assert (error > 1e-3).mean() < 5e-3
-    assert np.median(error) < 2e-5
+    assert np.median(error) < 1e-6  # seen: 7e-8
 
 
 def test_texel_centres_show_their_texels(sample: Any) -> None:
@@ -221,7 +221,7 @@ def test_checkerboard_at_a_grazing_angle_does_not_alias(engine: Engine) -> None:
     assert np.sqrt((error**2).mean()) < 0.035
     assert np.sqrt((error**2).mean()) < 0.2 * np.sqrt((aliased**2).mean())
     far = met & (np.indices(met.shape)[0] < CAMERA.cy + 8)
-    assert np.abs(found[..., 0] - 0.5)[far].max() < 0.25  # a distant board is grey
+    assert np.abs(found[..., 0] - 0.5)[far].max() < 0.02  # a distant board is grey; seen: 0.003
     # Neither darker nor brighter on the whole: the levels are means of light.
     assert found[met].mean(axis=0)[0] == pytest.approx(expected[met].mean(axis=0)[0], abs=0.01)
 

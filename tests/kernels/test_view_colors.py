@@ -11,9 +11,9 @@ from server.opencl.engine import Engine
 from server.volume.raycast import Surface
 from server.volume.view_colors import view_colors
 from server.volume.volume import Volume
-from tests.kernels.test_indirect import paint
 from tests.reference.view_colors import view_colors as twin
-from tests.solids import download4, float4
+from tests.scenes.painted_walls import paint
+from tests.scenes.solids import download4, float4
 
 VOXEL_M = 0.02
 SIZE = 5 * 8

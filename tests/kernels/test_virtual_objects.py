@@ -17,8 +17,8 @@ from server.objects.voxelize import ObjectTable, object_table
 from server.opencl.engine import Engine
 from server.opencl.program import KERNEL_FOLDER
 from server.scene.mesh import Mesh
-from tests.meshes import mesh_of, pose, public_mesh, shape_of
 from tests.reference import voxelize as twin
+from tests.scenes.meshes import mesh_of, pose, public_mesh, shape_of
 
 SOURCE = """
 #include "virtual_objects.clh"

@@ -32,22 +32,32 @@ from server.shading.virtual_point_lights import place_points
 from server.transfer.indirect import Indirect, gather_hits, no_hits, observe_indirect
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
 from server.volume.raycast import LABEL_STATIC, Surface, raycast
-from tests import lights
-from tests.analytic import Floats, look_at
-from tests.kernels.test_differential_rendering import buffer, camera_of, floor_points
-from tests.kernels.test_indirect import paint
-from tests.kernels.test_indirect import shape_of as voxels_of
-from tests.kernels.test_lanes import Narrow, Wide
-from tests.meshes import pose, shape_of
-from tests.solids import SCENES, SIDE_M, Box, Scene, box, download4, fill_volume, float4, floor, hit, upload_surface
-from tests.tolerance import relative_tolerance
+from tests.scenes import lights
+from tests.scenes.analytic import Floats, look_at
+from tests.scenes.lanes import KINDS
+from tests.scenes.meshes import pose, shape_of
+from tests.scenes.painted_walls import paint, voxels_of
+from tests.scenes.shaded_floor import buffer, camera_of, floor_points
+from tests.scenes.solids import (
+    SCENES,
+    SIDE_M,
+    Box,
+    Scene,
+    box,
+    download4,
+    fill_volume,
+    float4,
+    floor,
+    hit,
+    upload_surface,
+)
+from tests.scenes.tolerance import relative_tolerance
 
 VOXEL_M, ROOM_M = 0.01, 1000.0
 FLOOR: Scene = (floor(),)
 UP = np.array([0.0, 1.0, 0.0])
 PLATE = box((0.4, 0.2, 0.4), (0.56, 0.24, 0.56))
 WALL = box((0.62, 0.1, 0.05), (0.68, 0.7, 0.91))
-KINDS = pytest.mark.parametrize("kind", [Narrow, Wide])
 WHITE = (1.0, 1.0, 1.0)
 CODED = 3e-3
 """Of a colour of 1 in 9, 9 and 8 bits of its root, and of a surface's shading by 81 directions under an even sky."""

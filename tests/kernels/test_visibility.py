@@ -14,19 +14,18 @@ from server.opencl.program import KERNEL_FOLDER
 from server.transfer.radiance_transfer import direction_sets
 from server.transfer.visibility import trace_visibility
 from server.volume.brick_table import AWAY_SLOT
-from server.volume.volume import BRICK, Volume
-from tests.kernels.test_lanes import Narrow, Wide
-from tests.lights import random_directions
+from server.volume.volume import Volume
 from tests.reference import visibility as twin
 from tests.reference.radiance_transfer import direction_set
-from tests.solids import SCENES, SIDE_M, fill_volume, float4, points_on, solid_voxels, upload_surface
-from tests.volumes import fill, vectors
+from tests.scenes.lanes import KINDS
+from tests.scenes.lights import random_directions
+from tests.scenes.solids import SCENES, SIDE_M, fill_volume, float4, points_on, scattered, solid_voxels, upload_surface
+from tests.scenes.volumes import vectors
 
 VOXEL_M = 0.01
 ROOM_M = 1000.0
 MOST_BOXES = 16
 """As in blockers.clh."""
-EVERYWHERE = ((0.11, 0.05, 0.11), (0.85, 0.9, 0.85))
 BOXES = """
 #include "blockers.clh"
 kernel void boxes(const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid,
@@ -47,14 +46,6 @@ kernel void boxes(const int4 bricks, global const int *slots, global const uchar
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-
-
-def scattered(engine: Engine, share: float) -> tuple[Volume, Bools]:
-    """A volume whose voxels are solid one by one, [z, y, x]."""
-    volume = Volume(engine, (0, 0, 0, SIDE_M, SIDE_M, SIDE_M), VOXEL_M)
-    solid = np.random.default_rng(15).random([BRICK * n for n in volume.bricks[::-1]]) < share
-    fill(engine, volume, np.where(solid, -0.5, 1.0), np.ones(solid.shape))
-    return volume, solid
 
 
 def boxes_of(
@@ -92,7 +83,7 @@ def assert_boxes(
 @pytest.mark.parametrize("share", [0.0, 0.0003, 0.01])
 @pytest.mark.parametrize("reach", [0.5, 3.7, 12.8, 16.0])
 def test_boxes_of_scattered_voxels_are_the_twins(device: Device, engine: Engine, share: float, reach: float) -> None:
-    volume, solid = scattered(engine, share)
+    volume, solid = scattered(engine, share, VOXEL_M, np.random.default_rng(15))
     normals = random_directions(60, 4)
     normals[:6] = np.concatenate([np.eye(3), -np.eye(3)])
     normals[6:12] = normals[:6] - 1e-10  # as good as along an axis, and falling along the others
@@ -107,7 +98,7 @@ def test_boxes_of_scattered_voxels_are_the_twins(device: Device, engine: Engine,
 
 def released(engine: Engine) -> tuple[Volume, Bools]:
     """Scattered voxels whose bricks are all away, and what is known of them: cells of 2x2x2 voxels, [z, y, x]."""
-    volume, solid = scattered(engine, 0.0003)
+    volume, solid = scattered(engine, 0.0003, VOXEL_M, np.random.default_rng(15))
     volume.slots_device.set(np.full_like(engine.download(volume.slots_device), AWAY_SLOT), engine.queue)
     cells = solid.reshape(*(n for size in solid.shape for n in (size // 2, 2))).any((1, 3, 5))
     return volume, cells.repeat(2, 0).repeat(2, 1).repeat(2, 2)
@@ -141,18 +132,18 @@ def visibility_of(
     return free[..., :rays].astype(bool), blocked[..., :rays].astype(bool), origins, directions
 
 
-@pytest.mark.parametrize("kind", [Narrow, Wide])
+@KINDS
 @pytest.mark.parametrize("name", [*SCENES, "scattered"])
 @pytest.mark.parametrize("reach_m", [ROOM_M, 0.25, 0.1])
 @pytest.mark.parametrize("rays", [81, 30])
 def test_rays_are_the_twins(device: Device, kind: type[Engine], name: str, reach_m: float, rays: int) -> None:
     engine = kind(device)
     if name == "scattered":
-        volume, solid = scattered(engine, 0.0005)
+        volume, solid = scattered(engine, 0.0005, VOXEL_M, np.random.default_rng(15))
         points, normals = np.random.default_rng(6).uniform(-0.1, 1.06, (512, 3)), random_directions(512, 16)
     else:
         volume = fill_volume(engine, SCENES[name], VOXEL_M)
-        points, normals = points_on(SCENES[name], 256, 2, EVERYWHERE)
+        points, normals = points_on(SCENES[name], 256, 2)
         solid = solid_voxels(SCENES[name], volume)
     free, blocked, origins, directions = visibility_of(engine, volume, points, normals, rays, reach_m)
     assert not (free & blocked).any()
@@ -162,14 +153,14 @@ def test_rays_are_the_twins(device: Device, kind: type[Engine], name: str, reach
     traced = free | blocked
     exact = twin.trace_volume(solid, VOXEL_M, origins[traced], directions[traced], reach_m)
     # Steps go a hundredth of a voxel beyond what is empty and miss clipped corners; what they find, is there.
-    assert (free[traced] & ~exact).mean() < 0.005
+    assert (free[traced] & ~exact).mean() < 0.001  # seen: 0.0003
     assert name != "scattered" or (free[traced] & ~exact).sum() < 0.04 * (~exact).sum()
     assert (blocked[traced] & exact).mean() < 1e-3  # origins in float32, and the last sample at `reach_m`
     assert reach_m == 0.1 or (~exact).mean() > 0.01
     engine.close()
 
 
-@pytest.mark.parametrize("kind", [Narrow, Wide])
+@KINDS
 def test_rays_meet_cells_of_released_bricks(device: Device, kind: type[Engine]) -> None:
     engine = kind(device)
     volume, whole = released(engine)
@@ -185,7 +176,7 @@ def test_rays_meet_cells_of_released_bricks(device: Device, kind: type[Engine]) 
 
 def test_rays_without_length_are_free(engine: Engine) -> None:
     """Even where they begin in a solid voxel."""
-    volume, _ = scattered(engine, 0.5)
+    volume, _ = scattered(engine, 0.5, VOXEL_M, np.random.default_rng(15))
     points = np.random.default_rng(7).uniform(0, SIDE_M, (64, 3))
     free, blocked, _, _ = visibility_of(engine, volume, points, random_directions(64, 8), 81, 0.0)
     assert not blocked.any()

@@ -16,11 +16,11 @@ from server.transfer.radiance_transfer import direction_sets, first_set, transfe
 from server.transfer.visibility_cache import VisibilityCaches
 from server.volume.raycast import LABEL_DYNAMIC, LABEL_STATIC, Surface, raycast
 from server.volume.volume import Volume
-from tests.analytic import look_at
 from tests.reference import visibility_cache as twin
 from tests.reference.radiance_transfer import direction_set
-from tests.solids import SCENES, download4, fill_volume, floor, upload_surface
-from tests.volumes import fill
+from tests.scenes.analytic import look_at
+from tests.scenes.solids import SCENES, download4, fill_volume, floor, upload_surface
+from tests.scenes.volumes import fill
 
 VOXEL_M = 0.01
 CAMERA = CameraModel(width=96, height=64, fx=80.0, fy=80.0, cx=47.5, cy=31.5)
@@ -146,7 +146,7 @@ def test_moving_view_takes_what_the_twin_takes(engine: Engine, stride: int) -> N
             agree = (frame["traced"][here] == ~found).all(1)
             agree &= (frame["sets"][here] == np.where(found, sets, own[:, None])).all(1)
             # float32: a sample may fall to either of two cells, or on either side of a limit
-            assert agree.mean() > 0.995
+            assert agree.mean() > 0.999  # seen: 0.9998
             taken = found[:, np.arange(COUNT) % interleave]
             above = above_of(frame["sets"][here], normals)
             free = above & ~np.where(taken, blocked, frame["blocked"][here])

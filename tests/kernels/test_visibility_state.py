@@ -12,9 +12,9 @@ from server.transfer.radiance_transfer import Transfer, direction_sets, transfer
 from server.transfer.visibility_state import LEAST_OPEN, VisibilityState
 from server.volume.raycast import LABEL_STATIC, Surface, raycast
 from server.volume.volume import BRICK, Volume
-from tests.analytic import look_at
-from tests.solids import Scene, ball, download4, fill_volume, floor, signed_distances
-from tests.volumes import fill
+from tests.scenes.analytic import look_at
+from tests.scenes.solids import Scene, ball, download4, fill_volume, floor, signed_distances
+from tests.scenes.volumes import fill
 
 VOXEL_M = 0.02
 REACH_M = 0.1

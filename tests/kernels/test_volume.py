@@ -11,10 +11,10 @@ from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine, int4
 from server.volume.brick_pool import BRICK_BYTES
 from server.volume.volume import BRICK, TRUNCATION_VOXELS, Volume, VolumeSizeError
-from tests.analytic import Shape, look, look_at, plane, room, sphere
 from tests.reference import integrate as integrate_twin
 from tests.reference import volume as twin
-from tests.volumes import cast, dense_voxels, fill, fuse, in_bricks, upload_depth
+from tests.scenes.analytic import Shape, look, look_at, plane, room, sphere
+from tests.scenes.volumes import cast, dense_voxels, fill, fuse, in_bricks, upload_depth
 
 CAMERA = CameraModel(width=97, height=71, fx=80.0, fy=78.0, cx=47.3, cy=36.1)
 BOUNDS = {0.04: (-1.0, -1.0, 0.0, 1.0, 1.0, 2.4), 0.015: (-0.5, -0.5, 0.6, 0.5, 0.5, 1.8)}

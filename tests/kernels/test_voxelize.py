@@ -15,8 +15,8 @@ from server.objects.virtual_object import VirtualObject
 from server.objects.voxelize import LEAST_CELLS, MARGIN_CELLS, MOST_CELLS, NEAR_CELLS, place_grid, squared_distance
 from server.opencl.engine import Engine
 from server.scene.mesh import Mesh
-from tests.meshes import mesh_of, public_mesh, shape_of, soup_of
 from tests.reference import voxelize as twin
+from tests.scenes.meshes import mesh_of, public_mesh, shape_of, soup_of
 
 MARGIN = 1e-4
 """The device's cells are larger by this on every side, so that rounding never loses one."""

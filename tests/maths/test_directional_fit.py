@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from server.maths.directional_fit import DirectionalFit, directional_sh
-from tests import lights
-from tests.lights import random_directions
+from tests.scenes import lights
+from tests.scenes.lights import random_directions
 
 Floats = NDArray[np.float64]
 PARAMETERS = np.array([0.7, 0.5, -0.2, 0.4, 0.05, -0.3, 0.9, 0.1, 0.2])

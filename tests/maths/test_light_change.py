@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from server.maths.light_change import CELL_M, LEAST_SHARED, Shot, Shown, change_between, shown_by, surface_cells
-from tests.analytic import Floats, look_at
+from tests.scenes.analytic import Floats, look_at
 
 HERE = Shot(np.eye(4))
 BACK_M = 3.0

@@ -19,7 +19,7 @@ from server.maths.lobes import (
     spread_of,
 )
 from server.maths.sh import sh_basis, spherical_fibonacci
-from tests.analytic import Floats
+from tests.scenes.analytic import Floats
 
 
 def balls(count: int, seed: int = 0) -> Floats:

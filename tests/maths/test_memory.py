@@ -7,7 +7,7 @@ import pytest
 
 from server.maths.bayes import NormalEquations
 from server.maths.memory import remembered
-from tests.analytic import Floats
+from tests.scenes.analytic import Floats
 
 X = np.random.default_rng(1).normal(size=(6, 2))
 

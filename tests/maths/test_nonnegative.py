@@ -9,8 +9,8 @@ from scipy.optimize import minimize, nnls
 
 from server.maths import nonnegative
 from server.maths.nonnegative import faded, nonnegative_mean, nonnegative_sum
-from tests import lights
 from tests.reference.sh import sh_basis, sphere_rule
+from tests.scenes import lights
 
 SPHERE = sphere_rule(40, 80)[0]
 

@@ -8,8 +8,8 @@ import pytest
 from server.maths.lobes import CELL_SR, WIDTHS_DEG, CellEquations, cell_directions, cells_to_sh, fit_width
 from server.maths.normals import GREATEST, NormalWeights, normal_weights
 from server.maths.sh import spherical_fibonacci
-from tests.analytic import Floats
-from tests.lights import degrees_between, random_directions
+from tests.scenes.analytic import Floats
+from tests.scenes.lights import degrees_between, random_directions
 
 UP = np.array([0.0, -1.0, 0.0])
 WAYS: list[NormalWeights] = ["none", "even", "printed"]

@@ -6,19 +6,9 @@ import numpy as np
 import pytest
 
 from server.maths.planes import CELL_M, STEPS_M, PlanePatch, find_planes
-from tests.analytic import Floats
 from tests.reference.planes import beyond
-
-WALL, FLOOR = np.array([0.0, 0.0, -1.0]), np.array([0.0, -1.0, 0.0])
-
-
-def corner(count: int = 400, noise_m: float = 0.002, shift: float = 0.0) -> tuple[Floats, Floats]:
-    """Points of a wall z = 2 with x and y in [0, 1], and of a floor y = 1 with z in [1, 2], and their normals."""
-    rng = np.random.default_rng(3)
-    wall = np.column_stack([rng.random((count, 2)) + np.array([shift, 0]), np.full(count, 2.0)])
-    floor = np.column_stack([rng.random(count) + shift, np.full(count, 1.0), 1 + rng.random(count)])
-    points = np.concatenate([wall, floor]) + noise_m * rng.normal(size=(2 * count, 3))
-    return points, np.repeat([WALL, FLOOR], count, axis=0)
+from tests.scenes.analytic import Floats
+from tests.scenes.plane_patches import FLOOR, WALL, corner
 
 
 def plane_with(planes: list[PlanePatch], normal: Floats) -> PlanePatch:

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from server.maths import sh
-from tests import lights
 from tests.data import data_folder
-from tests.lights import random_directions, unit
 from tests.reference.sh import lambert_bands, sh_basis, sphere_rule
+from tests.scenes import lights
+from tests.scenes.lights import random_directions, unit
 
 AXES = np.concatenate([np.eye(3), -np.eye(3)])
 NEAR_POLES = unit([[1e-9, 0, 1], [0, -1e-7, 1], [1e-5, 1e-5, -1], [0, 1e-3, -1]])

@@ -7,8 +7,8 @@ import pytest
 
 from server.maths.sh import band_of
 from server.maths.sh_polynomials import sh_with_slope
-from tests.lights import random_directions
 from tests.reference.sh import sh_basis
+from tests.scenes.lights import random_directions
 
 
 @pytest.mark.parametrize("bands", [1, 2, 4, 6])

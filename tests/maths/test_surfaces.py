@@ -16,7 +16,7 @@ from server.maths.surfaces import (
     lightness_levels,
     one_albedo,
 )
-from tests.analytic import Floats
+from tests.scenes.analytic import Floats
 
 GREY, RED, BLUE = np.array([0.5, 0.5, 0.5]), np.array([0.8, 0.3, 0.25]), np.array([0.2, 0.3, 0.8])
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.maths.sh import LAMBERT_BANDS, lambert_transfer, webxr_floats, webxr_from_world
-from tests import lights
-from tests.lights import random_directions
 from tests.reference.sh import sh_basis, sphere_rule
+from tests.scenes import lights
+from tests.scenes.lights import random_directions
 
 Floats = NDArray[np.float64]
 SIX_DIGITS = 2e-6

@@ -17,8 +17,8 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.opencl.transfer import copy_into
 from server.scene.placement import Placement
-from tests.analytic import look, plane, room
-from tests.meshes import soup_of
+from tests.scenes.analytic import look, plane, room
+from tests.scenes.meshes import soup_of
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 
 from server.opencl import program
 from server.opencl.engine import Engine, float4, float16, int4
-from tests.volumes import vectors
+from tests.scenes.volumes import vectors
 
 SOURCE = """
 kernel void count_visits(const int width, const int height, const int depth, global int *visits) {

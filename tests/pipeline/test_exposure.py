@@ -19,9 +19,9 @@ from server.meshing.scene_mesh import SceneMesh
 from server.opencl.device import Device
 from server.pipeline import FrameResult
 from server.scene.placement import Placement
-from tests.analytic import Floats
-from tests.lights import degrees_between
-from tests.meshes import shape_of
+from tests.scenes.analytic import Floats
+from tests.scenes.lights import degrees_between
+from tests.scenes.meshes import shape_of
 
 FRAMES = range(0, 60, 3)
 SETTLED = slice(6, None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -22,10 +23,10 @@ from server.evaluation.noise import plane_normals
 from server.evaluation.rooms import CAMERA as VGA
 from server.opencl.device import Device
 from server.volume.raycast import LABEL_DYNAMIC, LABEL_STATIC
-from tests.analytic import Shape, Truth, look, pixel_rays, sphere
 from tests.bench.hand import hand_volume
 from tests.data import data_folder
-from tests.rooms import BOUNDS, ROOM, VOXEL_M, view_at
+from tests.scenes.analytic import Shape, Truth, look, pixel_rays, sphere
+from tests.scenes.rooms import BOUNDS, ROOM, VOXEL_M, view_at
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
@@ -66,13 +67,22 @@ class Film:
     def pose(self, index: int) -> Floats:
         return view_at(0.5 * index)
 
+    @cached_property
+    def truths(self) -> list[Truth]:
+        """Of every frame; tests look at each many times."""
+        return [look(scene, self.camera, self.pose(index)) for index, scene in enumerate(self.scenes)]
+
     def truth(self, index: int) -> Truth:
-        return look(self.scenes[index], self.camera, self.pose(index))
+        return self.truths[index]
+
+    @cached_property
+    def bare_m(self) -> list[Floats]:
+        """[h, w] depth of the bare room, of every frame."""
+        return [look(ROOM, self.camera, self.pose(index)).depth_m for index in range(len(self))]
 
     def ball_px(self, index: int) -> Bools:
         """[h, w] what of the frame is not the bare room."""
-        bare = look(ROOM, self.camera, self.pose(index)).depth_m
-        return bare - self.truth(index).depth_m > 1e-9
+        return self.bare_m[index] - self.truth(index).depth_m > 1e-9
 
     @property
     def frames_with_hand(self) -> range:
@@ -115,10 +125,14 @@ def grown(mask: Bools, by_px: int) -> Bools:
 
 
 @pytest.fixture(scope="module")
-def passing(device: Device) -> tuple[Film, dict[int, Shown]]:
+def crossing() -> Film:
     """A ball that crosses the room, 20 cm a frame, and is taken out of it."""
-    film = Film([ROOM] * FIRST + [ball(x) for x in WAY_M] + [ROOM] * 2)
-    return film, play(device, film, FIRST)
+    return Film([ROOM] * FIRST + [ball(x) for x in WAY_M] + [ROOM] * 2)
+
+
+@pytest.fixture(scope="module")
+def passing(device: Device, crossing: Film) -> tuple[Film, dict[int, Shown]]:
+    return crossing, play(device, crossing, FIRST)
 
 
 def test_what_moves_is_where_it_is(passing: tuple[Film, dict[int, Shown]]) -> None:
@@ -187,9 +201,9 @@ def check_silhouettes(found: HandReport, worst_plain: float) -> None:
     assert found.leftover_px["plain"][0] > 500
 
 
-def test_silhouette_of_a_ball(device: Device) -> None:
-    film = Film([ROOM] * FIRST + [ball(x) for x in WAY_M] + [ROOM] * 2)
-    found = measure_hand(device, Film([ROOM] * len(film)), film, BOUNDS, VOXEL_M, range(len(film)))
+def test_silhouette_of_a_ball(device: Device, crossing: Film) -> None:
+    bare, frames = Film([ROOM] * len(crossing)), range(len(crossing))
+    found = measure_hand(device, bare, crossing, BOUNDS, VOXEL_M, frames)
     assert len(found.iou["hybrid"]) == len(WAY_M)
     check_silhouettes(found, worst_plain=0.2)
 

@@ -12,8 +12,7 @@ from client.laptop.source import open_source
 from client.laptop.synthetic.lights import ring_light
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import CameraModel
-from server.geometry.merge import merge_depth
-from server.input.measure import Measurement, measure
+from server.input.measure import Measurement
 from server.light.light_estimation import LEAST_FLATNESS, LightEstimator, sum_tiles
 from server.maths.self_occlusion import printed_threshold
 from server.maths.sh import dominant_direction
@@ -21,14 +20,14 @@ from server.opencl.engine import Engine
 from server.transfer.image_space import ImageSpaceTransfer
 from server.transfer.radiance_transfer import Transfer, direction_sets, transfer_radiance
 from server.transfer.sampling import PRESETS
-from server.volume.integrate import integrate
-from server.volume.raycast import LABEL_STATIC, Surface, raycast
+from server.volume.raycast import LABEL_STATIC, Surface
 from server.volume.volume import Volume
-from tests.analytic import look_at, pixel_rays, plane, sphere
-from tests.lights import degrees_between, random_directions, uniform, unit
-from tests.pipeline.test_white_furnace import CAMERA, VIEWS
-from tests.pipeline.test_white_furnace import reconstruct as reconstruct_body
-from tests.solids import HalfSpace, ball, fill_volume, float4, normal_at, upload_surface
+from tests.scenes.analytic import look_at, pixel_rays, plane, sphere
+from tests.scenes.furnace import CAMERA, VIEWS
+from tests.scenes.furnace import reconstruct as reconstruct_body
+from tests.scenes.lights import degrees_between, random_directions, uniform, unit
+from tests.scenes.solids import HalfSpace, ball, fill_volume, float4, normal_at, upload_surface
+from tests.scenes.volumes import fuse_frame, merged_surface
 
 ROOM_M = 1000.0
 RAYS = direction_sets(81, 4)
@@ -59,14 +58,8 @@ def reconstruct(engine: Engine, source: str, frames: range) -> Scene:
     bounds = default_volume(opened, frames)
     volume, camera = Volume(engine, bounds, default_voxel(bounds)), opened.camera
     for index in frames:
-        frame = opened[index]
-        assert frame.world_from_camera is not None
-        pose = volume.volume_from_world() @ frame.world_from_camera
-        measured = measure(engine, camera, frame)
-        volume.allocate(camera, pose, measured.depth_m)
-        integrate(engine, volume, camera, pose, measured)
-    model = raycast(engine, camera, pose, volume)
-    surface = merge_depth(engine, camera, pose, measured, model, volume)
+        pose, measured = fuse_frame(engine, volume, camera, opened[index])
+    surface = merged_surface(engine, volume, camera, pose, measured)
     return Scene(engine, camera, volume, surface, pose, measured)
 
 

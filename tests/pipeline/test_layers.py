@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import msgspec
@@ -12,34 +11,13 @@ import pytest
 from client.laptop.gallery.play import wishes_of
 from client.laptop.gallery.source import GallerySource
 from protocol.codec import encode
-from protocol.messages import Wishes
-from server.client_session import ClientSession
-from server.effects.table import effect_names
+from server.effects.table import EFFECTS
 from server.opencl.device import Device
-from server.pipeline import FrameResult
-from server.scene.mesh import load_mesh
-from server.scene.placement import Placement
+from server.pipeline import FrameResult, Pipeline
 from server.shading.layer import NEUTRAL, NOTHING
+from tests.scenes.played_layers import answered, played
 
 ENDS = {"composite", "compose_layer"}
-
-
-def played(
-    device: Device, source: GallerySource, wishes: Wishes, frames: int, watched: Sequence[int] = ()
-) -> list[FrameResult]:
-    """The first frames' results; the scene's things in their first places. watched: frames that somebody else sees."""
-    pipeline = ClientSession(device, source.camera, wishes)
-    try:
-        for number, thing in enumerate(source.scene.things):
-            mesh = load_mesh(thing.glb(), "glb")
-            pipeline.place_object(f"object-{number}", mesh, Placement(position_m=thing.place(0)))
-        return [pipeline.process(source[index], watched=index in watched) for index in range(frames)]
-    finally:
-        pipeline.close()
-
-
-def answered(wishes: Wishes, answer: str) -> Wishes:
-    return msgspec.structs.replace(wishes, answer=answer)
 
 
 def lights(results: list[FrameResult]) -> list[bytes]:

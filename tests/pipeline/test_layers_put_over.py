@@ -17,8 +17,8 @@ from protocol.images import encode_color, encode_depth
 from protocol.messages import Frame
 from server.opencl.device import Device
 from server.pipeline import FrameResult
-from server.service.result_encoding import layer_message
-from tests.pipeline.test_layers import answered, played
+from server.service.answers import layer_message
+from tests.scenes.played_layers import answered, played
 
 TURNED_DEG, MOVED_M = 9.0, 0.05
 

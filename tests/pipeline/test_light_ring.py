@@ -16,12 +16,14 @@ from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Light, Wishes
 from server.client_session import ClientSession
 from server.opencl.device import Device
-from tests.lights import degrees_between
+from server.pipeline import Pipeline
+from tests.scenes.lights import degrees_between
 
 FRAMES = range(0, 90, 18)
 """Half of the path: 70 degrees around the table."""
-GREATEST_ERROR_DEG = 8.0
-"""The worst of the ring is at about 6 degrees; with exact geometry and many rays it is under 1 for most lights."""
+GREATEST_ERROR_DEG = 7.0
+"""Seen: 2.6 to 6.4 degrees, and no more than 0.05 apart where one code in a hundred changes by one. With exact geometry
+and 243 rays it is 0.2 to 3.2 (test_known_light.py): the rest is what the cameras did not see."""
 
 
 def source_of(light: int) -> SyntheticSource:

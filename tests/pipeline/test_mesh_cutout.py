@@ -9,7 +9,7 @@ import pytest
 
 from server.scene import cutout
 from server.scene.mesh import Mesh, MeshError, load_mesh
-from tests.gltf_files import QUAD, Gltf, Json, assert_well_formed, color_uv
+from tests.scenes.gltf_files import QUAD, Gltf, Json, assert_well_formed, color_uv
 
 SIDE, RADIUS = 64, 0.3
 UNIT_UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)

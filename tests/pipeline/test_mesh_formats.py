@@ -8,8 +8,8 @@ import trimesh
 
 from server.scene.mesh import load_mesh
 from tests.data import data_folder
-from tests.gltf_files import Gltf, assert_well_formed, shown_texture
-from tests.meshes import public_mesh
+from tests.scenes.gltf_files import Gltf, assert_well_formed, shown_texture
+from tests.scenes.meshes import public_mesh
 
 
 @pytest.mark.parametrize(("format", "up"), [("ply", "z"), ("stl", "z"), ("obj", "y"), ("glb", "y")])

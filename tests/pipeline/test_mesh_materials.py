@@ -8,7 +8,7 @@ import trimesh
 
 from server.scene.materials import MATTE
 from server.scene.mesh import load_mesh
-from tests.gltf_files import QUAD, QUAD_UV, Gltf, Json, linear
+from tests.scenes.gltf_files import QUAD, QUAD_UV, Gltf, Json, linear
 
 
 def test_no_colour_is_grey() -> None:

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from server.scene.mesh import load_mesh
-from tests.gltf_files import Gltf
+from tests.scenes.gltf_files import Gltf
 
 
 def test_creases_are_kept_sharp() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from server.scene.mesh import MeshError, load_mesh
-from tests.gltf_files import QUAD_UV, Gltf, Json, assert_well_formed
+from tests.scenes.gltf_files import QUAD_UV, Gltf, Json, assert_well_formed
 
 
 def test_unreadable_texture_is_noted() -> None:

@@ -13,7 +13,7 @@ import trimesh
 
 from server.scene.limits import MAX_TRIANGLES
 from server.scene.mesh import MeshError, load_mesh
-from tests.gltf_files import QUAD_UV, TWO, Gltf, Json, assert_well_formed
+from tests.scenes.gltf_files import QUAD_UV, TWO, Gltf, Json, assert_well_formed
 
 
 @pytest.mark.parametrize("format", ["glb", "gltf", "obj", "ply", "stl"])

@@ -10,7 +10,7 @@ import pytest
 from server.scene import gltf_pictures
 from server.scene.materials import Beyond
 from server.scene.mesh import MeshError, load_mesh
-from tests.gltf_files import QUAD, QUAD_UV, Gltf, assert_well_formed, color_uv, shown_texture
+from tests.scenes.gltf_files import QUAD, QUAD_UV, Gltf, assert_well_formed, color_uv, shown_texture
 
 
 @pytest.mark.parametrize("kind", [".png", ".jpg"])

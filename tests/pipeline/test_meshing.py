@@ -28,8 +28,8 @@ from server.opencl.engine import Engine
 from server.scene.colors import linear_from_srgb
 from server.scene.mesh import load_mesh
 from server.volume.volume import BRICK, TRUNCATION_VOXELS, Bricks
-from tests.bricks import Field, ball, bricks_of, reordered
 from tests.data import data_folder
+from tests.scenes.bricks import Field, ball, bricks_of, reordered
 from tests.service.fakes import CAMERA
 
 CENTER, RADIUS = (40.3, 38.7, 41.1), 30.0

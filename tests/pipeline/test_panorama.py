@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from server.light.panorama import PanoramaError, panorama_directions, panorama_sh, read_panorama
 from server.maths.sh import dominant_direction, webxr_from_world
-from tests import lights
 from tests.data import data_folder
-from tests.lights import degrees_between
 from tests.reference.sh import sh_basis
+from tests.scenes import lights
+from tests.scenes.lights import degrees_between
 
 Floats = NDArray[np.float64]
 

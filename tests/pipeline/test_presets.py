@@ -13,19 +13,15 @@ from numpy.typing import NDArray
 from client.laptop.source import open_source
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Wishes
-from server.client_session import ClientSession
-from server.geometry.merge import merge_depth
-from server.input.measure import measure
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.quality.settings import sampling_of
 from server.scene.placement import Placement
 from server.transfer.radiance_transfer import TURNS, direction_sets, transfer_radiance
 from server.transfer.sampling import PRESETS, Sampling, TransferSampler
-from server.volume.integrate import integrate
-from server.volume.raycast import raycast
 from server.volume.volume import Volume
-from tests.meshes import shape_of
+from tests.scenes.meshes import shape_of
+from tests.scenes.volumes import fuse_frame, merged_surface
 
 SOURCE = "synthetic:table?light=1&frames=30&size=160x120"
 ROOM_M = 1000.0
@@ -63,13 +59,8 @@ def test_caches_bring_transfer_nearer_to_the_truth(device: Device, moving: bool)
     truth = direction_sets(810, 4)
     for step in range(8):
         frame = source[step if moving else min(step, 3)]
-        assert frame.world_from_camera is not None
-        pose = volume.volume_from_world() @ frame.world_from_camera
-        measured = measure(engine, source.camera, frame)
-        volume.allocate(source.camera, pose, measured.depth_m)
-        integrate(engine, volume, source.camera, pose, measured)
-        model = raycast(engine, source.camera, pose, volume)
-        surface = merge_depth(engine, source.camera, pose, measured, model, volume)
+        pose, measured = fuse_frame(engine, volume, source.camera, frame)
+        surface = merged_surface(engine, volume, source.camera, pose, measured)
         engine.queue.finish()
         found = [s.transfer(volume, surface, pose, UP, ROOM_M) for s in (plain, cached)]
         transfers = [e.download(t.coefficients) for e, t in zip((engine, other), found, strict=True)]
@@ -89,14 +80,8 @@ def test_turning_evens_out_over_frames(device: Device, preset: str) -> None:
     bounds = default_volume(source, range(30))
     engine = Engine(device)
     volume = Volume(engine, bounds, default_voxel(bounds))
-    frame = source[3]
-    assert frame.world_from_camera is not None
-    pose = volume.volume_from_world() @ frame.world_from_camera
-    measured = measure(engine, source.camera, frame)
-    volume.allocate(source.camera, pose, measured.depth_m)
-    integrate(engine, volume, source.camera, pose, measured)
-    model = raycast(engine, source.camera, pose, volume)
-    surface = merge_depth(engine, source.camera, pose, measured, model, volume)
+    pose, measured = fuse_frame(engine, volume, source.camera, source[3])
+    surface = merged_surface(engine, volume, source.camera, pose, measured)
     found = {}
     for turning in (True, False):
         sampling = replace(PRESETS[preset], turning=turning)
@@ -144,15 +129,8 @@ def test_short_rays_with_the_visibility_state_give_the_same_light(device: Device
     plain = TransferSampler(engine, source.camera, Sampling(4), 81, 4)
     stated = TransferSampler(other, source.camera, Sampling(4, visibility_state=True), 81, 4)
     for step in range(4):
-        frame = source[step]
-        assert frame.world_from_camera is not None
-        pose = volume.volume_from_world() @ frame.world_from_camera
-        measured = measure(engine, source.camera, frame)
-        volume.allocate(source.camera, pose, measured.depth_m)
-        integrate(engine, volume, source.camera, pose, measured)
-        surface = merge_depth(
-            engine, source.camera, pose, measured, raycast(engine, source.camera, pose, volume), volume
-        )
+        pose, measured = fuse_frame(engine, volume, source.camera, source[step])
+        surface = merged_surface(engine, volume, source.camera, pose, measured)
         engine.queue.finish()
         one, two = (s.transfer(volume, surface, pose, UP, 0.1) for s in (plain, stated))
         other.queue.finish()

@@ -18,8 +18,8 @@ from server.client_session import ClientSession
 from server.maths.sh import dominant_direction
 from server.opencl.device import Device
 from server.shading.composite import srgb_codes
-from tests.analytic import Floats
-from tests.lights import degrees_between
+from tests.scenes.analytic import Floats
+from tests.scenes.lights import degrees_between
 
 BLACK = 0.12
 """Of what the rest sends back."""
@@ -71,7 +71,11 @@ def error_deg(source: SyntheticSource, light: Light) -> float:
 
 
 def test_stripes_do_not_turn_the_light(device: Device, table: SyntheticSource, frames: list[RgbdFrame]) -> None:
-    """One albedo for all is 51 degrees off after six frames, albedos of their own 2 to 4."""
+    """One albedo for all is 50 degrees off after six frames, albedos of their own 2, and 7 without indirect light.
+
+    Noise of a code in one of a hundred values moves these by 0.1 degree: what is left of the bounds is for other
+    processors, whose rounding may choose other groups of samples.
+    """
     constant = lights(device, table, frames, albedo="constant", indirect="none")
     estimated = lights(device, table, frames, albedo="estimated", indirect="observed")
     direct = lights(device, table, frames, albedo="estimated", indirect="none")
@@ -79,8 +83,8 @@ def test_stripes_do_not_turn_the_light(device: Device, table: SyntheticSource, f
         assert np.isfinite(light.sh).all()
         assert np.isfinite([x for row in light.sh_std or () for x in row if x is not None]).all()
     assert error_deg(table, constant[-1]) > 25.0
-    assert error_deg(table, estimated[-1]) < 0.7 * error_deg(table, constant[-1])
-    assert error_deg(table, direct[-1]) < 0.7 * error_deg(table, constant[-1])
+    assert error_deg(table, estimated[-1]) < 5.0
+    assert error_deg(table, direct[-1]) < 10.0
     assert any((np.array(a.sh) != np.array(b.sh)).any() for a, b in zip(estimated, direct, strict=True))
 
 

@@ -20,8 +20,8 @@ from server.volume.brick_pool import BRICK_BYTES
 from server.volume.brick_table import AWAY_SLOT, BRICK, NO_SLOT
 from server.volume.raycast import raycast
 from server.volume.volume import Volume, VolumeSizeError
-from tests.analytic import look, look_at, plane, room, sphere
-from tests.volumes import cast, fuse, upload_depth
+from tests.scenes.analytic import look, look_at, plane, room, sphere
+from tests.scenes.volumes import cast, fuse, upload_depth
 
 CAMERA = CameraModel(width=160, height=120, fx=131.0, fy=131.0, cx=79.5, cy=59.5)
 ROOM_BOUNDS = (-0.1, -0.1, -0.1, 6.1, 3.1, 6.1)

@@ -14,9 +14,9 @@ from server.room.room import Room
 from server.service.room_saver import RoomSaver
 from server.service.room_store import RoomStore
 from server.service.saving.room_saves import Saved
-from tests.faulty_disk import FaultyDisk, full
-from tests.kept_rooms import client_of, print_of, scan
-from tests.rooms import wishes
+from tests.scenes.faulty_disk import FaultyDisk, full
+from tests.scenes.kept_rooms import client_of, print_of, scan
+from tests.scenes.rooms import wishes
 
 
 @pytest.fixture

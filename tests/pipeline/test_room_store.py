@@ -16,8 +16,7 @@ from msgspec import structs
 
 from protocol.frames import RgbdFrame
 from protocol.messages import Light, Marker
-from server.client_session import ClientSession
-from server.input.measure import GREATEST_DEPTH_M, measure
+from server.input.measure import GREATEST_DEPTH_M
 from server.light.light_estimation import LightEstimate
 from server.light.lobe_estimator import KnownLight
 from server.light.room_light import KnownRoomLight, RoomLight
@@ -30,15 +29,15 @@ from server.room.room import Room
 from server.scene.placement import Placement
 from server.service.room_store import RoomStore, folder_name
 from server.service.saving.brick_files import merged, read_bricks, write_bricks
-from server.volume.integrate import integrate
 from server.volume.raycast import raycast
 from server.volume.volume import Volume
-from tests import corners
-from tests.analytic import Floats, look_at
-from tests.corners import FLOOR, WALL, corner_frame
-from tests.kept_rooms import BALL, CUBE, PLACE, client_of, print_of, scan, voxels_of
-from tests.lights import degrees_between, lobe_and_sky
-from tests.rooms import CAMERA, VOXEL_M, frame_at, view_at, wishes
+from tests.scenes import corners
+from tests.scenes.analytic import Floats, look_at
+from tests.scenes.corners import FLOOR, WALL, corner_frame
+from tests.scenes.kept_rooms import BALL, CUBE, PLACE, client_of, print_of, scan, voxels_of
+from tests.scenes.lights import degrees_between, lobe_and_sky
+from tests.scenes.rooms import CAMERA, VOXEL_M, frame_at, view_at, wishes
+from tests.scenes.volumes import fuse_frame
 
 TOWARDS = (0.5, 0.8, 0.0)
 LIGHT = 0.3 * lobe_and_sky(TOWARDS)
@@ -247,12 +246,9 @@ def test_changes_behind_the_farthest_surface_that_is_fused_are_told(engine: Engi
     frame = RgbdFrame(0, 0.0, np.full((*depth.shape, 3), 128, np.uint8), depth, view)
     corner = (GREATEST_DEPTH_M + 0.3) / np.sqrt(3)
     volume = Volume(engine, (corner - 1.6,) * 3 + (corner + 1.6,) * 3, 0.1)
-    pose = volume.volume_from_world() @ view
     for _ in range(2):
         before, bits = volume.changes, voxels_of(volume)
-        measured = measure(engine, CAMERA, frame)
-        volume.allocate(CAMERA, pose, measured.depth_m)
-        integrate(engine, volume, CAMERA, pose, measured)
+        fuse_frame(engine, volume, CAMERA, frame)
         after = voxels_of(volume)
         differing = {place for place in after if after[place] != bits.get(place)}
         assert 2 + 4 * (2 + 4 * 2) in differing  # that brick, x fastest

@@ -21,12 +21,12 @@ from server.opencl.device import Device
 from server.pipeline import FrameResult
 from server.room.room import Room
 from server.scene.placement import Placement
-from tests import corners
-from tests.analytic import Floats
-from tests.corners import FLOOR, WALL, corner_frame
-from tests.lights import degrees_between, lobe_and_sky
-from tests.meshes import shape_of
-from tests.rooms import BOUNDS, CAMERA, VOXEL_M, frame_at, view_at, wishes
+from tests.scenes import corners
+from tests.scenes.analytic import Floats
+from tests.scenes.corners import FLOOR, WALL, corner_frame
+from tests.scenes.lights import degrees_between, lobe_and_sky
+from tests.scenes.meshes import shape_of
+from tests.scenes.rooms import BOUNDS, CAMERA, VOXEL_M, frame_at, view_at, wishes
 
 TOWARDS = (0.5, 0.8, 0.0)
 LIGHT = 0.3 * lobe_and_sky(TOWARDS)

@@ -15,7 +15,7 @@ from server.scene.limits import MeshError
 from server.scene.materials import Beyond, Material, Texture
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
-from tests.meshes import shape_of
+from tests.scenes.meshes import shape_of
 
 UP = np.array([0.0, 1.0, 0.0])
 HERE = Placement((0.0, 0.0, 1.0))

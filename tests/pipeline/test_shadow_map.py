@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from unittest.mock import patch
 
 import numpy as np
@@ -19,11 +20,11 @@ from server.maths.directional_fit import directional_sh
 from server.opencl.device import Device
 from server.pipeline import FrameResult
 from server.scene.placement import Placement
-from tests import lights
-from tests.analytic import look, look_at, plane
-from tests.meshes import shape_of
 from tests.reference.shadow_map import irradiance
-from tests.solids import Scene, box, hit
+from tests.scenes import lights
+from tests.scenes.analytic import look, look_at, plane
+from tests.scenes.meshes import shape_of
+from tests.scenes.solids import Scene, box, hit
 
 CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
 BOUNDS = (-0.8, -0.6, 0.5, 0.8, 0.4, 2.1)
@@ -82,6 +83,7 @@ def ratio_of(result: FrameResult) -> Floats:
     return np.asarray(linear[result.color[..., 1]] / linear[GREY])
 
 
+@cache
 def exact_ratio(spread_deg: float) -> tuple[Floats, NDArray[np.bool_]]:
     """[h, w] of a floor in the open under the sky and a disc of the lobe's spread; and where the floor is seen."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]

@@ -7,30 +7,16 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from server.client_session import ClientSession
 from server.maths.sh import rotate_sh, webxr_from_world
 from server.opencl.device import Device
 from server.pipeline import FrameResult
 from server.scene.placement import Placement
-from tests import lights
-from tests.analytic import look, look_at, plane
-from tests.lights import degrees_between
-from tests.meshes import shape_of
-
-CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
-BOUNDS = (-0.8, -0.3, 0.5, 0.8, 0.4, 2.1)
-POLE_M = (0.0, 0.2, 1.2)
-"""Foot of the virtual pole, on the floor; y is down."""
-VIEW = look_at((0.4, -0.6, 0.1), POLE_M)
-GREY = 150
-
-
-def frame() -> RgbdFrame:
-    seen = look([plane(POLE_M, (0.0, -1.0, 0.0))], CAMERA, VIEW).depth_m
-    depth = np.where(seen < 4, np.rint(1000 * seen), 0).astype(np.uint16)
-    return RgbdFrame(0, 0.0, np.full((CAMERA.height, CAMERA.width, 3), GREY, np.uint8), depth, VIEW)
+from tests.scenes import lights
+from tests.scenes.lights import degrees_between
+from tests.scenes.lit_pole import BOUNDS, CAMERA, GREY, POLE_M, VIEW, frame
+from tests.scenes.meshes import shape_of
 
 
 def shown(device: Device, light: NDArray[np.float64], axes: str) -> FrameResult:

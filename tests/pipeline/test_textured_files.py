@@ -18,8 +18,8 @@ from server.scene.coarse_colors import colors_at
 from server.scene.colors import linear_from_srgb
 from server.scene.materials import Beyond, Material, Texture
 from server.scene.mesh import load_mesh
-from tests.meshes import mesh_of, pose
-from tests.textured import FACE_COLORS, ROUGHNESS, write_glb, write_obj
+from tests.scenes.meshes import mesh_of, pose
+from tests.scenes.textured import FACE_COLORS, ROUGHNESS, write_glb, write_obj
 
 CAMERA = CameraModel(width=120, height=120, fx=150.0, fy=150.0, cx=59.5, cy=59.5)
 WRITERS = {"glb": write_glb, "obj": write_obj}

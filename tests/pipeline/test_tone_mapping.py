@@ -17,9 +17,9 @@ from server.maths.sh import LUMINANCE
 from server.opencl.device import Device
 from server.pipeline import FrameResult
 from server.scene.placement import Placement
-from tests import lights
-from tests.meshes import shape_of
-from tests.pipeline.test_static_light import BOUNDS, CAMERA, POLE_M, frame
+from tests.scenes import lights
+from tests.scenes.lit_pole import BOUNDS, CAMERA, POLE_M, frame
+from tests.scenes.meshes import shape_of
 
 LIGHT = 0.3 * lights.lobe_and_sky((0.5, -0.8, -0.3))
 LINEAR = linear_values("srgb8").astype(np.float64)

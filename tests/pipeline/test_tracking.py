@@ -16,9 +16,10 @@ from server.evaluation.trajectory import ate_rmse_m, position_errors_m, track_so
 from server.geometry.geometry import Geometry
 from server.maths.registration import angle_between, distance_between, motion_of_twist
 from server.opencl.engine import Engine
-from tests.analytic import Floats, plane
+from server.pipeline import Pipeline
 from tests.data import data_folder
-from tests.rooms import BOUNDS, CAMERA, VOXEL_M, frame_at, view_at, wishes
+from tests.scenes.analytic import Floats, plane
+from tests.scenes.rooms import BOUNDS, CAMERA, VOXEL_M, frame_at, view_at, wishes
 
 Open = Callable[[str], Geometry]
 
@@ -39,8 +40,8 @@ def test_track_follows_without_poses(open_geometry: Open) -> None:
         found.append(result.world_from_camera)
     np.testing.assert_array_equal(found[0], truth[0])
     assert sum(distance_between(a, b) for a, b in pairwise(truth)) > 0.8
-    assert ate_rmse_m(found, truth) < 0.15 * VOXEL_M
-    assert max(angle_between(a, b) for a, b in zip(found, truth, strict=True)) < np.radians(0.15)
+    assert ate_rmse_m(found, truth) < 0.15 * VOXEL_M  # seen: 0.128; a view of the model is kept over many frames
+    assert max(angle_between(a, b) for a, b in zip(found, truth, strict=True)) < np.radians(0.1)  # seen: 0.072
 
 
 def test_tracking_starts_from_the_identity_without_any_pose(open_geometry: Open) -> None:
@@ -55,19 +56,19 @@ def test_sensor_noise_does_not_lead_away(open_geometry: Open) -> None:
     for index in range(40):
         truth.append(view_at(index))
         frame = frame_at(truth[-1], index, noise_m=0.006, given=truth[0])
-        found.append(geometry.scan(frame).world_from_camera)
-    assert ate_rmse_m(found, truth) < 0.3 * VOXEL_M
+        found.append(geometry.update(frame).world_from_camera)
+    assert ate_rmse_m(found, truth) < 0.3 * VOXEL_M  # seen: 0.226, of noise of 6 mm, which is 0.3 voxel
 
 
-@pytest.mark.parametrize(("noise_m", "bound_m"), [(0.0, 2e-6), (0.003, 1e-3)])
+@pytest.mark.parametrize(("noise_m", "bound_m"), [(0.0, 5e-7), (0.003, 6e-4)])
 def test_a_camera_that_stands_still_does_not_drift(open_geometry: Open, noise_m: float, bound_m: float) -> None:
-    """Once the volume has settled."""
+    """Once the volume has settled. Seen: 8e-8 m (a float32 at 1.5 m ends at 1e-7) and 4.2e-4 m; in the means 7e-6 m."""
     geometry = open_geometry("track")
     view = view_at(5)
     frames = [frame_at(view, index, noise_m=noise_m, given=view) for index in range(20)]
     found = [geometry.scan(frames[index % 20]).world_from_camera for index in range(300)]
     assert max(distance_between(pose, found[40]) for pose in found[40:]) < bound_m
-    assert distance_between(np.mean(found[-50:], axis=0), np.mean(found[40:90], axis=0)) < 5e-5
+    assert distance_between(np.mean(found[-50:], axis=0), np.mean(found[40:90], axis=0)) < 2e-5
 
 
 def test_given_poses_are_taken_as_they_are(open_geometry: Open) -> None:
@@ -87,7 +88,7 @@ def test_refine_corrects_a_client_that_drifts(open_geometry: Open) -> None:
         found.append(geometry.scan(frame_at(truth[-1], index, given=given[-1])).world_from_camera)
         drift = drift @ motion_of_twist(np.array([0.001, -0.0005, 0.0008, 0.002, 0.0005, -0.001]))
     assert ate_rmse_m(given, truth) > 0.04
-    assert ate_rmse_m(found, truth) < 0.15 * VOXEL_M
+    assert ate_rmse_m(found, truth) < 0.15 * VOXEL_M  # seen: 0.121, as without any pose of the client
 
 
 def test_refine_follows_motion_that_tracking_alone_cannot(open_geometry: Open) -> None:
@@ -100,7 +101,7 @@ def test_refine_follows_motion_that_tracking_alone_cannot(open_geometry: Open) -
         outcomes[mode] = distance_between(results[-1].world_from_camera, views[-1])
         if mode == "refine":
             assert [result.tracking for result in results] == ["given", *["tracked"] * 4]
-    assert outcomes["refine"] < 0.15 * VOXEL_M
+    assert outcomes["refine"] < 0.15 * VOXEL_M  # seen: 0.082
 
 
 def test_refine_takes_the_clients_motion_where_the_depth_does_not_fit(open_geometry: Open) -> None:
@@ -125,8 +126,8 @@ def test_what_a_plane_does_not_fix_is_said(open_geometry: Open, mode: str, words
     assert "turning about (0.00, 0.00, 1.00)" in note
     assert words in note
     expected = end if mode == "refine" else motion_of_twist(np.array([0, 0, 0, 0, 0, 0.008]))
-    assert distance_between(result.world_from_camera, expected) < 5e-4
-    assert angle_between(result.world_from_camera, expected) < 1e-3
+    assert distance_between(result.world_from_camera, expected) < 5e-5  # seen: 9e-6
+    assert angle_between(result.world_from_camera, expected) < 1e-6  # seen: 1e-7
 
 
 def test_the_pipeline_lights_a_tracked_stream(engine: Engine) -> None:
@@ -139,7 +140,7 @@ def test_the_pipeline_lights_a_tracked_stream(engine: Engine) -> None:
         results[mode] = result
         pipeline.close()
     directions = [np.array(results[mode].light.dominant_direction) for mode in results]
-    assert np.degrees(np.arccos(np.clip(directions[0] @ directions[1], -1, 1))) < 2
+    assert np.degrees(np.arccos(np.clip(directions[0] @ directions[1], -1, 1))) < 0.5  # seen: 0.19
     assert results["track"].tracking == "tracked"
 
 
@@ -167,7 +168,7 @@ def test_track_source_says_every_frames_pose_and_state(engine: Engine) -> None:
     track = track_source(engine, Source(), range(2, 6), VOXEL_M, BOUNDS, "track", lambda *n: told.append(n))  # type: ignore[arg-type]
     assert track.statuses == ["tracked"] * 4
     assert told == [(n, 4) for n in (1, 2, 3, 4)]
-    assert ate_rmse_m(track.poses, [view_at(index) for index in range(2, 6)]) < 0.1 * VOXEL_M
+    assert ate_rmse_m(track.poses, [view_at(index) for index in range(2, 6)]) < 0.06 * VOXEL_M  # seen: 0.039
     assert all(ms > 0 for ms in track.track_ms[1:])
 
 
@@ -175,13 +176,14 @@ def test_track_source_says_every_frames_pose_and_state(engine: Engine) -> None:
 @pytest.mark.parametrize(
     ("name", "frames", "bound_m"),
     [
-        ("mitsuba_track_clean", 100, 0.0006),
+        ("mitsuba_track_clean", 100, 0.0002),
         ("mitsuba_track_noisy", 100, 0.0012),
-        ("rgbd_livingroom1_synth", 60, 0.02),
-        ("rgbd_7scenes_redkitchen", 60, 0.03),
+        ("rgbd_livingroom1_synth", 60, 0.01),
+        ("rgbd_7scenes_redkitchen", 60, 0.01),
     ],
 )
 def test_trajectories_of_public_data(engine: Engine, name: str, frames: int, bound_m: float) -> None:
+    """Seen: 0.10, 1.13, 6.9 and 7.1 mm. The two rooms of real size drift with the frames; nothing closes loops."""
     source = open_source(str(data_folder(name)))
     is_cube = name.startswith("mitsuba")
     volume = (0.0, 0.0, 0.1, 2.0, 2.0, 2.1) if is_cube else default_volume(source, range(len(source)))

@@ -11,9 +11,9 @@ from protocol.messages import Wishes
 from server.geometry.geometry import Geometry
 from server.opencl.engine import Engine
 from server.volume.bounds import bounds_seen
-from tests.analytic import look
-from tests.lenses import BALL, CAMERA, LENS, ROOM, WORLD_FROM_COLOR, is_seen_by_both, moved, seen_by_depth
-from tests.volumes import vectors
+from tests.scenes.analytic import look
+from tests.scenes.lenses import BALL, CAMERA, LENS, ROOM, WORLD_FROM_COLOR, is_seen_by_both, moved, seen_by_depth
+from tests.scenes.volumes import vectors
 
 VOXEL_M = 0.02
 SCENE = [ROOM, BALL]

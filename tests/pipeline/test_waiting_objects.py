@@ -12,8 +12,8 @@ from server.client_session import ClientSession
 from server.opencl.device import Device
 from server.room.room import Room
 from server.scene.placement import Placement
-from tests.kept_rooms import CUBE, scan
-from tests.rooms import CAMERA, wishes
+from tests.scenes.kept_rooms import CUBE, scan
+from tests.scenes.rooms import CAMERA, wishes
 
 THERE, ELSEWHERE = Placement(position_m=(-0.9, 0.6, 1.0)), Placement(position_m=(-0.7, 0.5, 1.2))
 

@@ -7,11 +7,20 @@ import pytest
 
 from server.client_session import ClientSession
 from server.maths.direct_lights import split_light
-from server.opencl.device import open_device
+from server.opencl.device import Device, open_device
+from server.pipeline import Pipeline
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.service.warm_up import SHARP_LIGHT, warm_up
-from tests.rooms import CAMERA, frame_at, view_at, wishes
+from tests.scenes.rooms import CAMERA, frame_at, view_at, wishes
+
+
+@pytest.fixture(scope="module")
+def warm() -> tuple[Device, set[object]]:
+    """A device of its own that was warmed up, and the programs that it then has."""
+    device = open_device(None)
+    warm_up(device)
+    return device, set(device.programs._programs)
 
 
 @pytest.mark.parametrize(
@@ -25,11 +34,9 @@ from tests.rooms import CAMERA, frame_at, view_at, wishes
         {"preset": "gr15fast", "light": SHARP_LIGHT, "answer": "layer"},
     ],
 )
-def test_later_sessions_compile_nothing(asked: dict[str, object]) -> None:
-    device = open_device(None)
-    warm_up(device)
-    built = set(device.programs._programs)
-    pipeline = ClientSession(device, CAMERA, wishes("given", **asked))
+def test_later_sessions_compile_nothing(warm: tuple[Device, set[object]], asked: dict[str, object]) -> None:
+    device, built = warm
+    pipeline = Pipeline(device, CAMERA, wishes("given", **asked))
     square = Mesh(
         vertices=np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0.3, 0.3, 0]], np.float32),
         triangles=np.array([[0, 1, 2], [1, 3, 2]], np.int32),

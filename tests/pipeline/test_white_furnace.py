@@ -15,15 +15,11 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import trimesh
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from protocol.frames import CameraModel, RgbdFrame
+from protocol.frames import CameraModel
 from protocol.limits import MAX_SH_BANDS
 from protocol.messages import Preset, Wishes
-from server.client_session import ClientSession
-from server.geometry.merge import merge_depth
-from server.input.measure import measure
 from server.light.light_estimation import LEAST_FLATNESS
 from server.opencl.device import Device
 from server.opencl.engine import Engine
@@ -32,47 +28,21 @@ from server.quality.settings import THESIS_REACH_M, WHOLE_ROOM_M
 from server.scene.placement import Placement
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
 from server.transfer.sampling import PRESETS
-from server.volume.integrate import integrate
-from server.volume.raycast import LABEL_STATIC, Surface, raycast
-from server.volume.volume import Volume
-from tests.analytic import Shape, look, look_at, plane, sphere
-from tests.lights import random_directions, uniform
-from tests.meshes import shape_of
-from tests.solids import HalfSpace, ball, fill_volume, points_on, upload_surface
+from server.volume.raycast import LABEL_STATIC
+from tests.scenes.analytic import Shape, plane, sphere
+from tests.scenes.furnace import BOUNDS, CAMERA, VOXEL_M, frames, reconstruct
+from tests.scenes.lights import random_directions, uniform
+from tests.scenes.meshes import shape_of
+from tests.scenes.solids import HalfSpace, ball, fill_volume, points_on, upload_surface
 
 STRIDES = {name: PRESETS[name].stride for name in ("rm", "reg4", "reg8")}
 """Presets that differ in what one frame traces; the others add what earlier frames found."""
-CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
-BOUNDS = (-0.8, -0.8, 0.5, 0.8, 0.8, 2.1)
-VOXEL_M = 0.008
 BODIES: dict[str, Shape] = {
     "floor": plane((0, 0.2, 1.2), (0.1, -1.0, -0.8)),
     "wall": plane((0, 0, 1.3), (0.45, 0.2, -1.0)),
     "ball": sphere((0, 0, 1.2), 0.4),
 }
-VIEWS = [look_at((x, -0.1, 0.0), (0, 0, 1.2)) for x in (0.0, 0.2, -0.2)]
 RAYS, REACHES_M = (81, 169, 32), (WHOLE_ROOM_M, THESIS_REACH_M)
-
-
-def frames(body: Shape, color: NDArray[np.uint8]) -> Iterator[RgbdFrame]:
-    for index, view in enumerate(VIEWS):
-        depth = np.rint(1000 * look([body], CAMERA, view).depth_m)
-        yield RgbdFrame(index, index / 30, color, np.where(depth > 5000, 0, depth).astype(np.uint16), view)
-
-
-def reconstruct(engine: Engine, body: Shape) -> tuple[Volume, Surface]:
-    """The spine up to the merged geometry buffer."""
-    volume = Volume(engine, BOUNDS, VOXEL_M)
-    grey = np.full((CAMERA.height, CAMERA.width, 3), 188, np.uint8)
-    for frame in frames(body, grey):
-        assert frame.world_from_camera is not None
-        pose = volume.volume_from_world() @ frame.world_from_camera
-        measured = measure(engine, CAMERA, frame)
-        volume.allocate(CAMERA, pose, measured.depth_m)
-        integrate(engine, volume, CAMERA, pose, measured)
-        model = raycast(engine, CAMERA, pose, volume)
-        surface = merge_depth(engine, CAMERA, pose, measured, model, volume)
-    return volume, surface
 
 
 def configurations() -> Iterator[tuple[str, int, int, float]]:

@@ -14,19 +14,6 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 
-def first_solid(solid: Bools, voxel_m: float, origin: Floats, directions: Floats) -> Floats:
-    """[n] distance in metres along unit rays from outside to the first cube of `solid` [z, y, x], 0 where none is met:
-    every cube against every ray."""
-    low = np.argwhere(solid)[:, ::-1] * voxel_m - origin
-    slope = np.where(np.abs(directions) < 1e-12, 1e-12, directions)
-    nearest = np.full(len(directions), np.inf)
-    for some in np.array_split(np.arange(len(directions)), -(-len(directions) // 64)):
-        a, b = low / slope[some, None], (low + voxel_m) / slope[some, None]
-        enter, leave = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
-        nearest[some] = np.where(enter < leave, enter, np.inf).min(-1)
-    return np.where(np.isfinite(nearest), nearest, 0.0)
-
-
 @dataclass(frozen=True)
 class Views:
     """Auxiliary views: as server.transfer.auxiliary_views.AuxiliaryViews, on the host."""
@@ -46,6 +33,12 @@ class Views:
         right, down, forward = self.axes[view]
         return slope[:, None, None] * down + slope[None, :, None] * right + forward
 
+    def line(self, view: int, row: int, col: int) -> Floats:
+        """[3] the line of sight of one pixel."""
+        right, down, forward = self.axes[view]
+        middle = (self.depths.shape[1] - 1) / 2
+        return self.per_pixel * ((col - middle) * right + (row - middle) * down) + forward
+
     def eye(self, view: int) -> Floats:
         """[3] volume space."""
         return self.center - self.distance_m * self.axes[view, 2]
@@ -63,7 +56,7 @@ class Views:
         depth = self.depths[view, row, col]
         if depth == 0 or depth >= z:
             return True
-        to = self.eye(view) + depth * self.lines(view)[row, col] - point
+        to = self.eye(view) + depth * self.line(view, row, col) - point
         return bool(to @ normal <= lift_m or to @ to >= reach_m**2)
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.maths.planes import CELL_M, PlanePatch
-from tests.analytic import Floats
+from tests.scenes.analytic import Floats
 
 
 def beyond(plane: PlanePatch, origins: Floats, directions: Floats, least_m: float) -> list[Floats]:

@@ -8,26 +8,38 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-def trace_volume(
-    solid: NDArray[np.bool_], voxel_m: float, origins: Floats, directions: Floats, reach_m: float
-) -> NDArray[np.bool_]:
-    """[n] whether unit rays are free of the cubes of `solid` [z, y, x] for `reach_m` (Amanatides & Woo 1987)."""
+def first_solid(solid: NDArray[np.bool_], voxel_m: float, origins: Floats, directions: Floats) -> Floats:
+    """[n] metres along unit rays to the first cube of `solid` [z, y, x], inf: none (Amanatides & Woo 1987)."""
     position, size = origins / voxel_m, np.array(solid.shape[::-1])
     slope = np.where(np.abs(directions) < 1e-12, 1e-12, directions)
     cell = np.floor(position).astype(int)
     step = np.sign(slope).astype(int)
     onward = (cell + (step > 0) - position) / slope
-    free = np.ones(len(origins), bool)
-    for _ in range(sum(solid.shape) + 3):
+    period = np.abs(1 / slope)
+    number = np.arange(len(origins))  # of the rays that still go on
+    entered = np.zeros(len(origins))
+    found = np.full(len(origins), np.inf)
+    while len(number):
         inside = ((cell >= 0) & (cell < size)).all(-1)
         held = np.clip(cell, 0, size - 1)
-        free &= ~(inside & solid[held[:, 2], held[:, 1], held[:, 0]])
-        axis = onward.argmin(-1)
-        rows = np.flatnonzero(free & (onward.min(-1) < reach_m / voxel_m))
-        axis = axis[rows]
+        met = inside & solid[held[:, 2], held[:, 1], held[:, 0]]
+        found[number[met]] = entered[met]
+        gone = ((cell < 0) & (step < 0) | (cell >= size) & (step > 0)).any(-1)
+        on = ~met & ~gone
+        if not on.all():
+            number, cell, step, onward, period = (a[on] for a in (number, cell, step, onward, period))
+        rows, axis = np.arange(len(number)), onward.argmin(-1)
+        entered = onward[rows, axis]
         cell[rows, axis] += step[rows, axis]
-        onward[rows, axis] += np.abs(1 / slope[rows, axis])
-    return free
+        onward[rows, axis] += period[rows, axis]
+    return found * voxel_m
+
+
+def trace_volume(
+    solid: NDArray[np.bool_], voxel_m: float, origins: Floats, directions: Floats, reach_m: float
+) -> NDArray[np.bool_]:
+    """[n] whether unit rays are free of the cubes of `solid` [z, y, x] for `reach_m`."""
+    return first_solid(solid, voxel_m, origins, directions) >= reach_m
 
 
 def find_blockers(

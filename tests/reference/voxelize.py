@@ -8,29 +8,34 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-def overlaps_cell(triangle: Floats, centers: Floats, half: float) -> NDArray[np.bool_]:
-    """[n] whether `triangle` [3, 3] touches the cubes around `centers` [n, 3]: all 13 axes (Akenine-Moeller)."""
-    edges = np.roll(triangle, -1, axis=0) - triangle
-    axes = [*np.eye(3), np.cross(edges[0], edges[1])]
-    axes += [np.cross(edge, axis) for edge in edges for axis in np.eye(3)]
+def overlaps_cell(triangles: Floats, centers: Floats, half: float) -> NDArray[np.bool_]:
+    """[n] whether each of `triangles` [n, 3, 3] touches the cube around its center: all 13 axes (Akenine-Moeller)."""
+    edges = np.roll(triangles, -1, axis=1) - triangles
+    axes = [np.broadcast_to(axis, centers.shape) for axis in np.eye(3)] + [np.cross(edges[:, 0], edges[:, 1])]
+    axes += [np.cross(edges[:, k], axis) for k in range(3) for axis in np.eye(3)]
+    offsets = triangles - centers[:, None]
     touches = np.ones(len(centers), bool)
     for axis in axes:
-        corners = (triangle[None] - centers[:, None]) @ axis
-        reach = half * np.abs(axis).sum()
+        corners = (offsets * axis[:, None]).sum(-1)
+        reach = half * np.abs(axis).sum(-1)
         touches &= (corners.max(axis=1) >= -reach) & (corners.min(axis=1) <= reach)
     return touches
 
 
 def mark_cells(vertices: Floats, triangles: NDArray[np.int64], dims: tuple[int, int, int], half: float) -> Floats:
     """[z, y, x] bool: the cells (cubes of half width `half` around i + 0.5) that a triangle touches; grid units."""
+    corners = vertices[triangles]
+    low = np.maximum(np.floor(corners.min(axis=1) - 0.01).astype(int), 0)
+    size = np.minimum(np.floor(corners.max(axis=1) + 0.01).astype(int) + 1, dims) - low
+    count = np.maximum(size, 0).prod(axis=1)
+    triangle = np.repeat(np.arange(len(triangles)), count)  # one entry a triangle and cell of its box
+    number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    along_x, along_y = size[triangle, 0], size[triangle, 1]
+    in_box = np.stack([number % along_x, number // along_x % along_y, number // (along_x * along_y)], axis=-1)
+    cells = low[triangle] + in_box
+    x, y, z = cells[overlaps_cell(corners[triangle], cells + 0.5, half)].T
     occupied = np.zeros(dims[::-1], bool)
-    for triangle in vertices[triangles]:
-        low = np.maximum(np.floor(triangle.min(axis=0) - 0.01).astype(int), 0)
-        high = np.minimum(np.floor(triangle.max(axis=0) + 0.01).astype(int) + 1, dims)
-        cells = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), -1)
-        cells = cells.reshape(-1, 3)
-        x, y, z = cells[overlaps_cell(triangle, cells + 0.5, half)].T
-        occupied[z, y, x] = True
+    occupied[z, y, x] = True
     return occupied
 
 

@@ -32,12 +32,12 @@ from server.scene.limits import MeshError
 from server.scene.materials import Beyond, Material, Texture
 from server.scene.mesh import Mesh, load_mesh
 from tests.data import ROOT
-from tests.gltf_files import assert_well_formed
+from tests.scenes.gltf_files import assert_well_formed
+from tests.scenes.textured import write_glb
 from tests.service.fakes import CAMERA, PATIENCE_S, fake_mesh, frame_message, rgbd_frame
 from tests.service.jobs import triangle
 from tests.service.test_http import rows
 from tests.service.wire import Wire
-from tests.textured import write_glb
 
 STUBBORN_MESHES = replace(MESH_JOB, job="tests.service.jobs:read_mesh")
 STUBBORN_PICTURES = replace(PICTURE_JOB, job="tests.service.jobs:read_picture")

@@ -13,7 +13,7 @@ import pytest
 from server.opencl.device import Device
 from server.room.room import Room
 from server.service.scheduler import Scheduler
-from tests.rooms import wishes
+from tests.scenes.rooms import wishes
 from tests.service.fakes import PATIENCE_S
 
 FRAME_S = 0.002

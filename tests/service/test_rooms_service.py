@@ -21,7 +21,7 @@ from server.opencl.device import Device
 from server.service.limits import Limits
 from server.service.serve import BackgroundServer
 from server.service.service import Service
-from tests.rooms import CAMERA, frame_at, view_at, wishes
+from tests.scenes.rooms import CAMERA, frame_at, view_at, wishes
 from tests.service import fakes
 from tests.service.wire import Wire
 

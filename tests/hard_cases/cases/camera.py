@@ -8,11 +8,11 @@ from msgspec.structs import replace
 from server.input.measure import GREATEST_DEPTH_M
 from server.maths.registration import motion_of_twist
 from server.maths.rigid import inverse_rigid
-from tests.analytic import look
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial
-from tests.kernels.test_measure import PLAIN, frame_of, measured, random_frame
-from tests.kernels.test_track import CAMERA, FLAT, SCENE, START, VOXEL_M, moved, world
 from tests.reference import measure as twin
+from tests.scenes.analytic import look
+from tests.scenes.raw_frames import PLAIN, frame_of, measured, random_frame
+from tests.scenes.tracked_scene import CAMERA, FLAT, SCENE, START, VOXEL_M, moved, world
 
 TRACKING, INPUT = Family("tracking"), Family("input")
 _SHARE = 0.05 * VOXEL_M

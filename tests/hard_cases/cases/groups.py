@@ -7,17 +7,15 @@ from itertools import pairwise
 import numpy as np
 import pyopencl as cl
 
-from server.input.measure import measure
 from server.light.light_estimation import sum_tiles
 from server.opencl.device import Device
 from server.opencl.engine import Engine, KernelArgument
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
-from server.volume.integrate import integrate
 from server.volume.raycast import Surface, raycast
 from server.volume.volume import Volume
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial
-from tests.hard_cases.test_bad_depth import BOUNDS, CAMERA, frame_of, good_depth
-from tests.volumes import vectors
+from tests.scenes.bad_depth import BOUNDS, CAMERA, frame_of, good_depth
+from tests.scenes.volumes import fuse_frame, vectors
 
 GROUPS = Family("work-groups")
 _VOXEL_M = 0.06
@@ -47,10 +45,7 @@ def _chain(engine: Engine) -> Floats:
     """Everything from the sensor's picture to the light's sums, of one frame."""
     frame = frame_of(good_depth(np.eye(4)), np.eye(4))
     volume = Volume(engine, BOUNDS, _VOXEL_M)
-    pose = volume.volume_from_world()
-    measurement = measure(engine, CAMERA, frame)
-    volume.allocate(CAMERA, pose, measurement.depth_m)
-    integrate(engine, volume, CAMERA, pose, measurement)
+    pose, measurement = fuse_frame(engine, volume, CAMERA, frame)
     seen = raycast(engine, CAMERA, pose, volume)
     labels = (vectors(engine.download(seen.positions))[..., 3] > 0).astype(np.uint8)
     surface = Surface(seen.positions, seen.normals, engine.workspace.upload("labels", labels))

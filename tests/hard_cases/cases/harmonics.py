@@ -10,11 +10,11 @@ from server.maths.sh import rotate_sh, spherical_fibonacci
 from server.maths.sh import sh_basis as host_basis
 from server.opencl.program import KERNEL_FOLDER
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial
-from tests.kernels.test_composite import NONE_TAKEN, WALL, buffer, camera_picture, compose, plane
-from tests.kernels.test_sh import AXES, NEAR_POLES, SOURCE
-from tests.lights import random_directions, unit
 from tests.reference.composite import srgb_codes
 from tests.reference.sh import open_transfer, sh_basis
+from tests.scenes.composite_scene import NONE_TAKEN, WALL, buffer, camera_picture, compose, plane
+from tests.scenes.lights import random_directions, unit
+from tests.scenes.sh_kernel import AXES, NEAR_POLES, SOURCE
 
 HARMONICS = Family("spherical harmonics")
 _SUN = unit([0.3, -0.8, -0.5])

@@ -13,8 +13,8 @@ from server.light.lobe_estimator import LobeEstimator
 from server.maths.lobes import cells_to_sh
 from server.maths.sh import LUMINANCE
 from tests.hard_cases.catalogue import Family, Found, Trial
-from tests.kernels.test_lobe_estimator import CONSTANT, GRID, Run, View, direction, halves, sun
-from tests.lights import unit
+from tests.scenes.light_pools import CONSTANT, GRID, Run, View, direction, halves, sun
+from tests.scenes.lights import unit
 
 Floats = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from server.maths.bayes import NormalEquations, solve_plain, solve_with_evidence
 from server.maths.sh import LUMINANCE
 from tests.hard_cases.cases.seen import COUNT, FLOAT, LIGHT, SEEN, around, shading, sums, walls
 from tests.hard_cases.catalogue import Family, Found, Trial
-from tests.lights import lobe_and_sky, uniform, unit
 from tests.reference.sh import open_transfer
+from tests.scenes.lights import lobe_and_sky, uniform, unit
 
 Floats = NDArray[np.float64]
 

@@ -6,26 +6,19 @@ import numpy as np
 
 from server.objects.rasterize import NEAR_M
 from server.shading.tone_mapping import AverageMemory, Averages
-from tests import lights
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial, share_beyond
-from tests.kernels import test_rasterize
-from tests.kernels.test_composite import LIGHT as COMPOSITE_LIGHT
-from tests.kernels.test_composite import (
-    NONE_TAKEN,
-    WALL,
-    buffer,
-    camera_picture,
-    compose,
-    plane,
-)
-from tests.kernels.test_differential_rendering import LIGHT, PLATE, shade_floor
-from tests.kernels.test_rasterize import EXACT, EYE, FLIPS, SOUPS, at_pixels, draw, random_soup, triangulated_grid
-from tests.kernels.test_tone_mapping import Case as ToneCase
-from tests.meshes import pose, soup_of
 from tests.reference import rasterize as raster_twin
 from tests.reference.composite import srgb_codes
 from tests.reference.sh import open_transfer
-from tests.solids import box
+from tests.scenes import lights
+from tests.scenes.composite_scene import LIGHT as COMPOSITE_LIGHT
+from tests.scenes.composite_scene import NONE_TAKEN, WALL, buffer, camera_picture, compose, plane
+from tests.scenes.meshes import pose, soup_of
+from tests.scenes.shaded_floor import LIGHT, PLATE, shade_floor
+from tests.scenes.solids import box
+from tests.scenes.soups import CAMERA as SOUP_CAMERA
+from tests.scenes.soups import EXACT, EYE, FLIPS, SOUPS, at_pixels, draw, random_soup, triangulated_grid
+from tests.scenes.toned_picture import Case as ToneCase
 
 SHADOWS, RASTER = Family("differential rendering"), Family("rasteriser")
 
@@ -114,8 +107,8 @@ def _against_twin(trial: Trial, corners: Floats) -> Found:
     soup = soup_of(corners)
     picture = draw(trial.engine, (soup, EYE))
     vertices, triangles = soup.vertices.astype(np.float64), soup.triangles.astype(np.int64)
-    setup = raster_twin.setup_triangles(test_rasterize.CAMERA, EYE, vertices, triangles)
-    return Found(picture.triangle, raster_twin.raster_tiles(test_rasterize.CAMERA, setup))
+    setup = raster_twin.setup_triangles(SOUP_CAMERA, EYE, vertices, triangles)
+    return Found(picture.triangle, raster_twin.raster_tiles(SOUP_CAMERA, setup))
 
 
 for _name in SOUPS:
@@ -189,7 +182,7 @@ def shared_edges(trial: Trial) -> Found:
 def equally_near(trial: Trial) -> Found:
     rng = np.random.default_rng(0)
     pixels = rng.uniform((10, 10), (140, 90), (60, 1, 2)) + rng.uniform(-0.5, 0.5, (60, 3, 2)) * 40
-    corners = at_pixels(test_rasterize.CAMERA, pixels) * rng.uniform(0.5, 2, (60, 1, 1))
+    corners = at_pixels(SOUP_CAMERA, pixels) * rng.uniform(0.5, 2, (60, 1, 1))
     thrice = draw(trial.engine, (soup_of(np.concatenate([corners] * 3)), EYE))
     return Found(thrice.triangle, draw(trial.engine, (soup_of(corners), EYE)).triangle)
 

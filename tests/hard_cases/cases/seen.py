@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from server.light.light_estimation import ASSUMED_ALBEDO, LightEstimate, TileSums, sum_tiles
 from server.opencl.engine import Engine
 from server.volume.raycast import LABEL_STATIC
-from tests import lights
-from tests.kernels.test_light_estimation import Frame
 from tests.reference.sh import open_transfer
+from tests.scenes import lights
+from tests.scenes.light_samples import Frame
 
 Floats = NDArray[np.float64]
 

@@ -16,20 +16,11 @@ from protocol.messages import Wishes
 from server.client_session import ClientSession
 from server.pipeline import FrameResult
 from server.scene.placement import Placement
-from tests.analytic import look_at
 from tests.hard_cases.catalogue import Family, Found, Trial, share_beyond
-from tests.hard_cases.test_bad_depth import (
-    BAD_DEPTH,
-    CAMERA,
-    PYRAMID,
-    SIZE,
-    WISHES,
-    assert_sound,
-    frame_of,
-    good_depth,
-)
-from tests.lights import unit
-from tests.meshes import soup_of
+from tests.scenes.analytic import look_at
+from tests.scenes.bad_depth import BAD_DEPTH, CAMERA, PYRAMID, SIZE, WISHES, assert_sound, frame_of, good_depth
+from tests.scenes.lights import unit
+from tests.scenes.meshes import soup_of
 
 SESSIONS = Family("sessions")
 _TABLE = "synthetic:table?light=1&frames=12&size=160x120"

@@ -8,16 +8,16 @@ from numpy.typing import NDArray
 from server.light.near_light import Emitters
 from server.volume.integrate import GREATEST_WEIGHT, integrate
 from server.volume.volume import Volume
-from tests.analytic import look, look_at
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial, share_beyond
-from tests.kernels import test_raycast
-from tests.kernels.test_integrate import CAMERA
-from tests.kernels.test_near_light import samples_of
-from tests.kernels.test_radiance_transfer import trace
 from tests.reference.integrate import voxel_centers
 from tests.reference.sh import open_transfer
-from tests.solids import SCENES, fill_volume, normal_at
-from tests.volumes import cast, dense_voxels, fill, fuse, upload_measurement
+from tests.scenes import fused_scenes
+from tests.scenes.analytic import look, look_at
+from tests.scenes.fused_scenes import CAMERA
+from tests.scenes.light_samples import samples_of
+from tests.scenes.solids import SCENES, fill_volume, normal_at
+from tests.scenes.traced_points import trace
+from tests.scenes.volumes import cast, dense_voxels, fill, fuse, upload_measurement
 
 TRANSFER, VOLUME = Family("transfer"), Family("volume")
 VOXEL_M = 0.01
@@ -177,16 +177,16 @@ def no_depth(trial: Trial) -> Found:
 
 @VOLUME.case("empty, from inside, outside and 9 km off", 0, "hits", "there is no surface to see.")
 def empty(trial: Trial) -> Found:
-    volume = Volume(trial.engine, test_raycast.BOUNDS, 0.04)
+    volume = Volume(trial.engine, fused_scenes.BOUNDS, 0.04)
     eyes = ((0, 0, 0), (0, 0, -4), (9e3, 0, 0))
     views = [look_at(eye, (0.01, 0.0, 0.02)) for eye in eyes]
-    return Found([float(cast(trial.engine, volume, test_raycast.CAMERA, view)[0].sum()) for view in views], 0)
+    return Found([float(cast(trial.engine, volume, CAMERA, view)[0].sum()) for view in views], 0)
 
 
 def _seen_from(trial: Trial, offset: Floats) -> tuple[NDArray[np.bool_], Floats]:
     """Hits and depths of tilted planes, the whole of it moved by `offset`."""
-    scene, views, new = test_raycast.SCENES["tilted planes"]
-    bounds = tuple(float(v) for v in np.array(test_raycast.BOUNDS) + np.tile(offset, 2))
+    scene, views, new = fused_scenes.SCENES["tilted planes"]
+    bounds = tuple(float(v) for v in np.array(fused_scenes.BOUNDS) + np.tile(offset, 2))
     volume = Volume(trial.engine, bounds, 0.04)  # type: ignore[arg-type]
 
     def moved(view: Floats) -> Floats:
@@ -195,8 +195,8 @@ def _seen_from(trial: Trial, offset: Floats) -> tuple[NDArray[np.bool_], Floats]
         return result
 
     for view in views:
-        fuse(trial.engine, volume, test_raycast.CAMERA, moved(view), look(scene, test_raycast.CAMERA, view).depth_m)
-    hit, depth, _ = cast(trial.engine, volume, test_raycast.CAMERA, moved(new))
+        fuse(trial.engine, volume, CAMERA, moved(view), look(scene, CAMERA, view).depth_m)
+    hit, depth, _ = cast(trial.engine, volume, CAMERA, moved(new))
     return hit, depth
 
 
@@ -223,9 +223,9 @@ for _offset in (10.0, 1e4, 1e6):
 )
 def inside_surface(trial: Trial) -> Found:
     """3 cm inside a wall."""
-    camera = test_raycast.CAMERA
+    camera = CAMERA
     views = [look_at((0, 0, -1), (0, 0, 1))]
-    volume = Volume(trial.engine, test_raycast.BOUNDS, 0.04)
+    volume = Volume(trial.engine, fused_scenes.BOUNDS, 0.04)
     for view in views:
         fuse(trial.engine, volume, camera, view, np.full((camera.height, camera.width), 1.5))
     hit, depth, _ = cast(trial.engine, volume, camera, look_at((0.0, 0.0, 0.53), (0.0, 0.0, 2.0)))

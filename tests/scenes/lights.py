@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tests.reference.sh import sh_basis, sphere_rule
+from tests.scenes.analytic import Floats
 
-Floats = NDArray[np.float64]
 _RULE = sphere_rule(12, 24)
 
 

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, DepthCamera
-from tests.analytic import Floats, Shape, look, look_at, room, sphere
+from tests.scenes.analytic import Floats, Shape, look, look_at, room, sphere
 
 LENS = DepthCamera(
     width=80, height=60, fx=66.0, fy=65.0, cx=39.2, cy=30.1, distortion=(-0.21, 0.07, 0.001, -0.0008, -0.01)

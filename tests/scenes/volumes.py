@@ -9,16 +9,16 @@ import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
-from protocol.frames import CameraModel
-from server.input.measure import Measurement
+from protocol.frames import CameraModel, RgbdFrame
+from server.geometry.merge import merge_depth
+from server.input.measure import Measurement, measure
 from server.opencl.engine import Engine
 from server.volume.brick_pool import BRICK_VOXELS
 from server.volume.brick_table import AWAY_SLOT, BRICK
 from server.volume.integrate import integrate
-from server.volume.raycast import raycast
+from server.volume.raycast import Surface, raycast
 from server.volume.volume import Volume
-
-Floats = NDArray[np.float64]
+from tests.scenes.analytic import Floats
 
 
 def vectors(array: NDArray[Any]) -> NDArray[np.float32]:
@@ -90,6 +90,23 @@ def fuse(
     measurement = upload_measurement(engine, depth_m, radiance)
     volume.allocate(camera, pose, measurement.depth_m)
     integrate(engine, volume, camera, pose, measurement)
+
+
+def fuse_frame(engine: Engine, volume: Volume, camera: CameraModel, frame: RgbdFrame) -> tuple[Floats, Measurement]:
+    """Allocate and integrate a frame where it says that it was taken; its volume_from_camera and rectified picture."""
+    assert frame.world_from_camera is not None
+    pose = volume.volume_from_world() @ frame.world_from_camera
+    measurement = measure(engine, camera, frame)
+    volume.allocate(camera, pose, measurement.depth_m)
+    integrate(engine, volume, camera, pose, measurement)
+    return pose, measurement
+
+
+def merged_surface(
+    engine: Engine, volume: Volume, camera: CameraModel, pose: Floats, measurement: Measurement
+) -> Surface:
+    """The geometry buffer of a frame that was fused: what the volume shows, and what the sensor alone knows."""
+    return merge_depth(engine, camera, pose, measurement, raycast(engine, camera, pose, volume), volume)
 
 
 def cast(

@@ -8,7 +8,7 @@ import numpy as np
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from server.maths.sh import sh_basis, spherical_fibonacci
-from tests.analytic import Floats, look_at, pixel_rays
+from tests.scenes.analytic import Floats, look_at, pixel_rays
 
 CAMERA = CameraModel(
     width=128, height=96, fx=100.0, fy=100.0, cx=63.5, cy=47.5, depth_scale_m=0.0002, color_encoding="linear16"

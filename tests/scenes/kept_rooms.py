@@ -20,8 +20,8 @@ from server.service.saving.room_state import state_to_bytes
 from server.service.saving.save_slot import SaveSlot
 from server.service.saving.snapshot import snapshot_within
 from server.volume.volume import Volume
-from tests.meshes import shape_of
-from tests.rooms import CAMERA, frame_at, view_at
+from tests.scenes.meshes import shape_of
+from tests.scenes.rooms import CAMERA, frame_at, view_at
 
 CUBE = shape_of(trimesh.creation.box((0.2, 0.2, 0.2)))
 BALL = shape_of(trimesh.creation.icosphere(1, 0.1))

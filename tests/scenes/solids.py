@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from server.opencl.engine import Engine
 from server.volume.raycast import LABEL_NONE, LABEL_STATIC, Surface
 from server.volume.volume import BRICK, Volume
-from tests.volumes import fill, vectors
-
-Floats = NDArray[np.float64]
+from tests.scenes.analytic import Floats
+from tests.scenes.volumes import fill, vectors
 
 
 class Solid(Protocol):
@@ -120,6 +119,9 @@ def ball(center: ArrayLike, radius: float) -> Ball:
 SIDE_M = 0.96
 """Side of the volume of the scenes below."""
 
+INSIDE = ((0.11, 0.05, 0.11), (0.85, 0.9, 0.85))
+"""A box that holds surface of each of them and stays clear of the volume's border."""
+
 SCENES: dict[str, Scene] = {
     "ball above a floor": (floor(), ball((0.5, 0.42, 0.45), 0.2)),
     "room open at the top": (
@@ -151,7 +153,9 @@ def normal_at(scene: Scene, points: Floats) -> Floats:
     return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
 
 
-def points_on(scene: Scene, count: int, seed: int, within: tuple[ArrayLike, ArrayLike]) -> tuple[Floats, Floats]:
+def points_on(
+    scene: Scene, count: int, seed: int, within: tuple[ArrayLike, ArrayLike] = INSIDE
+) -> tuple[Floats, Floats]:
     """`count` random points on the scene's surfaces inside a box, and their normals: where random rays meet them."""
     random = np.random.default_rng(seed)
     low, high = (np.asarray(corner, float) for corner in within)
@@ -189,6 +193,16 @@ def solid_voxels(scene: Scene, volume: Volume) -> NDArray[np.bool_]:
     """[z, y, x] the voxels that `fill_volume` makes solid: seen, and behind a surface."""
     signed_m = signed_distances(scene, volume)
     return (signed_m < 0) & (signed_m > -volume.truncation_m)
+
+
+def scattered(
+    engine: Engine, share: float, voxel_m: float, random: np.random.Generator
+) -> tuple[Volume, NDArray[np.bool_]]:
+    """A volume in which a share of the voxels is solid, each alone and at random: [z, y, x] which."""
+    volume = Volume(engine, (0.0, 0.0, 0.0, SIDE_M, SIDE_M, SIDE_M), voxel_m)
+    solid = random.random([BRICK * n for n in volume.bricks[::-1]]) < share
+    fill(engine, volume, np.where(solid, -0.5, 1.0), np.ones(solid.shape))
+    return volume, solid
 
 
 def float4(xyz: NDArray[Any], w: NDArray[Any] | float = 1.0) -> NDArray[np.void]:

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
-from tests.analytic import Floats, Shape, look, look_at, room, sphere
+from tests.scenes.analytic import Floats, Shape, look, look_at, room, sphere
 
 CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
 VOXEL_M = 0.02

@@ -1,0 +1,32 @@
+"""A session of a synthetic source, frame by frame, with composites or with layers as its answer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+
+from client.laptop.gallery.source import GallerySource
+from protocol.messages import Wishes
+from server.opencl.device import Device
+from server.pipeline import FrameResult, Pipeline
+from server.scene.mesh import load_mesh
+from server.scene.placement import Placement
+
+
+def played(
+    device: Device, source: GallerySource, wishes: Wishes, frames: int, watched: Sequence[int] = ()
+) -> list[FrameResult]:
+    """The first frames' results; the scene's things in their first places. watched: frames that somebody else sees."""
+    pipeline = Pipeline(device, source.camera, wishes)
+    try:
+        for number, thing in enumerate(source.scene.things):
+            mesh = load_mesh(thing.glb(), "glb")
+            pipeline.place_object(f"object-{number}", mesh, Placement(position_m=thing.place(0)))
+        return [pipeline.process(source[index], watched=index in watched) for index in range(frames)]
+    finally:
+        pipeline.close()
+
+
+def answered(wishes: Wishes, answer: str) -> Wishes:
+    return msgspec.structs.replace(wishes, answer=answer)

@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.opencl.device import Device
 from server.pipeline import FrameResult
 from server.scene.placement import Placement
@@ -34,7 +35,7 @@ from tests.scenes.bad_depth import (
 )
 from tests.scenes.meshes import soup_of
 
-Open = Callable[..., Pipeline]
+Open = Callable[..., ClientSession]
 
 
 @pytest.fixture
@@ -53,7 +54,7 @@ def open_pipeline(device: Device) -> Iterator[Open]:
         pipeline.close()
 
 
-def lit(pipeline: Pipeline, offset: Any = (0.0, 0.0, 0.0)) -> FrameResult:
+def lit(pipeline: ClientSession, offset: Any = (0.0, 0.0, 0.0)) -> FrameResult:
     """The result of some good frames."""
     for index, x in enumerate((0.0, 0.1, 0.2)):
         view = look_at((x, -0.2, 0.0), (0.1, 0.3, 1.2))

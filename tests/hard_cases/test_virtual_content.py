@@ -93,7 +93,7 @@ def test_session_lives(pipeline: ClientSession, name: str) -> None:
 
 
 @pytest.mark.parametrize("when", ["before the first frame", "between frames"])
-def test_behind_the_camera_it_only_shades_the_wall_and_it_comes_back(pipeline: Pipeline, when: str) -> None:
+def test_behind_the_camera_it_only_shades_the_wall_and_it_comes_back(pipeline: ClientSession, when: str) -> None:
     """A box of 20 cm, 1.9 m from the wall, takes 1/280 of its light, more where the light comes from there."""
     box, behind = shape_of(BOX), Placement((0, 0.1, -0.9))
     if when == "between frames":

@@ -36,7 +36,6 @@ from server.maths.lobes import CELLS, RIDGE, cell_directions, lobe_family
 from server.maths.planes import SIDES, STEPS_M, PlanePatch, find_planes
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.pipeline import Pipeline
 from tests.data import data_folder
 from tests.reference.planes import beyond, looked_through
 from tests.scenes.analytic import Floats

@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from server.effects import functions as effects
-from server.effects.functions import View, add_objects
 from server.light.continuation import NO_PLANES, PlaneArrays
 from server.maths.direct_lights import DirectLight, SplitLight, split_light
 from server.maths.directional_fit import directional_sh
@@ -40,6 +39,7 @@ from server.transfer.radiance_transfer import Directions, direction_sets, transf
 from server.transfer.sample_grid import SampleGrid
 from tests.reference import shadow_map as twin
 from tests.scenes import glossy_surface, lights
+from tests.scenes.contexts import context_of
 from tests.scenes.lanes import KINDS, Narrow, Wide
 from tests.scenes.painted_walls import WALL as WALL_COLOR
 from tests.scenes.painted_walls import floor_beside_a_wall, wall_seen_from

@@ -19,6 +19,7 @@ from client.laptop.synthetic.lights import ring_light
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.light.light_estimation import ASSUMED_ALBEDO
 from server.maths.sh import dominant_direction
 from server.opencl.device import Device

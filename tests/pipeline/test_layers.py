@@ -11,9 +11,10 @@ import pytest
 from client.laptop.gallery.play import wishes_of
 from client.laptop.gallery.source import GallerySource
 from protocol.codec import encode
-from server.effects.table import EFFECTS
+from server.client_session import ClientSession
+from server.effects.table import effect_names
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.shading.layer import NEUTRAL, NOTHING
 from tests.scenes.played_layers import answered, played
 

@@ -17,7 +17,6 @@ from protocol.messages import Wishes
 from server.client_session import ClientSession
 from server.maths.sh import dominant_direction
 from server.opencl.device import Device
-from server.pipeline import Pipeline
 from tests.scenes.analytic import Floats, look, sphere
 
 FRAMES, FIRST = 18, 13

@@ -16,7 +16,6 @@ from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Light, Wishes
 from server.client_session import ClientSession
 from server.opencl.device import Device
-from server.pipeline import Pipeline
 from tests.scenes.lights import degrees_between
 
 FRAMES = range(0, 90, 18)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from client.laptop.source import open_source
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.quality.settings import sampling_of

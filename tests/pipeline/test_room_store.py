@@ -16,6 +16,7 @@ from msgspec import structs
 
 from protocol.frames import RgbdFrame
 from protocol.messages import Light, Marker
+from server.client_session import ClientSession
 from server.input.measure import GREATEST_DEPTH_M
 from server.light.light_estimation import LightEstimate
 from server.light.lobe_estimator import KnownLight

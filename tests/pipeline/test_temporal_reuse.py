@@ -12,7 +12,18 @@ from protocol.frames import CameraModel, RgbdFrame
 from server.culling.reason import ALLOWANCE, CullReason
 from server.light.continuation import NO_PLANES
 from server.opencl.engine import Engine
-from server.reuse.temporal_reuse import ECHO_FRAMES, NOISE, NOISY, RATE, ROUND, ROUNDING, SAME, SHARE, TemporalReuse
+from server.reuse.temporal_reuse import (
+    ECHO_FRAMES,
+    NOISE,
+    NOISY,
+    RATE,
+    ROUND,
+    ROUNDING,
+    SAME,
+    SHARE,
+    SceneVersion,
+    TemporalReuse,
+)
 from tests.scenes import lights
 
 CAMERA = CameraModel(width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)

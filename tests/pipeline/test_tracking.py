@@ -16,7 +16,6 @@ from server.evaluation.trajectory import ate_rmse_m, position_errors_m, track_so
 from server.geometry.geometry import Geometry
 from server.maths.registration import angle_between, distance_between, motion_of_twist
 from server.opencl.engine import Engine
-from server.pipeline import Pipeline
 from tests.data import data_folder
 from tests.scenes.analytic import Floats, plane
 from tests.scenes.rooms import BOUNDS, CAMERA, VOXEL_M, frame_at, view_at, wishes
@@ -56,7 +55,7 @@ def test_sensor_noise_does_not_lead_away(open_geometry: Open) -> None:
     for index in range(40):
         truth.append(view_at(index))
         frame = frame_at(truth[-1], index, noise_m=0.006, given=truth[0])
-        found.append(geometry.update(frame).world_from_camera)
+        found.append(geometry.scan(frame).world_from_camera)
     assert ate_rmse_m(found, truth) < 0.3 * VOXEL_M  # seen: 0.226, of noise of 6 mm, which is 0.3 voxel
 
 

@@ -8,7 +8,6 @@ import pytest
 from server.client_session import ClientSession
 from server.maths.direct_lights import split_light
 from server.opencl.device import Device, open_device
-from server.pipeline import Pipeline
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.service.warm_up import SHARP_LIGHT, warm_up
@@ -36,7 +35,7 @@ def warm() -> tuple[Device, set[object]]:
 )
 def test_later_sessions_compile_nothing(warm: tuple[Device, set[object]], asked: dict[str, object]) -> None:
     device, built = warm
-    pipeline = Pipeline(device, CAMERA, wishes("given", **asked))
+    pipeline = ClientSession(device, CAMERA, wishes("given", **asked))
     square = Mesh(
         vertices=np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0.3, 0.3, 0]], np.float32),
         triangles=np.array([[0, 1, 2], [1, 3, 2]], np.int32),

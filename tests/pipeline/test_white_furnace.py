@@ -20,6 +20,7 @@ from scipy import ndimage
 from protocol.frames import CameraModel
 from protocol.limits import MAX_SH_BANDS
 from protocol.messages import Preset, Wishes
+from server.client_session import ClientSession
 from server.light.light_estimation import LEAST_FLATNESS
 from server.opencl.device import Device
 from server.opencl.engine import Engine

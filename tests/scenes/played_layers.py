@@ -8,8 +8,9 @@ import msgspec
 
 from client.laptop.gallery.source import GallerySource
 from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.opencl.device import Device
-from server.pipeline import FrameResult, Pipeline
+from server.pipeline import FrameResult
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 
@@ -18,7 +19,7 @@ def played(
     device: Device, source: GallerySource, wishes: Wishes, frames: int, watched: Sequence[int] = ()
 ) -> list[FrameResult]:
     """The first frames' results; the scene's things in their first places. watched: frames that somebody else sees."""
-    pipeline = Pipeline(device, source.camera, wishes)
+    pipeline = ClientSession(device, source.camera, wishes)
     try:
         for number, thing in enumerate(source.scene.things):
             mesh = load_mesh(thing.glb(), "glb")

@@ -32,7 +32,7 @@ from server.service.room_store import RoomStore
 from server.service.scheduler import Scheduler
 from server.service.serve import BackgroundServer
 from server.service.service import Service
-from server.service.worker import Worker, Workshop
+from server.service.worker import Worker, WorkerContext
 from tests.scenes.rooms import CAMERA, frame_at, view_at, wishes
 from tests.service import fakes
 from tests.service.fakes import PATIENCE_S, FakePipeline, Lab, fake_mesh, frame_message

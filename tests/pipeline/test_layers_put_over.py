@@ -7,7 +7,6 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from server.service.answers import layer_message
 
 from client.laptop.gallery.play import wishes_of
 from client.laptop.gallery.source import GallerySource
@@ -18,6 +17,7 @@ from protocol.images import encode_color, encode_depth
 from protocol.messages import Frame
 from server.opencl.device import Device
 from server.pipeline import FrameResult
+from server.service.result_encoding import layer_message
 from tests.scenes.played_layers import answered, played
 
 TURNED_DEG, MOVED_M = 9.0, 0.05

@@ -8,13 +8,12 @@ import threading
 from pathlib import Path
 
 import pytest
-from server.service.saving.upkeep import DAY_S
 
 from server.opencl.device import Device
 from server.room.room import Room
 from server.service.room_saver import RoomSaver
 from server.service.room_store import RoomStore, folder_name
-from server.service.saving.retention import RetentionLimits
+from server.service.saving.retention import DAY_S, RetentionLimits
 from tests.scenes.rooms import wishes
 
 NOW_S = 2.0e9

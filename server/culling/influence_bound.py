@@ -1,7 +1,7 @@
-"""What virtual objects can change of real surface in view at most, without tracing. Kernels: influence_bound.cl.
+"""Bounds of the change that virtual objects make to real surface in view, without tracing. Kernels: influence_bound.cl.
 
-Each object is taken to be the ball around its box. A few samples come first: most often they say already that there is
-something to be seen, and the rest is not asked.
+Each object is replaced by the ball around its box. A few samples are tested first: most often they already show that
+the change is visible, and the rest is skipped.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from server.volume.raycast import Surface
 from server.volume.volume import Volume
 
 MOST_BALLS = 16
-"""Of more objects, one ball around all."""
+"""With more objects, one ball around all of them is used."""
 WIDER = 1.05
-"""Balls, than the box: rays meet an object as its distance grid has it, up to a cell (a sixtieth) off its surface."""
+"""Factor of the ball's radius: the distance grid that rays meet is up to one cell (1/60) larger than the mesh."""
 EVERY = 4
-"""Of how many samples along an axis one comes first."""
+"""Every so many samples along an axis are tested first."""
 WINDOW = 16.0
-"""Samples that a pixel's mean is of, at most: the pixel of a sample has at least so large a part of its bound."""
+"""Most samples in a pixel's mean: the pixel of a sample gets at least this part of its bound."""
 _CHUNK = 16  # pixels of a work-item, as in influence_bound.cl
 
 Floats = NDArray[np.float64]
@@ -40,7 +40,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class InfluenceBound:
-    """Bounds that hold at every pixel of real surface; infinite where they were not looked for."""
+    """Bounds for every pixel of real surface; infinite where they were not computed."""
 
     change: float
     """Of |R' / R - 1| (eq. 7.1) by what objects hide and send, less bounced light."""

@@ -1,7 +1,8 @@
-"""Chooses a session's operating point from its device's front: by a budget, a greatest light error, or neither (U1).
+"""Controls a session's operating point: by a time budget, a greatest light error, or neither (U1).
 
-A controller of steps, not of a continuous knob: down at once where the budget is broken, up one point at a time and
-only after a while of calm, twice as long after each climb that had to be taken back. So the picture does not pump.
+The controller steps along the Pareto front of the device. It steps down as soon as the budget is exceeded. It steps up
+one point at a time, after a number of frames within the budget; that number doubles after each step up that had to be
+taken back. So the picture does not oscillate.
 """
 
 from __future__ import annotations
@@ -12,27 +13,27 @@ from server.quality.costs import CostModel
 from server.quality.pareto_front import ParetoFront, ParetoPoint, read_front
 
 TOLERANCE = 1.1
-"""Frames may take so much of the budget; it is what they are held to."""
+"""Share of the budget that frames may take."""
 UP_TO = 0.92
-"""A better point must be expected to stay below so much of the budget, its scatter counted, before it is taken."""
+"""Share of the budget that a better point may be expected to take, with its spread, before it is chosen."""
 CALM_FRAMES, MOST_CALM_FRAMES = 15, 240
 FIRST_CALM_FRAMES = 4
-"""Before the first climb: a session begins low, and the first frames tell what the scene costs."""
+"""Before the first step up: a session starts low, and its first frames show what the scene costs."""
 TAKEN_BACK_FRAMES = 45
-"""A climb that does not last so long was a mistake."""
+"""A step up that lasts less was a mistake."""
 BEGIN = 0.75
-"""Of the budget that the first point may be expected to take: nothing is known of the scene yet."""
+"""Share of the budget that the first point may be expected to take: the scene is not known yet."""
 SETTLING_FRAMES = 2
-"""After a change: arrays are made and caches are empty, so that these say little. One that is far too slow counts."""
+"""Frames ignored after a change, while arrays are made and caches fill, unless they are far too slow."""
 BADLY = 1.5
 LEAST_KNOWN_FRAMES = 5
-"""Before what frames are expected to take is believed."""
+"""Before the expected time is trusted."""
 GOOD_ENOUGH_DEG = 1.0
-"""With nothing asked for: above the least light error."""
+"""Allowed above the least light error where neither budget nor error is given."""
 
 
 class OperatingPointControl:
-    """One session's choice. `observe` after every frame; `chosen` is the next one's."""
+    """Of one session. Call `observe` after every frame; `chosen` holds for the next."""
 
     def __init__(
         self, front: ParetoFront, budget_ms: float | None = None, max_light_error_deg: float | None = None
@@ -50,12 +51,12 @@ class OperatingPointControl:
 
     @property
     def chosen(self) -> ParetoPoint:
-        """For the next frame."""
+        """Operating point of the next frame."""
         return self._ladder[self._index]
 
     @property
     def said(self) -> OperatingPoint:
-        """What a frame says of it."""
+        """As the message of a frame describes it."""
         chosen = self.chosen
         return OperatingPoint(
             settings=chosen.point.settings,
@@ -65,7 +66,7 @@ class OperatingPointControl:
         )
 
     def observe(self, timings: Timings) -> None:
-        """One frame ran at `chosen`."""
+        """Add the times of a frame that ran at `chosen`."""
         self._since += 1
         if self._since > SETTLING_FRAMES:
             self._costs.observe(self.chosen, timings)
@@ -141,9 +142,9 @@ class OperatingPointControl:
         self._costs.changed()
 
     def _most_accurate(self, below_ms: float) -> int:
-        """The best point expected to take less, its scatter counted; the fastest where none does.
+        """The most accurate point expected to take less, with its spread; the fastest where there is none.
 
-        With a greatest light error, the fastest that keeps it is enough.
+        With a greatest light error, the fastest point that keeps it.
         """
         spread = self._costs.spread
         fitting = [i for i, p in enumerate(self._ladder) if self._costs.expected_ms(p) * spread <= below_ms * TOLERANCE]
@@ -156,7 +157,7 @@ class OperatingPointControl:
 
 
 def control_for(device: Device, wishes: Wishes) -> OperatingPointControl | None:
-    """Of a session that lets its point be chosen. Raises NoFrontError where the device was not measured."""
+    """The controller of a session with preset `auto`, else None. Raises NoFrontError for an unmeasured device."""
     if wishes.preset != "auto":
         return None
     return OperatingPointControl(read_front(device.name), wishes.budget_ms, wishes.max_light_error_deg)

@@ -1,4 +1,4 @@
-"""What accuracy costs in time on one device: its measured operating points, kept in the user's cache directory (U1)."""
+"""Accuracy against time on one device: measured operating points, kept in the user's cache directory (U1)."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from platformdirs import user_cache_path
 from server.quality.sampling_settings import SamplingSettings
 
 SAME_ERROR_DEG = 0.1
-"""Light errors that differ by less are the same: frames scatter by more."""
+"""Light errors that differ by less count as equal: frames vary by more."""
 SAME_PICTURE_ERROR = 0.02
-"""Relative, likewise."""
+"""Relative difference of picture errors that count as equal."""
 
 
 class ParetoPoint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One operating point as it was measured."""
+    """One measured operating point."""
 
     point: SamplingSettings
     ms: dict[str, float]
@@ -32,12 +32,12 @@ class ParetoPoint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
     @property
     def total_ms(self) -> float:
-        """Of a frame."""
+        """Median time of a frame."""
         return sum(self.ms.values())
 
 
 class ParetoFront(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What was measured on one device."""
+    """All measurements of one device."""
 
     device: str
     version: str
@@ -45,10 +45,10 @@ class ParetoFront(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     """Date, ISO."""
     scene: str
     points: tuple[ParetoPoint, ...]
-    """All that were measured."""
+    """All measured points, dominated ones too."""
 
     def best(self) -> tuple[ParetoPoint, ...]:
-        """Those that no faster one is as good as, fastest first: each next one errs less."""
+        """The Pareto front: points that no faster point equals in accuracy, fastest first."""
         found: list[ParetoPoint] = []
         for point in sorted(self.points, key=lambda p: (p.total_ms, p.light_error_deg)):
             if not found or _is_better(point, found[-1]):
@@ -57,7 +57,7 @@ class ParetoFront(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
 
 class NoFrontError(ValueError):
-    """The device was not measured; one line that says what to do."""
+    """The device has no measured front; the message says what to do."""
 
 
 def _is_better(a: ParetoPoint, b: ParetoPoint) -> bool:
@@ -67,7 +67,7 @@ def _is_better(a: ParetoPoint, b: ParetoPoint) -> bool:
 
 
 def own_version() -> str:
-    """Of the program: a front of another one is none."""
+    """Version of the program: a front of another version is not used."""
     try:
         return version("probeless")
     except PackageNotFoundError:
@@ -75,7 +75,7 @@ def own_version() -> str:
 
 
 def front_path(device: str) -> Path:
-    """Where a device's front is kept; PROBELESS_FRONTS names another folder than the user's cache directory."""
+    """File of a device's front, in the user's cache directory or in the folder PROBELESS_FRONTS."""
     folder = os.environ.get("PROBELESS_FRONTS")
     base = Path(folder) if folder else user_cache_path("probeless") / "fronts"
     key = hashlib.sha256(f"{device}\n{own_version()}".encode()).hexdigest()[:16]
@@ -83,7 +83,7 @@ def front_path(device: str) -> Path:
 
 
 def write_front(front: ParetoFront) -> Path:
-    """Keep a front, whole or not at all. Raises OSError."""
+    """Write a front atomically. Raises OSError."""
     path = front_path(front.device)
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_suffix(f".{os.getpid()}")
@@ -93,7 +93,7 @@ def write_front(front: ParetoFront) -> Path:
 
 
 def read_front(device: str) -> ParetoFront:
-    """The device's front. Raises NoFrontError where there is none, or none that can be read."""
+    """Read the device's front. Raises NoFrontError where it is missing or unreadable."""
     path = front_path(device)
     advice = "run `probeless tune`, or choose a --preset"
     try:

@@ -1,4 +1,4 @@
-"""Operating points: where and how finely transfer is sampled, which is what a budget of time may choose."""
+"""Sampling settings: where and how finely transfer is sampled. A time budget chooses among them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from protocol.messages import OperatingPoint, Preset, Wishes
 
 
 class SamplingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
-    """The wishes that may change while a session runs; see there for what they mean."""
+    """The wishes that may change during a session; see `Wishes` for their meaning."""
 
     preset: Preset = "reg4"
     rays: int = 81
@@ -22,16 +22,16 @@ class SamplingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @classmethod
     def of(cls, wishes: Wishes) -> SamplingSettings:
-        """That of a session's wishes."""
+        """The settings in a session's wishes."""
         return cls(**{name: getattr(wishes, name) for name in cls.__struct_fields__})
 
     def wishes(self, others: Wishes) -> Wishes:
-        """`others` at this point: nothing is left to choose."""
+        """`others` with these settings, and nothing left to choose."""
         return structs.replace(others, **structs.asdict(self), budget_ms=None, max_light_error_deg=None)
 
     @property
     def settings(self) -> str:
-        """As options of the command line, those that are not the preset's own."""
+        """As options of the command line, without those that the preset implies."""
         words = [f"--preset {self.preset}", f"--rays {self.rays}"]
         for name, value in structs.asdict(self).items():
             if name not in ("preset", "rays") and value is not None:
@@ -40,7 +40,7 @@ class SamplingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def option_of(name: str, value: Any) -> str:
-    """A wish as an option of the command line."""
+    """A wish as a command-line option."""
     flag = "--" + name.removesuffix("_m").replace("_", "-")
     if isinstance(value, bool):
         return flag if value else flag.replace("--", "--no-", 1)
@@ -48,5 +48,5 @@ def option_of(name: str, value: Any) -> str:
 
 
 def asked_for(wishes: Wishes) -> OperatingPoint:
-    """What a frame says of a point that was not chosen but wished."""
+    """Operating point of a frame whose settings were given by the client."""
     return OperatingPoint(settings=SamplingSettings.of(wishes).settings, reason="asked for")

@@ -1,4 +1,4 @@
-"""What a session's wishes mean: the presets, and which wishes this server can fulfil."""
+"""Resolves a session's wishes into settings, and refuses those that this server cannot meet."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from server.input.denoise import DenoiseMethod
 from server.transfer.sampling import PRESETS, Sampling
 
 WHOLE_ROOM_M = 1000.0
-"""Visibility rays this long leave any volume."""
+"""Visibility rays of this length leave any volume."""
 THESIS_REACH_M = 0.1
 
 T = TypeVar("T")
@@ -18,29 +18,29 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Settings:
-    """A session's operating point."""
+    """Resolved settings of a session."""
 
     sampling: Sampling
     lamps: Literal["auto", "on", "off"]
-    """Whether lights inside the room are looked for."""
+    """Whether to search for lights inside the room."""
     rays: int
     bands: int
     reach_m: float
     as_thesis: bool
     robustness: frozenset[str]
-    """P3: which of `openness`, `normals`, `normals_printed`, `memory`, `outliers` are on."""
+    """P3: enabled measures out of `openness`, `normals`, `normals_printed`, `memory`, `outliers`."""
     edges: Literal["smooth", "hard"]
     tone_mapping: Literal["auto", "light", "average"]
-    """What virtual things' brightness rests on: the light's scale, or the averages of picture and shading."""
+    """Brightness of virtual objects: from the scale of the light, or from the averages of picture and shading."""
     light_color: Literal["estimated", "white"]
     albedo: Literal["constant", "estimated"]
     indirect: Literal["none", "observed"]
     denoise: DenoiseMethod
     denoise_iterations: int
     plan: Literal["needed", "everything"]
-    """Whether what would hardly be seen is left out."""
+    """Whether effects that would hardly be seen are left out."""
     smooth_depth: bool
-    """Whether merged depth is smoothed once more (D''')."""
+    """Whether merged depth gets the last median (D''')."""
 
 
 def read_wishes(wishes: Wishes) -> Settings:

@@ -1,10 +1,9 @@
-"""Whether a frame shows nothing new: camera, scene and light as in the frames before, but for the sensor's noise.
+"""Change detection: whether a frame differs from the frames before it by more than sensor noise.
 
-The noise is what the frames themselves have: each tile's, of 8 x 8 pixels, is the mean square by which it has differed
-from the mean of those before it, which is noise as long as it does not grow. A tile that differs by more than noise may
-by chance is news, as a hand's edge is, and so is a block of 4 x 4 tiles whose mean does, as by a lamp that goes out.
-What cannot be told from noise is less than HIDDEN_MEAN_CODES of the whole picture's mean, and of a block's than
-HIDDEN_CODES and six deviations of such a mean.
+The noise is measured on the frames themselves. For each tile of 8 x 8 pixels it is the mean square difference from the
+mean of the frames before. A frame has changed where a tile differs by more than noise does by chance (the edge of a
+hand), or where the mean of a block of 4 x 4 tiles does (a lamp that goes out). Smaller changes are not detected: less
+than HIDDEN_MEAN_CODES in the mean of the picture, less than HIDDEN_CODES plus six deviations in the mean of a block.
 """
 
 from __future__ import annotations
@@ -23,31 +22,30 @@ from server.reuse.frame_difference import Differences, MeanPicture
 Floats = NDArray[np.float64]
 
 MOST_NOISE_CODES, MOST_NOISE_M = 12.0, 0.1
-"""Deviations beyond which no camera's noise lies: what differs so is another picture."""
+"""Standard deviations that no camera noise exceeds: a larger difference is another picture."""
 ODD_MEDIAN = 1.5
-"""Times the usual that the median tile's energy may have: what moves everywhere, if only a little, differs the more the
-longer it does."""
+"""Times its usual value that the energy of the median tile may have. Slow motion of the whole picture grows beyond."""
 DEVIATIONS = 6.0
-"""By which a tile's energy may be off by chance, and the mean of a block."""
+"""Standard deviations by which the energy of a tile, or the mean of a block, may be off by chance."""
 BLOCK = 4
-"""Tiles to a side of a block: shadows and lamps are larger than a tile, and of more pixels a mean says more."""
+"""Tiles along a side of a block. Shadows are larger than a tile, and a mean of more pixels has less noise."""
 TOGETHER, TOGETHER_DEPTH = 4.0, 16.0
-"""Numbers that err together, by JPEG and by stereo: the mean of n has the noise of n / 4."""
+"""Values whose errors are correlated, by JPEG and by stereo: the mean of n has the noise of n over this."""
 HIDDEN_CODES, HIDDEN_MEAN_CODES = 0.5, 0.25
-"""Codes of 255 that are let pass besides: by rounding, and by a lamp's own flicker."""
+"""Codes of 255 that are tolerated besides: rounding, and the flicker of lamps."""
 MOST_FLIPS = 6.0
-"""Numbers of depth in a tile that may come or go, over twice the most so far."""
+"""Depth values of a tile that may appear or vanish, beyond twice the most so far."""
 FIRST = 2
-"""Frames by which noise is known: until then tiles may have as much as a camera's can be."""
+"""Frames until the noise is known. Until then any camera noise is accepted."""
 PARALLAX_PX = 0.05
-"""By which no pixel may move where the client tells the pose."""
+"""Pixels that the picture may move by, where the client gives the pose."""
 NEAREST_M = 0.3
-"""For the parallax: sensors do not measure nearer."""
+"""Nearest surface, for the parallax: sensors do not measure nearer."""
 
 
 @dataclass
 class _Noise:
-    """What a kind of picture has shown so far, of each tile."""
+    """Noise statistics of each tile, of colour or of depth."""
 
     energy: Floats
     """Sum over frames of the mean square, as if one frame had been compared with an endless mean."""
@@ -56,13 +54,13 @@ class _Noise:
 
     @property
     def usual(self) -> Floats:
-        """Mean square by noise; not below a quarter of the median, as that of a tile that clips is."""
+        """Mean square noise, at least a quarter of the median: a clipped tile shows less than it has."""
         own = self.energy / max(self.frames, 1)
         return np.maximum(own, 0.25 * float(np.median(own)))
 
 
 class ChangeDetection:
-    """One camera's. `look` at each frame; `count` frames have been alike."""
+    """Of one camera. Call `look` for each frame; `count` is the number of unchanged frames."""
 
     def __init__(self, engine: Engine, camera: CameraModel, *, poses_are_given: bool) -> None:
         self._camera = camera
@@ -73,18 +71,18 @@ class ChangeDetection:
         self._first: RgbdFrame | None = None
         self.count = 0
         self.is_exact = True
-        """Whether all frames were the same to the byte."""
+        """Whether all frames were equal byte for byte."""
 
     def forget(self) -> None:
-        """The next frame is the first of its kind."""
+        """Start again with the next frame."""
         self._first, self._noise, self.count, self.is_exact = None, None, 0, True
         self._color.forget()
         self._depth.forget()
 
     def look(self, frame: RgbdFrame, *, learn: bool) -> bool:
-        """Whether it shows nothing new; else it is the first of what follows. learn: of its noise, to tell by later."""
+        """Whether the frame is unchanged; if not, detection restarts with it. learn: update the noise statistics."""
         if self._first is not None and self._is_placed_alike(self._first, frame):
-            if self.count == 1:  # before a moving camera nothing has to be uploaded
+            if self.count == 1:  # a moving camera needs no upload
                 self._add(self._first)
             color, depth = self._color.upload(frame.color), self._depth.upload(frame.depth)
             parts = (self._color.compare(color), self._depth.compare(depth))
@@ -113,7 +111,7 @@ class ChangeDetection:
         return parallax_px(self._camera, first.world_from_camera, frame.world_from_camera) <= PARALLAX_PX
 
     def _judge(self, parts: tuple[Differences, Differences]) -> tuple[bool, tuple[_Noise, _Noise]]:
-        """Whether it is noise that the pictures differ by, and what is then known of it."""
+        """Whether the difference is noise, and the statistics with it."""
         before = self._color.frames
         known = self._noise or tuple(_Noise(np.zeros(len(p.count)), np.zeros(len(p.count))) for p in parts)
         most = (MOST_NOISE_CODES * self._unit, MOST_NOISE_M / self._camera.depth_scale_m)
@@ -132,7 +130,7 @@ class ChangeDetection:
 
 
 def _is_noise(part: Differences, energy: Floats, noise: _Noise, limit: float, floor: float, together: float) -> bool:
-    """Whether tiles differ by noise alone. energy: their mean squares, as of one frame; floor: codes let pass."""
+    """Whether all tiles differ by noise alone. energy: mean squares, as of one frame; floor: tolerated codes."""
     median = float(np.median(energy))
     if median > limit**2 / 4:
         return False
@@ -160,7 +158,7 @@ def _of_blocks(of_tiles: Floats, cols: int) -> Floats:
 
 
 def parallax_px(camera: CameraModel, before: Floats, now: Floats) -> float:
-    """The most that a picture of what is NEAREST_M away or farther moves between two poses, about."""
+    """Approximate bound of the image motion between two poses, for surface at NEAREST_M or farther."""
     turned, moved = angle_between(before, now), distance_between(before, now)
     corner = math.hypot(camera.width / camera.fx, camera.height / camera.fy) / 2
     return max(camera.fx, camera.fy) * (1 + corner**2) * (turned + moved / NEAREST_M)

@@ -1,4 +1,4 @@
-"""What a frame differs by from the mean of those before it, tile by tile, in codes. Kernel: frame_difference.cl."""
+"""Differences of a frame from the mean of the frames before it, per tile, in codes. Kernel: frame_difference.cl."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from server.opencl.engine import Engine
 from server.opencl.transfer import fill_bytes
 
 TILE = 8
-"""Pixels to a side, as in the kernel."""
+"""Pixels along a side of a tile, as in the kernel."""
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Differences:
-    """Of each tile, [tiles] float64."""
+    """Per tile, [tiles] float64."""
 
     mean: Floats
-    """Codes of this frame less those of the mean."""
+    """Mean of the frame's codes minus those of the mean picture."""
     mean_square: Floats
-    """Of the same."""
+    """Mean square of the same difference."""
     count: Floats
-    """Numbers that are known to both; 0 leaves the means at 0."""
+    """Values that are valid in both; where it is 0 the means are 0."""
     flipped: Floats
-    """Numbers that are known to one of the two alone: depth that comes and goes."""
+    """Values that are valid in one of the two only: depth that appears or vanishes."""
     cols: int
     """Tiles in a row."""
 
 
 class MeanPicture:
-    """The running mean of pictures [h, w, 3], or of depth [h, w], of which 0 and 65535 are unknown; uint8 or uint16."""
+    """Running mean of pictures [h, w, 3], or of depth [h, w] in which 0 and 65535 are invalid; uint8 or uint16."""
 
     def __init__(self, engine: Engine, name: str) -> None:
-        """`name` of its arrays in the engine's workspace."""
+        """`name`: prefix of its arrays in the workspace."""
         self._engine = engine
         self._name = name
         self.frames = 0
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Start again."""
         self.frames = 0
 
     def upload(self, codes: NDArray[np.uint8] | NDArray[np.uint16]) -> cl_array.Array:
@@ -52,7 +52,7 @@ class MeanPicture:
         return self._engine.workspace.upload(f"{self._name}_codes", codes)
 
     def compare(self, codes: cl_array.Array) -> Differences:
-        """What an uploaded picture differs by, which is of the size of those before. Waits for the device."""
+        """Differences of an uploaded picture, of the same size as those before. Waits for the device."""
         engine, (height, width) = self._engine, codes.shape[:2]
         cols, rows = -(-width // TILE), -(-height // TILE)
         sums = engine.workspace.array(f"{self._name}_sums", (rows, cols), cl_types.float4)

@@ -45,21 +45,21 @@ MOST_FRAMES = 64
 """After which a view that has not settled begins anew."""
 RATE = 1.0 - FORGETTING
 SHARE = 0.5
-"""Of the allowance that a light may take which still moves though nothing else does."""
+"""Of the allowance: the most that a light which has not settled may take while nothing else changes."""
 ROUNDING = 0.01
-"""Display units: what the order of sums leaves of frames that are the same."""
+"""Display units: rounding of sums in another order, for equal frames."""
 OUTLIERS = 5e-4
 """Share of the pixels that may have changed by more than one code: half of what may not be seen."""
 _DIRECTIONS = 1024
 
 ECHO_FRAMES = 30
-"""For which the light's running mean remembers what frames at rest would have told it: then 0.9^30 of it, 4 %."""
+"""Frames after which the running mean of the light holds 0.9^30, 4 %, of what it missed while frames were reused."""
 
-# Reasons. The bounds of noise are of all but a thousandth of the pixels.
+# Reasons. Bounds under noise hold for all but a thousandth of the pixels.
 SAME = "neither the picture nor the geometry has changed, and the light has settled"
 NOISE = "nothing but the sensor's noise has changed, and what is drawn has settled"
 
-ECHO = "the light is a mean that frames at rest are not in: it is as far off as it was then"
+ECHO = "the light is a mean without the frames that were reused: it is as far off as it was then"
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]

@@ -1,13 +1,16 @@
-"""The command line as a user meets it: exit status, and one line for every error."""
+"""The command line as a user meets it: exit status, and one line for every error.
+
+Most of it runs in this process; what concerns signals, the installed program or a whole run has a process of its own.
+"""
 
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -16,7 +19,7 @@ import pytest
 import trimesh
 
 from client.bench import SUITES, find_suite
-from client.cli import run_command
+from client.cli import main, run_command
 from tests.client import folders
 from tests.data import ROOT
 
@@ -24,19 +27,35 @@ PROGRAM = Path(sys.executable).with_name("probeless")
 TABLE = "synthetic:table?size=160x120&frames=4"
 
 
-def probeless(*words: object, timeout_s: float = 300, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [PROGRAM, *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=timeout_s,
-        check=False,
-        cwd=ROOT,
-        env=os.environ | environment,
-    )
+Done = subprocess.CompletedProcess[str]
+Probeless = Callable[..., Done]
 
 
-def assert_one_line(done: subprocess.CompletedProcess[str], status: int, words: str) -> None:
+def probeless_process(*words: object, timeout_s: float = 300) -> Done:
+    """The installed program in a process of its own."""
+    command = [PROGRAM, *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False, cwd=ROOT)
+
+
+@pytest.fixture
+def probeless(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Probeless:
+    """The program in this process, in a terminal 200 columns wide."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def run(*words: object) -> Done:
+        arguments = [str(word) for word in words]
+        monkeypatch.setattr(sys, "argv", ["probeless", *arguments])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert isinstance(ended.value.code, int)
+        return Done(arguments, ended.value.code, *capsys.readouterr())
+
+    return run
+
+
+def assert_one_line(done: Done, status: int, words: str) -> None:
     assert done.returncode == status, done.stderr
     assert done.stdout == ""
     assert done.stderr.count("\n") == 1, done.stderr
@@ -69,7 +88,7 @@ def assert_one_line(done: subprocess.CompletedProcess[str], status: int, words: 
         (["bench", "nothing"], "nothing"),
     ],
 )
-def test_wrong_use_ends_with_2(words: list[str], error: str, tmp_path: Path) -> None:
+def test_wrong_use_ends_with_2(words: list[str], error: str, tmp_path: Path, probeless: Probeless) -> None:
     assert_one_line(probeless(*(word.format(tmp=tmp_path) for word in words)), 2, error)
 
 
@@ -84,15 +103,23 @@ def test_wrong_use_ends_with_2(words: list[str], error: str, tmp_path: Path) -> 
         (["run", TABLE, "--out", "{tmp}", "--object", "pyproject.toml@0,0,0"], "not a mesh"),
         (["run", TABLE, "--out", "{tmp}", "--device", "no such device"], "no OpenCL device is called"),
         (["run", TABLE, "--out", "/proc/probeless"], "cannot be written"),
-        (["serve", "--device", "no such device", "--port", "0"], "no OpenCL device is called"),
-        (["serve", "--tls-cert", "{tmp}/none.pem", "--tls-key", "{tmp}/none.pem"], "none.pem"),
     ],
 )
-def test_what_cannot_be_done_ends_with_1(words: list[str], error: str, tmp_path: Path) -> None:
+def test_what_cannot_be_done_ends_with_1(words: list[str], error: str, tmp_path: Path, probeless: Probeless) -> None:
     assert_one_line(probeless(*(word.format(tmp=tmp_path) for word in words)), 1, error)
 
 
-def test_truncated_picture_in_the_middle_of_a_run(tmp_path: Path) -> None:
+def test_the_installed_program_ends_so_too(tmp_path: Path) -> None:
+    """`serve` ends its process itself, whatever threads are left, so it has one of its own here."""
+    assert_one_line(probeless_process("fly"), 2, "No such command")
+    assert_one_line(
+        probeless_process("serve", "--device", "no such device", "--port", "0"), 1, "no OpenCL device is called"
+    )
+    certificate = tmp_path / "none.pem"
+    assert_one_line(probeless_process("serve", "--tls-cert", certificate, "--tls-key", certificate), 1, "none.pem")
+
+
+def test_truncated_picture_in_the_middle_of_a_run(tmp_path: Path, probeless: Probeless) -> None:
     folder = folders.ground_truth(tmp_path / "set", count=4)
     file = folder / "color" / "000002.png"
     file.write_bytes(file.read_bytes()[:100])
@@ -102,7 +129,7 @@ def test_truncated_picture_in_the_middle_of_a_run(tmp_path: Path) -> None:
     assert [json.loads(line)["frame"] for line in lines] == [0, 1]
 
 
-def test_mesh_is_written_and_an_empty_one_told(tmp_path: Path) -> None:
+def test_mesh_is_written_and_an_empty_one_told(tmp_path: Path, probeless: Probeless) -> None:
     volume = ["--volume", "-0.7,-0.1,-0.5,0.7,0.4,0.5", "--voxel", "0.02", "--mesh", "--out"]
     done = probeless("run", TABLE, "--frames", "0:2", *volume, tmp_path)
     assert done.returncode == 0, done.stderr
@@ -113,22 +140,22 @@ def test_mesh_is_written_and_an_empty_one_told(tmp_path: Path) -> None:
     assert_one_line(probeless("run", TABLE, "--frames", "0:2", *volume, tmp_path), 1, "there is no surface to mesh")
 
 
-def test_debug_shows_the_traceback_wherever_it_stands() -> None:
+def test_debug_shows_the_traceback_wherever_it_stands(probeless: Probeless) -> None:
     for words in (["--debug", "run", "/nowhere", "--out", "x"], ["run", "/nowhere", "--out", "x", "--debug"]):
         done = probeless(*words)
         assert done.returncode == 1
         assert "Traceback" in done.stderr
 
 
-def test_stream_without_a_server() -> None:
+def test_stream_without_a_server(probeless: Probeless) -> None:
     done = probeless("stream", TABLE, "--server", "http://127.0.0.1:9")
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     assert "no server at http://127.0.0.1:9" in done.stderr.splitlines()[-1]
 
 
-def test_help_names_every_command_and_option() -> None:
-    general = probeless("--help", COLUMNS="200").stdout
+def test_help_names_every_command_and_option(probeless: Probeless) -> None:
+    general = probeless("--help").stdout
     for command in ("run", "stream", "model", "serve", "demo", "devices", "bench"):
         assert command in general
     shared = (
@@ -136,18 +163,18 @@ def test_help_names_every_command_and_option() -> None:
         "--object --up --light --panorama --lamps --exposure --mesh --budget-ms --max-light-error --out"
     )
     for command in ("run", "stream"):
-        text = probeless(command, "--help", COLUMNS="200").stdout
+        text = probeless(command, "--help").stdout
         assert [option for option in shared.split() if option not in text] == []
 
 
-def test_devices_lists_the_one_that_would_be_used() -> None:
-    done = probeless("devices", COLUMNS="200")
+def test_devices_lists_the_one_that_would_be_used(probeless: Probeless) -> None:
+    done = probeless("devices")
     assert done.returncode == 0
     assert "would be used" in done.stdout
 
 
 def test_run_writes_what_is_promised(tmp_path: Path) -> None:
-    done = probeless("run", TABLE, "--frames", "1:4", "--out", tmp_path)
+    done = probeless_process("run", TABLE, "--frames", "1:4", "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     assert "3 frames" in done.stdout
     assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == ["000001.png", "000002.png", "000003.png"]
@@ -189,7 +216,7 @@ def test_bench_finds_only_what_is_a_suite() -> None:
 
 
 def test_demo_ends_by_itself_with_pictures(tmp_path: Path) -> None:
-    done = probeless("demo", "--out", tmp_path / "demo", timeout_s=600)
+    done = probeless_process("demo", "--out", tmp_path / "demo", timeout_s=600)
     assert done.returncode == 0, done.stderr
     first, *_, last = done.stdout.splitlines()
     assert "http://" in first

@@ -34,7 +34,7 @@ BYTES_PER_S = 2e6 / 8
 DELAY_S = 0.02
 SETTLED, LOOKED_AT = 12, 10
 """Answers until the page has found its rung, and those whose age is then looked at."""
-LONGEST_S = 30.0
+LONGEST_S = 60.0
 AGE_BOUND_MS = 500.0
 """Of a frame when it is answered, from its capture: about what one picture at the best takes over the link."""
 

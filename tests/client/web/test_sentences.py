@@ -15,7 +15,7 @@ from server.service.graceful_shutdown import DRAINING, GOODBYE
 from server.service.room_registry import key_digest_of
 from server.service.serve import BackgroundServer
 from server.service.service import Service
-from tests.client.web.conftest import OpenPage, wait_for_text
+from tests.client.web.conftest import PATIENCE_MS, OpenPage, wait_for_text
 from tests.client.web.page import start_capture
 from tests.client.web.received import CAMERA, frames_seen
 from tests.client.web.sequence import of_device
@@ -207,7 +207,7 @@ class _Choosy(fakes.FakePipeline):
 
 def wait_for_entry(page: Page, lab: Lab, entry: tuple) -> None:
     """Until the pipeline was asked this."""
-    for _ in range(200):
+    for _ in range(PATIENCE_MS // 50):
         if entry in lab.log:
             return
         page.wait_for_timeout(50)

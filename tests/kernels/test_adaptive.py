@@ -19,12 +19,13 @@ from server.shading.differential_rendering import RealShadow, shadow_real, shado
 from server.shading.traced_scene import trace_scene, upload_light
 from server.transfer.radiance_transfer import Directions, direction_sets, transfer_radiance
 from server.transfer.sample_grid import SampleGrid
-from server.volume.raycast import LABEL_STATIC, Surface, raycast
+from server.volume.raycast import Surface
 from tests.reference import adaptive as twin
 from tests.reference.composite import Buffer, Samples, upsample
 from tests.scenes.analytic import look_at
 from tests.scenes.meshes import shape_of
 from tests.scenes.solids import SCENES, download4, fill_volume, float4
+from tests.scenes.volumes import seen_surface
 
 VOXEL_M = 0.01
 CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
@@ -41,9 +42,7 @@ class Stage:
     def __init__(self, engine: Engine, stride: int, rays: Directions | None = None) -> None:
         self.engine = engine
         self.volume = fill_volume(engine, SCENES["ball above a floor"], VOXEL_M)
-        model = raycast(engine, CAMERA, VIEW, self.volume)
-        labels = np.full(SIZE, LABEL_STATIC, np.uint8)
-        self.surface = Surface(model.positions, model.normals, engine.workspace.upload("test_labels", labels))
+        self.surface = seen_surface(engine, self.volume, CAMERA, VIEW)
         self.rays = rays or direction_sets(81, 4)
         plain = direction_sets(self.rays.count, 4)
         self.transfer = transfer_radiance(engine, CAMERA, self.volume, self.surface, stride, plain, ROOM_M)

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from protocol.frames import CameraModel
-from server.light.cell_transfer import PoolWindow, pool_grid
+from server.light.cell_transfer import Pools, PoolWindow, pool_grid
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.transfer.indirect import LEAST_COSINE, Indirect, gather_hits, mean_sent, no_hits
 from server.transfer.radiance_transfer import SETS, Directions, Transfer, direction_sets, own_sets, transfer_radiance
 from server.volume.brick_table import AWAY_SLOT
 from server.volume.raycast import Surface
+from server.volume.volume import Volume
 from tests.reference import indirect as twin
 from tests.scenes.analytic import Floats
 from tests.scenes.lanes import KINDS
@@ -161,6 +162,26 @@ def on_the_floor(engine: Engine, distance_m: float) -> tuple[Surface, int]:
     return upload_surface(engine, points, up, np.ones((16, 16), bool)), 16
 
 
+def floor_before_the_wall(
+    engine: Engine, rays: Directions, distance_m: float
+) -> tuple[Volume, Surface, CameraModel, Transfer]:
+    """Floor at one distance of the wall, and what of its sky is open."""
+    volume, _ = floor_beside_a_wall(engine)
+    surface, size = on_the_floor(engine, distance_m)
+    camera = camera_of(size, size)
+    return volume, surface, camera, transfer_radiance(engine, camera, volume, surface, 1, rays, ROOM_M)
+
+
+def pooled(
+    engine: Engine, surface: Surface, camera: CameraModel, transfer: Transfer, rays: Directions, indirect: Indirect
+) -> Pools:
+    """Everything of a surface of one grey, as the light is estimated from it."""
+    grid = pool_grid(transfer)
+    observed = engine.workspace.upload("test_observed", float4(np.full((camera.height, camera.width, 3), 0.5)))
+    window = PoolWindow(engine, grid.count, 1)
+    return window.pool(0, grid, surface, camera, transfer, rays, observed, indirect, VOXEL_M)
+
+
 @KINDS
 @pytest.mark.parametrize("every", [1, 4])
 @pytest.mark.parametrize("distance_m", [0.1, 0.3])
@@ -168,20 +189,14 @@ def test_a_wall_sends_its_colour_to_the_floor(
     device: Device, kind: type[Engine], every: int, distance_m: float
 ) -> None:
     engine, rays = kind(device), direction_sets(81, 2)
-    volume, _ = floor_beside_a_wall(engine)
-    surface, size = on_the_floor(engine, distance_m)
-    camera = camera_of(size, size)
-    transfer = transfer_radiance(engine, camera, volume, surface, 1, rays, ROOM_M)
+    volume, surface, camera, transfer = floor_before_the_wall(engine, rays, distance_m)
     hits = gather_hits(engine, camera, volume, surface, transfer, rays, ROOM_M, every)
     np.testing.assert_allclose(mean_sent(engine, hits), WALL, atol=ROUNDING)
     cosines = 81 / 4  # of the whole sky: a direction stands for 4 pi / 81 sr
     shape = wall_seen_from(distance_m + VOXEL_M, SIDE_M, SIDE_M - 0.1)
     share = download4(engine, hits)[..., 3].mean() / cosines
     assert share == pytest.approx(shape, rel=0.06)
-    grid = pool_grid(transfer)
-    window = PoolWindow(engine, grid.count, 1)
-    observed = engine.workspace.upload("test_observed", float4(np.full((size, size, 3), 0.5)))
-    pools = window.pool(0, grid, surface, camera, transfer, rays, observed, Indirect(hits, np.zeros(3)), VOXEL_M)
+    pools = pooled(engine, surface, camera, transfer, rays, Indirect(hits, np.zeros(3)))
     sent = np.average(pools.sent, axis=0, weights=pools.weights)
     np.testing.assert_allclose(sent, shape * np.array(WALL), rtol=0.1)
     assert np.average(pools.unseen, weights=pools.weights) < 0.005  # of all that is hidden; seen: 0.0017
@@ -192,22 +207,14 @@ def test_a_wall_sends_its_colour_to_the_floor(
 def test_what_has_no_colour_is_not_seen(device: Device, kind: type[Engine]) -> None:
     """The left half of the wall was in no picture: half as much is known of the same sky, and the pools say so."""
     engine, rays = kind(device), direction_sets(81, 2)
-    volume, _ = floor_beside_a_wall(engine)
-    surface, size = on_the_floor(engine, 0.2)
-    camera = camera_of(size, size)
-    transfer = transfer_radiance(engine, camera, volume, surface, 1, rays, ROOM_M)
-    grid = pool_grid(transfer)
-    window = PoolWindow(engine, grid.count, 1)
-    observed = engine.workspace.upload("test_observed", float4(np.full((size, size, 3), 0.5)))
+    volume, surface, camera, transfer = floor_before_the_wall(engine, rays, 0.2)
     x = np.indices(voxels_of(volume))[2] * VOXEL_M
     sent, unseen = [], []
     for has_color in (x >= 0, x >= SIDE_M / 2):
         paint(engine, volume, np.full((*x.shape, 3), WALL), has_color)
         hits = gather_hits(engine, camera, volume, surface, transfer, rays, ROOM_M, 1)
         np.testing.assert_allclose(mean_sent(engine, hits), WALL, atol=ROUNDING)
-        pools = window.pool(
-            0, grid, surface, camera, transfer, rays, observed, Indirect(hits, np.full(3, 9.0)), VOXEL_M
-        )
+        pools = pooled(engine, surface, camera, transfer, rays, Indirect(hits, np.full(3, 9.0)))
         sent.append(np.average(pools.sent, axis=0, weights=pools.weights))
         unseen.append(np.average(pools.unseen, weights=pools.weights))
     hidden = wall_seen_from(0.21, SIDE_M, SIDE_M - 0.1)
@@ -221,10 +228,7 @@ def test_what_has_no_colour_is_not_seen(device: Device, kind: type[Engine]) -> N
 def test_released_bricks_count_as_not_seen(device: Device, kind: type[Engine]) -> None:
     """They stop rays, but the host keeps their colours."""
     engine, rays = kind(device), direction_sets(81, 2)
-    volume, _ = floor_beside_a_wall(engine)
-    surface, size = on_the_floor(engine, 0.2)
-    camera = camera_of(size, size)
-    transfer = transfer_radiance(engine, camera, volume, surface, 1, rays, ROOM_M)
+    volume, surface, camera, transfer = floor_before_the_wall(engine, rays, 0.2)
     colored = download4(engine, gather_hits(engine, camera, volume, surface, transfer, rays, ROOM_M, 1)).copy()
     slots = engine.download(volume.slots_device)
     slots[..., : slots.shape[2] // 2] = AWAY_SLOT  # x in the lower half

@@ -31,7 +31,6 @@ from server.shading.traced_scene import trace_scene, upload_light
 from server.shading.virtual_point_lights import place_points
 from server.transfer.indirect import Indirect, gather_hits, no_hits, observe_indirect
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
-from server.volume.raycast import LABEL_STATIC, Surface, raycast
 from tests.scenes import lights
 from tests.scenes.analytic import Floats, look_at
 from tests.scenes.lanes import KINDS
@@ -52,6 +51,7 @@ from tests.scenes.solids import (
     upload_surface,
 )
 from tests.scenes.tolerance import relative_tolerance
+from tests.scenes.volumes import seen_surface
 
 VOXEL_M, ROOM_M = 0.01, 1000.0
 FLOOR: Scene = (floor(),)
@@ -341,9 +341,7 @@ def bounced_wall(
     view = look_at((0.48, 0.5, 0.9), (0.48, 0.2, 0.2))
     volume, rays = fill_volume(engine, CORNER, VOXEL_M), direction_sets(81, 4)
     paint(engine, volume, np.broadcast_to(np.asarray(color, float), (*voxels_of(volume), 3)))
-    model = raycast(engine, CAMERA, view, volume)
-    labels = np.full((CAMERA.height, CAMERA.width), LABEL_STATIC, np.uint8)
-    surface = Surface(model.positions, model.normals, engine.workspace.upload("test_labels", labels))
+    surface = seen_surface(engine, volume, CAMERA, view)
     transfer = transfer_radiance(engine, CAMERA, volume, surface, stride, rays, ROOM_M)
     at = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     points, normals = (download4(engine, a)[at].astype(float) for a in (surface.positions, surface.normals))

@@ -14,13 +14,13 @@ from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine
 from server.transfer.radiance_transfer import direction_sets, first_set, transfer_radiance
 from server.transfer.visibility_cache import VisibilityCaches
-from server.volume.raycast import LABEL_DYNAMIC, LABEL_STATIC, Surface, raycast
+from server.volume.raycast import LABEL_DYNAMIC, LABEL_STATIC, Surface
 from server.volume.volume import Volume
 from tests.reference import visibility_cache as twin
 from tests.reference.radiance_transfer import direction_set
 from tests.scenes.analytic import look_at
 from tests.scenes.solids import SCENES, download4, fill_volume, floor, upload_surface
-from tests.scenes.volumes import fill
+from tests.scenes.volumes import fill, seen_surface
 
 VOXEL_M = 0.01
 CAMERA = CameraModel(width=96, height=64, fx=80.0, fy=80.0, cx=47.5, cy=31.5)
@@ -55,10 +55,7 @@ class Watcher:
 
     def see(self, view: Floats, labels: Any = LABEL_STATIC, reach_m: float = ROOM_M) -> dict[str, Any]:
         """The transfer of one frame, and what its layer holds."""
-        model = raycast(self.engine, CAMERA, view, self.volume)
-        values = np.broadcast_to(np.uint8(labels), (CAMERA.height, CAMERA.width))
-        labelled = self.engine.workspace.upload("test_labels", np.ascontiguousarray(values))
-        self.surface = Surface(model.positions, model.normals, labelled)
+        self.surface = seen_surface(self.engine, self.volume, CAMERA, view, labels)
         return self.look_at(self.surface, view, reach_m)
 
     def look_at(self, surface: Surface, view: Floats, reach_m: float = ROOM_M) -> dict[str, Any]:

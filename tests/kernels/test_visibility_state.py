@@ -10,11 +10,11 @@ from protocol.frames import CameraModel
 from server.opencl.engine import Engine
 from server.transfer.radiance_transfer import Transfer, direction_sets, transfer_radiance
 from server.transfer.visibility_state import LEAST_OPEN, VisibilityState
-from server.volume.raycast import LABEL_STATIC, Surface, raycast
+from server.volume.raycast import Surface
 from server.volume.volume import BRICK, Volume
 from tests.scenes.analytic import look_at
 from tests.scenes.solids import Scene, ball, download4, fill_volume, floor, signed_distances
-from tests.scenes.volumes import fill
+from tests.scenes.volumes import fill, seen_surface
 
 VOXEL_M = 0.02
 REACH_M = 0.1
@@ -25,9 +25,7 @@ SCENE: Scene = (floor(0.11), ball((0.5, 0.21, 0.5), 0.1))  # no surface on the b
 
 
 def surface_of(engine: Engine, volume: Volume) -> Surface:
-    model = raycast(engine, CAMERA, VIEW, volume)
-    labels = np.full((CAMERA.height, CAMERA.width), LABEL_STATIC, np.uint8)
-    return Surface(model.positions, model.normals, engine.workspace.upload("test_labels", labels))
+    return seen_surface(engine, volume, CAMERA, VIEW)
 
 
 def transfer_of(engine: Engine, volume: Volume, surface: Surface, state: VisibilityState | None) -> Transfer:

@@ -144,8 +144,8 @@ def test_the_mesh_has_the_colors_of_one_exposure(steady: Taken, given: Taken, es
         name: np.abs(colors_of(one) - expected).mean() / expected.mean()
         for name, one in (("given", given), ("estimated", estimated), ("ignored", ignored))
     }
-    assert error["given"] < 0.02
-    assert error["estimated"] < 0.03
+    assert error["given"] < 0.012  # seen: 0.0057
+    assert error["estimated"] < 0.015  # seen: 0.0068
     assert error["ignored"] > 0.05  # measured 0.09
 
 
@@ -164,14 +164,14 @@ def test_a_virtual_object_keeps_its_brightness_beside_the_room(steady: Taken, gi
     """Its light is that of the frame, and of no frame before it."""
     for one in (given, estimated):
         ratios = [object_over_picture(one, k) / object_over_picture(steady, k) for k in range(6, len(FRAMES))]
-        assert np.std(np.log(ratios)) < 0.06
-        assert abs(np.mean(np.log(ratios))) < 0.1
+        assert np.std(np.log(ratios)) < 0.025  # seen: 0.011
+        assert abs(np.mean(np.log(ratios))) < 0.015  # seen: 0.005
 
 
 def test_pixels_that_nothing_virtual_touches_are_the_camera_s(given: Taken) -> None:
     for number in (4, 15):
         same = (given.results[number].color == given.source[FRAMES[number]].color).all(axis=-1)
-        assert same.mean() > 0.5
+        assert same.mean() > 0.85  # seen: 0.89 and 0.91; the rest is the object and its shadow
 
 
 def test_a_given_light_is_that_of_the_first_frame(device: Device) -> None:
@@ -238,5 +238,5 @@ def test_a_light_that_jumps_is_followed_within_three_frames(device: Device) -> N
         source = before if index < 10 else after
         light = pipeline.process(replace(source[index], exposure=None)).light
     pipeline.close()
-    assert degrees_between(light.dominant_direction, after.light(0).direction) < 20  # measured 10; 70 in the first
+    assert degrees_between(light.dominant_direction, after.light(0).direction) < 10  # seen: 3.3; 70 in the first
     assert abs(np.log(light.exposure)) < 0.15  # measured 0.04

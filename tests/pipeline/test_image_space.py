@@ -129,7 +129,7 @@ def test_transfer_beside_ray_tracing(table: Scene) -> None:
     print({name: np.round(e, 4) for name, e in errors.items()})  # noqa: T201
     assert errors["image space"][0] < 0.10
     assert errors["image space"][1] < 0.06
-    assert abs(errors["image space"][2]) < 0.02
+    assert abs(errors["image space"][2]) < 0.008  # seen: 0.0026
     agree = (found.bits == expected.bits)[used].mean()
     assert agree > 0.95
 

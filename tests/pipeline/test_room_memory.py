@@ -194,7 +194,7 @@ def test_bricks_that_noise_asked_for_are_given_back(engine: Engine) -> None:
         fuse(engine, noisy, CAMERA, view, exact)
     assert noisy.allocated_bricks < needed + 0.25 * (grabbed - needed)  # those beside the wall's stay
     hit, depth, _ = cast(engine, noisy, CAMERA, view)
-    assert np.abs(depth - exact)[hit].max() < 0.1 * VOXEL_M
+    assert np.abs(depth - exact)[hit].max() < 0.03 * VOXEL_M  # seen: 0.015
     assert hit.mean() > 0.8  # the room ends within the picture
 
 
@@ -273,7 +273,7 @@ def depths_of_both(engine: Engine, views: Sequence[Floats], voxel_m: float) -> t
 def test_dense_and_sparse_are_one_surface(engine: Engine, views: Sequence[Floats], voxel_m: float) -> None:
     """Every pixel: bricks hold all voxels that interpolation reads."""
     sparse, dense = depths_of_both(engine, views, voxel_m)
-    assert np.abs(sparse - dense).max() < 0.01
+    assert np.abs(sparse - dense).max() < 1e-3  # seen: 4e-5
 
 
 @pytest.mark.parametrize("voxel_m", [0.02, 0.035])
@@ -285,7 +285,7 @@ def test_dense_and_sparse_all_round(engine: Engine, voxel_m: float) -> None:
     sparse, dense = depths_of_both(engine, AROUND, voxel_m)
     differs = np.abs(sparse - dense)
     assert np.quantile(differs, 0.99) < 1e-3
-    assert np.quantile(differs, 0.999) < 0.05
+    assert np.quantile(differs, 0.999) < 0.01  # seen: 0.0024
     assert (differs > 0.1).mean() < 1e-4
 
 
@@ -308,7 +308,7 @@ def test_a_room_at_a_centimetre_stays_under_600_mb(device: Device) -> None:
     gc.collect()
     figures = room_memory(device, lambda _: None, frames=24)
     assert figures["covered"] > 0.99
-    assert figures["median_error_voxels"] < 0.05
+    assert figures["median_error_voxels"] < 0.01  # seen: 0.0032
     assert figures["full_frames"] == 0
     assert figures["device_mb"] < 400
     assert not figures["growth_mb"] >= 600  # not a number where the system does not tell
@@ -327,6 +327,6 @@ def test_a_table_of_four_million_bricks_works(engine: Engine) -> None:
     fuse(engine, volume, CAMERA, view, depth)
     hit, found, _ = cast(engine, volume, CAMERA, view)
     assert hit[30:90, 40:120].all()
-    assert np.abs(found - depth)[hit].max() < 0.2 * volume.voxel_m
+    assert np.abs(found - depth)[hit].max() < 0.01 * volume.voxel_m  # seen: 0.0007
     volume.allocate(CAMERA, volume.volume_from_world() @ view, upload_depth(engine, np.zeros_like(depth)))
     assert not volume.is_full

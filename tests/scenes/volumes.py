@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from server.geometry.merge import merge_depth
@@ -16,7 +16,7 @@ from server.opencl.engine import Engine
 from server.volume.brick_pool import BRICK_VOXELS
 from server.volume.brick_table import AWAY_SLOT, BRICK
 from server.volume.integrate import integrate
-from server.volume.raycast import Surface, raycast
+from server.volume.raycast import LABEL_NONE, LABEL_STATIC, Surface, raycast
 from server.volume.volume import Volume
 from tests.scenes.analytic import Floats
 
@@ -100,6 +100,17 @@ def fuse_frame(engine: Engine, volume: Volume, camera: CameraModel, frame: RgbdF
     volume.allocate(camera, pose, measurement.depth_m)
     integrate(engine, volume, camera, pose, measurement)
     return pose, measurement
+
+
+def seen_surface(
+    engine: Engine, volume: Volume, camera: CameraModel, pose: Floats, labels: ArrayLike | None = None
+) -> Surface:
+    """The geometry buffer of a camera that sees the volume alone: all of it is static, unless labels are given."""
+    model = raycast(engine, camera, pose, volume)
+    if labels is None:
+        labels = np.where(vectors(engine.download(model.positions))[..., 3] > 0, LABEL_STATIC, LABEL_NONE)
+    whole = np.ascontiguousarray(np.broadcast_to(np.asarray(labels, np.uint8), (camera.height, camera.width)))
+    return Surface(model.positions, model.normals, engine.workspace.upload("test_labels", whole))
 
 
 def merged_surface(

@@ -11,11 +11,10 @@ from server.light.light_estimation import sum_tiles
 from server.opencl.device import Device
 from server.opencl.engine import Engine, KernelArgument
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
-from server.volume.raycast import Surface, raycast
 from server.volume.volume import Volume
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial
 from tests.scenes.bad_depth import BOUNDS, CAMERA, frame_of, good_depth
-from tests.scenes.volumes import fuse_frame, vectors
+from tests.scenes.volumes import fuse_frame, seen_surface, vectors
 
 GROUPS = Family("work-groups")
 _VOXEL_M = 0.06
@@ -46,12 +45,10 @@ def _chain(engine: Engine) -> Floats:
     frame = frame_of(good_depth(np.eye(4)), np.eye(4))
     volume = Volume(engine, BOUNDS, _VOXEL_M)
     pose, measurement = fuse_frame(engine, volume, CAMERA, frame)
-    seen = raycast(engine, CAMERA, pose, volume)
-    labels = (vectors(engine.download(seen.positions))[..., 3] > 0).astype(np.uint8)
-    surface = Surface(seen.positions, seen.normals, engine.workspace.upload("labels", labels))
+    surface = seen_surface(engine, volume, CAMERA, pose)
     transfer = transfer_radiance(engine, CAMERA, volume, surface, 4, direction_sets(81, 4), 1.0)
     total = sum_tiles(engine, CAMERA, measurement.radiance, surface, transfer, _VOXEL_M).total()
-    parts = (seen.positions, transfer.coefficients, transfer.openness)
+    parts = (surface.positions, transfer.coefficients, transfer.openness)
     downloaded = [vectors(engine.download(a)).ravel() for a in parts]
     return np.concatenate([*downloaded, total.matrix.ravel(), total.vector.ravel()]).astype(np.float64)
 

@@ -1,4 +1,4 @@
-"""Pictures that are one value all over but for a box, drawn anew each frame: what lies outside is not gone over."""
+"""Dirty regions: arrays that are constant outside of a box, so that only the box is redrawn each frame."""
 
 from __future__ import annotations
 

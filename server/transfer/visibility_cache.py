@@ -1,9 +1,9 @@
 """Visibility cache from earlier frames (thesis 6.1.1, steps 2 and 3). Device side: include/visibility_cache.clh.
 
 The directions are divided into k subsets, and a frame traces one of them, so k frames contain all. Each frame stores
-its visibility in a layer with its camera pose; a later frame projects its samples into the k - 1 layers before it. If no
-layer contains a subset, because the point was occluded, has moved or is new, it is traced at once, so that all samples
-have the same number of directions.
+its visibility in a layer with its camera pose; a later frame projects its samples into the k - 1 layers before it. If
+no layer contains a subset, because the point was occluded, has moved or is new, it is traced at once, so that all
+samples have the same number of directions.
 """
 
 from __future__ import annotations

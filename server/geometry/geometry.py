@@ -1,4 +1,4 @@
-"""The geometry half of the spine (thesis ch. 4): one RGB-D frame folded into the volume, and the surface it shows."""
+"""The geometry steps of a frame (thesis ch. 4): tracking, fusion into the volume, and the visible surface."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from server.volume.volume import Volume
 
 @dataclass(frozen=True)
 class GeometryFrame:
-    """What one frame gave; arrays are the session's and hold until its next frame."""
+    """Geometry of one frame; arrays are the session's and valid until its next frame."""
 
     measurement: Measurement
     exposure: float
@@ -45,7 +45,7 @@ class GeometryFrame:
 
 
 class Geometry:
-    """One camera's way into its volume. Owned by one thread."""
+    """Geometry of one camera. Owned by one thread."""
 
     def __init__(
         self, engine: Engine, camera: CameraModel, wishes: Wishes, reconstruction: Reconstruction | None = None

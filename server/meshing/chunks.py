@@ -1,4 +1,4 @@
-"""Sparse bricks as small dense blocks of voxels, each with the first voxels of its neighbours."""
+"""Arranges sparse bricks as small dense blocks of voxels that overlap by one voxel."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from server.volume.volume import BRICK, Bricks
 
 CHUNK_BRICKS = 4
 SIDE = CHUNK_BRICKS * BRICK + 1
-"""Voxels: the last one is the far corner of the last cells."""
+"""Voxels along an axis; the last one is the far corner of the last cells."""
 
 
 @dataclass(frozen=True)
@@ -25,15 +25,15 @@ class Chunk:
     tsdf: NDArray[np.float32]
     """[SIDE z, SIDE y, SIDE x] truncation units, positive in front."""
     seen: NDArray[np.bool_]
-    """[SIDE, SIDE, SIDE] False where tsdf has no meaning."""
+    """[SIDE, SIDE, SIDE] whether tsdf is valid."""
     colors: NDArray[np.float32]
     """[SIDE, SIDE, SIDE, 3] linear RGB."""
     colored: NDArray[np.bool_]
-    """[SIDE, SIDE, SIDE] False where colors has no meaning."""
+    """[SIDE, SIDE, SIDE] whether colors is valid."""
 
 
 class ChunkedBricks:
-    """Bricks, cut into chunks in a fixed order."""
+    """Bricks in chunks, in a fixed order."""
 
     def __init__(self, bricks: Bricks) -> None:
         self._bricks = bricks
@@ -55,7 +55,7 @@ class ChunkedBricks:
         return keys
 
     def _rows(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Row of each brick [..., 3], -1 where there is none."""
+        """Row of each brick index [..., 3]; -1 if there is none."""
         inside = ((indices >= 0) & (indices < self._size)).all(axis=-1)
         keys = self._keys(indices)
         place = np.minimum(np.searchsorted(self._sorted_keys, keys), len(self._sorted_keys) - 1)
@@ -83,6 +83,6 @@ class ChunkedBricks:
 
 
 def _overlap(start: int) -> tuple[slice, slice]:
-    """Where a brick that begins at `start` of a chunk's axis lies in the chunk, and which part of the brick that is."""
+    """Slices of the chunk and of a brick that overlap, for a brick that begins at `start` on the chunk's axis."""
     last = min(start + BRICK, SIDE)
     return slice(start, last), slice(0, last - start)

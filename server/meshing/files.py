@@ -1,7 +1,7 @@
-"""A scene's mesh as the bytes of a PLY and of a GLB file, written by trimesh. Equal meshes give equal bytes.
+"""Writes a scene's mesh as PLY and GLB with trimesh. Equal meshes give equal bytes.
 
-PLY: world axes and metres as they are. GLB: the same numbers under a node that turns the world upright, as glTF wants
-(+y up). Both carry normals and sRGB vertex colours; the GLB says that these are light already (KHR_materials_unlit).
+PLY: world axes, metres. GLB: the same numbers under a node that rotates the world upright (+y up), as glTF requires.
+Both have normals and sRGB vertex colours; the GLB uses KHR_materials_unlit, since the colours include the lighting.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def _as_trimesh(mesh: SceneMesh) -> Any:
 
 
 def _add_unlit_material(tree: dict[str, Any]) -> None:
-    """A viewer that does not know the extension sees a rough white surface instead of glTF's default metal."""
+    """A viewer without the extension shows a rough white surface instead of glTF's default metal."""
     rough = {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
     tree["materials"] = [{"pbrMetallicRoughness": rough, "extensions": {_UNLIT: {}}}]
     tree["extensionsUsed"] = [_UNLIT]

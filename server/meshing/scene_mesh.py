@@ -12,9 +12,9 @@ from server.meshing.surface import MeshingError, VoxelMesh, extract_surface
 from server.volume.volume import BRICK, Bricks
 
 LEAST_PIECE_VOXELS = BRICK
-"""A piece that hangs together and is smaller than this along x, y and z is noise."""
+"""A connected component smaller than this along x, y and z is treated as noise."""
 UNKNOWN_COLOR = 0.5
-"""Linear; of a piece of surface none of whose voxels has a colour."""
+"""Linear colour of components without any colour."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class SceneMesh:
     triangles: NDArray[np.int32]
     """[t, 3] counter-clockwise seen from free space."""
     normals: NDArray[np.float32]
-    """[v, 3] unit, world, towards free space; (0, 0, 0) where there is none."""
+    """[v, 3] unit, world, towards free space; (0, 0, 0) if undefined."""
     colors: NDArray[np.uint8]
     """[v, 3] sRGB."""
     gltf_from_world: NDArray[np.float64]
-    """[3, 3] rotation into glTF's axes: +y up, the first camera's view as near to -z as it goes."""
+    """[3, 3] rotation to glTF's axes: +y up, the first camera's view as close to -z as possible."""
 
 
 def scene_mesh(
@@ -40,11 +40,11 @@ def scene_mesh(
     gltf_from_world: NDArray[np.float64],
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> SceneMesh:
-    """The surface of all bricks, less specks. Raises MeshingError, one line, where nothing is left.
+    """The surface of all bricks without small components. Raises MeshingError if nothing is left.
 
-    A cell of the voxel grid has surface where its eight voxels were seen; pieces smaller than LEAST_PIECE_VOXELS along
-    every axis are dropped; vertices without a colour take their neighbours'. `progress` is told how many parts are
-    done and how many there are.
+    A voxel cell has surface only if its eight voxels were observed. Components smaller than LEAST_PIECE_VOXELS along
+    every axis are removed. Vertices without a colour take their neighbours' mean. `progress` is called with the number
+    of parts done and in total.
     """
     mesh = with_all_colors(without_specks(extract_surface(bricks, progress), LEAST_PIECE_VOXELS))
     return SceneMesh(
@@ -57,7 +57,7 @@ def scene_mesh(
 
 
 def without_specks(mesh: VoxelMesh, least_voxels: float) -> VoxelMesh:
-    """The pieces of at least this length along one axis. Raises MeshingError where there is none."""
+    """Components of at least this length along one axis. Raises MeshingError if there is none."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -83,7 +83,7 @@ def without_specks(mesh: VoxelMesh, least_voxels: float) -> VoxelMesh:
 
 
 def with_all_colors(mesh: VoxelMesh) -> VoxelMesh:
-    """Vertices without a colour get the mean of their neighbours that have one, ring by ring inwards."""
+    """Fill missing vertex colours with the mean of coloured neighbours, ring by ring."""
     ends = mesh.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     to, of = np.concatenate([ends, ends[:, ::-1]]).T
     colors, colored = mesh.colors.copy(), mesh.colored.copy()
@@ -103,7 +103,7 @@ def with_all_colors(mesh: VoxelMesh) -> VoxelMesh:
 
 
 def srgb8_from_linear(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """IEC 61966-2-1 encoding, 8 bits, of linear values; beyond [0, 1] they are clipped."""
+    """8-bit sRGB (IEC 61966-2-1) of linear values, clipped to [0, 1]."""
     clipped = np.clip(linear, 0, 1)
     encoded = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
     srgb: NDArray[np.uint8] = (encoded * 255).round().astype(np.uint8)

@@ -1,8 +1,8 @@
-"""The zero surface of bricks of TSDF as triangles: marching cubes by scikit-image, chunk by chunk, without seams.
+"""Extracts the zero surface of TSDF bricks as triangles: marching cubes by scikit-image, chunk by chunk, without seams.
 
-The library says which edges of the voxel grid the surface crosses and how the crossings are joined; where on its edge a
-crossing is and its colour are computed here from the edge's two voxels alone, so that chunks which share an edge agree
-on it bit for bit and are welded by its number.
+The library determines which grid edges the surface crosses and how crossings are connected. Position and colour of a
+crossing are computed here from the two voxels of its edge only, so that chunks that share an edge agree bit for bit and
+their vertices are merged by edge number.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from server.scene.normals import corner_angles, face_crosses, unit
 from server.volume.volume import BRICK, Bricks
 
 LEAST_TSDF = 1e-3
-"""Values nearer to zero are moved this far away: a crossing then is never a grid point, which belongs to six edges."""
+"""Values closer to zero are moved to this distance, so that a crossing is never a grid point shared by six edges."""
 GREATEST_STEP = 1.5
 """Truncations between two neighbouring voxels, beyond which a change of sign is no surface but the space behind one
 beside the open space in front of another: curtains that hang from silhouettes. Surfaces seen at a grazing angle step
@@ -26,7 +26,7 @@ by up to 1. Measured on the Mitsuba sequences, exact and noisy, as area more tha
 the surface seen that the mesh has: no limit 0.8 and 1.0 %, 99.6 and 99.8 %; 1.5: 0.2 and 0.4 %, 99.4 and 99.7 %;
 1.0: 0.01 and 0.02 %, 97.4 and 97.7 %."""
 _CELL = 3
-"""In place of an edge's axis: the vertex that Lewiner's tables put into the middle of an ambiguous cell."""
+"""Used instead of an edge's axis for the vertex that Lewiner's tables place inside an ambiguous cell."""
 
 
 Voxels = tuple[NDArray[np.int64], ...]
@@ -34,7 +34,7 @@ Voxels = tuple[NDArray[np.int64], ...]
 
 
 class MeshingError(ValueError):
-    """There is no mesh to be had; one line that says why."""
+    """No mesh can be extracted; one line."""
 
 
 @dataclass(frozen=True)
@@ -52,14 +52,14 @@ class VoxelMesh:
     area 0.6 and 1.2; from gradients of the TSDF 0.0 and 1.5.
     """
     colors: NDArray[np.float64]
-    """[v, 3] linear RGB; 0 where there is none."""
+    """[v, 3] linear RGB; 0 if unknown."""
     colored: NDArray[np.bool_]
-    """[v] whether there is."""
+    """[v] whether the colour is known."""
 
 
 @dataclass(frozen=True)
 class _Piece:
-    """One chunk's share, its vertices by number."""
+    """The surface of one chunk, with global vertex keys."""
 
     keys: NDArray[np.int64]
     vertices: NDArray[np.float64]
@@ -69,9 +69,9 @@ class _Piece:
 
 
 def extract_surface(bricks: Bricks, progress: Callable[[int, int], None] = lambda _done, _total: None) -> VoxelMesh:
-    """The surface where all eight voxels of a cell were seen. `progress` is told chunks done and in all.
+    """The surface in cells whose eight voxels were observed. `progress` is called with chunks done and in total.
 
-    Equal bricks give equal arrays, in whatever order they come. Raises MeshingError where there is no surface.
+    Equal bricks give equal arrays, independent of their order. Raises MeshingError if there is no surface.
     """
     marching_cubes = find_library()
     if len(bricks.indices) == 0:
@@ -90,7 +90,7 @@ def extract_surface(bricks: Bricks, progress: Callable[[int, int], None] = lambd
 
 
 def find_library() -> Callable[..., tuple[NDArray[np.float32], ...]]:
-    """scikit-image's marching_cubes. Raises MeshingError, saying what to install, where it is absent."""
+    """scikit-image's marching_cubes. Raises MeshingError with installation advice if it is missing."""
     try:
         from skimage.measure import marching_cubes
     except ImportError as error:
@@ -107,7 +107,7 @@ def _mesh_chunk(
     if not cells.any():
         return None
     mask = np.zeros(tsdf.shape, np.bool_)
-    mask[1:, 1:, 1:] = cells  # the library asks the mask at a cell's highest corner
+    mask[1:, 1:, 1:] = cells  # the library reads the mask at a cell's highest corner
     places, triangles, _, _ = marching_cubes(tsdf, 0.0, gradient_direction="ascent", allow_degenerate=True, mask=mask)
     low, axis = _grid_edges(places)
     exact, near, far, share = _crossings(tsdf, places.astype(np.float64), low, axis)

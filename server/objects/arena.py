@@ -1,4 +1,4 @@
-"""The meshes of a scene one after the other in shared arrays, so that one launch draws them all."""
+"""Stores all meshes of a scene in shared arrays, so that one launch draws them all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures that are one value outside of a box, drawn anew each frame: only the box and the last one are written."""
+"""Dirty regions: arrays that are constant outside of a box, so that only the box is redrawn each frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A tree of boxes around virtual objects, for rays that would else look at every one (include/virtual_objects.clh)."""
+"""Bounding volume hierarchy of virtual objects for rays (include/virtual_objects.clh)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pinhole camera, as drawing wants it: of any size."""
+"""A pinhole camera for rendering, without limits on its size."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which pixels of a picture a box in space can cover."""
+"""Screen-space bounds of boxes in space."""
 
 from __future__ import annotations
 

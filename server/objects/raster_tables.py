@@ -1,4 +1,4 @@
-"""The objects of a picture as the tables that rasterize.cl reads."""
+"""Builds the object tables that rasterize.cl reads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The virtual objects of a scene: uploaded once, moved by their placement."""
+"""The virtual objects of a scene: uploaded once and moved by their transforms."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FINE_GRIDS = 64
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One that stands in the scene."""
+    """A placed object."""
 
     mesh: Mesh
     digest: bytes

@@ -1,4 +1,4 @@
-"""Points spread evenly over a virtual object's surface, once a mesh: lit once a frame. Kernel: surface_points.cl."""
+"""Points spread evenly over a virtual object's surface, made once per mesh. Kernel: surface_points.cl."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One mesh as the device has it."""
+"""A mesh on the device."""
 
 from __future__ import annotations
 

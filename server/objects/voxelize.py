@@ -1,4 +1,4 @@
-"""Distance grids of virtual objects, and the table of them that rays are traced through (thesis 7.2, fig. 7.5).
+"""Distance grids of virtual objects, and the table of them for ray tracing (thesis 7.2, fig. 7.5).
 
 Kernels: voxelize.cl; rays: include/virtual_objects.clh.
 """

@@ -1,4 +1,4 @@
-"""Base colour at a few points of a mesh, on the host: its textures read coarsely, as what lies around a point."""
+"""Base colour at a few points of a mesh, computed on the host from a coarse mip level of its textures."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from server.scene.mesh import Mesh
 from server.scene.mipmaps import decoded, shrunk
 
 COARSE_SIDE = 32
-"""Textures are read from a level with no longer side."""
+"""Longest side of the mip level that is read."""
 
 Floats = NDArray[np.float64]
 
 
 def colors_at(mesh: Mesh, triangles: NDArray[np.int64], shares: Floats) -> Floats:
-    """[n, 3] linear base colour in `triangles` [n], at `shares` [n, 3] of their corners."""
+    """[n, 3] linear base colour in `triangles` [n] at barycentric coordinates `shares` [n, 3]."""
     corners = mesh.triangles[triangles]
     colors: Floats = (mesh.vertex_colors[corners].astype(np.float64) * shares[..., None]).sum(axis=1)
     uv = (mesh.texture_uv[corners, :2].astype(np.float64) * shares[..., None]).sum(axis=1)

@@ -1,8 +1,8 @@
-"""Parts whose opacity is cut off (glTF's alphaMode MASK): triangles cut along the outline that their texture draws.
+"""Alpha cutout (glTF's alphaMode MASK): cuts triangles along the outline of their texture's alpha channel.
 
-Cut once, when the file is read, what is left is a mesh like any other: it hides, casts shadows and sends light by its
-true outline, and nothing asks again for each pixel. Triangles that the outline crosses are halved until they are about
-a texel, or until there are too many, and then cut along a straight line.
+The cut is made once, when the file is read. The result is an ordinary mesh, whose outline is used for visibility,
+shadows and light without alpha tests. Triangles that cross the outline are bisected until they are about a texel in
+size, or until there are too many, and are then cut along a straight line.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from server.scene.mesh_parts import MeshPart
 from server.scene.normals import numbered, unit
 
 MOST_SIDE = 512
-"""Of the picture that outlines are found in, texels."""
+"""Largest side of the image in which outlines are found, texels."""
 MOST_TRIANGLES = 200_000
-"""That cutting may make of a file, besides those it has."""
+"""Limit on the triangles that cutting adds to a file."""
 SMALL_TEXELS = 1.5
-"""Longest edge of a triangle that is not halved any more."""
+"""Triangles with shorter edges are not bisected."""
 _MOST_HALVINGS = 10
 
 Floats = NDArray[np.float64]
@@ -31,18 +31,18 @@ _UV = slice(9, 11)
 
 @dataclass(frozen=True)
 class Outline:
-    """Where a texture is opaque enough."""
+    """Opacity test for one texture."""
 
     excess: Floats
-    """[h, w] opacity less what is cut off."""
+    """[h, w] opacity minus the cutoff."""
     beyond: tuple[Beyond, Beyond]
-    """In u and in v."""
+    """Wrap mode in u and in v."""
     sums: NDArray[np.int64]
-    """[H + 1, W + 1] how many texels above and left are kept; where it repeats, of two periods."""
+    """[H + 1, W + 1] summed-area table of the kept texels; over two periods if the texture repeats."""
 
     @classmethod
     def of(cls, texture: Texture, opacity: float, cutoff: float) -> Outline:
-        """Of a texture with an alpha channel, which `opacity` multiplies."""
+        """For a texture with an alpha channel, which is multiplied by `opacity`."""
         assert texture.alpha is not None
         alpha = texture.alpha
         height, width = (min(side, MOST_SIDE) for side in alpha.shape)
@@ -75,7 +75,7 @@ class Outline:
         return total
 
     def kept_shares(self, low: Floats, high: Floats) -> Floats:
-        """[n] 1 where all texels that boxes of coordinates [n, 2] may read are kept, 0 where none is, else between."""
+        """[n] share of kept texels that boxes of coordinates [n, 2] may read: 1 all, 0 none."""
         first, last = np.floor(low * self.size - 0.5).astype(np.int64), np.floor(high * self.size - 0.5).astype(int) + 1
         ends = []
         for k in (0, 1):
@@ -103,14 +103,14 @@ def _inside(index: NDArray[np.int64], side: int, beyond: Beyond) -> NDArray[np.i
 
 
 def cut_out(parts: list[MeshPart]) -> list[MeshPart]:
-    """The parts, which have normals, less what their materials cut off; those of which nothing is left are left out."""
+    """The parts (with normals) after the cutout; empty parts are removed."""
     share = MOST_TRIANGLES // max(sum(part.material.cutoff is not None for part in parts), 1)
     cut = [part if part.material.cutoff is None else _cut(part, share) for part in parts]
     return [part for part in cut if len(part.triangles)]
 
 
 def _has_area(corners: Floats) -> NDArray[np.bool_]:
-    """[t] triangles [t, 3, columns] that are more than a sliver's rounding."""
+    """[t] triangles [t, 3, columns] whose area is above rounding error."""
     a, b, c = (corners[:, k, :3] for k in range(3))
     longest = np.maximum(np.linalg.norm(b - a, axis=1), np.linalg.norm(c - a, axis=1))
     good: NDArray[np.bool_] = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-6 * longest**2
@@ -165,11 +165,11 @@ def _halved(outline: Outline, corners: Floats, most: int) -> tuple[Floats, Float
 
 
 def _clipped(outline: Outline, whole: Floats, crossed: Floats) -> Floats:
-    """`whole` and what is kept of `crossed`, cut along a straight line between where its edges leave the outline."""
+    """`whole`, and the kept parts of `crossed`, cut between the points where its edges cross the outline."""
     excess = outline.at(crossed[..., _UV].reshape(-1, 2)).reshape(-1, 3)
     inside = excess >= 0
     parts = [whole, crossed[inside.all(axis=1)]]
-    for alone in (True, False):  # one corner that is inside, or one that is not: it becomes the first
+    for alone in (True, False):  # rotate so that the single corner inside, or outside, is the first
         one = inside.sum(axis=1) == (1 if alone else 2)
         turn = (inside[one] == alone).argmax(axis=1)[:, None] + np.arange(3)
         corners = np.take_along_axis(crossed[one], turn[..., None] % 3, axis=1)

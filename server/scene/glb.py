@@ -1,4 +1,4 @@
-"""Writing a GLB from arrays: one buffer, and the JSON that says what lies where in it."""
+"""Writes a GLB from arrays: one buffer and the JSON that describes it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SHAPE = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
 
 def to_bytes(document: dict[str, Any], body: bytes | bytearray) -> bytes:
-    """The GLB of `document`, whose one buffer is `body`."""
+    """The GLB file with JSON `document` and buffer `body`."""
     if body:
         document["buffers"] = [{"byteLength": len(body)}]
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
@@ -53,7 +53,7 @@ def add_view(document: dict[str, Any], body: bytearray, data: bytes) -> int:
 
 
 def append(body: bytearray, data: bytes) -> int:
-    """Append bytes where a multiple of four begins; returns where."""
+    """Append bytes at a multiple of four; returns the offset."""
     body.extend(b"\0" * (-len(body) % 4))
     offset = len(body)
     body.extend(data)

@@ -1,8 +1,8 @@
-"""What is read of a glTF file before trimesh gets it: limits, and which material each part has.
+"""Prepares a glTF file for trimesh: checks limits and assigns materials to parts.
 
-trimesh keeps factors as 8-bit numbers and needs Pillow for textures, so materials are read by gltf_materials.py; here a
-material's name is replaced by its index, which is how a part finds it again, and the texture coordinates that it wants
-are given names that trimesh hands on as they are.
+trimesh stores factors as 8-bit numbers and needs Pillow for textures, so gltf_materials.py reads the materials. Here a
+material's name is replaced by its index, by which a part is matched with it later, and texture coordinates get names
+that trimesh passes through.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from server.scene.gltf_materials import GltfMaterial, Json, read_materials
 from server.scene.limits import MAX_PARTS, MAX_TRIANGLES, MAX_VERTICES, MeshError
 
 COLOR_UV, SURFACE_UV = "_COLOR_UV", "_SURFACE_UV"
-"""Attributes of a primitive: coordinates of its base colour's texture, and of roughness and metalness."""
+"""Attributes of a primitive: texture coordinates of base colour, and of roughness and metalness."""
 
 _MAGIC, _JSON, _BIN = b"glTF", 0x4E4F534A, 0x004E4942
 _COMPRESSIONS = {"KHR_draco_mesh_compression", "EXT_meshopt_compression"}
@@ -27,9 +27,9 @@ _TRIANGLES, _STRIP = 4, 5
 
 
 def prepare_gltf(data: bytes) -> tuple[bytes, list[GltfMaterial], tuple[str, ...]]:
-    """The file (GLB or JSON) as trimesh should see it, its materials, and notes.
+    """The file (GLB or JSON) for trimesh, its materials, and notes.
 
-    Raises MeshError for what is refused, and whatever indexing raises where the file names what is not there.
+    Raises MeshError for a refused file, and whatever indexing raises for invalid references (KeyError, IndexError ...).
     """
     header, binary = _split_glb(data) if data.startswith(_MAGIC) else (_parse(data), None)
     _refuse_unsupported(header)
@@ -37,14 +37,14 @@ def prepare_gltf(data: bytes) -> tuple[bytes, list[GltfMaterial], tuple[str, ...
     _refuse_oversized(header)
     materials, notes = read_materials(header, binary)
     notes += _connect_materials(header, materials) + _told(header)
-    for key in ("images", "textures", "samplers", "animations", "skins"):  # not trimesh's to read
+    for key in ("images", "textures", "samplers", "animations", "skins"):  # trimesh must not read these
         header.pop(key, None)
     header["materials"] = [{"name": str(index)} for index in range(len(materials))]
     return _join_glb(header, binary) if data.startswith(_MAGIC) else json.dumps(header).encode(), materials, notes
 
 
 def _connect_materials(header: Json, materials: list[GltfMaterial]) -> tuple[str, ...]:
-    """Give each primitive the coordinates that its material's textures want; returns notes."""
+    """Set the texture coordinates of each primitive's material; returns notes."""
     problems: Counter[str] = Counter()
     for primitive in (primitive for mesh in header.get("meshes", []) for primitive in mesh["primitives"]):
         attributes, index = primitive["attributes"], primitive.get("material")
@@ -64,7 +64,7 @@ def _connect_materials(header: Json, materials: list[GltfMaterial]) -> tuple[str
 
 
 def _told(header: Json) -> tuple[str, ...]:
-    """What whoever made the file has to say (client/laptop/obj_to_glb.py does), and what it asks for in vain."""
+    """Notes of the file's author (client/laptop/obj_to_glb.py writes them) and on unsupported extensions."""
     notes = header["asset"].get("extras", {}).get("notes", [])
     told = tuple(" ".join(str(note).split())[:_NOTE_CHARS] for note in notes[:_MOST_NOTES])
     missing = {str(name) for name in header.get("extensionsRequired", [])} - _KNOWN_EXTENSIONS
@@ -118,7 +118,7 @@ def _refuse_unsupported(header: Json) -> None:
 
 
 def _refuse_tangled(header: Json) -> None:
-    """Refuse a scene graph that is no tree: a node of two parents, or its own ancestor."""
+    """Refuse a scene graph that is not a tree: a node with two parents, or that is its own ancestor."""
     nodes: list[Any] = header.get("nodes", [])
     parent: dict[int, int] = {}
     for index, node in enumerate(nodes):
@@ -137,7 +137,7 @@ def _refuse_tangled(header: Json) -> None:
 
 
 def _refuse_oversized(header: Json) -> None:
-    """Refuse what a small file may ask to be unfolded into: many primitives that read the same bytes."""
+    """Refuse files that expand to a large model: many primitives that read the same bytes."""
     accessors = [int(accessor["count"]) for accessor in header.get("accessors", [])]
     primitives = [p for mesh in header.get("meshes", []) for p in mesh["primitives"]]
     corners = sum(accessors[p["indices"]] for p in primitives if "indices" in p)

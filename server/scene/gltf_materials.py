@@ -19,22 +19,22 @@ from server.scene.materials import Beyond, Material, Texture
 Json = dict[str, Any]
 
 _BEYOND = {10497: Beyond.REPEAT, 33071: Beyond.CLAMP, 33648: Beyond.MIRROR}
-"""By the numbers that glTF takes from OpenGL."""
+"""Wrap modes by their OpenGL numbers in glTF."""
 
 
 @dataclass(frozen=True)
 class TextureUse:
-    """Which coordinates a material reads a texture at."""
+    """Texture coordinates at which a material reads a texture."""
 
     uv_set: int
     """N of TEXCOORD_N."""
     transform: NDArray[np.float64]
-    """[2, 3] affine, on the file's coordinates (KHR_texture_transform)."""
+    """[2, 3] affine transform of the file's coordinates (KHR_texture_transform)."""
 
 
 @dataclass(frozen=True)
 class GltfMaterial:
-    """A material, the linear factor of its base colour, and how it reads its textures."""
+    """A material, the linear factor of its base colour, and its texture coordinates."""
 
     factor: tuple[float, float, float]
     material: Material
@@ -43,7 +43,7 @@ class GltfMaterial:
 
 
 def read_materials(header: Json, binary: bytes | None) -> tuple[list[GltfMaterial], tuple[str, ...]]:
-    """Every material of the file, and notes on what was not read or was scaled down. Raises MeshError."""
+    """All materials of the file, and notes on textures that were not read or were scaled down. Raises MeshError."""
     entries = header.get("materials", [])
     references = [(_reference(m, "baseColorTexture"), _reference(m, "metallicRoughnessTexture")) for m in entries]
     pictures = Pictures(header, binary)
@@ -100,7 +100,7 @@ def _reference(material: Json, name: str) -> Json | None:
 
 
 def _image_of(header: Json, reference: Json | None) -> int | None:
-    """Number of the image that a reference to a texture shows; -1 for one that is not there."""
+    """Index of the image of a texture reference; -1 if it does not exist."""
     if reference is None:
         return None
     try:
@@ -123,12 +123,12 @@ def _factor(values: Json) -> tuple[float, float, float]:
 
 
 def _unit(value: float) -> float:
-    """Cut to 0 to 1; NaN is 0."""
+    """Clipped to [0, 1]; NaN becomes 0."""
     return float(np.clip(np.nan_to_num(float(value)), 0.0, 1.0))
 
 
 def _use(reference: Json | None) -> TextureUse | None:
-    """KHR_texture_transform: scaled, turned by [[cos, sin], [-sin, cos]], moved."""
+    """KHR_texture_transform: scale, rotation by [[cos, sin], [-sin, cos]], translation."""
     if reference is None:
         return None
     change = reference.get("extensions", {}).get("KHR_texture_transform", {})

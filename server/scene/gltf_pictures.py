@@ -1,4 +1,4 @@
-"""Pictures inside a glTF file: decoded within limits, scaled down where they are too large to keep."""
+"""Images inside a glTF file: decoded within limits, and scaled down if they are too large."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Image = NDArray[np.uint8]
 
 
 class Pictures:
-    """The images of one file. `notes`: a line for each that could not be read or was scaled down."""
+    """The images of one file. `notes`: one line for each image that could not be read or was scaled down."""
 
     def __init__(self, header: Json, binary: bytes | None) -> None:
         self._header = header
@@ -30,7 +30,7 @@ class Pictures:
         self.notes: tuple[str, ...] = ()
 
     def load(self, wanted: set[int]) -> None:
-        """Find the wanted images and how large they are. Raises MeshError where one is too large to decode."""
+        """Find the wanted images and their sizes. Raises MeshError if one is too large to decode."""
         sizes: dict[int, tuple[int, int]] = {}
         for index in sorted(wanted):
             try:
@@ -50,7 +50,7 @@ class Pictures:
             self._most_side //= 2
 
     def image(self, index: int, *, is_srgb: bool) -> Image | None:
-        """[h, w, 3] RGB, None where it cannot be read. Scaled down as what it is used for: sRGB or linear values."""
+        """[h, w, 3] RGB; None if it cannot be read. Scaled down in linear light if it is sRGB, else by its values."""
         key = (index, is_srgb)
         if key not in self._images:
             encoded = self._encoded.get(index)
@@ -65,7 +65,7 @@ class Pictures:
         return self._images[key]
 
     def alpha(self, index: int) -> Image | None:
-        """[h, w] the picture's alpha, None where it has none or all of it is opaque; scaled down as it is."""
+        """[h, w] alpha; None if there is none or all of it is opaque. Scaled down like the image."""
         encoded = self._encoded.get(index)
         found = None if encoded is None else _decode(encoded, cv2.IMREAD_UNCHANGED)
         if found is None or found.ndim != 3 or found.shape[2] != 4 or found[..., 3].min() == 255:
@@ -109,7 +109,7 @@ def _decode(encoded: bytes, flags: int = cv2.IMREAD_COLOR_RGB) -> Image | None:
 
 
 def _picture_size(encoded: bytes) -> tuple[int, int]:
-    """Width and height that a PNG or JPEG announces, the two kinds glTF has. Raises ValueError."""
+    """Width and height in the header of a PNG or JPEG, the two formats of glTF. Raises ValueError."""
     if encoded.startswith(PNG_SIGNATURE) and len(encoded) > 24:
         width, height = struct.unpack_from(">II", encoded, 16)
         if width < 1 or height < 1:

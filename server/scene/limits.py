@@ -1,4 +1,4 @@
-"""What a mesh may be: refused beyond, before memory is spent on it."""
+"""Limits of meshes, checked before memory is allocated."""
 
 MAX_TRIANGLES = 2_000_000
 MAX_VERTICES = 3 * MAX_TRIANGLES
@@ -6,18 +6,18 @@ MAX_PARTS = 20_000
 MAX_COORDINATE_M = 1e6
 
 MAX_TEXTURE_PIXELS = 16384 * 16384
-"""Of one picture as the file has it."""
+"""Pixels of one image in the file."""
 MAX_KEPT_SIDE = 4096
-"""Longer sides are scaled down."""
+"""Images with longer sides are scaled down."""
 MAX_KEPT_PIXELS = 8192 * 8192
-"""Of all pictures of a model together, as they are kept; all are scaled down until they fit."""
+"""Pixels of all images of a model together after scaling; all are scaled down until they fit."""
 
 MAX_SCENE_TRIANGLES = 8_000_000
-"""Of all objects of a session together, each as often as it is placed."""
+"""Triangles of all objects of a session together, counted per placed object."""
 MAX_SCENE_TEXTURE_PIXELS = 4 * MAX_KEPT_PIXELS
-"""Likewise."""
+"""Texture pixels, likewise."""
 MAX_OBJECTS = 4096
 
 
 class MeshError(ValueError):
-    """A file that is no mesh that can be placed; one line that says what is wrong with it."""
+    """The file is not a mesh that can be placed; one line."""

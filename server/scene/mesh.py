@@ -1,4 +1,4 @@
-"""A virtual object's mesh: read from a file's bytes, checked, and made ready for the rasteriser."""
+"""A virtual object's mesh: reads a file, validates it, and prepares it for the rasterizer."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ UpAxis = Literal["y", "z"]
 __all__ = ["Mesh", "MeshError", "UpAxis", "load_mesh"]
 
 _LEAST_AREA = 1e-12
-"""A triangle is flat if its area is below this share of its longest edge's square."""
+"""A triangle is degenerate if its area is below this share of its longest edge squared."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Mesh:
     vertices: NDArray[np.float32]
     """[v, 3] model metres."""
     triangles: NDArray[np.int32]
-    """[t, 3] indices into the vertices, counter-clockwise seen from outside where the file says so."""
+    """[t, 3] vertex indices, counter-clockwise seen from outside if the file's winding is correct."""
     vertex_colors: NDArray[np.float32]
     """[v, 3] linear base colour, 0 to 1; the materials' textures multiply it."""
     normals: NDArray[np.float32]
@@ -38,21 +38,21 @@ class Mesh:
     up_axis: UpAxis
     """The model axis that points up: +y for obj, glb and gltf, +z for ply and stl."""
     notes: tuple[str, ...] = ()
-    """What was dropped or not read, one line each."""
+    """What was removed or not read, one line each."""
     uv: NDArray[np.float32] | None = None
     """[v, 4] texture coordinates of base colour, and of roughness and metalness; (0, 0) is the upper left corner."""
     triangle_materials: NDArray[np.int32] | None = None
-    """[t] which of the materials; None: the first."""
+    """[t] index of the material; None: all use the first."""
     materials: tuple[Material, ...] = (MATTE,)
 
     @property
     def texture_uv(self) -> NDArray[np.float32]:
-        """[v, 4] `uv`, zeros where there are none."""
+        """[v, 4] `uv`; zeros if there are none."""
         return np.zeros((len(self.vertices), 4), np.float32) if self.uv is None else self.uv
 
     @property
     def material_of(self) -> NDArray[np.int32]:
-        """[t] `triangle_materials`, zeros where all have the first."""
+        """[t] `triangle_materials`; zeros if all use the first."""
         return np.zeros(len(self.triangles), np.int32) if self.triangle_materials is None else self.triangle_materials
 
     @property
@@ -62,9 +62,9 @@ class Mesh:
 
 
 def load_mesh(data: bytes, format: str) -> Mesh:
-    """The mesh in `data`, a file of format glb, gltf, obj, ply or stl, with its scene graph applied.
+    """Load a mesh from the bytes of a glb, gltf, obj, ply or stl file and apply its scene graph.
 
-    Raises MeshError with one line if there is nothing that can be placed.
+    Raises MeshError, one line, if nothing can be placed.
     """
     if format not in FORMATS:
         raise MeshError(f"mesh format {format!r} is not supported: use {', '.join(FORMATS[:-1])} or {FORMATS[-1]}")
@@ -81,7 +81,7 @@ def load_mesh(data: bytes, format: str) -> Mesh:
 
 
 def _without_bad(part: MeshPart, dropped: Counter[str]) -> MeshPart:
-    """The part less the triangles that cannot be drawn, and less the vertices that nothing uses; counts them."""
+    """Remove and count triangles that cannot be drawn, and remove unused vertices."""
     exists = _all_corners((part.triangles >= 0) & (part.triangles < len(part.vertices)))
     triangles = _kept(part.triangles, exists, "with vertices that do not exist", dropped)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -123,12 +123,12 @@ def _has_area(vertices: NDArray[np.float32], triangles: NDArray[np.int64]) -> ND
 
 
 def _with_normals(part: MeshPart) -> MeshPart:
-    """The part with unit normals: its own where the file has all of them, else computed, sharp at creases."""
+    """The part with unit normals: the file's if complete, else computed and split at creases."""
     if part.normals is not None:
         lengths = np.linalg.norm(part.normals, axis=1)
         if (np.isfinite(lengths) & (lengths > 1e-6)).all():
             return replace(part, normals=unit(part.normals))
-    # An STL repeats its vertices in every triangle.
+    # STL repeats the vertices of every triangle.
     same = numbered(np.hstack([part.vertices, part.colors, part.uv]))
     _, first = np.unique(same, return_index=True)
     source, triangles, normals = creased_normals(part.vertices[first], same[part.triangles])

@@ -1,6 +1,6 @@
-"""The parts of a mesh file as trimesh reads them: placed by the file's scene graph, coloured in linear light.
+"""Reads the parts of a mesh file with trimesh: placed by the scene graph, with linear colours.
 
-Vertex colours are sRGB in every format, glTF's COLOR_0 included (the command line's contract), factors are linear.
+Vertex colours are sRGB in every format, including glTF's COLOR_0 (documented for the command line); factors are linear.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ DEFAULT_BASE_COLOR = 0.8
 _FARTHEST_UV = 1e6
 FORMATS = ("glb", "gltf", "obj", "ply", "stl")
 
-_loading = Lock()  # warnings.catch_warnings changes what the whole process warns of
+_loading = Lock()  # warnings.catch_warnings is not thread-safe
 
 
 @dataclass(frozen=True)
 class MeshPart:
-    """Triangles of one geometry at one place of the scene graph, unchecked, in model metres."""
+    """Triangles of one geometry at one node of the scene graph, not validated, in model metres."""
 
     vertices: NDArray[np.float64]
     """[v, 3]"""
     triangles: NDArray[np.int64]
-    """[t, 3] vertex numbers, which may not exist."""
+    """[t, 3] vertex indices, possibly out of range."""
     colors: NDArray[np.float32]
-    """[v, 3] linear base colour, less its texture."""
+    """[v, 3] linear base colour without its texture."""
     normals: NDArray[np.float64] | None
-    """[v, 3] of any length; None where the file has none."""
+    """[v, 3] of any length; None if the file has none."""
     uv: NDArray[np.float32]
     """[v, 4] texture coordinates of base colour, and of roughness and metalness."""
     material: Material = MATTE
 
 
 def read_parts(data: bytes, file_format: str) -> tuple[list[MeshPart], tuple[str, ...]]:
-    """Every part of a file of one of FORMATS, and notes on what was not read. Raises MeshError."""
+    """All parts of a file of one of FORMATS, and notes on what was not read. Raises MeshError."""
     if not data:
         raise MeshError(f"the {file_format} file is empty: export it again")
     with _loading, warnings.catch_warnings():
@@ -56,7 +56,7 @@ def read_parts(data: bytes, file_format: str) -> tuple[list[MeshPart], tuple[str
             return _read(data, file_format)
         except MeshError:
             raise
-        except Exception as error:  # whatever a damaged file makes trimesh or the lines below stumble over
+        except Exception as error:  # trimesh and the lines below raise various errors for damaged files
             reason = " ".join(f"{type(error).__name__} {error}".split())[:160]
             raise MeshError(f"not a readable {file_format} mesh: {reason}") from error
 
@@ -79,7 +79,7 @@ def _read(data: bytes, file_format: str) -> tuple[list[MeshPart], tuple[str, ...
 
 
 def _without_materials(obj: bytes) -> tuple[bytes, tuple[str, ...]]:
-    """An OBJ less the materials it only names: they are in another file, and trimesh copies all vertices for each."""
+    """Remove material references from an OBJ: they are in another file, and trimesh copies all vertices for each."""
     lines = obj.splitlines()
     kept = [line for line in lines if not line.lstrip().startswith((b"mtllib", b"usemtl"))]
     if len(kept) == len(lines):
@@ -88,7 +88,7 @@ def _without_materials(obj: bytes) -> tuple[bytes, tuple[str, ...]]:
 
 
 def _refuse_announced(data: bytes, file_format: str) -> None:
-    """Refuse a PLY or binary STL by the size that its header announces, before it is read."""
+    """Refuse a PLY or binary STL by the counts in its header, before it is read."""
     vertices, triangles = 0, 0
     if file_format == "ply":
         header = data[: data.find(b"end_header") + 1][:65536]
@@ -111,11 +111,11 @@ def _refuse_oversized(meshes: list[Any]) -> None:
 
 def _part(mesh: Any, matrix: NDArray[np.float64], materials: list[GltfMaterial]) -> MeshPart:
     vertices, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    # Only what the file brought: the property itself would compute them.
+    # Only normals from the file: the property itself would compute them.
     normals = mesh._cache.cache.get("vertex_normals")
     found = _material(mesh, materials)
     colors, (uv, material) = _base_colors(mesh, found), _texture_uv(mesh, found)
-    if mesh.visual.kind == "face":  # one colour a triangle: give each its own vertices
+    if mesh.visual.kind == "face":  # one colour per triangle: duplicate the vertices
         safe = np.clip(triangles.reshape(-1), 0, len(vertices) - 1)
         vertices, colors, uv = vertices[safe], np.repeat(colors, 3, axis=0), uv[safe]
         normals = None if normals is None else normals[safe]
@@ -130,7 +130,7 @@ def _placed(
     normals: NDArray[np.float64] | None,
     matrix: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
-    """The part moved by its node's `matrix`; a mirroring one turns the triangles back round."""
+    """The part transformed by its node's `matrix`; a reflection also reverses the winding."""
     with np.errstate(over="ignore", invalid="ignore"):
         linear = matrix[:3, :3]
         vertices = vertices @ linear.T + matrix[:3, 3]
@@ -142,13 +142,13 @@ def _placed(
 
 
 def _material(mesh: Any, materials: list[GltfMaterial]) -> GltfMaterial | None:
-    """What prepare_gltf said of the part's material; None where the file names none."""
+    """The part's material from prepare_gltf; None if the file names none."""
     name = str(getattr(getattr(mesh.visual, "material", None), "name", None))
     return materials[int(name)] if name.isdigit() and int(name) < len(materials) else None
 
 
 def _base_colors(mesh: Any, material: GltfMaterial | None) -> NDArray[np.float32]:
-    """[v, 3] linear (face colours: [t, 3]): the material's factor times vertex colours; grey where there is neither."""
+    """[v, 3] linear (face colours: [t, 3]): material factor times vertex colours; grey if there are neither."""
     visual, count = mesh.visual, len(mesh.vertices)
     if visual.kind == "face":
         return linear_from_srgb(unit_range(np.asarray(visual.face_colors))[:, :3])
@@ -164,7 +164,7 @@ def _base_colors(mesh: Any, material: GltfMaterial | None) -> NDArray[np.float32
 
 
 def _texture_uv(mesh: Any, found: GltfMaterial | None) -> tuple[NDArray[np.float32], Material]:
-    """[v, 4] where the part's vertices read its textures, 0 where they do not; its material less what has no places."""
+    """[v, 4] texture coordinates of the vertices, 0 if unused; and the material without textures that lack them."""
     uv = np.zeros((len(mesh.vertices), 4), np.float32)
     if found is None:
         return uv, MATTE
@@ -185,9 +185,9 @@ def _texture_uv(mesh: Any, found: GltfMaterial | None) -> tuple[NDArray[np.float
 def _changed_uv(
     given: NDArray[Any] | None, use: TextureUse | None, texture: Texture | None, count: int
 ) -> NDArray[np.float64] | None:
-    """[count, 2] coordinates as the device reads them: transformed, finite, and near 0 where the texture repeats.
+    """[count, 2] texture coordinates for the device: transformed, finite, and near 0 if the texture repeats.
 
-    None where there are none, or no texture.
+    None without coordinates or texture.
     """
     if given is None or use is None or texture is None or np.shape(given) != (count, 2):
         return None

@@ -1,4 +1,4 @@
-"""Materials and their textures as the tables that include/textures.clh reads, textures with all their mip levels."""
+"""Builds the tables that include/textures.clh reads: materials, and textures with all mip levels."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from server.scene.colors import linear_from_srgb
 from server.scene.materials import Material, Texture
 
 _SRGB, _LINEAR = 0, 256
-"""Where the values of sRGB bytes and of linear ones begin in CHANNEL_VALUES."""
+"""Offsets of the sRGB and of the linear values in CHANNEL_VALUES."""
 
 _LINEAR_OF_SRGB_BYTE = linear_from_srgb(np.arange(256) / 255.0)
 CHANNEL_VALUES: NDArray[np.float32] = np.concatenate([_LINEAR_OF_SRGB_BYTE, np.arange(256, dtype=np.float32) / 255])
-"""[512] linear value of a byte of a texel."""
+"""[512] linear values of texel bytes."""
 
 
 @dataclass(frozen=True)
 class MaterialTables:
-    """What shade_surface of rasterize.cl reads of an object's materials."""
+    """Material tables for shade_surface of rasterize.cl."""
 
     materials: NDArray[np.float32]
-    """[m, 4] roughness, metalness, numbers of the textures of base colour and of surface, -1 for none."""
+    """[m, 4] roughness, metalness, texture indices of base colour and of surface; -1 for none."""
     textures: NDArray[np.int32]
     """[n, 4] first level, levels, Beyond in u and in v."""
     levels: NDArray[np.int32]
-    """[l, 4] first texel, width, height, where its bytes' values begin in CHANNEL_VALUES."""
+    """[l, 4] first texel, width, height, offset of its values in CHANNEL_VALUES."""
     texels: NDArray[np.uint8]
-    """[texels, 4] RGB and nothing, each level's rows from the top."""
+    """[texels, 4] RGB and padding, each level's rows from the top."""
 
 
 def material_tables(materials: Sequence[Material]) -> MaterialTables:
-    """Tables of `materials`; a texture that several of them share is kept once."""
+    """Tables of `materials`; a shared texture is stored once."""
     rows: list[tuple[float, ...]] = []
     textures: list[tuple[int, ...]] = []
     levels: list[tuple[int, ...]] = []
@@ -68,9 +68,9 @@ def material_tables(materials: Sequence[Material]) -> MaterialTables:
 
 
 def mip_chain(image: NDArray[np.uint8], *, is_srgb: bool) -> list[NDArray[np.uint8]]:
-    """`image` [h, w, 3] and its halves down to 1 x 1, each texel the mean of the area it covers, in linear light.
+    """Mip levels of `image` [h, w, 3] down to 1 x 1; each texel is the mean of its area in linear light.
 
-    Sides that are odd are halved downwards; a texel then covers more than two.
+    Odd sides are halved and rounded down; a texel then covers more than two.
     """
     chain = [image]
     values = decoded(image, is_srgb=is_srgb)
@@ -82,7 +82,7 @@ def mip_chain(image: NDArray[np.uint8], *, is_srgb: bool) -> list[NDArray[np.uin
 
 
 def shrunk(image: NDArray[np.uint8], most: int, *, is_srgb: bool) -> NDArray[np.uint8]:
-    """`image` [h, w, 3] with no side longer than `most`, its proportions kept; in bands, so that memory stays small."""
+    """`image` [h, w, 3] scaled down to sides of at most `most`, keeping proportions; in bands, to limit memory."""
     height, width = image.shape[:2]
     step = -(-max(height, width) // most)
     if step == 1:
@@ -105,12 +105,12 @@ def decoded(image: NDArray[np.uint8], *, is_srgb: bool) -> NDArray[np.float32]:
 
 
 def encoded(values: NDArray[np.float32], *, is_srgb: bool) -> NDArray[np.uint8]:
-    """Bytes of linear values, rounded to the nearest on their own scale."""
+    """Bytes of linear values, rounded to the nearest code."""
     if is_srgb:
         values = np.where(values <= 0.0031308, 12.92 * values, 1.055 * np.maximum(values, 1e-9) ** (1 / 2.4) - 0.055)
     return np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
 
 
 def _resized(values: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
-    """The mean over the area that each new texel covers, partly covered ones by their share."""
+    """Area average: the mean over the area of each new texel, with partial coverage weighted."""
     return np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA), np.float32)

@@ -1,4 +1,4 @@
-"""Vertex normals for a mesh that brings none: smooth over gentle edges, split along sharp ones."""
+"""Computes vertex normals for a mesh without: smooth over gentle edges, split at creases."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 CREASE_DEG = 40.0
-"""Two triangles that share an edge are smoothed together if their normals differ by less."""
+"""Triangles that share an edge are smoothed if their normals differ by less."""
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -42,13 +42,13 @@ def creased_normals(vertices: NDArray[Any], triangles: Ints) -> tuple[Ints, Ints
     key = group * (len(vertices) + 1) + triangles.reshape(-1)
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
     normals = unit(sums[group[first]])
-    lost = ~normals.any(axis=1)  # opposite sheets that cancel out
+    lost = ~normals.any(axis=1)  # opposite faces that cancel out
     normals[lost] = faces[first[lost] // 3]
     return triangles.reshape(-1)[first], inverse.reshape(-1, 3), normals
 
 
 def numbered(rows: NDArray[Any]) -> Ints:
-    """[n] a number for each row, from 0 up, the same for rows that are exactly equal."""
+    """[n] an index for each row, equal for equal rows."""
     order = np.lexsort(rows.T)
     fresh = np.ones(len(rows), np.int64)
     fresh[1:] = (np.diff(rows[order], axis=0) != 0).any(axis=1)
@@ -74,7 +74,7 @@ def _smooth_links(places: Ints, faces: Floats) -> Ints:
 
 
 def _joined(count: int, links: Ints) -> Ints:
-    """[count] the lowest member of each item's group, groups being what `links` [n, 2] connect (pointer jumping)."""
+    """[count] lowest member of each item's connected component under `links` [n, 2] (pointer jumping)."""
     label = np.arange(count)
     while True:
         ends = label[links]

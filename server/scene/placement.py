@@ -1,4 +1,4 @@
-"""Where a virtual object stands: from model metres to the world."""
+"""Placement of a virtual object: the transform from model metres to the world."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from server.scene.mesh import Mesh, UpAxis
 Matrix = NDArray[np.float64]
 
 SMALLEST_M, LARGEST_M = 1e-4, 1e5
-"""Of an object's longest side, and of its distance from the world's origin."""
+"""Limits of an object's longest side, and of its distance from the world's origin."""
 
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _LEAST_HORIZONTAL = 1e-3
-"""Below this length the horizontal part of the world's x axis says nothing of a heading."""
+"""If the horizontal part of the world's x axis is shorter, it does not define a heading."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """`position_m`: world point on which the bottom centre of the model's box stands; None: the vertices are world
-    coordinates already, and scale and yaw are not used. `yaw_deg` turns counter-clockwise seen from above.
-    `room_from_client`: rigid [4, 4] from the world that this is said in to that of the room; None: they are one.
+    """`position_m`: world position of the bottom centre of the bounding box; None: the vertices are world coordinates
+    already, and scale and yaw are not used. `yaw_deg` rotates counter-clockwise seen from above.
+    `room_from_client`: rigid [4, 4] from the client's world to the room's; None: they are equal.
     Raises ValueError for numbers that are not finite and for a scale that is not positive.
     """
 
@@ -63,7 +63,7 @@ def world_from_model(mesh: Mesh, placement: Placement, up: NDArray[np.float64]) 
 
 
 def check_size(mesh: Mesh, placement: Placement) -> None:
-    """Raises ValueError, one line, for what float32 cannot draw: a speck, a planet, or a thing beyond the horizon."""
+    """Raises ValueError if the object is too small, too large or too far away for float32."""
     low, high = mesh.bounds
     scale = 1.0 if placement.position_m is None else placement.scale
     size_m = float((high - low).max()) * scale
@@ -78,7 +78,7 @@ def check_size(mesh: Mesh, placement: Placement) -> None:
 
 
 def bottom_center(mesh: Mesh) -> NDArray[np.float64]:
-    """[3] model metres: the middle of the lower side of the box around the vertices."""
+    """[3] model metres: centre of the lower side of the bounding box."""
     low, high = mesh.bounds
     center = (low + high) / 2
     axis = "xyz".index(mesh.up_axis)

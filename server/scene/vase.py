@@ -1,4 +1,4 @@
-"""A small virtual object of this project's own: a glazed vase, turned on a lathe from one outline, as GLB bytes."""
+"""Built-in virtual object: a glazed vase as a surface of revolution, as GLB bytes."""
 
 from __future__ import annotations
 

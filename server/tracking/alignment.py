@@ -1,4 +1,4 @@
-"""Where a client's world lies in the room's: as it says, by a marker, or by what the room has seen; then as depth fits.
+"""Aligns a client's world with the room's: by a given transform, a marker or relocalisation, then refined by depth.
 
 The world of a room is that of the client whose frame was fused first. A client that contradicts the room is not fused.
 """

@@ -1,4 +1,4 @@
-"""Where the camera is: from the client, or tracked against the volume (thesis 4.2.1); when it is lost, and found."""
+"""Camera pose: from the client, or tracked against the volume (thesis 4.2.1); detects tracking loss and relocalises."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _LOST = "the camera is lost, nothing is fused: "
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """Where one frame was taken."""
+    """Camera pose of one frame."""
 
     world_from_camera: Floats
     """The last good one where it is lost."""
@@ -69,7 +69,7 @@ class PoseEstimate:
 
 @dataclass
 class _Place:
-    """Where a camera has stayed for some frames."""
+    """A pose at which the camera has stayed for some frames."""
 
     volume_from_camera: Floats
     frames: int = 0
@@ -88,8 +88,8 @@ class _Place:
 class CameraTracking:
     """One camera's pose from frame to frame. `locate` a frame, fuse it, `remember` what the volume then shows.
 
-    given: the client's poses. track: the volume alone. refine: the client's motion from frame to frame, corrected by
-    the volume; where the two do not fit, the client's.
+    given: the client's poses. track: tracking against the volume. refine: the client's frame-to-frame motion, corrected
+    by tracking; if the two do not agree, the client's.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
 """Exposure of each picture relative to the session's first (B3): as the source gives it, else estimated as one factor.
 
 Kernel: exposure.cl. The volume holds what surfaces send in the units of the first picture; a picture's factor is where
-the ratios of its own brightness to that lie. A light that changes on all surfaces alike is taken for exposure: in the
-picture's own units, in which light is told, the two are the same.
+the ratios of its own brightness to that lie. A light change that is equal on all surfaces is treated as exposure: in
+the units of the frame's own image, in which light is reported, both are the same.
 """
 
 from __future__ import annotations

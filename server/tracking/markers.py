@@ -1,4 +1,4 @@
-"""Square fiducial markers (ArUco, AprilTag): where one stands before a camera."""
+"""Pose of square fiducial markers (ArUco, AprilTag) relative to a camera."""
 
 from __future__ import annotations
 

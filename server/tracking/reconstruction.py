@@ -1,4 +1,4 @@
-"""What cameras have scanned of a place together: the volume, remembered views of it, how it was exposed."""
+"""The reconstruction that cameras of a room share: volume, keyframes, exposure."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MARGIN_M = 1.5
 
 
 class Reconstruction:
-    """Grows with every frame that is fused, of whichever camera."""
+    """Accumulates the fused frames of all cameras."""
 
     def __init__(self, engine: Engine, *, is_shared: bool = False) -> None:
         self._engine = engine

@@ -1,5 +1,5 @@
-"""Finding a lost camera again: keyframes searched for the most similar picture (Klein and Murray 2008, sec. 3), and the
-measured depth laid on the surface that the volume shows from there."""
+"""Relocalisation: searches keyframes for the most similar image (Klein and Murray 2008, sec. 3) and registers the
+measured depth with the surface seen from there."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _REACH_M, _REACH_RAD = 0.5, np.radians(30.0)
 
 @dataclass(frozen=True)
 class Thumbnail:
-    """A picture small enough to compare with all others."""
+    """A small image for comparison with all keyframes."""
 
     intensity: NDArray[np.float32]
     """[30, 40] of mean 0 and deviation 1, whatever the exposure."""
@@ -40,7 +40,7 @@ class Thumbnail:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A view that is remembered."""
+    """A stored view."""
 
     thumbnail: Thumbnail
     volume_from_camera: NDArray[np.float64]
@@ -67,7 +67,7 @@ def dissimilarity(a: Thumbnail, b: Thumbnail) -> float:
 
 
 class Keyframes:
-    """Views of a volume that a lost camera is looked for in."""
+    """Stored views of a volume for relocalisation."""
 
     def __init__(self) -> None:
         self._kept: list[Keyframe] = []

@@ -1,9 +1,9 @@
 """Frame-to-model tracking (KinectFusion 3.5; thesis 4.2.1): point-to-plane ICP of the measured depth against the
 surface that the volume predicts. Kernels: track.cl.
 
-Every pixel of the model looks its measurement up: the measured point is a sample, never interpolated, and the surface
-that it is compared with is smooth. All pictures of the pair are camera-centred, so float32 holds at any distance from
-the volume's origin; poses and equations are float64.
+Projective data association: every model pixel reads its measured point, which is a sample and never interpolated; the
+model surface is smooth. All images are relative to the camera, so float32 suffices at any distance from the volume's
+origin; poses and equations are float64.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class ModelView:
 
 @dataclass(frozen=True)
 class Registration:
-    """How the measured depth lies on the model."""
+    """Result of registering the measured depth with the model."""
 
     volume_from_camera: NDArray[np.float64]
     deviation_m: float
@@ -142,7 +142,7 @@ def register(
     guess: NDArray[np.float64],
     tolerance_m: float,
 ) -> Registration | None:
-    """The measured depth laid on the model, from `guess` (volume_from_camera); None where they do not meet.
+    """Register the measured depth with the model, starting at `guess` (volume_from_camera); None without overlap.
 
     `tolerance_m`: directions that the scene fixes less well than this stay where the guess has them.
     """

@@ -1,8 +1,8 @@
-"""Depth pictures of the volume from all around it (thesis 7.3.2): what the camera does not see still casts shadows.
+"""Depth views of the volume from all around it (thesis 7.3.2): surfaces outside of the camera's view cast shadows too.
 
-Kernels: auxiliary_views.cl. The thesis has four (left, right, above, along the dominant light) and marches
-through them; here there are so many that each direction has one that looks nearly along it, so that a single look
-answers it. They are small, and the volume changes little from frame to frame, so only some are drawn anew each frame.
+Kernels: auxiliary_views.cl. The thesis uses four views (left, right, above, along the dominant light) and marches
+through them. Here there are so many that each direction has a view nearly along it, so that one look-up is enough. The
+views are small and the volume changes little between frames, so only some are redrawn in each frame.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ MOST_PER_FRAME = 96
 
 @dataclass(frozen=True)
 class AuxiliaryViews:
-    """Views of the volume, on the device. What a view does not see gets no light from where it stands."""
+    """Views of the volume on the device. Points that a view does not see get no light from its direction."""
 
     toward: Floats
     """[views, 3] unit directions from the scene to the views' eyes, world axes; the last is towards the dominant light,

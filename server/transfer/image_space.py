@@ -1,13 +1,13 @@
 """Radiance transfer in image space: GR15 and GR15FAST (thesis 6.2). Kernels: image_space.cl.
 
-Visibility is looked up instead of traced. A direction's far part is one look into the auxiliary view from where its
-light comes. Its near part, finer than their pixels, and what moves too fast for the volume is marched through the
-camera's own geometry buffer: samples at distances that grow by a constant ratio, so that each stands for a piece of
-the direction's cone, beginning elsewhere in each of 2 x 2 samples (6.2.1), with the self-occlusion correction of 6.2.2.
+Visibility is looked up instead of traced. The far part of a direction is one look-up in the auxiliary view along it.
+The near part, finer than their pixels, and moving objects that are not in the volume are found by marching through
+the camera's geometry buffer. Sample distances grow by a constant ratio, so that each sample covers a part of the
+direction's cone; the phase differs within blocks of 2 x 2 samples (6.2.1). 6.2.2 corrects self-occlusion.
 
-Eq. 6.4 as printed, chi = cos(half the angle), lets V' rise over nearly 90 degrees, and what merely stands beside a
-direction blocks it; 1 - cos, which its text wants, wins (tests/pipeline/test_image_space.py). In the auxiliary views
-nothing is left to correct: they look along the direction.
+Eq. 6.4 as printed, chi = cos(half the angle), lets V' rise over nearly 90 degrees, so that objects beside a direction
+block it; 1 - cos, as in its text, is more accurate (tests/pipeline/test_image_space.py). The auxiliary views need no
+correction: they look along the direction.
 """
 
 from __future__ import annotations

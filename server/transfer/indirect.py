@@ -1,6 +1,6 @@
-"""Indirect light as it was photographed: what hidden directions send is the radiance of the surface they meet.
+"""Observed indirect light: an occluded direction receives the radiance of the surface that occludes it.
 
-Kernel: indirect.cl. Surfaces are taken as Lambertian, so the colour that the volume holds is what they send anywhere.
+Kernel: indirect.cl. Surfaces are assumed Lambertian, so the colour in the volume is their radiance in all directions.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LEAST_COSINE = 0.05
 
 @dataclass(frozen=True)
 class Indirect:
-    """What surfaces of one frame send one another."""
+    """Indirect light between the surfaces of one frame."""
 
     hits: cl_array.Array
     """[rows, cols] float4, see gather_hits."""

@@ -1,4 +1,4 @@
-"""Depth pictures of real surface that visibility is looked up in (thesis 6.2.1, 7.3.2)."""
+"""Depth views of real surfaces for visibility look-ups (thesis 6.2.1, 7.3.2)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RealDepthViews:
-    """Pictures of real surface that shading looks into."""
+    """Depth views of real surfaces for shading."""
 
     views: AuxiliaryViews
     view_of: NDArray[np.int32]

@@ -1,4 +1,4 @@
-"""Values at some of a picture's pixels."""
+"""Values on a regular subset of an image's pixels."""
 
 from __future__ import annotations
 

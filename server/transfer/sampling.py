@@ -1,4 +1,4 @@
-"""Where and how radiance transfer is sampled (thesis ch. 6): the accelerations, each a switch, and the presets."""
+"""Sampling of radiance transfer (thesis ch. 6): the accelerations, each a switch, and the presets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Visibility of the sky from samples of the surface (thesis 5.1.2) by itself. Kernel: visibility.cl."""
+"""Visibility alone, without transfer, at samples of the surface (thesis 5.1.2). Kernel: visibility.cl."""
 
 from __future__ import annotations
 

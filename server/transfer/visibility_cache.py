@@ -1,9 +1,9 @@
-"""Visibility that earlier frames have found (thesis 6.1.1, steps 2 and 3). Device side: include/visibility_cache.clh.
+"""Visibility cache from earlier frames (thesis 6.1.1, steps 2 and 3). Device side: include/visibility_cache.clh.
 
-The directions fall into k subsets, and a frame traces one of them: k frames hold them all. Each frame leaves its
-visibility in a layer that lies as its camera did; a later frame projects its samples into the k - 1 layers before it.
-Where none of them knows a subset, because the point was hidden, has moved or is new, it is traced at once, so that no
-sample ever has fewer directions than another.
+The directions are divided into k subsets, and a frame traces one of them, so k frames contain all. Each frame stores
+its visibility in a layer with its camera pose; a later frame projects its samples into the k - 1 layers before it. If
+no layer contains a subset, because the point was occluded, has moved or is new, it is traced at once, so that all
+samples have the same number of directions.
 """
 
 from __future__ import annotations

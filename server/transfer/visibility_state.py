@@ -1,9 +1,9 @@
 """Visibility state in world space (thesis 6.1.2): voxels whose surface is known to be open need no rays.
 
-Kernels: visibility_state.cl. A voxel is open if the samples in it saw at least LEAST_OPEN of their sky when they were
-last traced. Cache validation cameras watch the volume: one from above, and one that follows the user's, which sees the
-volume as it is now from where it stood before. Where what they see has changed, voxels within the reach of a visibility
-ray are forgotten, and traced again when next seen.
+Kernels: visibility_state.cl. A voxel is open if at least LEAST_OPEN of the directions of its samples were visible when
+they were last traced. Cache validation cameras observe the volume: one from above, and one that sees the current volume
+from the user's previous pose. Where their view has changed, voxels within the length of a visibility ray are
+invalidated and traced again when next seen.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The box that a volume fills, and its voxels, where a session names neither."""
+"""Default bounds and voxel size of a volume."""
 
 from __future__ import annotations
 

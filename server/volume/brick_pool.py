@@ -1,4 +1,4 @@
-"""Device memory of the bricks' voxels: it grows with the surface. Kernels: brick_pool.cl."""
+"""Device memory for the bricks' voxels, which grows with the surface. Kernels: brick_pool.cl."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _BATCH = 1024
 
 
 class BrickPool:
-    """Slots 1 to `capacity`, and slot 0 for all bricks that are away."""
+    """Slots 1 to `capacity`; slot 0 stands for all bricks that are not on the device."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine

@@ -1,4 +1,4 @@
-"""Which bricks have device memory: those that a camera needs now, and as many others as the budget has room for."""
+"""Residency of bricks: those that a camera needs now are on the device, and others as far as the budget allows."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SPARE_SHARE = 1 / 16
 
 
 class Residency:
-    """Slots of the pool, given, taken and given back."""
+    """Allocates and frees slots of the pool."""
 
     def __init__(self, engine: Engine, tables: RayTables, voxel_m: float, budget_bytes: int, host_bytes: int) -> None:
         self._engine = engine

@@ -1,4 +1,4 @@
-"""Bricks that were released to the host, until the camera looks at them again."""
+"""Bricks that were moved to the host until a camera needs them again."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _BATCH = 1024
 
 
 class BrickStore:
-    """Voxels of released bricks, bit for bit, by place in the table."""
+    """Exact voxels of bricks on the host, by brick index."""
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity

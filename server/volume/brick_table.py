@@ -1,4 +1,4 @@
-"""Which brick of the volume holds which slot of the pool. Host only; the device has a copy of `slots`."""
+"""Maps bricks of the volume to slots of the pool. Host only; the device has a copy of `slots`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Voxels of bricks on the host, for meshes and files."""
+"""Voxels of bricks on the host, for meshing and saving."""
 
 from __future__ import annotations
 

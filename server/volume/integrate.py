@@ -1,4 +1,4 @@
-"""TSDF integration (KinectFusion; thesis 4.2.1): a depth picture folded into the volume. Kernel: integrate.cl."""
+"""TSDF integration (KinectFusion; thesis 4.2.1): fuses a depth image into the volume. Kernel: integrate.cl."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def integrate(
     volume_from_camera: NDArray[np.float64],
     measurement: Measurement,
 ) -> None:
-    """Fold a rectified picture into the bricks that are allocated."""
+    """Fuse a rectified depth image into the allocated bricks."""
     if not volume.allocated_bricks:
         return
     items = 64 if engine.lanes == 1 else 1  # a processor's core has a brick to itself

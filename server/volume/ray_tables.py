@@ -1,4 +1,4 @@
-"""What rays jump by: where the volume is solid, and how far apart that is. Kernels: volume.cl."""
+"""Tables for empty-space skipping: solid cells and the gaps between them. Kernels: volume.cl."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Surface prediction (KinectFusion; thesis 4.2.1): what of the volume a camera sees. Kernel: raycast.cl."""
+"""Surface prediction (KinectFusion; thesis 4.2.1): ray casts the volume from a camera. Kernel: raycast.cl."""
 
 from __future__ import annotations
 

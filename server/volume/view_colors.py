@@ -1,4 +1,4 @@
-"""A picture of what has been scanned, for somebody who has no camera. Kernel: view_colors.cl."""
+"""Image of the scanned surface for clients without a camera. Kernel: view_colors.cl."""
 
 from __future__ import annotations
 

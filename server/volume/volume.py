@@ -1,8 +1,8 @@
 """The brick volume: a TSDF whose memory follows the surface. Kernels: volume.cl, layout: include/volume.clh.
 
 Space is a regular grid of bricks of 8x8x8 voxels; a brick gets a slot of the pool when a measured surface comes
-near it. Past the budget, bricks that no camera looks at go to the host, the longest unwanted first, and come back
-bit for bit when one looks at them again. While away they still stop rays, as cells of 2x2x2 voxels.
+near it. Beyond the budget, bricks out of view move to the host, least recently used first, and return unchanged when a
+camera sees them again. Meanwhile they still block rays, as cells of 2x2x2 voxels.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _TILE = 4
 
 
 class VolumeSizeError(ValueError):
-    """The asked volume is empty or too fine; one line that says what to do."""
+    """The requested volume is empty or too fine; one line with a remedy."""
 
 
 class Volume:

@@ -12,7 +12,7 @@ const SRGB = Uint8ClampedArray.from({ length: 1025 }, (_, i) => {
   return 255 * (linear <= 0.0031308 ? 12.92 * linear : 1.055 * linear ** (1 / 2.4) - 0.055);
 });
 
-/** Exposure at which the mean of the light comes out as half of white. */
+/** Exposure that maps the mean of the light to half of white. */
 export function exposureOf(radiance: Float64Array): number {
   const mean = BASIS_0 * luminance(radiance[0]!, radiance[1]!, radiance[2]!);
   return mean > 1e-9 ? Math.LN2 / mean : 1;
@@ -24,7 +24,7 @@ export function toneMap(radiance: number, exposure: number): number {
   return SRGB[Math.round(1024 * shown)]!;
 }
 
-/** RGBA of a ball of which each point shows `flat` in the direction of its normal; outside it is transparent. */
+/** RGBA of a ball whose points show `flat` in the direction of their normals; transparent outside. */
 export function paintBall(
   flat: Float64Array,
   worldFromCamera: readonly number[],
@@ -49,7 +49,7 @@ export function paintBall(
   return pixels;
 }
 
-/** Mark where the light comes from: a dot on the ball (a ring where it is on the far side), an arrow beside it. */
+/** Mark the light's direction: a dot on the ball (a ring if it is on the far side) and an arrow beside it. */
 export function drawDirection(context: CanvasRenderingContext2D, direction: Vector3): void {
   const [x, y, z] = direction;
   const sideways = Math.hypot(x, y);
@@ -83,7 +83,7 @@ function drawArrow(context: CanvasRenderingContext2D, x: number, y: number): voi
   strokeTwice(context, 2.5);
 }
 
-/** Dark under bright, so that the mark is seen on any light. */
+/** Bright on dark, so that the mark is visible on any background. */
 function strokeTwice(context: CanvasRenderingContext2D, width: number): void {
   context.lineCap = context.lineJoin = "round";
   context.strokeStyle = "#101318";
@@ -105,7 +105,7 @@ export function drawOutline(context: CanvasRenderingContext2D): void {
   context.setLineDash([]);
 }
 
-/** Grey diagonal lines over the ball: this light is not to be relied on. */
+/** Grey diagonal lines over the ball: the light is not valid. */
 export function drawHatch(context: CanvasRenderingContext2D): void {
   context.save();
   context.beginPath();

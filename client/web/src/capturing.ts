@@ -1,4 +1,4 @@
-// A session of this page's own: from the form's button to its end.
+// A capturing session of this page, from the form's button to its end.
 
 import { worldFromCamera } from "./capture/axes";
 import { startCamera } from "./capture/camera_source";
@@ -10,21 +10,21 @@ import { scaled, type Seen, Y_UP } from "./objects/picking";
 import type { Remote } from "./remote";
 import type { Vector3 } from "./sh";
 
-/** Frames on the way whose depth a finger may still need. */
+/** Number of frames in flight whose depth is kept for picking. */
 const KEPT = 8;
 
 export interface CapturingHooks {
-  /** Something that the person should know; `isEnd`: the session is over with it. */
+  /** A message for the user; `isEnd`: the session has ended. */
   say(text: string, isEnd: boolean): void;
-  /** The picture on the screen is the device's newest, taken from there (row-major). */
+  /** The image on the screen is the device's newest, taken from this pose (row-major). */
   look(worldFromCamera: readonly number[]): void;
 }
 
-/** Who draws on this device, where anybody does. */
+/** The local renderer, if there is one. */
 export interface Screen {
   /** In a WebXR session. */
   readonly draw: Draw;
-  /** Pictures that the page displays itself. */
+  /** Images that the page displays by itself. */
   readonly show?: (shown: Shown) => void;
 }
 
@@ -40,7 +40,7 @@ export class Capturing implements Sink {
     private readonly screen: Screen | null,
   ) {}
 
-  /** Begin, to be called by a tap. Throws SourceError. */
+  /** Start; must be called from a user gesture. Throws SourceError. */
   async start(choice: Choice, stage: Element, url: string): Promise<void> {
     try {
       this.source = await this.open(choice, stage);
@@ -71,19 +71,19 @@ export class Capturing implements Sink {
     return startRecorded(file!, loops, this, screen?.show === undefined ? null : show);
   }
 
-  /** With which lens and from where a frame was taken, as far as it is not long ago. */
+  /** Lens and pose of a recent frame. */
   shotOf(frame: number): Shot | null {
     return this.shots.get(frame) ?? null;
   }
 
-  /** The frame of a number, as far as its depth is still here. `answered`: from where the server says that it was taken. */
+  /** The frame with this number, if its depth is still available. `answered`: its pose according to the server. */
   seenIn(frame: number, answered: readonly number[] | null): Seen | null {
     const seen = this.seen.get(frame);
     const world_from_camera = seen?.world_from_camera ?? answered;
     return seen === undefined || world_from_camera === null ? null : { ...seen, up: this.up, world_from_camera };
   }
 
-  /** In a room that somebody else has opened, what is up there; in the axes of this session. */
+  /** Up direction of a room that another client has opened, in the axes of this session. */
   noteUp(up: Vector3): void {
     this.up = up;
   }

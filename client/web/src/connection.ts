@@ -1,4 +1,4 @@
-// The socket to the server, which comes back by itself when it is lost. What is said on it is not known here.
+// The socket to the server, which reconnects automatically. It does not know the messages.
 
 import { decodeServer, encode } from "./messages";
 import { type ClientMessage, type ServerMessage, SUBPROTOCOL } from "./protocol";
@@ -6,17 +6,17 @@ import { type ClientMessage, type ServerMessage, SUBPROTOCOL } from "./protocol"
 export type ConnectionState =
   | { kind: "connecting" }
   | { kind: "open" }
-  /** `isFull`: the server is there, and has no place now. */
+  /** `isFull`: the server is running but has no place now. */
   | { kind: "lost"; reason: string; wait_ms: number; isFull: boolean }
   | { kind: "refused"; reason: string };
 
-/** Between tries: the first pause, and the longest. */
+/** Shortest and longest pause between attempts to connect. */
 export interface Pauses {
   first_ms: number;
   longest_ms: number;
 }
 
-/** For somebody who watches, and for a session that the server keeps for a while only. */
+/** For watchers, and for sessions that the server keeps for a limited time. */
 export const WATCHING: Pauses = { first_ms: 500, longest_ms: 15_000 };
 export const CAPTURING: Pauses = { first_ms: 100, longest_ms: 2_000 };
 

@@ -1,4 +1,4 @@
-// What was wrong with the input: each line once, with how often and when it was last said.
+// Notes about the input: each line once, with its count and last frame.
 
 import { byId, make } from "./dom";
 
@@ -12,10 +12,10 @@ interface Note {
 
 const notes = new Map<string, Note>();
 
-/** Remember a line; `frame` is the frame it was about, null where it was about none. */
+/** Add a line; `frame` is the frame it refers to, or null. */
 export function addNote(text: string, frame: number | null): void {
   const count = (notes.get(text)?.count ?? 0) + 1;
-  notes.delete(text); // the newest is the last of the map
+  notes.delete(text); // reinsert as the last entry
   notes.set(text, { count, frame });
   const oldest = notes.keys().next().value;
   if (notes.size > MOST && oldest !== undefined) notes.delete(oldest);

@@ -1,4 +1,4 @@
-// The plan of effects: which ran, which were left out, why, and what that can cost.
+// Shows the plan of effects: which ran, which were left out, why, and the error bound.
 
 import { byId, make } from "./dom";
 import type { LeftOut, Plan } from "./protocol";

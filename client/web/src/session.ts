@@ -1,12 +1,12 @@
-// What is asked of a server's session, whoever captures.
+// Types of requests to a session.
 
 import type { ClientMessage, Hello } from "./protocol";
 
-/** A hello but for the camera, which the first frame says. */
+/** A hello without the camera, which the first frame defines. */
 export type Setup = Omit<Hello, "type" | "camera" | "resume">;
 
-/** What is answered by `acknowledged`. */
+/** Requests that are answered by `acknowledged`. */
 export type Request = Extract<ClientMessage, { request: number }>;
 
-/** A request before it has its number. */
+/** A request without its number. */
 export type Asked = { [K in Request["type"]]: Omit<Extract<Request, { type: K }>, "request"> }[Request["type"]];

@@ -1,4 +1,4 @@
-// One capturing session for a program, in a browser or in Node.js: frames out, the room's light and pictures back.
+// One capturing session for programs, in a browser or in Node.js: sends frames, receives light and images.
 
 import { CaptureStream, type Numbered } from "./capture/stream";
 import { type ConnectionState, streamUrl } from "./connection";
@@ -6,12 +6,12 @@ import { encodeDepth } from "./depth";
 import type { Acknowledged, CameraModel, ColorImage, Composite, DepthImage, Dropped, Frame, Layer, Light, ServerMessage, Welcome } from "./protocol";
 import type { Asked, Request, Setup } from "./session";
 
-/** What a session begins with; see protocol/README.md. */
+/** Options of a session; see protocol/README.md. */
 export interface SessionOptions extends Setup {
   camera: CameraModel;
-  /** For how long a server that does not answer is waited for, once it has answered. */
+  /** How long to wait for a server that stops answering. */
   patience_s?: number;
-  /** Something that whoever looks at the program may want to know, in one sentence. */
+  /** Receives notices, each one sentence. */
   onNote?(text: string): void;
 }
 
@@ -26,7 +26,7 @@ export interface Shot {
   exposure?: number | null;
 }
 
-/** What the server made of a frame; a picture or a layer where `wishes.answer` asks for one. */
+/** The server's result for a frame; with an image or a layer according to `wishes.answer`. */
 export interface Answer {
   type: "answer";
   light: Light;
@@ -52,10 +52,10 @@ export class StreamClient {
   private failure: Error | null = null;
   private count = 0;
   private giveUp: ReturnType<typeof setTimeout> | undefined;
-  /** What the server said of the session; after a lost connection, what it said last. */
+  /** The server's last welcome. */
   welcome!: Welcome;
 
-  /** Open a session on a server, by the URL that it prints. Rejects with one sentence where it is absent or refuses. */
+  /** Open a session at the URL that the server prints. Rejects with one sentence if there is no server or it refuses. */
   static connect(url: string, options: SessionOptions): Promise<StreamClient> {
     return new Promise((resolve, reject) => {
       const client = new StreamClient(url, options);
@@ -77,14 +77,14 @@ export class StreamClient {
     });
   }
 
-  /** Resolves when a frame that is taken now would be sent at once: a live camera takes its newest frame here. */
+  /** Resolves when a frame would be sent at once; take a live camera's newest frame then. */
   ready(): Promise<void> {
     if (this.failure !== null) return Promise.reject(this.failure);
     if (this.isWanted) return Promise.resolve();
     return new Promise((resolve, reject) => this.sending.push({ resolve, reject }));
   }
 
-  /** Send a frame as soon as there is room; its answer, or why there is none. */
+  /** Send a frame as soon as the window allows; resolves with its answer, or with the reason why there is none. */
   async send(shot: Shot): Promise<Answer | Dropped> {
     const { width } = this.options.camera.depth ?? this.options.camera;
     const depth = shot.depth instanceof Uint16Array ? await encodeDepth(shot.depth, width) : shot.depth;
@@ -99,7 +99,7 @@ export class StreamClient {
     return answer;
   }
 
-  /** Ask for something: place_object, move_object, remove_object, quality. What is wrong with it is in its `error`. */
+  /** Send a request: place_object, move_object, remove_object, quality. A refusal is in `error`. */
   request(asked: Asked): Promise<Acknowledged> {
     if (this.failure !== null) return Promise.reject(this.failure);
     const request = this.count++;
@@ -108,7 +108,7 @@ export class StreamClient {
     return answer;
   }
 
-  /** Leave; what is not answered yet is rejected. */
+  /** Close the session; pending promises are rejected. */
   close(reason = ""): void {
     this.fail(new Error("the session was closed"));
     this.stream.stop(reason);

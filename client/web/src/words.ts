@@ -1,4 +1,4 @@
-// Numbers and names of the protocol in words.
+// Formats numbers and names of the protocol as text.
 
 import type { Sending } from "./capture/encode";
 import type { OperatingPoint } from "./protocol";
@@ -6,7 +6,7 @@ import type { Vector3 } from "./sh";
 
 const degrees = (rad: number): number => Math.round((rad * 180) / Math.PI);
 
-/** A direction in camera axes (x right, y down, z forward), towards the light, as somebody behind the camera says it. */
+/** A direction towards the light in camera axes (x right, y down, z forward), in words. */
 export function describeDirection([x, y, z]: Vector3): string {
   if (Math.hypot(x, y, z) < 1e-6) return "none";
   const right = degrees(Math.atan2(x, Math.abs(z)));
@@ -20,7 +20,7 @@ function angle(value: number, positive: string, negative: string): string {
   return value === 0 ? "" : `${Math.abs(value)}° ${value > 0 ? positive : negative}`;
 }
 
-/** What leaving an effect out can change at most; `bound` is in display units, 1 is 1/255. */
+/** The error bound of an effect that was left out; `bound` is in display units, 1 is 1/255. */
 export function describeBound(bound: number | null): string {
   if (bound === null) return "no bound is known";
   if (bound === 0) return "changes nothing";
@@ -29,7 +29,7 @@ export function describeBound(bound: number | null): string {
   return bound <= 3 ? `hardly visible: ${most}` : `may be visible: ${most}`;
 }
 
-/** Where and how finely a frame was sampled, and why. */
+/** The sampling of a frame and the reason. */
 export function describePoint(point: OperatingPoint | null): string {
   if (point === null) return "none: the camera is lost";
   const expected = point.expected_ms == null ? "" : `, ${milliseconds(point.expected_ms)} ms expected`;

@@ -1,4 +1,4 @@
-// The worker: the socket, and all that is packed and unpacked, away from the page's own thread.
+// The Web Worker: socket, encoding and decoding, off the main thread.
 
 import { Adaptive, LADDER } from "./capture/adaptive";
 import { FrameEncoder } from "./capture/encode";
@@ -10,13 +10,13 @@ import { closeParts, decodeLayer, transferOf } from "./local/layer_parts";
 import type { Composite, Layer, LayerPatch, ServerMessage } from "./protocol";
 import type { FromWorker, News, ToWorker } from "./worker_messages";
 
-/** Quality yields until so many frames are carried, or as many as the server computes. */
+/** Quality is reduced until the link carries this frame interval, or the rate that the server computes. */
 const WANTED_INTERVAL_S = 1 / 15;
 
 let watching: Connection | null = null;
 let stream: CaptureStream | null = null;
 let encoder: FrameEncoder | null = null;
-/** An answer whose pictures are to be decoded. */
+/** An answer whose images are decoded here. */
 let waiting: { answer: Composite | Layer; times: Times | null } | null = null;
 let isDecoding = false;
 
@@ -65,7 +65,7 @@ function begin(next: number): void {
 }
 
 function beginStream({ url, setup, video, adapts }: Extract<ToWorker, { kind: "capture" }>): void {
-  // A light alone does not say how long the server took for it.
+  // A light alone lacks the server's times.
   const pace = adapts && setup.wishes?.answer !== "light" ? new Adaptive(WANTED_INTERVAL_S) : null;
   if (pace !== null) void measureDelay_s(url).then((delay_s) => (pace.delay_s = delay_s));
   const frames = new FrameEncoder(video, say, () => pace?.coding ?? LADDER[0]!, (sending) => post({ kind: "sending", sending }));
@@ -102,7 +102,7 @@ const bare = (layer: Layer): Layer => ({ ...layer, virtual: barePatch(layer.virt
 const barePatch = (patch: LayerPatch | null): LayerPatch | null =>
   patch === null ? null : { ...patch, color: withoutData(patch.color), depth: withoutData(patch.depth) };
 
-/** The newest picture; one that arrives while another is being decoded replaces an older one that waits. */
+/** Latest-wins decoder: a newer image replaces one that waits while another is being decoded. */
 async function decodeWaiting(): Promise<void> {
   if (isDecoding) return;
   isDecoding = true;

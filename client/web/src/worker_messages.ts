@@ -1,4 +1,4 @@
-// What the page and its worker say to each other.
+// Messages between the page and its worker.
 
 import type { Sending } from "./capture/encode";
 import type { Numbered, Times } from "./capture/stream";
@@ -8,9 +8,9 @@ import type { Composite, Layer, ServerMessage, Watch } from "./protocol";
 import type { Request, Setup } from "./session";
 
 export type ToWorker =
-  /** `run`: of watching or capturing; what is left of an earlier one is not heard. */
+  /** `run`: number of the watching or capturing run; messages of an earlier run are ignored. */
   | { kind: "watch"; run: number; url: string; watch: Watch }
-  /** `video`: colour is to go as H.264, where that can be. `adapts`: quality, size and rate follow the link. */
+  /** `video`: send colour as H.264 if possible. `adapts`: quality, size and rate follow the link. */
   | { kind: "capture"; run: number; url: string; setup: Setup; video: boolean; adapts: boolean }
   | { kind: "frame"; frame: Numbered }
   | { kind: "request"; request: Request }
@@ -19,14 +19,14 @@ export type ToWorker =
 
 export type News =
   | { kind: "state"; state: ConnectionState }
-  /** Every message of the server's; a composite and a layer without the bytes of their pictures. */
+  /** Every server message; composites and layers without their image data. */
   | { kind: "message"; message: ServerMessage }
-  /** A composite's picture, decoded; of those that come too fast, some are left out. */
+  /** A decoded composite; some are skipped if they arrive too fast. */
   | { kind: "picture"; composite: Composite; bitmap: ImageBitmap; times: Times | null }
-  /** A layer, likewise. */
+  /** A decoded layer, likewise. */
   | { kind: "layer"; layer: Layer; parts: LayerParts; times: Times | null }
   | { kind: "wanted" }
-  /** A frame goes to the server. */
+  /** A frame is being sent. */
   | { kind: "sending"; sending: Sending }
   | { kind: "say"; text: string };
 

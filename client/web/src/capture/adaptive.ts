@@ -1,17 +1,17 @@
-// What a link carries: picture quality, size and rate, from the round trips of the frames that were answered; the rules of
-// client/adaptive.py, which says why they are so. Pure logic; times of one clock, in seconds.
+// Adapts image quality, size and rate to the link, from the round trips of answered frames. Same rules as
+// client/adaptive.py, which explains them. Pure logic; times of one clock, in seconds.
 
-/** How a frame's colour goes over the wire. Depth is exact on every rung. */
+/** Coding of a frame's colour. Depth is lossless on every rung. */
 export interface Coding {
   /** JPEG's, 0 to 100. */
   readonly quality: number;
-  /** The picture is sent at 1/divisor of its width and height; the server enlarges it. */
+  /** The image is sent at 1/divisor of its width and height; the server enlarges it. */
   readonly divisor: number;
-  /** Of the best video's bits, which are what video has in place of both. */
+  /** Share of the best video's bit rate; used by video instead of quality and divisor. */
   readonly videoShare: number;
 }
 
-/** From the best to the cheapest. */
+/** From best to cheapest. */
 export const LADDER: readonly Coding[] = [
   { quality: 90, divisor: 1, videoShare: 1 },
   { quality: 80, divisor: 1, videoShare: 0.7 },
@@ -20,18 +20,18 @@ export const LADDER: readonly Coding[] = [
   { quality: 75, divisor: 2, videoShare: 0.2 },
   { quality: 50, divisor: 2, videoShare: 0.12 },
 ];
-/** Of the time between frames that the busier way may take. */
+/** Share of the frame interval that the busier direction may take. */
 const SHARE = 0.9;
-/** Where the server is slower still, quality costs nothing but age: a way may not take more than a share of this. */
+/** If the server is even slower, quality costs only latency: a direction may take at most a share of this interval. */
 const LONGEST_TRANSFER_S = 0.2;
 /** Weight of the newest measurement. */
 const SMOOTHING = 0.25;
-/** So many frames in a row that took too long: one rung down. */
+/** Number of consecutive slow frames before one rung down. */
 const BAD_ANSWERS = 2;
-/** So many in a row with time to spare: one up. Doubled each time that it was wrong. */
+/** Number of consecutive fast frames before one rung up; doubled after each failed try. */
 const GOOD_ANSWERS = 8;
 const MOST_GOOD_ANSWERS = 128;
-/** A rung up is tried where transfer takes less than this share of what it may. */
+/** A rung up is tried if transfer takes less than this share of its limit. */
 const SPARE = 0.8;
 const WINDOW = 32;
 
@@ -40,15 +40,15 @@ export interface Measured {
   /** Before its first byte went. */
   sent_s: number;
   answered_s: number;
-  /** Of it, in the server's pipeline. */
+  /** Part of it in the server's pipeline. */
   computed_s: number;
   bytes_up: number;
   bytes_down: number;
-  /** At the server, before it was computed; null: the server does not say it. */
+  /** Waiting time at the server before processing; null: not reported. */
   waited_s: number | null;
 }
 
-/** Told of answers, asked for the rung and for when the next frame may go. */
+/** Receives answers; returns the coding of the next frame and when to send it. */
 export class Adaptive {
   private place = 0;
   private readonly ways_s: number[] = [];
@@ -66,7 +66,7 @@ export class Adaptive {
   private told = 0;
   private stepped_s = -Infinity;
 
-  /** `wantedInterval_s`: between the frames that are wanted. `delay_s`: round trip of an empty message, where measured. */
+  /** `wantedInterval_s`: target frame interval. `delay_s`: round trip of an empty message, if measured. */
   constructor(
     private readonly wantedInterval_s: number,
     public delay_s = Infinity,
@@ -77,26 +77,26 @@ export class Adaptive {
     return this.place;
   }
 
-  /** How the next frame is to be sent. */
+  /** Coding of the next frame. */
   get coding(): Coding {
     return LADDER[this.place]!;
   }
 
-  /** Of the slowest stage that a frame passes: the next one would wait there. Stages overlap and do not add. */
+  /** Duration of a frame's slowest stage, where the next one would wait. Stages overlap, so durations do not add up. */
   get busy_s(): number {
     return Math.max(this.computed_s, this.transfer_s * greaterShare(this.bytesUp, this.bytesDown));
   }
 
-  /** For how long a frame sent now would wait for others; Infinity: an answer has to come first. */
+  /** How long a frame sent now would wait for others; Infinity: an answer must come first. */
   wait_s(now_s: number, lastSent_s: number, unanswered: number): number {
     if (unanswered === 0) return 0;
     if (unanswered > 1) return Infinity;
-    // The frame on the way was begun when it was sent, or when the answer before it left the server.
+    // Processing of the frame in flight began when it was sent, or when the answer before it left the server.
     const begun_s = Math.max(lastSent_s, this.lastAnswer_s - this.way_s);
     return Math.max(this.busy_s - (now_s - begun_s), 0);
   }
 
-  /** Whether a frame sent now would wait for nobody. */
+  /** Whether a frame sent now would not have to wait. */
   maySend(now_s: number, lastSent_s: number, unanswered: number): boolean {
     return this.wait_s(now_s, lastSent_s, unanswered) === 0;
   }
@@ -104,7 +104,7 @@ export class Adaptive {
   /** A frame was answered. */
   note(frame: Measured): void {
     const { sent_s, answered_s, computed_s, bytes_up, bytes_down } = frame;
-    // While the one before was computed, which was not answered yet when this one went.
+    // Time in which the frame before, unanswered when this one was sent, was being processed.
     const waited_s = frame.waited_s ?? Math.min(Math.max(this.lastAnswer_s - sent_s, 0), this.lastComputed_s);
     const way_s = Math.max(answered_s - sent_s - computed_s - waited_s, 0);
     [this.lastAnswer_s, this.lastComputed_s] = [answered_s, computed_s];
@@ -117,11 +117,11 @@ export class Adaptive {
     this.transfer_s += weight * (transfer_s - this.transfer_s);
     this.bytesUp += weight * (bytes_up - this.bytesUp);
     this.bytesDown += weight * (bytes_down - this.bytesDown);
-    // Those that were under way at a step tell of the rung before.
+    // Frames in flight during a step were coded with the previous rung.
     if (sent_s >= this.stepped_s) this.choose(transfer_s * greaterShare(bytes_up, bytes_down), answered_s);
   }
 
-  /** The connection was restored: what was measured before says nothing of it, and a rung down is safe. */
+  /** After a reconnect: discard earlier measurements and go one rung down. */
   noteLost(): void {
     this.ways_s.length = 0;
     this.lastAnswer_s = -Infinity;
@@ -151,5 +151,5 @@ export class Adaptive {
   }
 }
 
-/** Of both ways' bytes, that of the busier one: the ways carry at the same time. */
+/** Bytes of the busier direction: both directions transfer at the same time. */
 const greaterShare = (up: number, down: number): number => Math.max(up, down) / Math.max(up + down, 1);

@@ -1,4 +1,4 @@
-// From WebXR's conventions to those of the wire (protocol/README.md), all of them here.
+// Converts WebXR's conventions to those of the wire format (protocol/README.md).
 //
 // WebXR: camera x right, y up, z backward; matrices column-major; pictures' edges are at -1 and 1.
 // The wire: camera x right, y down, z forward; matrices row-major; a pixel's centre is at integer coordinates.
@@ -21,7 +21,7 @@ export function worldFromCamera(matrix: Float32Array): number[] {
   return [0, 1, 2, 3].flatMap((row) => [at(row, 0), -at(row, 1), -at(row, 2), at(row, 3)]);
 }
 
-/** The lens of a picture of this size that fills the view. */
+/** The lens of an image of this size that fills the view. */
 export function lensOf(projection: Float32Array, width: number, height: number): Lens {
   return {
     width,
@@ -33,7 +33,7 @@ export function lensOf(projection: Float32Array, width: number, height: number):
   };
 }
 
-/** Depth as it lies in the view: a point x of the view's side, from 0 to 1, is at `share x + offset` of the depth's. */
+/** Position of the depth in the view: x in [0, 1] of the view's side is at `share x + offset` of the depth's side. */
 export interface UprightDepth {
   width: number;
   height: number;
@@ -44,7 +44,7 @@ export interface UprightDepth {
 
 const MOST_UNITS = 65535;
 
-/** uint16 units of a depth buffer, 0 where there is no measurement, and what one is in metres. */
+/** uint16 values of a depth buffer, 0: no measurement, and the unit in metres. */
 export function depthUnits(depth: XrDepth, format: XrDepthFormat): { units: Uint16Array; scale_m: number } {
   const count = depth.width * depth.height;
   if (format !== "float32") return { units: new Uint16Array(depth.data, 0, count), scale_m: depth.rawValueToMeters };
@@ -87,7 +87,7 @@ export function upright(units: Uint16Array, width: number, height: number, matri
   };
 }
 
-/** The lens of upright depth beside a colour picture that fills the view. */
+/** The lens of upright depth for a colour image that fills the view. */
 export function depthLens(color: Lens, depth: UprightDepth): Lens {
   const [shareX, shareY] = depth.share;
   const [offsetX, offsetY] = depth.offset;
@@ -104,10 +104,10 @@ export function depthLens(color: Lens, depth: UprightDepth): Lens {
 }
 
 const NUMBERS = ["fx", "fy", "cx", "cy"] as const;
-/** Pixels over the width: less is the same lens, told with another rounding. */
+/** Tolerance as a share of the width; smaller differences are rounding. */
 const SAME = 2e-3;
 
-/** Whether two cameras are one, so that a session may go on. */
+/** Whether two cameras are equal, so that a session may continue. */
 export function isSameCamera(a: CameraModel, b: CameraModel): boolean {
   return a.depth_scale_m === b.depth_scale_m && isSameLens(a, b) && isSameLens(a.depth ?? null, b.depth ?? null);
 }

@@ -1,4 +1,4 @@
-// A camera that gives pictures and nothing else: it joins a room that others scan, and a marker says where it is.
+// A camera without depth and pose: it joins a room that others scan, and is located by a marker.
 
 import type { CameraModel } from "../protocol";
 import { fitted, type Size } from "./readback";
@@ -6,7 +6,7 @@ import { now_ms, reasonOf, type Sink, type Source, SourceError } from "./source"
 
 const LONGEST_PX = 640;
 
-/** Begin with the camera that looks away from the person. `view_deg`: along the picture's longer side. Throws SourceError. */
+/** Start the rear camera. `view_deg`: field of view along the longer side. Throws SourceError. */
 export async function startCamera(view_deg: number, sink: Sink): Promise<Source> {
   let stream: MediaStream;
   try {
@@ -32,7 +32,7 @@ function refusal(error: unknown): string {
   return `The camera cannot be used (${reasonOf(error)}).`;
 }
 
-/** A lens without distortion whose longer side sees `view_deg`. */
+/** A lens without distortion with field of view `view_deg` along the longer side. */
 export function lensOfView({ width, height }: Size, view_deg: number): CameraModel {
   const focal = Math.max(width, height) / 2 / Math.tan((view_deg * Math.PI) / 360);
   return { width, height, fx: focal, fy: focal, cx: (width - 1) / 2, cy: (height - 1) / 2 };

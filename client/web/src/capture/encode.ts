@@ -1,4 +1,4 @@
-// Captured frames as they go over the wire.
+// Encodes captured frames for the wire.
 
 import { encodeDepth } from "../depth";
 import type { ColorImage, Frame, ServerMessage } from "../protocol";
@@ -7,16 +7,16 @@ import { type Captured, reasonOf } from "./source";
 import type { Numbered } from "./stream";
 import { canBeVideo, videoLack, VideoStream } from "./video";
 
-/** How a frame was sent. */
+/** Coding that was used for a frame. */
 export type Sending = { as: "jpeg" | "video"; coding: Coding } | { as: "recorded" };
 
-/** Of one session; one frame after the other. Told of what the server says, on which video depends. */
+/** Encoder of one session, one frame after the other. Receives the server's messages, on which video depends. */
 export class FrameEncoder {
   private readonly video = new VideoStream();
   private isVideo = false;
   private depthCodec: "zdelta" | "zranks" = "zdelta";
 
-  /** `wantsVideo`: colour as H.264, where server and browser can; `say`: why it is not. */
+  /** `wantsVideo`: colour as H.264 if server and browser support it; `say`: receives the reason if not. */
   constructor(
     private readonly wantsVideo: boolean,
     private readonly say: (text: string) => void,
@@ -24,14 +24,14 @@ export class FrameEncoder {
     private readonly onSending: (sending: Sending) => void = () => undefined,
   ) {}
 
-  /** What the server said; `dropped` and a new connection break the video. */
+  /** Handle a server message; `dropped` and a new connection require a key picture. */
   async hear(message: ServerMessage): Promise<void> {
     if (message.type === "dropped") this.video.needKey();
     if (message.type !== "welcome") return;
     this.video.needKey();
     this.depthCodec = message.depth_codecs?.includes("zranks") === true ? "zranks" : "zdelta";
     if (!this.wantsVideo) return;
-    const isRead = message.codecs?.includes("h264") === true; // older servers say nothing of it
+    const isRead = message.codecs?.includes("h264") === true; // older servers do not send codecs
     const lack = isRead ? await videoLack() : "This server reads no video: colour is sent as JPEG.";
     this.isVideo = lack === null;
     if (lack !== null) this.say(lack);
@@ -84,7 +84,7 @@ function pixelsOf(frame: Captured): Uint8ClampedArray {
   return drawn(frame).getImageData(0, 0, width, height).data;
 }
 
-/** The picture on a canvas; a bitmap is disposed of. */
+/** The image on a canvas; closes a bitmap. */
 function drawn({ color, camera: { width, height } }: Captured): OffscreenCanvasRenderingContext2D {
   const context = canvasOf(width, height);
   if ("close" in color) {
@@ -96,12 +96,12 @@ function drawn({ color, camera: { width, height } }: Captured): OffscreenCanvasR
   return context;
 }
 
-/** The picture at 1/divisor of its width and height, as the server enlarges it. */
+/** The image at 1/divisor of its width and height; the server enlarges it. */
 function reduced(full: OffscreenCanvasRenderingContext2D, divisor: number): OffscreenCanvasRenderingContext2D {
   if (divisor === 1) return full;
   const { width, height } = full.canvas;
   const context = canvasOf(Math.ceil(width / divisor), Math.ceil(height / divisor));
-  context.imageSmoothingQuality = "medium"; // means of pixels; "low" leaves pixels out
+  context.imageSmoothingQuality = "medium"; // averages pixels; "low" skips pixels
   context.drawImage(full.canvas, 0, 0, context.canvas.width, context.canvas.height);
   return context;
 }

@@ -1,4 +1,4 @@
-// A camera's texture as bytes: made smaller on the GPU, the top row first.
+// Reads a camera texture as bytes, scaled down on the GPU, top row first.
 
 export interface Size {
   width: number;
@@ -10,7 +10,7 @@ interface Step extends Size {
   buffer: WebGLRenderbuffer;
 }
 
-/** Reads textures of one WebGL context. What it binds, it unbinds. */
+/** Reads textures of one WebGL context and restores its bindings. */
 export class Readback {
   private readonly source: WebGLFramebuffer;
   private readonly steps: Step[] = [];

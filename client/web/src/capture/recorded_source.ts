@@ -1,20 +1,20 @@
-// A recorded sequence as a camera: its frames as they were recorded, at their own pace, from a file of this device.
+// Plays a recording as a camera: its frames unchanged, in real time, from a local file.
 
 import type { CameraModel, Wishes } from "../protocol";
 import { pictureOf } from "./recorded_picture";
 import { framesOf, type RecordedFrame } from "./recording";
 import { now_ms, type Packed, reasonOf, type Sink, type Source, SourceError } from "./source";
 
-/** Between looks whether a frame is due or wanted. */
+/** Polling interval for frames that are due or requested. */
 const LOOK_MS = 4;
-/** Of a sequence of one frame. */
+/** Frame interval of a recording with one frame. */
 const STILL_STEP_S = 1 / 15;
-/** A page that was asleep does not make up for more. */
+/** Largest delay that playback catches up with after the page was suspended. */
 const LATEST_MS = 200;
-/** A longer pause in a recording is cut down to this: nobody waits for it. */
+/** Longer pauses in a recording are shortened to this. */
 const LONGEST_STEP_S = 5;
 
-/** The newest picture, for whoever shows it before the server has answered. Closed when the next one is here. */
+/** The newest image, for display before the server has answered. Closed when the next one arrives. */
 export interface Shown {
   bitmap: ImageBitmap;
   camera: CameraModel;
@@ -22,7 +22,7 @@ export interface Shown {
   world_from_camera: number[] | null;
 }
 
-/** Begin to play `file`: again and again, or once, after which its last frame stands. Throws SourceError. */
+/** Play `file` in a loop, or once and hold the last frame. Throws SourceError. */
 export async function startRecorded(file: File, loops: boolean, sink: Sink, onShown: ((shown: Shown) => void) | null = null): Promise<Source> {
   const first = (await framesOf(file, () => undefined).next()).value ?? null;
   if (first === null) throw new SourceError(`${file.name} holds no frames: choose a file that probeless stream SOURCE --record FILE has made.`);
@@ -34,7 +34,7 @@ export class RecordedSource implements Source {
   private hasEnded = false;
   private shown: Shown | null = null;
   private isShowing = false;
-  /** Where the frame that is due now stands in time, seconds since the beginning. */
+  /** Time of the frame that is due now, in seconds since the beginning. */
   private time_s = 0;
 
   constructor(
@@ -70,7 +70,7 @@ export class RecordedSource implements Source {
       due_ms = Math.max(due_ms + 1000 * step_s, performance.now() - LATEST_MS);
       do {
         if (now !== null && !isSent) isSent = this.send(now);
-        await pause(LOOK_MS); // also where it is late: the page has other things to do
+        await pause(LOOK_MS); // also if late, so that the page stays responsive
       } while (!this.hasEnded && performance.now() < due_ms);
       this.time_s += step_s;
       if (this.hasEnded) return;
@@ -80,7 +80,7 @@ export class RecordedSource implements Source {
     }
   }
 
-  /** The session begins with a frame that says which camera it is, and is not sent. */
+  /** The first frame defines the session's camera and is not sent. */
   private async announce(first: RecordedFrame): Promise<void> {
     while (!this.sink.wantsFrame()) {
       if (this.hasEnded) return;
@@ -90,7 +90,7 @@ export class RecordedSource implements Source {
     while (!this.hasEnded && !this.sink.wantsFrame()) await pause(LOOK_MS);
   }
 
-  /** Every frame, and for how long the one before it is seen; endless. */
+  /** Endless sequence of frames, each with the time since the previous one. */
   private async *paced(): AsyncGenerator<{ next: RecordedFrame; step_s: number }> {
     let last: RecordedFrame | null = null;
     let usual_s = STILL_STEP_S;
@@ -114,7 +114,7 @@ export class RecordedSource implements Source {
     this.hasSaid = true;
   }
 
-  /** Whether it is sent: the server may be busy. */
+  /** Whether the frame is sent; the server may be busy. */
   private send({ camera, frame }: RecordedFrame): boolean {
     if (this.hasEnded || !this.sink.wantsFrame()) return false;
     const { world_from_camera, color = null, depth = null, exposure = null } = frame;
@@ -123,7 +123,7 @@ export class RecordedSource implements Source {
     return true;
   }
 
-  /** Unpack the picture for who shows it; while one is being unpacked, others are left out. */
+  /** Decode the image for display; skipped while another one is being decoded. */
   private async show({ camera, frame }: RecordedFrame): Promise<void> {
     if (this.onShown === null || this.isShowing || !frame.color) return;
     this.isShowing = true;
@@ -141,7 +141,7 @@ export class RecordedSource implements Source {
   }
 }
 
-/** What its session asks: of geometry and exposure as whoever recorded it did, and always what is up. */
+/** Wishes of the session: geometry and exposure as recorded, and always the up direction. */
 function wishesOf({ wishes, frame }: RecordedFrame): Wishes {
   const { poses, volume_m, voxel_m, exposure, denoise, lamps } = wishes;
   const asked: Wishes = { up: wishes.up ?? upOf(frame.world_from_camera), poses: poses ?? (frame.world_from_camera === null ? "track" : "given") };
@@ -151,7 +151,7 @@ function wishesOf({ wishes, frame }: RecordedFrame): Wishes {
   return asked;
 }
 
-/** The first camera's -y, as the server has it where nothing is said. */
+/** The first camera's -y, which is the server's default. */
 function upOf(pose: readonly number[] | null): [number, number, number] {
   return pose === null ? [0, -1, 0] : [-pose[1]!, -pose[5]!, -pose[9]!];
 }

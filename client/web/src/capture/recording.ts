@@ -1,11 +1,11 @@
-// A recording (protocol/README.md): messages one after another in a file, read in pieces and never as a whole.
+// Reads a recording (protocol/README.md): consecutive messages in a file, read in chunks.
 
 import { decodeClient } from "../messages";
 import { type CameraModel, type ClientMessage, type Frame, type Hello, MAX_MESSAGE_BYTES, type Wishes } from "../protocol";
 import { lengthOfValue } from "./message_length";
 import { reasonOf, SourceError } from "./source";
 
-/** What is read at once at least. */
+/** Minimum size of a chunk. */
 const PIECE_BYTES = 1 << 18;
 
 export interface RecordedFrame {
@@ -14,11 +14,11 @@ export interface RecordedFrame {
   frame: Frame;
 }
 
-/** What is wrong with a file, in one sentence. */
+/** Error in a file, in one sentence. */
 const noRecording = (file: File, at: number, why: string): SourceError =>
   new SourceError(`${file.name} is no recording (byte ${at}: ${why}): choose a file that probeless stream SOURCE --record FILE has made.`);
 
-/** The frames of a recording in their order. Throws SourceError. `onCut`: the file ends inside a message, in one sentence. */
+/** The frames of a recording in order. Throws SourceError. `onCut` is called if the file ends inside a message. */
 export async function* framesOf(file: File, onCut: (text: string) => void): AsyncGenerator<RecordedFrame> {
   let hello: Hello | null = null;
   for await (const { at, bytes } of messagesOf(file, onCut)) {
@@ -45,10 +45,10 @@ function read(file: File, at: number, bytes: Uint8Array): ClientMessage | { type
   return message;
 }
 
-/** Codecs of pictures that stand for themselves: some are left out where the server is slower than the recording. */
+/** Codecs of independent images: frames may be skipped if the server is slower than the recording. */
 const SINGLE: ReadonlySet<string> = new Set(["jpeg", "png", "raw"]);
 
-/** Each whole message and where it begins. */
+/** Each complete message and its offset. */
 async function* messagesOf(file: File, onCut: (text: string) => void): AsyncGenerator<{ at: number; bytes: Uint8Array<ArrayBuffer> }> {
   let piece = new Uint8Array();
   let start = 0; // of the piece in the file

@@ -1,17 +1,17 @@
-// What a camera of this page gives, whichever it is.
+// Common interface of the page's cameras.
 
 import type { CameraModel, Frame, Wishes } from "../protocol";
 
-/** Milliseconds that page and worker count alike. */
+/** Milliseconds on a clock that page and worker share. */
 export const now_ms = (): number => performance.timeOrigin + performance.now();
 
-/** Where and when a frame was taken. */
+/** Pose and time of a frame. */
 export interface Shot {
   timestamp_s: number;
-  /** When it was in this page's hands. */
+  /** Time of arrival in this page. */
   captured_ms: number;
   camera: CameraModel;
-  /** Row-major; null where the device does not say where it is. */
+  /** Row-major; null if the device has no pose. */
   world_from_camera: number[] | null;
 }
 
@@ -22,29 +22,29 @@ export interface Captured extends Shot {
   depth: Uint16Array<ArrayBuffer> | null;
 }
 
-/** A frame whose pictures are packed already; they are sent as they are. */
+/** A frame whose images are encoded already and are sent unchanged. */
 export interface Packed extends Shot {
   packed: Pick<Frame, "color" | "depth" | "exposure">;
 }
 
-/** Where frames go. */
+/** Receiver of frames. */
 export interface Sink {
-  /** Whether a frame that is captured now would be sent now. */
+  /** Whether a frame captured now would be sent now. */
   wantsFrame(): boolean;
   take(frame: Captured | Packed): void;
-  /** Something that the person should know. */
+  /** A message for the user. */
   say(text: string): void;
-  /** The source has ended by itself; why, in one sentence. */
+  /** The source has ended; the reason in one sentence. */
   ended(reason: string): void;
 }
 
 export interface Source {
-  /** What it asks of its session besides what the person chose. */
+  /** Wishes of the source in addition to the user's. */
   readonly wishes?: Wishes;
   stop(): Promise<void>;
 }
 
-/** A source cannot be started: one sentence that says what is missing and what to do. */
+/** A source cannot be started: one sentence with what is missing and what to do. */
 export class SourceError extends Error {}
 
 export const reasonOf = (error: unknown): string =>

@@ -1,4 +1,4 @@
-// One capturing session: hello, frames as the server has room for them, requests until they are answered, and back again
+// One capturing session: hello, frames within the server's window, requests until they are answered, and resumption
 // after a lost connection (protocol/README.md).
 
 import { CAPTURING, Connection, type ConnectionState, REFUSED_CAPTURE } from "../connection";
@@ -11,7 +11,7 @@ import { type Captured, now_ms, type Packed } from "./source";
 
 export type Numbered = (Captured | Packed) & { number: number };
 
-/** When a frame was where, in milliseconds that page and worker count alike. */
+/** Times of a frame's stages, in milliseconds on a clock that page and worker share. */
 export interface Times {
   captured_ms: number;
   sent_ms: number;
@@ -19,10 +19,10 @@ export interface Times {
 }
 
 export interface StreamHooks {
-  /** A frame that is captured now would be sent at once. */
+  /** A frame captured now would be sent at once. */
   onWanted(): void;
   onState(state: ConnectionState): void;
-  /** `times`: of an answer to a frame. */
+  /** `times`: only for an answer to a frame. */
   onMessage(message: ServerMessage, times: Times | null): void;
   say(text: string): void;
 }
@@ -42,7 +42,7 @@ export class CaptureStream {
   private lastSent_ms = -Infinity;
   private timer: ReturnType<typeof setTimeout> | undefined;
   private readonly requests = new Map<number, Request>();
-  /** Of the connection: what was begun on another one is not sent on this one. */
+  /** Number of the connection: work begun on an earlier one is not sent on this one. */
   private epoch = 0;
 
   /**
@@ -57,13 +57,13 @@ export class CaptureStream {
     private readonly pace: Adaptive | null = null,
   ) {}
 
-  /** Begin, with a camera; where it is not known yet, the first frame says it and is not sent. */
+  /** Start with a camera; if it is not known yet, the first frame defines it and is not sent. */
   start(camera: CameraModel | null = null): void {
     if (camera !== null) this.openFor(camera);
     else this.askForFrame();
   }
 
-  /** Send a frame that was asked for; whether it was sent. */
+  /** Send a requested frame; returns whether it was sent. */
   async offer(frame: Numbered): Promise<boolean> {
     this.wasAsked = false;
     const isOther = this.camera === null || !isSameCamera(this.camera, frame.camera);
@@ -85,13 +85,13 @@ export class CaptureStream {
     }
   }
 
-  /** Have something done once, however often the connection is lost. */
+  /** Send a request that is applied exactly once, even if the connection is lost. */
   request(message: Request): void {
     this.requests.set(message.request, message);
     if (this.isWelcome) this.connection?.send(message);
   }
 
-  /** Try now to come back. */
+  /** Try to reconnect now. */
   retry(): void {
     this.connection?.open();
   }
@@ -102,7 +102,7 @@ export class CaptureStream {
     this.leave();
   }
 
-  /** A session has one camera: another one, as of a tablet that was turned, is a session of its own. */
+  /** A session has one camera; another camera, for example after rotating a tablet, needs a new session. */
   private openFor(camera: CameraModel): void {
     if (this.camera !== null) this.hooks.say("the camera’s picture has another shape now: the session begins anew");
     this.connection?.stop("another camera");
@@ -144,14 +144,14 @@ export class CaptureStream {
     if (this.wasAsked || !(this.camera === null || this.hasRoom())) return;
     const wait_ms = this.wait_ms();
     if (wait_ms > 0) {
-      if (wait_ms < Infinity) this.timer = setTimeout(() => this.askForFrame(), wait_ms); // else the next answer asks
+      if (wait_ms < Infinity) this.timer = setTimeout(() => this.askForFrame(), wait_ms); // else the next answer does it
       return;
     }
     this.wasAsked = true;
     this.hooks.onWanted();
   }
 
-  /** Until a frame that is sent waits on its way for no other. */
+  /** Time until a frame can be sent without waiting behind another. */
   private wait_ms(): number {
     return 1000 * (this.pace?.wait_s(now_ms() / 1000, this.lastSent_ms / 1000, this.unanswered.size) ?? 0);
   }

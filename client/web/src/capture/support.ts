@@ -1,9 +1,9 @@
-// What this browser can do, and in plain words what it lacks.
+// Capabilities of this browser, and messages about what it lacks.
 
 import { reasonOf } from "./source";
 import { xrSystem } from "./xr";
 
-/** Of each source: null where it can be used, else why not and what to do. */
+/** For each source: null if it can be used, else the reason and what to do. */
 export interface Support {
   xr: string | null;
   camera: string | null;

@@ -1,11 +1,11 @@
-// Colour as H.264 video, where this browser has an encoder: each picture at once, key pictures only where they are needed.
+// Colour as H.264 video, if this browser has an encoder: no delay, and key pictures only when needed.
 
 import type { ColorImage } from "../protocol";
 import { reasonOf } from "./source";
 
-/** Constrained Baseline, level 3.1: no pictures that wait for later ones. */
+/** Constrained Baseline, level 3.1: no B pictures, so no reordering delay. */
 const CODEC = "avc1.42E01F";
-/** Of a stream of 15 pictures a second: about as good as the JPEG that it takes the place of. */
+/** Bit rate at 15 pictures a second; quality similar to the JPEG that it replaces. */
 const BITS_PER_PIXEL = 0.55;
 const FRAMES_PER_S = 15;
 
@@ -26,17 +26,17 @@ const configOf = (width: number, height: number, share = 1): VideoEncoderConfig 
   bitrate: Math.round(share * BITS_PER_PIXEL * width * height * FRAMES_PER_S),
 });
 
-/** Why colour cannot be sent as video here, in one sentence; null: it can. */
+/** Why colour cannot be sent as video, in one sentence; null if it can. */
 export async function videoLack(): Promise<string | null> {
   if (!("VideoEncoder" in globalThis)) return "This browser lets pages write no video: colour is sent as JPEG.";
   const { supported } = await VideoEncoder.isConfigSupported(configOf(640, 480)).catch(() => ({ supported: false }));
   return supported === true ? null : "This browser writes no H.264: colour is sent as JPEG.";
 }
 
-/** 4:2:0 has pictures of even sides only. */
+/** 4:2:0 requires even sides. */
 export const canBeVideo = (width: number, height: number): boolean => width % 2 === 0 && height % 2 === 0;
 
-/** One session's video. `encode` is called for one picture after the other. */
+/** Video encoder of one session. Call `encode` for one picture at a time. */
 export class VideoStream {
   private encoder: VideoEncoder | null = null;
   private size = "";
@@ -46,12 +46,12 @@ export class VideoStream {
   private isKeyNeeded = true;
   private count = 0;
 
-  /** A picture was lost on the way: the next one shall rest on none before it. */
+  /** A picture was lost: make the next one a key picture. */
   needKey(): void {
     this.isKeyNeeded = true;
   }
 
-  /** The next picture, of a share of the best one's bits. Throws Error where the browser's encoder fails. */
+  /** Encode the next picture with a share of the best bit rate. Throws Error if the browser's encoder fails. */
   async encode(picture: Picture, share = 1): Promise<ColorImage> {
     const { width, height } = picture;
     const encoder = this.encoderOf(width, height, share);
@@ -86,7 +86,7 @@ export class VideoStream {
   private encoderOf(width: number, height: number, share: number): VideoEncoder {
     const size = `${width}x${height}`;
     if (this.encoder !== null && this.size === size && this.encoder.state === "configured") {
-      if (share !== this.share) this.encoder.configure(configOf(width, height, share)); // the video goes on
+      if (share !== this.share) this.encoder.configure(configOf(width, height, share)); // without a new key picture
       this.share = share;
       return this.encoder;
     }
@@ -105,7 +105,7 @@ export class VideoStream {
   }
 }
 
-/** Y, Cb and Cr one after the other, BT.601 of full range, as in JPEG; chroma of 2 by 2 pixels. */
+/** Planes Y, Cb and Cr, BT.601 full range as in JPEG, 4:2:0. */
 export function planesOf({ rgba, width, height }: Picture): Uint8Array<ArrayBuffer> {
   const halfWidth = width / 2;
   const count = width * height;

@@ -1,4 +1,4 @@
-// A tablet or phone that knows where it is: colour, depth and pose of a WebXR session.
+// Colour, depth and pose of a WebXR session on a tablet or phone.
 
 import { depthLens, depthUnits, lensOf, upright, worldFromCamera } from "./axes";
 import { fitted, Readback } from "./readback";
@@ -12,7 +12,7 @@ export type Draw = (view: XrView, layer: XrLayer, gl: WebGL2RenderingContext, ca
 /** The bottom row first; holds only while a frame of the session is drawn. */
 type CameraImage = () => WebGLTexture | null;
 
-/** Begin a session whose overlay is `root`; to be called by a tap. Throws SourceError. */
+/** Start a session with overlay `root`. Must be called from a user gesture. Throws SourceError. */
 export async function startXr(root: Element, sink: Sink, draw: Draw | null = null): Promise<Source> {
   const { XRWebGLLayer, XRWebGLBinding } = xrGlobals();
   if (XRWebGLLayer === undefined || XRWebGLBinding === undefined) throw new SourceError("This browser has no WebXR.");
@@ -26,7 +26,7 @@ export async function startXr(root: Element, sink: Sink, draw: Draw | null = nul
     const onView = draw === null ? null : (view: XrView, camera: CameraImage) => draw(view, layer, gl, camera);
     return new XrSource(session, space, new XRWebGLBinding(session, gl), new Readback(gl), sink, onView);
   } catch (error) {
-    await session.end().catch(() => undefined); // what went wrong first is what is told
+    await session.end().catch(() => undefined); // report the first error
     throw error;
   }
 }
@@ -78,7 +78,7 @@ class XrSource implements Source {
     this.sink.ended(reason);
   }
 
-  /** Textures and depth hold only until this returns. */
+  /** Textures and depth are valid only until this returns. */
   private readonly onFrame = (time_ms: number, frame: XrFrame): void => {
     if (this.hasEnded) return;
     this.session.requestAnimationFrame(this.onFrame);
@@ -94,7 +94,7 @@ class XrSource implements Source {
     }
   };
 
-  /** Asked for at most once a frame. */
+  /** Requested at most once per frame. */
   private cameraImage(view: XrView | undefined): CameraImage {
     let image: WebGLTexture | null | undefined;
     return () => (image === undefined ? (image = view?.camera ? this.binding.getCameraImage(view.camera) : null) : image);

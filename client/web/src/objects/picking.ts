@@ -1,23 +1,23 @@
-// From a finger on the picture to a place in the room, and back.
+// Picking: maps between pixels of the image and points in the room.
 
 import type { Lens } from "../capture/axes";
 import { decodeDepth } from "../depth";
 import type { CameraModel, DepthImage } from "../protocol";
 import { toCamera, toWorld, type Vector3 } from "../sh";
 
-/** Of a WebXR session's world. */
+/** Up direction in a WebXR session's world. */
 export const Y_UP: Vector3 = [0, 1, 0];
 
-/** A frame as far as a finger needs it. */
+/** Data of a frame that picking needs. */
 export interface Seen {
   camera: CameraModel;
-  /** Row-major, of the picture on the screen. */
+  /** Row-major pose of the image on the screen. */
   world_from_camera: readonly number[];
-  /** Of the depth, where that is of another picture. */
+  /** Pose of the depth, if it belongs to another image. */
   measured_from?: readonly number[];
-  /** Unit, in the world. */
+  /** Unit vector in the world. */
   up: Vector3;
-  /** Packed as long as no finger has needed it. */
+  /** Compressed until it is needed. */
   depth: Uint16Array | DepthImage;
 }
 
@@ -27,13 +27,13 @@ export interface Measured extends Seen {
 
 export const isMeasured = (seen: Seen): seen is Measured => seen.depth instanceof Uint16Array;
 
-/** With its depth unpacked, for the next time too. Throws Error. */
+/** The frame with its depth decompressed and cached. Throws Error. */
 export async function measured(seen: Seen): Promise<Measured> {
   if (!isMeasured(seen)) seen.depth = await decodeDepth(seen.depth as DepthImage);
   return seen as Measured;
 }
 
-/** The same depth, under a picture that was taken from elsewhere. */
+/** The same depth with an image taken from another pose. */
 export function seenFrom(seen: Seen, world_from_camera: readonly number[]): Seen {
   return { ...seen, world_from_camera, measured_from: seen.measured_from ?? seen.world_from_camera };
 }
@@ -50,7 +50,7 @@ export const dot = (a: Vector3, b: Vector3): number => a[0] * b[0] + a[1] * b[1]
 export const scaled = (a: Vector3, by: number): Vector3 => [a[0] * by, a[1] * by, a[2] * by];
 export const sum = (...all: readonly Vector3[]): Vector3 => all.reduce((a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]]);
 export const cross = (a: Vector3, b: Vector3): Vector3 => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-/** What is level of a direction. */
+/** Horizontal part of a direction. */
 export const levelled = (a: Vector3, up: Vector3): Vector3 => sum(a, scaled(up, -dot(a, up)));
 
 export interface Pixel {
@@ -65,7 +65,7 @@ export function toWorldPoint(m: readonly number[], point: Vector3): Vector3 {
   return [turned[0] + m[3]!, turned[1] + m[7]!, turned[2] + m[11]!];
 }
 
-/** Where a point of the world is in the picture; null behind the camera. */
+/** Pixel of a world point; null behind the camera. */
 export function project(lens: Lens, worldFromCamera: readonly number[], [x, y, z]: Vector3): Pixel | null {
   const [px, py, pz] = positionOf(worldFromCamera);
   const [right, down, ahead] = toCamera(worldFromCamera, [x - px, y - py, z - pz]);
@@ -74,10 +74,10 @@ export function project(lens: Lens, worldFromCamera: readonly number[], [x, y, z
 }
 
 const FARTHEST_PX = 6;
-/** Of the way along a ray; what is further behind a surface than its thickness is hidden by it. */
+/** Step length as a share of the distance, and assumed thickness of surfaces: points further behind are occluded. */
 const [FIRST_M, LAST_M, STEP, THICKNESS] = [0.1, 20, 1.01, 0.03] as const;
 
-/** The surface under a pixel of the picture; null where none was measured there or near. Distortion is left out. */
+/** The surface point at a pixel; null if there is no depth nearby. Ignores distortion. */
 export function surfaceAt(seen: Omit<Measured, "up">, pixel: Pixel): Vector3 | null {
   const [right, down] = slopes(seen.camera, pixel);
   for (let reach = 1; reach <= FARTHEST_PX; reach += 2) {
@@ -87,13 +87,13 @@ export function surfaceAt(seen: Omit<Measured, "up">, pixel: Pixel): Vector3 | n
   return null;
 }
 
-/** How far ahead of the camera the ray first meets what was measured; where depth is of another place, step by step. */
+/** Distance along z at which the ray first meets the depth; by ray marching if depth has another pose. */
 function aheadOf(seen: Omit<Measured, "up">, right: number, down: number, reach: number): number | null {
   const { camera, world_from_camera, depth } = seen;
   const lens = camera.depth ?? camera;
   const inWorld = (ahead: number): Vector3 => toWorldPoint(world_from_camera, [right * ahead, down * ahead, ahead]);
   const worldFromLens = worldFromLensOf(seen);
-  /** By how much a point of the ray is behind the surface; null where none was measured. */
+  /** Distance of a ray point behind the surface; null without depth. */
   const behind = (ahead: number): number | null => {
     const point = inWorld(ahead);
     const place = project(lens, worldFromLens, point);
@@ -115,7 +115,7 @@ function aheadOf(seen: Omit<Measured, "up">, right: number, down: number, reach:
   return null;
 }
 
-/** Of the depth's lens; the camera's own where they are one. */
+/** Lens of the depth; the camera's if they share one. */
 function worldFromLensOf({ camera, world_from_camera, measured_from = world_from_camera }: Pick<Measured, "camera" | "world_from_camera" | "measured_from">): readonly number[] {
   const fromLens = camera.depth?.color_from_depth;
   if (fromLens === undefined) return measured_from;
@@ -125,13 +125,13 @@ function worldFromLensOf({ camera, world_from_camera, measured_from = world_from
   return [0, 1, 2].flatMap((row) => [x[row]!, y[row]!, z[row]!, place[row]!]).concat([0, 0, 0, 1]);
 }
 
-/** How far ahead of a camera a point of the world is. */
+/** z of a world point in a camera. */
 const aheadIn = (worldFromCamera: readonly number[], point: Vector3): number =>
   toCamera(worldFromCamera, sum(point, scaled(positionOf(worldFromCamera), -1)))[2];
 
 const fromPixel = (lens: Lens, { x, y }: Pixel, ahead: number): Vector3 => [((x - lens.cx) / lens.fx) * ahead, ((y - lens.cy) / lens.fy) * ahead, ahead];
 
-/** Where the ray through a pixel meets the level plane of a height; null where it does not, or beyond 20 m. */
+/** Intersection of a pixel's ray with the horizontal plane of a height; null if there is none within 20 m. */
 export function levelAt({ camera, world_from_camera, up }: Omit<Seen, "depth">, pixel: Pixel, height_m: number): Vector3 | null {
   const [right, down] = slopes(camera, pixel);
   const ray = toWorld(world_from_camera, [right, down, 1]);
@@ -140,7 +140,7 @@ export function levelAt({ camera, world_from_camera, up }: Omit<Seen, "depth">, 
   return Number.isFinite(ahead) && ahead > 0 && ahead <= 20 ? sum(from, scaled(ray, ahead)) : null;
 }
 
-/** How far a pixel's ray goes right and down for each metre ahead. */
+/** Direction of a pixel's ray: x and y for z = 1. */
 function slopes(camera: Lens, pixel: Pixel): [number, number] {
   return [(pixel.x - camera.cx) / camera.fx, (pixel.y - camera.cy) / camera.fy];
 }
@@ -159,7 +159,7 @@ function medianAround(depth: Uint16Array, { width, height }: Lens, column: numbe
 
 const LOWEST_SHARE = 0.02;
 
-/** Height of the lowest surface in sight, a few outliers aside; null without depth. */
+/** Height of the lowest visible surface, robust to a few outliers; null without depth. */
 export function floorOf(seen: Measured): number | null {
   const { camera, up, depth } = seen;
   const lens = camera.depth ?? camera;

@@ -5,11 +5,11 @@ import type { Asked } from "../session";
 import type { Vector3 } from "../sh";
 
 export interface Model {
-  /** In words. */
+  /** Name for the user. */
   name: string;
   format: "glb" | "obj" | "ply" | "stl";
   data: Uint8Array;
-  /** Of the box around it, metres. */
+  /** Bounding box, metres. */
   radius_m: number;
   height_m: number;
 }
@@ -61,7 +61,7 @@ export class Scene {
     this.onChange();
   }
 
-  /** Give an object another place, turn or size. */
+  /** Change position, yaw or scale of an object. */
   change(placed: Placed, to: Partial<Pick<Placed, "position" | "yaw_deg" | "scale">>): void {
     const slot = this.slots.get(placed.id);
     if (slot === undefined) return;
@@ -80,7 +80,7 @@ export class Scene {
     this.onChange();
   }
 
-  /** The server has answered a request; what it found wrong with an object of this scene, else null. */
+  /** Handle the answer to a request; returns the error about an object of this scene, else null. */
   acknowledge(request: number, error: string | null): string | null {
     const slot = [...this.slots.values()].find((each) => each.underWay === request);
     if (slot === undefined) return null;
@@ -89,13 +89,13 @@ export class Scene {
       this.advance(slot);
       return null;
     }
-    this.slots.delete(slot.placed.id); // there is nothing of it to be moved
+    this.slots.delete(slot.placed.id); // it was never placed
     if (this.selected === slot.placed) this.selected = null;
     this.onChange();
     return `${slot.placed.model.name}: ${error}`;
   }
 
-  /** The server has begun anew and knows nothing; answers to what it was asked before are not waited for. */
+  /** The server was restarted: place all objects again and ignore earlier requests. */
   placeAgain(): void {
     for (const slot of [...this.slots.values()]) {
       Object.assign(slot, { underWay: null, isThere: false, isStale: true });

@@ -10,6 +10,11 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from server.opencl.device import Device
+from server.service.serve import BackgroundServer
+from tests.servers import fake_server
+from tests.service.fakes import Lab
+
 HERE = Path(__file__).parent
 PICTURES = HERE.parents[2] / "out" / "web"
 PATIENCE_MS = 60_000
@@ -60,6 +65,60 @@ def open_page(browser: Browser) -> Iterator[OpenPage]:
     for context in contexts:
         context.close()
     assert not faults
+
+
+@pytest.fixture
+def lab() -> Lab:
+    """What the test shares with the fake pipelines."""
+    return Lab()
+
+
+@pytest.fixture
+def received() -> object:
+    """What the fake pipelines were given, where a test's server is of them."""
+    from tests.client.web.received import Received
+
+    return Received()
+
+
+@pytest.fixture
+def build_pipeline(lab: Lab) -> Callable[..., object]:
+    """What makes the pipelines of `server`: fakes, unless a file has another fixture of this name."""
+    return lab.build
+
+
+@pytest.fixture
+def server_options() -> dict[str, object]:
+    """What else `server` is started with."""
+    return {}
+
+
+@pytest.fixture
+def server(build_pipeline: Callable[..., object], server_options: dict[str, object]) -> Iterator[BackgroundServer]:
+    """A server with fake pipelines."""
+    with fake_server(build_pipeline, **server_options) as server:
+        yield server
+
+
+@pytest.fixture
+def watched(device: Device) -> Iterator[tuple[BackgroundServer, list]]:
+    """A server with real pipelines, and what they were asked."""
+    from tests.client.web.watched import watched_server
+
+    with watched_server(device) as watched:
+        yield watched
+
+
+@pytest.fixture
+def real_server(watched: tuple[BackgroundServer, list]) -> BackgroundServer:
+    """The server of `watched`."""
+    return watched[0]
+
+
+@pytest.fixture
+def asked(watched: tuple[BackgroundServer, list]) -> list:
+    """What the pipelines of `watched` were asked."""
+    return watched[1]
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -22,13 +22,12 @@ from server.pipeline import Pipeline
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from server.service.serve import BackgroundServer
-from server.service.service import Service
 from tests.client.web.conftest import PICTURES, OpenPage, wait_for_text
 from tests.client.web.page import start_capture
 from tests.client.web.received import Received
 from tests.client.web.sequence import FLIP, of_device
 from tests.service import fakes
-from tests.service.fakes import FAKE_DEVICE, FakeResult, fake_mesh
+from tests.service.fakes import FakeResult
 from tests.service.wire import Wire
 
 CAMERA = CameraModel(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
@@ -49,18 +48,12 @@ class _Lit(fakes.FakePipeline):
 
 
 @pytest.fixture
-def received() -> Received:
-    return Received()
-
-
-@pytest.fixture
-def server(received: Received) -> Iterator[BackgroundServer]:
+def build_pipeline(received: Received) -> Callable[..., object]:
     def build(_device: object, _camera: CameraModel, wishes: Wishes, *_room: object) -> _Lit:
         received.wishes.append(wishes)
         return _Lit(received.lab)
 
-    with BackgroundServer(Service(FAKE_DEVICE, pipeline_factory=build, mesh_loader=fake_mesh)) as server:
-        yield server
+    return build
 
 
 def plane() -> RgbdFrame:

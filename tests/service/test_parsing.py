@@ -34,8 +34,8 @@ from server.scene.mesh import Mesh, load_mesh
 from tests.data import ROOT
 from tests.gltf_files import assert_well_formed
 from tests.service.fakes import CAMERA, PATIENCE_S, fake_mesh, frame_message, rgbd_frame
+from tests.service.http import rows
 from tests.service.jobs import triangle
-from tests.service.test_http import rows
 from tests.service.wire import Wire
 from tests.textured import write_glb
 

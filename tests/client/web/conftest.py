@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
@@ -14,6 +16,9 @@ from server.opencl.device import Device
 from server.service.serve import BackgroundServer
 from tests.servers import fake_server
 from tests.service.fakes import Lab
+
+if TYPE_CHECKING:
+    from tests.client.web.received import Received
 
 HERE = Path(__file__).parent
 PICTURES = HERE.parents[2] / "out" / "web"
@@ -74,7 +79,7 @@ def lab() -> Lab:
 
 
 @pytest.fixture
-def received() -> object:
+def received() -> Received:
     """What the fake pipelines were given, where a test's server is of them."""
     from tests.client.web.received import Received
 
@@ -98,6 +103,23 @@ def server(build_pipeline: Callable[..., object], server_options: dict[str, obje
     """A server with fake pipelines."""
     with fake_server(build_pipeline, **server_options) as server:
         yield server
+
+
+@pytest.fixture
+def serve(received: Received) -> Iterator[Callable[[float], BackgroundServer]]:
+    """Start a server whose pipelines take so many seconds to draw the ball of a frame."""
+    from tests.client.web.layer_drawing import Drawing
+
+    with ExitStack() as running:
+
+        def start(takes_s: float) -> BackgroundServer:
+            def build(_device: object, _camera: object, wishes: object, *_room: object) -> Drawing:
+                received.wishes.append(wishes)
+                return Drawing(received, takes_s)
+
+            return running.enter_context(fake_server(build))
+
+        yield start
 
 
 @pytest.fixture

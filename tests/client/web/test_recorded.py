@@ -22,7 +22,7 @@ from server.service.serve import BackgroundServer
 from tests.client.web.conftest import PATIENCE_MS, OpenPage, wait_for_text
 from tests.client.web.page import newer_pictures, on_screen, picture, start_recording
 from tests.client.web.received import Received
-from tests.client.web.test_objects import may_be_seen
+from tests.client.web.visible_silhouette import may_be_seen
 from tests.client.web.watched import SIZE, TOUCHED, point_under, wait_for
 from tests.service.proxy import impaired
 

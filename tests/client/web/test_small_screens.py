@@ -11,7 +11,7 @@ from server.service.serve import BackgroundServer
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.page import start_capture
 from tests.client.web.sequence import of_device
-from tests.client.web.test_light_mode import CAMERA, plane
+from tests.client.web.wall import CAMERA, plane
 
 PLACES = """() => Object.fromEntries([".side", "#stop", "#full", "#selected-tools"].map(
     (name) => [name, document.querySelector(name).getBoundingClientRect().toJSON()]))"""

@@ -15,7 +15,7 @@ from server.service.serve import BackgroundServer
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.page import start_capture, wait_until
 from tests.client.web.sequence import of_device
-from tests.client.web.test_light_mode import CAMERA, plane
+from tests.client.web.wall import CAMERA, plane
 from tests.service.fakes import FakePipeline, FakeResult, Lab
 
 UP = cv2.Rodrigues(np.array([0.0, 0.0, 0.5]))[0] @ np.array([0.0, 1.0, 0.0])

@@ -33,6 +33,8 @@ demo: .venv/installed
 WORKERS ?= 2
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest
 PARALLEL := -n $(WORKERS) --dist worksteal
+# Where tests marked alone may be: tests/conftest.py refuses them elsewhere.
+ALONE := tests/client/web tests/cluster tests/service
 test test-slow test-second-device slow-list: export PROBELESS_DATA := $(or $(PROBELESS_DATA),$(DATA))
 test test-slow slow-list: export PROBELESS_TEST_DEVICE := $(or $(PROBELESS_TEST_DEVICE),portable computing language)
 
@@ -41,7 +43,7 @@ ifdef TESTS
 	$(PYTEST) $(TESTS)
 else
 	$(PYTEST) $(PARALLEL) -m "not slow and not alone"
-	$(PYTEST) -m "not slow and alone"
+	$(PYTEST) -m "not slow and alone" $(ALONE)
 endif
 
 test-all:
@@ -52,19 +54,19 @@ test-rest: test-slow test-second-device
 
 test-slow: .venv/installed-all
 	$(PYTEST) $(PARALLEL) -m "slow and not alone"
-	$(PYTEST) -m "slow and alone"
+	$(PYTEST) -m "slow and alone" $(ALONE)
 
 # The loader of OpenCL finds PoCL in any case, and Intel's runtime by this folder.
 test-second-device: export OCL_ICD_VENDORS := $(CURDIR)/.venv/opencl
 test-second-device: export PROBELESS_TEST_DEVICE := intel
 test-second-device: .venv/installed-all
 	$(PYTEST) $(PARALLEL) -m "device and not alone"
-	$(PYTEST) -m "device and alone"
+	$(PYTEST) -m "device and alone" $(ALONE)
 
 slow-list: .venv/installed-all
 	mkdir -p out
 	$(PYTEST) $(PARALLEL) --durations=0 -vv -m "not alone" > out/durations.log
-	$(PYTEST) --durations=0 -vv -m alone >> out/durations.log
+	$(PYTEST) --durations=0 -vv -m alone $(ALONE) >> out/durations.log
 	$(BIN)/python -m tests.slow out/durations.log
 
 lint: .venv/installed-test

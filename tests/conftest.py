@@ -11,6 +11,8 @@ from server.opencl.engine import Engine
 from tests.absent import fail_unexpected_skip
 from tests.slow import function_of, read_list, stale_lines, without_device
 
+ALONE_FOLDERS = ("tests/client/web/", "tests/cluster/", "tests/service/")
+"""Where `make` looks for tests that are marked alone."""
 COLLECTED = pytest.StashKey[list[str]]()
 """Names of all tests that were found, before any is deselected; without their device."""
 
@@ -45,6 +47,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         fixtures = getattr(item, "fixturenames", ())
         if "browser" in fixtures:
             item.add_marker("alone")
+        if item.get_closest_marker("alone") and not item.nodeid.startswith(ALONE_FOLDERS):
+            raise pytest.UsageError(f"{item.nodeid} is marked alone; such tests belong in {', '.join(ALONE_FOLDERS)}")
         if "device" in fixtures:
             item.add_marker("device")
 

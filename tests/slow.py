@@ -17,7 +17,7 @@ from server.opencl.device import list_devices
 LIST = Path(__file__).with_name("slow.txt")
 QUICK_FUNCTION_S = 0.6
 """The cheapest calls of a function are quick while they take no longer than this together."""
-QUICK_FILE_S = 3.0
+QUICK_FILE_S = 6.0
 """Where all calls in a file are slow by that rule, the cheapest is quick if it takes no longer than this."""
 _HEAD = """\
 # Tests that `make test` leaves out, with the seconds that each took: written by `make slow-list`.

@@ -7,13 +7,13 @@ import math
 from pathlib import Path
 
 import cv2
-import msgspec
 import numpy as np
 import pytest
 
 from client.laptop.errors import OutputError
 from client.laptop.output import FrameOutput, OutputWriter
 from protocol.messages import LeftOut, Light, Plan, Timings
+from tests.client.lights import light_of
 
 LIGHT_FIELDS = [
     *"frame timestamp_s sh sh_std sh_webxr dominant_direction dominant_intensity dominant_lights".split(),  # noqa: SIM905
@@ -22,21 +22,6 @@ LIGHT_FIELDS = [
 ROWS = (
     "input reconstruct surface dynamic_geometry radiance_transfer light_estimation rendering total".split()  # noqa: SIM905
 )
-
-
-def light_of(frame: int, **changes: object) -> Light:
-    light = Light(
-        frame=frame,
-        timestamp_s=frame / 30,
-        sh=tuple((0.1 * i, 1 / 3, 0.0) for i in range(16)),
-        sh_std=tuple((0.01, None, 0.5) for _ in range(16)),
-        sh_webxr=tuple(float(i) for i in range(27)),
-        dominant_direction=(0.6, 0.8, 0.0),
-        dominant_intensity=1.25,
-        condition=None,
-        valid=False,
-    )
-    return msgspec.structs.replace(light, **changes)
 
 
 def output_of(frame: int, notes: tuple[str, ...] = (), light: Light | None = None) -> FrameOutput:

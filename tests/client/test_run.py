@@ -11,7 +11,7 @@ from client.laptop.errors import RunError
 from client.laptop.run import object_id, process_frames
 from protocol.frames import RgbdFrame
 from protocol.messages import Plan, Timings
-from tests.client.test_output import light_of
+from tests.client.lights import light_of
 
 
 def frame_of(index: int) -> RgbdFrame:

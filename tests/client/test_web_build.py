@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from pathlib import Path
 from typing import get_args
@@ -10,40 +9,22 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from client.web.build import FOLDER, build, install, npm
+from client.web.build import FOLDER, build, npm
 from protocol.codec import decode_client
 from protocol.frames import CameraModel
 from protocol.images import decode_depth, encode_depth
 from protocol.limits import SUBPROTOCOL
 from protocol.messages import DepthCodec
 from tests.client.link_series import write_link_series
+from tests.node import copy_sources, run_npm
 from tests.protocol.golden import FOLDER as GOLDEN
 from tests.protocol.golden import depth_ramp
-
-UNREACHABLE = ("ENOTFOUND", "EAI_AGAIN", "ECONNREFUSED", "ETIMEDOUT", "ENETUNREACH", "ECONNRESET")
-
-
-def _run(*arguments: str, folder: Path) -> None:
-    """npm, its output shown where it fails."""
-    try:
-        npm(*arguments, folder=folder)
-    except subprocess.CalledProcessError as error:
-        pytest.fail(f"npm {' '.join(arguments)}:\n{error.stdout}{error.stderr}")
 
 
 @pytest.fixture(scope="module")
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the page's sources with exactly the pinned packages beside them."""
-    folder = tmp_path_factory.mktemp("web") / "sources"
-    shutil.copytree(FOLDER, folder, ignore=shutil.ignore_patterns("node_modules", "dist", ".test", "__pycache__"))
-    try:
-        install(folder)
-    except subprocess.CalledProcessError as error:
-        output = f"{error.stdout}{error.stderr}"
-        if any(code in output for code in UNREACHABLE):
-            pytest.skip("the npm registry cannot be reached and its packages are not in npm's cache")
-        pytest.fail(f"npm ci:\n{output}")
-    return folder
+    return copy_sources(tmp_path_factory.mktemp("web") / "sources")
 
 
 def test_the_committed_page_is_what_its_sources_build(sources: Path, tmp_path: Path) -> None:
@@ -56,7 +37,7 @@ def test_the_committed_page_is_what_its_sources_build(sources: Path, tmp_path: P
 
 
 def test_types_check(sources: Path) -> None:
-    _run("run", "check", folder=sources)
+    run_npm("run", "check", folder=sources)
 
 
 def test_the_type_check_can_fail(sources: Path) -> None:
@@ -92,7 +73,7 @@ def test_typescript_tests_pass_and_python_reads_what_a_browser_writes(
     monkeypatch.setenv("PROBELESS_PYTHON_DEPTHS", str(depths))
     assert write_link_series(tmp_path / "links.json") > 10_000
     monkeypatch.setenv("PROBELESS_LINK_SERIES", str(tmp_path / "links.json"))
-    _run("test", folder=sources)
+    run_npm("test", folder=sources)
     frame = decode_client(written.read_bytes())
     height, width = depth_ramp().shape
     camera = CameraModel(width=width, height=height, fx=1, fy=1, cx=0, cy=0)

@@ -14,20 +14,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from client.web.build import FOLDER, install, npm, pack
+from client.web.build import pack
 from server.opencl.device import Device
 from server.service.authenticator import Authenticator
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.data import ROOT
+from tests.node import copy_sources, node, run_npm
 from tests.service.conftest import keys_are_left_here  # noqa: F401
 from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
 from tests.service.proxy import impaired
-from tests.service.test_examples import node
 
 TOKEN = "a-token"
 PATIENCE_S = 60
-UNREACHABLE = ("ENOTFOUND", "EAI_AGAIN", "ECONNREFUSED", "ETIMEDOUT", "ENETUNREACH", "ECONNRESET")
 
 STRICT = """
 import { type Answer, type Dropped, encodeDepth, type Light, StreamClient, streamUrl } from "probeless";
@@ -43,29 +42,10 @@ export async function first(url: string): Promise<Light | string> {
 """
 
 
-def _npm(*arguments: str, folder: Path) -> None:
-    try:
-        npm(*arguments, folder=folder)
-    except subprocess.CalledProcessError as error:
-        output = f"{error.stdout}{error.stderr}"
-        if any(code in output for code in UNREACHABLE):
-            pytest.skip("the npm registry cannot be reached and its packages are not in npm's cache")
-        pytest.fail(f"npm {' '.join(arguments)}:\n{output}")
-
-
 @pytest.fixture(scope="module")
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the sources with their packages."""
-    folder = tmp_path_factory.mktemp("web") / "sources"
-    ignored = shutil.ignore_patterns("node_modules", "dist", ".test", "lib", "__pycache__")
-    shutil.copytree(FOLDER, folder, ignore=ignored)
-    try:
-        install(folder)
-    except subprocess.CalledProcessError as error:
-        if any(code in f"{error.stdout}{error.stderr}" for code in UNREACHABLE):
-            pytest.skip("the npm registry cannot be reached and its packages are not in npm's cache")
-        raise
-    return folder
+    return copy_sources(tmp_path_factory.mktemp("web") / "sources")
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +54,7 @@ def program(sources: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("program")
     pack(folder, sources)
     (folder / "package.json").write_text('{"type": "module", "private": true}')
-    _npm("install", "--no-audit", "--no-fund", "--prefer-offline", str(next(folder.glob("*.tgz"))), folder=folder)
+    run_npm("install", "--no-audit", "--no-fund", "--prefer-offline", str(next(folder.glob("*.tgz"))), folder=folder)
     shutil.copy(ROOT / "docs" / "examples" / "stream.mjs", folder)
     return folder
 

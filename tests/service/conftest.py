@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from server.service.serve import BackgroundServer
-from server.service.service import Service
-from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
+from tests.servers import start_fake
+from tests.service.fakes import Lab
 from tests.service.wire import Wire
 
 StartServer = Callable[..., BackgroundServer]
@@ -33,11 +33,7 @@ def start_server(lab: Lab) -> Iterator[StartServer]:
     servers: list[BackgroundServer] = []
 
     def start(**options: object) -> BackgroundServer:
-        at_the_door = {
-            name: options.pop(name) for name in ("authenticator", "certificate", "library") if name in options
-        }
-        service = Service(FAKE_DEVICE, **{"pipeline_factory": lab.build, "mesh_loader": fake_mesh} | options)
-        servers.append(BackgroundServer(service, **at_the_door))
+        servers.append(start_fake(lab.build, **options))
         return servers[-1]
 
     yield start

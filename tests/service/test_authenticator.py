@@ -8,17 +8,16 @@ from pathlib import Path
 import httpx
 import pytest
 
-from client.client import Access, ClientError, StreamClient
+from client.client import Access
 from protocol.local_keys import LocalKey, find_key, key_left, key_path
 from protocol.messages import Error
 from server.service.app import create_app
 from server.service.authenticator import Authenticator, is_loopback, is_token, new_token
 from server.service.serve import BackgroundServer
 from server.service.service import Service
-from tests.service.fakes import CAMERA, FAKE_DEVICE, PATIENCE_S, fake_mesh
+from tests.service.admission import TOKEN, connected, not_connected
+from tests.service.fakes import FAKE_DEVICE, fake_mesh
 from tests.service.wire import Wire
-
-TOKEN = "a+b/c=d&e?f%20"  # what a URL must quote
 
 
 @pytest.fixture
@@ -33,28 +32,6 @@ def refused(url: str, path: str = "/v1/stream", **options: str) -> tuple[int, st
     code, reason, messages = wire.ending()
     assert messages == [Error(reason=reason, fatal=True)], "the close frame must hold the whole line"
     return code, reason
-
-
-def connected(url: str, access: Access | None = None) -> str:
-    """The device of a server that lets a client in."""
-
-    async def run() -> str:
-        client = await StreamClient.connect(url, access=access)
-        try:
-            return (await client.hello(CAMERA)).device
-        finally:
-            await client.close()
-
-    return asyncio.run(asyncio.wait_for(run(), PATIENCE_S))
-
-
-def not_connected(url: str, access: Access | None = None) -> str:
-    """The line of a client that is not let in; it must not give away what it knocked with."""
-    with pytest.raises(ClientError) as error:
-        connected(url, access)
-    assert "\n" not in str(error.value)
-    assert TOKEN not in str(error.value)
-    return str(error.value)
 
 
 def test_without_its_token_nobody_comes_in_and_is_told_what_to_do(locked) -> None:

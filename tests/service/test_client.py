@@ -3,7 +3,7 @@
 import asyncio
 import socket
 import threading
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
@@ -11,27 +11,11 @@ import numpy as np
 import pytest
 from websockets.sync.server import Server, serve
 
-from client.client import Answer, ClientError, StreamClient, stream_url
+from client.client import ClientError, StreamClient, stream_url
 from protocol.images import decode_color
-from protocol.messages import Bye, Composite, Dropped, Error, Frame, Hello, Light, Welcome, Wishes
-from tests.service.fakes import CAMERA, EXPLODE_MM, PATIENCE_S, REFUSE_MM, fake_light, frame_message, rgbd_frame
-
-
-def with_client(url: str, talk: Callable[[StreamClient], Awaitable], **options: object) -> object:
-    """Run a conversation over a new connection, with a limit on its time."""
-
-    async def run() -> object:
-        client = await StreamClient.connect(url, **options)
-        try:
-            return await talk(client)
-        finally:
-            await client.close()
-
-    return asyncio.run(asyncio.wait_for(run(), PATIENCE_S))
-
-
-async def next_answer(client: StreamClient) -> Answer | Dropped | Error:
-    return await anext(client.answers())
+from protocol.messages import Bye, Composite, Frame, Hello, Light, Welcome, Wishes
+from tests.service.conversation import next_answer, with_client
+from tests.service.fakes import CAMERA, EXPLODE_MM, REFUSE_MM, fake_light, frame_message, rgbd_frame
 
 
 @pytest.mark.parametrize(

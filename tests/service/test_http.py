@@ -7,7 +7,6 @@ from pathlib import Path
 
 import httpx
 import pytest
-from prometheus_client.parser import text_string_to_metric_families
 
 from protocol.messages import Composite, Error, Hello, Timings
 from server.service.app import create_app
@@ -15,17 +14,8 @@ from server.service.self_check import CheckFailed
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.service.fakes import CAMERA, FAKE_DEVICE, PATIENCE_S, REFUSE_MM, fake_mesh, frame_message
+from tests.service.http import get, rows
 from tests.service.wire import Wire
-
-
-def get(server, path: str) -> httpx.Response:
-    return httpx.get(server.url + path, trust_env=False, timeout=PATIENCE_S)
-
-
-def rows(server) -> dict[tuple[str, ...], float]:
-    """Every sample of /metrics, by name and label values, as another library reads it."""
-    families = text_string_to_metric_families(get(server, "/metrics").text)
-    return {(s.name, *s.labels.values()): s.value for family in families for s in family.samples}
 
 
 def test_health_counts_sessions(server, dial) -> None:

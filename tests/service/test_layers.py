@@ -26,9 +26,9 @@ from server.service.serve import BackgroundServer
 from server.service.service import Service
 from server.shading import layer as of_server
 from server.shading.layer import LayerPart
+from tests.service.conversation import next_answer, with_client
 from tests.service.fakes import CAMERA, POSE, REFUSE_MM, fake_layer, fake_light, frame_message, rgbd_frame
-from tests.service.test_client import next_answer, with_client
-from tests.service.test_stream import FakeSource
+from tests.service.streaming import FakeSource
 
 
 def quietly(*args: object, **options: object) -> StreamSummary:

@@ -16,9 +16,9 @@ from protocol.limits import MAX_MESH_PART_BYTES, SUBPROTOCOL
 from protocol.messages import Acknowledged, Composite, Hello, Light, MeshPart, RequestMesh, Welcome, Wishes
 from server.meshing.files import mesh_files
 from server.service import mesh_message
+from tests.service.conversation import with_client
 from tests.service.fakes import CAMERA, PATIENCE_S, frame_message, terrain
-from tests.service.test_client import with_client
-from tests.service.test_stream import FakeSource, files, quietly
+from tests.service.streaming import FakeSource, files, quietly
 
 
 async def fetched(client: StreamClient) -> dict[str, bytes]:

@@ -12,7 +12,7 @@ from protocol.codec import ProtocolError, decode_client, encode
 from protocol.limits import MAX_REASON_CHARS
 from tests.protocol.samples import CLIENT
 from tests.service.mutations import NESTED, Mutator, Nested, packed
-from tests.service.test_faults import HELLO, after_control, serves_frames
+from tests.service.wrong_messages import HELLO, after_control, serves_frames
 
 MESSAGES, OVER_SOCKET = 2000, 60
 SEEDS = [encode(message) for message in CLIENT.values()]

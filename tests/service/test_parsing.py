@@ -35,8 +35,8 @@ from tests.data import ROOT
 from tests.scenes.gltf_files import assert_well_formed
 from tests.scenes.textured import write_glb
 from tests.service.fakes import CAMERA, PATIENCE_S, fake_mesh, frame_message, rgbd_frame
+from tests.service.http import rows
 from tests.service.jobs import triangle
-from tests.service.test_http import rows
 from tests.service.wire import Wire
 
 STUBBORN_MESHES = replace(MESH_JOB, job="tests.service.jobs:read_mesh")

@@ -36,7 +36,7 @@ from server.service.worker import Worker, WorkerContext
 from tests.scenes.rooms import CAMERA, frame_at, view_at, wishes
 from tests.service import fakes
 from tests.service.fakes import PATIENCE_S, FakePipeline, Lab, fake_mesh, frame_message
-from tests.service.test_rooms_service import answered, message_of
+from tests.service.room_clients import answered, message_of
 from tests.service.wire import Wire
 
 CUBE = trimesh.creation.box((0.2, 0.2, 0.2)).export(file_type="ply")

@@ -14,15 +14,15 @@ from typer.testing import CliRunner
 from client.cli import app
 from client.laptop.errors import OptionError
 from client.room_options import room_place
-from protocol.frames import IDENTITY, RgbdFrame
-from protocol.images import encode_color, encode_depth
-from protocol.messages import Acknowledged, Composite, Error, Frame, Hello, Light, Marker, PlaceObject, Watch, Welcome
+from protocol.frames import IDENTITY
+from protocol.messages import Acknowledged, Composite, Error, Hello, Light, Marker, PlaceObject, Watch, Welcome
 from server.opencl.device import Device
 from server.service.limits import Limits
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.scenes.rooms import CAMERA, frame_at, view_at, wishes
 from tests.service import fakes
+from tests.service.room_clients import answered, message_of
 from tests.service.wire import Wire
 
 PATIENT = Limits(max_period_s=3600.0)
@@ -41,24 +41,6 @@ def enter(url: str, **said: object) -> tuple[Wire, Welcome]:
     welcome = wire.hear()
     assert isinstance(welcome, Welcome), welcome
     return wire, welcome
-
-
-def message_of(frame: RgbdFrame) -> Frame:
-    assert frame.world_from_camera is not None
-    return Frame(
-        frame=frame.index,
-        timestamp_s=frame.timestamp_s,
-        world_from_camera=tuple(frame.world_from_camera.ravel().tolist()),
-        color=encode_color(frame.color, "png"),
-        depth=encode_depth(frame.depth),
-    )
-
-
-def answered(wire: Wire, step: int) -> Composite:
-    wire.say(message_of(frame_at(view_at(step), step, given=view_at(step))))
-    composite = wire.hear_until(Composite)[-1]
-    assert isinstance(composite, Composite)
-    return composite
 
 
 def test_clients_of_a_room_share_it_and_others_do_not(real_server: BackgroundServer) -> None:

@@ -14,17 +14,8 @@ from server.service.service import Service
 from tests.absent import NO_HARDWARE
 from tests.data import ROOT
 from tests.service.fakes import FAKE_DEVICE, PATIENCE_S, fake_mesh
+from tests.service.serve_fake import SERVE_FAKE
 from tests.service.wire import Wire
-
-SERVE_FAKE = """
-import sys
-from server.service.serve import listen, serve_on
-from server.service.service import Service
-from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
-
-service = Service(FAKE_DEVICE, pipeline_factory=Lab().build, mesh_loader=fake_mesh)
-sys.exit(serve_on(listen("127.0.0.1", 0), service, lambda line: print(line, flush=True)))
-"""
 
 
 def test_port_in_use_is_one_line_and_status_1(capsys) -> None:

@@ -15,38 +15,12 @@ from client.laptop.errors import ObjectError, OutputError, SourceError
 from client.laptop.objects import ObjectFile
 from client.laptop.output import FrameOutput, OutputWriter
 from client.laptop.stream import stream
-from protocol.frames import RgbdFrame
 from protocol.messages import Bye, Composite, Frame, Hello, Light, PlaceObject, Welcome
 from protocol.recording import read_messages
-from tests.service.fakes import CAMERA, EXPLODE_MM, REFUSE_MM, fake_result, rgbd_frame
+from tests.service.fakes import EXPLODE_MM, REFUSE_MM, fake_result, rgbd_frame
+from tests.service.streaming import FakeSource, files, quietly
 
 TRIANGLE_OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
-
-
-class FakeSource:
-    """A source of noise; `depths_mm` gives some frames a first depth that the fake pipeline acts upon."""
-
-    name, camera, has_poses, up = "fake", CAMERA, True, None
-
-    def __init__(self, count: int, fps: float = 1000.0, depths_mm: dict[int, int] | None = None) -> None:
-        self.count, self.fps, self.depths_mm = count, fps, depths_mm or {}
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, index: int) -> RgbdFrame:
-        if self.depths_mm.get(index) == 0:
-            raise SourceError(f"frame {index}: the picture is truncated")
-        return rgbd_frame(index, self.depths_mm.get(index, 1000))
-
-
-def quietly(*args: object, **options: object) -> streaming.StreamSummary:
-    return stream(*args, console=Console(file=io.StringIO()), **options)
-
-
-def files(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder by its relative name."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def run_in_process(source: FakeSource, frames: range, folder: Path) -> None:

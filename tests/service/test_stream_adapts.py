@@ -8,7 +8,7 @@ from client.laptop.stream import Sending
 from protocol.messages import Frame
 from protocol.recording import read_messages
 from tests.service.proxy import impaired
-from tests.service.test_stream import FakeSource, quietly
+from tests.service.streaming import FakeSource, quietly
 
 BYTES_PER_S = 60_000
 """A frame at full quality takes about 5 kB: twelve a second, of sixty."""

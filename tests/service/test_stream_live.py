@@ -9,7 +9,7 @@ import pytest
 from client.laptop.recorded import open_recording
 from client.laptop.source import ENDLESS
 from protocol.frames import RgbdFrame
-from tests.service.test_stream import FakeSource, quietly
+from tests.service.streaming import FakeSource, quietly
 
 
 class Camera(FakeSource):

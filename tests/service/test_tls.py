@@ -20,7 +20,7 @@ from server.service import tls
 from server.service.authenticator import Authenticator
 from server.service.serve import BackgroundServer
 from server.service.tls import Certificate, CertificateError, given_certificate, own_certificate
-from tests.service.test_authenticator import TOKEN, connected, not_connected
+from tests.service.admission import TOKEN, connected, not_connected
 
 
 @pytest.fixture(scope="module")

@@ -28,9 +28,9 @@ from protocol.messages import Composite, Dropped, Frame, Hello, Welcome
 from protocol.recording import read_messages, write_message
 from server.parsing.parsers import VIDEO_JOB, Parsers
 from tests.service.fakes import CAMERA, PATIENCE_S, REFUSE_MM, Lab, rgbd_frame
+from tests.service.http import rows
 from tests.service.proxy import impaired
-from tests.service.test_http import rows
-from tests.service.test_stream import FakeSource, quietly
+from tests.service.streaming import FakeSource, quietly
 from tests.service.wire import Wire
 
 VIDEO = Sending(adapts=False, video=True)

@@ -5,10 +5,20 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
+
+from server.opencl.device import Device
+from server.service.serve import BackgroundServer
+from tests.servers import fake_server
+from tests.service.fakes import Lab
+
+if TYPE_CHECKING:
+    from tests.client.web.received import Received
 
 HERE = Path(__file__).parent
 PICTURES = HERE.parents[2] / "out" / "web"
@@ -60,6 +70,77 @@ def open_page(browser: Browser) -> Iterator[OpenPage]:
     for context in contexts:
         context.close()
     assert not faults
+
+
+@pytest.fixture
+def lab() -> Lab:
+    """What the test shares with the fake pipelines."""
+    return Lab()
+
+
+@pytest.fixture
+def received() -> Received:
+    """What the fake pipelines were given, where a test's server is of them."""
+    from tests.client.web.received import Received
+
+    return Received()
+
+
+@pytest.fixture
+def build_pipeline(lab: Lab) -> Callable[..., object]:
+    """What makes the pipelines of `server`: fakes, unless a file has another fixture of this name."""
+    return lab.build
+
+
+@pytest.fixture
+def server_options() -> dict[str, object]:
+    """What else `server` is started with."""
+    return {}
+
+
+@pytest.fixture
+def server(build_pipeline: Callable[..., object], server_options: dict[str, object]) -> Iterator[BackgroundServer]:
+    """A server with fake pipelines."""
+    with fake_server(build_pipeline, **server_options) as server:
+        yield server
+
+
+@pytest.fixture
+def serve(received: Received) -> Iterator[Callable[[float], BackgroundServer]]:
+    """Start a server whose pipelines take so many seconds to draw the ball of a frame."""
+    from tests.client.web.layer_drawing import Drawing
+
+    with ExitStack() as running:
+
+        def start(takes_s: float) -> BackgroundServer:
+            def build(_device: object, _camera: object, wishes: object, *_room: object) -> Drawing:
+                received.wishes.append(wishes)
+                return Drawing(received, takes_s)
+
+            return running.enter_context(fake_server(build))
+
+        yield start
+
+
+@pytest.fixture
+def watched(device: Device) -> Iterator[tuple[BackgroundServer, list]]:
+    """A server with real pipelines, and what they were asked."""
+    from tests.client.web.watched import watched_server
+
+    with watched_server(device) as watched:
+        yield watched
+
+
+@pytest.fixture
+def real_server(watched: tuple[BackgroundServer, list]) -> BackgroundServer:
+    """The server of `watched`."""
+    return watched[0]
+
+
+@pytest.fixture
+def asked(watched: tuple[BackgroundServer, list]) -> list:
+    """What the pipelines of `watched` were asked."""
+    return watched[1]
 
 
 @pytest.fixture

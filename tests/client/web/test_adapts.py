@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,11 +21,10 @@ from protocol.h264 import is_key_picture
 from protocol.messages import ColorImage, Hello, Wishes
 from protocol.recording import write_message
 from server.service.serve import BackgroundServer
-from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.page import start_capture, start_recording
 from tests.client.web.sequence import of_device
-from tests.service.fakes import FAKE_DEVICE, FakePipeline, FakeResult, Lab, fake_mesh
+from tests.service.fakes import FakePipeline, FakeResult, Lab
 from tests.service.proxy import impaired
 
 CAMERA = CameraModel(width=480, height=360, fx=400.0, fy=400.0, cx=239.5, cy=179.5, depth_scale_m=0.001)
@@ -74,10 +73,8 @@ class _Brief(FakePipeline):
 
 
 @pytest.fixture
-def server() -> Iterator[BackgroundServer]:
-    service = Service(FAKE_DEVICE, pipeline_factory=lambda *_: _Brief(Lab()), mesh_loader=fake_mesh)
-    with BackgroundServer(service) as server:
-        yield server
+def build_pipeline() -> Callable[..., object]:
+    return lambda *_: _Brief(Lab())
 
 
 def textured(count: int = 3) -> list[RgbdFrame]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from types import SimpleNamespace
 
@@ -13,12 +13,10 @@ import pytest
 from playwright.sync_api import Page
 
 from server.service.serve import BackgroundServer
-from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.page import start_capture
 from tests.client.web.received import CAMERA, DEPTH_SIZE, FRAMES, Received, frames_seen
 from tests.client.web.sequence import ACROSS, STRAIGHT, of_device
-from tests.service.fakes import FAKE_DEVICE, fake_mesh
 from tests.service.proxy import impaired
 
 ROOM = "kitchen"
@@ -26,21 +24,15 @@ LEAST_PSNR_DB = 32.0
 
 
 @pytest.fixture
-def received() -> Received:
-    return Received()
+def build_pipeline(received: Received) -> Callable[..., object]:
+    return received.build
 
 
 @pytest.fixture
-def server(received: Received) -> Iterator[BackgroundServer]:
+def server_options() -> dict[str, object]:
+    """Rooms that do nothing."""
     room = SimpleNamespace(close=lambda: None, key_digest=None)
-    service = Service(
-        FAKE_DEVICE,
-        pipeline_factory=received.build,
-        mesh_loader=fake_mesh,
-        room_factory=lambda _wishes, _name: room,
-    )
-    with BackgroundServer(service) as server:
-        yield server
+    return {"room_factory": lambda _wishes, _name: room}
 
 
 def degrees_between(a: np.ndarray, b: np.ndarray) -> float:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -13,73 +11,30 @@ import pytest
 from numpy.typing import NDArray
 from playwright.sync_api import Page
 
-from protocol.frames import CameraModel, RgbdFrame
-from protocol.messages import Wishes
+from protocol.frames import RgbdFrame
 from server.service.serve import BackgroundServer
-from server.service.service import Service
 from tests.client.web.ball_scene import CAMERA, linear, look
-from tests.client.web.conftest import PICTURES, OpenPage, wait_for_text
+from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.displayed import display
+from tests.client.web.layer_drawing import (
+    SLOW_S,
+    STEP_DEG,
+    WALL_CODE,
+    colorful,
+    composite,
+    frame_at,
+    is_ball,
+    keep,
+    turning,
+)
 from tests.client.web.layer_figures import errors_of
 from tests.client.web.page import start_capture
 from tests.client.web.received import Received
 from tests.client.web.red_ball import DEGREES_PER_S, turned
 from tests.client.web.sequence import of_device
-from tests.service import fakes
-from tests.service.fakes import FAKE_DEVICE, FakeResult, fake_mesh
 
-SLOW_S = 0.3
-STEP_DEG, REACH_DEG = 0.5, 10.0
-WALL_CODE = 150
 NUMBER_PX = 10
 """Side of the corner that holds a picture's number, with what it is mixed with where the picture is enlarged."""
-
-
-class Drawing(fakes.FakePipeline):
-    """A pipeline that takes its time to draw the ball, exactly."""
-
-    def __init__(self, received: Received, takes_s: float) -> None:
-        super().__init__(received.lab)
-        self._received, self._takes_s = received, takes_s
-
-    def process(self, frame: RgbdFrame, **_: Any) -> FakeResult:
-        self._received.frames.append(frame)
-        time.sleep(self._takes_s)
-        return dataclasses.replace(super().process(frame), layer=look(frame.world_from_camera).layer())
-
-
-@pytest.fixture
-def received() -> Received:
-    return Received()
-
-
-@pytest.fixture
-def serve(received: Received) -> Iterator[Callable[[float], BackgroundServer]]:
-    """A server whose pipeline takes so many seconds for a frame."""
-    running = []
-
-    def start(takes_s: float) -> BackgroundServer:
-        def build(_device: object, _camera: CameraModel, wishes: Wishes, *_room: object) -> Drawing:
-            received.wishes.append(wishes)
-            return Drawing(received, takes_s)
-
-        service = Service(FAKE_DEVICE, pipeline_factory=build, mesh_loader=fake_mesh)
-        running.append(BackgroundServer(service))
-        return running[-1].__enter__()
-
-    yield start
-    for each in running:
-        each.__exit__(None, None, None)
-
-
-def frame_at(pose: NDArray[np.float64], index: int, color: NDArray[np.uint8] | None = None) -> RgbdFrame:
-    wall = np.full((CAMERA.height, CAMERA.width, 3), WALL_CODE, np.uint8) if color is None else color
-    return RgbdFrame(index, index / 30, wall, look(pose).wall_depth, pose)
-
-
-def turning() -> list[RgbdFrame]:
-    angles = np.arange(-REACH_DEG, REACH_DEG + STEP_DEG / 2, STEP_DEG)
-    return [frame_at(turned(angle), index) for index, angle in enumerate(angles)]
 
 
 def open_layers(open_page: OpenPage, server: BackgroundServer, frames: list[RgbdFrame], **device: object) -> Page:
@@ -91,17 +46,6 @@ def open_layers(open_page: OpenPage, server: BackgroundServer, frames: list[Rgbd
     wait_for_text(page, "#picture-caption", "Frame")
     wait_for_text(page, "#state", "Live, captured here")
     return page
-
-
-def keep(name: str, rgb: NDArray[Any]) -> None:
-    PICTURES.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(PICTURES / f"{name}.png"), cv2.cvtColor(rgb.astype(np.uint8), cv2.COLOR_RGB2BGR))
-
-
-def colorful() -> NDArray[np.uint8]:
-    """[h, w, 3] every channel from dark to bright."""
-    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
-    return np.stack([20 + 1.4 * u, 10 + 2 * v, 250 - u - 0.7 * v], axis=-1).astype(np.uint8)
 
 
 def test_over_its_own_picture_a_layer_is_the_linear_composition_and_others_find_webgl_as_they_left_it(
@@ -137,11 +81,6 @@ def test_the_cameras_picture_is_of_now_however_slow_the_server_is(
     assert float(page.locator("#age-layer").text_content() or "") > 1e3 * SLOW_S
 
 
-def is_ball(rgb: NDArray[Any]) -> NDArray[np.bool_]:
-    """Redder than the wall."""
-    return linear(rgb[..., 0]) - linear(rgb[..., 1]) > 0.06
-
-
 def is_shadow(rgb: NDArray[Any]) -> NDArray[np.bool_]:
     """Darker than the wall, and not the ball."""
     dark = linear(rgb[..., 1]) < 0.6 * linear(np.uint8(WALL_CODE))
@@ -165,10 +104,3 @@ def test_virtual_things_and_shadows_are_where_the_newest_camera_sees_them(
         assert (errors.shares < 0.25).all()
         assert errors.moved_px.mean(axis=0).max() < 0.5
     keep(f"layer_mode_moved_{scale}", shown[int(np.argmax(errors.still_px[:, 0]))].rgb)
-
-
-def composite(frame: RgbdFrame) -> NDArray[np.uint8]:
-    """[h, w, 3] sRGB: what its camera would see."""
-    wall = np.full((CAMERA.height, CAMERA.width, 3), WALL_CODE, np.uint8)
-    picture: NDArray[np.uint8] = look(frame.world_from_camera).over(wall).round().astype(np.uint8)
-    return picture

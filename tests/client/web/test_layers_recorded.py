@@ -22,22 +22,19 @@ from server.service.serve import BackgroundServer
 from tests.client.web.ball_scene import CAMERA, look
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.displayed import Displayed
-from tests.client.web.layer_figures import errors_of
-from tests.client.web.received import Received
-from tests.client.web.red_ball import turned
-from tests.client.web.test_layer_mode import (
+from tests.client.web.layer_drawing import (
     SLOW_S,
     colorful,
     composite,
     frame_at,
     is_ball,
     keep,
-    received,
-    serve,
     turning,
 )
+from tests.client.web.layer_figures import errors_of
+from tests.client.web.received import Received
+from tests.client.web.red_ball import turned
 
-__all__ = ["received", "serve"]  # fixtures
 DISTORTION = (0.12, -0.2, 0.004, -0.003, 0.05)
 _PICTURE = """() => ({
   url: document.getElementById("picture").toDataURL("image/png"),

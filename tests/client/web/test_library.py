@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,19 +12,13 @@ from server.scene.vase import vase_glb
 from server.service.authenticator import Authenticator
 from server.service.object_library import ObjectLibrary
 from server.service.serve import BackgroundServer
-from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.page import start_capture
 from tests.client.web.received import CAMERA, frames_seen
 from tests.client.web.sequence import of_device
-from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
+from tests.service.fakes import Lab
 
 SOFA = b"v 0 0 0\nv 2 0 0\nv 0 2 0\nf 1 2 3\n"
-
-
-@pytest.fixture
-def lab() -> Lab:
-    return Lab()
 
 
 @pytest.fixture
@@ -35,10 +29,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def server(lab: Lab, folder: Path) -> Iterator[BackgroundServer]:
-    service = Service(FAKE_DEVICE, pipeline_factory=lab.build, mesh_loader=fake_mesh)
-    with BackgroundServer(service, authenticator=Authenticator("a-token"), library=ObjectLibrary(folder)) as server:
-        yield server
+def server_options(folder: Path) -> dict[str, object]:
+    return {"door": Authenticator("a-token"), "library": ObjectLibrary(folder)}
 
 
 @pytest.fixture

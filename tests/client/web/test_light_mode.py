@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -22,18 +22,16 @@ from server.opencl.device import Device
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from server.service.serve import BackgroundServer
-from server.service.service import Service
 from tests.client.web.conftest import PICTURES, OpenPage, wait_for_text
 from tests.client.web.page import start_capture
 from tests.client.web.received import Received
-from tests.client.web.sequence import FLIP, of_device
+from tests.client.web.sequence import of_device
+from tests.client.web.wall import CAMERA, DEPTH_M, RADIUS_M, plane
 from tests.service import fakes
-from tests.service.fakes import FAKE_DEVICE, FakeResult, fake_mesh
+from tests.service.fakes import FakeResult
 from tests.service.wire import Wire
 
-CAMERA = CameraModel(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 TOUCHED = (79.5, 74.5)
-DEPTH_M, RADIUS_M = 0.6, 0.08
 SH = np.zeros((16, 3))
 SH[:9] = np.outer([2.0, 0.5, 0.4, -0.3, 0.15, -0.1, 0.12, 0.2, -0.15], [1.0, 0.9, 0.8])
 TOLERANCE = 0.02
@@ -49,24 +47,12 @@ class _Lit(fakes.FakePipeline):
 
 
 @pytest.fixture
-def received() -> Received:
-    return Received()
-
-
-@pytest.fixture
-def server(received: Received) -> Iterator[BackgroundServer]:
+def build_pipeline(received: Received) -> Callable[..., object]:
     def build(_device: object, _camera: CameraModel, wishes: Wishes, *_room: object) -> _Lit:
         received.wishes.append(wishes)
         return _Lit(received.lab)
 
-    with BackgroundServer(Service(FAKE_DEVICE, pipeline_factory=build, mesh_loader=fake_mesh)) as server:
-        yield server
-
-
-def plane() -> RgbdFrame:
-    """A wall across the view of a camera that stands in the origin, by WebXR's axes."""
-    depth = np.full((CAMERA.height, CAMERA.width), round(DEPTH_M * 1000), np.uint16)
-    return RgbdFrame(0, 0.0, np.full((*depth.shape, 3), 90, np.uint8), depth, FLIP)
+    return build
 
 
 def foot() -> NDArray[np.float64]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -12,32 +12,16 @@ from playwright.sync_api import Page
 
 from client.laptop.source import open_source
 from protocol.frames import CameraModel, RgbdFrame
-from server.opencl.device import Device
 from server.service.serve import BackgroundServer
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.page import newer_pictures, on_screen, picture, start_capture, wait_until
 from tests.client.web.sequence import of_device
-from tests.client.web.watched import SIZE, TOUCHED, point_under, wait_for, watched_server
+from tests.client.web.visible_silhouette import may_be_seen
+from tests.client.web.watched import SIZE, TOUCHED, point_under, wait_for
 
 SOURCE = "synthetic:table?light=7&size=160x120&frames=1"
 DRAGGED_TO = (52.0, 95.0)
 """Another one, at the front."""
-
-
-@pytest.fixture
-def watched(device: Device) -> Iterator[tuple[BackgroundServer, list]]:
-    with watched_server(device) as watched:
-        yield watched
-
-
-@pytest.fixture
-def server(watched: tuple[BackgroundServer, list]) -> BackgroundServer:
-    return watched[0]
-
-
-@pytest.fixture
-def asked(watched: tuple[BackgroundServer, list]) -> list:
-    return watched[1]
 
 
 def still() -> tuple[CameraModel, RgbdFrame]:
@@ -58,10 +42,10 @@ def matrix(camera: CameraModel) -> NDArray[np.float64]:
 
 
 def test_a_vase_is_placed_by_touch_throws_a_shadow_and_is_moved_turned_and_deleted(
-    server: BackgroundServer, asked: list, open_page: OpenPage, keep_picture: Callable[[Page, str], None]
+    real_server: BackgroundServer, asked: list, open_page: OpenPage, keep_picture: Callable[[Page, str], None]
 ) -> None:
     camera, frame = still()
-    page = open_page(server.url, of_device(camera, [frame], loops=True), size=SIZE)
+    page = open_page(real_server.url, of_device(camera, [frame], loops=True), size=SIZE)
     start_capture(page)
     wait_for_text(page, "#state", "Live, captured here")
     newer_pictures(page)
@@ -107,17 +91,3 @@ def test_a_vase_is_placed_by_touch_throws_a_shadow_and_is_moved_turned_and_delet
     wait_until(lambda: asked[-1][0] == "remove")
     newer_pictures(page)
     assert np.abs(picture(page) - before).mean() < 2
-
-
-def may_be_seen(camera: CameraModel, frame: RgbdFrame, foot: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """[height, width] where the vase can be, with a margin."""
-    camera_from_world = np.linalg.inv(frame.world_from_camera)
-
-    def pixel(height_m: float, aside_m: float) -> tuple[int, int]:
-        x, y, z = camera_from_world[:3, :3] @ (foot + np.array([0.0, height_m, 0.0])) + camera_from_world[:3, 3]
-        return round(camera.fx * (x + aside_m) / z + camera.cx), round(camera.fy * y / z + camera.cy)
-
-    mask = np.zeros((camera.height, camera.width), np.uint8)
-    corners = [pixel(height, aside) for height, aside in ((-0.08, -0.1), (-0.08, 0.1), (0.32, 0.1), (0.32, -0.1))]
-    cv2.fillConvexPoly(mask, np.array(corners), 1)
-    return mask == 1

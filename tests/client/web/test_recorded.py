@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
@@ -18,15 +18,12 @@ from client.laptop.stream import stream
 from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
 from protocol.recording import read_messages
-from server.opencl.device import Device
 from server.service.serve import BackgroundServer
-from server.service.service import Service
 from tests.client.web.conftest import PATIENCE_MS, OpenPage, wait_for_text
 from tests.client.web.page import newer_pictures, on_screen, picture, start_recording
 from tests.client.web.received import Received
-from tests.client.web.test_objects import may_be_seen
-from tests.client.web.watched import SIZE, TOUCHED, point_under, wait_for, watched_server
-from tests.service.fakes import FAKE_DEVICE, fake_mesh
+from tests.client.web.visible_silhouette import may_be_seen
+from tests.client.web.watched import SIZE, TOUCHED, point_under, wait_for
 from tests.service.proxy import impaired
 
 FRAMES = 8
@@ -35,26 +32,20 @@ COUNT = 8 * FRAMES
 
 
 @pytest.fixture
-def received() -> Received:
-    return Received()
+def build_pipeline(received: Received) -> Callable[..., object]:
+    """Pipelines that keep what they were given."""
+    return received.build
 
 
 @pytest.fixture
-def fake_server(received: Received) -> Iterator[BackgroundServer]:
-    """With pipelines that keep what they were given."""
-    with BackgroundServer(Service(FAKE_DEVICE, pipeline_factory=received.build, mesh_loader=fake_mesh)) as server:
-        yield server
-
-
-@pytest.fixture
-def recording(fake_server: BackgroundServer, received: Received, tmp_path: Path) -> Path:
+def recording(server: BackgroundServer, received: Received, tmp_path: Path) -> Path:
     """Of eight frames, by the Python client."""
     path = tmp_path / "table.rec"
     source = open_source(SOURCE)
     wishes = Wishes(poses="given", up=source.up, voxel_m=0.01)
     others = {"record": path, "realtime": False}
     with ThreadPoolExecutor() as aside:  # Playwright's own loop runs in this thread
-        aside.submit(stream, source, fake_server.url, (), wishes, **others).result()
+        aside.submit(stream, source, server.url, (), wishes, **others).result()
     assert len(open_recording(path)) == FRAMES
     for kept in (received.hellos, received.cameras, received.wishes, received.frames):
         kept.clear()
@@ -66,9 +57,9 @@ def same_pixels(a: RgbdFrame, b: RgbdFrame) -> bool:
 
 
 def test_frames_arrive_bit_for_bit_at_their_own_pace_again_and_again(
-    fake_server: BackgroundServer, received: Received, recording: Path, open_page: OpenPage
+    server: BackgroundServer, received: Received, recording: Path, open_page: OpenPage
 ) -> None:
-    page = open_page(fake_server.url)
+    page = open_page(server.url)
     start_recording(page, recording)
     received.wait(1)
     begun_s = time.monotonic()
@@ -97,9 +88,9 @@ def test_frames_arrive_bit_for_bit_at_their_own_pace_again_and_again(
 
 
 def test_at_its_end_the_last_picture_stands(
-    fake_server: BackgroundServer, received: Received, recording: Path, open_page: OpenPage
+    server: BackgroundServer, received: Received, recording: Path, open_page: OpenPage
 ) -> None:
-    page = open_page(fake_server.url)
+    page = open_page(server.url)
     start_recording(page, recording, "once")
     received.wait(FRAMES + 4)
     last = open_recording(recording)[FRAMES - 1]
@@ -113,9 +104,9 @@ def test_at_its_end_the_last_picture_stands(
 
 
 def test_a_file_that_is_none_and_one_that_was_cut_off_are_told(
-    fake_server: BackgroundServer, received: Received, recording: Path, open_page: OpenPage, tmp_path: Path
+    server: BackgroundServer, received: Received, recording: Path, open_page: OpenPage, tmp_path: Path
 ) -> None:
-    page = open_page(f"{fake_server.url}/?answer=light")
+    page = open_page(f"{server.url}/?answer=light")
     page.locator("input[name=source][value=recorded]").check()
     assert page.locator("[name=answer]").input_value() == "picture"  # light is for what WebXR shows
     page.locator("#start").click()
@@ -139,14 +130,14 @@ def test_a_file_that_is_none_and_one_that_was_cut_off_are_told(
 
 
 def test_a_large_file_is_never_in_memory_as_a_whole(
-    fake_server: BackgroundServer, received: Received, recording: Path, open_page: OpenPage, tmp_path: Path
+    server: BackgroundServer, received: Received, recording: Path, open_page: OpenPage, tmp_path: Path
 ) -> None:
     large = tmp_path / "large.rec"
     data = recording.read_bytes()
     with large.open("wb") as file:
         while file.tell() < 400 << 20:
             file.write(data)
-    page = open_page(fake_server.url)
+    page = open_page(server.url)
     reads = "() => { const all = []; const own = Blob.prototype.slice; window.reads = all;"
     reads += " Blob.prototype.slice = function (a, b) { all.push(b - a); return own.call(this, a, b); }; }"
     page.evaluate(reads)
@@ -157,24 +148,8 @@ def test_a_large_file_is_never_in_memory_as_a_whole(
     assert sum(sizes) < 64 << 20  # as far as it was played
 
 
-@pytest.fixture
-def watched(device: Device) -> Iterator[tuple[BackgroundServer, list]]:
-    with watched_server(device) as watched:
-        yield watched
-
-
-@pytest.fixture
-def server(watched: tuple[BackgroundServer, list]) -> BackgroundServer:
-    return watched[0]
-
-
-@pytest.fixture
-def asked(watched: tuple[BackgroundServer, list]) -> list:
-    return watched[1]
-
-
 def test_the_real_server_renders_into_it_objects_are_placed_by_touch_and_a_cut_is_mended(
-    server: BackgroundServer,
+    real_server: BackgroundServer,
     asked: list,
     recording: Path,
     open_page: OpenPage,
@@ -182,7 +157,7 @@ def test_the_real_server_renders_into_it_objects_are_placed_by_touch_and_a_cut_i
 ) -> None:
     source = open_recording(recording)
     last = source[FRAMES - 1]
-    with impaired(server.url) as proxy, closing(open_page(proxy.url, size=SIZE)) as page:
+    with impaired(real_server.url) as proxy, closing(open_page(proxy.url, size=SIZE)) as page:
         start_recording(page, recording, "once")
         wait_for_text(page, "#state", "Live, captured here")
         wait_for_text(page, "#notes", "its last picture stands")

@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 from playwright.sync_api import Page
 
 from server.service.serve import BackgroundServer
-from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.page import start_capture
 from tests.client.web.sequence import of_device
-from tests.client.web.test_light_mode import CAMERA, plane
-from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
+from tests.client.web.wall import CAMERA, plane
 
 PLACES = """() => Object.fromEntries([".side", "#stop", "#full", "#selected-tools"].map(
     (name) => [name, document.querySelector(name).getBoundingClientRect().toJSON()]))"""
-
-
-@pytest.fixture
-def server() -> Iterator[BackgroundServer]:
-    with BackgroundServer(Service(FAKE_DEVICE, pipeline_factory=Lab().build, mesh_loader=fake_mesh)) as server:
-        yield server
 
 
 @pytest.mark.parametrize("answer", ["light", "picture"])

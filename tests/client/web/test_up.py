@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -12,12 +12,11 @@ from msgspec import structs
 
 from protocol.frames import RgbdFrame
 from server.service.serve import BackgroundServer
-from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.page import start_capture, wait_until
 from tests.client.web.sequence import of_device
-from tests.client.web.test_light_mode import CAMERA, plane
-from tests.service.fakes import FAKE_DEVICE, FakePipeline, FakeResult, Lab, fake_mesh
+from tests.client.web.wall import CAMERA, plane
+from tests.service.fakes import FakePipeline, FakeResult, Lab
 
 UP = cv2.Rodrigues(np.array([0.0, 0.0, 0.5]))[0] @ np.array([0.0, 1.0, 0.0])
 """Leaning by 29 degrees to the left."""
@@ -30,15 +29,8 @@ class _Leaning(FakePipeline):
 
 
 @pytest.fixture
-def lab() -> Lab:
-    return Lab()
-
-
-@pytest.fixture
-def server(lab: Lab) -> Iterator[BackgroundServer]:
-    service = Service(FAKE_DEVICE, pipeline_factory=lambda *_: _Leaning(lab), mesh_loader=fake_mesh)
-    with BackgroundServer(service) as server:
-        yield server
+def build_pipeline(lab: Lab) -> Callable[..., object]:
+    return lambda *_: _Leaning(lab)
 
 
 def test_what_is_level_is_so_in_the_room(server: BackgroundServer, lab: Lab, open_page: OpenPage, keep_picture) -> None:

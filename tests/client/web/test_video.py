@@ -17,12 +17,14 @@ from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.page import start_capture
 from tests.client.web.received import CAMERA, Received, frames_seen
 from tests.client.web.sequence import STRAIGHT, of_device
-from tests.client.web.test_capture import received, server
-
-__all__ = ["received", "server"]
 
 LEAST_PSNR_DB = 30.0
 PICTURES = 40
+
+
+@pytest.fixture
+def build_pipeline(received: Received) -> Callable[..., object]:
+    return received.build
 
 
 @pytest.fixture

@@ -165,6 +165,6 @@ def _is_same(a: Snapshot, b: Snapshot) -> bool:
 def _with_delta(room: Room, header: Header, delta: PlacementDelta | None) -> Room:
     """Apply the placement delta to a loaded room."""
     for moved in delta.moved if delta else ():
-        room.objects.move_back(moved.object_id, moved.place)
+        room.objects.restore_place(moved.object_id, moved.place)
     room.objects.resume(delta.revision if delta else header.revision, header.owed)
     return room

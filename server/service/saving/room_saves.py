@@ -126,7 +126,7 @@ class RoomSaves:
             return None
         if delta is None or delta.applies_to(header.revision):
             return delta
-        delete_delta(self.folder)  # they are of a save that is not there any more
+        delete_delta(self.folder)  # it belongs to a save that no longer exists
         return None
 
     def key_digest(self) -> bytes | None:

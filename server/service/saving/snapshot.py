@@ -110,7 +110,7 @@ def _rebuild_objects(room: Room, state: RoomState, slot: SaveSlot) -> None:
             mesh = mesh_from_bytes(_only(read_parts(slot.folder / kept.mesh)))
             room.objects.restore(ObjectRecord(kept.object_id, mesh, place))
         except ValueError as error:
-            log.warning("object %r of room %r is not there any more: %s", kept.object_id, room.name, error)
+            log.warning("object %r of room %r could not be restored: %s", kept.object_id, room.name, error)
 
 
 def _only(parts: Iterable[bytes]) -> bytes:

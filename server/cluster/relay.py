@@ -20,7 +20,7 @@ STREAM_PATH = "/v1/stream"
 OPEN_PATIENCE_S = 5.0
 PING_S, PING_PATIENCE_S = 5.0, 10.0
 """A host that does not answer is given up after the sum of both."""
-MOVED = "the machine of this room has gone, the room moves to another one: come again"
+MOVED = "the machine of this room has failed and the room moves to another one: connect again"
 
 
 async def open_host(address: Address) -> ClientConnection:

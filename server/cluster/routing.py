@@ -47,7 +47,7 @@ def route_of(first: ClientMessage | None) -> Route:
     """Route of a first message. Raises Refusal if it names no room."""
     match first:
         case Hello(resume=str(key)):
-            room_id, own = _split(key, Refusal(GONE, "there is no session of that key: it ended"))
+            room_id, own = _split(key, Refusal(GONE, "there is no session with this key: it ended"))
             return Route(room_id, encode(structs.replace(first, resume=own)), may_open=False)
         case Hello(room=None):
             return Route(secrets.token_hex(ID_BYTES), encode(first), may_open=True)

@@ -1,4 +1,4 @@
-"""The light in cells of the sphere, once albedos are known: its width, its colours, its covariance."""
+"""Light in cells of the sphere for given albedos: its width, colours and covariance."""
 
 from __future__ import annotations
 

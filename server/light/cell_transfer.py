@@ -1,8 +1,8 @@
 """Transfer to cells of the sphere and the normal equations of their radiances. Kernel: cell_transfer.cl.
 
-Cells know where light comes from as finely as the picture's shadows do, which few spherical harmonics do not. Samples
-are pooled over neighbours on one surface and of one colour, each traced along other directions: least squares takes
-what error the transfer has left for signal.
+Cells resolve the direction of light as finely as shadows do, unlike a few spherical harmonics. Samples are averaged
+over neighbours with the same surface and colour, each traced along other directions, since least squares would fit the
+remaining error of the transfer as signal.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PoolGrid:
-    """How a picture is cut into pools."""
+    """Division of an image into pools of samples."""
 
     step: int
     """Samples between pools."""
@@ -91,7 +91,7 @@ def cells_of(directions_bytes: bytes, count: int) -> NDArray[np.uint8]:
 
 
 class PoolWindow:
-    """Transfer of the pools of the last frames, on the device, a slot a frame. Frames may be of several cameras."""
+    """Transfer of the pools of recent frames on the device, one slot per frame. Frames may be from several cameras."""
 
     def __init__(self, engine: Engine, capacity: int, slots: int) -> None:
         """`capacity`: pools that a frame may have."""

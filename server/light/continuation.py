@@ -1,8 +1,8 @@
-"""Walls and tables go on beyond what was seen of them: how far, the shading shows.
+"""Continues planes such as walls and tables beyond their observed parts; shading determines how far.
 
-Where no camera looked, the volume is empty, and light would come through the rest of a wall. The planes of what was
-seen are continued into what was not, as far beyond each of their sides as explains the pictures best: the extents are
-changed one at a time, a few tries a frame, and kept where the light they leave fits clearly better.
+The volume is empty where no camera looked, so light would pass through the unobserved part of a wall. Observed planes
+are therefore extended beyond each side by the distance that explains the images best. Extents are changed one at a
+time, a few trials per frame, and kept if the remaining light fits clearly better.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Judged:
 
 @dataclass(frozen=True)
 class KnownPlanes:
-    """What a continuation knows, to go on with later."""
+    """State of a continuation, for saving and resuming."""
 
     planes: list[PlanePatch]
     boxes: list[Floats]
@@ -267,7 +267,7 @@ def spokes() -> Floats:
 
 @dataclass(frozen=True)
 class _Judgement:
-    """What pools say of some extents, and what makes the next judgement quick. Float32."""
+    """Fit of some extents to pools, with cached data for the next one. Float32."""
 
     met: NDArray[np.uint8]
     """[pairs] spokes that planes hide."""

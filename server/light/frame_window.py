@@ -1,7 +1,7 @@
-"""Which frames the light is estimated from: the last ones, and of those before the ones that show what these do not.
+"""Selects the frames that light is estimated from: recent ones, and earlier ones that show other surfaces.
 
-A camera that turns away forgets nothing; frames that show the same are one. What the light did since a frame is told by
-surface that it shares with the newest (light_change.py): frames under another light lose their weight.
+A camera that turns away loses no information; frames that show the same surfaces count once. Surfaces shared with the
+newest frame show whether the light has changed since (light_change.py): frames under another light lose their weight.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class _Entry:
 
 @dataclass(frozen=True)
 class Contradiction:
-    """What the newest frame says of those before it."""
+    """Evidence of the newest frame against earlier ones."""
 
     frames_ago: int
     """The youngest frame under another light, 0: none."""

@@ -1,7 +1,7 @@
-"""The lamps of one session (B4): when samples are taken, when lamps are looked for, and when they are forgotten.
+"""The lamps of one room (B4): schedules sampling and searching, and discards outdated lamps.
 
-A search is spread over frames. The room's light must not change while its samples are gathered; that it did is seen
-where a new view contradicts what was found.
+A search is spread over frames. The room's light must be constant while samples are gathered; a change is detected when
+a new view contradicts the result.
 """
 
 from __future__ import annotations

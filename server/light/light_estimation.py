@@ -1,4 +1,4 @@
-"""Light estimation (thesis 5.1.3, eq. 5.5-5.6), solved so that it cannot blow up. Kernel: light_estimation.cl.
+"""Regularised light estimation (thesis 5.1.3, eq. 5.5-5.6). Kernel: light_estimation.cl.
 
 The normal equations are summed on the device, a partial sum a tile of the picture, and solved in float64 with a prior
 that grows with the band, its weight chosen from the data. Samples of one tile share their errors (texture, geometry),
@@ -57,7 +57,7 @@ _VALID_RAD = np.deg2rad(15.0)
 
 @dataclass(frozen=True)
 class LightEstimate:
-    """The light as the pictures so far have it."""
+    """The light estimated from the images so far."""
 
     sh: NDArray[np.float64]
     """[bands^2, 3] radiance, RGB, world axes."""
@@ -77,7 +77,7 @@ class LightEstimate:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What an estimator knows, to go on with later."""
+    """State of an estimator, for saving and resuming."""
 
     equations: NormalEquations | None
     weight: float

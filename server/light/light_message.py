@@ -1,4 +1,4 @@
-"""The estimated light as the wire and `light.jsonl` carry it."""
+"""Converts the estimated light to the message that the wire and `light.jsonl` contain."""
 
 from __future__ import annotations
 

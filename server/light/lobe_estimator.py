@@ -1,4 +1,4 @@
-"""Light estimation (thesis 5.1.3) as it is in a room: non-negative, from everywhere, off surfaces of unknown albedo.
+"""Light estimation in rooms (extends thesis 5.1.3): non-negative light from all directions, unknown albedo.
 
 Model: radiance = albedo (visible sky + what surfaces send). The pools of some frames are kept (frame_window.py); their
 albedos and the light are found in turn, each given the other, a few rounds a frame. Luminance comes first. A colour
@@ -84,7 +84,7 @@ _LEAST_MISFIT = 1e-4  # of the frame's energy: below it a ratio of misfits says 
 
 @dataclass(frozen=True)
 class KnownLight:
-    """What an estimator knows but for the frames it knows it from, to go on with later."""
+    """State of an estimator without its frames, for saving and resuming."""
 
     estimate: LightEstimate
     light: LobeFit | None

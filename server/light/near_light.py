@@ -1,4 +1,4 @@
-"""Lights inside the room (B4): the search for lamps, and the picture without their light.
+"""Lights inside the room (B4): the search for lamps, and the radiance without their light.
 
 The mathematics is in server/maths/near_light.py, the samples are those of near_samples.py. Kernels: near_light.cl.
 """

@@ -1,4 +1,4 @@
-"""A lat-long picture of the surroundings as the light (S2): Csongei's photometric model, a static baseline.
+"""A lat-long panorama of the surroundings as the light (S2): Csongei's photometric model, a static baseline.
 
 Axes of a panorama: right-handed, +y up, -z along its middle column. The top row looks up, and columns run to the right
 as a photograph's do: from behind (+z) over the left (-x), the front (-z) and the right (+x) to behind again. These are
@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 
 class PanoramaError(ValueError):
-    """A file that is not a usable panorama; one line."""
+    """The file is not a usable panorama; one line."""
 
 
 def read_panorama(path: Path) -> Floats:

@@ -1,7 +1,7 @@
-"""The light of the room from one frame to the next: the estimator that a session's wishes call for.
+"""The light of a room over time, by the estimator that the wishes select.
 
-Where all surfaces are of one albedo and indirect light is left out, spherical harmonics are solved for directly, in a
-few milliseconds; else light, albedos and the room beyond the pictures are found together.
+With one constant albedo and no indirect light, spherical harmonics are solved directly in a few milliseconds. Otherwise
+light, albedos and the unobserved parts of the room are estimated together.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ AS_SURE = 1.1
 
 @dataclass(frozen=True)
 class KnownRoomLight:
-    """What is known of a room's light, to go on with later."""
+    """State of a room's light, for saving and resuming."""
 
     given: LightEstimate | None
     evidence: Evidence | None
@@ -47,7 +47,7 @@ class KnownRoomLight:
 
 
 class RoomLight:
-    """One room's light, by the frames of all its cameras."""
+    """One room's light, estimated from the frames of all its cameras."""
 
     def __init__(self, engine: Engine, settings: Settings) -> None:
         self._engine = engine

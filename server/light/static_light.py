@@ -1,4 +1,4 @@
-"""A light that is given instead of estimated: of a file (`--light`) or of a panorama (`--panorama`)."""
+"""A given light instead of an estimated one: from a file (`--light`) or a panorama (`--panorama`)."""
 
 from __future__ import annotations
 

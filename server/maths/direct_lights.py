@@ -1,9 +1,9 @@
-"""Lights that are drawn with shadow maps, taken out of a spherical-harmonics light (thesis 7.2.3, fig. 7.7).
+"""Splits a spherical-harmonics light into discs, rendered with shadow maps, and a rest (thesis 7.2.3, fig. 7.7).
 
-A light of b bands shows no edge sharper than about pi / b: rays that bring it throw soft shadows even where it is made
-of small lights. Its dominant lights (dominant.py) that are smaller than b bands can show are therefore taken out of it,
-each a far disc; what is left, in the same bands, is the rest. In these bands the lobes and the rest add up to the light
-exactly. How small a lobe is, its finest band says: exp(-l (l + 1) spread^2 / 2) of what a point would have there.
+A light of b bands has no detail finer than about pi / b, so its shadows are soft even if it consists of small lights.
+Dominant lights (dominant.py) that are smaller than b bands resolve are therefore taken out, each as a distant disc; the
+remainder in the same bands is the rest. In these bands the lobes and the rest add up to the light exactly. The finest
+band gives the size of a lobe: exp(-l (l + 1) spread^2 / 2) times the value of a point light.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from server.maths.dominant import DominantLight, dominant_lights
 from server.maths.sh import sh_basis, spherical_fibonacci
 
 SHARP, SOFT = 0.5, 0.3
-"""Lobes that keep as much of their finest band are taken out whole, those that keep no more than SOFT not at all; four
-bands: 19 and 26 degrees of spread."""
+"""Lobes with at least this share of their finest band are taken out completely, those with at most SOFT not at all; in
+four bands: 19 and 26 degrees of spread."""
 SHARPEST = 0.9
-"""Lobes that keep more are taken to keep so much (8 degrees in four bands): no estimate tells them from points."""
+"""Upper limit on that share (8 degrees in four bands): narrower lobes cannot be distinguished from point lights."""
 HALF_ANGLE = 1.75
-"""Of a disc, in the lobe's standard deviations. Two have the same variance, but the lobe's tails are no light's."""
+"""Radius of a disc in standard deviations of the lobe. Two would give equal variance, but the tails are no light."""
 LEAST_BANDS = 3
-"""Two tell no spread."""
+"""Two bands do not determine a spread."""
 LEAST_GAIN = 0.005
-"""See dominant_lights. Where a third light is missed, two are too wide, and the rest goes below zero."""
+"""See dominant_lights. If a third light is missed, two are too wide, and the rest becomes negative."""
 LEAST_REST = 0.1
-"""How far below zero the rest may go, in means of the light; what the light goes below by itself is let."""
+"""How negative the rest may become, in means of the light; negative parts of the light itself are allowed."""
 _DIRECTIONS = 1024
 _REMEMBERED = 8
 
@@ -40,21 +40,21 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DirectLight:
-    """A far disc of even radiance."""
+    """A distant disc of uniform radiance."""
 
     direction: Floats
-    """[3] unit, towards its middle, in the coefficients' axes."""
+    """[3] unit, towards its centre, in the coefficients' axes."""
     irradiance: Floats
-    """[3] RGB radiance of a white surface that faces it, were it a point; lit by it alone."""
+    """[3] RGB radiance of a white surface that faces it and receives no other light, as for a point light."""
     half_angle_rad: float
 
 
 @dataclass(frozen=True)
 class SplitLight:
-    """A light in two parts."""
+    """A light as discs and a rest."""
 
     rest: Floats
-    """[bands^2, 3] radiance coefficients of what the discs leave."""
+    """[bands^2, 3] radiance coefficients of the rest."""
     discs: tuple[DirectLight, ...]
     """Strongest first."""
 
@@ -64,7 +64,7 @@ def split_light(coefficients: Floats) -> SplitLight:
     return _split(np.ascontiguousarray(coefficients, np.float64).tobytes())
 
 
-@lru_cache(_REMEMBERED)  # a light that is given is the same every frame
+@lru_cache(_REMEMBERED)  # a given light is the same in every frame
 def _split(raw: bytes) -> SplitLight:
     light = np.frombuffer(raw, np.float64).reshape(-1, 3)
     bands = round(sqrt(len(light)))
@@ -83,7 +83,7 @@ def _split(raw: bytes) -> SplitLight:
 
 
 def _share(lobe: DominantLight, bands: int) -> float:
-    """Of a lobe: how much is taken out, so that none comes or goes at once where an estimate changes."""
+    """Share of a lobe that is taken out; continuous, so that discs do not pop as the estimate changes."""
     finest = bands * (bands - 1) / 2
     return float(np.clip((np.exp(-finest * lobe.spread_rad**2) - SOFT) / (SHARP - SOFT), 0.0, 1.0))
 
@@ -104,7 +104,7 @@ def _basis(bands: int) -> Floats:
 
 
 def _most_of(light: Floats, out: Floats, bands: int) -> float:
-    """How much of `out` can be taken from `light`, at most 1, and the rest arrives from nowhere too far below zero."""
+    """Largest share of `out`, at most 1, that can be taken from `light` without making the rest too negative."""
     basis = _basis(bands)
     arriving, taken = basis @ light, basis @ out
     allowed = np.maximum(LEAST_REST * arriving.mean(axis=0), -arriving.min(axis=0))

@@ -1,4 +1,4 @@
-"""Where in a disc of light things are looked for, and where rays to it go. Counts as in shadow_map.cl."""
+"""Sample positions in a disc light, for blocker search and for rays. Counts as in shadow_map.cl."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 SEARCHED = 6
 RINGS = (4, 8, 12)
-"""Parts of a disc on each of its rings."""
+"""Number of parts on each ring of a disc."""
 RAYS, RAY_SETS = 8, 16
-"""Rays of a sample; sets of them, for its neighbours."""
+"""Rays per sample, and number of ray sets that neighbouring samples alternate between."""
 
 Floats = NDArray[np.float64]
 
@@ -21,7 +21,7 @@ def search_places() -> Floats:
 
 
 def disc_places() -> Floats:
-    """[parts, 2] in the unit disc, each of a part of the same size; they lie point to point."""
+    """[parts, 2] in the unit disc, one for each part of equal area; point-symmetric."""
     upto = np.cumsum([0, *RINGS]) / sum(RINGS)
     rings = []
     for count, begin, end, first in zip(RINGS, upto[:-1], upto[1:], (0.2, 0.6, 0.1), strict=True):
@@ -31,10 +31,10 @@ def disc_places() -> Floats:
 
 
 def ray_places() -> Floats:
-    """[RAY_SETS * RAYS, 2] in the unit disc, set by set; all sets together are a spiral, and so is each."""
+    """[RAY_SETS * RAYS, 2] in the unit disc, set by set; each set, and all together, form a spiral."""
     index = np.arange(RAYS * RAY_SETS)
     turn, radius = np.pi * (3 - np.sqrt(5)) * index, np.sqrt((index + 0.5) / len(index))
     spiral = np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=1)
-    scattered = index[:RAY_SETS] * 7 % RAY_SETS  # neighbours' sets are not neighbours on the spiral
+    scattered = index[:RAY_SETS] * 7 % RAY_SETS  # sets of neighbouring samples are apart on the spiral
     places: Floats = spiral[(RAY_SETS * index[:RAYS] + scattered[:, None]).ravel()]
     return places

@@ -1,7 +1,7 @@
-"""What earlier frames' evidence is worth beside a new frame's (thesis 5.4, whose moving average is one setting of it).
+"""Weight of earlier frames' information relative to a new frame's (generalises the moving average of thesis 5.4).
 
-Forgetting is directional: of what is known of a direction of the unknowns a new frame replaces as much as it brings
-itself, and of what it says nothing about nothing is forgotten.
+Directional forgetting: along each direction of the unknowns, a new frame replaces as much information as it brings, and
+nothing is forgotten along directions about which it has no information.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from server.maths.bayes import NormalEquations
 
-_NOTHING = 1e-9  # of what is known of the best known direction: rounding, not knowledge
+_NOTHING = 1e-9  # share of the largest information below which it is rounding error
 
 Floats = NDArray[np.float64]
 

@@ -18,12 +18,12 @@ _UPPER = np.triu_indices(6)
 
 @dataclass(frozen=True)
 class Scale:
-    """Where the points of a registration lie, so that turning and shifting can be compared."""
+    """Extent of the registered points, which makes rotations and translations comparable."""
 
     center: Floats
-    """[3] metres; turns are about it."""
+    """[3] metres; centre of rotations."""
     radius_m: float
-    """A turn by an angle moves the points by as many radians times this."""
+    """Radius in metres: a rotation moves the points by its angle times this."""
 
     def twist_from_scaled(self) -> Floats:
         """[6, 6]: the twist of (radius * turn about the centre, shift of the centre), both in metres."""
@@ -36,14 +36,14 @@ class Scale:
 
 @dataclass(frozen=True)
 class Solution:
-    """A step of Gauss-Newton."""
+    """A Gauss-Newton step."""
 
     twist: Floats
     """[6] step that moves the origin, the camera, as little as the fixed directions allow."""
     free: Floats
     """[k, 6] orthonormal scaled directions that are not fixed, the most nearly pure shifts first."""
     step_m: float
-    """How far the step moves the points."""
+    """Distance by which the step moves the points, metres."""
 
 
 def symmetric(upper: Floats) -> Floats:

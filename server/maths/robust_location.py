@@ -1,4 +1,4 @@
-"""The value that most of many noisy numbers agree on, where up to half of them may mean something else."""
+"""Robust location of many noisy values, of which up to half may be outliers."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 TUKEY = 4.685
-"""Scales at which a value has no weight any more (Beaton and Tukey 1974): 95 % as good as the mean on normal errors."""
+"""Cutoff of Tukey's biweight in scales (Beaton and Tukey 1974): 95 % efficiency for normal errors."""
 HEAP = 0.3
-"""Of the weight: what lies closest together. Half, as usual, would not tell one of two equal heaps from both."""
+"""Share of the weight in the shortest interval. Half, as usual, could not separate two equal clusters."""
 HEAP_OF_NORMAL = 0.7706
-"""Standard deviations that hold so much of a normal distribution."""
+"""Width, in standard deviations, of the shortest interval with that share of a normal distribution."""
 _ROUNDS = 8
 
 
 @dataclass(frozen=True)
 class Location:
-    """Where the values lie."""
+    """Robust location of a set of values."""
 
     value: float
     std: float
-    """Of `value`; errors that a group shares are counted once."""
+    """Standard deviation of `value`; errors that a group shares count once."""
     scale: float
     """Standard deviation of one value of weight 1 around it."""
     share: float
-    """Of the weight that lies within two scales."""
+    """Share of the weight within two scales."""
 
 
 def shortest_part(values: Floats, weights: Floats, share: float) -> tuple[float, float]:
@@ -49,8 +49,8 @@ def robust_location(
 ) -> Location:
     """Location of `values` [n] with `weights` [n] > 0, reweighted by Tukey's biweight.
 
-    Where values lie in several heaps, the one at `near` is taken if it holds half as much as the largest. `groups` [n]:
-    numbers from 0 of what shares its errors. Scales are `least_scale` at least.
+    If the values form several clusters, the one at `near` is used if it has at least half the weight of the largest.
+    `groups` [n]: numbers from 0; values of a group share their errors. The scale is at least `least_scale`.
     """
     middle, width = shortest_part(values, weights, HEAP)
     scale = max(width / HEAP_OF_NORMAL, least_scale)

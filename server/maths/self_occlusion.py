@@ -9,11 +9,11 @@ Floats = NDArray[np.float64]
 
 
 def spherical_delaunay(points: Floats) -> NDArray[np.int64]:
-    """Triangles [2 n - 4, 3] of the spherical Delaunay triangulation of unit points [n, 3], n >= 4, turning left seen
+    """Triangles [2 n - 4, 3] of the spherical Delaunay triangulation of unit points [n, 3], n >= 4, counter-clockwise
     from outside.
 
-    It is their convex hull, found by wrapping: the plane through an edge is turned until it has all points on one side.
-    Raises ValueError for points that do not surround the sphere's centre, or four of which share an empty circle.
+    It is the convex hull, computed by gift wrapping. Raises ValueError for points that do not surround the sphere's
+    centre, or if four share an empty circle.
     """
     if len(points) < 4:
         raise ValueError(f"{len(points)} points do not surround a sphere's centre")

@@ -105,7 +105,10 @@ def _unpacked(packed: _Mesh) -> Mesh:
     triangles = _rows("triangles", packed.triangles, np.int32, 3)
     _require(0 < count <= MAX_VERTICES and 0 < len(triangles) <= MAX_TRIANGLES, "it is empty or too large")
     _require_numbers("triangles", triangles, count)
-    _require(0 < len(packed.materials) <= MAX_MATERIALS and len(packed.notes) <= MAX_NOTES, "it says too much")
+    _require(
+        0 < len(packed.materials) <= MAX_MATERIALS and len(packed.notes) <= MAX_NOTES,
+        "too many materials or notes",
+    )
     textures = [_texture(texture) for texture in packed.textures]
     _require(
         sum(t.image.shape[0] * t.image.shape[1] for t in textures) <= 2 * MAX_KEPT_PIXELS, "textures are too large"

@@ -132,8 +132,8 @@ def _shared_picture(answer: bytearray, memory: mmap.mmap | None) -> NDArray[np.u
     """[h, w, 3] as a copy. Raises ValueError for an invalid size."""
     assert memory is not None
     if len(answer) != _SIZE.size:
-        raise ValueError("color.data: its reader said no size")
+        raise ValueError("color.data: its reader returned no size")
     height, width = _SIZE.unpack(answer)
     if 3 * height * width > len(memory):
-        raise ValueError("color.data: its reader said a wrong size")
+        raise ValueError("color.data: its reader returned an invalid size")
     return np.frombuffer(memory, np.uint8, 3 * height * width).reshape(height, width, 3).copy()

@@ -91,7 +91,7 @@ class ChildProcess:
         state, size = ANSWER.unpack(self._read(ANSWER.size, deadline_s))
         if size > self._spec.max_answer_bytes:
             self.kill()
-            raise ChildDied("was stopped: it made more of it than may be")
+            raise ChildDied("was stopped: its answer was too large")
         body = self._read(size, deadline_s)
         if state != DONE:
             raise ValueError(body[:2000].decode(errors="replace"))

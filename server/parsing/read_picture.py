@@ -25,6 +25,6 @@ def share(rgb: NDArray[np.uint8]) -> bytes:
     """Copy [h, w, 3] to the shared memory and return height and width. Raises ValueError if it is too large."""
     memory = shared_memory()
     if rgb.nbytes > len(memory):
-        raise ValueError("color.data is a larger picture than may be")
+        raise ValueError("color.data: the picture is too large")
     memory[: rgb.nbytes] = rgb.data.cast("B") if rgb.flags.c_contiguous else rgb.tobytes()
     return SIZE.pack(*rgb.shape[:2])

@@ -90,7 +90,7 @@ class RoomObjects:
         """All objects, including waiting ones, in order of placement."""
         return list(self.inventory().objects)
 
-    def put_back(self, kept: ObjectRecord) -> None:
+    def restore(self, kept: ObjectRecord) -> None:
         """Recreate an object from a record, after `begin` if its pose was known. Raises ValueError."""
         if isinstance(kept.place, Placement):
             self.place(kept.object_id, kept.mesh, kept.place)
@@ -99,7 +99,7 @@ class RoomObjects:
             with self._change():
                 self._objects.put(kept.object_id, kept.mesh, kept.place)
 
-    def move_back(self, object_id: str, place: Place) -> None:
+    def restore_place(self, object_id: str, place: Place) -> None:
         """Apply a later move to a recreated object. Does nothing if the object is missing."""
         known = {kept.object_id: kept.place for kept in self.kept()}
         if type(known.get(object_id)) is not type(place):

@@ -66,7 +66,7 @@ def _add_stream(app: FastAPI, service: Service, authenticator: Authenticator) ->
     async def elsewhere(websocket: WebSocket) -> None:
         connection = Connection(websocket)
         if await connection.accept():
-            await connection.close(POLICY, f"nothing listens here; the stream is at {STREAM_PATH}")
+            await connection.close(POLICY, f"there is no socket at this path; the stream is at {STREAM_PATH}")
 
 
 def _add_health(app: FastAPI, service: Service) -> None:

@@ -99,7 +99,7 @@ class RoomPersistence:
         most = self._limits.space_bytes
         is_too_much = most is not None and self.storage.space_bytes > most
         if is_too_much and not self._has_warned_of_space:
-            log.warning("rooms take more space than they may, and all of them are in use")
+            log.warning("rooms exceed their space limit, and all of them are in use")
         self._has_warned_of_space = is_too_much
 
     def stop(self) -> None:

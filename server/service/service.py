@@ -267,7 +267,7 @@ class Service:
     async def _resume(self, connection: Connection, key: str) -> None:
         session = self._resumable_sessions.get(key)
         if session is None:
-            raise Refusal(GONE, "there is no session of that key: it ended, or the server was started anew")
+            raise Refusal(GONE, "there is no session with this key: it ended, or the server was restarted")
         await session.resume(connection)
 
     def _admit(self) -> None:

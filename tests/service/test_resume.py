@@ -91,7 +91,7 @@ def test_a_client_that_does_not_come_back_is_let_go(server, proxy: Proxy, lab: L
     assert lab.closed.wait(PATIENCE_S)
     code, reason, _ = resumed(server.url, key)
     assert code == 4410
-    assert "no session of that key" in reason
+    assert "no session with this key" in reason
 
 
 def test_a_client_that_says_bye_is_not_waited_for(server, lab: Lab) -> None:
@@ -104,7 +104,7 @@ def test_a_client_that_says_bye_is_not_waited_for(server, lab: Lab) -> None:
 def test_a_key_that_is_none_is_refused(server) -> None:
     code, reason, _ = resumed(server.url, "guessed")
     assert code == 4410
-    assert "no session of that key" in reason
+    assert "no session with this key" in reason
 
 
 def resumed(url: str, key: str) -> tuple[int, str, list]:

@@ -126,7 +126,7 @@ class RoomSaves:
             return None
         if delta is None or delta.applies_to(header.revision):
             return delta
-        delete_delta(self.folder)  # they are of a save that is not there any more
+        delete_delta(self.folder)  # it belongs to a save that no longer exists
         return None
 
     def key_digest(self) -> bytes | None:
@@ -165,6 +165,6 @@ def _is_same(a: Snapshot, b: Snapshot) -> bool:
 def _with_delta(room: Room, header: Header, delta: PlacementDelta | None) -> Room:
     """Apply the placement delta to a loaded room."""
     for moved in delta.moved if delta else ():
-        room.objects.move_back(moved.object_id, moved.place)
+        room.objects.restore_place(moved.object_id, moved.place)
     room.objects.resume(delta.revision if delta else header.revision, header.owed)
     return room

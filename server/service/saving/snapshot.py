@@ -108,9 +108,9 @@ def _rebuild_objects(room: Room, state: RoomState, slot: SaveSlot) -> None:
         place = kept.world_from_model if kept.world_from_model is not None else kept.placement or Placement()
         try:
             mesh = mesh_from_bytes(_only(read_parts(slot.folder / kept.mesh)))
-            room.objects.put_back(ObjectRecord(kept.object_id, mesh, place))
+            room.objects.restore(ObjectRecord(kept.object_id, mesh, place))
         except ValueError as error:
-            log.warning("object %r of room %r is not there any more: %s", kept.object_id, room.name, error)
+            log.warning("object %r of room %r could not be restored: %s", kept.object_id, room.name, error)
 
 
 def _only(parts: Iterable[bytes]) -> bytes:

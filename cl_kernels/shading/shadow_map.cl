@@ -41,11 +41,10 @@ kernel void halve_maps(const int count, const int level, global float2 *maps) {
 }
 
 #define TRACE_PARAMETERS \
-    const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid, global const uchar *octets, \
-        global const float2 *voxels, const float voxel_m, const float truncation_m, const float reach_m, const int plane_count, \
+    VOLUME_PARAMETERS, const float reach_m, const int plane_count, \
         global const float4 *planes, global const int4 *shapes, global const uchar *plane_maps, const float cell_m, \
         const float least_m, global const float2 *ray_places
-#define VOLUME_OF_TRACE make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels)
+#define VOLUME_OF_PARAMETERS VOLUME_OF_PARAMETERS
 #define PLANES_OF_TRACE {plane_count, planes, shapes, plane_maps, cell_m, least_m}
 
 // The part of what a disc brings to the surface that real things leave, along RAYS rays to places [RAYS] in the unit disc. axes: of
@@ -102,7 +101,7 @@ kernel void trace_discs(const int cols, const int rows, const int stride, const 
     if (col >= cols || row >= rows) return;
     const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
     const float4 position = positions[pixel], normal = normals[pixel];
-    const Volume volume = VOLUME_OF_TRACE;
+    const Volume volume = VOLUME_OF_PARAMETERS;
     const Continued continued = PLANES_OF_TRACE;
     const DirectLights lights = DIRECT_OF_PARAMETERS;
     float4 result = (float4)(0.0f);
@@ -257,7 +256,7 @@ kernel void light_glow(const int points_count, global const float4 *points, glob
                        DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *radiances) {
     const int first = get_global_id(0) * LANES;
     if (first >= points_count) return;
-    const Volume volume = VOLUME_OF_TRACE;
+    const Volume volume = VOLUME_OF_PARAMETERS;
     const Continued continued = PLANES_OF_TRACE;
     const DirectLights lights = DIRECT_OF_PARAMETERS;
     float left[3][LANES];

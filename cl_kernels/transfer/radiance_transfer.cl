@@ -28,8 +28,7 @@
 // With IS_CHOSEN only the samples `chosen` [chosen_count] are done, one item each; what is kept of the others stays as it was.
 kernel void transfer_radiance(const int cols, const int rows, const int stride, const int width, const int height, const int radius,
                               global const float4 *positions, global const float4 *normals, global const uchar *labels,
-                              const int4 bricks, global const int *slots, global const uchar *gaps,
-                              global const ulong *solid, global const uchar *octets, global const float2 *voxels, const float voxel_m, const float truncation_m,
+                              VOLUME_PARAMETERS,
                               const int count, const int first_set, global const float4 *directions, global const float *basis,
                               const float reach_m, const int phase, const float4 intrinsics, const int layers, const int newest,
                               global const float16 *cameras, global float4 *points, global float4 *cached_normals,
@@ -54,9 +53,9 @@ kernel void transfer_radiance(const int cols, const int rows, const int stride, 
     const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
     const float4 position = positions[pixel];
     const int valid = position.w > 0.0f && normals[pixel].w > 0.0f;
-    const float4 normal = valid ? smooth_normal(width, height, positions, normals, pixel % width, pixel / width, radius, voxel_m)
+    const float4 normal = valid ? smooth_normal(width, height, positions, normals, pixel % width, pixel / width, radius, shape.voxel_m)
                                 : (float4)(0.0f);
-    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
+    const Volume volume = VOLUME_OF_PARAMETERS;
     const int own = first_set + direction_set(row, col);
 
     uint wanted = valid ? ALL_SUBSETS : 0u;
@@ -71,7 +70,7 @@ kernel void transfer_radiance(const int cols, const int rows, const int stride, 
     const int lasting = valid && labels[pixel] == LABEL_STATIC;
     if (lasting && wanted) {
         const Layers known = {cols, rows, stride, intrinsics, layers, newest, cameras, points, cached_normals, traced, blocked};
-        wanted = find_cached(known, position.xyz, normal.xyz, voxel_m, ALL_SUBSETS & ~(1u << phase), stops, set) | 1u << phase;
+        wanted = find_cached(known, position.xyz, normal.xyz, shape.voxel_m, ALL_SUBSETS & ~(1u << phase), stops, set) | 1u << phase;
     }
 #endif
     if (wanted) {
@@ -80,7 +79,7 @@ kernel void transfer_radiance(const int cols, const int rows, const int stride, 
             asked[i] = bits_of_subsets(wanted);
             open[i] = 0;
         }
-        trace_hemisphere(volume, position.xyz + voxel_m * normal.xyz, normal.xyz, directions + own * count, count, reach_m, asked,
+        trace_hemisphere(volume, position.xyz + shape.voxel_m * normal.xyz, normal.xyz, directions + own * count, count, reach_m, asked,
                          open, stops);  // fig. 7.5
     }
 #if INTERLEAVE > 1

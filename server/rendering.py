@@ -214,7 +214,6 @@ class Rendering:
             made.geometry.measurement.radiance,
             made.geometry.surface,
             transfer,
-            made.volume,
             made.sampler.rays,
             light,
             indirect,

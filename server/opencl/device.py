@@ -44,8 +44,6 @@ class Device:
         self.context = cl.Context([cl_device])
         self.programs = ProgramCache(self.context)
         self.memory = DeviceMemory()
-        self.part_alignment_bytes = max(cl_device.mem_base_addr_align // 8, 64)
-        """Of what begins inside a buffer: what the device asks of sub-buffers, and a float16."""
         self.volume_bytes = VOLUME_BYTES
         """Of its memory, what one volume may take; beyond, parts of it go to the host."""
 

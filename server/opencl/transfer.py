@@ -31,7 +31,8 @@ def copy_into(queue: cl.CommandQueue, whole: cl_array.Array, start: int, part: c
 
 
 def part_of(whole: cl_array.Array, start: int, shape: tuple[int, ...], dtype: DTypeLike) -> cl_array.Array:
-    """An array in the memory of `whole`, from its byte `start` on, a multiple of Device.part_alignment_bytes."""
+    """An array in the memory of `whole`, from its byte `start` on, a multiple of
+    part_alignment_bytes (parts.py)."""
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     return cl_array.Array(whole.queue, shape, dtype, data=_memory(whole).get_sub_region(start, size))
 

@@ -7,6 +7,7 @@ import pyopencl.array as cl_array
 from numpy.typing import NDArray
 
 from server.opencl.engine import Engine, int4
+from server.opencl.parts import part_alignment_bytes
 from server.opencl.transfer import copy_beginning, fill_bytes, part_of
 from server.volume.brick_pool import BrickPool, rounded, upload_list
 
@@ -22,7 +23,7 @@ class RayTables:
         self._engine = engine
         self.bricks = bricks
         space, count = engine.workspace, bricks[0] * bricks[1] * bricks[2]
-        step = engine.device.part_alignment_bytes
+        step = part_alignment_bytes(engine.device.cl_device)
         self.gaps_at = -(-8 * count // step) * step
         """Byte of `memory` at which the gaps begin."""
         self.memory: cl_array.Array = space.array("brick_tables", (self.gaps_at + 8 * count,), np.uint8)

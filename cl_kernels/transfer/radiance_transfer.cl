@@ -30,7 +30,7 @@
 kernel void transfer_radiance(const TransferParameters parameters, global const float4 *positions, global const float4 *normals,
                               global const uchar *labels, global const int *slots, global const ulong *solid, global const uchar *octets,
                               global const float4 *directions, global const float *basis, global const float16 *cameras,
-                              global float4 *points, global float4 *cached_normals, global ushort *traced, global uint *blocked,
+                              global float4 *points, global ushort *traced, global uint *blocked,
                               global float *transfer, global float *openness, global float *flatness,
                               global uint *free_mask, global uchar *sets
 #ifdef HAS_STATE
@@ -69,6 +69,7 @@ kernel void transfer_radiance(const TransferParameters parameters, global const 
     if (valid && is_open(volume, state, position.xyz)) wanted = 0;
 #endif
 #if INTERLEAVE > 1
+    global float4 *cached_normals = (global float4 *)((global uchar *)points + parameters.cached_normals_at);
     const int lasting = valid && labels[pixel] == LABEL_STATIC;
     if (lasting && wanted) {
         const Layers known = {grid.cols, grid.rows, grid.stride, parameters.intrinsics, parameters.layers, parameters.newest, cameras, points, cached_normals, traced, blocked};

@@ -39,7 +39,7 @@ class Struct:
             offsets.append(_rounded(end, alignment))
             end = offsets[-1] + dtype.itemsize
         size = _rounded(end, self.alignment)
-        layout: dict[str, Any] = {"names": [*fields], "formats": dtypes, "offsets": offsets, "itemsize": size}
+        layout: Any = {"names": [*fields], "formats": dtypes, "offsets": offsets, "itemsize": size}
         self.dtype: np.dtype[Any] = np.dtype(layout)
         types = {field: of.name if isinstance(of, Struct) else of for field, of in fields.items()}
         members = "".join(f"    {of} {field};\n" for field, of in types.items())
@@ -140,9 +140,10 @@ TRANSFER_PARAMETERS = Struct(
     phase="int",
     layers="int",
     newest="int",
+    cached_normals_at="int",
     chosen_count="int",
 )
-"""Of radiance_transfer.cl."""
+"""Of radiance_transfer.cl. cached_normals_at: byte of the cache's surface at which its normals begin."""
 
 VIEW_TRANSFER_PARAMETERS = Struct(
     "ViewTransferParameters",

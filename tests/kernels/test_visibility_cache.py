@@ -69,7 +69,8 @@ class Watcher:
         )
         get = self.engine.download
         assert found.sets is not None
-        _, points, normals, traced, blocked = self.caches.buffers()
+        _, _, traced, blocked = self.caches.buffers()
+        points, normals = (self.caches.surface.array(name) for name in ("points", "normals"))
         phase, known, newest = (self.caches.parameters()[name] for name in ("phase", "layers", "newest"))
         layer = (int(newest) + 1) % self.interleave  # type: ignore[call-overload]
         assert layer == phase

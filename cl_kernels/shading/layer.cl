@@ -31,9 +31,9 @@ static inline void clear(global uchar4 *virtual_layer, global ushort *virtual_de
 }
 
 // codes [65536]: sRGB code of linear radiance i / 65535; depth_scale_m: metres of a unit of depth.
-// One item LANES pixels of a row -> layer, which holds four arrays: virtual_layer [h][w]: sRGB codes and coverage, 255: all; virtual_depth [h][w] of the
-// surface that the colour is of, or none of the two without HAS_OBJECTS. ratio_layer [h][w][3]: codes of factors; real_depth
-// [h][w] of all real surface, or none of the two without HAS_SHADOWS.
+// One item LANES pixels of a row -> layer, a buffer of four arrays. virtual_layer [h][w]: sRGB codes and coverage, 255: all;
+// virtual_depth [h][w] of the surface that the colour is of; neither is written without HAS_OBJECTS. ratio_layer [h][w][3]: codes of
+// factors; real_depth [h][w] of all real surface; neither is written without HAS_SHADOWS.
 kernel void compose_layer(const LayerParameters parameters, MIXTURE_BUFFERS, global const uchar *codes, global uchar *layer) {
     const int first = get_global_id(0) * LANES;
     const int y = get_global_id(1);

@@ -18,10 +18,9 @@
 // T(x) = 1/pi * integral of V max(n.w, 0) Y(w) dw. The unoccluded part is exact (A_l Y(n) / pi); only what is blocked is
 // sampled and taken away, so an open surface shades without quadrature error.
 //
-// One item a sample. positions, normals, labels [h][w]: the geometry
-// buffer. directions [sets][count]: unit directions and their solid angle (w, sr), basis [sets][count][COEFFICIENTS]: Y there;
+// One item a sample. positions, normals, labels [h][w]: the geometry buffer. directions [sets][count]: unit directions and their solid angle (w, sr), basis [sets][count][COEFFICIENTS]: Y there;
 // first_set: see direction_sets.clh. radius: of the window that a sample's normal is the mean of, pixels.
-// phase: the subset that this frame traces (visibility_cache.clh); intrinsics, layers, newest, cameras, points, cached_normals,
+// phase: the subset that this frame traces (visibility_cache.clh); intrinsics, layers, newest, cameras, points and behind them normals,
 // traced, blocked: what earlier frames know, this frame's layer (newest + 1) is written. state: see visibility_state.clh.
 // -> transfer [rows][cols][COEFFICIENTS], openness [rows][cols]: free share of the cosine-weighted sky (-1 where there is no
 // surface), flatness [rows][cols]: share of the window on the sample's own surface, free_mask [rows][cols][MASK_WORDS]: bit j =

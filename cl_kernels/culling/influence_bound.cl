@@ -7,6 +7,7 @@
 #error BANDS must be defined: the number of spherical-harmonics bands
 #endif
 #include "real_shading.clh"
+#include "samples.clh"
 #include "sampled_value.clh"
 #include "sh.clh"
 
@@ -17,31 +18,33 @@ static inline float greatest(const float3 v) {
     return fmax(fmax(v.x, v.y), v.z);
 }
 
-// transfer [rows][cols][COEFFICIENTS]; hits [rows][cols]: see indirect.cl; light [COEFFICIENTS] rgb; at every `every`-th sample.
+// transfer [rows][cols][COEFFICIENTS]; hits [rows][cols]: see indirect.cl; at every `every`-th sample.
 // balls [balls_count]: center, radius; sent, real_sent: the most that objects and that real surface send (rgb).
 // -> bounds [bound_rows][bound_cols]: greatest change of R over R by what objects hide or send, by what they send alone;
 // of bounced light over that change (w = 1 valid, 0 where there is no surface). Without balls: 0, and what objects that hid all
 // would send.
-kernel void bound_samples(SAMPLE_PARAMETERS, global const float *transfer, global const float4 *hits, global const float4 *light,
-                          LIGHT_PARAMETERS, const int balls_count, global const float4 *balls, const float4 sent,
-                          const float4 real_sent, const int every, const int bound_cols, const int bound_rows, global float4 *bounds) {
+kernel void bound_samples(const Grid grid, SAMPLE_BUFFERS, global const float *transfer, global const float4 *hits,
+                          const LightParameters lit, LIGHT_BUFFERS, const int balls_count, global const float4 *balls,
+                          const float4 sent, const float4 real_sent, const int every, const int bound_cols, const int bound_rows,
+                          global float4 *bounds) {
     const int bound_col = get_global_id(0);
     const int bound_row = get_global_id(1);
     if (bound_col >= bound_cols || bound_row >= bound_rows) return;
     const int col = bound_col * every, row = bound_row * every;
-    const int sample = row * cols + col;
-    const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
+    const int sample = row * grid.cols + col;
+    const int pixel = sample_pixel(grid, row, col);
     const float4 position = positions[pixel], normal = normals[pixel];
     float4 bound = (float4)(0.0f);
     if (position.w > 0.0f && normal.w > 0.0f) {
-        const Arriving arrives = LIGHT_OF_PARAMETERS;
+        const Arriving arrives = make_arriving(lit, directions, light_table, 0, nothing_changed());
+        global const float4 *light = coefficients_of(lit, light_table);
         global const uint *free = free_mask + sample * MASK_WORDS;
         global const uchar *own = sets + sample * INTERLEAVE;
-        const float3 most_hidden = fmax(real_sent.xyz, unseen.xyz);
+        const float3 most_hidden = fmax(real_sent.xyz, lit.unseen.xyz);
         float3 all = (float3)(0.0f);
         float part = 0.0f;
-        for (int j = 0; j < count && balls_count > 0; j++) {
-            const int index = own[j % INTERLEAVE] * count + j;
+        for (int j = 0; j < lit.count && balls_count > 0; j++) {
+            const int index = own[j % INTERLEAVE] * lit.count + j;
             const float3 direction = directions[index].xyz;
             int meets = 0;
             for (int k = 0; k < balls_count; k++) {
@@ -52,7 +55,7 @@ kernel void bound_samples(SAMPLE_PARAMETERS, global const float *transfer, globa
             if (!meets || dot(normal.xyz, direction) <= 0.0f) continue;
             const int is_free = (free[j >> 5] >> (j & 31)) & 1;
             const float share = share_of(arrives, index, normal.xyz);
-            const float3 taken = is_free ? fmax(arriving[index].xyz, unseen.xyz) : most_hidden;
+            const float3 taken = is_free ? fmax(arrives.arriving[index].xyz, lit.unseen.xyz) : most_hidden;
             all += share * fmax(taken, sent.xyz);
             part += share;
         }
@@ -80,20 +83,19 @@ static inline int dims(const float4 disc, const float4 ball, const float3 positi
 // positions, normals [h][w] of real surface; bounds [rows][cols]: of bound_samples for every sample, or none where has_bounds is 0.
 // discs [discs_count]: see dims. -> most [h][ceil(w / CHUNK)]: the greatest of CHUNK pixels of what bounds are of, 0 where no sample
 // has a change; w: whether a disc is dimmed.
-kernel void bound_pixels(const int width, const int height, global const float4 *positions, global const float4 *normals,
-                         const int cols, const int rows, const int stride, const int has_bounds, global const float4 *bounds,
-                         const float tolerance_m, const int discs_count, global const float4 *discs, const int balls_count,
+kernel void bound_pixels(const int height, global const float4 *positions, global const float4 *normals,
+                         const Grid grid, const int has_bounds, global const float4 *bounds, const float tolerance_m, const int discs_count, global const float4 *discs, const int balls_count,
                          global const float4 *balls, global float4 *most) {
     const int chunk = get_global_id(0);
     const int y = get_global_id(1);
+    const int width = grid.width, stride = grid.stride;
     const int chunks = (width + CHUNK - 1) / CHUNK;
     if (chunk >= chunks || y >= height) return;
-    const Grid grid = {cols, rows, stride, width};
     const int end = min(width, (chunk + 1) * CHUNK);
     int any = 0;  // of the samples that pixels here are means of
-    for (int row = max(cell_of(y, stride) - 2, 0); has_bounds && row <= min(cell_of(y, stride) + 3, rows - 1); row++)
-        for (int col = max(cell_of(chunk * CHUNK, stride) - 2, 0); col <= min(cell_of(end - 1, stride) + 3, cols - 1); col++)
-            any |= bounds[row * cols + col].x > 0.0f;
+    for (int row = max(cell_of(y, stride) - 2, 0); has_bounds && row <= min(cell_of(y, stride) + 3, grid.rows - 1); row++)
+        for (int col = max(cell_of(chunk * CHUNK, stride) - 2, 0); col <= min(cell_of(end - 1, stride) + 3, grid.cols - 1); col++)
+            any |= bounds[row * grid.cols + col].x > 0.0f;
     float4 greatest_of = (float4)(0.0f);
     for (int x = chunk * CHUNK; x < end; x++) {
         const float4 position = positions[y * width + x];

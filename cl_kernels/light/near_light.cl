@@ -142,13 +142,11 @@ static inline floatn emitter_shares(const Volume volume, const float3 emitter, c
 // -> shares [emitters][points]: g of emitter_shares.
 kernel void see_emitters(const int points, const int emitters, global const float4 *positions, global const float4 *normals,
                          global const float4 *emitter_positions, const float clearance_m,
-                         const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid,
-                         global const uchar *octets, global const float2 *voxels, const float voxel_m, const float truncation_m,
-                         global float *shares) {
+                         VOLUME_PARAMETERS, global float *shares) {
     const int first = get_global_id(0) * LANES;
     const int emitter = get_global_id(1);
     if (first >= points || emitter >= emitters) return;
-    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
+    const Volume volume = VOLUME_OF_PARAMETERS;
     const intn chosen = min(first + CONVERT_INTN(LANE_NUMBERS), points - 1);
     const floatn found = emitter_shares(volume, emitter_positions[emitter].xyz, clearance_m, positions, normals, chosen);
     float each[LANES];
@@ -160,12 +158,10 @@ kernel void see_emitters(const int points, const int emitters, global const floa
 // of a pixel (w) stays. One item LANES pixels of [pixels]. lamps [count][2]: position (volume space), intensity (rgb).
 kernel void remove_lamps(const int pixels, const int count, global const float4 *positions, global const float4 *normals,
                          global const float4 *lamps, const float clearance_m, const float albedo,
-                         const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid,
-                         global const uchar *octets, global const float2 *voxels, const float voxel_m, const float truncation_m,
-                         global const float4 *radiance, global float4 *without) {
+                         VOLUME_PARAMETERS, global const float4 *radiance, global float4 *without) {
     const int first = get_global_id(0) * LANES;
     if (first >= pixels) return;
-    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
+    const Volume volume = VOLUME_OF_PARAMETERS;
     const intn chosen = min(first + CONVERT_INTN(LANE_NUMBERS), pixels - 1);
     float3 arriving[LANES];
     for (int lane = 0; lane < LANES; lane++) arriving[lane] = (float3)(0.0f);

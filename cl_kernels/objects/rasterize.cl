@@ -344,17 +344,17 @@ static int object_of(const int triangle, const int count, const global int8 *obj
 // The ray of pixel (u, v) is model_from_pixel's column 3 + t * its columns 0 to 2 times (u, v, 1), with t the depth;
 // its last row is not part of that: it takes a model point to its depth.
 // Goes over the pixels `around` (x0 y0 x1 y1, half-open); `visible` is known in the tiles of `region`.
-kernel void shade_surface(const int2 size, const int4 around, const int4 region, const global int *visible,
-                          const int object_count, const global int8 *objects, const global float16 *matrices,
-                          const global float *vertices, const global int *triangles,
+kernel void shade_surface(const SurfaceParameters parameters, const global int *visible, const global int8 *objects,
+                          const global float16 *matrices, const global float *vertices, const global int *triangles,
                           const global float4 *attributes, const global int *material_of,
                           const global float4 *materials, const global int4 *texture_table, const global int4 *levels,
                           const global uchar4 *texels, const global float *values, global int *object_index,
                           global float4 *position, global float4 *normal, global float4 *base_color,
                           global float4 *surface) {
+    const int4 around = parameters.around, region = parameters.region;
     const int2 pixel = around.xy + (int2)(get_global_id(0), get_global_id(1));
     if (pixel.x >= around.z || pixel.y >= around.w) return;
-    const int index = pixel.y * size.x + pixel.x;
+    const int index = pixel.y * parameters.width + pixel.x;
     const int2 tile = pixel / TILE;
     const bool drawn = tile.x >= region.x && tile.y >= region.y && tile.x < region.z && tile.y < region.w;
     if (!drawn || visible[index] == NOBODY) {
@@ -362,7 +362,7 @@ kernel void shade_surface(const int2 size, const int4 around, const int4 region,
         position[index] = normal[index] = base_color[index] = surface[index] = (float4)(0.0f);
         return;
     }
-    const int number = object_index[index] = object_of(visible[index], object_count, objects);
+    const int number = object_index[index] = object_of(visible[index], parameters.object_count, objects);
     const int8 object = objects[number];
     const float16 model_from_pixel = matrices[3 * number + 1];
     const int triangle = object.s1 + visible[index] - object.s5;

@@ -78,41 +78,38 @@ kernel void mark_shown(const int width, const int height, global const float4 *r
 }
 
 // What occluders take from the virtual surface at `pixels` [listed]; positions, normals, shown [h][w]: the virtual geometry buffer.
-// every: as in shadow_virtual; the picture is a mean over 4 x 4 pixels (upsample.clh). -> occluded [h][w] (rgb, w = 1); other pixels are left as they are.
-kernel void refine_virtual(const int listed, global const int *pixels, const int width,
-                           global const float4 *positions, global const float4 *normals, global const int *shown,
-                           SCENE_PARAMETERS, const int every, global float4 *occluded) {
+// scene.every: as in shadow_virtual; the picture is a mean over 4 x 4 pixels (upsample.clh). -> occluded [h][w] (rgb, w = 1); other pixels are left as they are.
+kernel void refine_virtual(SCENE_PARAMETERS, const int listed, global const int *pixels, global const float4 *positions,
+                           global const float4 *normals, global const int *shown, global float4 *occluded) {
     const int item = get_global_id(0);
     if (item >= listed) return;
     const int pixel = pixels[item];
-    const Volume volume = VOLUME_OF_PARAMETERS;
-    const Objects things = OBJECTS_OF_PARAMETERS(own_offset_m(objects, grid_from_volume, shown[pixel]));
-    const Arriving arrives = LIGHT_OF_PARAMETERS;
-    const int x = pixel % width, y = pixel / width;
+    const Volume volume = VOLUME_OF_SCENE;
+    const Objects things = OBJECTS_OF_SCENE(own_offset_m(scene.objects.count, grids_of(object_table), shown[pixel]));
+    const Arriving arrives = ARRIVING_OF_SCENE;
+    const int x = pixel % scene.samples.width, y = pixel / scene.samples.width;
     occluded[pixel] = taken_from_virtual(volume, things, arrives, positions[pixel], normals[pixel].xyz, direction_set(y, x),
-                                         direction_subset(y, x, every), every);
+                                         direction_subset(y, x, scene.every), scene.every);
 }
 
 // The ratio R' / R of shading with virtual objects to shading without, at `pixels` [listed] of the real surface. What the
 // objects take is sampled at the pixel; R changes little from sample to sample and is taken from them: shaded [rows][cols].
 // -> ratio [h][w] (rgb, w = 1), w = 0 where there is no surface; other pixels are left as they are.
-kernel void refine_real(const int listed, global const int *pixels, const int width,
-                        global const float4 *positions, global const float4 *normals, SCENE_PARAMETERS, const int every, const float4 ball, global const float4 *light,
-                        const int cols, const int rows, const int stride, global const float4 *shaded, global float4 *ratio) {
+kernel void refine_real(REAL_SCENE_PARAMETERS, const int listed, global const int *pixels, global const float4 *positions,
+                        global const float4 *normals, global const float4 *shaded, global float4 *ratio) {
     const int item = get_global_id(0);
     if (item >= listed) return;
     const int pixel = pixels[item];
-    const int x = pixel % width, y = pixel / width;
+    const int x = pixel % scene.samples.width, y = pixel / scene.samples.width;
     float4 result = (float4)(0.0f);
     if (positions[pixel].w > 0.0f && normals[pixel].w > 0.0f) {
-        const Grid grid = {cols, rows, stride, width};
-        const float4 without = upsample(grid, shaded, positions, normals, x, y, voxel_m);
-        const Volume volume = VOLUME_OF_PARAMETERS;
-        const Objects things = OBJECTS_OF_PARAMETERS(0.0f);
-        const Arriving arrives = LIGHT_OF_PARAMETERS;
-        const float3 taken = taken_from_real(volume, things, arrives, ball, positions[pixel].xyz, normals[pixel].xyz,
-                                             direction_set(y, x), direction_subset(y, x, every), every, 0, 1, 0);
-        const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
+        const Volume volume = SOLIDS_OF_SCENE;
+        const Objects things = OBJECTS_OF_SCENE(0.0f);
+        const Arriving arrives = ARRIVING_UNCHANGED;
+        const float4 without = upsample(scene.samples, shaded, positions, normals, x, y, volume.voxel_m);
+        const float3 taken = taken_from_real(volume, things, arrives, scene.objects.ball, positions[pixel].xyz, normals[pixel].xyz,
+                                             direction_set(y, x), direction_subset(y, x, scene.every), scene.every, 0, 1, 0);
+        const float3 floor = LEAST_SHADING * 0.28209479f * coefficients_of(scene.light, light_table)[0].xyz + 1e-9f;
         result = (float4)(fmax(without.xyz - taken, floor) / fmax(without.xyz, floor), without.w);
     }
     ratio[pixel] = result;

@@ -20,19 +20,21 @@ static inline void copy_codes(global const uchar *shown, global uchar *picture, 
 
 // shown [h][w][3]: the camera picture as sRGB codes. codes [65536]: sRGB code of linear radiance i / 65535.
 // One item LANES pixels of a row -> picture [h][w][3] sRGB. A pixel that nothing virtual touches is the camera's, byte for byte.
-kernel void composite(MIXTURE_ARGUMENTS, global const uchar *shown, global const uchar *codes, global uchar *picture) {
+kernel void composite(const MixtureParameters parameters, MIXTURE_BUFFERS, global const uchar *shown, global const uchar *codes, global uchar *picture) {
     const int first = get_global_id(0) * LANES;
     const int y = get_global_id(1);
-    if (first >= width || y >= height) return;
-    if (first + LANES <= width && !may_change(MIXTURE, first, y)) {
+    const int width = parameters.real_samples.width;
+    if (first >= width || y >= parameters.height) return;
+    const Mixture mixture = MIXTURE_OF_BUFFERS(parameters);
+    if (first + LANES <= width && !may_change(mixture, first, y)) {
         copy_codes(shown, picture, y * width + first);
         return;
     }
     float4 factors[LANES];
-    factors_of(MIXTURE, first, y, factors);
+    factors_of(mixture, first, y, factors);
     for (int x = first; x < min(first + LANES, width); x++) {
         const int pixel = y * width + x;
-        const Mixed mixed = mixed_at(MIXTURE, x, y, factors[x - first]);
+        const Mixed mixed = mixed_at(mixture, x, y, factors[x - first]);
         float3 color = radiance[pixel].xyz;
         if (mixed.is_touched) color = color * mixed.factor;
         if (mixed.part > 0.0f) color = color + mixed.part * (mixed.own - color);

@@ -7,66 +7,70 @@
 #include "direction_sets.clh"
 #include "open_shading.clh"
 #include "real_shading.clh"
+#include "samples.clh"
 #include "shadows.clh"
 
 // Real surface: the ratio R' / R of shading with virtual objects to shading without, at the samples of the transfer.
-// transfer [rows][cols][COEFFICIENTS]; hits [rows][cols]: see indirect.cl; light [COEFFICIENTS] rgb.
-// ball: center and radius of a ball around all objects.
+// transfer [rows][cols][COEFFICIENTS]; hits [rows][cols]: see indirect.cl.
 // -> ratio [rows][cols] (rgb, w = 1), shaded [rows][cols] (rgb of R, w = 1); w = 0 where there is no surface. R is whole where nothing
 // is taken too: other parts of the light (shadow_map.cl), bounces and refined pixels (adaptive.cl) are set against it.
-kernel void shadow_real(SAMPLE_PARAMETERS, global const float *transfer, global const float4 *hits, global const float4 *light,
-                        SCENE_PARAMETERS, const float4 ball, global float4 *ratio, global float4 *shaded) {
+kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, global const float *transfer, global const float4 *hits,
+                        global float4 *ratio, global float4 *shaded) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
-    if (col >= cols || row >= rows) return;
-    const int sample = row * cols + col;
-    const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
+    const Grid grid = scene.samples;
+    if (col >= grid.cols || row >= grid.rows) return;
+    const int sample = row * grid.cols + col;
+    const int pixel = sample_pixel(grid, row, col);
     const float4 normal = normals[pixel], position = positions[pixel];
     if (position.w <= 0.0f || normal.w <= 0.0f) {
         ratio[sample] = shaded[sample] = (float4)(0.0f);
         return;
     }
-    const Volume volume = VOLUME_OF_PARAMETERS;
-    const Objects things = OBJECTS_OF_PARAMETERS(0.0f);
-    const Arriving arrives = LIGHT_OF_PARAMETERS;
+    const Volume volume = SOLIDS_OF_SCENE;
+    const Objects things = OBJECTS_OF_SCENE(0.0f);
+    const Arriving arrives = ARRIVING_UNCHANGED;
+    global const float4 *light = coefficients_of(scene.light, light_table);
     global const uint *free = free_mask + sample * MASK_WORDS;
     global const uchar *own = sets + sample * INTERLEAVE;
     float3 without = (float3)(0.0f);
     for (int i = 0; i < COEFFICIENTS; i++) without += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
     without = shading_without(arrives, position.xyz, normal.xyz, without, openness[sample], hits[sample], own, free);
-    const float3 taken = taken_from_real(volume, things, arrives, ball, position.xyz, normal.xyz, 0, 0, 1, own, INTERLEAVE, free);
+    const float3 taken = taken_from_real(volume, things, arrives, scene.objects.ball, position.xyz, normal.xyz, 0, 0, 1, own, INTERLEAVE, free);
     const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
     ratio[sample] = (float4)(fmax(without - taken, floor) / fmax(without, floor), 1.0f);
     shaded[sample] = (float4)(without, 1.0f);
 }
 
 // What a sample of real surface gains from other real surface whose own shading virtual objects changed (eq. 7.6: R'_ID - R_ID),
-// added to the ratio. It follows every `every`-th of its hidden directions, beginning with another one than its neighbours do.
+// added to the ratio. It follows every `scene.every`-th of its hidden directions, beginning with another one than its neighbours do.
 // ratio, shaded [rows][cols]: of shadow_real; changed: that ratio. returned: the most that what a hidden direction brings can change
 // by; a sample that this can change by no more than `spare` of `least` [rows][cols], which is no more than `shaded`, follows none.
 // -> bounced [rows][cols] (rgb, w = 1), w = 0 as in ratio.
-kernel void bounce_real(SAMPLE_PARAMETERS, global const float4 *light, SCENE_PARAMETERS, const int every,
-                        global const float4 *shaded, const float returned, const float spare, global const float4 *least,
-                        global float4 *bounced) {
+kernel void bounce_real(SURROUNDINGS_PARAMETERS, SAMPLE_BUFFERS, global const float4 *shaded, const float returned,
+                        const float spare, global const float4 *least, global float4 *bounced) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
-    if (col >= cols || row >= rows) return;
-    const int sample = row * cols + col;
-    const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
+    const Grid grid = scene.samples;
+    if (col >= grid.cols || row >= grid.rows) return;
+    const int sample = row * grid.cols + col;
+    const int pixel = sample_pixel(grid, row, col);
     const float4 normal = normals[pixel], before = changed_ratio[sample];
     if (before.w <= 0.0f) {
         bounced[sample] = before;
         return;
     }
-    const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
+    const float3 floor = LEAST_SHADING * 0.28209479f * coefficients_of(scene.light, light_table)[0].xyz + 1e-9f;
     const float3 counts = fmax(least[sample].xyz, floor);
     const float part_hidden = clamp(1.0f - openness[sample], 0.0f, 1.0f);
     if (part_hidden == 0.0f || part_hidden * returned <= spare * fmin(fmin(counts.x, counts.y), counts.z)) {
         bounced[sample] = before;
         return;
     }
-    const Volume volume = VOLUME_OF_PARAMETERS;
-    const Arriving arrives = LIGHT_OF_PARAMETERS;
+    const Volume volume = SOLIDS_OF_SCENE;
+    const Arriving arrives = ARRIVING_OF_SCENE;
+    const int count = arrives.count, every = scene.every;
+    const float voxel_m = volume.voxel_m;
     const float3 origin = positions[pixel].xyz + voxel_m * normal.xyz;
     float4 sum = (float4)(0.0f);
     int chosen[LANES];
@@ -93,34 +97,33 @@ kernel void bounce_real(SAMPLE_PARAMETERS, global const float4 *light, SCENE_PAR
     bounced[sample] = (float4)(fmax(before.xyz * without + gained, floor) / without, 1.0f);
 }
 
-// Virtual surface: the radiance that real and virtual occluders take from it, at every `stride`-th pixel it covers.
+// Virtual surface: the radiance that real and virtual occluders take from it, at the samples that it covers.
 // positions, normals [h][w] (w = 1 where covered), shown [h][w] (which object, -1 none): the virtual geometry buffer.
-// every: of how many directions of its set a sample traces one, its neighbours others. -> occluded [rows][cols] (rgb, w = 1 valid).
-kernel void shadow_virtual(const int cols, const int rows, const int stride, const int width,
-                           global const float4 *positions, global const float4 *normals, global const int *shown,
-                           SCENE_PARAMETERS, const int every, global float4 *occluded) {
+// scene.every: of how many directions of its set a sample traces one, its neighbours others. -> occluded [rows][cols] (rgb, w = 1 valid).
+kernel void shadow_virtual(SCENE_PARAMETERS, global const float4 *positions, global const float4 *normals, global const int *shown,
+                           global float4 *occluded) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
-    if (col >= cols || row >= rows) return;
-    const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
-    const Volume volume = VOLUME_OF_PARAMETERS;
-    const Objects things = OBJECTS_OF_PARAMETERS(own_offset_m(objects, grid_from_volume, shown[pixel]));
-    const Arriving arrives = LIGHT_OF_PARAMETERS;
-    occluded[row * cols + col] = taken_from_virtual(volume, things, arrives, positions[pixel], normals[pixel].xyz, direction_set(row, col),
-                                                    direction_subset(row, col, every), every);
+    const Grid grid = scene.samples;
+    if (col >= grid.cols || row >= grid.rows) return;
+    const int pixel = sample_pixel(grid, row, col);
+    const Volume volume = VOLUME_OF_SCENE;
+    const Objects things = OBJECTS_OF_SCENE(own_offset_m(scene.objects.count, grids_of(object_table), shown[pixel]));
+    const Arriving arrives = ARRIVING_OF_SCENE;
+    occluded[row * grid.cols + col] = taken_from_virtual(volume, things, arrives, positions[pixel], normals[pixel].xyz, direction_set(row, col),
+                                                    direction_subset(row, col, scene.every), scene.every);
 }
 
 // Points on virtual objects: what they send. points, normals (volume space), albedos [points_count] -> radiances [points_count] (rgb).
 // offsets_m [points_count]: how far off the surface rays begin.
-kernel void light_points(const int points_count, global const float4 *points, global const float4 *normals,
-                         global const float4 *albedos, global const float *offsets_m, global const float4 *light,
-                         SCENE_PARAMETERS, global float4 *radiances) {
+kernel void light_points(SCENE_PARAMETERS, const int points_count, global const float4 *points, global const float4 *normals,
+                         global const float4 *albedos, global const float *offsets_m, global float4 *radiances) {
     const int index = get_global_id(0);
     if (index >= points_count) return;
-    const Volume volume = VOLUME_OF_PARAMETERS;
-    const Objects things = OBJECTS_OF_PARAMETERS(offsets_m[index]);
-    const Arriving arrives = LIGHT_OF_PARAMETERS;
+    const Volume volume = VOLUME_OF_SCENE;
+    const Objects things = OBJECTS_OF_SCENE(offsets_m[index]);
+    const Arriving arrives = ARRIVING_OF_SCENE;
     const float3 normal = normals[index].xyz;
     const float4 taken = taken_from_virtual(volume, things, arrives, points[index], normal, direction_set(index >> 3, index & 7), 0, 1);
-    radiances[index] = (float4)(albedos[index].xyz * fmax(open_shading(normal, light) - taken.xyz, 0.0f), 1.0f);
+    radiances[index] = (float4)(albedos[index].xyz * fmax(open_shading(normal, coefficients_of(scene.light, light_table)) - taken.xyz, 0.0f), 1.0f);
 }

@@ -31,27 +31,34 @@ static inline void clear(global uchar4 *virtual_layer, global ushort *virtual_de
 }
 
 // codes [65536]: sRGB code of linear radiance i / 65535; depth_scale_m: metres of a unit of depth.
-// One item LANES pixels of a row -> virtual_layer [h][w]: sRGB codes and coverage, 255: all; virtual_depth [h][w] of the
-// surface that the colour is of, or none of the two without HAS_OBJECTS. ratio_layer [h][w][3]: codes of factors; real_depth
-// [h][w] of all real surface, or none of the two without HAS_SHADOWS.
-kernel void compose_layer(MIXTURE_ARGUMENTS, const float depth_scale_m, global const uchar *codes, global uchar4 *virtual_layer,
-                          global ushort *virtual_depth, global uchar *ratio_layer, global ushort *real_depth) {
+// One item LANES pixels of a row -> layer, a buffer of four arrays. virtual_layer [h][w]: sRGB codes and coverage, 255: all;
+// virtual_depth [h][w] of the surface that the colour is of; neither is written without HAS_OBJECTS. ratio_layer [h][w][3]: codes of
+// factors; real_depth [h][w] of all real surface; neither is written without HAS_SHADOWS.
+kernel void compose_layer(const LayerParameters parameters, MIXTURE_BUFFERS, global const uchar *codes, global uchar *layer) {
     const int first = get_global_id(0) * LANES;
     const int y = get_global_id(1);
-    if (first >= width || y >= height) return;
+    const int width = parameters.mixture.real_samples.width;
+    if (first >= width || y >= parameters.mixture.height) return;
+    const Mixture mixture = MIXTURE_OF_BUFFERS(parameters.mixture);
+    const float16 camera_from_volume = parameters.mixture.camera_from_volume;
+    const float depth_scale_m = parameters.depth_scale_m;
+    global uchar4 *virtual_layer = (global uchar4 *)layer;
+    global ushort *virtual_depth = (global ushort *)(layer + parameters.virtual_depth_at);
+    global uchar *ratio_layer = layer + parameters.ratio_at;
     const int end = min(first + LANES, width);
     for (int x = first; x < end; x++) {
         clear(virtual_layer, virtual_depth, ratio_layer, y * width + x);
 #ifdef HAS_SHADOWS
+        global ushort *real_depth = (global ushort *)(layer + parameters.real_depth_at);
         real_depth[y * width + x] = depth_at(positions, y * width + x, camera_from_volume, depth_scale_m);
 #endif
     }
-    if (first + LANES <= width && !may_change(MIXTURE, first, y)) return;
+    if (first + LANES <= width && !may_change(mixture, first, y)) return;
     float4 factors[LANES];
-    factors_of(MIXTURE, first, y, factors);
+    factors_of(mixture, first, y, factors);
     for (int x = first; x < end; x++) {
         const int pixel = y * width + x;
-        const Mixed mixed = mixed_at(MIXTURE, x, y, factors[x - first]);
+        const Mixed mixed = mixed_at(mixture, x, y, factors[x - first]);
 #ifdef HAS_SHADOWS
         if (mixed.is_touched) {
             ratio_layer[3 * pixel] = ratio_code(mixed.factor.x);

@@ -63,30 +63,30 @@ static float3 mean_arriving(const Volume volume, const Objects things, const Arr
 }
 
 // positions, normals, base_colors, materials [h][w] (w = 1 where covered): the virtual geometry buffer, materials: roughness, metalness.
-// eye: where the camera is, volume metres. light [COEFFICIENTS].
+// The scene's samples are the pixels.
 // -> reflected [h][w]: radiance to add (rgb) and what remains of the diffuse one (w); (0, 0, 0, 1) for what is matt.
-kernel void reflect_surroundings(const int width, const int height, global const float4 *positions, global const float4 *normals,
-                                 global const float4 *base_colors, global const float4 *materials, const float4 eye,
-                                 const float least_gloss, global const float4 *light, SCENE_PARAMETERS, global const int *shown,
-                                 global float4 *reflected) {
+kernel void reflect_surroundings(const ReflectionParameters parameters, SCENE_BUFFERS, global const float4 *positions,
+                                 global const float4 *normals, global const float4 *base_colors, global const float4 *materials,
+                                 global const int *shown, global float4 *reflected) {
     const int x = get_global_id(0);
     const int y = get_global_id(1);
-    if (x >= width || y >= height) return;
-    const int pixel = y * width + x;
+    const SceneParameters scene = parameters.scene;
+    if (x >= scene.samples.cols || y >= scene.samples.rows) return;
+    const int pixel = y * scene.samples.width + x;
     const float4 position = positions[pixel], material = materials[pixel];
     float4 result = (float4)(0.0f, 0.0f, 0.0f, 1.0f);
-    if (position.w > 0.0f && fmax(1.0f - material.x, material.y) >= least_gloss) {
-        const Volume volume = VOLUME_OF_PARAMETERS;
-        const Objects things = OBJECTS_OF_PARAMETERS(own_offset_m(objects, grid_from_volume, shown[pixel]));
-        const Arriving arrives = LIGHT_OF_PARAMETERS;
-        const float3 normal = normals[pixel].xyz, back = normalize(eye.xyz - position.xyz);
+    if (position.w > 0.0f && fmax(1.0f - material.x, material.y) >= parameters.least_gloss) {
+        const Volume volume = VOLUME_OF_SCENE;
+        const Objects things = OBJECTS_OF_SCENE(own_offset_m(scene.objects.count, grids_of(object_table), shown[pixel]));
+        const Arriving arrives = ARRIVING_OF_SCENE;
+        const float3 normal = normals[pixel].xyz, back = normalize(parameters.eye.xyz - position.xyz);
         const float cosine = clamp(dot(normal, back), 0.0f, 1.0f), metal = clamp(material.y, 0.0f, 1.0f);
         const float3 head_on = (1.0f - metal) * (float3)(0.04f) + metal * base_colors[pixel].xyz;
         const float2 share = reflected_share(material.x, cosine);
         // Light that leaves microfacets only after several of them is lost to the fit; Turquin (2019) gives it back.
         const float3 gloss = clamp((share.x + share.y * head_on) * (1.0f + head_on * (1.0f / (share.x + share.y) - 1.0f)), 0.0f, 1.0f);
         const float turn = GOLDEN * ((y & 3) * 4 + (x & 3));
-        const float3 arriving = mean_arriving(volume, things, arrives, light, position.xyz, normal, 2.0f * dot(normal, back) * normal - back,
+        const float3 arriving = mean_arriving(volume, things, arrives, whole_light_of(scene.light, light_table), position.xyz, normal, 2.0f * dot(normal, back) * normal - back,
                                               material.x * material.x, turn);
         const float dielectric = clamp(share.x + 0.04f * share.y, 0.0f, 1.0f);
         result = (float4)(gloss * arriving, (1.0f - metal) * (1.0f - dielectric));

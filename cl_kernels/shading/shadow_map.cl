@@ -1,12 +1,13 @@
 // Shadow maps along the sharp lights of a room and what these lights bring past them (thesis 7.2.3, fig. 7.7).
 // Provides begin_maps, halve_maps, trace_discs, light_virtual, light_real, light_glow, light_samples, mix_direct,
 // unmix_direct.
+#include "arriving.clh"
 #include "camera.clh"
 #include "clear_origin.clh"
-#include "continued.clh"
 #include "direct_lights.clh"
 #include "direct_mix.clh"
 #include "rays.clh"
+#include "samples.clh"
 #include "sampled_value.clh"
 #include "upsample_row.clh"
 
@@ -41,12 +42,8 @@ kernel void halve_maps(const int count, const int level, global float2 *maps) {
 }
 
 #define TRACE_PARAMETERS \
-    const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid, global const uchar *octets, \
-        global const float2 *voxels, const float voxel_m, const float truncation_m, const float reach_m, const int plane_count, \
-        global const float4 *planes, global const int4 *shapes, global const uchar *plane_maps, const float cell_m, \
-        const float least_m, global const float2 *ray_places
-#define VOLUME_OF_TRACE make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels)
-#define PLANES_OF_TRACE {plane_count, planes, shapes, plane_maps, cell_m, least_m}
+    VOLUME_PARAMETERS, const LightParameters lit, global const uchar *light_table, global const float2 *ray_places
+#define PLANES_OF_TRACE make_continued(lit, light_table)
 
 // The part of what a disc brings to the surface that real things leave, along RAYS rays to places [RAYS] in the unit disc. axes: of
 // the disc, as DirectLights has them.
@@ -93,23 +90,22 @@ static float4 real_parts(const Volume volume, const Continued continued, const f
     return vload4(0, parts);
 }
 
-// Samples of a surface, every `stride` pixels: positions, normals [h][w] (w = 0 without surface). ray_places [RAY_SETS][RAYS].
+// Samples of a surface: positions, normals [h][w] (w = 0 without surface). ray_places [RAY_SETS][RAYS].
 // -> parts [rows][cols]: of what each disc brings, the part that real things leave (xyz: discs 0 to 2, w = 1 valid).
-kernel void trace_discs(const int cols, const int rows, const int stride, const int width, global const float4 *positions,
-                        global const float4 *normals, const int is_virtual, DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *parts) {
+kernel void trace_discs(const Grid grid, global const float4 *positions, global const float4 *normals, const int is_virtual, DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *parts) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
-    if (col >= cols || row >= rows) return;
-    const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
+    if (col >= grid.cols || row >= grid.rows) return;
+    const int pixel = sample_pixel(grid, row, col);
     const float4 position = positions[pixel], normal = normals[pixel];
-    const Volume volume = VOLUME_OF_TRACE;
+    const Volume volume = VOLUME_OF_PARAMETERS;
     const Continued continued = PLANES_OF_TRACE;
     const DirectLights lights = DIRECT_OF_PARAMETERS;
     float4 result = (float4)(0.0f);
     if (position.w > 0.0f && normal.w > 0.0f)
-        result = real_parts(volume, continued, reach_m, lights, position.xyz, normal.xyz, is_virtual,
+        result = real_parts(volume, continued, lit.reach_m, lights, position.xyz, normal.xyz, is_virtual,
                             ray_places + RAYS * ((row & 3) * 4 + (col & 3)));
-    parts[row * cols + col] = result;
+    parts[row * grid.cols + col] = result;
 }
 
 // The first three of four of LANES neighbours from vectors[i] on, those past `last` 0; `known` where w > 0.
@@ -146,19 +142,17 @@ static inline void store_vectors(const Vectors v, const float w, const int i, co
 
 // positions, normals [h][w] (w = 1 where covered): the virtual geometry buffer; parts [rows][cols]: of trace_discs. One item LANES
 // pixels of a row of `around` (x0 y0 x1 y1, half-open). -> direct [h][w]: what reaches white surface, 0 where there is none.
-kernel void light_virtual(const int width, const int4 around, global const float4 *positions, global const float4 *normals,
-                          const int cols, const int rows, const int stride, global const float4 *parts, const float tolerance_m,
-                          DIRECT_PARAMETERS, global float4 *direct) {
+kernel void light_virtual(const Grid grid, const int4 around, global const float4 *positions, global const float4 *normals,
+                          global const float4 *parts, const float tolerance_m, DIRECT_PARAMETERS, global float4 *direct) {
     const int x = around.x + get_global_id(0) * LANES;
     const int y = around.y + get_global_id(1);
     if (x >= around.z || y >= around.w) return;
-    const int pixel = y * width + x, last = y * width + around.z - 1;
+    const int pixel = y * grid.width + x, last = y * grid.width + around.z - 1;
     intn covered;
     neighbours(positions, pixel, last, &covered);
     Vectors with = {0.0f, 0.0f, 0.0f};
     if (ANY(covered)) {
         const DirectLights lights = DIRECT_OF_PARAMETERS;
-        const Grid grid = {cols, rows, stride, width};
         const Row row = row_from(grid, positions, normals, x, y);
         intn found;
         Vectors left = upsample_row(grid, parts, positions, normals, row, tolerance_m, &found);
@@ -184,24 +178,23 @@ static inline intn touched_lanes(global const uchar *touched, const int cols, co
 }
 
 // positions, normals [h][w]: real surface; parts [rows][cols]: of trace_discs; ratio, rest [rows][cols], refined [h][w]: R' / R and R
-// of the rest of the light, see composite.cl; touched: of change_mask.cl for `ratio`; least: see direct_mix.clh. One item LANES pixels
+// of the rest of the light, see composite.cl; touched: of change_mask.cl for `ratio`. One item LANES pixels
 // -> mixed [h][w]: R' / R of all of the light (rgb), w = 1 where it may be other than 1, else all 0.
-kernel void light_real(const int width, const int height, global const float4 *positions, global const float4 *normals,
-                       const int cols, const int rows, const int stride, global const float4 *parts, const float tolerance_m,
-                       global const float4 *ratio, const int has_refined, global const float4 *refined, global const float4 *rest,
-                       global const uchar *touched, const float4 least, DIRECT_PARAMETERS, global float4 *mixed) {
+kernel void light_real(const Grid grid, const int height, global const float4 *positions, global const float4 *normals,
+                       global const float4 *parts, const float tolerance_m, global const float4 *ratio, const int has_refined, global const float4 *refined, global const float4 *rest,
+                       global const uchar *touched, DIRECT_PARAMETERS, global float4 *mixed) {
     const int x = get_global_id(0) * LANES;
     const int y = get_global_id(1);
+    const int width = grid.width;
     if (x >= width || y >= height) return;
     const int pixel = y * width + x, last = y * width + width - 1;
     const DirectLights lights = DIRECT_OF_PARAMETERS;
-    const Grid grid = {cols, rows, stride, width};
     intn surface, faced;
     const Vectors position = neighbours(positions, pixel, last, &surface), normal = neighbours(normals, pixel, last, &faced);
     surface &= faced;
     floatn ahead[MOST_LIGHTS];
     intn wanted = objects_ahead_of_all(lights, position, normal, 0, surface, ahead);
-    wanted = surface & (wanted | touched_lanes(touched, cols, stride, x, y, width));
+    wanted = surface & (wanted | touched_lanes(touched, grid.cols, grid.stride, x, y, width));
     if (!ANY(wanted)) {
         const Vectors nothing = {0.0f, 0.0f, 0.0f};
         store_vectors(nothing, 0.0f, pixel, last, mixed);
@@ -212,7 +205,7 @@ kernel void light_real(const int width, const int height, global const float4 *p
     Vectors sums[3] = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};  // of R of the rest, what real things leave, R' / R
     for (int i = row.first.y; i <= row.last.y; i++) {
         for (int j = row.first.x; j <= row.last.x; j++) {
-            const int sample = i * cols + j;
+            const int sample = i * grid.cols + j;
             const float4 values[3] = {rest[sample], parts[sample], ratio[sample]};
             if (values[0].w <= 0.0f) continue;
             const floatn weight = weights_of(grid, positions, normals, row, i, j, tolerance_m);
@@ -244,7 +237,7 @@ kernel void light_real(const int width, const int height, global const float4 *p
             if (has_refined && refined[pixel + lane].w > 0.0f)
 #endif
                 mean = value_at(grid, ratio, refined, has_refined, positions, normals, x + lane, y, height, tolerance_m);
-            result = (float4)(mixed_ratio(mean.xyz, of_rest[lane].xyz, without[lane].xyz, with[lane].xyz, least.xyz),
+            result = (float4)(mixed_ratio(mean.xyz, of_rest[lane].xyz, without[lane].xyz, with[lane].xyz, discs.least.xyz),
                               valid[lane] ? mean.w : 0.0f);
         }
         mixed[pixel + lane] = result;
@@ -257,13 +250,13 @@ kernel void light_glow(const int points_count, global const float4 *points, glob
                        DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *radiances) {
     const int first = get_global_id(0) * LANES;
     if (first >= points_count) return;
-    const Volume volume = VOLUME_OF_TRACE;
+    const Volume volume = VOLUME_OF_PARAMETERS;
     const Continued continued = PLANES_OF_TRACE;
     const DirectLights lights = DIRECT_OF_PARAMETERS;
     float left[3][LANES];
     for (int lane = 0; lane < LANES; lane++) {
         const int index = min(first + lane, points_count - 1);
-        const float4 parts = real_parts(volume, continued, reach_m, lights, points[index].xyz, normals[index].xyz, 1,
+        const float4 parts = real_parts(volume, continued, lit.reach_m, lights, points[index].xyz, normals[index].xyz, 1,
                                         ray_places + RAYS * (index & 15));
         left[0][lane] = parts.x, left[1][lane] = parts.y, left[2][lane] = parts.z;
     }
@@ -279,18 +272,17 @@ kernel void light_glow(const int points_count, global const float4 *points, glob
         radiances[first + lane].xyz += albedos[first + lane].xyz * with[lane].xyz;
 }
 
-// Samples of real surface, every `stride` pixels: positions, normals [h][w]; parts [rows][cols]: of trace_discs. One item LANES samples
+// Samples of real surface: positions, normals [h][w]; parts [rows][cols]: of trace_discs. One item LANES samples
 // -> without, with [rows][cols]: what the discs bring to white surface without and with objects (rgb).
-kernel void light_samples(const int cols, const int rows, const int stride, const int width, global const float4 *positions,
-                          global const float4 *normals, global const float4 *parts, DIRECT_PARAMETERS,
+kernel void light_samples(const Grid grid, global const float4 *positions, global const float4 *normals, global const float4 *parts, DIRECT_PARAMETERS,
                           global float4 *without, global float4 *with) {
     const int col = get_global_id(0) * LANES;
     const int row = get_global_id(1);
-    if (col >= cols || row >= rows) return;
-    const int sample = row * cols + col, last = row * cols + cols - 1;
+    if (col >= grid.cols || row >= grid.rows) return;
+    const int sample = row * grid.cols + col, last = row * grid.cols + grid.cols - 1;
     float4 at[LANES], facing[LANES];
     for (int lane = 0; lane < LANES; lane++) {
-        const int pixel = (stride / 2 + row * stride) * width + stride / 2 + min(col + lane, cols - 1) * stride;
+        const int pixel = sample_pixel(grid, row, min(col + lane, grid.cols - 1));
         at[lane] = positions[pixel], facing[lane] = normals[pixel];
     }
     const Vectors position = from_lanes(at), normal = from_lanes(facing);

@@ -18,27 +18,25 @@ static inline float slope_of(const float pixel, const float per_pixel) {
 // Where the lines of sight of auxiliary views first meet a solid voxel: what is behind it, as seen from there, gets no light from
 // there. One item LANES pixels of a row of views[get_global_id(2)]. axes [views][3]: right, down and forward, unit, volume space; a
 // view's eye is distance_m before center. per_pixel: slope of a pixel. -> depths [view][SIDE][SIDE]: metres along the axis, 0 = none.
-kernel void draw_views(const int count, global const int *views, const int4 bricks, global const int *slots, global const uchar *gaps,
-                       global const ulong *solid, global const uchar *octets, global const float2 *voxels, const float voxel_m,
-                       const float truncation_m, const float4 center, const float distance_m, const float per_pixel,
+kernel void draw_views(const int count, global const int *views, VOLUME_PARAMETERS, const float4 center, const float distance_m, const float per_pixel,
                        global const float4 *axes, global float *depths) {
     const int x = get_global_id(0) * LANES;
     const int y = get_global_id(1);
     if (x >= SIDE || y >= SIDE || (int)get_global_id(2) >= count) return;
     const int view = views[get_global_id(2)];
     const float4 right = axes[3 * view], down = axes[3 * view + 1], ahead = axes[3 * view + 2];
-    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
+    const Volume volume = VOLUME_OF_PARAMETERS;
     const floatn across = (CONVERT_FLOATN(x + CONVERT_INTN(LANE_NUMBERS)) - 0.5f * (SIDE - 1)) * per_pixel;
     const float4 middle = ahead + slope_of(y, per_pixel) * down;
     const floatn shorten = 1.0f / sqrt(across * across + dot(middle, middle));
     const Vectors direction = {(middle.x + across * right.x) * shorten, (middle.y + across * right.y) * shorten,
                                (middle.z + across * right.z) * shorten};
-    const Rays rays = make_rays((center.xyz - distance_m * ahead.xyz) / voxel_m, direction);
+    const Rays rays = make_rays((center.xyz - distance_m * ahead.xyz) / shape.voxel_m, direction);
     floatn begin, end;
     clip_rays(volume, rays, &begin, &end);
     const floatn t = find_solid_voxels(volume, rays, begin, end);
     float found[LANES];
-    STORE_LANES((MASK(t < end) & MASK(begin < end)) ? t * shorten * voxel_m : 0.0f, found);
+    STORE_LANES((MASK(t < end) & MASK(begin < end)) ? t * shorten * shape.voxel_m : 0.0f, found);
     for (int lane = 0; lane < min(LANES, SIDE - x); lane++) depths[(view * SIDE + y) * SIDE + x + lane] = found[lane];
 }
 

@@ -2,6 +2,7 @@
 // Provides measure_depths, smooth_normals, transfer_from_views.
 #include "camera.clh"
 #include "direction_sets.clh"
+#include "samples.clh"
 #include "sh.clh"
 #include "smooth_normal.clh"
 #include "lanes.clh"
@@ -125,20 +126,19 @@ kernel void smooth_normals(const int cols, const int rows, const int stride, con
 // camera_from_volume, intrinsics: the camera's picture, looked into at `steps` distances, which lie within near_m, and at `further`
 // ones where there is something that the volume does not know. starts [4][count]: distance of a direction's first sample in metres,
 // for the 2 x 2 pattern of jitter. inverse_threshold: 1 / chi.
-kernel void transfer_from_views(const int cols, const int rows, const int stride, const int width, const int height,
-                                global const float4 *positions, global const float4 *sample_normals, const float voxel_m,
-                                global const uint *lit, global const float *camera_depths, const float16 camera_from_volume,
-                                const float4 intrinsics, const int count, const int first_set, global const float4 *directions,
-                                global const float *basis,
-                                global const float *starts, const float ratio, const int steps, const int further,
-                                global const int *any_unknown, const float near_m, const float reach_m, const float slack,
-                                const float lift_m, const float inverse_threshold,
-                                global float *transfer, global float *openness, global float *flatness, global uint *free_mask) {
+kernel void transfer_from_views(const ViewTransferParameters parameters, global const float4 *positions,
+                                global const float4 *sample_normals, global const uint *lit, global const float *camera_depths,
+                                global const float4 *directions, global const float *basis, global const float *starts,
+                                global const int *any_unknown, global float *transfer, global float *openness,
+                                global float *flatness, global uint *free_mask) {
+    const Grid grid = parameters.grid;
+    const int count = parameters.count;
+    const float voxel_m = parameters.voxel_m;
     const int col = get_global_id(0);
     const int row = get_global_id(1);
-    if (col >= cols || row >= rows) return;
-    const int sample = row * cols + col;
-    const float4 position = positions[(stride / 2 + row * stride) * width + stride / 2 + col * stride];
+    if (col >= grid.cols || row >= grid.rows) return;
+    const int sample = row * grid.cols + col;
+    const float4 position = positions[sample_pixel(grid, row, col)];
     const float4 normal = sample_normals[sample];
     const int valid = normal.w > 0.0f;
 
@@ -152,13 +152,13 @@ kernel void transfer_from_views(const int cols, const int rows, const int stride
         sh_basis(normal.xyz, t);
         for (int l = 0; l < BANDS; l++)
             for (int i = l * l; i < (l + 1) * (l + 1); i++) t[i] *= lambert_band(l);
-        const int set = (first_set + direction_set(row, col)) * count;
+        const int set = (parameters.first_set + direction_set(row, col)) * count;
         float open[DIRECTIONS];
         for (int j = 0; j < count; j++) open[j] = (lit[sample * MASK_WORDS + (j >> 5)] >> (j & 31)) & 1;
-        const View camera = {camera_from_volume, intrinsics, width, height, camera_depths};
+        const View camera = {parameters.camera_from_volume, parameters.intrinsics, grid.width, parameters.height, camera_depths};
         look_near(camera, position.xyz + voxel_m * normal.xyz, position.xyz, normal.xyz, count, directions + set,
-                  starts + ((row & 1) * 2 + (col & 1)) * count, ratio, *any_unknown ? further : steps, near_m,
-                  reach_m, voxel_m, voxel_m, slack, inverse_threshold, open);
+                  starts + ((row & 1) * 2 + (col & 1)) * count, parameters.ratio, *any_unknown ? parameters.further : parameters.steps,
+                  parameters.near_m, parameters.reach_m, voxel_m, voxel_m, parameters.slack, parameters.inverse_threshold, open);
         for (int j = 0; j < count; j++) {
             const float4 direction = directions[set + j];
             const float share = fmax(dot(normal.xyz, direction.xyz), 0.0f) * direction.w * M_1_PI_F;

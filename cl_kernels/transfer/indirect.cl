@@ -14,9 +14,7 @@
 // times `every`.
 kernel void gather_hits(const int cols, const int rows, const int stride, const int width, global const float4 *positions,
                         global const float4 *normals, global const uint *free_mask, global const uchar *sets,
-                        const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid,
-                        global const uchar *octets, global const float2 *voxels, const float voxel_m, const float truncation_m,
-                        global const uint *colors, const int count, global const float4 *directions, const float reach_m,
+                        VOLUME_PARAMETERS, global const uint *colors, const int count, global const float4 *directions, const float reach_m,
                         const int every, const float least_cosine, global float4 *hits) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
@@ -24,10 +22,10 @@ kernel void gather_hits(const int cols, const int rows, const int stride, const 
     const int sample = row * cols + col;
     const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
     const float4 position = positions[pixel], normal = normals[pixel];
-    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
+    const Volume volume = VOLUME_OF_PARAMETERS;
     float4 sum = (float4)(0.0f);
     if (position.w > 0.0f && normal.w > 0.0f) {
-        const float3 origin_m = position.xyz + voxel_m * normal.xyz;
+        const float3 origin_m = position.xyz + shape.voxel_m * normal.xyz;
         int chosen[LANES];
         int waiting = 0, met = (col + 2 * row) % every;
         for (int j = 0; j < count; j++) {
@@ -40,14 +38,14 @@ kernel void gather_hits(const int cols, const int rows, const int stride, const 
             const Rays rays = volume_rays(volume, origin_m, directions, chosen);
             floatn begin, end;
             clip_rays(volume, rays, &begin, &end);
-            end = fmin(end, reach_m / voxel_m);
+            end = fmin(end, reach_m / shape.voxel_m);
             const floatn t = find_solid_voxels(volume, rays, begin, end);
             float distance[LANES];
             STORE_LANES(t < end ? t : -1.0f, distance);
             for (int lane = 0; lane < waiting; lane++) {
                 if (distance[lane] < 0.0f) continue;
                 const float3 direction = directions[chosen[lane]].xyz;
-                const float4 color = color_at(volume, colors, origin_m / voxel_m + distance[lane] * direction);
+                const float4 color = color_at(volume, colors, origin_m / shape.voxel_m + distance[lane] * direction);
                 sum += color.w * dot(normal.xyz, direction) * (float4)(color.xyz, 1.0f);
             }
             waiting = 0;

@@ -5,6 +5,7 @@
 #endif
 #include "direction_sets.clh"
 #include "hemisphere.clh"
+#include "samples.clh"
 #include "sh.clh"
 #include "smooth_normal.clh"
 #include "visibility_cache.clh"
@@ -17,47 +18,46 @@
 // T(x) = 1/pi * integral of V max(n.w, 0) Y(w) dw. The unoccluded part is exact (A_l Y(n) / pi); only what is blocked is
 // sampled and taken away, so an open surface shades without quadrature error.
 //
-// One item a sample; samples lie every `stride` pixels from stride / 2. positions, normals, labels [h][w]: the geometry
-// buffer. directions [sets][count]: unit directions and their solid angle (w, sr), basis [sets][count][COEFFICIENTS]: Y there;
+// One item a sample. positions, normals, labels [h][w]: the geometry buffer. directions [sets][count]: unit directions and their solid angle (w, sr), basis [sets][count][COEFFICIENTS]: Y there;
 // first_set: see direction_sets.clh. radius: of the window that a sample's normal is the mean of, pixels.
-// phase: the subset that this frame traces (visibility_cache.clh); intrinsics, layers, newest, cameras, points, cached_normals,
+// phase: the subset that this frame traces (visibility_cache.clh); intrinsics, layers, newest, cameras, points and behind them normals,
 // traced, blocked: what earlier frames know, this frame's layer (newest + 1) is written. state: see visibility_state.clh.
 // -> transfer [rows][cols][COEFFICIENTS], openness [rows][cols]: free share of the cosine-weighted sky (-1 where there is no
 // surface), flatness [rows][cols]: share of the window on the sample's own surface, free_mask [rows][cols][MASK_WORDS]: bit j =
 // direction j lies above the surface and is free, sets [rows][cols][INTERLEAVE]: direction j is that of set sets[j % INTERLEAVE].
 // With IS_CHOSEN only the samples `chosen` [chosen_count] are done, one item each; what is kept of the others stays as it was.
-kernel void transfer_radiance(const int cols, const int rows, const int stride, const int width, const int height, const int radius,
-                              global const float4 *positions, global const float4 *normals, global const uchar *labels,
-                              const int4 bricks, global const int *slots, global const uchar *gaps,
-                              global const ulong *solid, global const uchar *octets, global const float2 *voxels, const float voxel_m, const float truncation_m,
-                              const int count, const int first_set, global const float4 *directions, global const float *basis,
-                              const float reach_m, const int phase, const float4 intrinsics, const int layers, const int newest,
-                              global const float16 *cameras, global float4 *points, global float4 *cached_normals,
-                              global ushort *traced, global uint *blocked, global const uint *state,
+kernel void transfer_radiance(const TransferParameters parameters, global const float4 *positions, global const float4 *normals,
+                              global const uchar *labels, global const int *slots, global const ulong *solid, global const uchar *octets,
+                              global const float4 *directions, global const float *basis, global const float16 *cameras,
+                              global float4 *points, global ushort *traced, global uint *blocked,
                               global float *transfer, global float *openness, global float *flatness,
                               global uint *free_mask, global uchar *sets
+#ifdef HAS_STATE
+                              , global const uint *state
+#endif
 #ifdef IS_CHOSEN
-                              , const int chosen_count, global const int *chosen
+                              , global const int *chosen
 #endif
 ) {
+    const Grid grid = parameters.grid;
 #ifdef IS_CHOSEN
-    if (get_global_id(0) >= chosen_count) return;
+    if ((int)get_global_id(0) >= parameters.chosen_count) return;
     const int sample = chosen[get_global_id(0)];
-    const int col = sample % cols;
-    const int row = sample / cols;
+    const int col = sample % grid.cols;
+    const int row = sample / grid.cols;
 #else
     const int col = get_global_id(0);
     const int row = get_global_id(1);
-    if (col >= cols || row >= rows) return;
-    const int sample = row * cols + col;
+    if (col >= grid.cols || row >= grid.rows) return;
+    const int sample = row * grid.cols + col;
 #endif
-    const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
+    const int pixel = sample_pixel(grid, row, col), width = grid.width, count = parameters.count;
+    const Volume volume = make_volume(parameters.volume, slots, solid, octets, 0);
     const float4 position = positions[pixel];
     const int valid = position.w > 0.0f && normals[pixel].w > 0.0f;
-    const float4 normal = valid ? smooth_normal(width, height, positions, normals, pixel % width, pixel / width, radius, voxel_m)
+    const float4 normal = valid ? smooth_normal(width, parameters.height, positions, normals, pixel % width, pixel / width, parameters.radius, volume.voxel_m)
                                 : (float4)(0.0f);
-    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
-    const int own = first_set + direction_set(row, col);
+    const int own = parameters.first_set + direction_set(row, col);
 
     uint wanted = valid ? ALL_SUBSETS : 0u;
     uint stops[MASK_WORDS];  // directions that are blocked
@@ -68,10 +68,11 @@ kernel void transfer_radiance(const int cols, const int rows, const int stride, 
     if (valid && is_open(volume, state, position.xyz)) wanted = 0;
 #endif
 #if INTERLEAVE > 1
+    global float4 *cached_normals = (global float4 *)((global uchar *)points + parameters.cached_normals_at);
     const int lasting = valid && labels[pixel] == LABEL_STATIC;
     if (lasting && wanted) {
-        const Layers known = {cols, rows, stride, intrinsics, layers, newest, cameras, points, cached_normals, traced, blocked};
-        wanted = find_cached(known, position.xyz, normal.xyz, voxel_m, ALL_SUBSETS & ~(1u << phase), stops, set) | 1u << phase;
+        const Layers known = {grid.cols, grid.rows, grid.stride, parameters.intrinsics, parameters.layers, parameters.newest, cameras, points, cached_normals, traced, blocked};
+        wanted = find_cached(known, position.xyz, normal.xyz, volume.voxel_m, ALL_SUBSETS & ~(1u << parameters.phase), stops, set) | 1u << parameters.phase;
     }
 #endif
     if (wanted) {
@@ -80,11 +81,11 @@ kernel void transfer_radiance(const int cols, const int rows, const int stride, 
             asked[i] = bits_of_subsets(wanted);
             open[i] = 0;
         }
-        trace_hemisphere(volume, position.xyz + voxel_m * normal.xyz, normal.xyz, directions + own * count, count, reach_m, asked,
+        trace_hemisphere(volume, position.xyz + volume.voxel_m * normal.xyz, normal.xyz, directions + own * count, count, parameters.reach_m, asked,
                          open, stops);  // fig. 7.5
     }
 #if INTERLEAVE > 1
-    const int layer = (newest + 1) % INTERLEAVE * rows * cols + sample;
+    const int layer = (parameters.newest + 1) % INTERLEAVE * grid.rows * grid.cols + sample;
     points[layer] = (float4)(position.xyz, lasting ? 1.0f : 0.0f);
     cached_normals[layer] = normal;
     traced[layer] = (ushort)(wanted | own << 8);

@@ -6,17 +6,14 @@
 // directions [256][count]: unit directions, see direction_sets.clh. -> free, blocked [rows][cols][MASK_WORDS]: bit j: direction j
 // lies above the surface, and is free for `reach_m` or is not; zeros where there is no surface.
 kernel void trace_visibility(const int cols, const int rows, const int stride, const int width,
-                             global const float4 *positions, global const float4 *normals, const int4 bricks,
-                             global const int *slots, global const uchar *gaps, global const ulong *solid,
-                             global const uchar *octets, global const float2 *voxels, const float voxel_m,
-                             const float truncation_m, const int count, global const float4 *directions, const float reach_m,
+                             global const float4 *positions, global const float4 *normals, VOLUME_PARAMETERS, const int count, global const float4 *directions, const float reach_m,
                              global uint *free, global uint *blocked) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= cols || row >= rows) return;
     const int pixel = (stride / 2 + row * stride) * width + stride / 2 + col * stride;
     const float4 position = positions[pixel], normal = normals[pixel];
-    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
+    const Volume volume = VOLUME_OF_PARAMETERS;
     uint asked[MASK_WORDS], is_free[MASK_WORDS], is_blocked[MASK_WORDS];
     for (int i = 0; i < MASK_WORDS; i++) {
         asked[i] = 0xFFFFFFFFu;
@@ -24,7 +21,7 @@ kernel void trace_visibility(const int cols, const int rows, const int stride, c
     }
     global const float4 *own = directions + direction_set(row, col) * count;
     if (position.w > 0.0f && normal.w > 0.0f)
-        trace_hemisphere(volume, position.xyz + voxel_m * normal.xyz, normal.xyz, own, count, reach_m, asked, is_free, is_blocked);
+        trace_hemisphere(volume, position.xyz + shape.voxel_m * normal.xyz, normal.xyz, own, count, reach_m, asked, is_free, is_blocked);
     const int first = (row * cols + col) * MASK_WORDS;
     for (int i = 0; i < MASK_WORDS; i++) {
         free[first + i] = is_free[i];

@@ -109,15 +109,13 @@ static floatn find_surface(const Volume volume, const Rays rays, const floatn be
 
 // Volume and view -> positions [h][w] (volume space metres, w = 1 surface, 0 none), normals [h][w] (unit, towards free
 // space, w likewise). One item LANES pixels of a row.
-kernel void raycast(const int width, const int height, const int4 bricks, global const int *slots, global const uchar *gaps,
-                    global const ulong *solid, global const uchar *octets, global const float2 *voxels, const float voxel_m,
-                    const float truncation_m, const float4 intrinsics, const float16 volume_from_camera,
+kernel void raycast(const int width, const int height, VOLUME_PARAMETERS, const float4 intrinsics, const float16 volume_from_camera,
                     const float greatest_depth_m, global const int *nearest, global const int *farthest,
                     global float4 *positions, global float4 *normals) {
     const int x = get_global_id(0) * LANES;
     const int y = get_global_id(1);
     if (x >= width || y >= height) return;
-    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
+    const Volume volume = VOLUME_OF_PARAMETERS;
     const float16 m = volume_from_camera;
     const floatn u = (x + LANE_NUMBERS - intrinsics.s2) / intrinsics.s0;
     const float v = (y - intrinsics.s3) / intrinsics.s1;
@@ -125,11 +123,11 @@ kernel void raycast(const int width, const int height, const int4 bricks, global
     const floatn shorten = 1.0f / length;
     const Vectors direction = {(m.s0 * u + (m.s1 * v + m.s2)) * shorten, (m.s4 * u + (m.s5 * v + m.s6)) * shorten,
                                (m.s8 * u + (m.s9 * v + m.sa)) * shorten};
-    const Rays rays = make_rays(m.s37b / voxel_m, direction);
+    const Rays rays = make_rays(m.s37b / shape.voxel_m, direction);
     floatn begin, end;
     clip_rays(volume, rays, &begin, &end);
     const int tile = y / TILE * ((width + TILE - 1) / TILE) + x / TILE;
-    const floatn per_depth = length / voxel_m;
+    const floatn per_depth = length / shape.voxel_m;
     begin = fmax(begin, as_float(nearest[tile]) * per_depth);
     end = fmin(end, fmin(greatest_depth_m, as_float(farthest[tile])) * per_depth);
 
@@ -147,7 +145,7 @@ kernel void raycast(const int width, const int height, const int4 bricks, global
     const int lanes = min(LANES, width - x);
     for (int lane = 0; lane < lanes; lane++) {
         const float hit = hits[lane] > 0.0f ? 1.0f : 0.0f;
-        positions[y * width + x + lane] = (float4)(hit * voxel_m * (float3)(px[lane], py[lane], pz[lane]), hit);
+        positions[y * width + x + lane] = (float4)(hit * shape.voxel_m * (float3)(px[lane], py[lane], pz[lane]), hit);
         normals[y * width + x + lane] = (float4)(nx[lane], ny[lane], nz[lane], hit);
     }
 }

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.objects.rasterize import Placed
 from server.opencl.engine import Engine, float4
-from server.shading.differential_rendering import ball_around
-from server.shading.traced_scene import DeviceLight, light_arguments
+from server.shading.traced_scene import DeviceLight, ball_around, light_arguments
 from server.transfer.indirect import Indirect, no_hits
-from server.transfer.radiance_transfer import Directions, Transfer, sample_arguments
+from server.transfer.radiance_transfer import Directions, Transfer, sample_arguments, sample_grid
 from server.transfer.sampling import Upsampling
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
@@ -82,9 +81,7 @@ def bound_influence(
     balls = balls_around(objects)
 
     def at_samples(every: int, those: NDArray[np.float32]) -> cl_array.Array:
-        return _bound_samples(
-            engine, camera, surface, transfer, volume, rays, reach_m, light, indirect, those, most, every
-        )
+        return _bound_samples(engine, camera, surface, transfer, rays, reach_m, light, indirect, those, most, every)
 
     few = _greatest(engine, at_samples(EVERY, balls))
     is_seen = few.change > WINDOW * seen_from
@@ -123,7 +120,6 @@ def _bound_samples(
     camera: CameraModel,
     surface: Surface,
     transfer: Transfer,
-    volume: Volume,
     rays: Directions,
     reach_m: float,
     light: DeviceLight,
@@ -139,11 +135,11 @@ def _bound_samples(
     engine.launch(
         engine.kernel("influence_bound.cl", "bound_samples", **_defines(engine, light, transfer)),
         (cols, rows),
-        *sample_arguments(engine, camera, surface, transfer),
+        sample_grid(camera, transfer),
+        *sample_arguments(engine, surface, transfer),
         transfer.coefficients,
         indirect.hits if indirect else no_hits(engine, transfer),
-        light.coefficients,
-        *light_arguments(engine, light, volume, rays, reach_m),
+        *light_arguments(engine, light, rays, reach_m),
         len(balls),
         space.upload("reach_balls", balls) if len(balls) else space.array("unused", (1,), cl_types.float4),
         float4(*most.objects, 0.0),
@@ -176,13 +172,10 @@ def _bound_pixels(
     engine.launch(
         engine.kernel("influence_bound.cl", "bound_pixels", **defines),
         (chunks, camera.height),
-        camera.width,
         camera.height,
         surface.positions,
         surface.normals,
-        transfer.cols,
-        transfer.rows,
-        transfer.stride,
+        sample_grid(camera, transfer),
         has_bounds,
         bounds,
         volume.voxel_m,

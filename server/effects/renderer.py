@@ -187,7 +187,6 @@ class Renderer:
             context.measurement.radiance,
             context.surface,
             transfer,
-            context.volume,
             context.rays,
             light,
             spine.samples.indirect,

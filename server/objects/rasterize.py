@@ -23,6 +23,7 @@ from server.objects.pixel_boxes import NEAR_M, PixelBox, pixel_boxes
 from server.objects.raster_tables import CHUNK, TILE, Picture, tabulate
 from server.objects.virtual_object import VirtualObject
 from server.opencl.engine import Engine, int2, int4
+from server.opencl.structs import SURFACE_PARAMETERS
 
 __all__ = [
     "NEAR_M",
@@ -280,11 +281,13 @@ def _shade(engine: Engine, picture: Picture, visible: cl_array.Array, name: str)
         engine.launch(
             _kernel(engine, "shade_surface"),
             (x1 - x0, y1 - y0),
-            picture.size,
-            int4(x0, y0, x1, y1),
-            int4(*picture.region),
+            SURFACE_PARAMETERS(
+                around=int4(x0, y0, x1, y1),
+                region=int4(*picture.region),
+                width=picture.camera.width,
+                object_count=picture.count,
+            ),
             visible,
-            picture.count,
             picture.objects,
             picture.matrices,
             arena.vertices,

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from server.objects.object_tree import FEW_OBJECTS, grid_boxes, tree_rows
 from server.opencl.engine import Engine, float16, int4
+from server.opencl.parts import Parts
 from server.opencl.transfer import copy_into
 
 if TYPE_CHECKING:
@@ -63,14 +64,22 @@ class ObjectTable:
     """What `trace_objects` of virtual_objects.clh takes; arrays of the engine's workspace, valid until the next one."""
 
     count: int
-    grid_from_volume: cl_array.Array
-    """[count] float16: row-major 4x4, volume metres to cells; where there are many, then a tree of their boxes."""
-    dims: cl_array.Array
-    """[count] int4: cells in x, y, z, and where the object's distances begin in the pool."""
+    rows: Parts
+    """`grid_from_volume` and `dims`, in one buffer."""
     distances: cl_array.Array
     """All distance grids one after the other, each once, float32, cells."""
     cell_m: tuple[float, ...]
     """Side of each object's cells in volume metres: how far off its surface a ray must start."""
+
+    @property
+    def grid_from_volume(self) -> cl_array.Array:
+        """[count] float16: row-major 4x4, volume metres to cells; where there are many, then a tree of their boxes."""
+        return self.rows.array("grid_from_volume")
+
+    @property
+    def dims(self) -> cl_array.Array:
+        """[count] int4: cells in x, y, z, and where the object's distances begin in the pool."""
+        return self.rows.array("dims")
 
 
 def voxelize(
@@ -154,8 +163,10 @@ def object_table(engine: Engine, objects: Sequence[tuple[VirtualObject, Matrix]]
     table = np.concatenate(rows if count else [np.zeros((1, 16))]).astype(np.float32)
     return ObjectTable(
         count=count,
-        grid_from_volume=space.upload("object_grid_from_volume", table.view(cl_types.float16)[:, 0]),
-        dims=space.upload("object_dims", dims.view(cl_types.int4)[:, 0]),
+        rows=space.upload_parts(
+            "object_table",
+            {"grid_from_volume": table.view(cl_types.float16)[:, 0], "dims": dims.view(cl_types.int4)[:, 0]},
+        ),
         distances=pool,
         cell_m=tuple((1 / np.linalg.norm(matrices[:, 0, :3], axis=1)).tolist()),
     )

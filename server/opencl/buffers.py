@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from typing import Any, cast
 
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
 from numpy.typing import DTypeLike, NDArray
+
+from server.opencl.parts import Parts, pack, part_alignment_bytes, place
 
 
 class Workspace:
@@ -46,6 +49,19 @@ class Workspace:
         if found is not None and found.shape == values.shape and found.dtype == values.dtype:
             return found
         return self.upload(name, values)
+
+    def parts(self, name: str, shapes: Mapping[str, tuple[tuple[int, ...], DTypeLike]]) -> Parts:
+        """Arrays in one buffer called `name`; contents are kept as `array` does."""
+        starts, size = place(shapes, part_alignment_bytes(self._queue.device))
+        return Parts(self.array(name, (size,), np.uint8), starts, shapes)
+
+    def upload_parts(self, name: str, arrays: Mapping[str, NDArray[Any]], *, is_constant: bool = False) -> Parts:
+        """Copy `arrays` into one buffer called `name`; is_constant: the first time only, as `constant` does."""
+        shapes = {part: (values.shape, values.dtype) for part, values in arrays.items()}
+        starts, size = place(shapes, part_alignment_bytes(self._queue.device))
+        packed = pack(arrays, starts, size)
+        memory = self.constant(name, packed) if is_constant else self.upload(name, packed)
+        return Parts(memory, starts, shapes)
 
     @property
     def bytes_held(self) -> int:

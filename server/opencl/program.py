@@ -1,4 +1,5 @@
-"""The one loader of OpenCL programs: real files, real includes, sorted defines, built once per device."""
+"""The one loader of OpenCL programs: real files, real includes, device structs in front, sorted defines, built once
+per device."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ from threading import Lock
 import pyopencl as cl
 
 import cl_kernels
+from server.opencl.structs import struct_text
 
 KERNEL_FOLDER = Path(cl_kernels.__file__).parent
 _OPTIONS = ("-cl-std=CL1.2", "-Werror", "-cl-fp32-correctly-rounded-divide-sqrt")
@@ -57,7 +59,7 @@ class ProgramCache:
 
     def _build(self, file: str, defines: tuple[str, ...]) -> cl.Program:
         path = next(KERNEL_FOLDER.rglob(file))  # names are unique over the folders
-        source = f'{_PROLOGUE}#line 1 "{file}"\n' + path.read_text()
+        source = f'{_PROLOGUE}{struct_text()}#line 1 "{file}"\n' + path.read_text()
         options = [*self._options, "-I", str(KERNEL_FOLDER / "include"), *defines]
         try:
             program: cl.Program = cl.Program(self._context, source).build(options)

@@ -1,4 +1,4 @@
-"""Copies and fills of raw memory, queued: what pyopencl's arrays would launch kernels of their own for."""
+"""Raw memory: copies and fills, queued, that pyopencl's arrays would launch kernels of their own for; and parts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 
 def fill_bytes(queue: cl.CommandQueue, array: cl_array.Array, value: int) -> None:
@@ -28,6 +28,13 @@ def copy_into(queue: cl.CommandQueue, whole: cl_array.Array, start: int, part: c
     """Copy all of `part` into `whole`, from its byte `start` on."""
     if part.nbytes:
         cl.enqueue_copy(queue, _memory(whole), _memory(part), byte_count=part.nbytes, dst_offset=start)
+
+
+def part_of(whole: cl_array.Array, start: int, shape: tuple[int, ...], dtype: DTypeLike) -> cl_array.Array:
+    """An array in the memory of `whole`, from its byte `start` on, a multiple of
+    part_alignment_bytes (parts.py)."""
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    return cl_array.Array(whole.queue, shape, dtype, data=_memory(whole).get_sub_region(start, size))
 
 
 def _memory(array: cl_array.Array) -> cl.Buffer:

@@ -16,9 +16,9 @@ from protocol.frames import CameraModel
 from server.objects.rasterize import VirtualSurface
 from server.opencl.engine import Engine, float4
 from server.opencl.transfer import fill_bytes
-from server.shading.differential_rendering import RealShadow, ball_around
+from server.shading.differential_rendering import RealShadow
 from server.shading.traced_scene import TracedScene
-from server.transfer.sample_grid import SampleGrid
+from server.transfer.sample_grid import SampleGrid, grid_of, pixel_grid
 from server.volume.raycast import Surface
 
 LEAST_CHANGE = 1 / 8
@@ -42,14 +42,13 @@ def refine_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface,
     engine.launch(
         engine.kernel("adaptive.cl", "refine_virtual", **_defines(engine, scene.bands)),
         (listed,),
+        scene.parameters(engine, pixel_grid(camera), scene.rays.interleave),
+        *scene.arguments(engine),
         listed,
         pixels,
-        camera.width,
         virtual.position,
         virtual.normal,
         virtual.object_index,
-        *scene.arguments(engine),
-        scene.rays.interleave,
         occluded,
     )
     return occluded
@@ -79,18 +78,12 @@ def refine_real(
     engine.launch(
         engine.kernel("adaptive.cl", "refine_real", **_defines(engine, scene.bands)),
         (listed,),
+        scene.parameters(engine, grid_of(ratio, camera), scene.rays.interleave),
+        *scene.real_arguments(engine),
         listed,
         pixels,
-        camera.width,
         surface.positions,
         surface.normals,
-        *scene.arguments(engine),
-        scene.rays.interleave,
-        ball_around(scene.objects),
-        scene.light.coefficients,
-        ratio.cols,
-        ratio.rows,
-        ratio.stride,
         ratio.shaded,
         refined,
     )

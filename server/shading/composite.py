@@ -15,9 +15,10 @@ from server.input.measure import linear_values
 from server.maths.rigid import inverse_rigid
 from server.objects.rasterize import SUBPIXELS, VirtualSurface
 from server.opencl.engine import Engine, KernelArgument, float16
+from server.opencl.structs import MIXTURE_PARAMETERS
 from server.shading.change_mask import mark_changes
 from server.shading.traced_scene import DeviceLight
-from server.transfer.sample_grid import SampleGrid
+from server.transfer.sample_grid import SampleGrid, grid_of, no_samples
 from server.transfer.sampling import Upsampling
 from server.volume.raycast import Surface
 
@@ -87,8 +88,25 @@ class CompositeInputs:
         return self.virtual is None and self.ratio is None
 
 
-def launch_mixture(engine: Engine, file: str, name: str, mixture: CompositeInputs, *others: KernelArgument) -> None:
-    """Enqueue a kernel whose arguments begin with MIXTURE_ARGUMENTS of composite_inputs.clh; `others` are its own."""
+def mixture_parameters(mixture: CompositeInputs) -> np.void:
+    """MixtureParameters of structs.py."""
+    occluded, ratio, camera = mixture.occluded, mixture.ratio, mixture.camera
+    return MIXTURE_PARAMETERS(
+        camera_from_volume=float16(inverse_rigid(mixture.volume_from_camera)),
+        height=camera.height,
+        tolerance_m=mixture.tolerance_m,
+        virtual_gain=mixture.gain,
+        virtual_samples=grid_of(occluded, camera) if occluded else no_samples(camera),
+        real_samples=grid_of(ratio, camera) if ratio else no_samples(camera),
+        has_refined_occluded=mixture.refined_occluded is not None,
+        has_refined_ratio=mixture.refined_ratio is not None,
+    )
+
+
+def launch_mixture(
+    engine: Engine, file: str, name: str, mixture: CompositeInputs, parameters: np.void, *others: KernelArgument
+) -> None:
+    """Enqueue a kernel whose arguments are its `parameters`, MIXTURE_BUFFERS of composite_inputs.clh and `others`."""
     camera, light, virtual, ratio = mixture.camera, mixture.light, mixture.virtual, mixture.ratio
     unused = engine.workspace.array("unused", (1,), cl_types.float4)
 
@@ -113,24 +131,18 @@ def launch_mixture(engine: Engine, file: str, name: str, mixture: CompositeInput
     engine.launch(
         kernel,
         (-(-camera.width // engine.lanes), camera.height),
-        camera.width,
-        camera.height,
+        parameters,
         mixture.radiance,
         mixture.surface.positions,
         mixture.surface.normals,
-        float16(inverse_rigid(mixture.volume_from_camera)),
-        mixture.tolerance_m,
         *((virtual.position, virtual.normal, virtual.base_color) if virtual else (unused, unused, unused)),
         given(mixture.coverage),
         given(mixture.reflected),
         light.coefficients,
-        mixture.gain,
-        *_grid(mixture.occluded, unused),
-        *_grid(ratio, unused),
+        mixture.occluded.values if mixture.occluded else unused,
+        ratio.values if ratio else unused,
         given(reached),
-        mixture.refined_occluded is not None,
         given(mixture.refined_occluded),
-        mixture.refined_ratio is not None,
         given(mixture.refined_ratio),
         given(mixture.direct_virtual),
         given(mixture.direct_ratio),
@@ -150,10 +162,5 @@ def composite(engine: Engine, shown: NDArray[np.uint8], mixture: CompositeInputs
     space, camera = engine.workspace, mixture.camera
     picture = space.array("picture", (camera.height, camera.width, 3), np.uint8)
     others = (space.upload("shown", shown), srgb_table(engine), picture)
-    launch_mixture(engine, "composite.cl", "composite", mixture, *others)
+    launch_mixture(engine, "composite.cl", "composite", mixture, mixture_parameters(mixture), *others)
     return engine.download(picture)
-
-
-def _grid(grid: SampleGrid | None, unused: cl_array.Array) -> tuple[KernelArgument, ...]:
-    """cols, rows, stride, values."""
-    return (grid.cols, grid.rows, grid.stride, grid.values) if grid else (0, 0, 1, unused)

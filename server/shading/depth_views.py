@@ -20,6 +20,7 @@ from server.input.measure import intrinsics
 from server.objects.rasterize import Placed
 from server.objects.voxelize import DistanceGrid
 from server.opencl.engine import Engine, KernelArgument, float4, float16, int4
+from server.opencl.structs import VIEW_PARAMETERS
 from server.opencl.transfer import copy_into
 from server.transfer.real_depth_views import RealDepthViews
 
@@ -65,24 +66,27 @@ class DepthViews:
     def arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
         """VIEW_PARAMETERS of include/views.clh."""
         views = self.real.views
+        parameters = VIEW_PARAMETERS(
+            picture_from_volume=float16(self.real.camera_from_volume),
+            picture_intrinsics=intrinsics(self.real.camera),
+            center=float4(*views.center, 0.0),
+            side=views.side,
+            distance_m=views.distance_m,
+            per_pixel=views.per_pixel,
+            picture_width=self.real.camera.width,
+            picture_height=self.real.camera.height,
+            near_m=self.real.near_m,
+            near_ratio=self.real.ratio,
+            most_apart=self.real.threshold / 2,
+        )
         return (
-            views.side,
+            parameters,
             engine.workspace.upload("view_of", self.real.view_of),
             views.axes,
             views.depths,
-            float4(*views.center, 0.0),
-            views.distance_m,
-            views.per_pixel,
-            float16(self.real.camera_from_volume),
-            intrinsics(self.real.camera),
-            self.real.camera.width,
-            self.real.camera.height,
             self.real.depths,
             self.real.surface.positions,
             self.real.surface.normals,
-            self.real.near_m,
-            self.real.ratio,
-            self.real.threshold / 2,
             self.texels,
             self.slots,
         )

@@ -6,7 +6,6 @@ Kernel: differential_rendering.cl.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,13 +14,13 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.objects.rasterize import Placed, VirtualSurface
-from server.opencl.engine import Engine, float4
+from server.objects.rasterize import VirtualSurface
+from server.opencl.engine import Engine
 from server.shading.traced_scene import Changed, TracedScene
 from server.shading.virtual_point_lights import PlacedPoints, VirtualPointLights, place_points
 from server.transfer.indirect import Indirect, no_hits
-from server.transfer.radiance_transfer import Transfer, sample_arguments
-from server.transfer.sample_grid import SampleGrid
+from server.transfer.radiance_transfer import Transfer, sample_arguments, sample_grid
+from server.transfer.sample_grid import NO_GRID, SampleGrid, grid_of
 from server.volume.raycast import Surface
 
 VIRTUAL_STRIDE = 2
@@ -62,12 +61,11 @@ def shadow_real(
     engine.launch(
         engine.kernel("differential_rendering.cl", "shadow_real", **_sample_defines(engine, transfer, scene)),
         (transfer.cols, transfer.rows),
-        *sample_arguments(engine, camera, surface, transfer),
+        scene.parameters(engine, sample_grid(camera, transfer)),
+        *scene.real_arguments(engine),
+        *sample_arguments(engine, surface, transfer),
         transfer.coefficients,
         indirect.hits if indirect else no_hits(engine, transfer),
-        scene.light.coefficients,
-        *scene.arguments(engine),
-        ball_around(scene.objects),
         ratio,
         shaded,
     )
@@ -96,10 +94,9 @@ def bounce_real(
     engine.launch(
         engine.kernel("differential_rendering.cl", "bounce_real", **_sample_defines(engine, transfer, scene)),
         (transfer.cols, transfer.rows),
-        *sample_arguments(engine, camera, surface, transfer),
-        scene.light.coefficients,
-        *shadowed.arguments(engine),
-        BOUNCE_EVERY,
+        shadowed.parameters(engine, sample_grid(camera, transfer), BOUNCE_EVERY),
+        *shadowed.surroundings_arguments(engine),
+        *sample_arguments(engine, surface, transfer),
         shadow.shaded,
         returned,
         spare,
@@ -113,20 +110,6 @@ def _sample_defines(engine: Engine, transfer: Transfer, scene: TracedScene) -> d
     return scene.defines(engine) | {"MASK_WORDS": transfer.free_mask.shape[2], "INTERLEAVE": transfer.interleave}
 
 
-_CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
-"""[8, 3] of a box: 0 for its low side, 1 for its high one."""
-
-
-def ball_around(objects: Sequence[Placed]) -> np.generic:
-    """Centre (volume space) and radius in metres of a ball that holds all objects, as a float4."""
-    matrices = np.array([matrix for _, matrix in objects])
-    bounds = np.array([thing.bounds for thing, _ in objects])
-    in_model = bounds[:, _CORNERS, np.arange(3)]  # [n, 8, 3]
-    corners = (in_model @ matrices[:, :3, :3].swapaxes(1, 2) + matrices[:, None, :3, 3]).reshape(-1, 3)
-    center = (corners.min(axis=0) + corners.max(axis=0)) / 2
-    return float4(*center, float(np.linalg.norm(corners - center, axis=1).max()) * 1.02)
-
-
 def shadow_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, scene: TracedScene) -> SampleGrid:
     """Radiance that real and virtual occluders take from the virtual surface, at every VIRTUAL_STRIDE-th pixel."""
     shape = (camera.height // VIRTUAL_STRIDE, camera.width // VIRTUAL_STRIDE)
@@ -134,15 +117,11 @@ def shadow_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface,
     engine.launch(
         engine.kernel("differential_rendering.cl", "shadow_virtual", **scene.defines(engine)),
         (occluded.cols, occluded.rows),
-        occluded.cols,
-        occluded.rows,
-        VIRTUAL_STRIDE,
-        camera.width,
+        scene.parameters(engine, grid_of(occluded, camera), scene.rays.interleave),
+        *scene.arguments(engine),
         virtual.position,
         virtual.normal,
         virtual.object_index,
-        *scene.arguments(engine),
-        scene.rays.interleave,
         occluded.values,
     )
     return occluded
@@ -155,17 +134,17 @@ def light_points(engine: Engine, scene: TracedScene, placed: PlacedPoints | None
     """
     placed = placed or place_points(engine, scene.objects)
     radiances = engine.workspace.upload("glow_radiances", placed.under_even_light(scene.light.mean))
-    lit = min(placed.count, MOST_POINTS)
+    lit, traced = min(placed.count, MOST_POINTS), replace(scene, glow=placed.glow)
     engine.launch(
         engine.kernel("differential_rendering.cl", "light_points", **scene.defines(engine)),
         (lit,),
+        traced.parameters(engine, NO_GRID),
+        *traced.arguments(engine),
         lit,
         placed.points,
         placed.normals,
         placed.albedos,
         placed.offsets_m,
-        scene.light.coefficients,
-        *replace(scene, glow=placed.glow).arguments(engine),
         radiances,
     )
     return replace(placed.glow, radiances=radiances)

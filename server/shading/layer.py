@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.opencl.engine import Engine
-from server.shading.composite import CompositeInputs, launch_mixture, srgb_table
+from server.opencl.structs import LAYER_PARAMETERS
+from server.shading.composite import CompositeInputs, launch_mixture, mixture_parameters, srgb_table
 
 DEPTH_SCALE_M = 0.001
 """Metres of a unit of a layer's depth: to 65 m; half a unit moves what is 0.5 m away by a tenth of a pixel where the
@@ -49,18 +50,31 @@ def compose_layer(engine: Engine, mixture: CompositeInputs) -> Layer:
     """What composite would mix with the camera's picture."""
     if mixture.is_nothing:
         return NOTHING
-    space, size = engine.workspace, (mixture.camera.height, mixture.camera.width)
-    virtual, ratio = (space.array(f"layer_{name}", (*size, n), np.uint8) for name, n in (("virtual", 4), ("ratio", 3)))
-    depths = [space.array(f"layer_{name}_depth", size, np.uint16) for name in ("virtual", "real")]
-    others = (DEPTH_SCALE_M, srgb_table(engine), virtual, depths[0], ratio, depths[1])
-    launch_mixture(engine, "layer.cl", "compose_layer", mixture, *others)
+    size = (mixture.camera.height, mixture.camera.width)
+    layer = engine.workspace.parts(
+        "layer",
+        {
+            "virtual": ((*size, 4), np.uint8),
+            "virtual_depth": (size, np.uint16),
+            "ratio": ((*size, 3), np.uint8),
+            "real_depth": (size, np.uint16),
+        },
+    )
+    parameters = LAYER_PARAMETERS(
+        mixture=mixture_parameters(mixture),
+        depth_scale_m=DEPTH_SCALE_M,
+        **{f"{part}_at": layer.starts[part] for part in ("virtual_depth", "ratio", "real_depth")},
+    )
+    launch_mixture(engine, "layer.cl", "compose_layer", mixture, parameters, srgb_table(engine), layer.memory)
     seen = changed = None
     if mixture.virtual is not None:
-        color = engine.download(virtual)
-        seen = _cropped(color, engine.download(depths[0]), color[..., 3] > 0)
+        color = engine.download(layer.array("virtual"))
+        seen = _cropped(color, engine.download(layer.array("virtual_depth")), color[..., 3] > 0)
     if mixture.ratio is not None:
-        factors = engine.download(ratio)
-        changed = _cropped(factors, engine.download(depths[1]), (factors != NEUTRAL).any(axis=-1), margin=1)
+        factors = engine.download(layer.array("ratio"))
+        changed = _cropped(
+            factors, engine.download(layer.array("real_depth")), (factors != NEUTRAL).any(axis=-1), margin=1
+        )
     return Layer(seen, changed)
 
 

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.objects.rasterize import VirtualSurface
 from server.opencl.engine import Engine, float4
+from server.opencl.structs import REFLECTION_PARAMETERS
 from server.shading.traced_scene import TracedScene
+from server.transfer.sample_grid import pixel_grid
 
 LEAST_GLOSS = 0.02
 """Of one less the roughness, or of the metalness: below it a surface is matt, its diffuse shading all there is."""
@@ -39,16 +41,16 @@ def reflect_surroundings(
     engine.launch(
         engine.kernel("reflect.cl", "reflect_surroundings", **scene.defines(engine)),
         (camera.width, camera.height),
-        camera.width,
-        camera.height,
+        REFLECTION_PARAMETERS(
+            scene=scene.parameters(engine, pixel_grid(camera)),
+            eye=float4(*volume_from_camera[:3, 3], 1.0),
+            least_gloss=LEAST_GLOSS,
+        ),
+        *scene.arguments(engine),
         virtual.position,
         virtual.normal,
         virtual.base_color,
         virtual.material,
-        float4(*volume_from_camera[:3, 3], 1.0),
-        LEAST_GLOSS,
-        scene.light.whole,
-        *scene.arguments(engine),
         virtual.object_index,
         reflected,
     )

@@ -27,12 +27,13 @@ from server.objects.pinhole import Pinhole
 from server.objects.rasterize import Placed, VirtualSurface, drawn_depths
 from server.opencl.engine import Engine, KernelArgument, float4, int4
 from server.opencl.program import Define
+from server.opencl.structs import DIRECT_PARAMETERS
 from server.shading.change_mask import mark_changes
-from server.shading.differential_rendering import MOST_POINTS, VIRTUAL_STRIDE, RealShadow, ball_around
-from server.shading.traced_scene import DeviceLight
+from server.shading.differential_rendering import MOST_POINTS, VIRTUAL_STRIDE, RealShadow
+from server.shading.traced_scene import DeviceLight, ball_around, light_parameters
 from server.shading.virtual_point_lights import PlacedPoints, VirtualPointLights
 from server.transfer.auxiliary_views import view_axes
-from server.transfer.sample_grid import SampleGrid
+from server.transfer.sample_grid import SampleGrid, grid_of
 from server.transfer.sampling import Upsampling
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
@@ -74,17 +75,17 @@ class ShadowMaps:
     def arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
         """DIRECT_PARAMETERS of include/direct_lights.clh."""
         return (
-            len(self.light.discs),
+            DIRECT_PARAMETERS(ball=float4(*self.ball), least=float4(*self.least, 0.0), count=len(self.light.discs)),
             self.rows,
             engine.workspace.constant("disc_places", _float2(np.concatenate([search_places(), disc_places()]))),
-            float4(*self.ball),
             self.objects,
         )
 
     def trace_arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
         """TRACE_PARAMETERS of shadow_map.cl."""
         places = engine.workspace.constant("disc_ray_places", _float2(ray_places()))
-        return (*self.volume.arguments(), self.reach_m, *self.light.continued, places)
+        lit = light_parameters(self.light, 0, self.reach_m)  # no directions: discs have their own
+        return (*self.volume.arguments(), lit, self.light.table.memory, places)
 
 
 @dataclass(frozen=True)
@@ -116,11 +117,11 @@ def light_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, 
         engine.launch(
             _kernel(engine, "light_virtual"),
             (-(-(x1 - x0) // engine.lanes), y1 - y0),
-            camera.width,
+            grid_of(parts, camera),
             int4(x0, y0, x1, y1),
             virtual.position,
             virtual.normal,
-            *_grid(parts),
+            parts.values,
             maps.volume.voxel_m,
             *maps.arguments(engine),
             direct,
@@ -157,22 +158,21 @@ def light_real(
     ratio: of the rest of the light; parts: of trace_real; refined: what stands for `ratio` where w = 1; reached: of
     change_mask.py, the cells in which `ratio` counts, None: wherever it is not 1.
     """
-    size, space = (camera.width, camera.height), engine.workspace
-    mixed = space.array("direct_ratio", (camera.height, camera.width), cl_types.float4)
+    mixed = engine.workspace.array("direct_ratio", (camera.height, camera.width), cl_types.float4)
     engine.launch(
         _kernel(engine, "light_real", BICUBIC=upsampling == "bicubic"),
         (-(-camera.width // engine.lanes), camera.height),
-        *size,
+        grid_of(parts, camera),
+        camera.height,
         surface.positions,
         surface.normals,
-        *_grid(parts),
+        parts.values,
         maps.volume.voxel_m,
         ratio.values,
         refined is not None,
         ratio.values if refined is None else refined,
         ratio.shaded,
         mark_changes(engine, camera, surface, ratio) if reached is None else reached,
-        float4(*maps.least, 0.0),
         *maps.arguments(engine),
         mixed,
     )
@@ -205,10 +205,7 @@ def light_samples(
     engine.launch(
         _kernel(engine, "light_samples"),
         (-(-parts.cols // engine.lanes), parts.rows),
-        parts.cols,
-        parts.rows,
-        parts.stride,
-        camera.width,
+        grid_of(parts, camera),
         surface.positions,
         surface.normals,
         parts.values,
@@ -276,10 +273,7 @@ def _trace_discs(
     engine.launch(
         _kernel(engine, "trace_discs"),
         (parts.cols, parts.rows),
-        parts.cols,
-        parts.rows,
-        parts.stride,
-        camera.width,
+        grid_of(parts, camera),
         positions,
         normals,
         is_virtual,
@@ -287,10 +281,6 @@ def _trace_discs(
         *maps.trace_arguments(engine),
         parts.values,
     )
-
-
-def _grid(grid: SampleGrid) -> tuple[KernelArgument, ...]:
-    return grid.cols, grid.rows, grid.stride, grid.values
 
 
 def _rows(discs: Sequence[DirectLight], axes: Floats) -> NDArray[np.float32]:

@@ -20,9 +20,8 @@ from server.light.light_estimation import ASSUMED_ALBEDO, FORGETTING
 from server.opencl.engine import Engine
 from server.shading.traced_scene import DeviceLight, light_arguments
 from server.transfer.indirect import Indirect, no_hits
-from server.transfer.radiance_transfer import Directions, Transfer, sample_arguments
+from server.transfer.radiance_transfer import Directions, Transfer, sample_arguments, sample_grid
 from server.volume.raycast import Surface
-from server.volume.volume import Volume
 
 EVERY = 3
 """Of how many samples along an axis one counts; an odd number, so that all direction sets take part."""
@@ -74,7 +73,6 @@ def measure_averages(
     radiance: cl_array.Array,
     surface: Surface,
     transfer: Transfer,
-    volume: Volume,
     rays: Directions,
     light: DeviceLight,
     indirect: Indirect | None,
@@ -88,12 +86,12 @@ def measure_averages(
     engine.launch(
         engine.kernel("tone_mapping.cl", "shade_pairs", **defines),
         (cols, rows),
-        *sample_arguments(engine, camera, surface, transfer),
+        sample_grid(camera, transfer),
+        *sample_arguments(engine, surface, transfer),
         radiance,
         transfer.coefficients,
         indirect.hits if indirect else no_hits(engine, transfer),
-        light.coefficients,
-        *light_arguments(engine, light, volume, rays, reach_m),
+        *light_arguments(engine, light, rays, reach_m),
         EVERY,
         cols,
         rows,

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -16,11 +17,14 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.input.measure import intrinsics
-from server.light.continuation import NO_PLANES, PlaneArrays, plane_arguments
+from server.light.continuation import LEAST_M, NO_PLANES, PlaneArrays
 from server.maths.direct_lights import DirectLight, SplitLight
+from server.maths.planes import CELL_M
 from server.objects.rasterize import Placed
 from server.objects.voxelize import ObjectTable, object_table
 from server.opencl.engine import Engine, KernelArgument, float4, float16, int4
+from server.opencl.parts import Parts
+from server.opencl.structs import CHANGED_PARAMETERS, LIGHT_PARAMETERS, OBJECT_PARAMETERS, SCENE_PARAMETERS
 from server.shading.depth_views import DepthViews
 from server.shading.virtual_point_lights import VirtualPointLights, no_point_lights
 from server.transfer.indirect import Indirect
@@ -37,11 +41,13 @@ class DeviceLight:
     """[bands^2] float4: RGB radiance coefficients."""
     mean: NDArray[np.float64]
     """[3] radiance, over all directions."""
-    arriving: cl_array.Array
-    """[SETS, count] float4: RGB radiance from each direction that visibility is tested along; not below 0, as that of
-    few harmonics may be: to hide darkness would light up."""
-    continued: tuple[KernelArgument, ...]
-    """Planes that hide it where the volume is empty, as Continued of include/continued.clh takes them."""
+    table: Parts
+    """`arriving` [SETS, count] float4: RGB radiance from each direction that visibility is tested along; not below 0,
+    as that of few harmonics may be: to hide darkness would light up. For the rest see include/arriving.clh."""
+    planes: PlaneArrays
+    """What hides it where the volume is empty."""
+    sh: NDArray[np.float64]
+    """[bands^2, 3]: coefficients of all of it."""
     unseen: NDArray[np.float64]
     """[3] radiance that hidden directions bring where no picture shows what hides them; 0 without indirect light."""
     surface_gain: float
@@ -60,6 +66,11 @@ class DeviceLight:
     def whole(self) -> cl_array.Array:
         """[bands^2] float4: coefficients of all of the light."""
         return self.coefficients if self.with_discs is None else self.with_discs
+
+    @property
+    def arriving(self) -> cl_array.Array:
+        """[SETS, count] float4 of the table."""
+        return self.table.array("arriving")
 
 
 @dataclass(frozen=True)
@@ -105,40 +116,101 @@ class TracedScene:
         """The same, with visibility traced."""
         return replace(self, looks=None)
 
-    def arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
-        """SCENE_PARAMETERS of include/shadows.clh."""
-        table, sent = self.table, self.glow or no_point_lights(engine, self.table.count)
-        return (
-            *self.volume.arguments(),
-            *light_arguments(engine, self.light, self.volume, self.rays, self.reach_m, self.changed),
-            table.count,
-            table.grid_from_volume,
-            table.dims,
-            table.distances,
-            *sent.arguments(),
-            *(self.looks.arguments(engine) if self.looks else ()),
+    @cached_property
+    def ball(self) -> np.generic:
+        """Around all objects."""
+        return ball_around(self.objects)
+
+    def parameters(self, engine: Engine, samples: np.void, every: int = 1) -> np.void:
+        """SceneParameters for a kernel that shades at `samples`, a GRID."""
+        return SCENE_PARAMETERS(
+            volume=self.volume.shape,
+            light=light_parameters(self.light, self.rays.count, self.reach_m),
+            changed=_changed_parameters(self.changed),
+            objects=object_parameters(self.table, self._sent(engine), self.ball),
+            samples=samples,
+            every=every,
         )
 
+    def arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
+        """SCENE_BUFFERS of include/scene.clh."""
+        slots, solid, octets, voxels = self.volume.arguments()[1:]
+        return (
+            *(slots, solid, octets, voxels),
+            *(self.rays.on_device(engine), self.light.table.memory, self.volume.colors),
+            *_changed_buffers(engine, self.changed),
+            *self._object_buffers(engine),
+            *self._view_arguments(engine),
+        )
 
-def light_arguments(
-    engine: Engine,
-    light: DeviceLight,
-    volume: Volume,
-    rays: Directions,
-    reach_m: float,
-    changed: Changed | None = None,
-) -> tuple[KernelArgument, ...]:
-    """LIGHT_PARAMETERS of include/shadows.clh."""
-    return (
-        rays.count,
-        rays.on_device(engine),
-        light.arriving,
-        reach_m,
-        *light.continued,
-        volume.colors,
-        float4(*light.unseen, light.surface_gain),
-        *_changed_arguments(engine, changed),
+    def real_arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
+        """REAL_SCENE_PARAMETERS of include/scene.clh after the struct."""
+        return (*self._solid_arguments(engine), *self._object_buffers(engine), *self._view_arguments(engine))
+
+    def surroundings_arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
+        """SURROUNDINGS_PARAMETERS of include/scene.clh after the struct."""
+        changed = _changed_buffers(engine, self.changed)
+        return (*self._solid_arguments(engine), *changed, *self._view_arguments(engine))
+
+    def _sent(self, engine: Engine) -> VirtualPointLights:
+        return self.glow or no_point_lights(engine, self.table.count)
+
+    def _solid_arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
+        slots, solid, octets, _ = self.volume.arguments()[1:]
+        return slots, solid, octets, self.rays.on_device(engine), self.light.table.memory, self.volume.colors
+
+    def _object_buffers(self, engine: Engine) -> tuple[KernelArgument, ...]:
+        sent = self._sent(engine)
+        return self.table.rows.memory, self.table.distances, sent.table.memory, sent.radiances
+
+    def _view_arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
+        return self.looks.arguments(engine) if self.looks else ()
+
+
+def light_parameters(light: DeviceLight, count: int, reach_m: float) -> np.void:
+    """LightParameters of structs.py. count: directions of one set."""
+    starts = light.table.starts
+    return LIGHT_PARAMETERS(
+        unseen=float4(*light.unseen, light.surface_gain),
+        count=count,
+        reach_m=reach_m,
+        plane_count=len(light.planes[1]),
+        cell_m=CELL_M,
+        least_m=LEAST_M,
+        **{f"{part}_at": starts[part] for part in ("arriving", "planes", "shapes", "maps", "coefficients", "whole")},
     )
+
+
+def light_arguments(engine: Engine, light: DeviceLight, rays: Directions, reach_m: float) -> tuple[KernelArgument, ...]:
+    """LightParameters and LIGHT_BUFFERS of include/scene.clh."""
+    return light_parameters(light, rays.count, reach_m), rays.on_device(engine), light.table.memory
+
+
+def object_parameters(table: ObjectTable, sent: VirtualPointLights, ball: np.generic) -> np.void:
+    """ObjectParameters of structs.py."""
+    starts = sent.table.starts
+    return OBJECT_PARAMETERS(
+        ball=ball,
+        count=table.count,
+        dims_at=table.rows.starts["dims"],
+        **{f"{part}_at": starts[part] for part in ("normals", "cells", "nearest")},
+    )
+
+
+def ball_around(objects: Sequence[Placed]) -> np.generic:
+    """Centre (volume space) and radius in metres of a ball that holds all objects, as a float4; 0 without any."""
+    if not objects:
+        return float4(0, 0, 0, 0)
+    matrices = np.array([matrix for _, matrix in objects])
+    bounds = np.array([thing.bounds for thing, _ in objects])
+    in_model = bounds[:, _CORNERS, np.arange(3)]  # [n, 8, 3]
+    corners = (in_model @ matrices[:, :3, :3].swapaxes(1, 2) + matrices[:, None, :3, 3]).reshape(-1, 3)
+    center = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    return float4(*center, float(np.linalg.norm(corners - center, axis=1).max()) * 1.02)
+
+
+_CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
+"""[8, 3] of a box: 0 for its low side, 1 for its high one."""
 
 
 def trace_scene(
@@ -164,8 +236,9 @@ def upload_light(
     return DeviceLight(
         engine.workspace.upload("light", _float4(sh)),
         np.maximum(0.5 / np.sqrt(np.pi) * sh[0], 0.0),
-        engine.workspace.upload("arriving", _arriving(rays, sh)),
-        plane_arguments(engine, "light_planes", planes),
+        _upload_table(engine, "light_table", rays, sh, sh, planes),
+        planes,
+        sh,
         exposure * indirect.mean if indirect else np.zeros(3),
         exposure if indirect else 0.0,
     )
@@ -181,24 +254,48 @@ def take_discs(
     return replace(
         light,
         coefficients=engine.workspace.upload("light_rest", _float4(rest)),
-        arriving=engine.workspace.upload("arriving_rest", _arriving(rays, rest)),
+        table=_upload_table(engine, "light_rest_table", rays, rest, light.sh, light.planes),
         discs=tuple(replace(disc, irradiance=exposure * disc.irradiance) for disc in split.discs),
         with_discs=light.coefficients,
     )
+
+
+def _upload_table(
+    engine: Engine,
+    name: str,
+    rays: Directions,
+    sh: NDArray[np.float64],
+    whole: NDArray[np.float64],
+    planes: PlaneArrays,
+) -> Parts:
+    """The light's table as include/arriving.clh has it."""
+    rows, shapes, maps = planes
+    arrays = {"coefficients": _float4(sh), "whole": _float4(whole), "arriving": _arriving(rays, sh)}
+    return engine.workspace.upload_parts(name, arrays | {"planes": rows, "shapes": shapes, "maps": maps})
 
 
 def _arriving(rays: Directions, sh: NDArray[np.float64]) -> NDArray[np.float32]:
     return _float4(np.maximum(rays.basis @ sh.astype(np.float32), 0.0))
 
 
-def _changed_arguments(engine: Engine, changed: Changed | None) -> tuple[KernelArgument, ...]:
-    """CHANGED_PARAMETERS of include/changed.clh."""
+def _changed_parameters(changed: Changed | None) -> np.void:
+    """ChangedParameters of structs.py."""
     if changed is None:
-        unused = engine.workspace.array("unused", (1,), cl_types.float4)
-        return float16(np.eye(4)), float4(1, 1, 0, 0), int4(0, 0, 1, 0), unused, unused
+        return CHANGED_PARAMETERS(
+            camera_from_volume=float16(np.eye(4)), intrinsics=float4(1, 1, 0, 0), grid=int4(0, 0, 1, 0)
+        )
     ratio, camera = changed.ratio, changed.camera
-    grid = int4(ratio.cols, ratio.rows, ratio.stride, camera.width)
-    return float16(changed.camera_from_volume), intrinsics(camera), grid, changed.positions, ratio.values
+    return CHANGED_PARAMETERS(
+        camera_from_volume=float16(changed.camera_from_volume),
+        intrinsics=intrinsics(camera),
+        grid=int4(ratio.cols, ratio.rows, ratio.stride, camera.width),
+    )
+
+
+def _changed_buffers(engine: Engine, changed: Changed | None) -> tuple[cl_array.Array, cl_array.Array]:
+    """CHANGED_BUFFERS of include/scene.clh."""
+    unused = engine.workspace.array("unused", (1,), cl_types.float4)
+    return (changed.positions, changed.ratio.values) if changed else (unused, unused)
 
 
 def _float4(rgb: NDArray[np.floating]) -> NDArray[np.float32]:

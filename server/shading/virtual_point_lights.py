@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from server.objects.rasterize import Placed
 from server.objects.surface_points import SIDES, SurfacePoints, float4_rows
-from server.opencl.engine import Engine, KernelArgument
+from server.opencl.engine import Engine
+from server.opencl.parts import Parts
 
 Floats = NDArray[np.float64]
 
@@ -26,15 +27,9 @@ Floats = NDArray[np.float64]
 class VirtualPointLights:
     """What Glow of virtual_point_lights.clh takes; arrays of the engine's workspace, valid until the next frame."""
 
-    nearest: cl_array.Array
-    cells: cl_array.Array
-    points: cl_array.Array
-    normals: cl_array.Array
+    table: Parts
+    """`points`, `normals`, `cells` and `nearest`, in one buffer."""
     radiances: cl_array.Array
-
-    def arguments(self) -> tuple[KernelArgument, ...]:
-        """In the order of OBJECT_PARAMETERS of include/shadows.clh."""
-        return self.nearest, self.cells, self.points, self.normals, self.radiances
 
 
 @dataclass(frozen=True)
@@ -63,13 +58,15 @@ class PlacedPoints:
 def no_point_lights(engine: Engine, objects: int = 1) -> VirtualPointLights:
     """So many objects that send nothing: they have no cells."""
     count = max(objects, 1)
-    empty = engine.workspace.constant("no_glow", np.zeros(1, cl_types.float4))
+    empty = np.zeros(1, cl_types.float4)
+    cells, nearest = np.zeros(count, cl_types.int4), np.full(SIDES, -1, np.int32)
     return VirtualPointLights(
-        engine.workspace.constant("no_glow_nearest", np.full(SIDES, -1, np.int32)),
-        engine.workspace.constant(f"no_glow_cells_{count}", np.zeros(count, cl_types.int4)),
-        empty,
-        empty,
-        empty,
+        engine.workspace.upload_parts(
+            f"no_glow_table_{count}",
+            {"points": empty, "normals": empty, "cells": cells, "nearest": nearest},
+            is_constant=True,
+        ),
+        engine.workspace.constant("no_glow", empty),
     )
 
 
@@ -132,10 +129,15 @@ def place_points(engine: Engine, objects: Sequence[Placed]) -> PlacedPoints:
         space.upload("glow_albedos", float4_rows(every.albedos)),
         space.upload("glow_offsets", cells_m[every.owners].astype(np.float32)),
         VirtualPointLights(
-            space.upload("glow_nearest", every.nearest),
-            space.upload("glow_cells", every.cells.view(cl_types.int4)[:, 0]),
-            space.upload("glow_points", float4_rows(every.points)),
-            space.upload("glow_normals", float4_rows(every.normals)),
+            space.upload_parts(
+                "glow_table",
+                {
+                    "points": float4_rows(every.points),
+                    "normals": float4_rows(every.normals),
+                    "cells": every.cells.view(cl_types.int4)[:, 0],
+                    "nearest": every.nearest,
+                },
+            ),
             space.upload("glow_nothing", np.zeros(len(points), cl_types.float4)),
         ),
     )

@@ -23,6 +23,7 @@ from server.maths.rigid import inverse_rigid
 from server.maths.self_occlusion import occlusion_threshold
 from server.maths.sh import GOLDEN_TURN
 from server.opencl.engine import Engine, float16
+from server.opencl.structs import VIEW_TRANSFER_PARAMETERS
 from server.transfer.auxiliary_views import VIEWS, AuxiliaryViews, ViewsAround, look_into_views
 from server.transfer.radiance_transfer import (
     Directions,
@@ -30,6 +31,7 @@ from server.transfer.radiance_transfer import (
     first_set,
     own_sets,
     room_for_transfer,
+    sample_grid,
     window_arguments,
 )
 from server.transfer.real_depth_views import RealDepthViews
@@ -210,32 +212,30 @@ def transfer_from_views(
     engine.launch(
         engine.kernel("image_space.cl", "transfer_from_views", **defines),
         (cols, rows),
-        cols,
-        rows,
-        stride,
-        camera.width,
-        camera.height,
+        VIEW_TRANSFER_PARAMETERS(
+            grid=sample_grid(camera, result),
+            camera_from_volume=float16(inverse_rigid(volume_from_camera)),
+            intrinsics=intrinsics(camera),
+            height=camera.height,
+            voxel_m=volume.voxel_m,
+            count=rays.count,
+            first_set=first_set(turn),
+            ratio=ratio,
+            steps=NEAR_STEPS,
+            further=FURTHER_STEPS,
+            near_m=near_m,
+            reach_m=reach_m,
+            slack=SLACK,
+            inverse_threshold=1.0 / threshold,
+        ),
         surface.positions,
         normals,
-        volume.voxel_m,
         look_into_views(engine, camera, surface, normals, stride, views, view_of, rays, reach_m, lift_m, turn),
         depths,
-        float16(inverse_rigid(volume_from_camera)),
-        intrinsics(camera),
-        rays.count,
-        first_set(turn),
         rays.on_device(engine),
         rays.basis_on_device(engine),
         engine.workspace.upload("sample_starts", starts),
-        ratio,
-        NEAR_STEPS,
-        FURTHER_STEPS,
         any_unknown,
-        near_m,
-        reach_m,
-        SLACK,
-        lift_m,
-        1.0 / threshold,
         result.coefficients,
         result.openness,
         result.flatness,

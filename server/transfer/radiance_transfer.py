@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.maths.sh import GOLDEN_TURN, sh_basis, spherical_fibonacci
 from server.opencl.engine import Engine, KernelArgument
-from server.transfer.visibility_cache import VisibilityCaches, no_caches
+from server.opencl.structs import GRID, TRANSFER_PARAMETERS
+from server.transfer.visibility_cache import NO_CACHES, VisibilityCaches, no_caches
 from server.transfer.visibility_state import VisibilityState
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
@@ -134,23 +135,31 @@ def transfer_radiance(
     defines = {"BANDS": result.bands, "MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": rays.interleave}
     if state is not None:
         defines["HAS_STATE"] = 1
-    only: tuple[KernelArgument, ...] = ()
+    only: tuple[KernelArgument, ...] = (state.bits,) if state else ()
     if chosen is not None:
         defines["IS_CHOSEN"] = 1
-        only = len(chosen), space.upload(f"chosen_{rows}x{cols}", np.resize(chosen, rows * cols))
+        only = (*only, space.upload(f"chosen_{rows}x{cols}", np.resize(chosen, rows * cols)))
     engine.launch(
         engine.kernel("radiance_transfer.cl", "transfer_radiance", **defines),
         (cols, rows) if chosen is None else (len(chosen),),
-        *window_arguments(camera, surface, stride),
+        TRANSFER_PARAMETERS(
+            grid=sample_grid(camera, result),
+            volume=volume.shape,
+            height=camera.height,
+            radius=window_px(camera),
+            count=rays.count,
+            first_set=first_set(turn),
+            reach_m=reach_m,
+            chosen_count=0 if chosen is None else len(chosen),
+            **(caches.parameters() if caches else NO_CACHES),
+        ),
+        surface.positions,
+        surface.normals,
         surface.labels,
-        *volume.arguments(),
-        rays.count,
-        first_set(turn),
+        *volume.arguments()[1:4],
         rays.on_device(engine),
         rays.basis_on_device(engine),
-        reach_m,
-        *(caches.arguments() if caches else no_caches(engine)),
-        state.bits if state else space.array("unused_state", (1,), np.uint32),
+        *(caches.buffers() if caches else no_caches(engine)),
         result.coefficients,
         result.openness,
         result.flatness,
@@ -182,8 +191,12 @@ def room_for_transfer(
 def window_arguments(camera: CameraModel, surface: Surface, stride: int) -> tuple[KernelArgument, ...]:
     """Where samples lie, and the window that the normal of each is the mean of (smooth_normal.clh)."""
     cols, rows = camera.width // stride, camera.height // stride
-    window_px = max(1, round(camera.width * _WINDOW))
-    return cols, rows, stride, camera.width, camera.height, window_px, surface.positions, surface.normals
+    return cols, rows, stride, camera.width, camera.height, window_px(camera), surface.positions, surface.normals
+
+
+def window_px(camera: CameraModel) -> int:
+    """Half the side of that window, pixels."""
+    return max(1, round(camera.width * _WINDOW))
 
 
 def first_set(turn: int) -> int:
@@ -196,15 +209,14 @@ def own_sets(engine: Engine, rows: int, cols: int, turn: int = 0) -> cl_array.Ar
     return engine.workspace.constant(f"own_sets_{turn % TURNS}_{rows}x{cols}", _sets_of(rows, cols, turn % TURNS))
 
 
-def sample_arguments(
-    engine: Engine, camera: CameraModel, surface: Surface, transfer: Transfer
-) -> tuple[KernelArgument, ...]:
-    """SAMPLE_PARAMETERS of real_shading.clh: the samples of real surface, and which of their directions are free."""
+def sample_grid(camera: CameraModel, transfer: Transfer) -> np.void:
+    """GRID of the transfer's samples."""
+    return GRID(cols=transfer.cols, rows=transfer.rows, stride=transfer.stride, width=camera.width)
+
+
+def sample_arguments(engine: Engine, surface: Surface, transfer: Transfer) -> tuple[KernelArgument, ...]:
+    """SAMPLE_BUFFERS of real_shading.clh: the samples of real surface, and which of their directions are free."""
     return (
-        transfer.cols,
-        transfer.rows,
-        transfer.stride,
-        camera.width,
         surface.positions,
         surface.normals,
         transfer.openness,

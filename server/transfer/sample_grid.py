@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import pyopencl.array as cl_array
+
+from protocol.frames import CameraModel
+from server.opencl.structs import GRID
+
+NO_GRID = GRID(cols=0, rows=0, stride=1, width=0)
+"""For kernels that shade no samples of a picture."""
 
 
 @dataclass(frozen=True)
@@ -23,3 +30,18 @@ class SampleGrid:
     def cols(self) -> int:
         """Samples across."""
         return int(self.values.shape[1])
+
+
+def grid_of(samples: SampleGrid, camera: CameraModel) -> np.void:
+    """GRID of samples of a camera's picture."""
+    return GRID(cols=samples.cols, rows=samples.rows, stride=samples.stride, width=camera.width)
+
+
+def pixel_grid(camera: CameraModel) -> np.void:
+    """GRID whose samples are all pixels."""
+    return GRID(cols=camera.width, rows=camera.height, stride=1, width=camera.width)
+
+
+def no_samples(camera: CameraModel) -> np.void:
+    """GRID without samples."""
+    return GRID(cols=0, rows=0, stride=1, width=camera.width)

@@ -16,6 +16,7 @@ from protocol.frames import CameraModel
 from server.input.measure import intrinsics
 from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine, KernelArgument
+from server.opencl.parts import Parts
 
 
 class VisibilityCaches:
@@ -53,23 +54,45 @@ class VisibilityCaches:
         self._lens = intrinsics(camera)
         self._cameras[self._frame % self._interleave] = inverse_rigid(volume_from_camera)
 
-    def arguments(self) -> tuple[KernelArgument, ...]:
+    def parameters(self) -> dict[str, object]:
+        """Fields of TransferParameters."""
+        k = self._interleave
+        return {
+            "phase": self._frame % k,
+            "intrinsics": self._lens,
+            "layers": self._known - 1,
+            "newest": (self._frame - 1) % k,
+            "cached_normals_at": self.surface.starts["normals"],
+        }
+
+    @property
+    def surface(self) -> Parts:
+        """`points` and `normals` of all layers, [k, rows, cols] float4."""
+        shape = ((self._interleave, *self._shape[:2]), cl_types.float4)
+        return self._engine.workspace.parts("cache_surface", {"points": shape, "normals": shape})
+
+    def buffers(self) -> tuple[KernelArgument, ...]:
         """What transfer_radiance of radiance_transfer.cl takes, in its order."""
         space, k, (rows, cols, words) = self._engine.workspace, self._interleave, self._shape
         return (
-            self._frame % k,
-            self._lens,
-            self._known - 1,
-            (self._frame - 1) % k,
             space.upload("cache_cameras", self._cameras.reshape(k, 16).view(cl_types.float16)),
-            space.array("cache_points", (k, rows, cols), cl_types.float4),
-            space.array("cache_normals", (k, rows, cols), cl_types.float4),
+            self.surface.memory,
             space.array("cache_traced", (k, rows, cols), np.uint16),
             space.array("cache_blocked", (k, rows, cols, words), np.uint32),
         )
 
 
 def no_caches(engine: Engine) -> tuple[KernelArgument, ...]:
-    """The arguments where every frame traces every direction."""
+    """The buffers where every frame traces every direction."""
     unused = engine.workspace.array("unused", (1,), cl_types.float4)
-    return 0, np.zeros(1, cl_types.float4)[0], 0, 0, unused, unused, unused, unused, unused
+    return unused, unused, unused, unused
+
+
+NO_CACHES: dict[str, object] = {
+    "phase": 0,
+    "intrinsics": np.zeros(1, cl_types.float4)[0],
+    "layers": 0,
+    "newest": 0,
+    "cached_normals_at": 0,
+}
+"""Fields of TransferParameters where every frame traces every direction."""

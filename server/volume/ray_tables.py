@@ -7,7 +7,8 @@ import pyopencl.array as cl_array
 from numpy.typing import NDArray
 
 from server.opencl.engine import Engine, int4
-from server.opencl.transfer import copy_beginning, fill_bytes
+from server.opencl.parts import part_alignment_bytes
+from server.opencl.transfer import copy_beginning, fill_bytes, part_of
 from server.volume.brick_pool import BrickPool, rounded, upload_list
 
 GREATEST_GAP = 15
@@ -22,8 +23,13 @@ class RayTables:
         self._engine = engine
         self.bricks = bricks
         space, count = engine.workspace, bricks[0] * bricks[1] * bricks[2]
-        self.solid: cl_array.Array = space.array("brick_solid", bricks[::-1], np.uint64)
-        self.gaps: cl_array.Array = space.array("brick_gaps", (8 * count,), np.uint8)
+        step = part_alignment_bytes(engine.device.cl_device)
+        self.gaps_at = -(-8 * count // step) * step
+        """Byte of `memory` at which the gaps begin."""
+        self.memory: cl_array.Array = space.array("brick_tables", (self.gaps_at + 8 * count,), np.uint8)
+        """The solid cells, and the gaps behind them: kernels take both as one argument."""
+        self.solid: cl_array.Array = part_of(self.memory, 0, bricks[::-1], np.uint64)
+        self.gaps: cl_array.Array = part_of(self.memory, self.gaps_at, (8 * count,), np.uint8)
         self._occupied = space.array("brick_occupied", (count,), np.uint8)
         self._inner = [space.array(f"gaps_{axis}", ((2 << axis) * count + 16,), np.uint8) for axis in range(2)]
         self._changed = space.array("changed_bricks", (6,), np.int32)
@@ -33,7 +39,7 @@ class RayTables:
     @property
     def bytes_held(self) -> int:
         """Device memory."""
-        return sum(a.nbytes for a in (self.solid, self.gaps, self._occupied, self._changed, *self._inner))
+        return sum(a.nbytes for a in (self.memory, self._occupied, self._changed, *self._inner))
 
     def find_solid(self, listed: cl_array.Array, count: int, slots: cl_array.Array, pool: BrickPool) -> None:
         """Look through the voxels of the first `count` listed bricks."""

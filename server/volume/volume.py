@@ -18,6 +18,7 @@ from protocol.frames import CameraModel
 from server.input.measure import intrinsics
 from server.maths.rigid import translation
 from server.opencl.engine import Engine, KernelArgument, float16, int4
+from server.opencl.structs import VOLUME_SHAPE
 from server.opencl.transfer import fill_bytes
 from server.volume.brick_pool import BRICK_VOXELS
 from server.volume.brick_residency import Residency
@@ -157,16 +158,17 @@ class Volume:
         return translation(-self.origin_world)
 
     def arguments(self) -> tuple[KernelArgument, ...]:
-        """What make_volume of include/volume.clh takes, in its order."""
-        return (
-            int4(*self.bricks, 0),
-            self.slots_device,
-            self._tables.gaps,
-            self._tables.solid,
-            self.octets,
-            self.voxels,
-            self.voxel_m,
-            self.truncation_m,
+        """VOLUME_PARAMETERS of include/volume.clh."""
+        return self.shape, self.slots_device, self._tables.memory, self.octets, self.voxels
+
+    @property
+    def shape(self) -> np.void:
+        """VolumeShape of structs.py."""
+        return VOLUME_SHAPE(
+            bricks=int4(*self.bricks, 0),
+            voxel_m=self.voxel_m,
+            truncation_m=self.truncation_m,
+            gaps_at=self._tables.gaps_at,
         )
 
     def allocate(self, camera: CameraModel, volume_from_camera: NDArray[np.float64], depth_m: cl_array.Array) -> None:

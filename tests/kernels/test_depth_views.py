@@ -17,6 +17,7 @@ from server.objects.rasterize import Placed
 from server.objects.virtual_object import VirtualObject
 from server.opencl.engine import Engine
 from server.opencl.program import KERNEL_FOLDER
+from server.opencl.structs import struct_text
 from server.shading import depth_views as stage
 from server.shading.depth_views import DepthViews, ViewShape, draw_depth_views, view_axes
 from server.shading.traced_scene import TracedScene, trace_scene, upload_light
@@ -24,6 +25,7 @@ from server.transfer.auxiliary_views import ViewsAround
 from server.transfer.image_space import nearest_views
 from server.transfer.radiance_transfer import Directions, direction_sets
 from server.transfer.real_depth_views import RealDepthViews
+from server.transfer.sample_grid import NO_GRID
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
 from tests.reference import depth_views as twin
@@ -64,9 +66,9 @@ kernel void probe(const int items, global const float4 *points, global const flo
                   global float4 *places) {
     const int item = get_global_id(0);
     if (item >= items) return;
-    const Volume volume = VOLUME_OF_PARAMETERS;
-    const Objects things = OBJECTS_OF_PARAMETERS(offset_m);
-    const Arriving light = LIGHT_OF_PARAMETERS;
+    const Volume volume = VOLUME_OF_SCENE;
+    const Objects things = OBJECTS_OF_SCENE(offset_m);
+    const Arriving light = ARRIVING_OF_SCENE;
     int chosen[LANES];
     float at_m[LANES];
     float3 at[LANES];
@@ -132,12 +134,13 @@ def probe(engine: Engine, scene: TracedScene, points: Floats, normals: Floats, o
     """points, normals [n, 3] with n the directions of all sets. offset_m: > 0 asks for points of virtual surface."""
     defines = [f"-D{name}={value}" for name, value in scene.defines(engine).items()]
     options = ["-cl-std=CL1.2", "-Werror", "-I", str(KERNEL_FOLDER / "include"), *defines]
-    kernel = cl.Kernel(cl.Program(engine.device.context, SOURCE).build(options), "probe")
+    kernel = cl.Kernel(cl.Program(engine.device.context, struct_text() + SOURCE).build(options), "probe")
     space, count = engine.workspace, len(points)
     found: list[Any] = [space.array(f"test_found_{k}", (count,), t) for k, t in enumerate((np.int32, "f4", "f4"))]
     places = space.upload("test_places", float4(np.zeros((count, 3)), np.ones(count)))
     given = (space.upload(f"test_{k}", float4(v, np.ones(count))) for k, v in enumerate((points, normals)))
-    engine.launch(kernel, (count,), count, *given, *scene.arguments(engine), offset_m, *found, places)
+    whole = (scene.parameters(engine, NO_GRID), *scene.arguments(engine))
+    engine.launch(kernel, (count,), count, *given, *whole, offset_m, *found, places)
     blocked, object_m, met = (engine.download(a) for a in found)
     at = vectors(engine.download(places))[:, :3].astype(float)
     return Probed(blocked > 0, object_m.astype(float), met.astype(float), at)

@@ -83,7 +83,6 @@ class Case:
             self.camera,
             self.surface,
             self.device_transfer,
-            self.volume,
             self.rays,
             1000.0,
             self.device_light(),

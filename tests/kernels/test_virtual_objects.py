@@ -16,6 +16,7 @@ from server.objects.virtual_object import VirtualObject
 from server.objects.voxelize import ObjectTable, object_table
 from server.opencl.engine import Engine
 from server.opencl.program import KERNEL_FOLDER
+from server.opencl.structs import struct_text
 from server.scene.mesh import Mesh
 from tests.reference import voxelize as twin
 from tests.scenes.meshes import mesh_of, pose, public_mesh, shape_of
@@ -41,7 +42,7 @@ Points = NDArray[np.float64]
 def trace(engine: Engine) -> Any:
     """Visibility of rays (origins [n, 3], directions [n, 3], reach) through a table."""
     options = ["-cl-std=CL1.2", "-Werror", "-I", str(KERNEL_FOLDER / "include")]
-    kernel = cl.Kernel(cl.Program(engine.device.context, SOURCE).build(options), "trace")
+    kernel = cl.Kernel(cl.Program(engine.device.context, struct_text() + SOURCE).build(options), "trace")
 
     def run(table: ObjectTable, origins: Points, directions: Points, reach_m: float = FAR_M) -> NDArray[np.float32]:
         space, rays = engine.workspace, len(origins)

@@ -11,6 +11,7 @@ from protocol.frames import CameraModel
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.opencl.program import KERNEL_FOLDER
+from server.opencl.structs import struct_text
 from server.transfer.radiance_transfer import direction_sets
 from server.transfer.visibility import trace_visibility
 from server.volume.brick_table import AWAY_SLOT
@@ -28,13 +29,11 @@ MOST_BOXES = 16
 """As in blockers.clh."""
 BOXES = """
 #include "blockers.clh"
-kernel void boxes(const int4 bricks, global const int *slots, global const uchar *gaps, global const ulong *solid,
-                  global const uchar *octets, global const float2 *voxels, const float voxel_m,
-                  const float truncation_m, const int count, global const float4 *origins,
+kernel void boxes(VOLUME_PARAMETERS, const int count, global const float4 *origins,
                   global const float4 *normals, const float reach, global float4 *low, global float4 *high) {
     const int i = get_global_id(0);
     if (i >= count) return;
-    const Volume volume = make_volume(bricks, voxel_m, truncation_m, slots, gaps, solid, octets, voxels);
+    const Volume volume = VOLUME_OF_PARAMETERS;
     Blockers boxes;
     find_blockers(volume, origins[i].xyz, normals[i].xyz, reach, &boxes);
     for (int k = 0; k < MOST_BOXES; k++) {
@@ -53,7 +52,7 @@ def boxes_of(
 ) -> list[tuple[Floats, Floats]]:
     """Lower and upper corners [boxes, 3] of each point's boxes; voxels."""
     options = ["-cl-std=CL1.2", "-Werror", "-I", str(KERNEL_FOLDER / "include")]
-    kernel = cl.Kernel(cl.Program(device.context, BOXES).build(options), "boxes")
+    kernel = cl.Kernel(cl.Program(device.context, struct_text() + BOXES).build(options), "boxes")
     space, count = engine.workspace, len(origins)
     inputs = [space.upload(f"box_{k}", float4(a)) for k, a in enumerate((origins, normals))]
     outputs = [space.upload(f"box_{name}", float4(np.zeros((count, MOST_BOXES, 3)))) for name in ("low", "high")]

@@ -66,7 +66,9 @@ class Watcher:
         )
         get = self.engine.download
         assert found.sets is not None
-        phase, _, known, newest, _, points, normals, traced, blocked = self.caches.arguments()
+        _, _, traced, blocked = self.caches.buffers()
+        points, normals = (self.caches.surface.array(name) for name in ("points", "normals"))
+        phase, known, newest = (self.caches.parameters()[name] for name in ("phase", "layers", "newest"))
         layer = (int(newest) + 1) % self.interleave  # type: ignore[call-overload]
         assert layer == phase
         bits = np.unpackbits(get(blocked)[layer].view(np.uint8), axis=-1, bitorder="little")  # type: ignore[arg-type]

@@ -10,7 +10,6 @@ from server.shading.tone_mapping import EVERY, Averages, measure_averages
 from server.shading.traced_scene import upload_light
 from server.transfer.indirect import Indirect
 from server.transfer.radiance_transfer import Transfer, direction_sets
-from server.volume.volume import Volume
 from tests.reference import tone_mapping as twin
 from tests.reference.sh import open_transfer
 from tests.scenes import lights
@@ -58,8 +57,7 @@ class Case:
         sent = Indirect(hits, np.array([0.1, 0.2, 0.3])) if indirect else None
         device_light = upload_light(engine, light, rays, indirect=sent, exposure=2.0)
         radiance = space.upload("test_radiance", float4(everywhere[0][..., :3], everywhere[0][..., 3]))
-        volume = Volume(engine, (0, 0, 0, 0.5, 0.5, 0.5), 0.02)
-        return measure_averages(engine, camera, radiance, surface, transfer, volume, rays, device_light, sent, 1000.0)
+        return measure_averages(engine, camera, radiance, surface, transfer, rays, device_light, sent, 1000.0)
 
     def expected(self, light: Floats = LIGHT, *, indirect: bool = True) -> Averages:
         """Of the twin."""

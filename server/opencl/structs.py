@@ -1,0 +1,214 @@
+"""Device structs: what kernels take by value beside their buffers. Each is declared once, as a NumPy dtype.
+
+The C text is made from the same declaration and stands in front of every program (program.py). OpenCL 1.2 allows no
+pointers in the structs of kernel arguments, so buffers stay arguments of their own. Vectors of three are left out: C
+gives a float3 the size of a float4.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+_TYPES: dict[str, np.dtype[Any]] = {
+    "int": np.dtype(np.int32),
+    "float": np.dtype(np.float32),
+    "int4": cl_types.int4,
+    "float4": cl_types.float4,
+    "float16": cl_types.float16,
+}
+
+
+class Struct:
+    """A C struct of 32-bit scalars, vectors and other structs; called with all fields by name, it gives a value."""
+
+    def __init__(self, name: str, **fields: str | Struct) -> None:
+        """Each field is the name of an OpenCL C type, or a struct. Raises KeyError for a type that is not shared."""
+        self.name: str = name
+        dtypes = [field.dtype if isinstance(field, Struct) else _TYPES[field] for field in fields.values()]
+        alignments = [
+            field.alignment if isinstance(field, Struct) else _TYPES[field].itemsize for field in fields.values()
+        ]
+        self.alignment: int = max(alignments)
+        """Bytes. C aligns scalars and vectors to their size, and a struct as its most aligned field."""
+        offsets, end = [], 0
+        for dtype, alignment in zip(dtypes, alignments, strict=True):
+            offsets.append(_rounded(end, alignment))
+            end = offsets[-1] + dtype.itemsize
+        size = _rounded(end, self.alignment)
+        layout: Any = {"names": [*fields], "formats": dtypes, "offsets": offsets, "itemsize": size}
+        self.dtype: np.dtype[Any] = np.dtype(layout)
+        types = {field: of.name if isinstance(of, Struct) else of for field, of in fields.items()}
+        members = "".join(f"    {of} {field};\n" for field, of in types.items())
+        self.c_text = f"typedef struct {{\n{members}}} {name};\n"
+
+    def __call__(self, **values: object) -> np.void:
+        """A kernel argument. Raises TypeError where a field is missing or unknown."""
+        names = self.dtype.names or ()
+        if values.keys() != set(names):
+            wrong = ", ".join(sorted(values.keys() ^ set(names)))
+            raise TypeError(f"{self.name} has the fields {', '.join(names)}; missing or unknown: {wrong}")
+        filled: NDArray[np.void] = np.zeros(1, self.dtype)
+        for field, value in values.items():
+            filled[field] = value
+        result: np.void = filled[0]
+        return result
+
+
+def _rounded(count: int, step: int) -> int:
+    return -(-count // step) * step
+
+
+GRID = Struct("Grid", cols="int", rows="int", stride="int", width="int")
+"""Samples of a picture `width` wide: sample (row, col) lies at pixel stride / 2 + stride * (row, col)."""
+
+VOLUME_SHAPE = Struct("VolumeShape", bricks="int4", voxel_m="float", truncation_m="float", gaps_at="int")
+"""Of include/volume.clh. gaps_at: byte of the ray tables at which the gaps begin, behind the solid cells."""
+
+LIGHT_PARAMETERS = Struct(
+    "LightParameters",
+    unseen="float4",
+    count="int",
+    reach_m="float",
+    plane_count="int",
+    cell_m="float",
+    least_m="float",
+    arriving_at="int",
+    planes_at="int",
+    shapes_at="int",
+    maps_at="int",
+    coefficients_at="int",
+    whole_at="int",
+)
+"""Of Arriving in include/arriving.clh. ..._at: byte of the light's table at which an array begins."""
+
+CHANGED_PARAMETERS = Struct("ChangedParameters", camera_from_volume="float16", intrinsics="float4", grid="int4")
+"""Of Changed in include/changed.clh."""
+
+OBJECT_PARAMETERS = Struct(
+    "ObjectParameters", ball="float4", count="int", dims_at="int", normals_at="int", cells_at="int", nearest_at="int"
+)
+"""Of Objects in include/scene.clh. ball: around all objects, centre and radius. dims_at: byte of the objects'
+table; the others: bytes of the points' table."""
+
+SCENE_PARAMETERS = Struct(
+    "SceneParameters",
+    volume=VOLUME_SHAPE,
+    light=LIGHT_PARAMETERS,
+    changed=CHANGED_PARAMETERS,
+    objects=OBJECT_PARAMETERS,
+    samples=GRID,
+    every="int",
+)
+"""Of include/scene.clh. samples: where the kernel shades; every: of how many directions it follows one."""
+
+REFLECTION_PARAMETERS = Struct("ReflectionParameters", scene=SCENE_PARAMETERS, eye="float4", least_gloss="float")
+"""Of reflect.cl. eye: where the camera is, volume metres."""
+
+VIEW_PARAMETERS = Struct(
+    "ViewParameters",
+    picture_from_volume="float16",
+    picture_intrinsics="float4",
+    center="float4",
+    side="int",
+    distance_m="float",
+    per_pixel="float",
+    picture_width="int",
+    picture_height="int",
+    near_m="float",
+    near_ratio="float",
+    most_apart="float",
+)
+"""Of RealViews and Picture in include/views.clh."""
+
+DIRECT_PARAMETERS = Struct("DirectParameters", ball="float4", least="float4", count="int")
+"""Of DirectLights in include/direct_lights.clh. least: shading that counts at least, see include/direct_mix.clh."""
+
+TRANSFER_PARAMETERS = Struct(
+    "TransferParameters",
+    grid=GRID,
+    volume=VOLUME_SHAPE,
+    intrinsics="float4",
+    height="int",
+    radius="int",
+    count="int",
+    first_set="int",
+    reach_m="float",
+    phase="int",
+    layers="int",
+    newest="int",
+    cached_normals_at="int",
+    chosen_count="int",
+)
+"""Of radiance_transfer.cl. cached_normals_at: byte of the cache's surface at which its normals begin."""
+
+VIEW_TRANSFER_PARAMETERS = Struct(
+    "ViewTransferParameters",
+    grid=GRID,
+    camera_from_volume="float16",
+    intrinsics="float4",
+    height="int",
+    voxel_m="float",
+    count="int",
+    first_set="int",
+    ratio="float",
+    steps="int",
+    further="int",
+    near_m="float",
+    reach_m="float",
+    slack="float",
+    inverse_threshold="float",
+)
+"""Of transfer_from_views in image_space.cl."""
+
+MIXTURE_PARAMETERS = Struct(
+    "MixtureParameters",
+    camera_from_volume="float16",
+    height="int",
+    tolerance_m="float",
+    virtual_gain="float",
+    virtual_samples=GRID,
+    real_samples=GRID,
+    has_refined_occluded="int",
+    has_refined_ratio="int",
+)
+"""Of Mixture in include/composite_inputs.clh."""
+
+LAYER_PARAMETERS = Struct(
+    "LayerParameters",
+    mixture=MIXTURE_PARAMETERS,
+    depth_scale_m="float",
+    virtual_depth_at="int",
+    ratio_at="int",
+    real_depth_at="int",
+)
+"""Of layer.cl. ..._at: byte of the layer's buffer at which an array begins."""
+
+SURFACE_PARAMETERS = Struct("SurfaceParameters", around="int4", region="int4", width="int", object_count="int")
+"""Of shade_surface in rasterize.cl."""
+
+STRUCTS = (
+    GRID,
+    VOLUME_SHAPE,
+    LIGHT_PARAMETERS,
+    CHANGED_PARAMETERS,
+    OBJECT_PARAMETERS,
+    SCENE_PARAMETERS,
+    REFLECTION_PARAMETERS,
+    VIEW_PARAMETERS,
+    DIRECT_PARAMETERS,
+    TRANSFER_PARAMETERS,
+    VIEW_TRANSFER_PARAMETERS,
+    MIXTURE_PARAMETERS,
+    LAYER_PARAMETERS,
+    SURFACE_PARAMETERS,
+)
+"""All of them; a struct comes after those that it holds."""
+
+
+def struct_text() -> str:
+    """C declarations of all structs, for the front of a program's source."""
+    return '#line 1 "structs.py"\n' + "".join(struct.c_text for struct in STRUCTS)

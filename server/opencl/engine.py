@@ -92,11 +92,13 @@ def _make_queue(device: Device) -> cl.CommandQueue:
 
 
 def _type_of(value: KernelArgument) -> Any:
-    """None for memory."""
+    """None for memory and structs."""
     if isinstance(value, bool | int):
         return np.int32
     if isinstance(value, float):
         return np.float32
+    if isinstance(value, np.void) and value.dtype not in cl_types.vec_type_to_scalar_and_count:
+        return None  # a struct: pyopencl's cache on disk takes those of one size for the same type
     return value.dtype if isinstance(value, np.generic) else None
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyopencl as cl
@@ -38,5 +38,5 @@ def part_of(whole: cl_array.Array, start: int, shape: tuple[int, ...], dtype: DT
 
 
 def _memory(array: cl_array.Array) -> cl.Buffer:
-    assert isinstance(array.data, cl.Buffer)
-    return array.data
+    assert isinstance(array.data, cl.MemoryObject)
+    return cast(cl.Buffer, array.data)

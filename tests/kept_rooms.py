@@ -16,8 +16,8 @@ from server.opencl.device import Device
 from server.room.room import Room
 from server.scene.placement import Placement
 from server.service.room_store import RoomStore
+from server.service.saving.room_snapshots import snapshot_within
 from server.service.saving.slot import Slot
-from server.service.saving.snapshot import snapshot_within
 from server.service.saving.state import state_to_bytes
 from server.volume.volume import Volume
 from tests.meshes import shape_of

@@ -18,8 +18,8 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
+from client.laptop.object_placing import place_objects
 from client.laptop.objects import ObjectFile
-from client.laptop.run import place_objects
 from client.laptop.synthetic.export import write_guests
 from client.laptop.synthetic.lights import disc_light
 from client.laptop.synthetic.source import SyntheticSource, open_synthetic

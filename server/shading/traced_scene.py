@@ -18,8 +18,8 @@ from protocol.frames import CameraModel
 from server.input.measure import intrinsics
 from server.light.continuation import NO_PLANES, PlaneArrays, plane_arguments
 from server.maths.direct_lights import DirectLight, SplitLight
+from server.objects.object_table import ObjectTable, object_table
 from server.objects.rasterize import Placed
-from server.objects.voxelize import ObjectTable, object_table
 from server.opencl.engine import Engine, KernelArgument, float4, float16, int4
 from server.shading.depth_views import DepthViews
 from server.shading.virtual_point_lights import VirtualPointLights, no_point_lights

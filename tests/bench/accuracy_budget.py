@@ -15,7 +15,7 @@ from statistics import fmean, median
 import numpy as np
 from msgspec import structs
 
-from client.laptop.source import Source
+from client.laptop.frame_source import Source
 from client.laptop.tune import tune
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Wishes

@@ -12,8 +12,8 @@ import numpy as np
 from msgspec import Struct, structs
 from numpy.typing import NDArray
 
+from client.laptop.object_placing import place_objects
 from client.laptop.objects import ObjectFile
-from client.laptop.run import place_objects
 from server.client_session import ClientSession
 from server.evaluation.environment import direction_error_deg, environment_difference, irradiance_error
 from server.evaluation.flip import flip_map

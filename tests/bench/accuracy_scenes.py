@@ -17,7 +17,8 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
-from client.laptop.source import Source, open_source
+from client.laptop.frame_source import Source
+from client.laptop.source import open_source
 from client.laptop.synthetic.export import write_guests
 from client.laptop.synthetic.lights import disc_light
 from client.laptop.synthetic.source import open_synthetic

@@ -17,7 +17,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from client.client import Answer, StreamClient
-from client.laptop.source import Source, open_source
+from client.laptop.frame_source import Source
+from client.laptop.source import open_source
 from protocol.codec import encode
 from protocol.messages import ClientMessage, ServerMessage, Wishes
 from tests.bench.service_process import resident_mb, serving

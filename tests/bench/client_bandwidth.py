@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from client.adaptive import LADDER
 from client.coding import Coding, frame_message, picture_bytes
-from client.laptop.source import Source, open_source
+from client.laptop.frame_source import Source
+from client.laptop.source import open_source
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import decode_color, decode_depth
 from server.client_session import ClientSession

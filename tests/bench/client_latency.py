@@ -15,7 +15,7 @@ import numpy as np
 from rich.console import Console
 
 from client.client import Access
-from client.laptop.source import Source
+from client.laptop.frame_source import Source
 from client.laptop.stream import Sending, StreamSummary, stream
 from client.laptop.stream_figures import STAGES
 from client.video import IS_POSSIBLE

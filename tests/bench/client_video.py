@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.coding import Coding, frame_message
-from client.laptop.source import Source, open_source
+from client.laptop.frame_source import Source
+from client.laptop.source import open_source
 from client.video import IS_POSSIBLE, VideoEncoder
 from protocol.colors import ColorReader
 from protocol.frames import RgbdFrame

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.source import Source
+from client.laptop.frame_source import Source
 from client.progress import note
 from server.evaluation.hand import HandBefore
 from server.evaluation.interleaving import interleaving_spread

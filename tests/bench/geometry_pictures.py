@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from client.laptop.source import Source
+from client.laptop.frame_source import Source
 from server.evaluation.hand import HandBefore
 from server.evaluation.hybrid import depth_of, run_geometry, vectors
 from server.opencl.device import Device

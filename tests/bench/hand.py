@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.source import Source
+from client.laptop.frame_source import Source
 from client.laptop.volume import default_volume, default_voxel
 from server.evaluation.hand import HandBefore
 from server.evaluation.hybrid import HandReport, measure_hand

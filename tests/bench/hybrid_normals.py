@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from client.laptop.source import Source
+from client.laptop.frame_source import Source
 from client.laptop.synthetic.source import SyntheticSource, open_synthetic
 from client.laptop.volume import default_volume, default_voxel
 from server.evaluation.hybrid_normals import BufferNormals, TrueNormals, measure_normals

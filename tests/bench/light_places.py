@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from client.laptop.source import Source
+from client.laptop.frame_source import Source
 from client.laptop.synthetic.source import open_synthetic
 from protocol.messages import Wishes
 from server.evaluation.environment import direction_error_deg

@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from client.laptop.frame_source import Source
+from client.laptop.object_placing import place_objects
 from client.laptop.objects import ObjectFile
-from client.laptop.run import place_objects
-from client.laptop.source import Source
 from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import RgbdFrame
 from protocol.messages import Preset, Wishes
@@ -27,7 +27,7 @@ REFERENCE: Preset = "rm"
 
 @dataclass(frozen=True)
 class Exposed:
-    """A linear16 source whose pictures are taken with a shorter exposure; see client.laptop.source.Source."""
+    """A linear16 source whose pictures are taken with a shorter exposure; see client.laptop.frame_source.Source."""
 
     source: Source
     factor: float

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from client.laptop.source import Source, open_source
+from client.laptop.frame_source import Source
+from client.laptop.source import open_source
 from server.opencl.device import Device
 from tests.bench.finished import ROOT, UnmeasurableError
 

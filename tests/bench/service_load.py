@@ -23,7 +23,8 @@ from typing import Any
 import trimesh
 
 from client.client import Answer, ClientError, StreamClient
-from client.laptop.source import Source, open_source
+from client.laptop.frame_source import Source
+from client.laptop.source import open_source
 from client.laptop.volume import default_volume
 from protocol.frames import RgbdFrame
 from protocol.messages import Acknowledged, Composite, Dropped, Preset, Wishes

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.client import Answer, StreamClient
-from client.laptop.source import Source, open_source
+from client.laptop.frame_source import Source
+from client.laptop.source import open_source
 from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
 from server.scene.vase import vase_glb

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.source import Source
+from client.laptop.frame_source import Source
 from client.laptop.synthetic.noise import kinect_like
 from client.laptop.volume import default_volume, default_voxel
 from server.evaluation.hybrid import depth_of, run_geometry, vectors

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.source import Source
+from client.laptop.frame_source import Source
 from client.laptop.volume import default_volume, default_voxel
 from server.evaluation.trajectory import Track, aligned_ate_rmse_m, ate_rmse_m, consistency, track_source
 from server.opencl.device import Device

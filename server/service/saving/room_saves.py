@@ -14,8 +14,9 @@ from server.opencl.device import Device
 from server.room.room import Room
 from server.service.saving.files import DamagedFile
 from server.service.saving.moves import Moves, forget_moves, moves_since, read_moves, write_moves
+from server.service.saving.room_snapshots import rebuilt, snapshot
 from server.service.saving.slot import Slot
-from server.service.saving.snapshot import Snapshot, rebuilt, snapshot
+from server.service.saving.snapshot import Snapshot
 from server.service.saving.state import VERSION, Header, state_to_bytes
 
 SLOTS = ("0", "1")

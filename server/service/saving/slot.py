@@ -7,17 +7,18 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 from weakref import ref
 
 import msgspec
 from msgspec import structs
 
 from server.parsing.mesh_bytes import mesh_to_bytes
+from server.room.room_objects import KeptObject
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.service.saving.brick_files import Batch, merged, write_bricks
 from server.service.saving.files import DamagedFile, check_file, read_parts, sync_folder, write_parts
+from server.service.saving.snapshot import Snapshot
 from server.service.saving.state import (
     VERSION,
     FileName,
@@ -30,10 +31,6 @@ from server.service.saving.state import (
 )
 from server.service.saving.upkeep import ASIDE
 from server.volume.volume import Volume
-
-if TYPE_CHECKING:
-    from server.room.room_objects import KeptObject
-    from server.service.saving.snapshot import Snapshot
 
 SAVE, PART = "save", "save.part"
 """What a save is read by; it names all other files."""

@@ -50,7 +50,7 @@ bench: .venv/installed-bench
 
 # Oclgrind has a folder of its own: in .venv its simulator would pass for a GPU and be preferred.
 check-races: .venv/installed-test .oclgrind/installed
-	$(BIN)/python -m tests.bench.stability_races .oclgrind $(FAMILIES)
+	$(BIN)/python -m tests.bench.stability.races .oclgrind $(FAMILIES)
 
 web: .venv/installed-test
 	$(BIN)/python -m protocol.typescript

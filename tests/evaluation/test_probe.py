@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from protocol.frames import CameraModel
-from server.evaluation.probe import (
+from tests import lights
+from tests.bench.truth.probe import (
     ProbeError,
     Sphere,
     active_probe,
@@ -17,7 +18,6 @@ from server.evaluation.probe import (
     passive_probe,
     sphere_pixels,
 )
-from tests import lights
 from tests.lights import degrees_between
 from tests.reference.sh import lambert_bands, sh_basis
 

@@ -8,9 +8,9 @@ import pytest
 
 from client.laptop.synthetic.noise import kinect_like
 from protocol.frames import CameraModel
-from server.evaluation.noise import NormalView, depth_normals, normal_improvement, plane_normals
 from server.opencl.device import Device
 from tests.analytic import look, look_at, plane, quantised, room, sphere
+from tests.bench.geometry.noise import NormalView, depth_normals, normal_improvement, plane_normals
 from tests.data import data_folder
 
 CAMERA = CameraModel(width=320, height=240, fx=262.5, fy=262.5, cx=159.5, cy=119.5)

@@ -11,8 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.evaluation.memory import room_memory
-from server.evaluation.rooms import LIVING_ROOM, walk
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
@@ -21,6 +19,8 @@ from server.volume.brick_table import AWAY_SLOT, BRICK, NO_SLOT
 from server.volume.raycast import raycast
 from server.volume.volume import Volume, VolumeSizeError
 from tests.analytic import look, look_at, plane, room, sphere
+from tests.bench.geometry.memory import room_memory
+from tests.bench.truth.rooms import LIVING_ROOM, walk
 from tests.volumes import cast, fuse, upload_depth
 
 CAMERA = CameraModel(width=160, height=120, fx=131.0, fy=131.0, cx=79.5, cy=59.5)

@@ -8,9 +8,9 @@ import pytest
 
 from client.laptop.source import open_source
 from protocol.frames import CameraModel, RgbdFrame
-from server.evaluation.surface import SurfaceView, fused_views, inside_bounds, surface_accuracy
 from server.opencl.device import Device
 from tests.analytic import look, look_at, room
+from tests.bench.geometry.surface import SurfaceView, fused_views, inside_bounds, surface_accuracy
 from tests.data import data_folder
 
 CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)

@@ -179,6 +179,7 @@ def test_a_picture_for_each_set(tmp_path: Path) -> None:
 def test_figures_go_between_the_marks(tmp_path: Path) -> None:
     result = {
         "commit": "abc",
+        "date": "2026-11-22",
         "device": "device",
         "sizes": {"frames": 3},
         "rows": [
@@ -188,6 +189,7 @@ def test_figures_go_between_the_marks(tmp_path: Path) -> None:
         "unmeasured": [{"name": "x", "reason": "no GPU"}],
     }
     text = figures(result)
+    assert text.startswith("Commit abc, measured 2026-11-22 on device. frames: 3.")
     assert "| held | 1 | deg | <= 2 | yes |" in text
     assert "| beside | 2 |  |" in text
     assert "- x: no GPU" in text

@@ -24,12 +24,18 @@ def write_page(page: Path, result: Path, shown: Callable[[str], bool] = lambda _
     shutil.copy(result, page.with_suffix(".json"))
 
 
+def origin(result: dict[str, Any]) -> str:
+    """The commit, the date and the machine of a result; results of earlier versions have no date."""
+    date = f" {result['date']}" if "date" in result else ""
+    return f"Commit {result['commit']}, measured{date} on {result['device']}"
+
+
 def figures(result: dict[str, Any]) -> str:
     """Markdown: the machine, what was held and what not, all rows, what was not measured."""
     sizes = ", ".join(f"{name}: {count}" for name, count in result["sizes"].items())
     held = [row for row in result["rows"] if row["goal"]]
     others = [row for row in result["rows"] if not row["goal"]]
-    lines = [f"Commit {result['commit']} on {result['device']}. {sizes}.", "", "Held against a goal:", ""]
+    lines = [f"{origin(result)}. {sizes}.", "", "Held against a goal:", ""]
     lines += ["| row | value | unit | goal | holds |", "|---|---|---|---|---|"]
     for row in held:
         holds = "yes" if row["holds"] else "**no**"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,9 @@ class Report:
         """One object, as the command line's contract has it."""
         rows = [{**asdict(row), "goal": row.goal or None, "holds": row.holds} for row in self.rows]
         unmeasured = [asdict(item) for item in self.unmeasured]
-        return {"device": self.device, "commit": commit(), "rows": rows, "unmeasured": unmeasured, "sizes": self.sizes}
+        today = datetime.now(UTC).date().isoformat()
+        head = {"device": self.device, "commit": commit(), "date": today}
+        return {**head, "rows": rows, "unmeasured": unmeasured, "sizes": self.sizes}
 
 
 def commit() -> str:

@@ -11,7 +11,7 @@ from itertools import groupby
 from typing import Any
 
 from tests.bench.report.finished import ROOT
-from tests.bench.report.page import END, START
+from tests.bench.report.page import END, START, origin
 from tests.bench.stability.suite import OUT
 
 PAGE = ROOT / "docs" / "benchmarks" / "stability.md"
@@ -20,7 +20,7 @@ PAGE = ROOT / "docs" / "benchmarks" / "stability.md"
 def figures(result: dict[str, Any]) -> str:
     """Markdown: what was run, what is red, and every case with bound and errors."""
     builds, cases = result["builds"], result["cases"]
-    lines = [f"Commit {result['commit']} on {result['device']}: {len(cases)} cases in {len(builds)} builds.", ""]
+    lines = [f"{origin(result)}: {len(cases)} cases in {len(builds)} builds.", ""]
     lines += ["| build | green | red |", "|---|---|---|"]
     for build in builds:
         red = sum(case["builds"][build]["fault"] is not None for case in cases)

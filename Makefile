@@ -74,19 +74,15 @@ lint: .venv/installed-test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+# Each suite measures, then writes its page of docs/benchmarks with the commit and the date.
+SUITES := geometry light rendering accuracy plan stability service client
 bench: .venv/installed-bench
-	$(BIN)/probeless bench geometry
-	$(BIN)/probeless bench light
-	$(BIN)/probeless bench rendering
-	$(BIN)/probeless bench accuracy
-	$(BIN)/probeless bench plan
-	$(BIN)/probeless bench stability
-	$(BIN)/probeless bench service
-	$(BIN)/probeless bench client
+	set -e; for suite in $(SUITES); do \
+		$(BIN)/probeless bench $$suite; $(BIN)/python -m tests.bench.$$suite.doc; done
 
 # Oclgrind has a folder of its own: in .venv its simulator would pass for a GPU and be preferred.
 check-races: .venv/installed-test .oclgrind/installed
-	$(BIN)/python -m tests.bench.stability_races .oclgrind $(FAMILIES)
+	$(BIN)/python -m tests.bench.stability.races .oclgrind $(FAMILIES)
 
 web: .venv/installed-test
 	$(BIN)/python -m protocol.typescript

@@ -1,6 +1,6 @@
 """`probeless bench SUITE`: finds the suite, runs it, prints its rows.
 
-A suite is a module of `server.evaluation` or `tests.bench` named after it, with
+Suites are part of a source checkout, not of the installed package. A suite is the module `tests.bench.NAME.suite`, with
 `run_suite(quick: bool, progress: Callable[[str], None]) -> dict`: `device`, `commit`, `rows`, `unmeasured`.
 """
 
@@ -18,52 +18,62 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from client.laptop.errors import OptionError
+from client.laptop.errors import OptionError, RunError
 from client.progress import note, say
 
 SUITES = ("geometry", "light", "rendering", "accuracy", "stability", "plan", "service", "client")
+OWN_PACKAGES = ("tests", "client", "server", "protocol", "cl_kernels")
 _CHECKOUT = Path(__file__).resolve().parents[1]
-PACKAGES = ("server.evaluation", "tests.bench")
 
 Suite = Callable[..., dict[str, Any]]
 
 
 def run_bench(name: str, as_json: bool, quick: bool, options: Mapping[str, Any] | None = None) -> None:
-    """Run a suite and print what it measured. `options`: those that only some suites take; None where nothing was said.
+    """Run a suite and print what it measured. `options`: those that only some suites take; None where not given.
 
-    Raises OptionError, listing the suites that exist, and for an option that the suite does not take.
+    Raises OptionError for an unknown suite and for an option that the suite does not take. Raises RunError where the
+    suite's files or a package that it needs are missing.
     """
     suite = find_suite(name)
-    if suite is None:
-        existing = ", ".join(known for known in SUITES if find_suite(known) is not None)
-        raise OptionError(f"there is no suite {name!r} here; there are: {existing or 'none yet'}")
-    said = {option: value for option, value in (options or {}).items() if value is not None}
-    for option in said:
+    given = {option: value for option, value in (options or {}).items() if value is not None}
+    for option in given:
         if option not in signature(suite).parameters:
             raise OptionError(f"--{option}: bench {name} has no such option; leave it out")
-    result = suite(quick, note, **said)
+    try:
+        result = suite(quick, note, **given)
+    except ModuleNotFoundError as error:
+        raise _missing(name, error) from error
     if as_json:
         say(json.dumps(result, allow_nan=False))
     else:
         _print(result)
 
 
-def find_suite(name: str) -> Suite | None:
-    """The suite's function, if this installation has it."""
+def find_suite(name: str) -> Suite:
+    """The suite's function. Raises OptionError for an unknown name, RunError where something is not installed."""
     if name not in SUITES:
-        return None
-    if str(_CHECKOUT) not in sys.path:  # the benchmarks lie beside the packages, not in them
+        raise OptionError(f"there is no suite {name!r}; there are: {', '.join(SUITES)}")
+    if str(_CHECKOUT) not in sys.path:  # the suites lie beside the packages, not in them
         sys.path.append(str(_CHECKOUT))
-    for package in PACKAGES:
-        if _exists(package) and _exists(f"{package}.{name}"):
-            function: Suite | None = getattr(import_module(f"{package}.{name}"), "run_suite", None)
-            if function is not None:
-                return function
-    return None
+    if not _exists(f"tests.bench.{name}.suite"):
+        raise RunError(f"bench {name}: suites are part of the source checkout; run make install-bench and bench there")
+    try:
+        function: Suite = import_module(f"tests.bench.{name}.suite").run_suite
+    except ModuleNotFoundError as error:
+        raise _missing(name, error) from error
+    return function
+
+
+def _missing(name: str, error: ModuleNotFoundError) -> Exception:
+    """The user's error where another project's package is missing. One of our own is a defect: the error itself."""
+    package = (error.name or "").split(".")[0]
+    if package in OWN_PACKAGES:
+        return error
+    return RunError(f"bench {name} needs {package}, which is not installed: make install-bench installs it")
 
 
 def _exists(module: str) -> bool:
-    """True if the module can be found; the benchmarks' package is not part of every installation."""
+    """True if the module can be found; the benchmarks are not part of every installation."""
     try:
         return find_spec(module) is not None
     except ModuleNotFoundError:

@@ -10,9 +10,10 @@ from typing import Any
 from client.capture_options import DENOISE, PRESETS, ROBUSTNESS, CaptureOptions
 from client.laptop.datasets.ground_truth import GroundTruthSource
 from client.laptop.errors import OptionError
+from client.laptop.frame_source import ENDLESS, Source, is_live
 from client.laptop.light_file import read_light, read_panorama_light
 from client.laptop.objects import ObjectFile, parse_object
-from client.laptop.source import ENDLESS, Source, is_live, open_source
+from client.laptop.source import open_source
 from client.laptop.volume import Volume, default_volume, default_voxel, with_room_to_move
 from protocol.messages import Wishes
 

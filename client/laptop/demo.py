@@ -8,8 +8,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from client.laptop.frame_source import Source
 from client.laptop.objects import ObjectFile
-from client.laptop.source import Source, open_source
+from client.laptop.source import open_source
 from client.laptop.stream import StreamSummary, stream
 from client.laptop.volume import default_volume, default_voxel
 from client.progress import say

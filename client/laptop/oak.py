@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from client.laptop.errors import SourceError
-from client.laptop.source import ENDLESS
+from client.laptop.frame_source import ENDLESS
 from protocol.frames import CameraModel, RgbdFrame
 
 SIZE = (640, 480)
@@ -29,7 +29,7 @@ class Reader(Protocol):
 
 
 class OakSource:
-    """See client.laptop.source.Source. Each index gives the newest frame that was not given yet, and names it."""
+    """See client.laptop.frame_source.Source. Each index gives the newest frame that was not given yet, and names it."""
 
     name = "oak"
     fps = FPS

@@ -60,7 +60,7 @@ class _Video:
 
 @dataclass(frozen=True)
 class RecordedSource:
-    """See client.laptop.source.Source; frames are read from the file when asked for."""
+    """See client.laptop.frame_source.Source; frames are read from the file when asked for."""
 
     path: Path
     camera: CameraModel

@@ -8,9 +8,9 @@ from types import TracebackType
 from typing import Protocol
 
 from client.laptop.errors import RunError
-from client.laptop.objects import ObjectFile, pack_mesh
+from client.laptop.frame_source import is_live
+from client.laptop.object_placing import place_objects
 from client.laptop.output import FrameOutput
-from client.laptop.source import is_live
 from client.laptop.stopping import stop_on_interrupt
 from client.options import Capture
 from protocol.frames import CameraModel, RgbdFrame
@@ -19,8 +19,6 @@ from server.client_session import ClientSession
 from server.meshing.files import mesh_files
 from server.opencl.device import open_device
 from server.pipeline import FrameResult
-from server.scene.mesh import load_mesh
-from server.scene.placement import Placement
 
 
 class Processor(Protocol):
@@ -83,24 +81,6 @@ def process_frames(pipeline: Processor, frames: Iterable[RgbdFrame]) -> Iterator
             plan=result.plan,
             notes=result.notes,
         )
-
-
-def place_objects(pipeline: ClientSession, objects: tuple[ObjectFile, ...], note: Callable[[str], None]) -> None:
-    """Put every object into the pipeline, named by `object_id`. Raises ObjectError, MeshError or RunError."""
-    for number, item in enumerate(objects):
-        format_, data = pack_mesh(item.path)
-        placement = Placement(position_m=item.position_m, scale=item.scale, yaw_deg=item.yaw_deg)
-        try:
-            notes = pipeline.place_object(object_id(number), load_mesh(data, format_), placement)
-        except ValueError as error:
-            raise RunError(f"{item.path}: {error}") from error
-        for text in notes:
-            note(f"{item.path.name}: {text}")
-
-
-def object_id(number: int) -> str:
-    """The session's name of the n-th `--object`, the same in `run` and `stream`."""
-    return f"object-{number}"
 
 
 def _open_pipeline(

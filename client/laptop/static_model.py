@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from client.laptop.cloud_normals import SurfacePoints, smooth, turned_outwards
 from client.laptop.errors import OptionError, OutputError, RunError
+from client.laptop.frame_source import Source
 from client.laptop.point_cloud import CloudFusion
-from client.laptop.source import Source, open_source
+from client.laptop.source import open_source
 from client.laptop.volume import default_volume, default_voxel
 from client.options import parse_frames
 from server.maths.sh import webxr_from_world

@@ -21,9 +21,9 @@ from client.adaptive import Adaptive, Measured
 from client.client import Access, Answer, ClientError, RoomPlace, StreamClient
 from client.coding import Coding, picture_bytes
 from client.laptop.errors import OutputError, SourceError
+from client.laptop.frame_source import ENDLESS, Source, is_live
 from client.laptop.objects import ObjectFile, pack_mesh
 from client.laptop.output import FrameOutput, OutputWriter
-from client.laptop.source import ENDLESS, Source, is_live
 from client.laptop.stopping import stop_on_interrupt
 from client.laptop.stream_figures import STAGES, StreamFigures
 from client.laptop.stream_view import StreamView

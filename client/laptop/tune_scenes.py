@@ -18,16 +18,16 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
+from client.laptop.known_light import LitFrame, found_lights, moving_light, shaded_views
+from client.laptop.object_placing import place_objects
 from client.laptop.objects import ObjectFile
-from client.laptop.run import place_objects
 from client.laptop.synthetic.export import write_guests
 from client.laptop.synthetic.lights import disc_light
 from client.laptop.synthetic.source import SyntheticSource, open_synthetic
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Wishes
 from server.client_session import ClientSession
-from server.evaluation.e1 import LitFrame, moving_light, score, shaded_views
-from server.evaluation.environment import direction_error_deg
+from server.maths.light_direction import direction_error_deg
 from server.maths.sh import spherical_fibonacci
 from server.opencl.device import Device
 from server.pipeline import FrameResult
@@ -114,14 +114,12 @@ class LitRoom:
 
     def error_deg(self, device: Device, point: SamplingSettings, say: Say) -> float:
         """Of the dominant direction, median over frames."""
-        found = score(device, self._source.camera, _told(self._frames, say), point.wishes(self._wishes))
-        errors = [direction_error_deg(a, b.sh) for a, b in zip(found.lights, self._frames, strict=True)]
+        lights = found_lights(device, self._source.camera, self._frames, point.wishes(self._wishes))
+        errors: list[float] = []
+        for frame, found in lights:
+            errors.append(direction_error_deg(found, frame.sh))
+            say(len(errors))
         return median(errors[LIT_SETTLING:])
-
-
-def _told(frames: list[LitFrame], say: Say) -> list[LitFrame]:
-    say(len(frames))
-    return frames
 
 
 def _usual(source: SyntheticSource) -> Wishes:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.laptop.errors import SourceError
-from client.laptop.source import Source, is_live
+from client.laptop.frame_source import Source, is_live
 from protocol.frames import CameraModel, RgbdFrame
 
 Volume = tuple[float, float, float, float, float, float]

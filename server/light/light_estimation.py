@@ -44,7 +44,7 @@ CHANGE = 3.0
 _LEAST_MISFIT = 1e-4  # of the frame's energy: below it a ratio of misfits says nothing
 MODEL_DOUBT = 1.3
 """Of the standard deviation over what the residuals tell of it: so that 95 % intervals hold what they should, by scenes
-of known light (tests/bench/light_honesty.py)."""
+of known light (tests/bench/light/honesty.py)."""
 THESIS_FORGETTING = 0.9
 COLOR_DEVIATION = 0.2
 """Prior size of a channel's deviation from its multiple of the luminance, relative to the luminance's."""

@@ -20,8 +20,8 @@ from server.input.measure import intrinsics
 from server.light.continuation import LEAST_M, NO_PLANES, PlaneArrays
 from server.maths.direct_lights import DirectLight, SplitLight
 from server.maths.planes import CELL_M
+from server.objects.object_table import ObjectTable, object_table
 from server.objects.rasterize import Placed
-from server.objects.voxelize import ObjectTable, object_table
 from server.opencl.engine import Engine, KernelArgument, float4, float16, int4
 from server.opencl.parts import Parts
 from server.opencl.structs import CHANGED_PARAMETERS, LIGHT_PARAMETERS, OBJECT_PARAMETERS, SCENE_PARAMETERS

@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from client.bench import SUITES, find_suite
 from client.cli import main, run_command
 from tests.client import folders
 from tests.data import ROOT
@@ -207,12 +206,6 @@ def test_an_error_of_the_program_itself_is_told_too(
     error = capsys.readouterr().err
     assert error.startswith("probeless: internal error, TypeError: ")
     assert error.count("\n") == 1
-
-
-def test_bench_finds_only_what_is_a_suite() -> None:
-    assert find_suite("depth_codecs") is None  # a module of the package, but no suite
-    assert find_suite("os") is None
-    assert all(callable(find_suite(name) or len) for name in SUITES)
 
 
 def test_demo_ends_by_itself_with_pictures(tmp_path: Path) -> None:

@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from client.capture_options import CaptureOptions
 from client.laptop.errors import SourceError
+from client.laptop.frame_source import ENDLESS, is_live
 from client.laptop.oak import OakSource
 from client.laptop.oak_pose import FLU_FROM_CAMERA, UP, PoseTrail, world_from_lens
 from client.laptop.run import Run
-from client.laptop.source import ENDLESS, is_live, open_source
+from client.laptop.source import open_source
 from client.laptop.stopping import stop_on_interrupt
 from client.options import prepare
 from protocol.frames import CameraModel, RgbdFrame

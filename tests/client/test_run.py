@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from client.laptop.errors import RunError
-from client.laptop.run import object_id, process_frames
+from client.laptop.object_placing import object_id
+from client.laptop.run import process_frames
 from protocol.frames import RgbdFrame
 from protocol.messages import Plan, Timings
 from tests.client.lights import light_of

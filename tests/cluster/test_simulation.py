@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from server.cluster.capacity import Policy
-from server.cluster.simulation import DAY_S, HOURS, TICK_S, Day, Fleet, Load, arrivals, simulate
+from tests.bench.cluster.simulation import DAY_S, HOURS, TICK_S, Day, Fleet, Load, arrivals, simulate
 
 LOAD, FLEET = Load(busiest_per_hour=60.0), Fleet()
 

@@ -8,8 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from tests.bench.thesis_numbers import FAMILIES, MOVING, PRESETS, ROWS, STATIC
-from tests.bench.thesis_runs import medians
+from tests.bench.thesis.numbers import FAMILIES, MOVING, PRESETS, ROWS, STATIC
+from tests.bench.thesis.runs import medians
 
 FRAMES = 4
 

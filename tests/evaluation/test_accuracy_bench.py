@@ -13,10 +13,11 @@ from client.laptop.errors import OptionError
 from protocol.messages import Wishes
 from server.opencl.device import Device
 from server.quality.settings import read_wishes
-from tests.bench import accuracy_scenes, sweep
-from tests.bench.accuracy_knobs import KNOBS, points
-from tests.bench.accuracy_points import MeasuredPoint, measure_point, words_of
-from tests.bench.sweep import SweepError, Task, run_sweep
+from tests.bench.accuracy import scenes as accuracy_scenes
+from tests.bench.accuracy.knobs import KNOBS, points
+from tests.bench.accuracy.points import MeasuredPoint, measure_point, words_of
+from tests.bench.report import sweep
+from tests.bench.report.sweep import SweepError, Task, run_sweep
 
 
 def point(task: Task, total_ms: float = 10.0) -> MeasuredPoint:

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tests.bench.accuracy_front import front_of, interval
-from tests.bench.accuracy_plots import curve_of, preset_of
-from tests.bench.accuracy_points import MeasuredPoint, words_of
-from tests.bench.accuracy_report import write_report
-from tests.bench.accuracy_thesis import PRESETS as PRESETS_PART
-from tests.bench.accuracy_thesis import SPEED
-from tests.bench.finished import Part
-from tests.bench.plotting import spread_labels
-from tests.bench.thesis_numbers import ROWS
-from tests.bench.thesis_tables import table_6_2
+from tests.bench.accuracy.front import front_of, interval
+from tests.bench.accuracy.plots import curve_of, preset_of
+from tests.bench.accuracy.points import MeasuredPoint, words_of
+from tests.bench.accuracy.report import write_report
+from tests.bench.accuracy.thesis import PRESETS as PRESETS_PART
+from tests.bench.accuracy.thesis import SPEED
+from tests.bench.report.finished import Part
+from tests.bench.report.plotting import spread_labels
+from tests.bench.thesis.numbers import ROWS
+from tests.bench.thesis.tables import table_6_2
 from tests.evaluation.made_up import presets_details, speed_details
 
 pytest.importorskip("matplotlib", reason="matplotlib is not installed: make install-bench")

@@ -12,7 +12,11 @@ from numpy.typing import NDArray
 from client.laptop.synthetic.source import open_synthetic
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Wishes
-from server.evaluation.bases import (
+from server.light.light_estimation import TileSums, prior_precision
+from server.maths.sh import LUMINANCE, spherical_fibonacci
+from server.opencl.device import Device
+from server.transfer.radiance_transfer import direction_sets
+from tests.bench.bases.bases import (
     FINE_BANDS,
     SIZES,
     Basis,
@@ -27,15 +31,11 @@ from server.evaluation.bases import (
     largest_haar,
     octahedral,
 )
-from server.evaluation.bases_estimation import estimate_light, nearest_nonnegative
-from server.evaluation.bases_lights import LATTICE, HardLight, disc, lattice, of_panorama, sun, two_lamps
-from server.evaluation.bases_scene import STRIDE, Ball, LitScene, rays_in
-from server.evaluation.bases_scores import Transfers, Truth, score_light
-from server.evaluation.environment import CUBE_SIDE, cube_directions
-from server.light.light_estimation import TileSums, prior_precision
-from server.maths.sh import LUMINANCE, spherical_fibonacci
-from server.opencl.device import Device
-from server.transfer.radiance_transfer import direction_sets
+from tests.bench.bases.estimation import estimate_light, nearest_nonnegative
+from tests.bench.bases.lights import LATTICE, HardLight, disc, lattice, of_panorama, sun, two_lamps
+from tests.bench.bases.scene import STRIDE, Ball, LitScene, rays_in
+from tests.bench.bases.scores import Transfers, Truth, score_light
+from tests.bench.light.environment import CUBE_SIDE, cube_directions
 from tests.reference.sh import lambert_bands, open_transfer, sh_basis, sphere_rule
 from tests.scenes.lights import degrees_between, random_directions, unit
 
@@ -378,7 +378,7 @@ def test_scores_are_nothing_where_nothing_is_wrong() -> None:
 
 def test_the_picture_is_drawn(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    from tests.bench.accuracy_bases import MEASURES, VARIANTS, draw_bases
+    from tests.bench.bases.comparison import MEASURES, VARIANTS, draw_bases
 
     points = [
         {"basis": name, "coefficients": size, "scene": "table", "variant": variant, "ms_ratio": size / 16,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from server.evaluation.composites import (
+from server.shading.composite import srgb_codes
+from tests.bench.rendering.composites import (
     NOISE,
     RIM_PX,
     bleeding_slope,
@@ -19,8 +20,7 @@ from server.evaluation.composites import (
     shadow_correlation,
     shadow_slope,
 )
-from server.evaluation.flip import flip_map
-from server.shading.composite import srgb_codes
+from tests.bench.rendering.flip import flip_map
 
 
 def picture(seed: int = 3) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from server.evaluation.coverage import Estimate, coverage
+from tests.bench.light.coverage import Estimate, coverage
 from tests.scenes.lights import lobe_and_sky, random_directions
 
 SPREAD = 0.01

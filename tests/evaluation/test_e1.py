@@ -8,12 +8,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from client.laptop.known_light import ALBEDO, BACKGROUND, ShadedView, moving_light, shaded_views
 from client.laptop.synthetic.source import open_synthetic
 from client.laptop.volume import default_volume, default_voxel
 from protocol.messages import Wishes
-from server.evaluation.e1 import ALBEDO, BACKGROUND, ShadedView, lag_of, moving_light, score, shaded_views
 from server.opencl.device import Device
-from tests.bench.light_e1 import FRAMES, SEQUENCES, Thing, WithThings, light_of
+from tests.bench.light.e1 import FRAMES, SEQUENCES, Thing, WithThings, light_of
+from tests.bench.light.light_score import lag_of, score
 from tests.scenes.lights import degrees_between, lobe_and_sky, uniform
 
 COUNT = 3

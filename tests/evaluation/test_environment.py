@@ -5,19 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from server.evaluation.environment import (
+from server.maths.light_direction import direction_dot, direction_error_deg
+from server.maths.sh import rotate_sh, webxr_from_world
+from tests.bench.light.environment import (
     bands_of,
     best_scale,
     cube_directions,
-    direction_dot,
-    direction_error_deg,
     environment_difference,
     irradiance_error,
     lat_long_directions,
     radiance_from,
     relative_rmse,
 )
-from server.maths.sh import rotate_sh, webxr_from_world
 from tests.reference.sh import open_transfer, sphere_rule
 from tests.scenes.lights import Floats, lobe, lobe_and_sky, uniform
 

@@ -17,15 +17,17 @@ from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
 from server.maths.sh import lambert_transfer, sh_basis, spherical_fibonacci
 from server.opencl.engine import Engine
-from tests.bench import light, light_parts, light_speed
-from tests.bench.finished import Part
-from tests.bench.light_e1 import SEQUENCES, overall_part
-from tests.bench.light_honesty import random_light
-from tests.bench.light_pictures import FOUND_COLOR, HEIGHT_PX, TRUE_COLOR, draw_rooms, environment_picture, panels
-from tests.bench.light_runs import Exposed, at_preset, refusal, wishes_for
-from tests.bench.light_speed import WARM_UP, errors_beside, timed
-from tests.bench.page import figures, write_page
-from tests.bench.run import Run
+from tests.bench.light import parts as light_parts
+from tests.bench.light import speed as light_speed
+from tests.bench.light import suite as light
+from tests.bench.light.e1 import SEQUENCES, overall_part
+from tests.bench.light.honesty import random_light
+from tests.bench.light.pictures import FOUND_COLOR, HEIGHT_PX, TRUE_COLOR, draw_rooms, environment_picture, panels
+from tests.bench.light.runs import Exposed, at_preset, refusal, wishes_for
+from tests.bench.light.speed import WARM_UP, errors_beside, timed
+from tests.bench.report.finished import Part
+from tests.bench.report.page import figures, write_page
+from tests.bench.report.run import Run
 from tests.scenes.lights import lobe, lobe_and_sky
 
 UP, VIEW = np.array([0.0, 1, 0]), np.array([0.0, 0, -1])
@@ -177,6 +179,7 @@ def test_a_picture_for_each_set(tmp_path: Path) -> None:
 def test_figures_go_between_the_marks(tmp_path: Path) -> None:
     result = {
         "commit": "abc",
+        "date": "2026-11-22",
         "device": "device",
         "sizes": {"frames": 3},
         "rows": [
@@ -186,6 +189,7 @@ def test_figures_go_between_the_marks(tmp_path: Path) -> None:
         "unmeasured": [{"name": "x", "reason": "no GPU"}],
     }
     text = figures(result)
+    assert text.startswith("Commit abc, measured 2026-11-22 on device. frames: 3.")
     assert "| held | 1 | deg | <= 2 | yes |" in text
     assert "| beside | 2 |  |" in text
     assert "- x: no GPU" in text

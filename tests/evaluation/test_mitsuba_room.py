@@ -7,11 +7,11 @@ import pytest
 
 from client.laptop.source import open_source
 from protocol.messages import Wishes
-from server.evaluation.mitsuba_room import RoomSet, model_for, room_sets
-from server.evaluation.object_shading import ObjectShading
 from server.maths.sh import dominant_direction, rotate_sh
-from tests.bench.light_room import in_picture
-from tests.bench.light_runs import Exposed
+from tests.bench.light.room import in_picture
+from tests.bench.light.runs import Exposed
+from tests.bench.truth.mitsuba_room import RoomSet, model_for, room_sets
+from tests.bench.truth.object_shading import ObjectShading
 from tests.data import data_folder
 from tests.reference.sh import open_transfer
 

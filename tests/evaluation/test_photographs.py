@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from server.evaluation.photometric_set import (
+from server.maths.sh import lambert_transfer
+from tests.bench.truth.photometric_set import (
     PhotometricSet,
     Samples,
     angles_deg,
@@ -19,7 +20,7 @@ from server.evaluation.photometric_set import (
     judge_sums,
     read_photometric_set,
 )
-from server.evaluation.socrates import (
+from tests.bench.truth.socrates import (
     BANDS,
     BustView,
     explained,
@@ -28,7 +29,6 @@ from server.evaluation.socrates import (
     plain_fit,
     without_effects,
 )
-from server.maths.sh import lambert_transfer
 from tests.data import data_folder
 from tests.scenes import lights
 from tests.scenes.lights import degrees_between, random_directions, unit

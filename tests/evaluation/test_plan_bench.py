@@ -26,7 +26,7 @@ from server.opencl.device import Device
 from server.reuse.temporal_reuse import NOISY
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
-from tests.bench.plan import changed_share, greatest, holds, is_as_known, stated_bound
+from tests.bench.plan.suite import changed_share, greatest, holds, is_as_known, stated_bound
 
 QUICK = (
     "elsewhere",

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from protocol.frames import CameraModel
-from server.evaluation.probe import (
+from tests.bench.truth.probe import (
     ProbeError,
     Sphere,
     active_probe,

@@ -16,21 +16,20 @@ from client.laptop.synthetic.lights import disc_light
 from client.laptop.synthetic.render import camera_rays, cast
 from client.laptop.synthetic.source import open_synthetic
 from server.effects.plan import Effect
-from server.evaluation import object_shading
-from server.evaluation.bleeding import Bleeding, to_objects, to_real
-from server.evaluation.composite_truth import CompositeTruth, linear_from_codes, score
-from server.evaluation.composites import grown
-from server.evaluation.mitsuba_room import RoomSet
-from server.evaluation.pasting import ObjectNormals, pasted
-from server.evaluation.room_composites import RoomTruth, SetTruth, set_truth
 from server.maths.sh import lambert_transfer
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.shading.composite import srgb_codes
-from tests.bench import rendering, rendering_room, rendering_speed, rendering_stage, rendering_turning
-from tests.bench.finished import Part, UnmeasurableError
-from tests.bench.rendering_common import PRESETS, require
-from tests.bench.rendering_pictures import (
+from tests.bench.rendering import room as rendering_room
+from tests.bench.rendering import speed as rendering_speed
+from tests.bench.rendering import stage as rendering_stage
+from tests.bench.rendering import suite as rendering
+from tests.bench.rendering import turning as rendering_turning
+from tests.bench.rendering.bleeding import Bleeding, to_objects, to_real
+from tests.bench.rendering.common import PRESETS, require
+from tests.bench.rendering.composites import grown
+from tests.bench.rendering.pasting import ObjectNormals, pasted
+from tests.bench.rendering.pictures import (
     CROP,
     ENLARGED,
     around_objects,
@@ -41,10 +40,10 @@ from tests.bench.rendering_pictures import (
     stack,
     tinted,
 )
-from tests.bench.rendering_report import write_report
-from tests.bench.rendering_rows import add_pasted, add_score
-from tests.bench.rendering_speed import SECTIONS, StageClock, torus
-from tests.bench.rendering_turning import (
+from tests.bench.rendering.report import write_report
+from tests.bench.rendering.rows import add_pasted, add_score
+from tests.bench.rendering.speed import SECTIONS, StageClock, torus
+from tests.bench.rendering.turning import (
     BALL_CENTER,
     BALL_RADIUS_M,
     SLAB,
@@ -57,7 +56,12 @@ from tests.bench.rendering_turning import (
     shadow_change,
     turning_camera,
 )
-from tests.bench.run import Run
+from tests.bench.report.finished import Part, UnmeasurableError
+from tests.bench.report.run import Run
+from tests.bench.truth import object_shading
+from tests.bench.truth.composite_truth import CompositeTruth, linear_from_codes, score
+from tests.bench.truth.mitsuba_room import RoomSet
+from tests.bench.truth.room_composites import RoomTruth, SetTruth, set_truth
 from tests.data import data_folder
 from tests.scenes.lights import lobe_and_sky, uniform
 

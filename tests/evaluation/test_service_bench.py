@@ -14,11 +14,11 @@ import trimesh
 from server.opencl.device import Device
 from server.service.serve import BackgroundServer
 from server.service.service import Service
-from tests.bench.service_bytes import Fed, _Kept, feed
-from tests.bench.service_faults import Tally, part_of
-from tests.bench.service_guests import CAMERA, FIRST_PX, FULL_S, LAST_PX, WALL_M, Guest, clock_frame, clock_s
-from tests.bench.service_http import bad_request
-from tests.bench.service_load import growth, overhead
+from tests.bench.service.bytes import Fed, _Kept, feed
+from tests.bench.service.faults import Tally, part_of
+from tests.bench.service.guests import CAMERA, FIRST_PX, FULL_S, LAST_PX, WALL_M, Guest, clock_frame, clock_s
+from tests.bench.service.http import bad_request
+from tests.bench.service.load import growth, overhead
 
 
 @pytest.mark.parametrize("shown_s", [0.0, 3.0, 12.0])

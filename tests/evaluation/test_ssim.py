@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from server.evaluation.ssim import ssim_map
+from tests.bench.rendering.ssim import ssim_map
 
 
 def test_alike_pictures_and_sizes() -> None:

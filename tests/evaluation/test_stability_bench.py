@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from server.opencl.device import Device, DeviceInfo
-from tests.bench import stability, stability_doc
-from tests.bench.stability import Results, apart, builds_of, report_of
-from tests.bench.stability_build import run_case
+from tests.bench.stability import doc as stability_doc
+from tests.bench.stability import suite as stability
+from tests.bench.stability.build import run_case
+from tests.bench.stability.suite import Results, apart, builds_of, report_of
 from tests.hard_cases.cases import CASES
 from tests.hard_cases.catalogue import Case, Found
 

@@ -12,17 +12,18 @@ from numpy.typing import NDArray
 
 from client.laptop.synthetic.source import open_synthetic
 from protocol.messages import Wishes
-from server.evaluation.environment import direction_error_deg
+from server.maths.light_direction import direction_error_deg
 from server.maths.sh import dominant_direction
 from server.opencl.device import Device
-from tests.bench import thesis_presets, thesis_runs
-from tests.bench.finished import Part
-from tests.bench.plotting import panels
-from tests.bench.run import Run
-from tests.bench.thesis_families import ROWS as RAYS
-from tests.bench.thesis_figures import draw_close_ups, draw_maps, draw_quality, draw_speed
-from tests.bench.thesis_light import SETS, WAYS, WHOLE
-from tests.bench.thesis_numbers import (
+from tests.bench.report.finished import Part
+from tests.bench.report.plotting import panels
+from tests.bench.report.run import Run
+from tests.bench.thesis import presets as thesis_presets
+from tests.bench.thesis import runs as thesis_runs
+from tests.bench.thesis.families import ROWS as RAYS
+from tests.bench.thesis.figures import draw_close_ups, draw_maps, draw_quality, draw_speed
+from tests.bench.thesis.light import SETS, WAYS, WHOLE
+from tests.bench.thesis.numbers import (
     DOTS,
     FAMILIES,
     MACHINES,
@@ -34,7 +35,7 @@ from tests.bench.thesis_numbers import (
     TABLE_6_2,
     TABLE_6_3,
 )
-from tests.bench.thesis_pictures import (
+from tests.bench.thesis.pictures import (
     draw_families,
     draw_probe,
     draw_reach,
@@ -43,11 +44,11 @@ from tests.bench.thesis_pictures import (
     environment,
     on_map,
 )
-from tests.bench.thesis_presets import changed_by_any, close_up, mean_difference, presets_part
-from tests.bench.thesis_probe import LP, probed
-from tests.bench.thesis_probe import PRESETS as PROBED
-from tests.bench.thesis_runs import WARM_UP, load_picture, medians, save_picture, turn_by_turn
-from tests.bench.thesis_tables import Table, table_6_1, table_6_2, table_6_3
+from tests.bench.thesis.presets import changed_by_any, close_up, mean_difference, presets_part
+from tests.bench.thesis.probe import LP, probed
+from tests.bench.thesis.probe import PRESETS as PROBED
+from tests.bench.thesis.runs import WARM_UP, load_picture, medians, save_picture, turn_by_turn
+from tests.bench.thesis.tables import Table, table_6_1, table_6_2, table_6_3
 from tests.evaluation.made_up import picture, presets_details, speed_details
 from tests.scenes.lights import lobe_and_sky
 

@@ -16,7 +16,6 @@ from client.laptop.volume import default_volume, default_voxel
 from protocol.frames import CameraModel
 from protocol.messages import Wishes
 from server.client_session import ClientSession
-from server.evaluation.environment import direction_error_deg
 from server.light.cell_transfer import PoolGrid, PoolWindow
 from server.light.continuation import (
     LEAST_M,
@@ -32,6 +31,7 @@ from server.light.continuation import (
 )
 from server.light.light_model import LightModel
 from server.light.lobe_estimator import LobeEstimator
+from server.maths.light_direction import direction_error_deg
 from server.maths.lobes import CELLS, RIDGE, cell_directions, lobe_family
 from server.maths.planes import SIDES, STEPS_M, PlanePatch, find_planes
 from server.opencl.device import Device

@@ -11,9 +11,9 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from server.objects.object_table import ObjectTable, object_table
 from server.objects.object_tree import FEW_OBJECTS, tree_rows
 from server.objects.virtual_object import VirtualObject
-from server.objects.voxelize import ObjectTable, object_table
 from server.opencl.engine import Engine
 from server.opencl.program import KERNEL_FOLDER
 from server.opencl.structs import struct_text

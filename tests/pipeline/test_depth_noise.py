@@ -8,8 +8,8 @@ import pytest
 
 from client.laptop.synthetic.noise import kinect_like
 from protocol.frames import CameraModel
-from server.evaluation.noise import NormalView, depth_normals, normal_improvement, plane_normals
 from server.opencl.device import Device
+from tests.bench.geometry.noise import NormalView, depth_normals, normal_improvement, plane_normals
 from tests.data import data_folder
 from tests.scenes.analytic import look, look_at, plane, quantised, room, sphere
 

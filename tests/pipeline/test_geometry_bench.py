@@ -11,16 +11,16 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
-from server.evaluation.report import Row, Unmeasured
-from server.evaluation.surface import SurfaceView
-from tests.bench import finished as finished_module
-from tests.bench.contest import ENTRIES, GRIDS, OURS, OURS_TRACKING, WARM_UP, Score, contest_part, fault
-from tests.bench.drawing import COLORS, bars, difference_picture, side_by_side
-from tests.bench.filters import energy
-from tests.bench.finished import Finished, Part, UnmeasurableError
+from tests.bench.geometry.filters import energy
+from tests.bench.geometry.surface import SurfaceView
 from tests.bench.peers import contestant
+from tests.bench.peers.contest import ENTRIES, GRIDS, OURS, OURS_TRACKING, WARM_UP, Score, contest_part, fault
 from tests.bench.peers.contestant import FILTER, INTEGRATE, RAYCAST, TRACK, Scene, Turn
 from tests.bench.peers.worker import ContestantLostError, Entry, Worker
+from tests.bench.report import finished as finished_module
+from tests.bench.report.drawing import COLORS, bars, difference_picture, side_by_side
+from tests.bench.report.finished import Finished, Part, UnmeasurableError
+from tests.bench.report.report import Row, Unmeasured
 
 TRUTH = np.tile(np.eye(4), (WARM_UP + 3, 1, 1))
 

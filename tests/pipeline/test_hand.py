@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
-from server.evaluation.hand import SEQUENCES, HandBefore, hand_pictures, nearest_part, reproject, skin_picture
-from server.evaluation.hybrid import agreement_m, silhouette
+from tests.bench.geometry.hybrid import agreement_m, silhouette
+from tests.bench.truth.hand_frames import SEQUENCES, HandBefore, hand_pictures, nearest_part, reproject, skin_picture
 from tests.data import data_folder
 
 Floats = NDArray[np.float64]

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from client.laptop.source import open_source
 from client.laptop.synthetic.noise import kinect_like
 from protocol.frames import CameraModel, RgbdFrame
-from server.evaluation.hand import HandBefore, hand_pictures
-from server.evaluation.hybrid import HandReport, agreement_m, depth_of, measure_hand, run_geometry
-from server.evaluation.hybrid_normals import TrueNormals, measure_normals
-from server.evaluation.noise import plane_normals
-from server.evaluation.rooms import CAMERA as VGA
 from server.opencl.device import Device
 from server.volume.raycast import LABEL_DYNAMIC, LABEL_STATIC
-from tests.bench.hand import hand_volume
+from tests.bench.geometry.hand import hand_volume
+from tests.bench.geometry.hybrid import HandReport, agreement_m, depth_of, measure_hand, run_geometry
+from tests.bench.geometry.noise import plane_normals
+from tests.bench.geometry.normals import TrueNormals, measure_normals
+from tests.bench.truth.hand_frames import HandBefore, hand_pictures
+from tests.bench.truth.rooms import CAMERA as VGA
 from tests.data import data_folder
 from tests.scenes.analytic import Shape, Truth, look, pixel_rays, sphere
 from tests.scenes.rooms import BOUNDS, ROOM, VOXEL_M, view_at

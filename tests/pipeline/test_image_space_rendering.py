@@ -33,8 +33,8 @@ from server.transfer.auxiliary_views import ViewsAround
 from server.transfer.image_space import nearest_views
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
 from server.transfer.real_depth_views import RealDepthViews
-from tests.bench import rendering_turning as turning
-from tests.bench.light_runs import at_preset, results_of, wishes_for
+from tests.bench.light.runs import at_preset, results_of, wishes_for
+from tests.bench.rendering import turning
 from tests.scenes import lights
 from tests.scenes.meshes import pose, shape_of
 from tests.scenes.solids import Scene, Solid, box, download4, fill_volume, float4, floor, upload_surface

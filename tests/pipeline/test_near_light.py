@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from server.opencl.device import Device
-from tests.bench.light_lamp import SCENE, search
+from tests.bench.light.lamp import SCENE, search
 
 
 @pytest.mark.parametrize("place", [0, 5])

@@ -11,8 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.evaluation.memory import room_memory
-from server.evaluation.rooms import LIVING_ROOM, walk
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
@@ -20,6 +18,8 @@ from server.volume.brick_pool import BRICK_BYTES
 from server.volume.brick_table import AWAY_SLOT, BRICK, NO_SLOT
 from server.volume.raycast import raycast
 from server.volume.volume import Volume, VolumeSizeError
+from tests.bench.geometry.memory import room_memory
+from tests.bench.truth.rooms import LIVING_ROOM, walk
 from tests.scenes.analytic import look, look_at, plane, room, sphere
 from tests.scenes.volumes import cast, fuse, upload_depth
 

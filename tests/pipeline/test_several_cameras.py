@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from server.evaluation.interleaving import NOISE, VOXEL_M, fuse_in_order, orders, stations
-from server.evaluation.rooms import LIVING_ROOM
 from server.opencl.device import Device
+from tests.bench.geometry.interleaving import NOISE, VOXEL_M, fuse_in_order, orders, stations
+from tests.bench.truth.rooms import LIVING_ROOM
 
 Floats = NDArray[np.float64]
 FEW, MANY = 4, 30

@@ -8,8 +8,8 @@ import pytest
 
 from client.laptop.source import open_source
 from protocol.frames import CameraModel, RgbdFrame
-from server.evaluation.surface import SurfaceView, fused_views, inside_bounds, surface_accuracy
 from server.opencl.device import Device
+from tests.bench.geometry.surface import SurfaceView, fused_views, inside_bounds, surface_accuracy
 from tests.data import data_folder
 from tests.scenes.analytic import look, look_at, room
 

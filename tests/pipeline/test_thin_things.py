@@ -6,9 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from server.evaluation.rooms import CAMERA
-from server.evaluation.thin import EYE_M, ROD_Z_M, SIZE_M, RodsBefore, measure_rods, thickness_m
 from server.opencl.device import Device
+from tests.bench.truth.rods import EYE_M, ROD_Z_M, SIZE_M, RodsBefore, measure_rods, thickness_m
+from tests.bench.truth.rooms import CAMERA
 
 QVGA = msgspec.structs.replace(CAMERA, width=320, height=240, fx=262.5, fy=262.5, cx=159.5, cy=119.5)
 VOXEL_M = 0.02

@@ -12,10 +12,10 @@ import pytest
 from client.laptop.source import open_source
 from client.laptop.volume import default_volume, default_voxel
 from server.client_session import ClientSession
-from server.evaluation.trajectory import ate_rmse_m, position_errors_m, track_source
 from server.geometry.geometry import Geometry
 from server.maths.registration import angle_between, distance_between, motion_of_twist
 from server.opencl.engine import Engine
+from tests.bench.geometry.trajectory import ate_rmse_m, position_errors_m, track_source
 from tests.data import data_folder
 from tests.scenes.analytic import Floats, plane
 from tests.scenes.rooms import BOUNDS, CAMERA, VOXEL_M, frame_at, view_at, wishes

@@ -5,7 +5,7 @@ from __future__ import annotations
 from protocol.frames import RgbdFrame
 from protocol.images import encode_color, encode_depth
 from protocol.messages import Composite, Frame
-from tests.rooms import frame_at, view_at
+from tests.scenes.rooms import frame_at, view_at
 from tests.service.wire import Wire
 
 

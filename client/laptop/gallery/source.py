@@ -1,4 +1,4 @@
-"""`synthetic:gallery/NAME`: a gallery scene as a source of frames; see client.laptop.source.Source."""
+"""`synthetic:gallery/NAME`: a gallery scene as a source of frames; see client.laptop.frame_source.Source."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.laptop.errors import SourceError
+from client.laptop.frame_source import GALLERY_PREFIX as PREFIX
 from client.laptop.gallery.scenes import GALLERY, GalleryScene, Part
-from client.laptop.source import GALLERY_PREFIX as PREFIX
 from client.laptop.synthetic.bake import bake
 from client.laptop.synthetic.charts import atlas
 from client.laptop.synthetic.harmonics import sphere_directions

@@ -59,7 +59,7 @@ class Truth:
 
 
 class SyntheticSource:
-    """A scene seen by a moving camera; see client.laptop.source.Source."""
+    """A scene seen by a moving camera; see client.laptop.frame_source.Source."""
 
     fps = FPS
     has_poses = True

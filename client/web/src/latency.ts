@@ -2,7 +2,6 @@
 
 import { now_ms } from "./capture/source";
 import type { Times } from "./capture/stream";
-import type { Ages } from "./layer_mode";
 import { byId, setText } from "./dom";
 import type { Timings } from "./protocol";
 import { milliseconds } from "./words";
@@ -36,6 +35,14 @@ export function stagesOf(times: Times, timings: Timings, shown_ms: number): Reco
     shown: shown_ms - times.answered_ms,
     all: shown_ms - times.captured_ms,
   };
+}
+
+/** How old what is on the screen is. */
+export interface Ages {
+  /** Of the camera's picture: times that the display has drawn since it came. */
+  picture_frames: number;
+  /** Of the frame that the virtual things were drawn for, since it was captured; null: there is none yet. */
+  layer_ms: number | null;
 }
 
 const ages: { layer: number[]; picture: number[] } = { layer: [], picture: [] };

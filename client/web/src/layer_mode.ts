@@ -4,21 +4,13 @@ import type { Shown } from "./capture/recorded_source";
 import { now_ms } from "./capture/source";
 import type { Times } from "./capture/stream";
 import type { Draw } from "./capture/xr_source";
-import { noteShown } from "./latency";
+import { type Ages, noteShown } from "./latency";
 import { closeParts } from "./local/layer_parts";
 import { type CameraPicture, LayerView, type PosedLayer, type Target } from "./local/layer_view";
 import { OwnDisplay } from "./local/own_display";
 import { STANDING, type View, viewOf } from "./local/view_matrix";
 import { drawPicture } from "./picture";
 import type { Layer } from "./protocol";
-
-/** How old what is on the screen is. */
-export interface Ages {
-  /** Of the camera's picture: times that the display has drawn since it came. */
-  picture_frames: number;
-  /** Of the frame that the virtual things were drawn for, since it was captured; null: there is none yet. */
-  layer_ms: number | null;
-}
 
 interface Received {
   layer: Layer;

@@ -14,9 +14,10 @@ from server.opencl.device import Device
 from server.room.room import Room
 from server.service.saving.checksummed_files import DamagedFile
 from server.service.saving.placement_delta import PlacementDelta, delete_delta, delta_since, read_delta, write_delta
+from server.service.saving.room_snapshots import rebuilt, snapshot
 from server.service.saving.room_state import VERSION, Header, state_to_bytes
 from server.service.saving.save_slot import SaveSlot
-from server.service.saving.snapshot import Snapshot, rebuilt, snapshot
+from server.service.saving.snapshot import Snapshot
 
 SLOTS = ("0", "1")
 NOTE_USE_S = 60.0

@@ -7,13 +7,13 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 from weakref import ref
 
 import msgspec
 from msgspec import structs
 
 from server.parsing.mesh_bytes import mesh_to_bytes
+from server.room.room_objects import ObjectRecord
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.service.saving.brick_files import Batch, merged, write_bricks
@@ -29,11 +29,8 @@ from server.service.saving.room_state import (
     state_from_bytes,
     state_to_bytes,
 )
+from server.service.saving.snapshot import Snapshot
 from server.volume.volume import Volume
-
-if TYPE_CHECKING:
-    from server.room.room_objects import ObjectRecord
-    from server.service.saving.snapshot import Snapshot
 
 SAVE, PART = "save", "save.part"
 """The index file, which names all other files of a save."""

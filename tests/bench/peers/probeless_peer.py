@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
-from server.evaluation.surface import model_depth
 from server.geometry.geometry import Geometry, GeometryFrame
 from server.input.denoise import bilateral_depth
 from server.input.measure import Measurement
@@ -26,6 +25,7 @@ from server.tracking import camera_tracking as tracking
 from server.tracking.camera_tracking import CameraTracking, PoseEstimate
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
+from tests.bench.geometry.surface import model_depth
 from tests.bench.peers.contestant import FILTER, INTEGRATE, RAYCAST, TRACK, Scene, Turn
 from tests.bench.peers.worker import device_name
 

@@ -34,9 +34,23 @@ def _name_of(item: pytest.Item) -> str:
     return without_device(item.nodeid, device) if device else item.nodeid
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark slow tests by tests/slow.txt, and others by the fixtures that they take."""
+@pytest.hookimpl(wrapper=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> Generator[None, None, None]:
+    """Mark slow tests by tests/slow.txt, and others by the fixtures that they take; put those with a browser last.
+
+    The one browser of a session runs an event loop in the main thread from its first test on: no test after that can
+    run another.
+    """
+    _mark(config, items)
+    yield
+    items.sort(key=_takes_browser)
+
+
+def _takes_browser(item: pytest.Item) -> bool:
+    return "browser" in getattr(item, "fixturenames", ())
+
+
+def _mark(config: pytest.Config, items: list[pytest.Item]) -> None:
     slow = set(read_list())
     config.stash[COLLECTED] = []
     for item in items:
@@ -44,12 +58,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.stash[COLLECTED].append(name)
         if name in slow or function_of(name) in slow:
             item.add_marker("slow")
-        fixtures = getattr(item, "fixturenames", ())
-        if "browser" in fixtures:
+        if _takes_browser(item):
             item.add_marker("alone")
         if item.get_closest_marker("alone") and not item.nodeid.startswith(ALONE_FOLDERS):
             raise pytest.UsageError(f"{item.nodeid} is marked alone; such tests belong in {', '.join(ALONE_FOLDERS)}")
-        if "device" in fixtures:
+        if "device" in getattr(item, "fixturenames", ()):
             item.add_marker("device")
 
 

@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 DATA ?= ../shared/data
 
-.PHONY: help install install-all install-bench install-cluster install-devices install-oak install-video demo \
+.PHONY: mutation-check help install install-all install-bench install-cluster install-devices install-oak install-video demo \
 	test test-all test-rest test-slow test-second-device slow-list lint bench check-races web package lock clean
 help:
 	@echo "make demo      the main job: server, streaming client, pictures in out/demo"
@@ -68,6 +68,10 @@ slow-list: .venv/installed-all
 	$(PYTEST) $(PARALLEL) --durations=0 -vv -m "not alone" > out/durations.log
 	$(PYTEST) --durations=0 -vv -m alone $(ALONE) >> out/durations.log
 	$(BIN)/python -m tests.slow out/durations.log
+
+# Small faults in kernels and host code, one at a time: do the tests see them? Takes hours.
+mutation-check: .venv/installed-test
+	$(BIN)/python -m tests.mutation_check --whole
 
 lint: .venv/installed-test
 	$(BIN)/ruff format --check .

@@ -62,6 +62,7 @@ def run_in_process(device: Device, scene: Scene, folder: Path) -> None:
         for frame in (scene.source[i] for i in range(FRAMES)):
             result = {**vars(pipeline.process(frame))}
             assert result.pop("layer") is None  # not wished for
+            result.pop("is_reused")  # of the server alone
             writer.write(FrameOutput(frame=frame.index, timestamp_s=frame.timestamp_s, **result))
         writer.write_mesh(mesh_files(pipeline.scene_mesh()))
     pipeline.close()

@@ -61,7 +61,7 @@ def prepare_rays(
 ) -> TracedScene:
     """Bring together what rays are traced through: the volume, the objects' distance grids, the light beyond."""
     scene = trace_scene(context.engine, context.volume, light, context.rays, context.ray_length_m, objects)
-    return replace(scene, looks=views)
+    return replace(scene, depth_views=views)
 
 
 def shadow_map(context: FrameContext, objects: VirtualObjects, light: SharpLight) -> ShadowMaps:
@@ -74,7 +74,7 @@ def light_objects(context: FrameContext, scene: TracedScene, maps: ShadowMaps | 
     placed = place_points(context.engine, scene.objects)
     lights = differential.light_points(context.engine, scene, placed)
     if maps is not None:
-        shadow_maps.light_glow(context.engine, placed, lights, maps)
+        shadow_maps.light_points_by_discs(context.engine, placed, lights, maps)
     return lights
 
 
@@ -95,7 +95,7 @@ def shadow_real(
     samples: DirectSamples | None,
 ) -> RealShadow:
     """What virtual things take from real ones, less what they send to them (eq. 7.1)."""
-    lit = replace(scene, glow=lights)
+    lit = replace(scene, point_lights=lights)
     shadow = differential.shadow_real(context.engine, context.camera, context.surface, transfer, lit, indirect)
     if maps is None or samples is None:
         return shadow
@@ -114,7 +114,7 @@ def bounce_real(
     samples: DirectSamples | None,
 ) -> BouncedShadow:
     """`ratio` with what real things then send to one another, less or more (eq. 7.6)."""
-    engine, lit = context.engine, replace(scene, glow=lights)
+    engine, lit = context.engine, replace(scene, point_lights=lights)
 
     def bounced(shadow: RealShadow) -> RealShadow:
         return differential.bounce_real(
@@ -145,10 +145,10 @@ def add_objects(
     """The scene as virtual objects have changed it: what they send, and what real surface sends besides them."""
     shadow = bounced or ratio
     if shadow is None:
-        return ChangedScene(replace(scene, glow=lights))
+        return ChangedScene(replace(scene, point_lights=lights))
     change = shadow.whole or shadow
     changed = Changed(context.camera, context.camera_from_volume, context.surface.positions, change)
-    return ChangedScene(replace(scene, glow=lights, changed=changed))
+    return ChangedScene(replace(scene, point_lights=lights, changed=changed))
 
 
 def shade_virtual(context: FrameContext, virtual: VirtualSurface, scene: ChangedScene) -> VirtualOcclusion:
@@ -176,7 +176,7 @@ def refine_real(
     virtual: VirtualSurface | None,
 ) -> RefinedReal:
     """Shadows on real things at every pixel of their rims (6.1.1)."""
-    lit, eye = replace(scene.by_rays(), glow=lights), context.volume_from_camera[:3, 3]
+    lit, eye = replace(scene.by_rays(), point_lights=lights), context.volume_from_camera[:3, 3]
     engine, camera, surface = context.engine, context.camera, context.surface
     return RefinedReal(adaptive.refine_real(engine, camera, surface, lit, bounced or ratio, virtual, eye))
 

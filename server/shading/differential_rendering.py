@@ -134,7 +134,7 @@ def light_points(engine: Engine, scene: TracedScene, placed: PlacedPoints | None
     """
     placed = placed or place_points(engine, scene.objects)
     radiances = engine.workspace.upload("glow_radiances", placed.under_even_light(scene.light.mean))
-    lit, traced = min(placed.count, MOST_POINTS), replace(scene, glow=placed.glow)
+    lit, traced = min(placed.count, MOST_POINTS), replace(scene, point_lights=placed.point_lights)
     engine.launch(
         engine.kernel("differential_rendering.cl", "light_points", **scene.defines(engine)),
         (lit,),
@@ -147,4 +147,4 @@ def light_points(engine: Engine, scene: TracedScene, placed: PlacedPoints | None
         placed.offsets_m,
         radiances,
     )
-    return replace(placed.glow, radiances=radiances)
+    return replace(placed.point_lights, radiances=radiances)

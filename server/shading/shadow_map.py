@@ -179,7 +179,9 @@ def light_real(
     return mixed
 
 
-def light_glow(engine: Engine, placed: PlacedPoints, glow: VirtualPointLights, maps: ShadowMaps) -> None:
+def light_points_by_discs(
+    engine: Engine, placed: PlacedPoints, point_lights: VirtualPointLights, maps: ShadowMaps
+) -> None:
     """Add what points on objects send of the discs' light. Those past the first are lit evenly as it is."""
     count = min(placed.count, MOST_POINTS)
     engine.launch(
@@ -191,7 +193,7 @@ def light_glow(engine: Engine, placed: PlacedPoints, glow: VirtualPointLights, m
         placed.albedos,
         *maps.arguments(engine),
         *maps.trace_arguments(engine),
-        glow.radiances,
+        point_lights.radiances,
         local=(max(64 // engine.lanes, 1),),
     )
 

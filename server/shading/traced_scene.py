@@ -95,11 +95,11 @@ class TracedScene:
     """Length of rays."""
     objects: Sequence[Placed]
     table: ObjectTable
-    glow: VirtualPointLights | None = None
+    point_lights: VirtualPointLights | None = None
     """What the objects send; None: nothing."""
     changed: Changed | None = None
     """What they change of what real surface sends; None: nothing."""
-    looks: DepthViews | None = None
+    depth_views: DepthViews | None = None
     """Pictures that visibility is looked up in; None: rays are traced."""
 
     @property
@@ -110,11 +110,11 @@ class TracedScene:
     def defines(self, engine: Engine) -> dict[str, int]:
         """Shapes that kernels are compiled for."""
         shapes = {"BANDS": self.bands, "MASK_WORDS": -(-self.rays.count // 32), "LANES": engine.lanes}
-        return shapes | (self.looks.defines() if self.looks else {})
+        return shapes | (self.depth_views.defines() if self.depth_views else {})
 
     def by_rays(self) -> TracedScene:
         """The same, with visibility traced."""
-        return replace(self, looks=None)
+        return replace(self, depth_views=None)
 
     @cached_property
     def ball(self) -> np.generic:
@@ -153,7 +153,7 @@ class TracedScene:
         return (*self._solid_arguments(engine), *changed, *self._view_arguments(engine))
 
     def _sent(self, engine: Engine) -> VirtualPointLights:
-        return self.glow or no_point_lights(engine, self.table.count)
+        return self.point_lights or no_point_lights(engine, self.table.count)
 
     def _solid_arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
         slots, solid, octets, _ = self.volume.arguments()[1:]
@@ -164,7 +164,7 @@ class TracedScene:
         return self.table.rows.memory, self.table.distances, sent.table.memory, sent.radiances
 
     def _view_arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
-        return self.looks.arguments(engine) if self.looks else ()
+        return self.depth_views.arguments(engine) if self.depth_views else ()
 
 
 def light_parameters(light: DeviceLight, count: int, reach_m: float) -> np.void:

@@ -47,7 +47,7 @@ class PlacedPoints:
     """[count] float4."""
     offsets_m: cl_array.Array
     """[count] float32: how far off its surface rays of a point begin."""
-    glow: VirtualPointLights
+    point_lights: VirtualPointLights
     """With nothing sent yet."""
 
     def under_even_light(self, radiance: Floats) -> NDArray[np.float32]:

@@ -72,7 +72,7 @@ class ImageSpaceTransfer:
         self._around = ViewsAround(engine, views, views_per_frame)
         self._cosines, self._nearest = nearest_views(rays, self._around.lattice)
         self._threshold = occlusion_threshold(rays.directions[0, :, :3].astype(np.float64))
-        self.looks: RealDepthViews | None = None
+        self.depth_views: RealDepthViews | None = None
 
     def transfer(
         self,
@@ -96,7 +96,7 @@ class ImageSpaceTransfer:
         views = self._around.update(volume, dominant_direction)
         view_of = self._views_for(views)
         near_m = near_reach_m(views, reach_m)
-        self.looks = RealDepthViews(
+        self.depth_views = RealDepthViews(
             views,
             view_of,
             camera,

@@ -59,7 +59,7 @@ class SampledTransfer:
     @property
     def depth_views(self) -> RealDepthViews | None:
         """What the last transfer was looked up in; None where rays are traced."""
-        return self._sampler.looks
+        return self._sampler.depth_views
 
     @property
     def period(self) -> int:

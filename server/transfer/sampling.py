@@ -86,9 +86,9 @@ class TransferSampler:
         self._image_space = ImageSpaceTransfer(engine, self.rays, sampling.views) if sampling.image_space else None
 
     @property
-    def looks(self) -> RealDepthViews | None:
+    def depth_views(self) -> RealDepthViews | None:
         """What the last transfer looked into; None where rays are traced."""
-        return self._image_space.looks if self._image_space else None
+        return self._image_space.depth_views if self._image_space else None
 
     @property
     def period(self) -> int:

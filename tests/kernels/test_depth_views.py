@@ -122,12 +122,12 @@ def far_away(engine: Engine) -> list[Placed]:
 
 
 def scene_of(
-    engine: Engine, volume: Volume, objects: list[Placed], looks: DepthViews, indirect: bool = False
+    engine: Engine, volume: Volume, objects: list[Placed], depth_views: DepthViews, indirect: bool = False
 ) -> TracedScene:
     light = upload_light(engine, lights.uniform(bands=2), RAYS)
     if indirect:
         light = replace(light, surface_gain=1.0)
-    return replace(trace_scene(engine, volume, light, RAYS, ROOM_M, objects), looks=looks)
+    return replace(trace_scene(engine, volume, light, RAYS, ROOM_M, objects), depth_views=depth_views)
 
 
 def probe(engine: Engine, scene: TracedScene, points: Floats, normals: Floats, offset_m: float = 0.0) -> Probed:
@@ -179,9 +179,9 @@ def test_every_direction_has_a_view_near_it() -> None:
     assert np.degrees(np.arccos(cosines.min())) < 7
 
 
-def host_object(engine: Engine, looks: DepthViews, thing: VirtualObject, slot: int = 0) -> twin.ObjectViews:
-    texels = engine.download(looks.texels)[slot]
-    return twin.ObjectViews.unpack(texels, thing.grid.dims, looks.shape.cells, looks.shape.px)
+def host_object(engine: Engine, depth_views: DepthViews, thing: VirtualObject, slot: int = 0) -> twin.ObjectViews:
+    texels = engine.download(depth_views.texels)[slot]
+    return twin.ObjectViews.unpack(texels, thing.grid.dims, depth_views.shape.cells, depth_views.shape.px)
 
 
 @pytest.mark.parametrize("name", ["ball", "box"])
@@ -224,8 +224,8 @@ def test_look_is_the_twins(engine: Engine, lift: float) -> None:
     volume = fill_volume(engine, (floor(-1.0),), 0.04)
     place = pose((0.4, 0.3, 0.5), (1, 2, 3), 0.8, 1.5)
     objects = [(thing, place)]
-    looks, _ = looks_of(engine, volume, objects)
-    scene = scene_of(engine, volume, objects, looks)
+    depth_views, _ = looks_of(engine, volume, objects)
+    scene = scene_of(engine, volume, objects, depth_views)
     w, random = directions(), np.random.default_rng(5)
     points = (
         np.array([0.4, 0.3, 0.5])
@@ -238,7 +238,7 @@ def test_look_is_the_twins(engine: Engine, lift: float) -> None:
     cell_m = 1 / np.linalg.norm(grid[0, :3])
     in_grid = points @ grid[:3, :3].T + grid[:3, 3]
     turned = cell_m * grid[:3, :3]
-    meets, met, brink = host_object(engine, looks, thing).look(in_grid, normals @ turned.T, w @ turned.T, lift)
+    meets, met, brink = host_object(engine, depth_views, thing).look(in_grid, normals @ turned.T, w @ turned.T, lift)
     sure = brink > 2e-3
     assert sure.mean() > 0.9
     assert (found.blocked != meets)[sure].mean() < 2e-3  # directions on the brink between two views
@@ -257,8 +257,8 @@ def test_nearest_of_many_objects_blocks(engine: Engine) -> None:
         balls.append(ball(center, radius))
         objects.append((thing, pose(center, random.normal(size=3), random.uniform(0, 3), radius)))
     volume = fill_volume(engine, (floor(-1.0),), 0.04)
-    looks, _ = looks_of(engine, volume, objects)
-    scene = scene_of(engine, volume, objects, looks)
+    depth_views, _ = looks_of(engine, volume, objects)
+    scene = scene_of(engine, volume, objects, depth_views)
     w = directions()
     points = random.uniform(-1, 1, w.shape)
     outside = np.min([b.distance(points) for b in balls], axis=0) > 0.05
@@ -282,8 +282,8 @@ def test_own_surface_does_not_block_a_ball(engine: Engine, monkeypatch: pytest.M
     thing = VirtualObject.upload(engine, shape_of(trimesh.creation.icosphere(5)), 48)
     objects = [(thing, pose((0.4, 0.4, 0.4), (1, 0, 0), 0.3, 0.2))]
     volume = fill_volume(engine, (floor(-1.0),), 0.04)
-    looks, _ = looks_of(engine, volume, objects)
-    scene = scene_of(engine, volume, objects, looks)
+    depth_views, _ = looks_of(engine, volume, objects)
+    scene = scene_of(engine, volume, objects, depth_views)
     w, normals = directions(), random_directions(len(directions()), 3)
     points = 0.4 + 0.2 * normals
     rising = (w * normals).sum(-1) > 0
@@ -311,9 +311,9 @@ def test_objects_are_drawn_once_and_keep_their_views(engine: Engine, monkeypatch
     things = [VirtualObject.upload(engine, shape_of(trimesh.creation.box(size)), 16) for size in sizes]
 
     def look(*which: int, at: float = 0.0) -> tuple[DepthViews, list[NDArray[np.uint32]]]:
-        looks, _ = looks_of(engine, volume, [(things[i], pose((at, 0, 0))) for i in which])
-        texels = engine.download(looks.texels)
-        return looks, [texels[slot] for slot in engine.download(looks.slots)]
+        depth_views, _ = looks_of(engine, volume, [(things[i], pose((at, 0, 0))) for i in which])
+        texels = engine.download(depth_views.texels)
+        return depth_views, [texels[slot] for slot in engine.download(depth_views.slots)]
 
     (alone,) = look(0)[1]
     assert len(drawn) == 1
@@ -344,11 +344,11 @@ def test_surface_is_what_the_nearest_view_shows(engine: Engine) -> None:
     scene = SCENES["ball above a floor"]
     volume = fill_volume(engine, scene, VOXEL_M)
     objects = far_away(engine)
-    looks, _ = looks_of(engine, volume, objects)
-    views, nearest = host_views(engine, looks.real.views), looks.real.view_of.ravel()
+    depth_views, _ = looks_of(engine, volume, objects)
+    views, nearest = host_views(engine, depth_views.real.views), depth_views.real.view_of.ravel()
     w, normals = directions(), random_directions(len(directions()), 4)
     points = np.random.default_rng(4).uniform(0.2, 0.8, w.shape)
-    found = probe(engine, scene_of(engine, volume, objects, looks), points, normals)
+    found = probe(engine, scene_of(engine, volume, objects, depth_views), points, normals)
     side = views.depths.shape[1]
     wrong = hidden = asked = 0
     for i in range(0, len(w), 3):
@@ -389,16 +389,16 @@ def test_near_surface_is_what_the_camera_shows(engine: Engine) -> None:
     volume = fill_volume(engine, (floor(-5.0),), VOXEL_M)
     near_m = 0.25
     objects = far_away(engine)
-    looks, _ = looks_of(engine, volume, objects, near_m=near_m)
+    depth_views, _ = looks_of(engine, volume, objects, near_m=near_m)
     surface, positions, depths = seen_by_camera(engine, scene)
     on_device = engine.workspace.upload("test_depths", depths.astype(np.float32))
-    looks = replace(looks, real=replace(looks.real, surface=surface, depths=on_device))
+    depth_views = replace(depth_views, real=replace(depth_views.real, surface=surface, depths=on_device))
     w, random = directions(), np.random.default_rng(6)
     rows, cols = random.integers(0, CAMERA.height, len(w)), random.integers(0, CAMERA.width, len(w))
     behind_m = random.uniform(-0.2, 0.15, (len(w), 1))  # things in front of the surface and behind it, which face it
     normals = lights.unit(random_directions(len(w), 5) - np.sign(behind_m) * VIEW[:3, 2])
     points = positions[rows, cols] + behind_m * VIEW[:3, 2]
-    found = probe(engine, scene_of(engine, volume, objects, looks), points, normals)
+    found = probe(engine, scene_of(engine, volume, objects, depth_views), points, normals)
     picture = twin.Picture(inverse_rigid(VIEW), (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy), depths)
     buffer = vectors(engine.download(surface.normals)).astype(float)
     wrong = met = asked = 0
@@ -426,11 +426,11 @@ def test_a_walls_inner_side_is_found_from_outside(engine: Engine) -> None:
     wall = box((0.1, -1.0, -1.0), (0.26, 2.0, 2.0))
     volume = fill_volume(engine, (wall,), VOXEL_M)
     objects = far_away(engine)
-    looks, _ = looks_of(engine, volume, objects, views=256)
+    depth_views, _ = looks_of(engine, volume, objects, views=256)
     w = directions()
     chosen = w[:, 0] < -0.9
     points = np.tile([0.5, 0.5, 0.5], (len(w), 1))
-    found = probe(engine, scene_of(engine, volume, objects, looks, indirect=True), points, w)
+    found = probe(engine, scene_of(engine, volume, objects, depth_views, indirect=True), points, w)
     assert (found.met[chosen] >= 0).all()
     x_m = found.places[chosen][:, 0] * VOXEL_M
     assert (np.abs(x_m - 0.25) < 1.5 * VOXEL_M).mean() > 0.95

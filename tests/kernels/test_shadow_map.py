@@ -24,7 +24,7 @@ from server.shading.shadow_map import (
     DirectSamples,
     ShadowMaps,
     draw_shadow_maps,
-    light_glow,
+    light_points_by_discs,
     light_real,
     light_samples,
     light_virtual,
@@ -485,9 +485,9 @@ def test_points_on_objects_send_what_the_disc_brings_them(engine: Engine) -> Non
     scene = lit(engine, light, solids=(CRATE, plate))
     points = place_points(engine, [placed(engine, solid) for solid in (CRATE, plate)])
     before = np.full((points.count, 3), 0.25)
-    glow = replace(points.glow, radiances=engine.workspace.upload("sent", float4(before)))
-    light_glow(engine, points, glow, scene.maps)
-    sent = download4(engine, glow.radiances)[:, :3].astype(float) - before
+    point_lights = replace(points.point_lights, radiances=engine.workspace.upload("sent", float4(before)))
+    light_points_by_discs(engine, points, point_lights, scene.maps)
+    sent = download4(engine, point_lights.radiances)[:, :3].astype(float) - before
     places, normals = (download4(engine, a)[:, :3].astype(float) for a in (points.points, points.normals))
     expected = [exact(p[None], light, (CRATE, plate), n, lift_m=1e-4)[0] for p, n in zip(places, normals, strict=True)]
     expected = np.array(expected)[:, None] * points.colors * light.irradiance

@@ -102,7 +102,7 @@ def light_floor(
     indirect = Indirect(hits, np.asarray(unseen, float))
     device_light = upload_light(engine, light, rays, indirect=indirect, exposure=exposure)
     traced = trace_scene(engine, volume, device_light, rays, ROOM_M, objects)
-    traced = replace(traced, glow=light_points(engine, traced))
+    traced = replace(traced, point_lights=light_points(engine, traced))
     shadow: RealShadow = shadow_real(engine, camera, surface, transfer, traced, indirect)
     refined = refine_real(engine, camera, surface, traced, shadow)
     return Lit(
@@ -212,7 +212,7 @@ def taken_from_top(
     empty = Indirect(space.constant("test_no_hits", np.zeros((1, 1, 4), np.float32)), np.asarray(unseen, float))
     device_light = upload_light(engine, light, rays, indirect=empty)
     traced = trace_scene(engine, volume, device_light, rays, ROOM_M, objects)
-    found = shadow_virtual(engine, camera, surface, replace(traced, glow=light_points(engine, traced)))
+    found = shadow_virtual(engine, camera, surface, replace(traced, point_lights=light_points(engine, traced)))
     return download4(engine, found.values).astype(float)
 
 
@@ -313,8 +313,8 @@ def test_points_are_lit_as_pixels_are(device: Device, engine: Engine) -> None:
     objects = [placed(engine, box((0.45, 0.45, 0.45), (0.5, 0.5, 0.5)), (0.2, 0.5, 0.8))]
     volume, rays = fill_volume(engine, (floor(-0.5),), VOXEL_M), direction_sets(81, 4)
     device_light = upload_light(engine, light, rays)
-    glow = light_points(engine, trace_scene(engine, volume, device_light, rays, ROOM_M, objects))
-    radiances = download4(engine, glow.radiances)[:, :3]
+    point_lights = light_points(engine, trace_scene(engine, volume, device_light, rays, ROOM_M, objects))
+    radiances = download4(engine, point_lights.radiances)[:, :3]
     normals = objects[0][0].surface_points.normals
     expected = np.array([0.2, 0.5, 0.8]) * np.maximum(lambert_transfer(normals, 4) @ light, 0.0)
     np.testing.assert_allclose(radiances, expected, atol=relative_tolerance(device) * expected.max())

@@ -95,7 +95,7 @@ def stand(engine: Engine, scene: Scene, objects: list[Placed], side_m: float = 0
     )
     light = upload_light(engine, lights.uniform(), RAYS)
     traced = trace_scene(engine, volume, light, RAYS, FAR_M, objects)
-    return Stand(engine, replace(traced, looks=draw_depth_views(engine, real, objects)))
+    return Stand(engine, replace(traced, depth_views=draw_depth_views(engine, real, objects)))
 
 
 def around_point(middle: Floats, half_m: float) -> Floats:

@@ -168,7 +168,7 @@ def test_surfaces_that_send_light_see_both_parts(device: Device) -> None:
     umbra = is_floor & (expected < expected[is_floor].min() + 0.02)
     assert both[umbra].mean() > direct[umbra].mean()
     assert np.abs(both - direct)[is_floor].mean() < 0.05
-    with patch("server.effects.functions.shadow_maps.light_glow"):
+    with patch("server.effects.functions.shadow_maps.light_points_by_discs"):
         dim = ratio_of(shown(device, light, indirect=True))
     assert (both >= dim).all()
     assert (both > dim).any()

@@ -9,7 +9,7 @@ from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.service.fakes import FAKE_DEVICE, fake_mesh
 
-OF_THE_SERVER = ("door", "certificate", "library")
+OF_THE_SERVER = ("authenticator", "certificate", "library")
 """Options that are not the service's."""
 
 

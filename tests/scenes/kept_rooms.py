@@ -76,7 +76,7 @@ def _print_of_object(kept: Any) -> str:
 
 
 def layout_of(kind: Any) -> Any:
-    """Names and types of all fields that a kept struct is made of, as plain lists."""
+    """Names on disk and types of all fields of a stored struct, as plain lists."""
     return _layout(msgspec.inspect.type_info(kind), set())
 
 
@@ -89,7 +89,7 @@ def _layout(info: Any, within: set[Any]) -> Any:
     if hasattr(info, "fields"):
         if cls in within:
             return cls.__name__
-        return [[field.name, _layout(field.type, within | {cls})] for field in info.fields]
+        return [[field.encode_name, _layout(field.type, within | {cls})] for field in info.fields]
     parts = [getattr(info, name, None) for name in ("item_type", "item_types", "types", "key_type", "value_type")]
     flat = [part for some in parts if some is not None for part in (some if isinstance(some, tuple) else (some,))]
     return [type(info).__name__, *(_layout(part, within) for part in flat)]

@@ -30,7 +30,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def server_options(folder: Path) -> dict[str, object]:
-    return {"door": Authenticator("a-token"), "library": ObjectLibrary(folder)}
+    return {"authenticator": Authenticator("a-token"), "library": ObjectLibrary(folder)}
 
 
 @pytest.fixture

@@ -35,7 +35,7 @@ def lab() -> Lab:
 
 @pytest.fixture
 def start(lab: Lab) -> Iterator[StartServer]:
-    """Start a server with fake pipelines; keywords go to the service, but for `door` and `port`."""
+    """Start a server with fake pipelines; keywords go to the service, but for `authenticator` and `port`."""
     servers: list[BackgroundServer] = []
 
     def start_one(authenticator: Authenticator | None = None, port: int = 0, **options: object) -> BackgroundServer:

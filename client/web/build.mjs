@@ -22,6 +22,7 @@ async function buildPage(folder) {
     charset: "utf8",
     legalComments: "none",
     logLevel: "warning",
+    preserveSymlinks: true, // or the names of chunks depend on where a linked node_modules lies
   });
   await copyFile("src/index.html", join(folder, "index.html"));
   const licences = await Promise.all(["@msgpack/msgpack", "fzstd", "three"].map((name) => readFile(`node_modules/${name}/LICENSE`, "utf8")));

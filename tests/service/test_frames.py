@@ -112,7 +112,7 @@ def test_reading_stops_while_too_much_is_unread_and_goes_on_later(dial, lab, mon
 
     def post_and_count(self: mailbox.Mailbox, message: mailbox.Control) -> mailbox.Receipt:
         receipt = post(self, message)
-        unread.append(len(self._letters))
+        unread.append(len(self._messages))
         return receipt
 
     monkeypatch.setattr(mailbox.Mailbox, "post", post_and_count)

@@ -14,6 +14,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from server.opencl.device import Device
 from server.service.serve import BackgroundServer
+from tests.client.web.patience import PATIENCE_MS
 from tests.servers import fake_server
 from tests.service.fakes import Lab
 
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
 
 HERE = Path(__file__).parent
 PICTURES = HERE.parents[2] / "out" / "web"
-PATIENCE_MS = 60_000
-"""Bounds only a test that hangs: a busy machine takes seconds for what a free one does at once."""
 FLAGS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",

@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from server.opencl.device import Device
 from server.service.serve import BackgroundServer
-from tests.client.web.patience import PATIENCE_MS
+from tests.client.web.constants import PATIENCE_MS, PICTURES
 from tests.servers import fake_server
 from tests.service.fakes import Lab
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from tests.client.web.received import Received
 
 HERE = Path(__file__).parent
-PICTURES = HERE.parents[2] / "out" / "web"
 FLAGS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import RgbdFrame
 from tests.client.web.ball_scene import CAMERA, linear, look
-from tests.client.web.conftest import PICTURES
+from tests.client.web.constants import PICTURES
 from tests.client.web.received import Received
 from tests.client.web.red_ball import turned
 from tests.service import fakes

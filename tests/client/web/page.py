@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from playwright.sync_api import Page
 
-from tests.client.web.patience import PATIENCE_MS
+from tests.client.web.constants import PATIENCE_MS
 
 
 def start_capture(page: Page, source: str = "xr") -> None:

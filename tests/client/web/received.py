@@ -10,7 +10,7 @@ import numpy as np
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Hello, Wishes
-from tests.client.web.patience import PATIENCE_MS
+from tests.client.web.constants import PATIENCE_MS
 from tests.service.fakes import FakePipeline, FakeResult, Lab
 
 CAMERA = CameraModel(width=120, height=160, fx=131.0, fy=133.0, cx=56.25, cy=83.5, depth_scale_m=0.00125)

@@ -10,7 +10,8 @@ import pytest
 from playwright.sync_api import Page
 
 from server.opencl.device import Device
-from tests.client.web.conftest import PICTURES, OpenPage
+from tests.client.web.conftest import OpenPage
+from tests.client.web.constants import PICTURES
 from tests.client.web.displayed import display
 from tests.client.web.layer_figures import errors_of
 from tests.client.web.layer_session import Seen, begin, foot_of, guide_error_px, place_ball, show_ball, watched_server

@@ -22,7 +22,8 @@ from server.opencl.device import Device
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from server.service.serve import BackgroundServer
-from tests.client.web.conftest import PICTURES, OpenPage, wait_for_text
+from tests.client.web.conftest import OpenPage, wait_for_text
+from tests.client.web.constants import PICTURES
 from tests.client.web.page import start_capture
 from tests.client.web.received import Received
 from tests.client.web.sequence import of_device

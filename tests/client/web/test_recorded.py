@@ -20,8 +20,8 @@ from protocol.messages import Wishes
 from protocol.recording import read_messages
 from server.service.serve import BackgroundServer
 from tests.client.web.conftest import OpenPage, wait_for_text
+from tests.client.web.constants import PATIENCE_MS
 from tests.client.web.page import newer_pictures, on_screen, picture, start_recording
-from tests.client.web.patience import PATIENCE_MS
 from tests.client.web.received import Received
 from tests.client.web.visible_silhouette import may_be_seen
 from tests.client.web.watched import SIZE, TOUCHED, point_under, wait_for

@@ -16,8 +16,8 @@ from server.service.room_registry import key_digest_of
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
+from tests.client.web.constants import PATIENCE_MS
 from tests.client.web.page import start_capture
-from tests.client.web.patience import PATIENCE_MS
 from tests.client.web.received import CAMERA, frames_seen
 from tests.client.web.sequence import of_device
 from tests.service import fakes

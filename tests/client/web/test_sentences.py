@@ -17,7 +17,7 @@ from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.constants import PATIENCE_MS
-from tests.client.web.page import start_capture
+from tests.client.web.page import start_capture, wait_until
 from tests.client.web.received import CAMERA, frames_seen
 from tests.client.web.sequence import of_device
 from tests.service import fakes
@@ -96,6 +96,7 @@ def test_a_server_that_is_started_anew_gets_objects_again(start: StartServer, la
     page.locator("#place").focus()
     page.keyboard.press("Enter")  # in the middle of the picture
     wait_for_text(page, "#object-said", "placed")
+    wait_until(lambda: any(entry[0] == "place" for entry in lab.log))
     placed = [entry for entry in lab.log if entry[0] == "place"]
     first.stop()
     wait_for_text(page, "#state", "Disconnected")

@@ -1,10 +1,11 @@
-"""The one place for device memory of a session: named arrays, made on first use and kept."""
+"""Device memory of a session. A stage declares its buffers; each is made on first use and kept."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
-from typing import Any, cast
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any, Generic, TypeVar, cast
+from weakref import ref
 
 import numpy as np
 import pyopencl as cl
@@ -13,65 +14,179 @@ from numpy.typing import DTypeLike, NDArray
 
 from server.opencl.parts import Parts, pack, part_alignment_bytes, place
 
+Group = TypeVar("Group", bound="StageBuffers")
 
-class Workspace:
-    """Named device arrays; the same name and shape is the same memory, so a steady stream allocates nothing."""
 
-    def __init__(self, queue: cl.CommandQueue) -> None:
-        self._queue = queue
-        self._arrays: dict[str, cl_array.Array] = {}
-        self._copying: deque[tuple[cl.Event, NDArray[Any]]] = deque()
+class DeviceBuffer:
+    """One array on the device. While its shape stays it is the same memory, so a steady stream allocates nothing."""
 
-    def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> cl_array.Array:
-        """The array called `name`; contents are kept while shape and dtype stay, undefined after they change."""
-        found = self._arrays.get(name)
-        if found is None or found.shape != shape or found.dtype != np.dtype(dtype):
-            found = self._arrays[name] = cl_array.empty(self._queue, shape, dtype)
-        return found
+    def __init__(self, workspace: Workspace, dtype: DTypeLike) -> None:
+        self._workspace = workspace
+        self._dtype: np.dtype[Any] = np.dtype(dtype)
+        self.current: cl_array.Array | None = None
+        """The array as it is; None before its first use."""
+        workspace.add(self)
 
-    def find(self, name: str) -> cl_array.Array | None:
-        """The array called `name` as it is, None before its first use."""
-        return self._arrays.get(name)
+    def array(self, shape: tuple[int, ...]) -> cl_array.Array:
+        """The array of that shape; its contents are kept while the shape stays, and undefined after it changes."""
+        if self.current is None or self.current.shape != shape:
+            self.current = cl_array.empty(self._workspace.queue, shape, self._dtype)
+        return self.current
 
-    def upload(self, name: str, values: NDArray[Any]) -> cl_array.Array:
-        """Copy `values` into the array called `name`, once what is queued has run; they may change right away."""
-        array = self.array(name, values.shape, values.dtype)
-        if array.nbytes:  # to wait for the copy would be to wait for all that is queued before it
-            memory, copied = cast(Any, array.data), np.array(values, order="C")
-            self._copying.append((cl.enqueue_copy(self._queue, memory, copied, is_blocking=False), copied))
-        while self._copying and self._copying[0][0].command_execution_status == cl.command_execution_status.COMPLETE:
-            self._copying.popleft()
+    def upload(self, values: NDArray[Any]) -> cl_array.Array:
+        """Copy `values` into the array, after what is queued already; the caller may change them at once.
+
+        Raises TypeError where `values` are of another type than the buffer.
+        """
+        if values.dtype != self._dtype:
+            raise TypeError(f"the buffer holds {self._dtype}, not {values.dtype}")
+        array = self.array(values.shape)
+        self._workspace.copy(array, values)
         return array
 
+    def constant(self, values: NDArray[Any]) -> cl_array.Array:
+        """The array, copied from `values` only the first time and when the shape changes. `values` must not change."""
+        if self.current is not None and self.current.shape == values.shape:
+            return self.current
+        return self.upload(values)
+
+    def parts(self, shapes: Mapping[str, tuple[tuple[int, ...], DTypeLike]]) -> Parts:
+        """Several arrays in this buffer, which must be of uint8; contents are kept as in `array`."""
+        starts, size = place(shapes, part_alignment_bytes(self._workspace.queue.device))
+        return Parts(self.array((size,)), starts, shapes)
+
+    def upload_parts(self, arrays: Mapping[str, NDArray[Any]], *, is_constant: bool = False) -> Parts:
+        """Copy `arrays` into this buffer, which must be of uint8. is_constant: only the first time, as `constant`."""
+        shapes = {part: (values.shape, values.dtype) for part, values in arrays.items()}
+        starts, size = place(shapes, part_alignment_bytes(self._workspace.queue.device))
+        packed = pack(arrays, starts, size)
+        return Parts(self.constant(packed) if is_constant else self.upload(packed), starts, shapes)
+
+
+class BufferDescription:
+    """Declares a buffer in the body of a `StageBuffers` class."""
+
+    def __init__(self, dtype: DTypeLike) -> None:
+        self.dtype: np.dtype[Any] = np.dtype(dtype)
+
+    def __get__(self, stage: StageBuffers, _: type) -> DeviceBuffer:
+        buffer: DeviceBuffer = stage.find(self, None, lambda: DeviceBuffer(stage.workspace, self.dtype))
+        return buffer
+
+
+class KeyedBuffers:
+    """Buffers of one description, one for each key, for instance for each pyramid level."""
+
+    def __init__(self, stage: StageBuffers, description: KeyedBufferDescription) -> None:
+        self._stage, self._description = stage, description
+
+    def __getitem__(self, key: Hashable) -> DeviceBuffer:
+        description, stage = self._description, self._stage
+        buffer: DeviceBuffer = stage.find(description, key, lambda: DeviceBuffer(stage.workspace, description.dtype))
+        return buffer
+
+
+class KeyedBufferDescription:
+    """Declares one buffer for each key that is asked for. There must be a bounded number of keys."""
+
+    def __init__(self, dtype: DTypeLike) -> None:
+        self.dtype: np.dtype[Any] = np.dtype(dtype)
+
+    def __get__(self, stage: StageBuffers, _: type) -> KeyedBuffers:
+        return KeyedBuffers(stage, self)
+
+
+class BufferGroup(Generic[Group]):
+    """Declares the buffers of another stage that this one calls, so that nobody else writes them."""
+
+    def __init__(self, kind: type[Group]) -> None:
+        self._kind = kind
+
+    def __get__(self, stage: StageBuffers, _: type) -> Group:
+        group: Group = stage.find(self, None, lambda: self._kind(stage.workspace))
+        return group
+
+
+class StageBuffers:
+    """Base of the classes in which stages declare their buffers. `Engine.buffers` gives the engine's instance; who
+    needs the same stage twice makes an instance of its own."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.workspace: Workspace = workspace
+        self._made: dict[tuple[object, Hashable], Any] = {}
+
+    def find(self, description: object, key: Hashable, make: Callable[[], Any]) -> Any:
+        """What belongs to a description and key; made on first use."""
+        found = self._made.get((description, key))
+        if found is None:
+            found = self._made[description, key] = make()
+        return found
+
+
+class Workspace:
+    """All buffers of one engine: counts them, copies to them and releases them."""
+
+    def __init__(self, queue: cl.CommandQueue) -> None:
+        self.queue: cl.CommandQueue = queue
+        self._buffers: list[ref[DeviceBuffer]] = []
+        self._named: dict[tuple[str, np.dtype[Any]], DeviceBuffer] = {}
+        self._copying: deque[tuple[cl.Event, NDArray[Any]]] = deque()
+
+    def add(self, buffer: DeviceBuffer) -> None:
+        """From now on it is counted, as long as somebody holds it."""
+        self._buffers = [*(held for held in self._buffers if held() is not None), ref(buffer)]
+
+    def copy(self, array: cl_array.Array, values: NDArray[Any]) -> None:
+        """Copy `values` into an array of their size. Waits for nothing: a copy of `values` is kept until it is done."""
+        if array.nbytes:
+            memory, copied = cast(Any, array.data), np.array(values, order="C")
+            self._copying.append((cl.enqueue_copy(self.queue, memory, copied, is_blocking=False), copied))
+        while self._copying and self._copying[0][0].command_execution_status == cl.command_execution_status.COMPLETE:
+            self._copying.popleft()
+
+    def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> cl_array.Array:
+        """As `DeviceBuffer.array`, for the buffer of that name and type. For the light's estimation and tests; other
+        stages declare their buffers."""
+        return self._by_name(name, dtype).array(shape)
+
+    def upload(self, name: str, values: NDArray[Any]) -> cl_array.Array:
+        """As `DeviceBuffer.upload`, for the buffer of that name."""
+        return self._by_name(name, values.dtype).upload(values)
+
     def constant(self, name: str, values: NDArray[Any]) -> cl_array.Array:
-        """The array called `name`, copied from `values` the first time only; `values` must not change."""
-        found = self._arrays.get(name)
-        if found is not None and found.shape == values.shape and found.dtype == values.dtype:
-            return found
-        return self.upload(name, values)
+        """As `DeviceBuffer.constant`, for the buffer of that name."""
+        return self._by_name(name, values.dtype).constant(values)
+
+    def find(self, name: str) -> cl_array.Array | None:  # until every stage declares its buffers
+        found = [b.current for (n, _), b in self._named.items() if n == name]
+        return found[0] if found else None
 
     def parts(self, name: str, shapes: Mapping[str, tuple[tuple[int, ...], DTypeLike]]) -> Parts:
-        """Arrays in one buffer called `name`; contents are kept as `array` does."""
-        starts, size = place(shapes, part_alignment_bytes(self._queue.device))
-        return Parts(self.array(name, (size,), np.uint8), starts, shapes)
+        return self._by_name(name, np.uint8).parts(shapes)
 
     def upload_parts(self, name: str, arrays: Mapping[str, NDArray[Any]], *, is_constant: bool = False) -> Parts:
-        """Copy `arrays` into one buffer called `name`; is_constant: the first time only, as `constant` does."""
-        shapes = {part: (values.shape, values.dtype) for part, values in arrays.items()}
-        starts, size = place(shapes, part_alignment_bytes(self._queue.device))
-        packed = pack(arrays, starts, size)
-        memory = self.constant(name, packed) if is_constant else self.upload(name, packed)
-        return Parts(memory, starts, shapes)
+        return self._by_name(name, np.uint8).upload_parts(arrays, is_constant=is_constant)
+
+    def _by_name(self, name: str, dtype: DTypeLike) -> DeviceBuffer:
+        key = (name, np.dtype(dtype))
+        if key not in self._named:
+            self._named[key] = DeviceBuffer(self, dtype)
+        return self._named[key]
 
     @property
     def bytes_held(self) -> int:
-        """Device memory of all arrays."""
-        return sum(array.nbytes for array in tuple(self._arrays.values()))  # asked for by other threads too
+        """Device memory of all buffers. Any thread may ask."""
+        held = [buffer() for buffer in self._buffers]
+        arrays = [buffer.current for buffer in held if buffer is not None]
+        return sum(array.nbytes for array in arrays if array is not None)
 
     def release(self) -> None:
         """Give all device memory back."""
         self._copying.clear()
-        for array in self._arrays.values():
-            if isinstance(array.base_data, cl.MemoryObject):
-                array.base_data.release()
-        self._arrays.clear()
+        for held in self._buffers:
+            buffer = held()
+            if buffer is None or buffer.current is None:
+                continue
+            if isinstance(buffer.current.base_data, cl.MemoryObject):
+                buffer.current.base_data.release()
+            buffer.current = None

@@ -10,7 +10,7 @@ import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
-from server.opencl.buffers import Workspace
+from server.opencl.buffers import Group, StageBuffers, Workspace
 from server.opencl.device import Device
 from server.opencl.profile import Profile
 from server.opencl.program import Define, define_options
@@ -33,6 +33,7 @@ class Engine:
         self._kernels: dict[tuple[object, ...], cl.Kernel] = beside._kernels if beside else {}
         self._typed: dict[int, cl.Kernel] = beside._typed if beside else {}
         self._states: dict[type[Any], Any] = {}
+        self._buffers: dict[type[StageBuffers], StageBuffers] = {}
 
     @property
     def lanes(self) -> int:
@@ -70,10 +71,16 @@ class Engine:
 
     def state(self, kind: type[State]) -> State:
         """The one instance of `kind` that belongs to this engine, made on first use: what a stage keeps of the frame
-        before, beside its arrays in the workspace."""
+        before, beside its buffers."""
         if kind not in self._states:
             self._states[kind] = kind()
         return cast(State, self._states[kind])
+
+    def buffers(self, kind: type[Group]) -> Group:
+        """The buffers of a stage that belong to this engine, made on first use."""
+        if kind not in self._buffers:
+            self._buffers[kind] = kind(self.workspace)
+        return cast(Group, self._buffers[kind])
 
     def download(self, array: cl_array.Array) -> NDArray[Any]:
         """Copy to the host; waits for everything queued before."""
@@ -84,6 +91,7 @@ class Engine:
         """Wait for the device and give its memory back."""
         self.queue.finish()
         self._states.clear()
+        self._buffers.clear()
         self.workspace.release()
 
 

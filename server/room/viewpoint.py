@@ -7,11 +7,16 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame, Viewpoint
 from server.maths.rigid import repaired_pose
+from server.opencl.buffers import BufferGroup, StageBuffers
 from server.opencl.engine import Engine
 from server.shading.composite import srgb_codes
-from server.volume.raycast import raycast
+from server.volume.raycast import SurfaceBuffers, raycast
 from server.volume.view_colors import view_colors
 from server.volume.volume import Volume
+
+
+class _Buffers(StageBuffers):
+    surface = BufferGroup(SurfaceBuffers)
 
 
 def imagined_frame(
@@ -23,7 +28,7 @@ def imagined_frame(
     pose = repaired_pose(view.world_from_camera)
     volume_from_camera = volume.volume_from_world() @ room_from_client @ pose
     volume.bring_back(camera, volume_from_camera)
-    surface = raycast(engine, camera, volume_from_camera, volume, "looked_at")
+    surface = raycast(engine, camera, volume_from_camera, volume, engine.buffers(_Buffers).surface)
     shown = engine.download(view_colors(engine, camera, surface, volume))
     linear = np.stack([shown[channel] for channel in "xyz"], axis=-1).astype(np.float64)
     is_linear = camera.color_encoding == "linear16"

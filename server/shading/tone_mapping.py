@@ -17,6 +17,7 @@ import pyopencl.cltypes as cl_types
 
 from protocol.frames import CameraModel
 from server.light.light_estimation import ASSUMED_ALBEDO, FORGETTING
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.shading.traced_scene import DeviceLight, light_arguments
 from server.transfer.indirect import Indirect, no_hits
@@ -27,6 +28,13 @@ EVERY = 3
 """Of how many samples along an axis one counts; an odd number, so that all direction sets take part."""
 LEAST_LUMINANCE = 1e-4
 """Of an average that says anything; the picture's white is 1."""
+
+
+class _Buffers(StageBuffers):
+    pairs = BufferDescription(cl_types.float4)
+    """[rows, cols]: luminance of the picture, of the shading, whether the sample is usable, unused."""
+    row_sums = BufferDescription(cl_types.float4)
+    """[rows]: the pairs of a row, added."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +88,8 @@ def measure_averages(
 ) -> Averages:
     """Averages of one frame. radiance: [h, w] float4 as in Measurement; indirect: what surfaces send, None: nothing."""
     cols, rows = -(-transfer.cols // EVERY), -(-transfer.rows // EVERY)
-    pairs = engine.workspace.array("tone_pairs", (rows, cols), cl_types.float4)
+    buffers = engine.buffers(_Buffers)
+    pairs = buffers.pairs.array((rows, cols))
     words = transfer.free_mask.shape[2]
     defines = {"BANDS": transfer.bands, "MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": transfer.interleave}
     engine.launch(
@@ -97,7 +106,7 @@ def measure_averages(
         rows,
         pairs,
     )
-    sums = engine.workspace.array("tone_sums", (rows,), cl_types.float4)
+    sums = buffers.row_sums.array((rows,))
     engine.launch(engine.kernel("tone_mapping.cl", "sum_rows", **defines), (rows,), cols, rows, pairs, sums)
     total = engine.download(sums).view(np.float32).reshape(-1, 4).sum(axis=0, dtype=np.float64)
     count = int(total[2])

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from server.maths.registration import angle_between, distance_between
+from server.opencl.buffers import BufferGroup, StageBuffers
 from server.opencl.engine import Engine
 from server.tracking.track import Pyramid, Registration, register, view_model
-from server.volume.raycast import raycast
+from server.volume.raycast import SurfaceBuffers, raycast
 from server.volume.volume import Volume
 
 THUMB = (40, 30)
@@ -24,6 +25,10 @@ _CANDIDATES = 3
 _LEAST_SHARE, _LEAST_OVERLAP, _GREATEST_DEVIATION_M = 0.6, 0.2, 0.012
 _REACH_M, _REACH_RAD = 0.5, np.radians(30.0)
 """A keyframe this far from where registration ends was not the same view."""
+
+
+class _Buffers(StageBuffers):
+    surface = BufferGroup(SurfaceBuffers)
 
 
 @dataclass(frozen=True)
@@ -129,7 +134,7 @@ def fit_near(
     pose: NDArray[np.float64],
 ) -> Registration | None:
     volume.bring_back(camera, pose)
-    seen = raycast(engine, camera, pose, volume, "relocalize")
+    seen = raycast(engine, camera, pose, volume, engine.buffers(_Buffers).surface)
     view = view_model(engine, camera, pose, seen, "relocalize")
     return register(engine, camera, view, pyramid, pose, 0.25 * volume.voxel_m)
 

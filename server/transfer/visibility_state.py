@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.maths.rigid import inverse_rigid
+from server.opencl.buffers import BufferDescription, BufferGroup, StageBuffers
 from server.opencl.engine import Engine, float16, int4
 from server.opencl.transfer import copy_beginning, fill_bytes
-from server.volume.raycast import Surface, raycast
+from server.volume.raycast import Surface, SurfaceBuffers, raycast
 from server.volume.volume import BRICK, Volume
 
 LEAST_OPEN = 0.99
@@ -33,11 +34,29 @@ _ABOVE_TANGENT = 1.2  # half the field of view of the camera above
 _ABOVE_HEIGHT = 0.95  # of the volume's height
 
 
+class _WatchBuffers(StageBuffers):
+    surface = BufferGroup(SurfaceBuffers)
+    seen = BufferDescription(cl_types.float4)
+    """[h, w] the surface's positions, kept from the last time."""
+
+
+class _Buffers(StageBuffers):
+    bits = BufferDescription(np.uint32)
+    following = BufferGroup(_WatchBuffers)
+    above = BufferGroup(_WatchBuffers)
+    before = BufferDescription(cl_types.float4)
+    """[h, w] what a camera saw the time before."""
+    changed_bricks = BufferDescription(np.uint8)
+    """[z, y, x] 1 where a camera sees another surface than before."""
+    stale_bricks = BufferDescription(np.uint8)
+    """[z, y, x] 1 for bricks near a changed one."""
+
+
 @dataclass
 class _Watch:
     """A validation camera and what it saw last."""
 
-    name: str
+    buffers: _WatchBuffers
     camera: CameraModel
     volume_from_camera: NDArray[np.float64]
     seen: cl_array.Array | None = None
@@ -51,11 +70,11 @@ class VisibilityState:
         voxels = int(np.prod(volume.bricks)) * BRICK**3
         if voxels > MOST_VOXELS:
             raise ValueError(f"a visibility state of {voxels} voxels is too large: give a larger --voxel")
-        self._engine, self._volume = engine, volume
-        self.bits = engine.workspace.array("visibility_state", (voxels // 32,), np.uint32)
+        self._engine, self._volume, self._buffers = engine, volume, _Buffers(engine.workspace)
+        self.bits = self._buffers.bits.array((voxels // 32,))
         """[voxels / 32] bit (z ny + y) nx + x: surface in that voxel is open."""
-        self._following = _Watch("following", _smaller(camera), np.eye(4))
-        self._above = _Watch("above", *_camera_above(volume, up))
+        self._following = _Watch(self._buffers.following, _smaller(camera), np.eye(4))
+        self._above = _Watch(self._buffers.above, *_camera_above(volume, up))
         self.forget()
 
     def forget(self) -> None:
@@ -67,8 +86,7 @@ class VisibilityState:
 
         `volume_from_camera`: of the user's camera now. Returns [z, y, x] the bricks that were forgotten.
         """
-        space, shape = self._engine.workspace, self._volume.bricks[::-1]
-        changed = space.array("changed_bricks", shape, np.uint8)
+        changed = self._buffers.changed_bricks.array(self._volume.bricks[::-1])
         fill_bytes(self._engine.queue, changed, 0)
         for watch in (self._above, self._following):
             self._compare(watch, changed)
@@ -81,7 +99,7 @@ class VisibilityState:
                 self._engine.kernel("visibility_state.cl", "clear_bricks"),
                 (x, BRICK * y, BRICK * z),
                 int4(x, y, z, 0),
-                space.upload("stale_bricks", stale.astype(np.uint8)),
+                self._buffers.stale_bricks.upload(stale.astype(np.uint8)),
                 self.bits,
             )
         return stale
@@ -109,9 +127,9 @@ class VisibilityState:
 
     def _look(self, watch: _Watch) -> cl_array.Array:
         """[h, w] float4 what `watch` sees now; kept as what it saw last."""
-        view = raycast(self._engine, watch.camera, watch.volume_from_camera, self._volume, f"watch_{watch.name}")
+        view = raycast(self._engine, watch.camera, watch.volume_from_camera, self._volume, watch.buffers.surface)
         shape = (watch.camera.height, watch.camera.width)
-        watch.seen = self._engine.workspace.array(f"seen_{watch.name}", shape, cl_types.float4)
+        watch.seen = watch.buffers.seen.array(shape)
         copy_beginning(self._engine.queue, watch.seen, view.positions)
         return watch.seen
 
@@ -120,7 +138,7 @@ class VisibilityState:
             if watch is self._above:
                 self._look(watch)
             return
-        before = self._engine.workspace.array("seen_before", watch.seen.shape, cl_types.float4)
+        before = self._buffers.before.array(watch.seen.shape)
         copy_beginning(self._engine.queue, before, watch.seen)
         self._engine.launch(
             self._engine.kernel("visibility_state.cl", "compare_views"),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.input.measure import GREATEST_DEPTH_M, intrinsics
 from server.maths.rigid import inverse_rigid
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, float16, int4
 from server.volume.volume import Volume
 
@@ -19,6 +20,21 @@ LABEL_NONE, LABEL_STATIC, LABEL_DYNAMIC, LABEL_FILLED = 0, 1, 2, 3
 
 _TILE = 8  # as in raycast.cl
 _FARTHEST = int(np.float32(np.inf).view(np.int32))
+
+
+class SurfaceBuffers(StageBuffers):
+    """Of one surface. Whoever needs two surfaces at a time declares a `BufferGroup` of its own for each."""
+
+    positions = BufferDescription(cl_types.float4)
+    normals = BufferDescription(cl_types.float4)
+    labels = BufferDescription(np.uint8)
+
+
+class _RayBuffers(StageBuffers):
+    nearest = BufferDescription(np.int32)
+    """[tile row, tile column] depth at which rays begin, as bits of float metres."""
+    farthest = BufferDescription(np.int32)
+    """[tile row, tile column] depth at which rays end, likewise."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +51,17 @@ class Surface:
 
 
 def raycast(
-    engine: Engine, camera: CameraModel, volume_from_camera: NDArray[np.float64], volume: Volume, buffers: str = "model"
+    engine: Engine,
+    camera: CameraModel,
+    volume_from_camera: NDArray[np.float64],
+    volume: Volume,
+    buffers: SurfaceBuffers | None = None,
 ) -> Surface:
-    """Surface of the volume alone; labels are not filled. `buffers` names the arrays, which the next call reuses."""
+    """Surface of the volume alone, in `buffers` (None: the engine's); labels are not filled."""
+    buffers = buffers or engine.buffers(SurfaceBuffers)
     size, lanes = (camera.height, camera.width), engine.lanes
-    positions = engine.workspace.array(f"{buffers}_positions", size, cl_types.float4)
-    normals = engine.workspace.array(f"{buffers}_normals", size, cl_types.float4)
+    positions = buffers.positions.array(size)
+    normals = buffers.normals.array(size)
     engine.launch(
         engine.kernel("raycast.cl", "raycast", LANES=lanes),
         (-(-camera.width // lanes), camera.height),
@@ -54,7 +75,7 @@ def raycast(
         positions,
         normals,
     )
-    return Surface(positions, normals, engine.workspace.array(f"{buffers}_labels", size, np.uint8))
+    return Surface(positions, normals, buffers.labels.array(size))
 
 
 def _ray_bounds(
@@ -62,8 +83,8 @@ def _ray_bounds(
 ) -> tuple[cl_array.Array, cl_array.Array]:
     """Nearest and farthest depth [tile row, tile column] with a solid voxel, as bits of float metres."""
     tiles = (-(-camera.height // _TILE), -(-camera.width // _TILE))
-    nearest = engine.workspace.array("rays_nearest", tiles, np.int32)
-    farthest = engine.workspace.array("rays_farthest", tiles, np.int32)
+    buffers = engine.buffers(_RayBuffers)
+    nearest, farthest = buffers.nearest.array(tiles), buffers.farthest.array(tiles)
     nearest.fill(np.int32(_FARTHEST))
     farthest.fill(np.int32(0))
     if volume.allocated_bricks:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import gc
 import threading
-from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -12,13 +12,27 @@ import pytest
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from server.client_session import ClientSession
-from server.opencl.buffers import Workspace
+from server.opencl.buffers import BufferDescription, BufferGroup, KeyedBufferDescription, StageBuffers, Workspace
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.opencl.transfer import copy_into
 from server.scene.placement import Placement
 from tests.scenes.analytic import look, plane, room
 from tests.scenes.meshes import soup_of
+
+
+class _Inner(StageBuffers):
+    """Of a stage that another one calls."""
+
+    sums = BufferDescription(np.float32)
+
+
+class _Stage(StageBuffers):
+    """Of a stage in these tests."""
+
+    sums = BufferDescription(np.float32)
+    levels = KeyedBufferDescription(np.int32)
+    inner = BufferGroup(_Inner)
 
 
 @pytest.fixture
@@ -37,10 +51,11 @@ def test_same_name_and_shape_is_the_same_memory(workspace: Workspace) -> None:
     assert workspace.bytes_held == 2 * 3 * 5 * 4
 
 
-def test_find_makes_nothing(workspace: Workspace) -> None:
-    assert workspace.find("a") is None
-    made = workspace.array("a", (3,), np.float32)
-    assert workspace.find("a") is made
+def test_nothing_is_made_before_the_first_use(engine: Engine) -> None:
+    sums = engine.buffers(_Stage).sums
+    assert sums.current is None
+    made = sums.array((3,))
+    assert sums.current is made
 
 
 def test_copy_into(engine: Engine) -> None:
@@ -50,12 +65,46 @@ def test_copy_into(engine: Engine) -> None:
     np.testing.assert_array_equal(engine.download(whole), [0, 1, 2, 70, 80, 5, 6, 7, 8, 9])
 
 
-@pytest.mark.parametrize(("shape", "dtype"), [((5, 3), np.float32), ((3, 6), np.float32), ((3, 5), np.int32)])
-def test_another_shape_or_type_replaces_it(workspace: Workspace, shape: tuple[int, ...], dtype: Any) -> None:
-    workspace.array("a", (3, 5), np.float32)
-    other = workspace.array("a", shape, dtype)
-    assert (other.shape, other.dtype) == (shape, np.dtype(dtype))
-    assert workspace.bytes_held == other.nbytes
+@pytest.mark.parametrize("shape", [(5, 3), (3, 6), (15,)])
+def test_another_shape_replaces_it(engine: Engine, shape: tuple[int, ...]) -> None:
+    sums = engine.buffers(_Stage).sums
+    first = sums.array((3, 5))
+    other = sums.array(shape)
+    assert other is not first
+    assert (other.shape, other.dtype) == (shape, np.dtype(np.float32))
+    assert engine.workspace.bytes_held == other.nbytes
+
+
+def test_a_stage_has_one_buffer_for_each_description_and_key(engine: Engine) -> None:
+    stage = engine.buffers(_Stage)
+    assert stage is engine.buffers(_Stage)
+    assert stage.sums is stage.sums
+    assert stage.levels[1] is stage.levels[1]
+    made = [stage.sums, stage.levels[0], stage.levels[1], stage.inner.sums, _Stage(engine.workspace).sums]
+    assert len({id(buffer.array((4,))) for buffer in made}) == len(made)
+    assert engine.workspace.bytes_held == 4 * 4 * len(made)
+
+
+def test_memory_goes_with_its_owner(engine: Engine) -> None:
+    owner = _Stage(engine.workspace)
+    owner.sums.array((4,))
+    assert engine.workspace.bytes_held == 16
+    del owner
+    gc.collect()
+    assert engine.workspace.bytes_held == 0
+
+
+def test_values_of_another_type_are_refused(engine: Engine) -> None:
+    with pytest.raises(TypeError, match="float32, not float64"):
+        engine.buffers(_Stage).sums.upload(np.zeros(3))
+
+
+def test_a_constant_is_copied_once(engine: Engine) -> None:
+    sums = engine.buffers(_Stage).sums
+    first = sums.constant(np.ones(3, np.float32))
+    assert sums.constant(np.zeros(3, np.float32)) is first
+    assert (first.get() == 1).all()
+    assert (sums.constant(np.zeros(4, np.float32)).get() == 0).all()
 
 
 def test_upload_copies_into_the_same_memory(workspace: Workspace) -> None:

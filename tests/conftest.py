@@ -8,6 +8,7 @@ import pytest
 
 from server.opencl.device import Device, list_devices, open_device
 from server.opencl.engine import Engine
+from tests import guards
 from tests.absent import fail_unexpected_skip
 from tests.slow import function_of, read_list, stale_lines, without_device
 
@@ -94,6 +95,14 @@ def stale_slow_lines(pytestconfig: pytest.Config) -> list[str]:
 def device(request: pytest.FixtureRequest) -> Device:
     """An opened OpenCL device."""
     return open_device(request.param)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def guarded_buffers() -> Iterator[None]:
+    """Bytes behind every device buffer of this process that no kernel may write."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        guards.install(monkeypatch)
+        yield
 
 
 @pytest.fixture

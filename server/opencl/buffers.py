@@ -17,6 +17,11 @@ from server.opencl.parts import Parts, pack, part_alignment_bytes, place
 Group = TypeVar("Group", bound="StageBuffers")
 
 
+def new_array(queue: cl.CommandQueue, shape: tuple[int, ...], dtype: DTypeLike) -> cl_array.Array:
+    """Device memory whose contents are undefined."""
+    return cl_array.empty(queue, shape, dtype)
+
+
 class DeviceBuffer:
     """One array on the device. While its shape stays it is the same memory, so a steady stream allocates nothing."""
 
@@ -30,7 +35,7 @@ class DeviceBuffer:
     def array(self, shape: tuple[int, ...]) -> cl_array.Array:
         """The array of that shape; its contents are kept while the shape stays, and undefined after it changes."""
         if self.current is None or self.current.shape != shape:
-            self.current = cl_array.empty(self._workspace.queue, shape, self._dtype)
+            self.current = new_array(self._workspace.queue, shape, self._dtype)
         return self.current
 
     def upload(self, values: NDArray[Any]) -> cl_array.Array:
@@ -176,9 +181,13 @@ class Workspace:
     @property
     def bytes_held(self) -> int:
         """Device memory of all buffers. Any thread may ask."""
+        return sum(array.nbytes for array in self.arrays())
+
+    def arrays(self) -> list[cl_array.Array]:
+        """Of all buffers that somebody holds."""
         held = [buffer() for buffer in self._buffers]
         arrays = [buffer.current for buffer in held if buffer is not None]
-        return sum(array.nbytes for array in arrays if array is not None)
+        return [array for array in arrays if array is not None]
 
     def release(self) -> None:
         """Give all device memory back."""

@@ -90,9 +90,9 @@ class Engine:
     def close(self) -> None:
         """Wait for the device and give its memory back."""
         self.queue.finish()
+        self.workspace.release()
         self._states.clear()
         self._buffers.clear()
-        self.workspace.release()
 
 
 def _make_queue(device: Device) -> cl.CommandQueue:

@@ -178,3 +178,11 @@ def test_a_steady_stream_allocates_nothing(device: Device, monkeypatch: pytest.M
         pipeline.process(RgbdFrame(index, index / 30, color, depth, np.eye(4)))
     assert made == []
     pipeline.close()
+
+
+def test_a_write_past_the_end_fails_the_test(engine: Engine) -> None:
+    """By one element: the guards that tests put behind every buffer (tests/guards.py) are seen to be written."""
+    array = engine.buffers(_Stage).sums.array((5,))
+    cl.enqueue_copy(engine.queue, array.base_data, np.zeros(6, np.float32))
+    with pytest.raises(AssertionError, match=r"past the end of a buffer \(5,\) of float32"):
+        engine.close()

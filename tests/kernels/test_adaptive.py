@@ -28,7 +28,7 @@ from tests.scenes.solids import SCENES, download4, fill_volume, float4
 from tests.scenes.volumes import seen_surface
 
 VOXEL_M = 0.01
-CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
+CAMERA = CameraModel(width=61, height=49, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
 VIEW = look_at((0.25, 0.5, 0.05), (0.4, 0.15, 0.4))
 STRIDE = 4
 ROOM_M = 1000.0

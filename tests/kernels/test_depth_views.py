@@ -53,7 +53,7 @@ VOXEL_M = 0.02
 ROOM_M = 1000.0
 SHAPE = ViewShape(9, 13)
 RAYS = direction_sets(16, 2)
-CAMERA = CameraModel(width=64, height=48, fx=52.0, fy=53.0, cx=31.3, cy=23.8)
+CAMERA = CameraModel(width=61, height=49, fx=52.0, fy=53.0, cx=31.3, cy=23.8)
 VIEW = look_at((0.48, 0.75, 0.85), (0.5, 0.3, 0.4), up=(0.0, 1.0, 0.0))
 RATIO, THRESHOLD = 1.5, 0.05
 

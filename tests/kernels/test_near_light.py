@@ -208,7 +208,7 @@ def test_some_samples_are_among_all(engine: Engine) -> None:
     surface = replace(surface, labels=engine.workspace.upload("other_labels", labels))
     seen = np.random.default_rng(4).uniform(0, 0.6, (48, 64, 3))
     radiance = engine.workspace.upload("radiance", float4(seen, (x < 0.7).astype(float)))
-    camera = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
+    camera = CameraModel(width=61, height=49, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
     whole = see_samples(engine, camera, radiance, surface, volume)
     some = see_some(engine, camera, radiance, surface, volume, 20, np.random.default_rng(1))
     assert len(whole) > 50

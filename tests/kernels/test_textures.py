@@ -173,7 +173,7 @@ def test_tables_share_textures() -> None:
 
 # ---- in the picture ----------------------------------------------------------------------------------------------
 
-CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=20.0)
+CAMERA = CameraModel(width=157, height=119, fx=140.0, fy=140.0, cx=79.5, cy=20.0)
 
 
 def floor_mesh(material: Material, repeats: float, length_m: float = 12.0, color: float = 1.0) -> Mesh:
@@ -189,7 +189,7 @@ def draw(engine: Engine, *placed: tuple[Mesh, Floats]) -> dict[str, NDArray[np.f
     objects = [(VirtualObject.upload(engine, mesh, cells=8), matrix) for mesh, matrix in placed]
     surface = rasterize(engine, CAMERA, np.eye(4), objects)
     names = ("position", "base_color", "material")
-    fields = {n: engine.download(getattr(surface, n)).view(np.float32).reshape(120, 160, 4) for n in names}
+    fields = {n: engine.download(getattr(surface, n)).view(np.float32).reshape(CAMERA.height, CAMERA.width, 4) for n in names}
     return fields | {"object_index": engine.download(surface.object_index)}
 
 
@@ -273,7 +273,7 @@ def test_each_object_has_its_own_textures(engine: Engine) -> None:
     things = [VirtualObject.upload(engine, mesh, cells=8) for mesh in (*meshes, side)]
     places = [(things[k], pose((x, 0.2, 0.0))) for k, x in ((1, -0.4), (0, -0.1), (2, 0.2), (0, 0.45))]
     surface = rasterize(engine, CAMERA, np.eye(4), places)
-    color = engine.download(surface.base_color).view(np.float32).reshape(120, 160, 4)
+    color = engine.download(surface.base_color).view(np.float32).reshape(CAMERA.height, CAMERA.width, 4)
     index = engine.download(surface.object_index)
     for number, expected in enumerate([(0, 0, 1), (1, 0, 0), (1, 1, 1), (1, 0, 0)]):
         assert (index == number).sum() > 100

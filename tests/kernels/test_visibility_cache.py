@@ -23,7 +23,7 @@ from tests.scenes.solids import SCENES, download4, fill_volume, floor, upload_su
 from tests.scenes.volumes import fill, seen_surface
 
 VOXEL_M = 0.01
-CAMERA = CameraModel(width=96, height=64, fx=80.0, fy=80.0, cx=47.5, cy=31.5)
+CAMERA = CameraModel(width=93, height=62, fx=80.0, fy=80.0, cx=47.5, cy=31.5)
 STRIDE = 4
 COUNT = 81
 ROOM_M = 1000.0

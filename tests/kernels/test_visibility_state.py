@@ -18,7 +18,7 @@ from tests.scenes.volumes import fill, seen_surface
 
 VOXEL_M = 0.02
 REACH_M = 0.1
-CAMERA = CameraModel(width=96, height=64, fx=80.0, fy=80.0, cx=47.5, cy=31.5)
+CAMERA = CameraModel(width=93, height=62, fx=80.0, fy=80.0, cx=47.5, cy=31.5)
 VIEW = look_at((0.3, 0.75, 0.1), (0.5, 0.1, 0.5))
 UP = np.array([0.0, 1.0, 0.0])
 SCENE: Scene = (floor(0.11), ball((0.5, 0.21, 0.5), 0.1))  # no surface on the border of two voxels

@@ -189,7 +189,9 @@ def draw(engine: Engine, *placed: tuple[Mesh, Floats]) -> dict[str, NDArray[np.f
     objects = [(VirtualObject.upload(engine, mesh, cells=8), matrix) for mesh, matrix in placed]
     surface = rasterize(engine, CAMERA, np.eye(4), objects)
     names = ("position", "base_color", "material")
-    fields = {n: engine.download(getattr(surface, n)).view(np.float32).reshape(CAMERA.height, CAMERA.width, 4) for n in names}
+    fields = {
+        n: engine.download(getattr(surface, n)).view(np.float32).reshape(CAMERA.height, CAMERA.width, 4) for n in names
+    }
     return fields | {"object_index": engine.download(surface.object_index)}
 
 

@@ -332,12 +332,16 @@ def test_a_sheet_has_points_on_both_sides(engine: Engine) -> None:
 CAMERA = CameraModel(width=61, height=49, fx=45.0, fy=45.0, cx=31.5, cy=23.5)
 CORNER = SCENES["floor under a wall"]  # y = 0.1 and z = 0.2
 FLOOR_RATIO = np.array([0.5, 0.8, 1.4])
+SHADED = 0.8
 
 
 def bounced_wall(
     engine: Engine, stride: int, color: ArrayLike = WHITE, spare: float = 0.0
 ) -> tuple[Floats, Floats, Floats]:
-    """Ratios [rows, cols, 4] of a corner where the floor's alone was FLOOR_RATIO, the samples' points and normals."""
+    """Ratios [rows, cols, 4] of a corner where the floor's alone was FLOOR_RATIO, the samples' points and normals.
+
+    R is SHADED everywhere, and every surface sends 1.
+    """
     view = look_at((0.48, 0.5, 0.9), (0.48, 0.2, 0.2))
     volume, rays = fill_volume(engine, CORNER, VOXEL_M), direction_sets(81, 4)
     paint(engine, volume, np.broadcast_to(np.asarray(color, float), (*voxels_of(volume), 3)))
@@ -348,9 +352,10 @@ def bounced_wall(
     is_floor = np.abs(points[..., 1] - 0.1) < VOXEL_M
     ratio = np.where(is_floor[..., None], FLOOR_RATIO, 1.0)
     valid = (points[..., 3] > 0).astype(float)
-    shaded = engine.workspace.upload("test_shaded", float4(np.ones_like(ratio), valid))
+    shaded = engine.workspace.upload("test_shaded", float4(np.full_like(ratio, SHADED), valid))
+    hits = engine.workspace.upload("test_hits", float4(np.ones_like(ratio), valid))
     shadow = RealShadow(stride, engine.workspace.upload("test_ratio", float4(ratio, valid)), shaded)
-    light = upload_light(engine, lights.uniform(), rays, indirect=Indirect(shaded, np.ones(3)))
+    light = upload_light(engine, lights.uniform(), rays, indirect=Indirect(hits, np.ones(3)))
     traced = trace_scene(engine, volume, light, rays, ROOM_M, [])
     returned = float(np.abs(FLOOR_RATIO - 1).max())
     bounced = bounce_real(engine, CAMERA, inverse_rigid(view), surface, transfer, traced, shadow, returned, spare)
@@ -378,13 +383,13 @@ def seen_floor(points: Floats, normals: Floats) -> tuple[Floats, Floats]:
 @KINDS
 @pytest.mark.parametrize("stride", [1, 4])
 def test_a_wall_loses_what_a_shadowed_floor_sends_less(device: Device, kind: type[Engine], stride: int) -> None:
-    """R = 1 and all surfaces send 1: the ratio falls by the floor's share of the sky times the floor's own loss."""
+    """R falls by the floor's share of the sky times the floor's own loss."""
     ratio, points, normals = bounced_wall(kind(device), stride)
     is_wall = (points[..., 3] > 0) & (normals[..., 2] > 0.9) & (np.abs(points[..., 0] - 0.48) < 0.2)
     is_wall &= points[..., 1] < 0.45
     chosen = np.argwhere(is_wall)[:: max(1, is_wall.sum() // 150)]
     shown, _ = seen_floor(*(a[chosen[:, 0], chosen[:, 1], :3] for a in (points, normals)))
-    lost = 1 - ratio[chosen[:, 0], chosen[:, 1], :3]
+    lost = SHADED * (1 - ratio[chosen[:, 0], chosen[:, 1], :3])
     assert shown.max() > 0.15
     for channel, change in enumerate(1 - FLOOR_RATIO):
         slope = (lost[:, channel] @ shown) / (shown @ shown)

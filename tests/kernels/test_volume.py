@@ -71,6 +71,14 @@ def test_a_thing_one_pixel_wide_has_its_bricks(engine: Engine, column: int) -> N
     assert_enough_bricks(engine, volume_of(engine), np.eye(4), depth)
 
 
+@pytest.mark.parametrize("row", [40, 41, 42, 43])
+def test_a_thing_one_pixel_high_has_its_bricks(engine: Engine, row: int) -> None:
+    """In front of a wall: a tile of pixels holds both."""
+    depth = np.full((CAMERA.height, CAMERA.width), 1.6)
+    depth[row] = 0.8
+    assert_enough_bricks(engine, volume_of(engine), np.eye(4), depth)
+
+
 @pytest.mark.parametrize("pixel", [(30, 40), (31, 40), (30, 41), (31, 41)])
 def test_one_valid_pixel_has_its_bricks(engine: Engine, pixel: tuple[int, int]) -> None:
     depth = np.zeros((CAMERA.height, CAMERA.width))

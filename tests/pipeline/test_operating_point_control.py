@@ -12,7 +12,12 @@ from msgspec import structs
 
 from protocol.messages import Timings, Wishes
 from server.quality.costs import CostModel, rows_of
-from server.quality.operating_point_control import CALM_FRAMES, TOLERANCE, OperatingPointControl
+from server.quality.operating_point_control import (
+    CALM_FRAMES,
+    SETTLING_FRAMES,
+    TOLERANCE,
+    OperatingPointControl,
+)
 from server.quality.pareto_front import (
     NoFrontError,
     ParetoFront,
@@ -103,6 +108,16 @@ def test_it_goes_down_at_once_and_climbs_back() -> None:
     assert slow.max() <= 104  # what comes after the change is told by two frames
     assert scene.presets[105] == "gr15fast"
     assert scene.changes <= 12
+
+
+def test_one_slow_frame_changes_nothing() -> None:
+    """A frame that is a little too slow is one of many reasons; two in a row are the scene's."""
+    budget_ms = 160.0
+    control = OperatingPointControl(front(), budget_ms)
+    slow = 1.05 * TOLERANCE * budget_ms / control.chosen.total_ms
+    scene = Scene(control, lambda i: slow if i == SETTLING_FRAMES else 1.0, noise=0.0).run(SETTLING_FRAMES + 2)
+    assert np.flatnonzero(np.array(scene.totals) > TOLERANCE * budget_ms).tolist() == [SETTLING_FRAMES]
+    assert scene.changes == 0
 
 
 def test_a_cost_at_the_edge_of_the_budget_does_not_pump() -> None:

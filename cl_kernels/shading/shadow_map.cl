@@ -1,5 +1,5 @@
 // Shadow maps along the sharp lights of a room and what these lights bring past them (thesis 7.2.3, fig. 7.7).
-// Provides begin_maps, halve_maps, trace_discs, light_virtual, light_real, light_glow, light_samples, mix_direct,
+// Provides begin_maps, halve_maps, trace_discs, light_virtual, light_real, light_points_by_discs, light_samples, mix_direct,
 // unmix_direct.
 #include "arriving.clh"
 #include "camera.clh"
@@ -246,7 +246,7 @@ kernel void light_real(const Grid grid, const int height, global const float4 *p
 
 // Points on virtual objects send more: points, normals (volume space), albedos [points_count]; radiances [points_count] are added to.
 // One item LANES points.
-kernel void light_glow(const int points_count, global const float4 *points, global const float4 *normals, global const float4 *albedos,
+kernel void light_points_by_discs(const int points_count, global const float4 *points, global const float4 *normals, global const float4 *albedos,
                        DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *radiances) {
     const int first = get_global_id(0) * LANES;
     if (first >= points_count) return;

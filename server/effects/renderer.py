@@ -31,6 +31,7 @@ from server.input.measure import Measurement
 from server.light.continuation import PlaneArrays
 from server.maths.direct_lights import split_light
 from server.objects.rasterize import Placed
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.quality.settings import Settings
 from server.reuse.frame_cache import FrameCache
@@ -49,6 +50,11 @@ Picture = NDArray[np.uint8]
 LASTING = frozenset({"virtual", "coverage"})
 """The same for all direction sets, and written only where an object has moved."""
 DRAWN_BY_CLIENT = CullReason("asked for: the client draws by itself", 0.0)
+
+
+class _Buffers(StageBuffers):
+    unlit = BufferDescription(cl_types.float4)
+    """[h, w] zeros."""
 
 
 @dataclass(frozen=True)
@@ -256,7 +262,7 @@ def _direct_virtual(context: FrameContext, parts: PictureParts) -> cl_array.Arra
     """What the discs of the light bring to virtual surface: zeros where this was left out."""
     if parts.direct_virtual is not None or parts.virtual is None or not parts.light.discs:
         return parts.direct_virtual
-    return context.engine.workspace.constant("unlit", np.zeros(context.surface.positions.shape, cl_types.float4))
+    return context.engine.buffers(_Buffers).unlit.constant(np.zeros(context.surface.positions.shape, cl_types.float4))
 
 
 def _composed(

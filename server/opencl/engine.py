@@ -10,13 +10,17 @@ import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
-from server.opencl.buffers import Group, StageBuffers, Workspace
+from server.opencl.buffers import BufferDescription, Group, StageBuffers, Workspace
 from server.opencl.device import Device
 from server.opencl.profile import Profile
 from server.opencl.program import Define, define_options
 
 State = TypeVar("State")
 KernelArgument = cl_array.Array | np.generic | int | float | None
+
+
+class _UnusedBuffers(StageBuffers):
+    one = BufferDescription(cl_types.float4)
 
 
 class Engine:
@@ -81,6 +85,11 @@ class Engine:
         if kind not in self._buffers:
             self._buffers[kind] = kind(self.workspace)
         return cast(Group, self._buffers[kind])
+
+    @property
+    def unused(self) -> cl_array.Array:
+        """For a kernel argument that the kernel, as it is compiled, does not read."""
+        return self.buffers(_UnusedBuffers).one.array((1,))
 
     def download(self, array: cl_array.Array) -> NDArray[Any]:
         """Copy to the host; waits for everything queued before."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.objects.rasterize import VirtualSurface
+from server.opencl.buffers import BufferDescription, DeviceBuffer, StageBuffers
 from server.opencl.engine import Engine, float4
 from server.opencl.transfer import fill_bytes
 from server.shading.differential_rendering import RealShadow
@@ -30,15 +31,28 @@ SHOWN_MARGIN_PX = 4
 _LEAST_LISTED = 1024
 
 
+class _Buffers(StageBuffers):
+    virtual_edges = BufferDescription(np.uint8)
+    """[h, w] 1 where virtual surface ends, bends or steps."""
+    edge_pixels = BufferDescription(np.int32)
+    visible_pixels = BufferDescription(np.uint8)
+    """[h, w] 0 where virtual surface hides the real one."""
+    varying_cells = BufferDescription(np.uint8)
+    """[rows + 1, cols + 1] 1 where the ratio changes from sample to sample."""
+    varying_pixels = BufferDescription(np.int32)
+    refined_occluded = BufferDescription(cl_types.float4)
+    refined_ratio = BufferDescription(cl_types.float4)
+
+
 def refine_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, scene: TracedScene) -> cl_array.Array:
     """[h, w] float4: radiance that occluders take from the virtual surface near its edges; w = 0 elsewhere."""
-    occluded = _empty(engine, camera, "refined_occluded")
-    edges = engine.workspace.array("virtual_edges", (camera.height, camera.width), np.uint8)
+    occluded = _cleared(engine, camera, engine.buffers(_Buffers).refined_occluded)
+    edges = engine.buffers(_Buffers).virtual_edges.array((camera.height, camera.width))
     kernel = engine.kernel("adaptive.cl", "mark_edges", **_defines(engine, scene.bands))
     size = (camera.width, camera.height)
     engine.launch(kernel, size, *size, virtual.position, virtual.normal, scene.volume.voxel_m, edges)
     near = grown(engine.download(edges) > 0, MARGIN_PX)
-    listed, pixels = _list_pixels(engine, "edge_pixels", near)
+    listed, pixels = _list_pixels(engine.buffers(_Buffers).edge_pixels, near)
     engine.launch(
         engine.kernel("adaptive.cl", "refine_virtual", **_defines(engine, scene.bands)),
         (listed,),
@@ -67,14 +81,14 @@ def refine_real(
 
     What `virtual` hides from `eye` ([3], volume space) is left out, if they are given.
     """
-    refined = _empty(engine, camera, "refined_ratio")
+    refined = _cleared(engine, camera, engine.buffers(_Buffers).refined_ratio)
     cells = varying_cells(engine, ratio, scene.bands)
     if not cells.any():
         return refined
     varying = pixels_of(cells, ratio.stride, camera.width, camera.height)
     if virtual is not None and eye is not None:
         varying &= grown(_shown(engine, camera, surface, virtual, eye), SHOWN_MARGIN_PX)
-    listed, pixels = _list_pixels(engine, "varying_pixels", varying)
+    listed, pixels = _list_pixels(engine.buffers(_Buffers).varying_pixels, varying)
     engine.launch(
         engine.kernel("adaptive.cl", "refine_real", **_defines(engine, scene.bands)),
         (listed,),
@@ -94,7 +108,7 @@ def _shown(
     engine: Engine, camera: CameraModel, surface: Surface, virtual: VirtualSurface, eye: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """[h, w] pixels whose middle the virtual surface does not hide."""
-    shown = engine.workspace.array("shown_pixels", (camera.height, camera.width), np.uint8)
+    shown = engine.buffers(_Buffers).visible_pixels.array((camera.height, camera.width))
     size, kernel = (camera.width, camera.height), engine.kernel("adaptive.cl", "mark_shown", **_defines(engine, 2))
     engine.launch(kernel, size, *size, surface.positions, virtual.position, float4(*eye, 0), shown)
     return np.asarray(engine.download(shown) > 0)
@@ -102,7 +116,7 @@ def _shown(
 
 def varying_cells(engine: Engine, ratio: SampleGrid, bands: int) -> NDArray[np.bool_]:
     """[rows + 1, cols + 1] the cells, from the one before the first sample, around which `ratio` changes."""
-    varying = engine.workspace.array("varying_cells", (ratio.rows + 1, ratio.cols + 1), np.uint8)
+    varying = engine.buffers(_Buffers).varying_cells.array((ratio.rows + 1, ratio.cols + 1))
     kernel = engine.kernel("adaptive.cl", "mark_varying", **_defines(engine, bands))
     size = (ratio.cols + 1, ratio.rows + 1)
     engine.launch(kernel, size, ratio.cols, ratio.rows, ratio.values, LEAST_CHANGE, varying)
@@ -132,15 +146,15 @@ def grown(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
     return result
 
 
-def _list_pixels(engine: Engine, name: str, mask: NDArray[np.bool_]) -> tuple[int, cl_array.Array]:
+def _list_pixels(buffer: DeviceBuffer, mask: NDArray[np.bool_]) -> tuple[int, cl_array.Array]:
     """Number and numbers (y width + x) of the pixels of a mask; the array is longer, so that it seldom changes size."""
     pixels = np.flatnonzero(mask).astype(np.int32)
     room = max(_LEAST_LISTED, 1 << len(pixels).bit_length())
-    return len(pixels), engine.workspace.upload(name, np.pad(pixels, (0, room - len(pixels))))
+    return len(pixels), buffer.upload(np.pad(pixels, (0, room - len(pixels))))
 
 
-def _empty(engine: Engine, camera: CameraModel, name: str) -> cl_array.Array:
-    array = engine.workspace.array(name, (camera.height, camera.width), cl_types.float4)
+def _cleared(engine: Engine, camera: CameraModel, buffer: DeviceBuffer) -> cl_array.Array:
+    array = buffer.array((camera.height, camera.width))
     fill_bytes(engine.queue, array, 0)
     return array
 

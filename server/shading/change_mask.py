@@ -9,10 +9,16 @@ import numpy as np
 import pyopencl.array as cl_array
 
 from protocol.frames import CameraModel
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.transfer.sample_grid import SampleGrid
 from server.transfer.sampling import Upsampling
 from server.volume.raycast import Surface
+
+
+class _Buffers(StageBuffers):
+    changed = BufferDescription(np.uint8)
+    """[rows + 1, cols + 1] as mark_changes returns it."""
 
 
 def mark_changes(
@@ -30,7 +36,7 @@ def mark_changes(
     Cells of the grid as in upsample.clh, from the one before the first sample. ratio: R' / R at samples; refined:
     [h, w] float4, what stands for it where w = 1; tolerance_m: of upsampling, read where something is spared.
     """
-    reached = engine.workspace.array("reached", (ratio.rows + 1, ratio.cols + 1), np.uint8)
+    changed = engine.buffers(_Buffers).changed.array((ratio.rows + 1, ratio.cols + 1))
     defines = {"BICUBIC": 1} if upsampling == "bicubic" else {}
     engine.launch(
         engine.kernel("change_mask.cl", "mark_reached", **defines),
@@ -47,6 +53,6 @@ def mark_changes(
         ratio.values if refined is None else refined,
         tolerance_m,
         spare,
-        reached,
+        changed,
     )
-    return reached
+    return changed

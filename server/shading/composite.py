@@ -7,13 +7,13 @@ from functools import cache
 
 import numpy as np
 import pyopencl.array as cl_array
-import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.input.measure import linear_values
 from server.maths.rigid import inverse_rigid
 from server.objects.rasterize import SUBPIXELS, VirtualSurface
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, KernelArgument, float16
 from server.opencl.structs import MIXTURE_PARAMETERS
 from server.shading.change_mask import mark_changes
@@ -48,6 +48,14 @@ def shown_picture(
     if camera.color_encoding == "linear16":
         return _shown_codes()[color]
     return color.astype(np.uint8, copy=False)
+
+
+class _Buffers(StageBuffers):
+    srgb_codes = BufferDescription(np.uint8)
+    shown = BufferDescription(np.uint8)
+    """[h, w, 3] the camera's picture."""
+    picture = BufferDescription(np.uint8)
+    """[h, w, 3] the result."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +116,7 @@ def launch_mixture(
 ) -> None:
     """Enqueue a kernel whose arguments are its `parameters`, MIXTURE_BUFFERS of composite_inputs.clh and `others`."""
     camera, light, virtual, ratio = mixture.camera, mixture.light, mixture.virtual, mixture.ratio
-    unused = engine.workspace.array("unused", (1,), cl_types.float4)
+    unused = engine.unused
 
     def given(array: cl_array.Array | None) -> cl_array.Array:
         return unused if array is None else array
@@ -152,15 +160,15 @@ def launch_mixture(
 
 def srgb_table(engine: Engine) -> cl_array.Array:
     """[65536] uint8: the sRGB code of linear radiance i / 65535."""
-    return engine.workspace.constant("srgb_codes", _shown_codes())
+    return engine.buffers(_Buffers).srgb_codes.constant(_shown_codes())
 
 
 def composite(engine: Engine, shown: NDArray[np.uint8], mixture: CompositeInputs) -> NDArray[np.uint8]:
     """Picture [h, w, 3] sRGB of the camera picture `shown` with what is virtual; unchanged where nothing virtual is."""
     if mixture.is_nothing:
         return shown
-    space, camera = engine.workspace, mixture.camera
-    picture = space.array("picture", (camera.height, camera.width, 3), np.uint8)
-    others = (space.upload("shown", shown), srgb_table(engine), picture)
+    buffers, camera = engine.buffers(_Buffers), mixture.camera
+    picture = buffers.picture.array((camera.height, camera.width, 3))
+    others = (buffers.shown.upload(shown), srgb_table(engine), picture)
     launch_mixture(engine, "composite.cl", "composite", mixture, mixture_parameters(mixture), *others)
     return engine.download(picture)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from server.input.measure import intrinsics
 from server.objects.rasterize import Placed
 from server.objects.voxelize import DistanceGrid
+from server.opencl.buffers import BufferDescription, KeyedBufferDescription, StageBuffers
 from server.opencl.engine import Engine, KernelArgument, float4, float16, int4
 from server.opencl.structs import VIEW_PARAMETERS
 from server.opencl.transfer import copy_into
@@ -48,9 +49,18 @@ MOST_FINE = 64
 """Different meshes up to which they are FINE."""
 
 
+class _Buffers(StageBuffers):
+    view_of = BufferDescription(np.int32)
+    """[directions] the auxiliary view that shows what a direction meets."""
+    object_slots = BufferDescription(np.int32)
+    """[objects] where each object's views begin."""
+    view_axes = KeyedBufferDescription(cl_types.float4)
+    """[cells^2, 3] for each number of cells: rows right, down and ahead of an object's views."""
+
+
 @dataclass(frozen=True)
 class DepthViews:
-    """What shading looks into instead of tracing rays; arrays of the engine's workspace, valid until the next frame."""
+    """What shading looks into instead of tracing rays; its arrays are valid until the next frame."""
 
     real: RealDepthViews
     shape: ViewShape
@@ -81,7 +91,7 @@ class DepthViews:
         )
         return (
             parameters,
-            engine.workspace.upload("view_of", self.real.view_of),
+            engine.buffers(_Buffers).view_of.upload(self.real.view_of),
             views.axes,
             views.depths,
             self.real.depths,
@@ -98,7 +108,7 @@ def draw_depth_views(engine: Engine, real: RealDepthViews, objects: Sequence[Pla
     grids = [thing.grid for thing, _ in objects]
     slots = views.slots_of(engine, grids)
     assert views.texels is not None
-    return DepthViews(real, views.shape, views.texels, engine.workspace.upload("object_slots", slots))
+    return DepthViews(real, views.shape, views.texels, engine.buffers(_Buffers).object_slots.upload(slots))
 
 
 class _ObjectViews:
@@ -149,7 +159,7 @@ def draw_object(engine: Engine, grid: DistanceGrid, shape: ViewShape, texels: cl
         (shape.px, shape.px, shape.cells**2),
         int4(*grid.dims, 0),
         grid.distance,
-        engine.workspace.constant(f"object_view_axes_{shape.cells}", axes.view(cl_types.float4)[..., 0]),
+        engine.buffers(_Buffers).view_axes[shape.cells].constant(axes.view(cl_types.float4)[..., 0]),
         slot,
         texels,
     )

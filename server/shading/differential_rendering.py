@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.objects.rasterize import VirtualSurface
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.shading.traced_scene import Changed, TracedScene
 from server.shading.virtual_point_lights import PlacedPoints, VirtualPointLights, place_points
@@ -31,6 +32,19 @@ BOUNCE_EVERY = 4
 
 MOST_POINTS = 8192
 """Points on objects that are lit one by one, the first objects'; others are taken to see an even light."""
+
+
+class _Buffers(StageBuffers):
+    ratio = BufferDescription(cl_types.float4)
+    """[rows, cols] R' / R of real surface (eq. 7.1), w = 1 valid."""
+    shaded = BufferDescription(cl_types.float4)
+    """[rows, cols] R."""
+    bounced = BufferDescription(cl_types.float4)
+    """[rows, cols] the ratio with the change of what real surfaces send to each other."""
+    occluded = BufferDescription(cl_types.float4)
+    """[rows, cols] radiance that occluders take from virtual surface."""
+    point_radiances = BufferDescription(cl_types.float4)
+    """[points] what points on objects send."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +69,8 @@ def shadow_real(
 
     indirect: what surfaces send to the same samples.
     """
-    shape, space = (transfer.rows, transfer.cols), engine.workspace
-    ratio = space.array("shadow_ratio", shape, cl_types.float4)
-    shaded = space.array("shadow_shaded", shape, cl_types.float4)
+    shape, buffers = (transfer.rows, transfer.cols), engine.buffers(_Buffers)
+    ratio, shaded = buffers.ratio.array(shape), buffers.shaded.array(shape)
     engine.launch(
         engine.kernel("differential_rendering.cl", "shadow_real", **_sample_defines(engine, transfer, scene)),
         (transfer.cols, transfer.rows),
@@ -89,7 +102,7 @@ def bounce_real(
     returned: the most radiance by which what any real surface sends can change. Where that is no more than the share
     `spare` of R, that of `least` or else of `shadow`, nothing is followed.
     """
-    bounced = engine.workspace.array("shadow_bounced", (transfer.rows, transfer.cols), cl_types.float4)
+    bounced = engine.buffers(_Buffers).bounced.array((transfer.rows, transfer.cols))
     shadowed = replace(scene, changed=Changed(camera, camera_from_volume, surface.positions, shadow))
     engine.launch(
         engine.kernel("differential_rendering.cl", "bounce_real", **_sample_defines(engine, transfer, scene)),
@@ -113,7 +126,7 @@ def _sample_defines(engine: Engine, transfer: Transfer, scene: TracedScene) -> d
 def shadow_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, scene: TracedScene) -> SampleGrid:
     """Radiance that real and virtual occluders take from the virtual surface, at every VIRTUAL_STRIDE-th pixel."""
     shape = (camera.height // VIRTUAL_STRIDE, camera.width // VIRTUAL_STRIDE)
-    occluded = SampleGrid(VIRTUAL_STRIDE, engine.workspace.array("virtual_occluded", shape, cl_types.float4))
+    occluded = SampleGrid(VIRTUAL_STRIDE, engine.buffers(_Buffers).occluded.array(shape))
     engine.launch(
         engine.kernel("differential_rendering.cl", "shadow_virtual", **scene.defines(engine)),
         (occluded.cols, occluded.rows),
@@ -133,7 +146,7 @@ def light_points(engine: Engine, scene: TracedScene, placed: PlacedPoints | None
     placed: of place_points for the scene's objects, None: to be placed.
     """
     placed = placed or place_points(engine, scene.objects)
-    radiances = engine.workspace.upload("glow_radiances", placed.under_even_light(scene.light.mean))
+    radiances = engine.buffers(_Buffers).point_radiances.upload(placed.under_even_light(scene.light.mean))
     lit, traced = min(placed.count, MOST_POINTS), replace(scene, point_lights=placed.point_lights)
     engine.launch(
         engine.kernel("differential_rendering.cl", "light_points", **scene.defines(engine)),

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.opencl.structs import LAYER_PARAMETERS
 from server.shading.composite import CompositeInputs, launch_mixture, mixture_parameters, srgb_table
@@ -46,13 +47,17 @@ class Layer:
 NOTHING = Layer()
 
 
+class _Buffers(StageBuffers):
+    layer = BufferDescription(np.uint8)
+    """Colours, ratios and depths, one after the other: downloaded part by part."""
+
+
 def compose_layer(engine: Engine, mixture: CompositeInputs) -> Layer:
     """What composite would mix with the camera's picture."""
     if mixture.is_nothing:
         return NOTHING
     size = (mixture.camera.height, mixture.camera.width)
-    layer = engine.workspace.parts(
-        "layer",
+    layer = engine.buffers(_Buffers).layer.parts(
         {
             "virtual": ((*size, 4), np.uint8),
             "virtual_depth": (size, np.uint16),

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.objects.rasterize import VirtualSurface
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, float4
 from server.opencl.structs import REFLECTION_PARAMETERS
 from server.shading.traced_scene import TracedScene
@@ -20,6 +21,11 @@ from server.transfer.sample_grid import pixel_grid
 
 LEAST_GLOSS = 0.02
 """Of one less the roughness, or of the metalness: below it a surface is matt, its diffuse shading all there is."""
+
+
+class _Buffers(StageBuffers):
+    reflected = BufferDescription(cl_types.float4)
+    """[h, w] as reflect_surroundings returns it."""
 
 
 def is_glossy(materials: NDArray[np.float32]) -> bool:
@@ -37,7 +43,7 @@ def reflect_surroundings(
 ) -> cl_array.Array:
     """[h, w] float4: radiance that virtual surface reflects, and in w what remains of its diffuse radiance."""
     assert virtual.material is not None
-    reflected = engine.workspace.array("reflected", (camera.height, camera.width), cl_types.float4)
+    reflected = engine.buffers(_Buffers).reflected.array((camera.height, camera.width))
     engine.launch(
         engine.kernel("reflect.cl", "reflect_surroundings", **scene.defines(engine)),
         (camera.width, camera.height),

@@ -25,6 +25,7 @@ from server.maths.dominant import MOST_LIGHTS
 from server.objects.dirty_region import box_around, dirty_region
 from server.objects.pinhole import Pinhole
 from server.objects.rasterize import Placed, VirtualSurface, drawn_depths
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, KernelArgument, float4, int4
 from server.opencl.program import Define
 from server.opencl.structs import DIRECT_PARAMETERS
@@ -49,9 +50,36 @@ _COARSEST_SIDE = 8
 Floats = NDArray[np.float64]
 
 
+class _Buffers(StageBuffers):
+    rows = BufferDescription(cl_types.float4)
+    """ShadowMaps.rows."""
+    maps = BufferDescription(cl_types.float2)
+    """ShadowMaps.objects."""
+    disc_places = BufferDescription(cl_types.float2)
+    """Places on a disc of radius 1 that shading looks at, first those that search for occluders."""
+    ray_places = BufferDescription(cl_types.float2)
+    """Places on a disc of radius 1 that rays are traced to."""
+    virtual = BufferDescription(cl_types.float4)
+    """[h, w] what the discs bring to virtual surface."""
+    virtual_parts = BufferDescription(cl_types.float4)
+    """[rows, cols] the part of each disc that real things leave to virtual surface."""
+    real_parts = BufferDescription(cl_types.float4)
+    """[rows, cols] the part of each disc that real things leave to real surface."""
+    ratio = BufferDescription(cl_types.float4)
+    """[h, w] R' / R under the whole light."""
+    samples_without = BufferDescription(cl_types.float4)
+    samples_with = BufferDescription(cl_types.float4)
+    """[rows, cols] what the discs bring, without and with objects."""
+    whole_ratio = BufferDescription(cl_types.float4)
+    whole_shaded = BufferDescription(cl_types.float4)
+    """[rows, cols] R' / R and R under the whole light."""
+    rest_ratio = BufferDescription(cl_types.float4)
+    """[rows, cols] R' / R under the light without its discs."""
+
+
 @dataclass(frozen=True)
 class ShadowMaps:
-    """One frame's; arrays of the engine's workspace, valid until the next."""
+    """The shadow maps of one frame. Its arrays are the engine's buffers, valid until the next frame."""
 
     volume: Volume
     light: DeviceLight
@@ -77,13 +105,13 @@ class ShadowMaps:
         return (
             DIRECT_PARAMETERS(ball=float4(*self.ball), least=float4(*self.least, 0.0), count=len(self.light.discs)),
             self.rows,
-            engine.workspace.constant("disc_places", _float2(np.concatenate([search_places(), disc_places()]))),
+            engine.buffers(_Buffers).disc_places.constant(_float2(np.concatenate([search_places(), disc_places()]))),
             self.objects,
         )
 
     def trace_arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
         """TRACE_PARAMETERS of shadow_map.cl."""
-        places = engine.workspace.constant("disc_ray_places", _float2(ray_places()))
+        places = engine.buffers(_Buffers).ray_places.constant(_float2(ray_places()))
         lit = light_parameters(self.light, 0, self.reach_m)  # no directions: discs have their own
         return (*self.volume.arguments(), lit, self.light.table.memory, places)
 
@@ -102,16 +130,16 @@ def draw_shadow_maps(
     """Pictures of `objects`, each with its `volume_from_model`, from every disc of `light`."""
     ball = np.array(ball_around(objects).tolist(), np.float64)
     axes = view_axes(np.stack([disc.direction for disc in light.discs]))
-    rows = engine.workspace.upload("direct_rows", _rows(light.discs, axes))
+    rows = engine.buffers(_Buffers).rows.upload(_rows(light.discs, axes))
     return ShadowMaps(volume, light, reach_m, rows, ball, _draw_objects(engine, axes, ball, objects))
 
 
 def light_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, maps: ShadowMaps) -> cl_array.Array:
     """[h, w] float4: what the discs bring to virtual surface, were it white."""
-    size, space = (camera.width, camera.height), engine.workspace
-    direct = space.array("direct_virtual", (camera.height, camera.width), cl_types.float4)
+    size, buffers = (camera.width, camera.height), engine.buffers(_Buffers)
+    direct = buffers.virtual.array((camera.height, camera.width))
     shape = (camera.height // VIRTUAL_STRIDE, camera.width // VIRTUAL_STRIDE)
-    parts = SampleGrid(VIRTUAL_STRIDE, space.array("direct_virtual_parts", shape, cl_types.float4))
+    parts = SampleGrid(VIRTUAL_STRIDE, buffers.virtual_parts.array(shape))
     _trace_discs(engine, camera, virtual.position, virtual.normal, parts, maps, is_virtual=True)
     with dirty_region(engine, "direct_virtual", direct, box_around(virtual.boxes), (0, 0, *size)) as (x0, y0, x1, y1):
         engine.launch(
@@ -136,7 +164,7 @@ def trace_real(
     for traced, parts in maps.traced:
         if traced is surface and (parts.stride, parts.values.shape) == (ratio.stride, ratio.values.shape):
             return parts
-    parts = SampleGrid(ratio.stride, engine.workspace.array("direct_parts", ratio.values.shape, cl_types.float4))
+    parts = SampleGrid(ratio.stride, engine.buffers(_Buffers).real_parts.array(ratio.values.shape))
     _trace_discs(engine, camera, surface.positions, surface.normals, parts, maps, is_virtual=False)
     maps.traced[:] = [(surface, parts)]  # there is one array
     return parts
@@ -158,7 +186,7 @@ def light_real(
     ratio: of the rest of the light; parts: of trace_real; refined: what stands for `ratio` where w = 1; reached: of
     change_mask.py, the cells in which `ratio` counts, None: wherever it is not 1.
     """
-    mixed = engine.workspace.array("direct_ratio", (camera.height, camera.width), cl_types.float4)
+    mixed = engine.buffers(_Buffers).ratio.array((camera.height, camera.width))
     engine.launch(
         _kernel(engine, "light_real", BICUBIC=upsampling == "bicubic"),
         (-(-camera.width // engine.lanes), camera.height),
@@ -185,7 +213,7 @@ def light_points_by_discs(
     """Add what points on objects send of the discs' light. Those past the first are lit evenly as it is."""
     count = min(placed.count, MOST_POINTS)
     engine.launch(
-        _kernel(engine, "light_glow"),
+        _kernel(engine, "light_points_by_discs"),
         (-(-count // engine.lanes),),
         count,
         placed.points,
@@ -202,8 +230,8 @@ def light_samples(
     engine: Engine, camera: CameraModel, surface: Surface, parts: SampleGrid, maps: ShadowMaps
 ) -> DirectSamples:
     """At the samples of `parts`, all of them."""
-    shape, space = (parts.rows, parts.cols), engine.workspace
-    without, lit = (space.array(f"direct_samples_{name}", shape, cl_types.float4) for name in ("without", "with"))
+    shape, buffers = (parts.rows, parts.cols), engine.buffers(_Buffers)
+    without, lit = buffers.samples_without.array(shape), buffers.samples_with.array(shape)
     engine.launch(
         _kernel(engine, "light_samples"),
         (-(-parts.cols // engine.lanes), parts.rows),
@@ -220,8 +248,8 @@ def light_samples(
 
 def with_direct(engine: Engine, shadow: RealShadow, samples: DirectSamples, maps: ShadowMaps) -> RealShadow:
     """The ratio of the whole light, from that of its rest."""
-    shape, space = (shadow.rows, shadow.cols), engine.workspace
-    whole, shaded = (space.array(f"direct_whole_{name}", shape, cl_types.float4) for name in ("ratio", "shaded"))
+    shape, buffers = (shadow.rows, shadow.cols), engine.buffers(_Buffers)
+    whole, shaded = buffers.whole_ratio.array(shape), buffers.whole_shaded.array(shape)
     count = shadow.rows * shadow.cols
     mixed = (shadow.values, shadow.shaded, samples.without, samples.with_objects)
     engine.launch(_kernel(engine, "mix_direct"), (count,), count, float4(*maps.least, 0.0), *mixed, whole, shaded)
@@ -232,7 +260,7 @@ def without_direct(
     engine: Engine, whole: RealShadow, shadow: RealShadow, samples: DirectSamples, maps: ShadowMaps
 ) -> RealShadow:
     """The ratio of the rest, from that of the whole light; `shadow`: what with_direct was given."""
-    rest = engine.workspace.array("direct_rest_ratio", (shadow.rows, shadow.cols), cl_types.float4)
+    rest = engine.buffers(_Buffers).rest_ratio.array((shadow.rows, shadow.cols))
     count = shadow.rows * shadow.cols
     mixed = (whole.values, shadow.shaded, samples.without, samples.with_objects)
     engine.launch(_kernel(engine, "unmix_direct"), (count,), count, float4(*maps.least, 0.0), *mixed, rest)
@@ -242,7 +270,7 @@ def without_direct(
 def _draw_objects(engine: Engine, axes: Floats, ball: Floats, objects: Sequence[Placed]) -> cl_array.Array:
     """The pyramids. axes: [lights, 3, 3]."""
     texels, distance_m = (4 * MAP_SIDE**2 - _COARSEST_SIDE**2) // 3, DISTANCE * float(ball[3])
-    maps = engine.workspace.array("object_maps", (MOST_LIGHTS, texels), cl_types.float2)
+    maps = engine.buffers(_Buffers).maps.array((MOST_LIGHTS, texels))
     middle, focal_px = (MAP_SIDE - 1) / 2, DISTANCE * MAP_SIDE / 2
     camera = Pinhole(MAP_SIDE, MOST_LIGHTS * MAP_SIDE, focal_px, focal_px, middle, middle)
     drawn: list[Placed] = []

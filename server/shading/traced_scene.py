@@ -22,6 +22,7 @@ from server.maths.direct_lights import DirectLight, SplitLight
 from server.maths.planes import CELL_M
 from server.objects.object_table import ObjectTable, object_table
 from server.objects.rasterize import Placed
+from server.opencl.buffers import BufferDescription, DeviceBuffer, StageBuffers
 from server.opencl.engine import Engine, KernelArgument, float4, float16, int4
 from server.opencl.parts import Parts
 from server.opencl.structs import CHANGED_PARAMETERS, LIGHT_PARAMETERS, OBJECT_PARAMETERS, SCENE_PARAMETERS
@@ -31,6 +32,16 @@ from server.transfer.indirect import Indirect
 from server.transfer.radiance_transfer import Directions
 from server.transfer.sample_grid import SampleGrid
 from server.volume.volume import Volume
+
+
+class _Buffers(StageBuffers):
+    coefficients = BufferDescription(cl_types.float4)
+    """[bands^2] of all of the light."""
+    table = BufferDescription(np.uint8)
+    """DeviceLight.table of all of the light."""
+    rest_coefficients = BufferDescription(cl_types.float4)
+    """[bands^2] of the light without its discs."""
+    rest_table = BufferDescription(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -86,7 +97,7 @@ class Changed:
 
 @dataclass(frozen=True)
 class TracedScene:
-    """One frame's; arrays of the engine's workspace, valid until the next."""
+    """The scene of one frame. Its arrays are the engine's buffers, valid until the next frame."""
 
     volume: Volume
     light: DeviceLight
@@ -232,11 +243,11 @@ def upload_light(
 
     indirect: what surfaces send, None to leave it out. exposure: radiance in the picture over that in `sh` and volume.
     """
-    sh = exposure * sh
+    sh, buffers = exposure * sh, engine.buffers(_Buffers)
     return DeviceLight(
-        engine.workspace.upload("light", _float4(sh)),
+        buffers.coefficients.upload(_float4(sh)),
         np.maximum(0.5 / np.sqrt(np.pi) * sh[0], 0.0),
-        _upload_table(engine, "light_table", rays, sh, sh, planes),
+        _upload_table(buffers.table, rays, sh, sh, planes),
         planes,
         sh,
         exposure * indirect.mean if indirect else np.zeros(3),
@@ -250,19 +261,18 @@ def take_discs(
     """`light`, of the same radiance and `exposure` as `split`, less its discs."""
     if not split.discs:
         return light
-    rest = exposure * split.rest
+    rest, buffers = exposure * split.rest, engine.buffers(_Buffers)
     return replace(
         light,
-        coefficients=engine.workspace.upload("light_rest", _float4(rest)),
-        table=_upload_table(engine, "light_rest_table", rays, rest, light.sh, light.planes),
+        coefficients=buffers.rest_coefficients.upload(_float4(rest)),
+        table=_upload_table(buffers.rest_table, rays, rest, light.sh, light.planes),
         discs=tuple(replace(disc, irradiance=exposure * disc.irradiance) for disc in split.discs),
         with_discs=light.coefficients,
     )
 
 
 def _upload_table(
-    engine: Engine,
-    name: str,
+    buffer: DeviceBuffer,
     rays: Directions,
     sh: NDArray[np.float64],
     whole: NDArray[np.float64],
@@ -271,7 +281,7 @@ def _upload_table(
     """The light's table as include/arriving.clh has it."""
     rows, shapes, maps = planes
     arrays = {"coefficients": _float4(sh), "whole": _float4(whole), "arriving": _arriving(rays, sh)}
-    return engine.workspace.upload_parts(name, arrays | {"planes": rows, "shapes": shapes, "maps": maps})
+    return buffer.upload_parts(arrays | {"planes": rows, "shapes": shapes, "maps": maps})
 
 
 def _arriving(rays: Directions, sh: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -294,8 +304,7 @@ def _changed_parameters(changed: Changed | None) -> np.void:
 
 def _changed_buffers(engine: Engine, changed: Changed | None) -> tuple[cl_array.Array, cl_array.Array]:
     """CHANGED_BUFFERS of include/scene.clh."""
-    unused = engine.workspace.array("unused", (1,), cl_types.float4)
-    return (changed.positions, changed.ratio.values) if changed else (unused, unused)
+    return (changed.positions, changed.ratio.values) if changed else (engine.unused, engine.unused)
 
 
 def _float4(rgb: NDArray[np.floating]) -> NDArray[np.float32]:

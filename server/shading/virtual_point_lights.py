@@ -17,15 +17,30 @@ from numpy.typing import NDArray
 
 from server.objects.rasterize import Placed
 from server.objects.surface_points import SIDES, SurfacePoints, float4_rows
+from server.opencl.buffers import BufferDescription, KeyedBufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.opencl.parts import Parts
 
 Floats = NDArray[np.float64]
 
 
+class _Buffers(StageBuffers):
+    points = BufferDescription(cl_types.float4)
+    normals = BufferDescription(cl_types.float4)
+    albedos = BufferDescription(cl_types.float4)
+    offsets_m = BufferDescription(np.float32)
+    table = BufferDescription(np.uint8)
+    """VirtualPointLights.table."""
+    unlit = BufferDescription(cl_types.float4)
+    """[count] zeros."""
+    empty_tables = KeyedBufferDescription(np.uint8)
+    """VirtualPointLights.table for each number of objects that send nothing."""
+    nothing_sent = BufferDescription(cl_types.float4)
+
+
 @dataclass(frozen=True)
 class VirtualPointLights:
-    """What Glow of virtual_point_lights.clh takes; arrays of the engine's workspace, valid until the next frame."""
+    """What PointLights of virtual_point_lights.clh takes. The arrays are valid until the next frame."""
 
     table: Parts
     """`points`, `normals`, `cells` and `nearest`, in one buffer."""
@@ -57,16 +72,15 @@ class PlacedPoints:
 
 def no_point_lights(engine: Engine, objects: int = 1) -> VirtualPointLights:
     """So many objects that send nothing: they have no cells."""
-    count = max(objects, 1)
+    count, buffers = max(objects, 1), engine.buffers(_Buffers)
     empty = np.zeros(1, cl_types.float4)
     cells, nearest = np.zeros(count, cl_types.int4), np.full(SIDES, -1, np.int32)
     return VirtualPointLights(
-        engine.workspace.upload_parts(
-            f"no_glow_table_{count}",
+        buffers.empty_tables[count].upload_parts(
             {"points": empty, "normals": empty, "cells": cells, "nearest": nearest},
             is_constant=True,
         ),
-        engine.workspace.constant("no_glow", empty),
+        buffers.nothing_sent.constant(empty),
     )
 
 
@@ -81,7 +95,7 @@ class _Gathered:
     normals: Floats
     albedos: Floats
     nearest: NDArray[np.int32]
-    """As Glow has it."""
+    """As PointLights has it."""
     cells: NDArray[np.int32]
     """[objects, 4]."""
 
@@ -114,7 +128,7 @@ def _gather(engine: Engine, surfaces: tuple[SurfacePoints, ...]) -> _Gathered:
 
 def place_points(engine: Engine, objects: Sequence[Placed]) -> PlacedPoints:
     """The points of `objects`, each with its `volume_from_model`, where they are now."""
-    space, every = engine.workspace, _gather(engine, tuple(thing.surface_points for thing, _ in objects))
+    buffers, every = engine.buffers(_Buffers), _gather(engine, tuple(thing.surface_points for thing, _ in objects))
     volume_from_model = np.array([matrix for _, matrix in objects])
     volume_from_grid = volume_from_model @ np.linalg.inv(np.array([thing.grid.grid_from_model for thing, _ in objects]))
     points = _turned(volume_from_grid[:, :3, :3], every.owners, every.points) + volume_from_grid[every.owners, :3, 3]
@@ -123,14 +137,13 @@ def place_points(engine: Engine, objects: Sequence[Placed]) -> PlacedPoints:
     cells_m = np.linalg.norm(volume_from_grid[:, :3, 0], axis=1)
     return PlacedPoints(
         len(points),
-        space.upload("glow_places", float4_rows(points, 1.0)),
-        space.upload("glow_place_normals", float4_rows(normals)),
+        buffers.points.upload(float4_rows(points, 1.0)),
+        buffers.normals.upload(float4_rows(normals)),
         every.albedos,
-        space.upload("glow_albedos", float4_rows(every.albedos)),
-        space.upload("glow_offsets", cells_m[every.owners].astype(np.float32)),
+        buffers.albedos.upload(float4_rows(every.albedos)),
+        buffers.offsets_m.upload(cells_m[every.owners].astype(np.float32)),
         VirtualPointLights(
-            space.upload_parts(
-                "glow_table",
+            buffers.table.upload_parts(
                 {
                     "points": float4_rows(every.points),
                     "normals": float4_rows(every.normals),
@@ -138,7 +151,7 @@ def place_points(engine: Engine, objects: Sequence[Placed]) -> PlacedPoints:
                     "nearest": every.nearest,
                 },
             ),
-            space.upload("glow_nothing", np.zeros(len(points), cl_types.float4)),
+            buffers.unlit.upload(np.zeros(len(points), cl_types.float4)),
         ),
     )
 

@@ -80,19 +80,19 @@ class NoMemory(Injected):
         super().__init__()
         from server.opencl import buffers
 
-        array = buffers.Workspace.array
+        array = buffers.DeviceBuffer.array
         number = 0
 
-        def failing(workspace: Any, name: str, shape: tuple[int, ...], dtype: Any) -> Any:
+        def failing(buffer: buffers.DeviceBuffer, shape: tuple[int, ...]) -> Any:
             nonlocal number
             number += 1
             # A steady stream allocates nothing: so that frames meet it too, every thousandth use counts as a new one.
-            if self.is_on and (workspace.find(name) is None or number % 1000 == 0):
+            if self.is_on and (buffer.current is None or number % 1000 == 0):
                 self.times += 1
                 raise cl.MemoryError("clCreateBuffer", cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE, "injected")
-            return array(workspace, name, shape, dtype)
+            return array(buffer, shape)
 
-        buffers.Workspace.array = failing  # type: ignore[method-assign]
+        buffers.DeviceBuffer.array = failing  # type: ignore[method-assign]
 
 
 INJECTED: dict[str, Callable[[], Injected]] = {"disk": FullDisk, "build": NoBuild, "allocation": NoMemory}

@@ -40,13 +40,15 @@ def position_errors_m(estimated: list[Floats], truth: list[Floats]) -> Floats:
 
 
 def aligned_ate_rmse_m(estimated: list[Floats], truth: list[Floats]) -> float:
-    """The same with all positions aligned as well as one rigid motion can (Horn 1987; Sturm et al. 2012, eq. 3)."""
-    position_errors_m(estimated, truth)  # checks the counts
-    a, b = (np.array(poses)[:, :3, 3] for poses in (estimated, truth))
-    u, _, vt = np.linalg.svd((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
-    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    apart = (a - a.mean(axis=0)) @ rotation.T - (b - b.mean(axis=0))
-    return float(np.sqrt((apart**2).sum(axis=1).mean()))
+    """The same with all positions aligned as well as one rigid motion can (Sturm et al. 2012, eq. 3); by evo."""
+    from evo.core.metrics import APE, PoseRelation, StatisticsType
+    from evo.core.trajectory import PosePath3D
+
+    moved, reference = PosePath3D(poses_se3=estimated), PosePath3D(poses_se3=truth)
+    moved.align(reference)
+    error = APE(PoseRelation.translation_part)
+    error.process_data((reference, moved))
+    return float(error.get_statistic(StatisticsType.rmse))
 
 
 class Frames(Protocol):

@@ -11,7 +11,7 @@ from protocol.messages import ClientMessage, ServerMessage
 
 T = TypeVar("T")
 _END_CHARS = 120
-"""Of a line that is too long."""
+"""Characters that are kept of each end of a line that is too long."""
 
 
 class ProtocolError(ValueError):

@@ -350,7 +350,7 @@ class OperatingPoint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """How a frame was sampled, and why."""
 
     settings: str
-    """As the command line's options."""
+    """The settings, written as options of the command line."""
     reason: str
     expected_ms: float | None = None
     """Expected time of a frame; like the next field, only for points that the server chose."""

@@ -28,13 +28,13 @@ class FrameContext:
     volume_from_camera: NDArray[np.float64]
     """[4, 4] rigid."""
     measurement: Measurement
-    """Of this frame."""
+    """The input of this frame, on the device."""
     surface: Surface
     """The hybrid geometry buffer (thesis 4.2.2)."""
     scene_radiance: cl_array.Array
     """[h, w] float4: `measurement.radiance` over `exposure`."""
     exposure: float
-    """Of the picture, relative to the first picture of the session."""
+    """Exposure of the picture, relative to the session's first picture."""
     sampling: Sampling
     rays: Directions
     """Directions that visibility is tested along."""

@@ -85,7 +85,7 @@ class Pipeline:
         self._reuse = None if settings.plan == "everything" else TemporalReuse(engine, camera, poses=wishes.poses)
         self._frames = self._losses = self._samplings = 0
         self.kernel_ms: dict[str, float] = {}
-        """Of the last frame."""
+        """Device time of each kernel in the last frame."""
 
     def use(self, settings: Settings) -> None:
         """Sample as these settings say from the next frame on."""

@@ -84,7 +84,7 @@ class PlanError(LookupError):
 
 @dataclass(frozen=True)
 class EffectTable(Generic[Facts]):
-    """All effects. Raises PlanError if two write one resource."""
+    """Make a table of effects. Raises PlanError if two of them write the same resource."""
 
     effects: tuple[Effect[Facts], ...]
     approximations: tuple[Approximation[Facts], ...] = ()
@@ -108,7 +108,7 @@ class EffectPlan(Generic[T]):
     left_out: tuple[LeftOut, ...]
 
     def described(self, *ends: str) -> Plan:
-        """As the wire has it; `ends`: names of what runs afterwards."""
+        """The plan as a message; `ends`: names of the effects that run last."""
         return Plan(run=(*(effect.name for effect in self.order), *ends), left_out=self.left_out)
 
     def execute(self, given: Mapping[Resource, object]) -> T:

@@ -22,31 +22,31 @@ KnownLight = NewType("KnownLight", DeviceLight)
 SharpLight = NewType("SharpLight", DeviceLight)
 """The light, where it has discs that need shadow maps."""
 ReturnedRadiance = NewType("ReturnedRadiance", float)
-"""The most that the radiance of real surface can change by, in the picture's units: all of it can be hidden."""
+"""Bound on the change of real surface's radiance, in the picture's units."""
 
 
 @dataclass(frozen=True)
 class FaintShadows:
-    """How weak a change of real surface may be to be left out."""
+    """Changes of real surface that are too weak to be drawn."""
 
     pixel_share: float
-    """Of R' / R of a pixel."""
+    """Largest change of a pixel's R' / R that is left out."""
     sample_share: float
-    """Of R' / R of a sample, by light that bounces."""
+    """Largest change of a sample's R' / R by bounced light that is left out."""
 
 
 # Written by effects. Arrays are [h, w] float4 on the device.
 
 Gain = NewType("Gain", float)
-"""By which virtual surface is brighter than the light makes it (7.1, H)."""
+"""Factor on the shading of virtual surface (7.1, H)."""
 Coverage = NewType("Coverage", cl_array.Array)
-"""Of rasterize.py: how much of each pixel the objects cover."""
+"""How much of each pixel the objects cover, of rasterize.py."""
 ChangedScene = NewType("ChangedScene", TracedScene)
-"""The scene as the objects have changed it: what they send, and what real surface then sends."""
+"""The scene with the light that the objects send and the changed light that real surface sends."""
 Reflected = NewType("Reflected", cl_array.Array)
-"""What glossy virtual surface reflects."""
+"""Radiance that glossy virtual surface reflects."""
 VirtualOcclusion = NewType("VirtualOcclusion", SampleGrid)
-"""What occluders take from virtual surface, less what they send to it."""
+"""Radiance that occluders take from virtual surface, less the radiance that they send to it."""
 BouncedShadow = NewType("BouncedShadow", RealShadow)
 """RealShadow with one bounce between real surfaces."""
 RefinedVirtual = NewType("RefinedVirtual", cl_array.Array)
@@ -54,9 +54,9 @@ RefinedVirtual = NewType("RefinedVirtual", cl_array.Array)
 RefinedReal = NewType("RefinedReal", cl_array.Array)
 """RealShadow at single pixels; w = 1 where it counts."""
 ChangeMask = NewType("ChangeMask", cl_array.Array)
-"""Of change_mask.py: the cells of the picture in which the shadow counts."""
+"""The cells of the picture in which the shadow counts, of change_mask.py."""
 DirectVirtual = NewType("DirectVirtual", cl_array.Array)
-"""What the discs of the light bring to virtual surface."""
+"""Radiance of virtual surface from the discs of the light."""
 DirectReal = NewType("DirectReal", cl_array.Array)
 """R' / R of the whole light at every pixel, its discs by shadow maps."""
 

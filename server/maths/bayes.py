@@ -124,7 +124,7 @@ class _Whitened:
 
     @property
     def least_ratio(self) -> float:
-        """As much prior as keeps float64 from dividing by zero."""
+        """The smallest prior that keeps float64 from dividing by zero."""
         return 1e-13 * max(float(self.values[-1]), _LEAST_SCALE)
 
     def misfits(self, ratios: NDArray[np.float64]) -> NDArray[np.float64]:

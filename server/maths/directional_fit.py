@@ -121,7 +121,7 @@ class DirectionalFit:
 
 
 def _taken_apart(parameters: Floats) -> tuple[Floats, Floats, Floats]:
-    """Of the lights: half the squared spread [k, 1], strength [k, 1], direction [k, 3]."""
+    """Parameters of the lights: half the squared spread [k, 1], strength [k, 1], direction [k, 3]."""
     lights = parameters[1:].reshape(-1, 4)
     vectors = lights[:, :3]
     length = np.maximum(np.sqrt(np.sum(vectors * vectors, axis=1, keepdims=True)), _LEAST_LENGTH)

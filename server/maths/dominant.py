@@ -20,9 +20,9 @@ from server.maths.sh import LUMINANCE, dominant_direction, luminance_sh, sh_basi
 
 MOST_LIGHTS = 3
 LEAST_SHARE = 0.1
-"""Of the strongest light's intensity: weaker ones are ringing as likely as light."""
+"""Share of the strongest light's intensity. Weaker lights may as well be ringing of the harmonics."""
 LEAST_GAIN = 0.02
-"""Of the energy that an even sky leaves: what a further light must explain."""
+"""Share of the energy, beyond an even sky, that a further light must explain."""
 _SLOANS_UNIT = 16 * pi / 17
 _REMEMBERED = 32
 

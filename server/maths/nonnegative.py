@@ -51,7 +51,7 @@ def nonnegative_mean(mean: NDArray[np.float64], precision: NDArray[np.float64]) 
 def _supported(
     reach: NDArray[np.float64], start: NDArray[np.float64], held: NDArray[np.int64], force: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Those of the constraints `held` that push, and their forces, from forces >= 0 that may not be the best."""
+    """The constraints in `held` with a positive multiplier, and their multipliers; `force`: a first guess, >= 0."""
     while len(held):
         wanted = np.asarray(np.linalg.lstsq(reach[:, held], -start, rcond=None)[0], np.float64)
         pulls = wanted <= 0

@@ -29,7 +29,7 @@ def sh_with_slope(points: Floats, bands: int) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True)
 class _Polynomials:
-    """All of a number of bands."""
+    """The polynomials of all bands."""
 
     degrees: NDArray[np.int64]
     """[3, monomials] powers of x, y, z."""
@@ -39,7 +39,7 @@ class _Polynomials:
 
 @cache
 def _polynomials(bands: int) -> _Polynomials:
-    """From `sh_basis`: on the sphere the monomials of one degree are independent."""
+    """Fitted to `sh_basis`: on the sphere the monomials of one degree are independent."""
     degrees = np.array([(a, b, l - a - b) for l in range(bands) for a in range(l + 1) for b in range(l + 1 - a)]).T
     points = spherical_fibonacci(8 * bands * bands)
     monomials = np.prod(points.T[:, None] ** degrees[..., None], axis=0)  # [monomials, points]

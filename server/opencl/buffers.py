@@ -138,7 +138,7 @@ class Workspace:
         self._copying: deque[tuple[cl.Event, NDArray[Any]]] = deque()
 
     def add(self, buffer: DeviceBuffer) -> None:
-        """From now on it is counted, as long as somebody holds it."""
+        """Count `buffer` from now on, as long as it exists."""
         self._buffers = [*(held for held in self._buffers if held() is not None), ref(buffer)]
 
     def copy(self, array: cl_array.Array, values: NDArray[Any]) -> None:
@@ -184,7 +184,7 @@ class Workspace:
         return sum(array.nbytes for array in self.arrays())
 
     def arrays(self) -> list[cl_array.Array]:
-        """Of all buffers that somebody holds."""
+        """The arrays of all buffers."""
         held = [buffer() for buffer in self._buffers]
         arrays = [buffer.current for buffer in held if buffer is not None]
         return [array for array in arrays if array is not None]

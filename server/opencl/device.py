@@ -45,7 +45,7 @@ class Device:
         self.programs = ProgramCache(self.context)
         self.memory = DeviceMemory()
         self.volume_bytes = VOLUME_BYTES
-        """Of its memory, what one volume may take; beyond, parts of it go to the host."""
+        """The share of its memory that one volume may use; the rest of the volume is moved to the host."""
 
 
 def _all_devices() -> list[cl.Device]:

@@ -120,7 +120,7 @@ def _type_of(value: KernelArgument) -> Any:
 
 
 def _vector(name: str, numbers: NDArray[Any]) -> np.generic:
-    """As pyopencl's own make_..., ten times as fast: a frame has a hundred of them."""
+    """As pyopencl's make_... functions, but ten times as fast: a frame makes a hundred vectors."""
     vector: np.generic = numbers.view(getattr(cl_types, name))[0]
     return vector
 

@@ -15,7 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 from server.opencl.transfer import part_of
 
 LEAST_ALIGNMENT_BYTES = 64
-"""Of a float16, the largest type that kernels load."""
+"""Alignment of a float16, the largest type that kernels load."""
 _STEP_BYTES = 4096
 """Buffers grow in such steps, so that a part that changes by little seldom takes new memory."""
 
@@ -25,23 +25,23 @@ class Parts:
     """Arrays in one buffer on the device."""
 
     memory: cl_array.Array
-    """All of them, uint8."""
+    """All parts, uint8."""
     starts: Mapping[str, int]
     """Byte at which each begins."""
     shapes: Mapping[str, tuple[tuple[int, ...], DTypeLike]]
 
     def array(self, name: str) -> cl_array.Array:
-        """One of them, in the same memory."""
+        """One part, in the same memory."""
         return part_of(self.memory, self.starts[name], *self.shapes[name])
 
 
 def part_alignment_bytes(device: cl.Device) -> int:
-    """Of where a part begins: what the device asks of sub-buffers, and the largest type."""
+    """Alignment of a part: of the device's sub-buffers and of the largest type."""
     return max(device.mem_base_addr_align // 8, LEAST_ALIGNMENT_BYTES)
 
 
 def place(shapes: Mapping[str, tuple[tuple[int, ...], DTypeLike]], alignment_bytes: int) -> tuple[dict[str, int], int]:
-    """Where each array begins, one after the other, and the bytes of all of them."""
+    """Where each array begins, one after the other, and the bytes in all."""
     starts, end = {}, 0
     for name, (shape, dtype) in shapes.items():
         starts[name] = -(-end // alignment_bytes) * alignment_bytes

@@ -66,7 +66,7 @@ GRID = Struct("Grid", cols="int", rows="int", stride="int", width="int")
 """Samples of a picture `width` wide: sample (row, col) lies at pixel stride / 2 + stride * (row, col)."""
 
 VOLUME_SHAPE = Struct("VolumeShape", bricks="int4", voxel_m="float", truncation_m="float", gaps_at="int")
-"""Of include/volume.clh. gaps_at: byte of the ray tables at which the gaps begin, behind the solid cells."""
+"""Volume of include/volume.clh. gaps_at: byte of the ray tables at which the gaps begin, behind the solid cells."""
 
 LIGHT_PARAMETERS = Struct(
     "LightParameters",
@@ -83,15 +83,15 @@ LIGHT_PARAMETERS = Struct(
     coefficients_at="int",
     whole_at="int",
 )
-"""Of Arriving in include/arriving.clh. ..._at: byte of the light's table at which an array begins."""
+"""Arriving of include/arriving.clh. ..._at: byte of the light's table at which an array begins."""
 
 CHANGED_PARAMETERS = Struct("ChangedParameters", camera_from_volume="float16", intrinsics="float4", grid="int4")
-"""Of Changed in include/changed.clh."""
+"""Changed of include/changed.clh."""
 
 OBJECT_PARAMETERS = Struct(
     "ObjectParameters", ball="float4", count="int", dims_at="int", normals_at="int", cells_at="int", nearest_at="int"
 )
-"""Of Objects in include/scene.clh. ball: around all objects, centre and radius. dims_at: byte of the objects'
+"""Objects of include/scene.clh. ball: around all objects, centre and radius. dims_at: byte of the objects'
 table; the others: bytes of the points' table."""
 
 SCENE_PARAMETERS = Struct(
@@ -103,10 +103,10 @@ SCENE_PARAMETERS = Struct(
     samples=GRID,
     every="int",
 )
-"""Of include/scene.clh. samples: where the kernel shades; every: of how many directions it follows one."""
+"""Scene of include/scene.clh. samples: where the kernel shades; every: it traces every n-th direction."""
 
 REFLECTION_PARAMETERS = Struct("ReflectionParameters", scene=SCENE_PARAMETERS, eye="float4", least_gloss="float")
-"""Of reflect.cl. eye: where the camera is, volume metres."""
+"""Parameters of reflect.cl. eye: where the camera is, volume metres."""
 
 VIEW_PARAMETERS = Struct(
     "ViewParameters",
@@ -122,10 +122,10 @@ VIEW_PARAMETERS = Struct(
     near_ratio="float",
     most_apart="float",
 )
-"""Of RealViews and Picture in include/views.clh."""
+"""RealViews and Picture of include/views.clh."""
 
 DIRECT_PARAMETERS = Struct("DirectParameters", ball="float4", least="float4", count="int")
-"""Of DirectLights in include/direct_lights.clh. least: shading that counts at least, see include/direct_mix.clh."""
+"""DirectLights of include/direct_lights.clh. least: the least shading that counts, see include/direct_mix.clh."""
 
 TRANSFER_PARAMETERS = Struct(
     "TransferParameters",
@@ -143,7 +143,7 @@ TRANSFER_PARAMETERS = Struct(
     cached_normals_at="int",
     chosen_count="int",
 )
-"""Of radiance_transfer.cl. cached_normals_at: byte of the cache's surface at which its normals begin."""
+"""Parameters of radiance_transfer.cl. cached_normals_at: byte of the cache's surface at which its normals begin."""
 
 VIEW_TRANSFER_PARAMETERS = Struct(
     "ViewTransferParameters",
@@ -162,7 +162,7 @@ VIEW_TRANSFER_PARAMETERS = Struct(
     slack="float",
     inverse_threshold="float",
 )
-"""Of transfer_from_views in image_space.cl."""
+"""Parameters of transfer_from_views in image_space.cl."""
 
 MIXTURE_PARAMETERS = Struct(
     "MixtureParameters",
@@ -175,7 +175,7 @@ MIXTURE_PARAMETERS = Struct(
     has_refined_occluded="int",
     has_refined_ratio="int",
 )
-"""Of Mixture in include/composite_inputs.clh."""
+"""Mixture of include/composite_inputs.clh."""
 
 LAYER_PARAMETERS = Struct(
     "LayerParameters",
@@ -185,10 +185,10 @@ LAYER_PARAMETERS = Struct(
     ratio_at="int",
     real_depth_at="int",
 )
-"""Of layer.cl. ..._at: byte of the layer's buffer at which an array begins."""
+"""Parameters of layer.cl. ..._at: byte of the layer's buffer at which an array begins."""
 
 SURFACE_PARAMETERS = Struct("SurfaceParameters", around="int4", region="int4", width="int", object_count="int")
-"""Of shade_surface in rasterize.cl."""
+"""Parameters of shade_surface in rasterize.cl."""
 
 STRUCTS = (
     GRID,
@@ -206,7 +206,7 @@ STRUCTS = (
     LAYER_PARAMETERS,
     SURFACE_PARAMETERS,
 )
-"""All of them; a struct comes after those that it holds."""
+"""All structs; a struct stands behind those that it contains."""
 
 
 def struct_text() -> str:

@@ -1,8 +1,8 @@
 """Adaptive refinement (thesis 6.1.1, step 1): shading at every pixel where virtual objects make it vary.
 
-Kernels: adaptive.cl. On virtual surface that is beside its edges of depth and normal. On real surface the thesis marks
-what rays from the virtual objects hit; here the samples already say where shading with the objects differs from shading
-without, so what is marked is where that changes from sample to sample: the rims of shadows, not their insides.
+Kernels: adaptive.cl. Virtual surface is refined at its edges of depth and normal. On real surface the thesis refines
+what rays from the virtual objects hit. Here the samples already give the ratio R' / R, so pixels are refined where it
+changes from sample to sample: at the rims of shadows, not inside them.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from server.transfer.sample_grid import SampleGrid, grid_of, pixel_grid
 from server.volume.raycast import Surface
 
 LEAST_CHANGE = 1 / 8
-"""Of R' / R from the 4 x 4 samples to one side to those to the other, from which on it is sampled at every pixel."""
+"""A larger difference of R' / R between the 4 x 4 samples on two opposite sides is refined."""
 MARGIN_PX = 2
-"""Around an edge: half of what a pixel's mean draws on, see upsample.clh."""
+"""Pixels around an edge that are refined: half the width of the upsampling filter, see upsample.clh."""
 SHOWN_MARGIN_PX = 4
-"""Around real surface that is shown: what a pixel's mean draws on, and one for pixels that are covered in part."""
+"""Pixels around visible real surface: the upsampling filter's width, and one more for partly covered pixels."""
 _LEAST_LISTED = 1024
 
 
@@ -79,7 +79,7 @@ def refine_real(
 ) -> cl_array.Array:
     """[h, w] float4: R' / R of real surface (eq. 7.1) where it varies among the samples of `ratio`; w = 0 elsewhere.
 
-    What `virtual` hides from `eye` ([3], volume space) is left out, if they are given.
+    Real surface that `virtual` hides from `eye` ([3], volume space) is not refined, if both are given.
     """
     refined = _cleared(engine, camera, engine.buffers(_Buffers).refined_ratio)
     cells = varying_cells(engine, ratio, scene.bands)
@@ -107,7 +107,7 @@ def refine_real(
 def _shown(
     engine: Engine, camera: CameraModel, surface: Surface, virtual: VirtualSurface, eye: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """[h, w] pixels whose middle the virtual surface does not hide."""
+    """[h, w] pixels whose centre the virtual surface does not hide."""
     shown = engine.buffers(_Buffers).visible_pixels.array((camera.height, camera.width))
     size, kernel = (camera.width, camera.height), engine.kernel("adaptive.cl", "mark_shown", **_defines(engine, 2))
     engine.launch(kernel, size, *size, surface.positions, virtual.position, float4(*eye, 0), shown)
@@ -115,7 +115,7 @@ def _shown(
 
 
 def varying_cells(engine: Engine, ratio: SampleGrid, bands: int) -> NDArray[np.bool_]:
-    """[rows + 1, cols + 1] the cells, from the one before the first sample, around which `ratio` changes."""
+    """[rows + 1, cols + 1] cells around which `ratio` changes; the first cell lies before the first sample."""
     varying = engine.buffers(_Buffers).varying_cells.array((ratio.rows + 1, ratio.cols + 1))
     kernel = engine.kernel("adaptive.cl", "mark_varying", **_defines(engine, bands))
     size = (ratio.cols + 1, ratio.rows + 1)
@@ -124,7 +124,7 @@ def varying_cells(engine: Engine, ratio: SampleGrid, bands: int) -> NDArray[np.b
 
 
 def pixels_of(cells: NDArray[np.bool_], stride: int, width: int, height: int) -> NDArray[np.bool_]:
-    """[height, width] the pixels of `cells` [rows + 1, cols + 1], which begin half a stride before the picture."""
+    """[height, width] the pixels of `cells` [rows + 1, cols + 1]; the grid begins half a stride before the picture."""
     row, col = (
         np.minimum((np.arange(n) + stride - stride // 2) // stride, m - 1)
         for n, m in zip((height, width), cells.shape, strict=True)
@@ -133,7 +133,7 @@ def pixels_of(cells: NDArray[np.bool_], stride: int, width: int, height: int) ->
 
 
 def grown(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    """[h, w] what lies within `by` pixels, along the axes, of `mask`."""
+    """[h, w] `mask` dilated by a square of `by` pixels to each side."""
     result = mask
     for axis in (0, 1):
         line = result
@@ -147,7 +147,7 @@ def grown(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
 
 
 def _list_pixels(buffer: DeviceBuffer, mask: NDArray[np.bool_]) -> tuple[int, cl_array.Array]:
-    """Number and numbers (y width + x) of the pixels of a mask; the array is longer, so that it seldom changes size."""
+    """How many pixels a mask has, and their indices (y width + x) in a longer array, whose size seldom changes."""
     pixels = np.flatnonzero(mask).astype(np.int32)
     room = max(_LEAST_LISTED, 1 << len(pixels).bit_length())
     return len(pixels), buffer.upload(np.pad(pixels, (0, room - len(pixels))))

@@ -1,4 +1,4 @@
-"""Where in the picture virtual objects change real surface by more than is to be left out (thesis 7.1).
+"""Where in the picture virtual objects change real surface visibly (thesis 7.1).
 
 Kernel: change_mask.cl.
 """
@@ -31,10 +31,10 @@ def mark_changes(
     spare: float = 0.0,
     upsampling: Upsampling = "bilateral",
 ) -> cl_array.Array:
-    """[rows + 1, cols + 1] uint8: 0 where R' / R may be taken to be 1, as no pixel's is farther from it than `spare`.
+    """[rows + 1, cols + 1] uint8: 0 where every pixel's R' / R differs from 1 by at most `spare`.
 
-    Cells of the grid as in upsample.clh, from the one before the first sample. ratio: R' / R at samples; refined:
-    [h, w] float4, what stands for it where w = 1; tolerance_m: of upsampling, read where something is spared.
+    The cells are those of upsample.clh; the first lies before the first sample. ratio: R' / R at samples; refined:
+    [h, w] float4, replaces it where w = 1; tolerance_m: of upsampling, used where spare > 0.
     """
     changed = engine.buffers(_Buffers).changed.array((ratio.rows + 1, ratio.cols + 1))
     defines = {"BICUBIC": 1} if upsampling == "bicubic" else {}

@@ -78,9 +78,9 @@ class CompositeInputs:
     refined_ratio: cl_array.Array | None = None
     upsampling: Upsampling = "bilateral"
     coverage: cl_array.Array | None = None
-    """Of nearest_depths, for smooth edges; without it a pixel is covered as its middle is."""
+    """Of nearest_depths, for smooth edges. Without it a pixel is covered if its centre is."""
     reflected: cl_array.Array | None = None
-    """Of reflect.py."""
+    """[h, w] float4 of reflect_surroundings."""
     gain: float = 1.0
     """By which virtual surface is brighter than `light` makes it (tone_mapping.py)."""
     direct_virtual: cl_array.Array | None = None
@@ -88,7 +88,7 @@ class CompositeInputs:
     direct_ratio: cl_array.Array | None = None
     """Stands for `ratio` and `refined_ratio` where the light has discs (shadow_map.py)."""
     reached: cl_array.Array | None = None
-    """Of change_mask.py, the cells in which `ratio` counts; None: wherever it is not 1."""
+    """Of mark_changes: the cells in which `ratio` counts; None: wherever it is not 1."""
 
     @property
     def is_nothing(self) -> bool:

@@ -1,9 +1,9 @@
 """Rendering in image space: GR15 and GR15FAST (thesis 7.3). Kernels: depth_views.cl; include/view_visibility.clh.
 
-What rays find out in the volume family, shading looks up in depth pictures: of real surface in the auxiliary views that
-the light is estimated with (auxiliary_views.py), of virtual objects in views of each from all around. The thesis draws
-objects into the buffers of the room; but an object of 20 cm is a few pixels of these. Here each has pictures of its own
-in its own axes, drawn once: they move with it. The shading itself is that of the volume family.
+Other presets trace rays through the volume. These look visibility up in depth pictures: of real surface in the
+auxiliary views that light estimation uses (auxiliary_views.py), of each virtual object in views from all around it.
+The thesis draws objects into the room's views, but an object of 20 cm covers only a few of their pixels. Here each
+object has views of its own, in its own axes, drawn once; they move with it. Shading is the same as with rays.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ViewShape:
-    """Of every object's views."""
+    """Layout of the views of one object."""
 
     cells: int
     """Views along a side of the octahedral map of the upper half of directions."""
@@ -39,14 +39,14 @@ class ViewShape:
 
     @property
     def texels(self) -> int:
-        """Of one object."""
+        """Number of texels of one object."""
         return (self.cells * self.px) ** 2
 
 
 FINE, COARSE = ViewShape(24, 32), ViewShape(12, 16)
-"""Neighbouring views are some 7 and 15 degrees apart; an object takes 2.4 MB or 0.15 MB."""
+"""Neighbouring views are about 7 and 15 degrees apart. An object needs 2.4 MB or 0.15 MB."""
 MOST_FINE = 64
-"""Different meshes up to which they are FINE."""
+"""Scenes of more different meshes use COARSE views."""
 
 
 class _Buffers(StageBuffers):
@@ -60,7 +60,7 @@ class _Buffers(StageBuffers):
 
 @dataclass(frozen=True)
 class DepthViews:
-    """What shading looks into instead of tracing rays; its arrays are valid until the next frame."""
+    """Depth pictures in which shading looks up visibility. The arrays are valid until the next frame."""
 
     real: RealDepthViews
     shape: ViewShape
@@ -103,7 +103,7 @@ class DepthViews:
 
 
 def draw_depth_views(engine: Engine, real: RealDepthViews, objects: Sequence[Placed]) -> DepthViews:
-    """The pictures of one frame; those of objects that are new are drawn."""
+    """The views of one frame. Views of new objects are drawn."""
     views = engine.state(_ObjectViews)
     grids = [thing.grid for thing, _ in objects]
     slots = views.slots_of(engine, grids)
@@ -112,16 +112,16 @@ def draw_depth_views(engine: Engine, real: RealDepthViews, objects: Sequence[Pla
 
 
 class _ObjectViews:
-    """The views of the meshes that were last in the scene, each in a slot of one array."""
+    """The views of the meshes in the scene, each in a slot of one array."""
 
     def __init__(self) -> None:
         self.shape = FINE
         self.texels: cl_array.Array | None = None
         self._grids: list[cl_array.Array | None] = []
-        """Whose distances are in each slot; kept, so that none gets another's id."""
+        """The distance grid of each slot. A reference is kept so that no other grid gets its id."""
 
     def slots_of(self, engine: Engine, grids: Sequence[DistanceGrid]) -> NDArray[np.int32]:
-        """The slot of each, drawn if it was not there."""
+        """The slot of each grid; new ones are drawn."""
         unique = {id(grid.distance): grid for grid in grids}
         shape = FINE if len(unique) <= MOST_FINE else COARSE
         if shape != self.shape:
@@ -140,7 +140,7 @@ class _ObjectViews:
         return np.array([slots[id(grid.distance)] for grid in grids], np.int32)
 
     def _make_room(self, engine: Engine, count: int) -> None:
-        """At least `count` slots; what is drawn is kept."""
+        """Make at least `count` slots; drawn views are kept."""
         if self.texels is not None and len(self._grids) >= count:
             return
         room = max(count, 2 * len(self._grids))
@@ -151,7 +151,7 @@ class _ObjectViews:
 
 
 def draw_object(engine: Engine, grid: DistanceGrid, shape: ViewShape, texels: cl_array.Array | None, slot: int) -> None:
-    """All views of an object, from its distance grid, into a slot of `texels` [slots, shape.texels]."""
+    """Draw all views of an object, from its distance grid, into a slot of `texels` [slots, shape.texels]."""
     axes = np.zeros((shape.cells**2, 3, 4), np.float32)
     axes[..., :3] = view_axes(shape.cells)
     engine.launch(
@@ -166,7 +166,7 @@ def draw_object(engine: Engine, grid: DistanceGrid, shape: ViewShape, texels: cl
 
 
 def view_axes(cells: int) -> Floats:
-    """[cells^2, 3, 3] rows right, down and ahead (z >= 0) of an object's views, the grid's axes: as views.clh."""
+    """[cells^2, 3, 3] rows right, down and ahead (z >= 0) of an object's views in the grid's axes, as in views.clh."""
     v, u = (np.mgrid[:cells, :cells].reshape(2, -1) + 0.5) * (2 / cells) - 1
     x, y = (u + v) / 2, (u - v) / 2
     ahead = np.stack([x, y, 1 - np.abs(x) - np.abs(y)], axis=-1)

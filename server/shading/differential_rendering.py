@@ -27,11 +27,11 @@ from server.volume.raycast import Surface
 VIRTUAL_STRIDE = 2
 """Occlusion of virtual surfaces is traced at every second pixel; the unoccluded part is exact at every pixel."""
 BOUNCE_EVERY = 4
-"""Of how many hidden directions a sample follows one, for what its surroundings send it less; its neighbours others."""
+"""A sample traces every BOUNCE_EVERY-th of its blocked directions; its neighbours trace the others."""
 
 
 MOST_POINTS = 8192
-"""Points on objects that are lit one by one, the first objects'; others are taken to see an even light."""
+"""At most this many points on objects are lit one by one; the others see an even light."""
 
 
 class _Buffers(StageBuffers):
@@ -52,9 +52,9 @@ class RealShadow(SampleGrid):
     """Ratios R' / R (eq. 7.1) at samples of real surface."""
 
     shaded: cl_array.Array
-    """[rows, cols] float4: R, what reaches white surface without objects, w = 1 valid."""
+    """[rows, cols] float4: R, shading of white surface without objects, w = 1 valid."""
     whole: SampleGrid | None = None
-    """The ratio with the discs' light (shadow_map.py), None where that is this one."""
+    """The ratio under the light with its discs (shadow_map.py); None where the light has none."""
 
 
 def shadow_real(
@@ -67,7 +67,7 @@ def shadow_real(
 ) -> RealShadow:
     """Ratio R' / R of real surface shaded with and without the objects, at the transfer's samples (eq. 7.1).
 
-    indirect: what surfaces send to the same samples.
+    indirect: radiance from surfaces at the same samples.
     """
     shape, buffers = (transfer.rows, transfer.cols), engine.buffers(_Buffers)
     ratio, shaded = buffers.ratio.array(shape), buffers.shaded.array(shape)
@@ -97,10 +97,10 @@ def bounce_real(
     spare: float = 0.0,
     least: RealShadow | None = None,
 ) -> RealShadow:
-    """`shadow` with what real surfaces then send one another less or more (eq. 7.6: R'_ID - R_ID).
+    """`shadow` with the change of the light between real surfaces (eq. 7.6: R'_ID - R_ID).
 
-    returned: the most radiance by which what any real surface sends can change. Where that is no more than the share
-    `spare` of R, that of `least` or else of `shadow`, nothing is followed.
+    returned: bound on the change of the radiance that any real surface sends. Where it is at most `spare` times R (of
+    `least`, or else of `shadow`), no ray is traced.
     """
     bounced = engine.buffers(_Buffers).bounced.array((transfer.rows, transfer.cols))
     shadowed = replace(scene, changed=Changed(camera, camera_from_volume, surface.positions, shadow))
@@ -141,9 +141,9 @@ def shadow_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface,
 
 
 def light_points(engine: Engine, scene: TracedScene, placed: PlacedPoints | None = None) -> VirtualPointLights:
-    """What the objects send: their points lit as their pixels are (eq. 7.3), but not by one another.
+    """Light the points of the objects as their pixels are lit (eq. 7.3), but not by each other.
 
-    placed: of place_points for the scene's objects, None: to be placed.
+    placed: of place_points for the scene's objects; None: they are placed here.
     """
     placed = placed or place_points(engine, scene.objects)
     radiances = engine.buffers(_Buffers).point_radiances.upload(placed.under_even_light(scene.light.mean))

@@ -1,4 +1,4 @@
-"""What is virtual in a frame, apart from the camera's picture (thesis 7.2.1). Kernel: layer.cl."""
+"""The virtual layer of a frame, without the camera's picture (thesis 7.2.1). Kernel: layer.cl."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from server.opencl.structs import LAYER_PARAMETERS
 from server.shading.composite import CompositeInputs, launch_mixture, mixture_parameters, srgb_table
 
 DEPTH_SCALE_M = 0.001
-"""Metres of a unit of a layer's depth: to 65 m; half a unit moves what is 0.5 m away by a tenth of a pixel where the
-camera moves by 10 cm."""
+"""Metres per unit of a layer's depth: up to 65 m. Rounding by half a unit shifts a point at 0.5 m by a tenth of a pixel
+when the camera moves by 10 cm."""
 NEUTRAL = 128
-"""Code of real surface that stays as it is."""
+"""Code of unchanged real surface."""
 
 
 @dataclass(frozen=True)
 class LayerPart:
-    """The box of the picture outside of which the layer says nothing."""
+    """A box of the picture. The layer is empty outside of it."""
 
     x: int
-    """Its first column."""
+    """First column of the box."""
     y: int
     color: NDArray[np.uint8]
-    """[h, w, 4] sRGB and coverage (255: all of the pixel), or [h, w, 3] roots of factors times 128."""
+    """[h, w, 4] sRGB and coverage (255: the whole pixel), or [h, w, 3] square roots of factors times 128."""
     depth: NDArray[np.uint16]
-    """[h, w] along the camera's z, in DEPTH_SCALE_M; 0: the pixel says nothing."""
+    """[h, w] depth along the camera's z in units of DEPTH_SCALE_M; 0: empty."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Layer:
     """picture = coverage * virtual + (1 - coverage) * ratio * camera, all linear."""
 
     virtual: LayerPart | None = None
-    """None: none is seen."""
+    """None: no virtual surface is visible."""
     ratio: LayerPart | None = None
-    """None: real surface stays as it is."""
+    """None: real surface is unchanged."""
     depth_scale_m: float = DEPTH_SCALE_M
 
 
@@ -53,7 +53,7 @@ class _Buffers(StageBuffers):
 
 
 def compose_layer(engine: Engine, mixture: CompositeInputs) -> Layer:
-    """What composite would mix with the camera's picture."""
+    """The layer that, mixed with the camera's picture, gives the picture of `composite`."""
     if mixture.is_nothing:
         return NOTHING
     size = (mixture.camera.height, mixture.camera.width)
@@ -86,7 +86,7 @@ def compose_layer(engine: Engine, mixture: CompositeInputs) -> Layer:
 def _cropped(
     color: NDArray[np.uint8], depth: NDArray[np.uint16], counts: NDArray[np.bool_], margin: int = 0
 ) -> LayerPart | None:
-    """The box of the pixels that count, and `margin` pixels around them; None where there are none."""
+    """The bounding box of the pixels in `counts`, with `margin` pixels around it; None without any."""
     rows, cols = (np.flatnonzero(counts.any(axis=axis)) for axis in (1, 0))
     if not rows.size:
         return None

@@ -1,7 +1,8 @@
 """Glossy virtual surface (thesis fig. 8.4): what it reflects. Kernel: reflect.cl.
 
-A few rays around the mirrored view, the wider the rougher, meet real and virtual surface or the light beyond, which is
-blurred as a lobe of that width does. How much of it is reflected: the microfacet model of glTF (GGX), integrated.
+A few rays are traced in a cone around the mirrored view direction; rough surfaces have a wide cone. A ray takes the
+radiance of the real or virtual surface that it meets, or else the light, blurred by a lobe of the cone's width. The
+reflected part follows the microfacet model of glTF (GGX), integrated over the hemisphere.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from server.shading.traced_scene import TracedScene
 from server.transfer.sample_grid import pixel_grid
 
 LEAST_GLOSS = 0.02
-"""Of one less the roughness, or of the metalness: below it a surface is matt, its diffuse shading all there is."""
+"""A surface is matt if both 1 - roughness and its metalness are below this: then only its diffuse shading is drawn."""
 
 
 class _Buffers(StageBuffers):
@@ -29,7 +30,7 @@ class _Buffers(StageBuffers):
 
 
 def is_glossy(materials: NDArray[np.float32]) -> bool:
-    """Whether any of an object's materials, rows as in MaterialTables, may not be matt; textures lower roughness."""
+    """Whether any material (rows as in MaterialTables) may be glossy. Textures can lower the roughness."""
     gloss = np.maximum(1 - materials[:, 0], materials[:, 1])
     return bool((gloss >= LEAST_GLOSS).any() or (materials[:, 3] >= 0).any())
 
@@ -41,7 +42,7 @@ def reflect_surroundings(
     virtual: VirtualSurface,
     scene: TracedScene,
 ) -> cl_array.Array:
-    """[h, w] float4: radiance that virtual surface reflects, and in w what remains of its diffuse radiance."""
+    """[h, w] float4: radiance that virtual surface reflects; w: the factor of its diffuse radiance."""
     assert virtual.material is not None
     reflected = engine.buffers(_Buffers).reflected.array((camera.height, camera.width))
     engine.launch(

@@ -1,10 +1,10 @@
 """Shadow maps along the sharp lights of a room (thesis 7.2.3, fig. 7.7). Kernels: shadow_map.cl.
 
-The discs that direct_lights.py takes out of the light bring theirs past a picture of the virtual objects, taken from
-each disc, fitted to them, with a pyramid of coverage and mean depth. A point looks for what stands in a disc's light,
-and then, as wide as that is far away, for the parts of the disc that it leaves, at every pixel. What real things leave
-of a disc is traced through the volume from samples of the surface. Light that they keep is missing with objects and
-without: what real things hide already, virtual ones do not darken again.
+direct_lights.py splits sharp lights, as discs, from the rest of the light. From each disc the virtual objects are drawn
+into a depth map that just fits them, with a pyramid of coverage and mean depth. At every pixel, shading first searches
+the map for occluders and their distance, then finds the visible part of the disc with a filter as wide as that distance
+asks for (percentage-closer soft shadows). Real occluders are traced through the volume, from samples of the surface.
+The light that they block is missing with and without virtual objects, so no shadow is drawn twice.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from server.volume.volume import Volume
 MAP_SIDE = 256
 """Texels along a side of the objects' map."""
 DISTANCE = 1024.0
-"""From where objects are drawn, in radii of the ball around them: as good as from infinity."""
+"""Distance of the map's camera, in radii of the ball around the objects: practically parallel projection."""
 LEAST_SHADING = 0.02
-"""As in include/shadows.clh."""
+"""The least shading that counts, as in include/shadows.clh."""
 _COARSEST_SIDE = 8
 
 Floats = NDArray[np.float64]
@@ -88,15 +88,15 @@ class ShadowMaps:
     rows: cl_array.Array
     """[MOST_LIGHTS, 4] float4: right, down, towards the light (w: tangent of half its angle), irradiance (w: _rows)."""
     ball: Floats
-    """Middle and radius of the ball around all objects, volume metres."""
+    """Centre and radius of the ball around all objects, volume metres."""
     objects: cl_array.Array
-    """[MOST_LIGHTS, texels of the pyramid] float2: covered part, mean depth in metres from the ball's middle."""
+    """[MOST_LIGHTS, texels of the pyramid] float2: coverage, mean depth in metres from the ball's centre."""
     traced: list[tuple[Surface, SampleGrid]] = field(default_factory=list)
-    """What trace_real found last, and of what: more than one effect asks for the same."""
+    """The last result of trace_real and its surface: several effects need it."""
 
     @property
     def least(self) -> Floats:
-        """[3] shading that counts at least, see include/direct_mix.clh."""
+        """[3] the least shading that counts, see include/direct_mix.clh."""
         least: Floats = LEAST_SHADING * self.light.mean + 1e-9
         return least
 
@@ -118,7 +118,7 @@ class ShadowMaps:
 
 @dataclass(frozen=True)
 class DirectSamples:
-    """What the discs bring to the samples of a ratio: [rows, cols] float4 each."""
+    """Radiance of white surface from the discs, at the samples of a ratio: [rows, cols] float4 each."""
 
     without: cl_array.Array
     with_objects: cl_array.Array
@@ -127,7 +127,7 @@ class DirectSamples:
 def draw_shadow_maps(
     engine: Engine, volume: Volume, light: DeviceLight, objects: Sequence[Placed], reach_m: float
 ) -> ShadowMaps:
-    """Pictures of `objects`, each with its `volume_from_model`, from every disc of `light`."""
+    """Depth maps of `objects`, each with its `volume_from_model`, from every disc of `light`."""
     ball = np.array(ball_around(objects).tolist(), np.float64)
     axes = view_axes(np.stack([disc.direction for disc in light.discs]))
     rows = engine.buffers(_Buffers).rows.upload(_rows(light.discs, axes))
@@ -135,7 +135,7 @@ def draw_shadow_maps(
 
 
 def light_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, maps: ShadowMaps) -> cl_array.Array:
-    """[h, w] float4: what the discs bring to virtual surface, were it white."""
+    """[h, w] float4: radiance from the discs on virtual surface of albedo 1."""
     size, buffers = (camera.width, camera.height), engine.buffers(_Buffers)
     direct = buffers.virtual.array((camera.height, camera.width))
     shape = (camera.height // VIRTUAL_STRIDE, camera.width // VIRTUAL_STRIDE)
@@ -160,13 +160,13 @@ def light_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, 
 def trace_real(
     engine: Engine, camera: CameraModel, surface: Surface, ratio: SampleGrid, maps: ShadowMaps
 ) -> SampleGrid:
-    """What real things leave of the discs at the samples of `ratio`: float4, a disc each, w = 1 valid."""
+    """The part of each disc that real surfaces do not block, at the samples of `ratio`: float4, w = 1 valid."""
     for traced, parts in maps.traced:
         if traced is surface and (parts.stride, parts.values.shape) == (ratio.stride, ratio.values.shape):
             return parts
     parts = SampleGrid(ratio.stride, engine.buffers(_Buffers).real_parts.array(ratio.values.shape))
     _trace_discs(engine, camera, surface.positions, surface.normals, parts, maps, is_virtual=False)
-    maps.traced[:] = [(surface, parts)]  # there is one array
+    maps.traced[:] = [(surface, parts)]  # the next call writes the same array
     return parts
 
 
@@ -183,7 +183,7 @@ def light_real(
 ) -> cl_array.Array:
     """[h, w] float4: R' / R of real surface under the whole light, w = 1 where it may be other than 1.
 
-    ratio: of the rest of the light; parts: of trace_real; refined: what stands for `ratio` where w = 1; reached: of
+    ratio: under the rest of the light; parts: of trace_real; refined: replaces `ratio` where its w = 1; reached: of
     change_mask.py, the cells in which `ratio` counts, None: wherever it is not 1.
     """
     mixed = engine.buffers(_Buffers).ratio.array((camera.height, camera.width))
@@ -210,7 +210,7 @@ def light_real(
 def light_points_by_discs(
     engine: Engine, placed: PlacedPoints, point_lights: VirtualPointLights, maps: ShadowMaps
 ) -> None:
-    """Add what points on objects send of the discs' light. Those past the first are lit evenly as it is."""
+    """Add the discs' light to what points on objects send. Points past MOST_POINTS see an even light and need none."""
     count = min(placed.count, MOST_POINTS)
     engine.launch(
         _kernel(engine, "light_points_by_discs"),
@@ -229,7 +229,7 @@ def light_points_by_discs(
 def light_samples(
     engine: Engine, camera: CameraModel, surface: Surface, parts: SampleGrid, maps: ShadowMaps
 ) -> DirectSamples:
-    """At the samples of `parts`, all of them."""
+    """Radiance from the discs at all samples of `parts`."""
     shape, buffers = (parts.rows, parts.cols), engine.buffers(_Buffers)
     without, lit = buffers.samples_without.array(shape), buffers.samples_with.array(shape)
     engine.launch(
@@ -247,7 +247,7 @@ def light_samples(
 
 
 def with_direct(engine: Engine, shadow: RealShadow, samples: DirectSamples, maps: ShadowMaps) -> RealShadow:
-    """The ratio of the whole light, from that of its rest."""
+    """The ratio under the whole light, from the ratio under its rest."""
     shape, buffers = (shadow.rows, shadow.cols), engine.buffers(_Buffers)
     whole, shaded = buffers.whole_ratio.array(shape), buffers.whole_shaded.array(shape)
     count = shadow.rows * shadow.cols
@@ -259,7 +259,7 @@ def with_direct(engine: Engine, shadow: RealShadow, samples: DirectSamples, maps
 def without_direct(
     engine: Engine, whole: RealShadow, shadow: RealShadow, samples: DirectSamples, maps: ShadowMaps
 ) -> RealShadow:
-    """The ratio of the rest, from that of the whole light; `shadow`: what with_direct was given."""
+    """The ratio under the rest of the light, from the whole light's. shadow: the argument of with_direct."""
     rest = engine.buffers(_Buffers).rest_ratio.array((shadow.rows, shadow.cols))
     count = shadow.rows * shadow.cols
     mixed = (whole.values, shadow.shaded, samples.without, samples.with_objects)
@@ -268,15 +268,13 @@ def without_direct(
 
 
 def _draw_objects(engine: Engine, axes: Floats, ball: Floats, objects: Sequence[Placed]) -> cl_array.Array:
-    """The pyramids. axes: [lights, 3, 3]."""
+    """The pyramids of all maps. axes: [lights, 3, 3]."""
     texels, distance_m = (4 * MAP_SIDE**2 - _COARSEST_SIDE**2) // 3, DISTANCE * float(ball[3])
     maps = engine.buffers(_Buffers).maps.array((MOST_LIGHTS, texels))
     middle, focal_px = (MAP_SIDE - 1) / 2, DISTANCE * MAP_SIDE / 2
     camera = Pinhole(MAP_SIDE, MOST_LIGHTS * MAP_SIDE, focal_px, focal_px, middle, middle)
     drawn: list[Placed] = []
-    for light, rotation in enumerate(
-        axes
-    ):  # one picture, a light's below the other's: each sees the objects for itself
+    for light, rotation in enumerate(axes):  # one picture, the maps below each other: one draw call
         camera_from_volume = np.eye(4)
         camera_from_volume[:3, :3] = rotation
         camera_from_volume[:3, 3] = -rotation @ ball[:3] + [0.0, 0.0, distance_m]

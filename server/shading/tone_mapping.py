@@ -1,9 +1,9 @@
-"""Tone mapping (thesis 7.1, H of eq. 7.1-7.2): how bright virtual things are beside what the camera pictures.
+"""Tone mapping (thesis 7.1, H of eq. 7.1-7.2): how bright virtual objects are beside the camera's picture.
 
-The light's own scale rests on the albedo that real surfaces are taken to have where nothing tells it, and on the fit of
-the light. H rests on the buffers' averages instead: shading is scaled so that on average a surface of that albedo is as
-bright as the picture, whatever the fit is. Under an estimated light that errs less (path-traced rooms, white and
-textured). On real surface R' / R needs no scale, which would cancel.
+The scale of an estimated light depends on the assumed albedo and on how well the light fits. H uses averages over the
+picture instead: shading is scaled so that a surface of the assumed albedo is on average as bright as the picture. Under
+an estimated light this has the smaller error (measured in path-traced rooms, white and textured). Real surface needs no
+scale: it cancels in R' / R.
 Kernel: tone_mapping.cl.
 """
 
@@ -25,9 +25,9 @@ from server.transfer.radiance_transfer import Directions, Transfer, sample_argum
 from server.volume.raycast import Surface
 
 EVERY = 3
-"""Of how many samples along an axis one counts; an odd number, so that all direction sets take part."""
+"""Every EVERY-th sample along each axis is used. An odd number, so that all direction sets contribute."""
 LEAST_LUMINANCE = 1e-4
-"""Of an average that says anything; the picture's white is 1."""
+"""Averages below this are not used. The picture's white is 1."""
 
 
 class _Buffers(StageBuffers):
@@ -65,7 +65,7 @@ class AverageMemory:
         self._samples = 0
 
     def update(self, frame: Averages, exposure: float) -> Averages:
-        """Averages with one more frame, of that `exposure`; one that cannot be matched leaves them as they are."""
+        """The averages with one more frame at `exposure`. A frame without usable samples changes nothing."""
         if frame.are_known:
             self._picture = FORGETTING * self._picture + frame.picture / exposure
             self._shading = FORGETTING * self._shading + frame.shading / exposure
@@ -86,7 +86,7 @@ def measure_averages(
     indirect: Indirect | None,
     reach_m: float,
 ) -> Averages:
-    """Averages of one frame. radiance: [h, w] float4 as in Measurement; indirect: what surfaces send, None: nothing."""
+    """Averages of one frame. radiance: [h, w] float4 as in Measurement; indirect: radiance from surfaces, None: 0."""
     cols, rows = -(-transfer.cols // EVERY), -(-transfer.rows // EVERY)
     buffers = engine.buffers(_Buffers)
     pairs = buffers.pairs.array((rows, cols))

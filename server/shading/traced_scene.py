@@ -1,4 +1,4 @@
-"""What rays of rendering are traced through, and what they bring: the room, its light, virtual objects (thesis 7.2).
+"""The scene that rendering traces rays through: the room's volume, its light and the virtual objects (thesis 7.2).
 
 Device side: include/shadows.clh.
 """
@@ -53,40 +53,40 @@ class DeviceLight:
     mean: NDArray[np.float64]
     """[3] radiance, over all directions."""
     table: Parts
-    """`arriving` [SETS, count] float4: RGB radiance from each direction that visibility is tested along; not below 0,
-    as that of few harmonics may be: to hide darkness would light up. For the rest see include/arriving.clh."""
+    """`arriving` [SETS, count] float4: RGB radiance from each direction of the visibility tests, clamped to 0
+    (harmonics can ring below 0, and blocking negative light would brighten). The rest: include/arriving.clh."""
     planes: PlaneArrays
-    """What hides it where the volume is empty."""
+    """Planes that block the light where the volume is empty."""
     sh: NDArray[np.float64]
-    """[bands^2, 3]: coefficients of all of it."""
+    """[bands^2, 3]: coefficients of the whole light."""
     unseen: NDArray[np.float64]
-    """[3] radiance that hidden directions bring where no picture shows what hides them; 0 without indirect light."""
+    """[3] radiance from blocked directions whose blocker no picture shows; 0 without indirect light."""
     surface_gain: float
-    """Radiance in the picture's units over that of the volume's colours; 0: surfaces send nothing."""
+    """Radiance in the picture's units per unit of the volume's colours; 0: surfaces send nothing."""
     discs: tuple[DirectLight, ...] = ()
-    """What is not in `coefficients` and `arriving`, for shadow maps to bring (shadow_map.py); volume axes."""
+    """Sharp lights that `coefficients` and `arriving` leave to shadow maps (shadow_map.py); volume axes."""
     with_discs: cl_array.Array | None = None
-    """[bands^2] float4: coefficients of all of it, None where those are `coefficients`."""
+    """[bands^2] float4: coefficients of the whole light; None where `coefficients` are these."""
 
     @property
     def bands(self) -> int:
-        """Of the coefficients."""
+        """Number of SH bands of the coefficients."""
         return math.isqrt(int(self.coefficients.shape[0]))
 
     @property
     def whole(self) -> cl_array.Array:
-        """[bands^2] float4: coefficients of all of the light."""
+        """[bands^2] float4: coefficients of the whole light."""
         return self.coefficients if self.with_discs is None else self.with_discs
 
     @property
     def arriving(self) -> cl_array.Array:
-        """[SETS, count] float4 of the table."""
+        """[SETS, count] float4 of the table: radiance from each direction."""
         return self.table.array("arriving")
 
 
 @dataclass(frozen=True)
 class Changed:
-    """How this picture shows real surface to change: what it then sends to others changes alike."""
+    """R' / R of real surface in this picture; the radiance that it sends to other surfaces changes likewise."""
 
     camera: CameraModel
     camera_from_volume: NDArray[np.float64]
@@ -107,29 +107,29 @@ class TracedScene:
     objects: Sequence[Placed]
     table: ObjectTable
     point_lights: VirtualPointLights | None = None
-    """What the objects send; None: nothing."""
+    """Radiance that the objects send; None: none."""
     changed: Changed | None = None
-    """What they change of what real surface sends; None: nothing."""
+    """Change of the radiance that real surface sends; None: none."""
     depth_views: DepthViews | None = None
-    """Pictures that visibility is looked up in; None: rays are traced."""
+    """Depth pictures in which visibility is looked up; None: rays are traced."""
 
     @property
     def bands(self) -> int:
-        """Of the light."""
+        """Number of SH bands of the light."""
         return math.isqrt(int(self.light.coefficients.shape[0]))
 
     def defines(self, engine: Engine) -> dict[str, int]:
-        """Shapes that kernels are compiled for."""
+        """Preprocessor definitions of the kernels."""
         shapes = {"BANDS": self.bands, "MASK_WORDS": -(-self.rays.count // 32), "LANES": engine.lanes}
         return shapes | (self.depth_views.defines() if self.depth_views else {})
 
     def by_rays(self) -> TracedScene:
-        """The same, with visibility traced."""
+        """The same scene, with visibility traced through the volume."""
         return replace(self, depth_views=None)
 
     @cached_property
     def ball(self) -> np.generic:
-        """Around all objects."""
+        """Ball around all objects, as ball_around returns it."""
         return ball_around(self.objects)
 
     def parameters(self, engine: Engine, samples: np.void, every: int = 1) -> np.void:
@@ -227,7 +227,7 @@ _CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
 def trace_scene(
     engine: Engine, volume: Volume, light: DeviceLight, rays: Directions, reach_m: float, objects: Sequence[Placed]
 ) -> TracedScene:
-    """The scene of one frame, whose objects send nothing yet."""
+    """The scene of one frame. Its objects send no light yet."""
     return TracedScene(volume, light, rays, reach_m, objects, object_table(engine, objects))
 
 
@@ -239,9 +239,9 @@ def upload_light(
     indirect: Indirect | None = None,
     exposure: float = 1.0,
 ) -> DeviceLight:
-    """Bring the light to the device: radiance coefficients [bands^2, 3], what they send along `rays`, what hides it.
+    """Upload the light: radiance coefficients [bands^2, 3], the radiance along `rays`, the planes that block it.
 
-    indirect: what surfaces send, None to leave it out. exposure: radiance in the picture over that in `sh` and volume.
+    indirect: radiance from surfaces, None for none. exposure: radiance in the picture over that in `sh` and volume.
     """
     sh, buffers = exposure * sh, engine.buffers(_Buffers)
     return DeviceLight(
@@ -258,7 +258,7 @@ def upload_light(
 def take_discs(
     engine: Engine, light: DeviceLight, split: SplitLight, rays: Directions, exposure: float = 1.0
 ) -> DeviceLight:
-    """`light`, of the same radiance and `exposure` as `split`, less its discs."""
+    """`light` without the discs of `split`, which must be of the same light and `exposure`."""
     if not split.discs:
         return light
     rest, buffers = exposure * split.rest, engine.buffers(_Buffers)
@@ -278,7 +278,7 @@ def _upload_table(
     whole: NDArray[np.float64],
     planes: PlaneArrays,
 ) -> Parts:
-    """The light's table as include/arriving.clh has it."""
+    """The light's table, laid out as in include/arriving.clh."""
     rows, shapes, maps = planes
     arrays = {"coefficients": _float4(sh), "whole": _float4(whole), "arriving": _arriving(rays, sh)}
     return buffer.upload_parts(arrays | {"planes": rows, "shapes": shapes, "maps": maps})

@@ -1,8 +1,8 @@
-"""What virtual objects send: one bounce of light off a few points of each (thesis 7.3.3, eq. 7.3-7.7).
+"""Virtual point lights: light that virtual objects reflect, one bounce, from a few points (thesis 7.3.3, eq. 7.3-7.7).
 
-The points are dealt over an object's surface once, on both of its sides. Every frame they are lit as its pixels are;
-rays that meet the object take what the points around send. Kernels: differential_rendering.cl (light_points),
-include/virtual_point_lights.clh.
+The points are distributed once over both sides of an object's surface. Every frame they are shaded as its pixels are.
+A ray that meets the object takes the mean radiance of the points around that place. Kernels: differential_rendering.cl
+(light_points), include/virtual_point_lights.clh.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class VirtualPointLights:
 
 @dataclass(frozen=True)
 class PlacedPoints:
-    """The points of all objects, to be lit."""
+    """The points of all objects, before they are lit."""
 
     count: int
     points: cl_array.Array
@@ -61,17 +61,17 @@ class PlacedPoints:
     albedos: cl_array.Array
     """[count] float4."""
     offsets_m: cl_array.Array
-    """[count] float32: how far off its surface rays of a point begin."""
+    """[count] float32: distance from the surface at which a point's rays begin, metres."""
     point_lights: VirtualPointLights
-    """With nothing sent yet."""
+    """The lights, which send nothing yet."""
 
     def under_even_light(self, radiance: Floats) -> NDArray[np.float32]:
-        """[count] float4: what the points send under a light [3] from everywhere."""
+        """[count] float4: what the points send under a radiance [3] that is the same from all directions."""
         return float4_rows(self.colors * radiance, 1.0)
 
 
 def no_point_lights(engine: Engine, objects: int = 1) -> VirtualPointLights:
-    """So many objects that send nothing: they have no cells."""
+    """Point lights of objects that send nothing."""
     count, buffers = max(objects, 1), engine.buffers(_Buffers)
     empty = np.zeros(1, cl_types.float4)
     cells, nearest = np.zeros(count, cl_types.int4), np.full(SIDES, -1, np.int32)
@@ -86,22 +86,22 @@ def no_point_lights(engine: Engine, objects: int = 1) -> VirtualPointLights:
 
 @dataclass(frozen=True)
 class _Gathered:
-    """The points of several objects, one object's after the other's, apart from where they stand."""
+    """The points of several objects, one object after the other, in each object's own space."""
 
     surfaces: tuple[SurfacePoints, ...]
     owners: NDArray[np.int64]
-    """[n] which object."""
+    """[n] index of the point's object."""
     points: Floats
     normals: Floats
     albedos: Floats
     nearest: NDArray[np.int32]
-    """As PointLights has it."""
+    """As in PointLights of virtual_point_lights.clh."""
     cells: NDArray[np.int32]
     """[objects, 4]."""
 
 
 class _LastGathered:
-    """Of an engine's objects in the frame before: they move, but seldom change."""
+    """The points of the last frame's objects: objects move often, but seldom change."""
 
     points: _Gathered | None = None
 
@@ -127,7 +127,7 @@ def _gather(engine: Engine, surfaces: tuple[SurfacePoints, ...]) -> _Gathered:
 
 
 def place_points(engine: Engine, objects: Sequence[Placed]) -> PlacedPoints:
-    """The points of `objects`, each with its `volume_from_model`, where they are now."""
+    """The points of `objects`, each with its `volume_from_model`, in volume space."""
     buffers, every = engine.buffers(_Buffers), _gather(engine, tuple(thing.surface_points for thing, _ in objects))
     volume_from_model = np.array([matrix for _, matrix in objects])
     volume_from_grid = volume_from_model @ np.linalg.inv(np.array([thing.grid.grid_from_model for thing, _ in objects]))
@@ -157,6 +157,6 @@ def place_points(engine: Engine, objects: Sequence[Placed]) -> PlacedPoints:
 
 
 def _turned(matrices: Floats, owners: NDArray[np.int64], vectors: Floats) -> Floats:
-    """[n, 3] each of `vectors` by its owner's matrix [objects, 3, 3]."""
+    """[n, 3] each of `vectors` multiplied by its owner's matrix [objects, 3, 3]."""
     turned: Floats = np.einsum("nij,nj->ni", matrices[owners], vectors)
     return turned

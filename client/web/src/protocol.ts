@@ -304,7 +304,7 @@ export interface LeftOut {
 
 /** How a frame was sampled, and why. */
 export interface OperatingPoint {
-  /** As the command line's options. */
+  /** The settings, written as options of the command line. */
   settings: string;
   reason: string;
   /** Expected time of a frame; like the next field, only for points that the server chose. */

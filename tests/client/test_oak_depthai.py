@@ -23,6 +23,7 @@ from client.laptop.oak_pose import FLU_FROM_CAMERA, UP  # noqa: E402
 from tests.absent import NO_HARDWARE  # noqa: E402
 
 FPS = 30.0
+PATIENCE_S = 60.0
 LENS = np.array([[60.0, 0, 31.0], [0, 61.0, 23.0], [0, 0, 1]])
 LEFT_FROM_COLOR = np.array([[1.0, 0, 0, -0.0375], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 
@@ -55,6 +56,7 @@ class Player(dai.node.ThreadedHostNode):
         super().__init__()
         self.color, self.depth, self.pose, self.pose_image = (self.createOutput() for _ in range(4))
         self.last = 10**6
+        self.sent = 0
         self.lost: range = range(0)
 
     def run(self) -> None:
@@ -69,6 +71,7 @@ class Player(dai.node.ThreadedHostNode):
                     self.pose.send(self._transform(late[0]))
                     self.pose_image.send(late[1])
                 late = number, left
+                self.sent = number + 1
                 time.sleep(0.005)
             self.stopPipeline()
 
@@ -99,12 +102,19 @@ class Rig:
 
     def __init__(self, with_pose: bool, **settings: object) -> None:
         self.pipeline = dai.Pipeline(createImplicitDevice=False)
-        player = self.pipeline.create(Player)
+        self.player = player = self.pipeline.create(Player)
         for name, value in settings.items():
             setattr(player, name, value)
         poses = (player.pose, player.pose_image) if with_pose else ()
         self.reader = FrameReader(self.pipeline, Outputs(player.color, player.depth, *poses), FPS, LEFT_FROM_COLOR)
         self.pipeline.start()
+
+    def wait_for_frames(self, count: int) -> None:
+        """Until the camera has sent so many more frames."""
+        until, until_s = self.player.sent + count, time.monotonic() + PATIENCE_S
+        while self.player.sent < until:
+            assert time.monotonic() < until_s
+            time.sleep(0.005)
 
 
 @pytest.fixture
@@ -121,7 +131,8 @@ def start():
 
 
 def test_frames_arrive_with_their_own_poses(start) -> None:
-    source = OakSource(start(True).reader, True, UP, lambda: None)
+    rig = start(True)
+    source = OakSource(rig.reader, True, UP, lambda: None)
     camera = source.camera
     assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (64, 48, 60, 61, 31, 23)
     seen = []
@@ -135,15 +146,17 @@ def test_frames_arrive_with_their_own_poses(start) -> None:
         np.testing.assert_array_equal(frame.depth, expected)
         np.testing.assert_allclose(frame.world_from_camera, world_from_left(number) @ LEFT_FROM_COLOR, atol=1e-5)
         assert frame.index == index
-        time.sleep(0.012 if index == 5 else 0)
+        if index == 5:
+            rig.wait_for_frames(2)
     assert seen == sorted(set(seen))
     assert source.missed >= seen[-1] - seen[0] - len(seen) + 1
 
 
 def test_a_slow_reader_gets_the_newest_frame(start) -> None:
-    source = OakSource(start(False).reader, False, None, lambda: None)
+    rig = start(False)
+    source = OakSource(rig.reader, False, None, lambda: None)
     first = source[0].timestamp_s
-    time.sleep(0.25)
+    rig.wait_for_frames(20)
     assert source[1].timestamp_s - first > 10 / FPS
     assert source.missed > 5
     assert source[2].world_from_camera is None

@@ -41,11 +41,26 @@ def newer_pictures(page: Page, count: int = 3) -> None:
     page.wait_for_function(f"first => ({caption})() >= first + {count}", arg=first)
 
 
-def wait_until(holds: Callable[[], bool]) -> None:
+def wait_until(holds: Callable[[], bool], page: Page | None = None) -> None:
+    """`page`: its events are handled meanwhile."""
     until_s = time.monotonic() + PATIENCE_MS / 1e3
     while not holds():
         assert time.monotonic() < until_s
-        time.sleep(0.02)
+        if page is None:
+            time.sleep(0.02)
+        else:
+            page.wait_for_timeout(20)
+
+
+def wait_for_drawing(page: Page, count: int = 10) -> None:
+    """Until the page has drawn so many times."""
+    page.evaluate(
+        """count => new Promise(done => {
+        const draw = () => count-- > 0 ? requestAnimationFrame(draw) : done();
+        draw();
+    })""",
+        count,
+    )
 
 
 def on_screen(page: Page, u: float, v: float) -> tuple[float, float]:

@@ -32,6 +32,7 @@ from tests.client.web.layer_drawing import (
     turning,
 )
 from tests.client.web.layer_figures import errors_of
+from tests.client.web.page import wait_for_drawing
 from tests.client.web.received import Received
 from tests.client.web.red_ball import turned
 
@@ -69,7 +70,7 @@ def play(open_page: OpenPage, server: BackgroundServer, path: Path) -> Page:
     page.locator("[name=recording]").set_input_files(path)
     page.locator("#start").click()
     wait_for_text(page, "#picture-caption", "Frame")
-    page.wait_for_timeout(500)  # until it is drawn
+    wait_for_drawing(page)
     return page
 
 

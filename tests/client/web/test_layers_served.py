@@ -15,6 +15,7 @@ from tests.client.web.constants import PICTURES
 from tests.client.web.displayed import display
 from tests.client.web.layer_figures import errors_of
 from tests.client.web.layer_session import Seen, begin, foot_of, guide_error_px, place_ball, show_ball, watched_server
+from tests.client.web.page import wait_until
 from tests.client.web.red_ball import TurningTable, is_red, silhouette
 from tests.client.web.sequence import of_device
 from tests.service.proxy import impaired
@@ -38,7 +39,8 @@ def test_a_ball_placed_by_touch_stays_where_it_stands_while_the_camera_turns(
         begin(page, "gr15fast")
         place_ball(page, source, seen)
         show_ball(page, source)
-        page.wait_for_timeout(1500)
+        drawn = len(seen.frames) + 10
+        wait_until(lambda: len(seen.frames) >= drawn, page)
         shown = display(page, 30)
         keep_picture(page, "layer_mode_served")
         guides_px = [guide_error_px(page, source, seen) for _ in range(8)]

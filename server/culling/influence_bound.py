@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.objects.rasterize import Placed
+from server.opencl.buffers import BufferDescription, KeyedBufferDescription, StageBuffers
 from server.opencl.engine import Engine, float4
 from server.shading.traced_scene import DeviceLight, ball_around, light_arguments
 from server.transfer.indirect import Indirect, no_hits
@@ -102,6 +103,17 @@ def bound_influence(
     return replace(found, change=np.inf) if is_dimmed > 0 else found
 
 
+class _Buffers(StageBuffers):
+    sample_bounds = KeyedBufferDescription(cl_types.float4)
+    """[rows, cols] bounds at every n-th sample, by n."""
+    balls = BufferDescription(cl_types.float4)
+    """[n] of balls_around."""
+    discs = BufferDescription(cl_types.float4)
+    """[n] direction and half angle (rad) of each disc of the light."""
+    greatest = BufferDescription(cl_types.float4)
+    """[h, chunks] the greatest bounds of a chunk of pixels."""
+
+
 def balls_around(objects: Sequence[Placed]) -> NDArray[np.float32]:
     """[n] float4: centre (volume space) and radius in metres of balls that hold what rays take the objects to be."""
     groups = [[item] for item in objects] if len(objects) <= MOST_BALLS else [objects]
@@ -129,9 +141,9 @@ def _bound_samples(
     every: int,
 ) -> cl_array.Array:
     """[rows, cols] float4, see influence_bound.cl."""
-    space = engine.workspace
+    buffers = engine.buffers(_Buffers)
     cols, rows = -(-transfer.cols // every), -(-transfer.rows // every)
-    bounds = space.array(f"reach_bounds_{every}", (rows, cols), cl_types.float4)
+    bounds = buffers.sample_bounds[every].array((rows, cols))
     engine.launch(
         engine.kernel("influence_bound.cl", "bound_samples", **_defines(engine, light, transfer)),
         (cols, rows),
@@ -141,7 +153,7 @@ def _bound_samples(
         indirect.hits if indirect else no_hits(engine, transfer),
         *light_arguments(engine, light, rays, reach_m),
         len(balls),
-        space.upload("reach_balls", balls) if len(balls) else space.array("unused", (1,), cl_types.float4),
+        buffers.balls.upload(balls) if len(balls) else engine.unused,
         float4(*most.objects, 0.0),
         float4(*most.real, 0.0),
         every,
@@ -165,9 +177,9 @@ def _bound_pixels(
     upsampling: Upsampling,
 ) -> NDArray[np.float32]:
     """[4] the greatest of all pixels, see influence_bound.cl."""
-    space, chunks = engine.workspace, -(-camera.width // _CHUNK)
+    buffers, chunks = engine.buffers(_Buffers), -(-camera.width // _CHUNK)
     table = np.array([(*disc.direction, disc.half_angle_rad) for disc in light.discs] or [(0, 0, 1, 0)], np.float32)
-    most = space.array("reach_most", (camera.height, chunks), cl_types.float4)
+    most = buffers.greatest.array((camera.height, chunks))
     defines = _defines(engine, light, transfer) | ({"BICUBIC": 1} if upsampling == "bicubic" else {})
     engine.launch(
         engine.kernel("influence_bound.cl", "bound_pixels", **defines),
@@ -180,9 +192,9 @@ def _bound_pixels(
         bounds,
         volume.voxel_m,
         len(light.discs),
-        space.upload("reach_discs", table.view(cl_types.float4)[:, 0]),
+        buffers.discs.upload(table.view(cl_types.float4)[:, 0]),
         len(balls),
-        space.upload("reach_balls", balls),
+        buffers.balls.upload(balls),
         most,
     )
     return np.asarray(engine.download(most).view(np.float32).reshape(-1, 4).max(axis=0, initial=0.0))

@@ -12,6 +12,7 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from server.objects.virtual_object import VirtualObject
+from server.opencl.buffers import BufferDescription, DeviceBuffer, StageBuffers
 from server.opencl.engine import Engine
 from server.opencl.transfer import copy_into
 from server.scene.mipmaps import CHANNEL_VALUES
@@ -45,6 +46,20 @@ class Arena:
     """[512] float32: linear value of a texel's byte."""
 
 
+class _Buffers(StageBuffers):
+    """Device buffers of the joined arrays, with the names of `Arena`."""
+
+    vertices = BufferDescription(np.float32)
+    triangles = BufferDescription(np.int32)
+    attributes = BufferDescription(np.float32)
+    material_of = BufferDescription(np.int32)
+    materials = BufferDescription(cl_types.float4)
+    textures = BufferDescription(cl_types.int4)
+    levels = BufferDescription(cl_types.int4)
+    texels = BufferDescription(np.uint8)
+    channel_values = BufferDescription(np.float32)
+
+
 class _LastArena:
     """The arena of an engine's frame before."""
 
@@ -65,9 +80,8 @@ def gather(engine: Engine, things: Sequence[VirtualObject]) -> Arena:
 
 
 def _is_valid(engine: Engine, arena: Arena) -> bool:
-    """Whether the engine's workspace still holds what the arena points to."""
-    values = arena.channel_values
-    return engine.workspace.constant("channel_values", CHANNEL_VALUES) is values
+    """Whether the arena's buffers have not been released since."""
+    return engine.buffers(_Buffers).channel_values.constant(CHANNEL_VALUES) is arena.channel_values
 
 
 def _gathered(engine: Engine, things: tuple[VirtualObject, ...]) -> Arena:
@@ -76,29 +90,27 @@ def _gathered(engine: Engine, things: tuple[VirtualObject, ...]) -> Arena:
     )
     firsts = np.cumsum(np.vstack([np.zeros((1, 3), np.int64), sizes]), axis=0)[:-1].astype(np.int32)
     materials, textures, levels = _joined_tables(things)
-    space = engine.workspace
+    buffers = engine.buffers(_Buffers)
     return Arena(
         things,
         firsts,
-        _joined(engine, "arena_vertices", [t.vertices for t in things], (3,), np.float32),
-        _joined(engine, "arena_triangles", [t.triangles for t in things], (3,), np.int32),
-        _joined(engine, "arena_attributes", [t.attributes for t in things], (12,), np.float32),
-        _joined(engine, "arena_material_of", [t.material_of for t in things], (), np.int32),
-        space.upload("arena_materials", materials.view(cl_types.float4)[:, 0]),
-        space.upload("arena_textures", textures.view(cl_types.int4)[:, 0]),
-        space.upload("arena_levels", levels.view(cl_types.int4)[:, 0]),
-        _joined(engine, "arena_texels", [t.texels for t in things], (4,), np.uint8),
-        space.constant("channel_values", CHANNEL_VALUES),
+        _joined(engine, buffers.vertices, [t.vertices for t in things], (3,)),
+        _joined(engine, buffers.triangles, [t.triangles for t in things], (3,)),
+        _joined(engine, buffers.attributes, [t.attributes for t in things], (12,)),
+        _joined(engine, buffers.material_of, [t.material_of for t in things], ()),
+        buffers.materials.upload(materials.view(cl_types.float4)[:, 0]),
+        buffers.textures.upload(textures.view(cl_types.int4)[:, 0]),
+        buffers.levels.upload(levels.view(cl_types.int4)[:, 0]),
+        _joined(engine, buffers.texels, [t.texels for t in things], (4,)),
+        buffers.channel_values.constant(CHANNEL_VALUES),
     )
 
 
-def _joined(
-    engine: Engine, name: str, parts: list[cl_array.Array], tail: tuple[int, ...], dtype: type
-) -> cl_array.Array:
+def _joined(engine: Engine, buffer: DeviceBuffer, parts: list[cl_array.Array], tail: tuple[int, ...]) -> cl_array.Array:
     """`parts` one after the other along their first axis."""
     if len(parts) == 1:
         return parts[0]
-    whole = engine.workspace.array(name, (max(sum(map(len, parts)), 1), *tail), dtype)
+    whole = buffer.array((max(sum(map(len, parts)), 1), *tail))
     start = 0
     for part in parts:
         copy_into(engine.queue, whole, start, part)

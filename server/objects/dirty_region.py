@@ -9,36 +9,31 @@ from functools import reduce
 import pyopencl.array as cl_array
 
 from server.objects.pixel_boxes import PixelBox
-from server.opencl.engine import Engine
 
 EMPTY: PixelBox = (0, 0, 0, 0)
 
 
-class _DirtyRegions:
-    """By the name of each picture of an engine: its array, and the box outside of which it is one value."""
+class DirtyRegion:
+    """The box of an array outside of which it is constant. Belongs to whoever owns the array's buffer."""
 
     def __init__(self) -> None:
-        self.boxes: dict[str, tuple[cl_array.Array, PixelBox]] = {}
+        self._array: cl_array.Array | None = None
+        self._box = EMPTY
 
+    @contextmanager
+    def redraw(self, array: cl_array.Array, box: PixelBox, whole: PixelBox) -> Iterator[PixelBox]:
+        """The box to write within the context so that `array` is constant outside of `box`: it includes the last box.
 
-@contextmanager
-def dirty_region(
-    engine: Engine, name: str, array: cl_array.Array, box: PixelBox, whole: PixelBox
-) -> Iterator[PixelBox]:
-    """The box to write so that only `box` of `array` differs from the value outside: that box and the one before it.
-
-    name: of the workspace's array. whole: all of it, for its first time. Boxes are half-open, in whatever unit.
-    """
-    held = engine.state(_DirtyRegions).boxes
-    before = held.get(name)
-    region = union(before[1], box) if before is not None and before[0] is array else whole
-    held[name] = (array, region)  # so much may differ where this frame fails
-    yield region
-    held[name] = (array, box)
+        whole: the box of the whole array, which is written the first time. Boxes are half-open, in any unit.
+        """
+        region = union(self._box, box) if self._array is array else whole
+        self._array, self._box = array, region  # this much may differ if this frame fails
+        yield region
+        self._box = box
 
 
 def box_around(boxes: Sequence[PixelBox | None]) -> PixelBox:
-    """The box around all that there are."""
+    """The box around all boxes; EMPTY without any."""
     return reduce(union, (box for box in boxes if box is not None), EMPTY)
 
 

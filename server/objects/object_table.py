@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from server.objects.object_tree import FEW_OBJECTS, grid_boxes, tree_rows
 from server.objects.virtual_object import VirtualObject
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.opencl.parts import Parts
 from server.opencl.transfer import copy_into
@@ -20,9 +21,16 @@ from server.opencl.transfer import copy_into
 Matrix = NDArray[np.float64]
 
 
+class _Buffers(StageBuffers):
+    rows = BufferDescription(np.uint8)
+    """ObjectTable.rows."""
+    distances = BufferDescription(np.float32)
+    """ObjectTable.distances of several meshes."""
+
+
 @dataclass(frozen=True)
 class ObjectTable:
-    """What `trace_objects` of virtual_objects.clh takes; arrays of the engine's workspace, valid until the next one."""
+    """What `trace_objects` of virtual_objects.clh takes. The arrays are valid until the next table."""
 
     count: int
     rows: Parts
@@ -48,7 +56,7 @@ def object_table(engine: Engine, objects: Sequence[tuple[VirtualObject, Matrix]]
 
     A mesh that is placed several times is kept once; distances are copied only when the set of meshes changes.
     """
-    space, count = engine.workspace, len(objects)
+    count = len(objects)
     grids = [thing.grid for thing, _ in objects]
     pool, starts = _gather_distances(engine, [grid.distance for grid in grids])
     dims = np.array([(*grid.dims, starts[id(grid.distance)]) for grid in grids] or [(0, 0, 0, 0)], np.int32)
@@ -60,8 +68,7 @@ def object_table(engine: Engine, objects: Sequence[tuple[VirtualObject, Matrix]]
     table = np.concatenate(rows if count else [np.zeros((1, 16))]).astype(np.float32)
     return ObjectTable(
         count=count,
-        rows=space.upload_parts(
-            "object_table",
+        rows=engine.buffers(_Buffers).rows.upload_parts(
             {"grid_from_volume": table.view(cl_types.float16)[:, 0], "dims": dims.view(cl_types.int4)[:, 0]},
         ),
         distances=pool,
@@ -85,8 +92,8 @@ def _gather_distances(engine: Engine, grids: list[cl_array.Array]) -> tuple[cl_a
     total = sum(grid.size for grid in unique)
     if total >= 1 << 31:
         raise ValueError(f"the objects' distance grids have {total} cells, more than 2^31: place fewer objects")
-    pooled, before = engine.state(_PooledGrids), engine.workspace.find("object_distances")
-    pool = engine.workspace.array("object_distances", (max(total, 1),), np.float32)
+    pooled, buffer = engine.state(_PooledGrids), engine.buffers(_Buffers).distances
+    before, pool = buffer.current, buffer.array((max(total, 1),))
     if pool is not before or [*map(id, pooled.grids)] != [*map(id, unique)]:
         for grid in unique:
             copy_into(engine.queue, pool, 4 * starts[id(grid)], grid)

@@ -16,12 +16,22 @@ from server.objects.dirty_region import box_around
 from server.objects.pinhole import Pinhole
 from server.objects.pixel_boxes import PixelBox
 from server.objects.virtual_object import VirtualObject
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, int2
 
 TILE = 8
 CHUNK = 128
 
 Matrix = NDArray[np.float64]
+
+
+class TableBuffers(StageBuffers):
+    """Device buffers of one picture's tables, with the names of `Picture`."""
+
+    objects = BufferDescription(cl_types.int8)
+    matrices = BufferDescription(cl_types.float16)
+    vertex_chunks = BufferDescription(cl_types.int2)
+    triangle_chunks = BufferDescription(cl_types.int2)
 
 
 @dataclass(frozen=True)
@@ -62,13 +72,12 @@ def tabulate(
     camera_from_volume: Matrix,
     objects: Sequence[tuple[VirtualObject, Matrix]],
     boxes: tuple[PixelBox | None, ...],
-    name: str,
+    buffers: TableBuffers,
 ) -> Picture:
-    """The tables of `objects`, each with its `volume_from_model`; those without a box are not drawn. name: of the
-    workspace's arrays."""
+    """The tables of `objects`, each with its `volume_from_model`; those without a box are not drawn."""
     things = [thing for thing, _ in objects]
     volume_from_model = np.array([matrix for _, matrix in objects], np.float64).reshape(-1, 4, 4)
-    arena, space = gather(engine, things), engine.workspace
+    arena = gather(engine, things)
     slot = {id(thing): k for k, thing in enumerate(arena.things)}
     rows = np.zeros((max(len(things), 1), 8), np.int32)
     in_view = np.array([box is not None for box in boxes], bool)
@@ -80,10 +89,10 @@ def tabulate(
     return Picture(
         camera,
         arena,
-        space.upload(f"{name}_objects", rows.view(cl_types.int8)[:, 0]),
-        space.upload(f"{name}_matrices", _matrices(camera, camera_from_volume, volume_from_model)),
-        space.upload(f"{name}_vertex_chunks", _chunks(sizes[:, 0])),
-        space.upload(f"{name}_triangle_chunks", _chunks(sizes[:, 1])),
+        buffers.objects.upload(rows.view(cl_types.int8)[:, 0]),
+        buffers.matrices.upload(_matrices(camera, camera_from_volume, volume_from_model)),
+        buffers.vertex_chunks.upload(_chunks(sizes[:, 0])),
+        buffers.triangle_chunks.upload(_chunks(sizes[:, 1])),
         len(things),
         int(sizes[:, 0].sum()),
         int(sizes[:, 1].sum()),

@@ -17,11 +17,12 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.objects.dirty_region import dirty_region, is_empty
+from server.objects.dirty_region import DirtyRegion, is_empty
 from server.objects.pinhole import Pinhole, finer
 from server.objects.pixel_boxes import NEAR_M, PixelBox, pixel_boxes
-from server.objects.raster_tables import CHUNK, TILE, Picture, tabulate
+from server.objects.raster_tables import CHUNK, TILE, Picture, TableBuffers, tabulate
 from server.objects.virtual_object import VirtualObject
+from server.opencl.buffers import BufferDescription, BufferGroup, StageBuffers, Workspace
 from server.opencl.engine import Engine, int2, int4
 from server.opencl.structs import SURFACE_PARAMETERS
 
@@ -54,9 +55,56 @@ Matrix = NDArray[np.float64]
 Placed = tuple[VirtualObject, Matrix]
 
 
+class RasterBuffers(StageBuffers):
+    """Device buffers of one picture's tables and lists."""
+
+    tables = BufferGroup(TableBuffers)
+    projected = BufferDescription(cl_types.int4)
+    """[vertices] on the screen."""
+    starts = BufferDescription(np.int32)
+    counts = BufferDescription(np.int32)
+    """[tiles and a few] where each tile's entries begin, and how many it has."""
+    corners = BufferDescription(cl_types.int8)
+    inverse_depths = BufferDescription(cl_types.float4)
+    """[pieces] of triangles."""
+    entries = BufferDescription(np.int32)
+    """[entries] pieces sorted by tile."""
+    fragments = BufferDescription(cl_types.int4)
+    """[fragments] of triangles smaller than a few pixels."""
+    nearest = BufferDescription(np.uint32)
+    """[h, w] bits of the nearest 1 / depth (1/metre)."""
+    visible = BufferDescription(np.int32)
+    """[h, w] index of the triangle that is seen."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace)
+        self.drawn: DirtyRegion = DirtyRegion()
+        """Of `nearest`."""
+
+
+class VirtualSurfaceBuffers(StageBuffers):
+    """Device buffers of a `VirtualSurface`, with its names."""
+
+    position = BufferDescription(cl_types.float4)
+    normal = BufferDescription(cl_types.float4)
+    base_color = BufferDescription(cl_types.float4)
+    material = BufferDescription(cl_types.float4)
+    object_index = BufferDescription(np.int32)
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace)
+        self.drawn: DirtyRegion = DirtyRegion()
+
+
+class _Buffers(StageBuffers):
+    lists = BufferGroup(RasterBuffers)
+    fine_lists = BufferGroup(RasterBuffers)
+    """Of nearest_depths."""
+
+
 @dataclass(frozen=True)
 class VirtualSurface:
-    """What the virtual objects show to one camera; arrays of the workspace, valid until the next call of that name."""
+    """The virtual objects as one camera sees them. The arrays are valid until the next call with the same buffers."""
 
     position: cl_array.Array
     """[h, w] float4: volume space metres (world axes, origin at the volume's), w = 1; all 0 where there is none."""
@@ -92,17 +140,19 @@ def rasterize(
     camera: CameraModel,
     camera_from_volume: Matrix,
     objects: Sequence[Placed],
-    name: str = "virtual",
+    buffers: VirtualSurfaceBuffers | None = None,
 ) -> VirtualSurface:
     """Draw `objects`, each with its `volume_from_model`, as a pinhole camera sees them (its distortion is ignored).
 
-    `camera_from_volume` [4, 4] float64, rigid: camera axes x right, y down, z forward. `name` tells the workspace's
-    arrays of one view from those of another. Waits for the device once.
+    `camera_from_volume` [4, 4] float64, rigid: camera axes x right, y down, z forward. buffers: of the result;
+    None: the engine's. Waits for the device once.
     """
     boxes = boxes_in_view(camera, camera_from_volume, objects)
-    picture = tabulate(engine, camera, camera_from_volume, objects, boxes, "raster")
-    _, visible = _draw(engine, picture, "raster")
-    object_index, position, normal, base_color, material = _shade(engine, picture, visible, name)
+    lists = engine.buffers(_Buffers).lists
+    picture = tabulate(engine, camera, camera_from_volume, objects, boxes, lists.tables)
+    _, visible = _draw(engine, picture, lists)
+    buffers = buffers or engine.buffers(VirtualSurfaceBuffers)
+    object_index, position, normal, base_color, material = _shade(engine, picture, visible, buffers)
     return VirtualSurface(position, normal, base_color, object_index, boxes, material)
 
 
@@ -111,18 +161,24 @@ def nearest_depths(
 ) -> cl_array.Array:
     """[SUBPIXELS h, SUBPIXELS w] uint32: bits of 1 / depth (1/metre) of the nearest object at the middles of the parts
     of each pixel, 0 where there is none."""
-    return drawn_depths(engine, finer(camera, SUBPIXELS), camera_from_volume, objects, "fine")
+    return drawn_depths(
+        engine, finer(camera, SUBPIXELS), camera_from_volume, objects, engine.buffers(_Buffers).fine_lists
+    )
 
 
 def drawn_depths(
-    engine: Engine, camera: CameraModel | Pinhole, camera_from_volume: Matrix, objects: Sequence[Placed], name: str
+    engine: Engine,
+    camera: CameraModel | Pinhole,
+    camera_from_volume: Matrix,
+    objects: Sequence[Placed],
+    buffers: RasterBuffers,
 ) -> cl_array.Array:
     """[h, w] uint32: bits of 1 / depth (1/metre) of the nearest object at the pixels' middles, 0 where there is none.
 
-    The array is valid until the next call with that `name`.
+    The array is valid until the next call with the same `buffers`.
     """
     boxes = boxes_in_view(camera, camera_from_volume, objects)
-    return _draw(engine, tabulate(engine, camera, camera_from_volume, objects, boxes, name), name)[0]
+    return _draw(engine, tabulate(engine, camera, camera_from_volume, objects, boxes, buffers.tables), buffers)[0]
 
 
 def boxes_in_view(
@@ -142,45 +198,44 @@ def _power_of_two(count: int) -> int:
     return 1 << max(count - 1, 0).bit_length()
 
 
-def _draw(engine: Engine, picture: Picture, name: str) -> tuple[cl_array.Array, cl_array.Array]:
-    """[h, w] bits of the nearest 1 / depth; [h, w] the triangle that has it, in the tiles of `picture.region` only.
-
-    name: of the arrays.
-    """
-    nearest = engine.workspace.array(f"{name}_nearest", (picture.camera.height, picture.camera.width), np.uint32)
-    with dirty_region(engine, f"{name}_nearest", nearest, picture.region, picture.all_tiles) as tiles:
-        lists = _make_lists(engine, picture, name, nearest, tiles)
-        return nearest, _raster(engine, picture, lists, name)
+def _draw(engine: Engine, picture: Picture, buffers: RasterBuffers) -> tuple[cl_array.Array, cl_array.Array]:
+    """[h, w] bits of the nearest 1 / depth; [h, w] the triangle that has it, in the tiles of `picture.region` only."""
+    nearest = buffers.nearest.array((picture.camera.height, picture.camera.width))
+    with buffers.drawn.redraw(nearest, picture.region, picture.all_tiles) as tiles:
+        lists = _make_lists(engine, picture, buffers, nearest, tiles)
+        return nearest, _raster(engine, picture, lists, buffers)
 
 
-def _make_lists(engine: Engine, picture: Picture, name: str, nearest: cl_array.Array, cleared: PixelBox) -> _Lists:
+def _make_lists(
+    engine: Engine, picture: Picture, buffers: RasterBuffers, nearest: cl_array.Array, cleared: PixelBox
+) -> _Lists:
     """Project, clip and sort; what is too small is made larger, so nothing is lost. cleared: tiles of `nearest`."""
-    space, tiles, shape = engine.workspace, picture.tiles, (picture.camera.height, picture.camera.width)
-    projected = _project(engine, picture)
-    starts = space.array(f"{name}_starts", (tiles + 3,), np.int32)
-    counts = space.array(f"{name}_counts", (2 + tiles,), np.int32)
+    tiles, shape = picture.tiles, (picture.camera.height, picture.camera.width)
+    projected = _project(engine, picture, buffers)
+    starts = buffers.starts.array((tiles + 3,))
+    counts = buffers.counts.array((2 + tiles,))
     pixels = shape[0] * shape[1]
     fragment_room = min(_FRAGMENTS_PER_TRIANGLE * picture.triangles, _FRAGMENTS_PER_PIXEL * pixels)
-    fragments = space.array(f"{name}_fragments", (_power_of_two(max(fragment_room, 1)),), cl_types.int4)
+    fragments = buffers.fragments.array((_power_of_two(max(fragment_room, 1)),))
     room, pieces = 0, min(picture.triangles, _PIECES_PER_PIXEL * pixels) + _LEAST_ROOM
     while pieces > room:
         room = _power_of_two(pieces)
-        corners = space.array(f"{name}_corners", (room,), cl_types.int8)
-        inverse_depths = space.array(f"{name}_inverse_depths", (room,), cl_types.float4)
+        corners = buffers.corners.array((room,))
+        inverse_depths = buffers.inverse_depths.array((room,))
         _clear(engine, picture, counts, nearest, cleared)
         _setup(engine, picture, projected, counts, corners, inverse_depths, nearest, fragments)
         scan = _kernel(engine, "scan_tiles")
         engine.launch(scan, (_SCAN_ITEMS,), tiles, _MOST_ENTRIES // tiles, counts, starts, local=(_SCAN_ITEMS,))
         total, pieces, fragment_count = (int(value) for value in engine.download(starts[tiles:]))
-    entries = space.array(f"{name}_entries", (_power_of_two(max(total, _LEAST_ENTRIES)),), np.int32)
+    entries = buffers.entries.array((_power_of_two(max(total, _LEAST_ENTRIES)),))
     engine.launch(_kernel(engine, "fill_tiles"), (pieces,), pieces, picture.size, corners, starts, counts, entries)
     return _Lists(projected, corners, inverse_depths, starts, entries, nearest, fragments, fragment_count)
 
 
-def _project(engine: Engine, picture: Picture) -> cl_array.Array:
+def _project(engine: Engine, picture: Picture, buffers: RasterBuffers) -> cl_array.Array:
     """The vertices of the objects in view on the screen, [vertices] int4."""
     room = _power_of_two(max(picture.vertices, _LEAST_ROOM))
-    projected = engine.workspace.array("raster_projected", (room,), cl_types.int4)
+    projected = buffers.projected.array((room,))
     engine.launch(
         _kernel(engine, "project_vertices"),
         (len(picture.vertex_chunks) * CHUNK if picture.vertices else 0,),
@@ -233,10 +288,10 @@ def _setup(
     )
 
 
-def _raster(engine: Engine, picture: Picture, lists: _Lists, name: str) -> cl_array.Array:
+def _raster(engine: Engine, picture: Picture, lists: _Lists, buffers: RasterBuffers) -> cl_array.Array:
     """Number of the triangle that each pixel shows, [h, w] int32, 2^31 - 1 where there is none; in `region` only."""
     x0, y0, x1, y1 = picture.region
-    visible = engine.workspace.array(f"{name}_visible", lists.nearest.shape, np.int32)
+    visible = buffers.visible.array(lists.nearest.shape)
     engine.launch(
         _kernel(engine, "raster_tiles"),
         ((x1 - x0) * (y1 - y0) * TILE * TILE,),
@@ -269,13 +324,14 @@ def _raster(engine: Engine, picture: Picture, lists: _Lists, name: str) -> cl_ar
     return visible
 
 
-def _shade(engine: Engine, picture: Picture, visible: cl_array.Array, name: str) -> list[cl_array.Array]:
+def _shade(
+    engine: Engine, picture: Picture, visible: cl_array.Array, buffers: VirtualSurfaceBuffers
+) -> list[cl_array.Array]:
     """Index of each pixel's object [h, w] int32; position, normal, base colour and material, [h, w] float4."""
-    space, arena = engine.workspace, picture.arena
-    object_index = space.array(f"{name}_object_index", visible.shape, np.int32)
-    parts = ("position", "normal", "base_color", "material")
-    fields = [space.array(f"{name}_{part}", visible.shape, cl_types.float4) for part in parts]
-    with dirty_region(engine, f"{name}_object_index", object_index, picture.region, picture.all_tiles) as tiles:
+    arena, object_index = picture.arena, buffers.object_index.array(visible.shape)
+    described = (buffers.position, buffers.normal, buffers.base_color, buffers.material)
+    fields = [buffer.array(visible.shape) for buffer in described]
+    with buffers.drawn.redraw(object_index, picture.region, picture.all_tiles) as tiles:
         x0, y0 = TILE * tiles[0], TILE * tiles[1]
         x1, y1 = min(TILE * tiles[2], picture.camera.width), min(TILE * tiles[3], picture.camera.height)
         engine.launch(

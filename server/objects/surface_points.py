@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from server.maths.sh import spherical_fibonacci
 from server.objects.voxelize import DistanceGrid
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, int4
 from server.scene.coarse_colors import colors_at
 from server.scene.mesh import Mesh
@@ -23,6 +24,15 @@ SIDES = 6
 _LATTICE = 64
 
 Floats = NDArray[np.float64]
+
+
+class _Buffers(StageBuffers):
+    points = BufferDescription(cl_types.float4)
+    normals = BufferDescription(cl_types.float4)
+    directions = BufferDescription(cl_types.float4)
+    """[_LATTICE] unit."""
+    open_counts = BufferDescription(np.int32)
+    """[n] of _count_open."""
 
 
 @dataclass(frozen=True)
@@ -64,17 +74,17 @@ def deal_points(engine: Engine, mesh: Mesh, grid: DistanceGrid) -> SurfacePoints
 
 def _count_open(engine: Engine, points: Floats, normals: Floats, grid: DistanceGrid) -> NDArray[np.int32]:
     """[n] directions, out of a lattice, in which the object does not hide the outside from its own points."""
-    space, lattice = engine.workspace, spherical_fibonacci(_LATTICE)
-    found = space.array("glow_open", (len(points),), np.int32)
+    buffers, lattice = engine.buffers(_Buffers), spherical_fibonacci(_LATTICE)
+    found = buffers.open_counts.array((len(points),))
     kernel = engine.kernel("surface_points.cl", "count_open", LANES=engine.lanes)
     engine.launch(
         kernel,
         (len(points),),
         len(points),
-        space.upload("glow_tested", float4_rows(points)),
-        space.upload("glow_tested_normals", float4_rows(normals)),
+        buffers.points.upload(float4_rows(points)),
+        buffers.normals.upload(float4_rows(normals)),
         _LATTICE,
-        space.constant("glow_lattice", float4_rows(lattice)),
+        buffers.directions.constant(float4_rows(lattice)),
         int4(*grid.dims, 0),
         grid.distance,
         found,

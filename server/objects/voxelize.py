@@ -9,6 +9,7 @@ import pyopencl as cl
 import pyopencl.array as cl_array
 from numpy.typing import NDArray
 
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, float16, int4
 
 MARGIN_CELLS = 2
@@ -21,6 +22,18 @@ _SLAB = 8
 
 Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]
+
+
+class VoxelizeBuffers(StageBuffers):
+    """Device buffers of voxelization, [z, y, x]."""
+
+    occupied = BufferDescription(np.int32)
+    """1 for cells that a triangle touches."""
+    near = BufferDescription(np.int32)
+    """Distance to the triangles near a cell, as the bits of a float."""
+    squared = BufferDescription(np.int32)
+    other_squared = BufferDescription(np.int32)
+    """Squared distances before and after each axis."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +67,8 @@ def voxelize(
     The distance array is the caller's to keep. Raises ValueError for a number of cells out of range.
     """
     dims, grid_from_model = place_grid(*bounds, cells)
-    space, shape = engine.workspace, dims[::-1]
-    occupied, near = (space.array(f"voxelize_{name}", shape, np.int32) for name in ("occupied", "near"))
+    buffers, shape = engine.buffers(VoxelizeBuffers), dims[::-1]
+    occupied, near = buffers.occupied.array(shape), buffers.near.array(shape)
     engine.launch(_kernel(engine, "clear_cells"), (occupied.size,), occupied.size, occupied, near)
     for name, cells_of in (("mark_cells", occupied), ("measure_near", near)):
         engine.launch(
@@ -99,10 +112,10 @@ def place_grid(low: Vector, high: Vector, cells: int) -> tuple[tuple[int, int, i
 def squared_distance(engine: Engine, occupied: cl_array.Array) -> cl_array.Array:
     """Squared cells from each cell to the nearest that is occupied (not 0), [z, y, x] int32; 2^28 where none is.
 
-    Exact, axis by axis (Felzenszwalb and Huttenlocher). The array is the workspace's, valid until the next call.
+    Exact, axis by axis (Felzenszwalb and Huttenlocher). The array is valid until the next call.
     """
-    space, (z, y, x), cells = engine.workspace, occupied.shape, occupied.size
-    one, other = (space.array(f"voxelize_squared_{k}", occupied.shape, np.int32) for k in (0, 1))
+    buffers, (z, y, x), cells = engine.buffers(VoxelizeBuffers), occupied.shape, occupied.size
+    one, other = buffers.squared.array(occupied.shape), buffers.other_squared.array(occupied.shape)
     spread = _kernel(engine, "spread_distance")
     engine.launch(_kernel(engine, "seed_distance"), (y * z,), int4(x, y, z, 0), occupied, one)
     engine.launch(spread, (cells,), cells, y, x, one, other)

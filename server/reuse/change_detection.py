@@ -66,7 +66,7 @@ class ChangeDetection:
         self._camera = camera
         self._unit = 257.0 if camera.color_encoding == "linear16" else 1.0
         self._poses_are_given = poses_are_given
-        self._color, self._depth = MeanPicture(engine, "still_color"), MeanPicture(engine, "still_depth")
+        self._color, self._depth = MeanPicture(engine), MeanPicture(engine)
         self._noise: tuple[_Noise, _Noise] | None = None
         self._first: RgbdFrame | None = None
         self.count = 0

@@ -6,10 +6,11 @@ One cache for a session. A value is stored under the version of what it was made
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import pyopencl.array as cl_array
 
+from server.opencl.buffers import DeviceBuffer
 from server.opencl.engine import Engine
 from server.opencl.transfer import copy_into
 
@@ -36,6 +37,7 @@ class FrameCache:
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
+        self._buffers: dict[tuple[object, ...], DeviceBuffer] = {}
         self._kept: dict[tuple[type, int], tuple[Version, object]] = {}
 
     def find(self, kind: type[T], version: Version) -> T | None:
@@ -48,23 +50,25 @@ class FrameCache:
 
         `lasting`: names of fields, at any depth, that later frames of this version do not write: they need no copy.
         """
-        kept = copied(self._engine, value, f"cached_{type(value).__name__}_{version.slot}", lasting)
+        kept: T = self._copied(value, (type(value), version.slot), lasting)
         self._kept[type(value), version.slot] = version, kept
         return kept
 
+    def _copied(self, value: Any, path: tuple[object, ...], lasting: frozenset[str] = frozenset()) -> Any:
+        """`value` with a copy of every device array in it, in its fields and in theirs.
 
-def copied(engine: Engine, value: T, name: str, lasting: frozenset[str] = frozenset()) -> T:
-    """`value` with every device array of it, of its fields and of theirs, in an array of its own under `name`.
-
-    lasting: names of fields that are not copied.
-    """
-    if isinstance(value, cl_array.Array):
-        copy = engine.workspace.array(name, value.shape, value.dtype)
-        copy_into(engine.queue, copy, 0, value)
-        return copy  # type: ignore[return-value]
-    if isinstance(value, tuple):
-        return tuple(copied(engine, item, f"{name}_{i}") for i, item in enumerate(value))  # type: ignore[return-value]
-    if is_dataclass(value) and not isinstance(value, type):
-        names = [field.name for field in fields(value) if field.name not in lasting]
-        return replace(value, **{n: copied(engine, getattr(value, n), f"{name}_{n}", lasting) for n in names})
-    return value
+        path: of the value within what is kept. lasting: names of fields that are not copied.
+        """
+        if isinstance(value, cl_array.Array):
+            key = (*path, value.dtype)
+            if key not in self._buffers:
+                self._buffers[key] = DeviceBuffer(self._engine.workspace, value.dtype)
+            copy = self._buffers[key].array(value.shape)
+            copy_into(self._engine.queue, copy, 0, value)
+            return copy
+        if isinstance(value, tuple):
+            return tuple(self._copied(item, (*path, i)) for i, item in enumerate(value))
+        if is_dataclass(value) and not isinstance(value, type):
+            names = [field.name for field in fields(value) if field.name not in lasting]
+            return replace(value, **{n: self._copied(getattr(value, n), (*path, n), lasting) for n in names})
+        return value

@@ -9,6 +9,7 @@ import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.opencl.transfer import fill_bytes
 
@@ -34,13 +35,20 @@ class Differences:
     """Tiles in a row."""
 
 
+class _Buffers(StageBuffers):
+    codes = BufferDescription(np.uint8)
+    wide_codes = BufferDescription(np.uint16)
+    """The picture that is compared, of 8 or 16 bits."""
+    mean = BufferDescription(np.float32)
+    sums = BufferDescription(cl_types.float4)
+    """[tile rows, tile columns] sums of differences, of their squares, and counts."""
+
+
 class MeanPicture:
     """Running mean of pictures [h, w, 3], or of depth [h, w] in which 0 and 65535 are invalid; uint8 or uint16."""
 
-    def __init__(self, engine: Engine, name: str) -> None:
-        """`name`: prefix of its arrays in the workspace."""
-        self._engine = engine
-        self._name = name
+    def __init__(self, engine: Engine) -> None:
+        self._engine, self._buffers = engine, _Buffers(engine.workspace)
         self.frames = 0
 
     def forget(self) -> None:
@@ -49,13 +57,14 @@ class MeanPicture:
 
     def upload(self, codes: NDArray[np.uint8] | NDArray[np.uint16]) -> cl_array.Array:
         """The picture on the device."""
-        return self._engine.workspace.upload(f"{self._name}_codes", codes)
+        buffers = self._buffers
+        return (buffers.wide_codes if codes.dtype == np.uint16 else buffers.codes).upload(codes)
 
     def compare(self, codes: cl_array.Array) -> Differences:
         """Differences of an uploaded picture, of the same size as those before. Waits for the device."""
         engine, (height, width) = self._engine, codes.shape[:2]
         cols, rows = -(-width // TILE), -(-height // TILE)
-        sums = engine.workspace.array(f"{self._name}_sums", (rows, cols), cl_types.float4)
+        sums = self._buffers.sums.array((rows, cols))
         kernel = engine.kernel("frame_difference.cl", "compare_codes", **_defines(codes))
         engine.launch(kernel, (cols, rows), width, height, cols, rows, codes, self._mean(codes), sums)
         found = engine.download(sums).view(np.float32).reshape(-1, 4).astype(np.float64)
@@ -72,7 +81,7 @@ class MeanPicture:
         self._engine.launch(kernel, (codes.size,), codes.size, self.frames, codes, mean)
 
     def _mean(self, codes: cl_array.Array) -> cl_array.Array:
-        return self._engine.workspace.array(f"{self._name}_mean", codes.shape, np.float32)
+        return self._buffers.mean.array(codes.shape)
 
 
 def _defines(codes: cl_array.Array) -> dict[str, int]:

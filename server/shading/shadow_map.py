@@ -22,10 +22,10 @@ from protocol.frames import CameraModel
 from server.maths.direct_lights import DirectLight
 from server.maths.disc_places import disc_places, ray_places, search_places
 from server.maths.dominant import MOST_LIGHTS
-from server.objects.dirty_region import box_around, dirty_region
+from server.objects.dirty_region import DirtyRegion, box_around
 from server.objects.pinhole import Pinhole
-from server.objects.rasterize import Placed, VirtualSurface, drawn_depths
-from server.opencl.buffers import BufferDescription, StageBuffers
+from server.objects.rasterize import Placed, RasterBuffers, VirtualSurface, drawn_depths
+from server.opencl.buffers import BufferDescription, BufferGroup, StageBuffers, Workspace
 from server.opencl.engine import Engine, KernelArgument, float4, int4
 from server.opencl.program import Define
 from server.opencl.structs import DIRECT_PARAMETERS
@@ -75,6 +75,13 @@ class _Buffers(StageBuffers):
     """[rows, cols] R' / R and R under the whole light."""
     rest_ratio = BufferDescription(cl_types.float4)
     """[rows, cols] R' / R under the light without its discs."""
+    objects = BufferGroup(RasterBuffers)
+    """Of the picture of all maps."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace)
+        self.drawn: DirtyRegion = DirtyRegion()
+        """Of `virtual`."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +148,7 @@ def light_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, 
     shape = (camera.height // VIRTUAL_STRIDE, camera.width // VIRTUAL_STRIDE)
     parts = SampleGrid(VIRTUAL_STRIDE, buffers.virtual_parts.array(shape))
     _trace_discs(engine, camera, virtual.position, virtual.normal, parts, maps, is_virtual=True)
-    with dirty_region(engine, "direct_virtual", direct, box_around(virtual.boxes), (0, 0, *size)) as (x0, y0, x1, y1):
+    with buffers.drawn.redraw(direct, box_around(virtual.boxes), (0, 0, *size)) as (x0, y0, x1, y1):
         engine.launch(
             _kernel(engine, "light_virtual"),
             (-(-(x1 - x0) // engine.lanes), y1 - y0),
@@ -280,7 +287,7 @@ def _draw_objects(engine: Engine, axes: Floats, ball: Floats, objects: Sequence[
         camera_from_volume[:3, 3] = -rotation @ ball[:3] + [0.0, 0.0, distance_m]
         camera_from_volume[1] += light * MAP_SIDE / focal_px * camera_from_volume[2]
         drawn += [(thing, camera_from_volume @ volume_from_model) for thing, volume_from_model in objects]
-    nearest = drawn_depths(engine, camera, np.eye(4), drawn, "shadow_map")
+    nearest = drawn_depths(engine, camera, np.eye(4), drawn, engine.buffers(_Buffers).objects)
     size = (MAP_SIDE, len(axes) * MAP_SIDE)
     engine.launch(_kernel(engine, "begin_maps"), size, len(axes), distance_m, nearest, maps)
     for level in range(1, (MAP_SIDE // _COARSEST_SIDE).bit_length()):

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.maths.sh import GOLDEN_TURN, spherical_fibonacci
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, float4
 from server.transfer.radiance_transfer import Directions, first_set
 from server.volume.raycast import Surface
@@ -73,6 +74,22 @@ class AuxiliaryViews:
         return self.per_pixel * self.distance_m
 
 
+class _ViewBuffers(StageBuffers):
+    axes = BufferDescription(cl_types.float4)
+    """AuxiliaryViews.axes."""
+    depths = BufferDescription(np.float32)
+    """AuxiliaryViews.depths."""
+
+
+class _Buffers(StageBuffers):
+    due_views = BufferDescription(np.int32)
+    """[n] indices of the views that a frame redraws."""
+    view_of = BufferDescription(np.int32)
+    """[SETS, count] index of the view for each direction."""
+    lit = BufferDescription(np.uint32)
+    """[rows, cols, words] as look_into_views returns it."""
+
+
 class ViewsAround:
     """The views of one session and volume. Owned by one thread."""
 
@@ -80,7 +97,7 @@ class ViewsAround:
         """`per_frame`: views drawn anew each frame, in turn, after the first, and more while the volume grows; None
         draws all."""
         self.lattice = spherical_fibonacci(count)
-        self._engine = engine
+        self._engine, self._buffers = engine, _ViewBuffers(engine.workspace)
         scattered = np.argsort(np.arange(count) * GOLDEN_TURN % 1)
         self._order = np.append(scattered, count)  # views drawn together lie all around
         self._axes = np.zeros((count + 1, 3, 4), np.float32)
@@ -127,12 +144,11 @@ class ViewsAround:
         size_m = np.array(volume.bricks) * (BRICK * volume.voxel_m)
         has_light = bool(self._light.any())
         toward = np.concatenate([self.lattice, self._light[None]]) if has_light else self.lattice
-        space = self._engine.workspace
         return AuxiliaryViews(
             toward,
             has_light,
-            space.upload("view_axes", self._axes.view(cl_types.float4)[..., 0]),
-            space.array("view_depths", (len(self._axes), SIDE_PX, SIDE_PX), np.float32),
+            self._buffers.axes.upload(self._axes.view(cl_types.float4)[..., 0]),
+            self._buffers.depths.array((len(self._axes), SIDE_PX, SIDE_PX)),
             size_m / 2,
             DISTANCE * float(np.linalg.norm(size_m)) / 2,
             2 / (SIDE_PX * float(np.sqrt(DISTANCE**2 - 1))),
@@ -154,7 +170,7 @@ def draw_views(engine: Engine, volume: Volume, views: AuxiliaryViews, due: NDArr
         _kernel(engine, "draw_views", views, 1),
         (-(-views.side // engine.lanes), views.side, len(due)),
         len(due),
-        engine.workspace.upload("due_views", due),
+        engine.buffers(_Buffers).due_views.upload(due),
         *volume.arguments(),
         float4(*views.center, 0.0),
         views.distance_m,
@@ -183,7 +199,7 @@ def look_into_views(
     """
     rows, cols = normals.shape
     words = -(-rays.count // 32)
-    lit = engine.workspace.array("lit", (rows, cols, words), np.uint32)
+    lit = engine.buffers(_Buffers).lit.array((rows, cols, words))
     lane_cols = 4 if engine.lanes == 8 else 1
     block_cols, block_rows = -(-cols // (_SET_STEP * lane_cols)), -(-rows // (_SET_STEP * engine.lanes // lane_cols))
     engine.launch(
@@ -200,7 +216,7 @@ def look_into_views(
         rays.count,
         first_set(turn),
         rays.on_device(engine),
-        engine.workspace.upload("view_of", view_of),
+        engine.buffers(_Buffers).view_of.upload(view_of),
         views.axes,
         views.depths,
         float4(*views.center, 0.0),

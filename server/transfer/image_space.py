@@ -22,6 +22,7 @@ from server.input.measure import intrinsics
 from server.maths.rigid import inverse_rigid
 from server.maths.self_occlusion import occlusion_threshold
 from server.maths.sh import GOLDEN_TURN
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, float16
 from server.opencl.structs import VIEW_TRANSFER_PARAMETERS
 from server.transfer.auxiliary_views import VIEWS, AuxiliaryViews, ViewsAround, look_into_views
@@ -58,6 +59,17 @@ SLACK = 0.15
 two samples."""
 LIFT_VOXELS = 1.5
 """What stands less than this above a point's tangent plane is the point's own surface: voxels are taken whole."""
+
+
+class _Buffers(StageBuffers):
+    camera_depths = BufferDescription(np.float32)
+    """[h, w] as camera_depths returns it."""
+    any_unknown = BufferDescription(np.int32)
+    """[1] 1 if the sensor alone knows the depth of a pixel."""
+    sample_starts = BufferDescription(np.float32)
+    """[4, rays] first distances of near_distances."""
+    normals = BufferDescription(cl_types.float4)
+    """[rows, cols] as smooth_normals returns it."""
 
 
 class ImageSpaceTransfer:
@@ -161,7 +173,7 @@ def near_reach_m(views: AuxiliaryViews, reach_m: float) -> float:
 
 def depth_room(engine: Engine, camera: CameraModel) -> cl_array.Array:
     """[h, w] float32 that `camera_depths` fills."""
-    return engine.workspace.array("camera_depths", (camera.height, camera.width), np.float32)
+    return engine.buffers(_Buffers).camera_depths.array((camera.height, camera.width))
 
 
 def camera_depths(
@@ -170,7 +182,7 @@ def camera_depths(
     """[h, w] float32 metres along the optical axis of the geometry buffer, 0 = no surface or one guessed from its
     neighbours, negative where the sensor alone knows it; [1] int32: 1 if there is such a pixel."""
     depths = depth_room(engine, camera)
-    any_unknown = engine.workspace.array("any_unknown", (1,), np.int32)
+    any_unknown = engine.buffers(_Buffers).any_unknown.array((1,))
     any_unknown.fill(np.int32(0))
     engine.launch(
         engine.kernel("image_space.cl", "measure_depths", **defines),
@@ -234,7 +246,7 @@ def transfer_from_views(
         depths,
         rays.on_device(engine),
         rays.basis_on_device(engine),
-        engine.workspace.upload("sample_starts", starts),
+        engine.buffers(_Buffers).sample_starts.upload(starts),
         any_unknown,
         result.coefficients,
         result.openness,
@@ -249,7 +261,7 @@ def smooth_normals(
 ) -> cl_array.Array:
     """[rows, cols] float4: the normals that samples stand for, volume space, w: flatness; 0 without surface."""
     cols, rows = camera.width // stride, camera.height // stride
-    normals = engine.workspace.array("sample_normals", (rows, cols), cl_types.float4)
+    normals = engine.buffers(_Buffers).normals.array((rows, cols))
     engine.launch(
         engine.kernel("image_space.cl", "smooth_normals", **defines),
         (cols, rows),

@@ -13,6 +13,7 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.transfer.radiance_transfer import Directions, Transfer, own_sets
 from server.volume.raycast import Surface
@@ -22,6 +23,13 @@ EVERY = 4
 """Of how many hidden directions a sample follows one; its neighbours follow the others."""
 LEAST_COSINE = 0.05
 """Of directions that count, as in cell_transfer.cl."""
+
+
+class _Buffers(StageBuffers):
+    hits = BufferDescription(cl_types.float4)
+    """[rows, cols] as gather_hits returns it."""
+    no_hits = BufferDescription(cl_types.float4)
+    """[rows, cols] zeros."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +68,7 @@ def gather_hits(
 ) -> cl_array.Array:
     """[rows, cols] float4: over a sample's hidden directions that meet surface with a colour, the sum of cosine times
     radiance (rgb) and of cosine (w), both times `every`."""
-    hits = engine.workspace.array("hits", (transfer.rows, transfer.cols), cl_types.float4)
+    hits = engine.buffers(_Buffers).hits.array((transfer.rows, transfer.cols))
     words = transfer.free_mask.shape[2]
     defines = {"MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": transfer.interleave}
     engine.launch(
@@ -88,7 +96,7 @@ def gather_hits(
 
 def no_hits(engine: Engine, transfer: Transfer) -> cl_array.Array:
     """The same where indirect light is left out."""
-    return engine.workspace.constant("no_hits", np.zeros((transfer.rows, transfer.cols), cl_types.float4))
+    return engine.buffers(_Buffers).no_hits.constant(np.zeros((transfer.rows, transfer.cols), cl_types.float4))
 
 
 def mean_sent(engine: Engine, hits: cl_array.Array) -> NDArray[np.float64]:

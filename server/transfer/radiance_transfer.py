@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.maths.sh import GOLDEN_TURN, sh_basis, spherical_fibonacci
+from server.opencl.buffers import KeyedBufferDescription, StageBuffers
 from server.opencl.engine import Engine, KernelArgument
 from server.opencl.structs import GRID, TRANSFER_PARAMETERS
 from server.transfer.visibility_cache import NO_CACHES, VisibilityCaches, no_caches
@@ -36,6 +37,27 @@ _WHOLE_TURNS = {1: 10, 2: 29, 4: 44, 8: 83}
 _WINDOW = 1 / 160  # half the window that a sample's normal is the mean of, in picture widths
 
 
+class _DirectionBuffers(StageBuffers):
+    directions = KeyedBufferDescription(cl_types.float4)
+    """[SETS, count] by interleave and count."""
+    bases = KeyedBufferDescription(np.float32)
+    """[SETS, count, bands^2] by interleave, count and bands^2."""
+
+
+class TransferBuffers(StageBuffers):
+    """Device buffers of transfers, for each number (rows, cols) of samples."""
+
+    coefficients = KeyedBufferDescription(np.float32)
+    openness = KeyedBufferDescription(np.float32)
+    flatness = KeyedBufferDescription(np.float32)
+    free_mask = KeyedBufferDescription(np.uint32)
+    sets = KeyedBufferDescription(np.uint8)
+    own_sets = KeyedBufferDescription(np.uint8)
+    """[rows, cols, 1] of own_sets, by turn, rows and columns."""
+    chosen = KeyedBufferDescription(np.int32)
+    """[rows cols] indices of the samples that are traced, repeated to fill the array."""
+
+
 @dataclass(frozen=True)
 class Directions:
     """Directions that visibility is tested along, with their basis functions."""
@@ -55,12 +77,12 @@ class Directions:
     def on_device(self, engine: Engine) -> cl_array.Array:
         """[SETS, count] float4: `directions`."""
         values = self.directions.view(cl_types.float4)
-        return engine.workspace.constant(f"directions_{self.interleave}_{self.count}", values)
+        return engine.buffers(_DirectionBuffers).directions[self.interleave, self.count].constant(values)
 
     def basis_on_device(self, engine: Engine) -> cl_array.Array:
         """[SETS, count, bands^2] float32: `basis`."""
-        name = f"direction_basis_{self.interleave}_{self.count}_{self.basis.shape[2]}"
-        return engine.workspace.constant(name, self.basis)
+        key = (self.interleave, self.count, self.basis.shape[2])
+        return engine.buffers(_DirectionBuffers).bases[key].constant(self.basis)
 
 
 @cache
@@ -128,8 +150,8 @@ def transfer_radiance(
     `chosen` [k]: the only samples that are traced, row * cols + col; what the arrays hold of the others stays.
     """
     cols, rows = camera.width // stride, camera.height // stride
-    space = engine.workspace
-    sets = space.array(f"sets_{rows}x{cols}", (rows, cols, rays.interleave), np.uint8)
+    buffers = engine.buffers(TransferBuffers)
+    sets = buffers.sets[rows, cols].array((rows, cols, rays.interleave))
     result = room_for_transfer(engine, rows, cols, stride, rays, sets)
     words = result.free_mask.shape[2]
     defines = {"BANDS": result.bands, "MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": rays.interleave}
@@ -138,7 +160,7 @@ def transfer_radiance(
     only: tuple[KernelArgument, ...] = (state.bits,) if state else ()
     if chosen is not None:
         defines["IS_CHOSEN"] = 1
-        only = (*only, space.upload(f"chosen_{rows}x{cols}", np.resize(chosen, rows * cols)))
+        only = (*only, buffers.chosen[rows, cols].upload(np.resize(chosen, rows * cols)))
     engine.launch(
         engine.kernel("radiance_transfer.cl", "transfer_radiance", **defines),
         (cols, rows) if chosen is None else (len(chosen),),
@@ -174,16 +196,16 @@ def room_for_transfer(
     engine: Engine, rows: int, cols: int, stride: int, rays: Directions, sets: cl_array.Array
 ) -> Transfer:
     """The arrays of a transfer, their contents undefined, kept by their number of samples; `sets` as given."""
-    space, coefficients, size = engine.workspace, rays.basis.shape[2], f"{rows}x{cols}"
+    buffers, coefficients, size = engine.buffers(TransferBuffers), rays.basis.shape[2], (rows, cols)
     return Transfer(
         stride,
         rows,
         cols,
         round(coefficients**0.5),
-        space.array(f"transfer_{size}", (rows, cols, coefficients), np.float32),
-        space.array(f"openness_{size}", (rows, cols), np.float32),
-        space.array(f"flatness_{size}", (rows, cols), np.float32),
-        space.array(f"free_mask_{size}", (rows, cols, -(-rays.count // 32)), np.uint32),
+        buffers.coefficients[size].array((rows, cols, coefficients)),
+        buffers.openness[size].array(size),
+        buffers.flatness[size].array(size),
+        buffers.free_mask[size].array((rows, cols, -(-rays.count // 32))),
         sets,
     )
 
@@ -206,7 +228,8 @@ def first_set(turn: int) -> int:
 
 def own_sets(engine: Engine, rows: int, cols: int, turn: int = 0) -> cl_array.Array:
     """[rows, cols, 1] uint8: the set of each sample where nothing is taken from other frames (direction_sets.clh)."""
-    return engine.workspace.constant(f"own_sets_{turn % TURNS}_{rows}x{cols}", _sets_of(rows, cols, turn % TURNS))
+    kept = engine.buffers(TransferBuffers).own_sets[turn % TURNS, rows, cols]
+    return kept.constant(_sets_of(rows, cols, turn % TURNS))
 
 
 def sample_grid(camera: CameraModel, transfer: Transfer) -> np.void:

@@ -6,13 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyopencl.array as cl_array
-import pyopencl.cltypes as cl_types
 
 from protocol.frames import CameraModel
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.transfer.radiance_transfer import Directions
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
+
+
+class _Buffers(StageBuffers):
+    free = BufferDescription(np.uint32)
+    blocked = BufferDescription(np.uint32)
 
 
 @dataclass(frozen=True)
@@ -33,8 +38,8 @@ def trace_visibility(
     Sample i along an axis lies at pixel stride / 2 + i stride. The arrays are reused by the next call.
     """
     cols, rows, words = camera.width // stride, camera.height // stride, -(-rays.count // 32)
-    space = engine.workspace
-    result = Visibility(*(space.array(f"visibility_{name}", (rows, cols, words), np.uint32) for name in "fb"))
+    buffers, shape = engine.buffers(_Buffers), (rows, cols, words)
+    result = Visibility(buffers.free.array(shape), buffers.blocked.array(shape))
     engine.launch(
         engine.kernel("visibility.cl", "trace_visibility", MASK_WORDS=words, LANES=engine.lanes),
         (cols, rows),
@@ -46,7 +51,7 @@ def trace_visibility(
         surface.normals,
         *volume.arguments(),
         rays.count,
-        space.constant("directions", rays.directions.view(cl_types.float4)),
+        rays.on_device(engine),
         reach_m,
         result.free,
         result.blocked,

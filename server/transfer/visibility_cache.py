@@ -15,15 +15,27 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.input.measure import intrinsics
 from server.maths.rigid import inverse_rigid
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, KernelArgument
 from server.opencl.parts import Parts
+
+
+class _Buffers(StageBuffers):
+    cameras = BufferDescription(cl_types.float16)
+    """[k] camera_from_volume of each layer."""
+    surface = BufferDescription(np.uint8)
+    """Points and normals of all layers."""
+    traced = BufferDescription(np.uint16)
+    """[k, rows, cols] which directions a layer's sample traced."""
+    blocked = BufferDescription(np.uint32)
+    """[k, rows, cols, words] which of them met surface."""
 
 
 class VisibilityCaches:
     """The layers of one session's last frames, on the device."""
 
     def __init__(self, engine: Engine, interleave: int) -> None:
-        self._engine = engine
+        self._buffers = _Buffers(engine.workspace)
         self._interleave = interleave
         self._cameras = np.zeros((interleave, 4, 4), np.float32)
         self._asked: tuple[object, ...] = ()
@@ -69,23 +81,22 @@ class VisibilityCaches:
     def surface(self) -> Parts:
         """`points` and `normals` of all layers, [k, rows, cols] float4."""
         shape = ((self._interleave, *self._shape[:2]), cl_types.float4)
-        return self._engine.workspace.parts("cache_surface", {"points": shape, "normals": shape})
+        return self._buffers.surface.parts({"points": shape, "normals": shape})
 
     def buffers(self) -> tuple[KernelArgument, ...]:
         """What transfer_radiance of radiance_transfer.cl takes, in its order."""
-        space, k, (rows, cols, words) = self._engine.workspace, self._interleave, self._shape
+        k, (rows, cols, words) = self._interleave, self._shape
         return (
-            space.upload("cache_cameras", self._cameras.reshape(k, 16).view(cl_types.float16)),
+            self._buffers.cameras.upload(self._cameras.reshape(k, 16).view(cl_types.float16)),
             self.surface.memory,
-            space.array("cache_traced", (k, rows, cols), np.uint16),
-            space.array("cache_blocked", (k, rows, cols, words), np.uint32),
+            self._buffers.traced.array((k, rows, cols)),
+            self._buffers.blocked.array((k, rows, cols, words)),
         )
 
 
 def no_caches(engine: Engine) -> tuple[KernelArgument, ...]:
     """The buffers where every frame traces every direction."""
-    unused = engine.workspace.array("unused", (1,), cl_types.float4)
-    return unused, unused, unused, unused
+    return engine.unused, engine.unused, engine.unused, engine.unused
 
 
 NO_CACHES: dict[str, object] = {

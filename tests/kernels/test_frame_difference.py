@@ -25,7 +25,7 @@ def test_matches_twin(engine: Engine, kind: str, size: tuple[int, int]) -> None:
     for picture in pictures:
         picture[rng.random(shape) < 0.1] = 0
         picture[rng.random(shape) < 0.1] = top
-    mean = MeanPicture(engine, "tested")
+    mean = MeanPicture(engine)
     for picture in pictures[:-1]:
         mean.add(mean.upload(picture))
     found = mean.compare(mean.upload(pictures[-1]))
@@ -41,7 +41,7 @@ def test_matches_twin(engine: Engine, kind: str, size: tuple[int, int]) -> None:
 
 
 def test_it_begins_anew(engine: Engine) -> None:
-    mean = MeanPicture(engine, "tested")
+    mean = MeanPicture(engine)
     mean.add(mean.upload(np.full((9, 9), 1000, np.uint16)))
     mean.forget()
     mean.add(mean.upload(np.zeros((9, 9), np.uint16)))

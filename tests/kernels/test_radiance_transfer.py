@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.transfer.radiance_transfer import SETS, direction_sets, transfer_radiance
+from server.transfer.radiance_transfer import SETS, TransferBuffers, direction_sets, transfer_radiance
 from server.volume.volume import Volume
 from tests.reference import radiance_transfer as twin
 from tests.reference.sh import open_transfer
@@ -311,7 +311,7 @@ def test_chosen_samples_are_those_of_the_whole_picture(engine: Engine) -> None:
     whole = found(None)
     assert np.ptp(whole[0]) > 1.1
     chosen = np.array([3, 0, 100, 77, 191], np.int32)
-    engine.workspace.find("openness_12x16").fill(-7.0)  # type: ignore[union-attr]
+    engine.buffers(TransferBuffers).openness[12, 16].array((12, 16)).fill(-7.0)
     some = found(chosen)
     np.testing.assert_array_equal(some[0].flat[chosen], whole[0].flat[chosen])
     assert (np.delete(some[0], chosen) == -7.0).all()

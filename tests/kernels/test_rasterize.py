@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.objects import rasterize as rasterize_module
-from server.objects.rasterize import NEAR_M, nearest_depths, rasterize
+from server.objects.rasterize import NEAR_M, VirtualSurfaceBuffers, nearest_depths, rasterize
 from server.objects.virtual_object import VirtualObject
 from server.opencl.device import Device
 from server.opencl.engine import Engine
@@ -362,11 +362,11 @@ def test_nearest_object_wins(engine: Engine) -> None:
             assert abs(y1 - rows.max()) < 12
 
 
-def test_two_views_by_name(engine: Engine) -> None:
+def test_two_views_in_buffers_of_their_own(engine: Engine) -> None:
     thing = VirtualObject.upload(engine, shape_of(trimesh.creation.box()), cells=8)
     first = rasterize(engine, CAMERA, EYE, [(thing, pose((0, 0, 3.0)))])
     expected = download(engine, first)
-    rasterize(engine, CAMERA, EYE, [(thing, pose((0.5, 0, 4.0)))], name="other")
+    rasterize(engine, CAMERA, EYE, [(thing, pose((0.5, 0, 4.0)))], VirtualSurfaceBuffers(engine.workspace))
     np.testing.assert_array_equal(download(engine, first).position, expected.position)
     np.testing.assert_array_equal(download(engine, first).index, expected.index)
 

@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from server.objects.virtual_object import VirtualObject
-from server.objects.voxelize import LEAST_CELLS, MARGIN_CELLS, MOST_CELLS, NEAR_CELLS, place_grid, squared_distance
+from server.objects.voxelize import (
+    LEAST_CELLS,
+    MARGIN_CELLS,
+    MOST_CELLS,
+    NEAR_CELLS,
+    VoxelizeBuffers,
+    place_grid,
+    squared_distance,
+)
 from server.opencl.engine import Engine
 from server.scene.mesh import Mesh
 from tests.reference import voxelize as twin
@@ -42,7 +50,7 @@ def grid_of(engine: Engine, mesh: Mesh, cells: int) -> Grid:
     matrix = grid.grid_from_model
     distance = engine.download(grid.distance)
     assert grid.dims == distance.shape[::-1]
-    occupied = engine.download(engine.workspace.array("voxelize_occupied", distance.shape, np.int32))
+    occupied = engine.download(engine.buffers(VoxelizeBuffers).occupied.array(distance.shape))
     vertices = mesh.vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
     return Grid(distance, occupied > 0, vertices, mesh.triangles.astype(np.int64))
 

@@ -1,6 +1,5 @@
 // Noise out of lightness and depth (thesis 5.1.1): CIE L*, TV-L1 (its [120]) and a bilateral filter.
-// Provides measure_lightness, relight, tv_l1_prepare, tv_l1_strips, tv_l1_dual, tv_l1_primal, tv_l1_finish, pad, bilateral,
-// invert.
+// Provides measure_lightness, relight, tv_l1_prepare, tv_l1_strips, tv_l1_dual, tv_l1_primal, tv_l1_finish, pad, bilateral.
 // Eight pixels of a row are one float8: PoCL vectorises little else. Pictures in work are [rows][stride], stride a multiple of 8.
 #include "portability.clh"
 
@@ -236,11 +235,4 @@ kernel void bilateral(const int width, const int height, const int stride, globa
     float result[8];
     vstore8(here + moved / total, 0, result);
     for (int k = 0; k < min(8, width - x); k++) filtered[y * width + x + k] = result[k];
-}
-
-// Depth to inverse depth and back, 1/m and m; 0 = none stays 0.
-kernel void invert(const int count, global const float *image, global float *inverse) {
-    const int i = get_global_id(0);
-    if (i >= count) return;
-    inverse[i] = image[i] > 0.0f ? 1.0f / image[i] : 0.0f;
 }

@@ -6,12 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Tracking, Wishes
 from server.geometry.merge import merge_depth
 from server.input.measure import GREATEST_DEPTH_M, Measurement, measure
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.tracking.camera_tracking import CameraTracking, PoseEstimate
 from server.tracking.exposure import ExposureTracking, scene_radiance
@@ -19,6 +21,11 @@ from server.tracking.reconstruction import Reconstruction
 from server.volume.integrate import integrate
 from server.volume.raycast import Surface, raycast
 from server.volume.volume import Volume
+
+
+class _Buffers(StageBuffers):
+    scene_radiance = BufferDescription(cl_types.float4)
+    """[h, w] as in GeometryFrame."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +58,7 @@ class Geometry:
         self, engine: Engine, camera: CameraModel, wishes: Wishes, reconstruction: Reconstruction | None = None
     ) -> None:
         """`reconstruction`: what others scan too; None: one of its own."""
-        self._engine = engine
+        self._engine, self._buffers = engine, _Buffers(engine.workspace)
         self._camera = camera
         self._wishes = wishes
         self._reconstruction = reconstruction or Reconstruction(engine)
@@ -86,7 +93,7 @@ class Geometry:
         assert self._last is not None
         last = self._last
         with self._engine.profile.stage("reconstruct"):
-            scene = scene_radiance(self._engine, measurement.radiance, last.exposure)
+            scene = self._scene_radiance(measurement, last.exposure)
             self._fuse(volume, last.volume_from_camera, Measurement(scene, measurement.depth_m), last.exposure)
         notes = input_notes(self._camera, frame, volume)
         return replace(last, measurement=measurement, scene_radiance=scene, notes=notes, is_held=True)
@@ -101,7 +108,7 @@ class Geometry:
             volume_from_camera = volume.volume_from_world() @ located.world_from_camera
             place = volume_from_camera if located.fuse else None
             exposure, doubts = self._exposure.update(frame, measurement, volume, place)  # B3
-            scene = scene_radiance(engine, measurement.radiance, exposure)
+            scene = self._scene_radiance(measurement, exposure)
             notes = (*located.notes, *doubts, *input_notes(camera, frame, volume))
             if self._last is not None and not located.fuse:
                 lost = replace(self._last, measurement=measurement, exposure=exposure, scene_radiance=scene)
@@ -135,6 +142,9 @@ class Geometry:
         if unaligned is None:
             return self._tracking.locate(frame, measurement, volume)
         return PoseEstimate(self._tracking.first_guess(frame), "lost", (unaligned,))
+
+    def _scene_radiance(self, measurement: Measurement, exposure: float) -> cl_array.Array:
+        return scene_radiance(self._engine, measurement.radiance, exposure, self._buffers.scene_radiance)
 
     def _fuse(
         self, volume: Volume, volume_from_camera: NDArray[np.float64], measured: Measurement, exposure: float

@@ -19,14 +19,14 @@ from __future__ import annotations
 
 import numpy as np
 import pyopencl.array as cl_array
-import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.input.measure import Measurement, intrinsics
 from server.maths.rigid import inverse_rigid
-from server.opencl.engine import Engine, float16, int4
-from server.volume.raycast import Surface
+from server.opencl.buffers import BufferDescription, BufferGroup, StageBuffers
+from server.opencl.engine import Engine, KernelArgument, float16, int4
+from server.volume.raycast import Surface, SurfaceBuffers
 from server.volume.volume import Volume
 
 LAMBDA_INTENSITY = 0.04
@@ -43,8 +43,30 @@ STILL_WEIGHT = 5.0
 """Frames, likewise, that must have seen a surface before it is called static: what moves agrees with a volume that it
 was fused into just now."""
 
-_BORDER = 8
-_PLANES = ("measured", "predicted", "shade", "sensed", "merged", "aligned")
+_BORDER = 8  # as in planes.clh
+
+
+class _Buffers(StageBuffers):
+    """Planes are [h + 2 _BORDER, pitch] metres, 0 = none, see include/planes.clh."""
+
+    measured = BufferDescription(np.float32)
+    """D_C."""
+    predicted = BufferDescription(np.float32)
+    """D_X."""
+    shade = BufferDescription(np.float32)
+    """Intensity: the square root of linear luminance."""
+    sensed = BufferDescription(np.float32)
+    """D_C, negative where it agrees with D_X, 0 where it mixes two surfaces."""
+    merged = BufferDescription(np.float32)
+    """D'; then D''', which does not read D'."""
+    aligned = BufferDescription(np.float32)
+    """D_X with marks of where it may not fill holes, until D' is known; then D''."""
+    surface = BufferGroup(SurfaceBuffers)
+
+    def planes(self, shape: tuple[int, int]) -> tuple[cl_array.Array, ...]:
+        """In the order in which lay_out of merge.cl takes them."""
+        buffers = self.measured, self.predicted, self.shade, self.sensed, self.merged, self.aligned
+        return tuple(buffer.array(shape) for buffer in buffers)
 
 
 def merge_depth(
@@ -58,76 +80,115 @@ def merge_depth(
 ) -> Surface:
     """The hybrid geometry buffer, in buffers of its own. Its colour is `measurement.radiance`, pixel by pixel.
 
-    smooth: whether the median D''' is taken of D''.
+    smooth: whether the median D''' is computed from D''.
 
     Labels: static where it is the volume's surface; dynamic where the sensor says otherwise, or the volume nothing;
     filled where the depth is neither's but the neighbourhood's median; none where nothing is known.
     """
-    size, space = (camera.width, camera.height), engine.workspace
-    shape, groups = size[::-1], (-(-size[0] // 8), size[1])
-    bordered = (8 * groups[0] + 2 * _BORDER, size[1] + 2 * _BORDER)
-    planes = {name: space.array(f"plane_{name}", bordered[::-1], np.float32) for name in _PLANES}
-    measured, predicted, shade, sensed, merged, aligned = planes.values()
-    smoothed = merged  # D''' does not read D'
-    trusted = aligned  # until D'' is written
-
-    def launch(file: str, name: str, items: tuple[int, int], *arguments: cl_array.Array | np.generic | float) -> None:
-        engine.launch(engine.kernel(file, name), items, *size, bordered[0], *arguments)
-
-    launch(
-        "merge.cl",
-        "lay_out",
-        bordered,
-        measurement.depth_m,
-        measurement.radiance,
-        model.positions,
-        float16(inverse_rigid(volume_from_camera)),
-        *planes.values(),
-    )
-    launch(
-        "merge.cl",
-        "compare_depth",
-        groups,
-        measured,
-        predicted,
-        model.positions,
-        int4(*volume.bricks, 0),
-        volume.slots_device,
-        volume.voxels,
-        volume.voxel_m,
-        min(STILL_WEIGHT, volume.frames / 2),
-        min(TRUSTED_WEIGHT, volume.frames / 2),
-        trusted,
-        sensed,
-    )
-    launch(
-        "merge.cl", "merge_depth", groups, sensed, trusted, shade, volume.voxel_m, LAMBDA_INTENSITY, merged
-    )  # eq. 4.3
-    launch("merge.cl", "align_depth", groups, merged, predicted, shade, LAMBDA_INTENSITY, aligned)  # eq. 4.4
+    merge = _Merge(engine, camera, volume_from_camera, model, volume)
+    merge.lay_out(measurement)
+    merge.compare()
+    merge.merge()
+    depth = merge.align()
     if smooth:
-        launch("merge.cl", "smooth_depth", groups, aligned, predicted, smoothed)  # eq. 4.5
-    else:
-        smoothed = aligned
+        depth = merge.smooth()
+    return merge.geometry_buffer(depth)
 
-    surface = Surface(
-        space.array("merged_positions", shape, cl_types.float4),
-        space.array("merged_normals", shape, cl_types.float4),
-        space.array("labels", shape, np.uint8),
-    )
-    lens, pose = intrinsics(camera), float16(volume_from_camera)
-    outputs = (surface.positions, surface.normals, surface.labels)
-    depths = (smoothed, sensed, predicted)
-    launch(
-        "geometry_buffer.cl",
-        "label_surface",
-        size,
-        *depths,
-        lens,
-        pose,
-        volume.voxel_m,
-        model.positions,
-        model.normals,
-        *outputs,
-    )
-    launch("geometry_buffer.cl", "fit_normals", groups, smoothed, surface.labels, lens, pose, surface.normals)
-    return surface
+
+class _Merge:
+    """The steps of one frame, in order."""
+
+    def __init__(
+        self,
+        engine: Engine,
+        camera: CameraModel,
+        volume_from_camera: NDArray[np.float64],
+        model: Surface,
+        volume: Volume,
+    ) -> None:
+        self._engine, self._camera, self._model, self._volume = engine, camera, model, volume
+        self._volume_from_camera = volume_from_camera
+        self._size = camera.width, camera.height
+        self._groups = -(-camera.width // 8), camera.height
+        self._bordered = 8 * self._groups[0] + 2 * _BORDER, camera.height + 2 * _BORDER
+        self._surface_buffers = engine.buffers(_Buffers).surface
+        self._planes = engine.buffers(_Buffers).planes(self._bordered[::-1])
+        self._measured, self._predicted, self._shade, self._sensed, self._merged, self._aligned = self._planes
+
+    def lay_out(self, measurement: Measurement) -> None:
+        """Depth and intensity as planes."""
+        self._launch(
+            "merge.cl",
+            "lay_out",
+            self._bordered,
+            measurement.depth_m,
+            measurement.radiance,
+            self._model.positions,
+            float16(inverse_rigid(self._volume_from_camera)),
+            *self._planes,
+        )
+
+    def compare(self) -> None:
+        """Where sensor and volume agree (first and second case of eq. 4.3)."""
+        volume = self._volume
+        self._launch(
+            "merge.cl",
+            "compare_depth",
+            self._groups,
+            self._measured,
+            self._predicted,
+            self._model.positions,
+            int4(*volume.bricks, 0),
+            volume.slots_device,
+            volume.voxels,
+            volume.voxel_m,
+            min(STILL_WEIGHT, volume.frames / 2),
+            min(TRUSTED_WEIGHT, volume.frames / 2),
+            self._aligned,
+            self._sensed,
+        )
+
+    def merge(self) -> None:
+        """D' (eq. 4.3)."""
+        planes = self._sensed, self._aligned, self._shade
+        lambdas = self._volume.voxel_m, LAMBDA_INTENSITY
+        self._launch("merge.cl", "merge_depth", self._groups, *planes, *lambdas, self._merged)
+
+    def align(self) -> cl_array.Array:
+        """D'' (eq. 4.4)."""
+        planes = self._merged, self._predicted, self._shade
+        self._launch("merge.cl", "align_depth", self._groups, *planes, LAMBDA_INTENSITY, self._aligned)
+        return self._aligned
+
+    def smooth(self) -> cl_array.Array:
+        """D''' (eq. 4.5)."""
+        self._launch("merge.cl", "smooth_depth", self._groups, self._aligned, self._predicted, self._merged)
+        return self._merged
+
+    def geometry_buffer(self, depth: cl_array.Array) -> Surface:
+        """Positions, normals and labels of a plane of depth."""
+        buffers, shape, model = self._surface_buffers, self._size[::-1], self._model
+        surface = Surface(buffers.positions.array(shape), buffers.normals.array(shape), buffers.labels.array(shape))
+        lens, pose = intrinsics(self._camera), float16(self._volume_from_camera)
+        self._launch(
+            "geometry_buffer.cl",
+            "label_surface",
+            self._size,
+            depth,
+            self._sensed,
+            self._predicted,
+            lens,
+            pose,
+            self._volume.voxel_m,
+            model.positions,
+            model.normals,
+            surface.positions,
+            surface.normals,
+            surface.labels,
+        )
+        outputs = surface.labels, lens, pose, surface.normals
+        self._launch("geometry_buffer.cl", "fit_normals", self._groups, depth, *outputs)
+        return surface
+
+    def _launch(self, file: str, name: str, items: tuple[int, int], *arguments: KernelArgument) -> None:
+        self._engine.launch(self._engine.kernel(file, name), items, *self._size, self._bordered[0], *arguments)

@@ -15,12 +15,26 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, DepthCamera
 from protocol.limits import MAX_IMAGE_SIDE_PX
+from server.opencl.buffers import BufferDescription, KeyedBufferDescription, StageBuffers
 from server.opencl.engine import Engine, float4, float16
 
 _NEWTON_STEPS = 20
 _CLOSE = 1e-9
 _SPREAD = 4.0
 """A triangle between neighbouring depth pixels may be this many times larger than one seen from the front."""
+
+
+class _Buffers(StageBuffers):
+    rays = KeyedBufferDescription(np.float32)
+    """By depth lens, [h, w, 4] as rays_of returns them."""
+    projected = BufferDescription(cl_types.float4)
+    """[h, w] of the depth lens: pixel in the colour picture, 1 / z there, z here; 0 = none."""
+    surface = BufferDescription(np.uint32)
+    """[h, w] bits of the depth of triangles between measurements."""
+    points = BufferDescription(np.uint32)
+    """[h, w] bits of the depth of single measurements."""
+    depth_m = BufferDescription(np.float32)
+    """[h, w] the result."""
 
 
 def register_depth(
@@ -34,8 +48,8 @@ def register_depth(
     lens = camera.depth
     assert lens is not None
     projected = _project(engine, camera, lens, units, greatest_depth_m)
-    size, space = (camera.height, camera.width), engine.workspace
-    surface, points = space.array("register_surface", size, np.uint32), space.array("register_points", size, np.uint32)
+    size, buffers = (camera.height, camera.width), engine.buffers(_Buffers)
+    surface, points = buffers.surface.array(size), buffers.points.array(size)
     count, focal_px = camera.width * camera.height, math.sqrt(lens.fx * lens.fy)
     engine.launch(engine.kernel("register.cl", "clear_depth"), (count,), count, surface, points)
     engine.launch(
@@ -52,7 +66,7 @@ def register_depth(
     )
     splat_points, resolve = (engine.kernel("register.cl", name) for name in ("splat_points", "resolve_depth"))
     engine.launch(splat_points, (projected.size,), projected.size, projected, camera.width, camera.height, points)
-    depth_m = space.array("depth_m", size, np.float32)
+    depth_m = buffers.depth_m.array(size)
     engine.launch(resolve, (count,), count, surface, points, focal_px, greatest_depth_m, depth_m)
     return depth_m
 
@@ -61,15 +75,15 @@ def _project(
     engine: Engine, camera: CameraModel, lens: DepthCamera, units: cl_array.Array, greatest_depth_m: float
 ) -> cl_array.Array:
     """[h, w] float4 of the depth lens: pixel in the colour picture, 1 / z there, z here; 0 = none."""
-    space, shape = engine.workspace, (lens.height, lens.width)
-    projected = space.array("projected_depth", shape, cl_types.float4)
+    buffers = engine.buffers(_Buffers)
+    projected = buffers.projected.array((lens.height, lens.width))
     engine.launch(
         engine.kernel("register.cl", "project_depth"),
         (lens.width, lens.height),
         lens.width,
         lens.height,
         units,
-        space.constant(f"rays of {lens}", rays_of(lens)),
+        buffers.rays[lens].constant(rays_of(lens)),
         camera.depth_scale_m,
         greatest_depth_m,
         float16(camera.color_from_depth),

@@ -20,6 +20,7 @@ from server.tracking.track import (
     ModelView,
     Pyramid,
     Registration,
+    ViewBuffers,
     depth_pyramid,
     finest_level,
     level_intrinsics,
@@ -99,6 +100,7 @@ class CameraTracking:
         self._engine = engine
         self._camera = camera
         self._mode = mode
+        self._view_buffers = ViewBuffers(engine.workspace)
         self._view: ModelView | None = None
         self._pose: Floats | None = None
         self._given: Floats | None = None
@@ -136,7 +138,7 @@ class CameraTracking:
         """What the volume shows from where the frame was located: the next one is compared with it."""
         if self._mode != "given":
             if self._needs_view(volume_from_camera):
-                self._view = view_model(self._engine, self._camera, volume_from_camera, model)
+                self._view = view_model(self._engine, self._camera, volume_from_camera, model, self._view_buffers)
             self._pose, self._given = located.world_from_camera, frame.world_from_camera
             self._is_lost = False
         if self._is_remembered and self._keyframes.is_new(volume_from_camera):

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel, RgbdFrame
 from server.input.measure import Measurement, intrinsics
 from server.maths.robust_location import Location, robust_location
+from server.opencl.buffers import BufferDescription, DeviceBuffer, StageBuffers
 from server.opencl.engine import Engine, float16, int4
 from server.volume.volume import Volume
 
@@ -40,6 +41,11 @@ _MOST_SAMPLES = 2304
 _LEAST_SCALE = 0.005
 _GROUP_SAMPLES = 8  # to a side, of a part of the picture that shares its errors
 _NOISE_FLOOR = 0.02  # luminance under which the noise of a camera is not in proportion to the root of it
+
+
+class _Buffers(StageBuffers):
+    samples = BufferDescription(cl_types.float4)
+    """[rows, cols] as compare_exposure of exposure.cl writes them."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +75,7 @@ def compare_exposure(
     """What a picture, not yet integrated, shows again of surface that the volume has a colour of."""
     stride = max(1, math.ceil(math.sqrt(camera.width * camera.height / _MOST_SAMPLES)))
     shape = (camera.height // stride, camera.width // stride)
-    samples = engine.workspace.array("exposure_samples", shape, cl_types.float4)
+    samples = engine.buffers(_Buffers).samples.array(shape)
     engine.launch(
         engine.kernel("exposure.cl", "compare_exposure"),
         shape[::-1],
@@ -115,15 +121,13 @@ def followed(last: float, found: Location) -> float:
     return min(max(last, found.value - band), found.value + band)
 
 
-def scene_radiance(
-    engine: Engine, radiance: cl_array.Array, exposure: float, buffer: str = "scene_radiance"
-) -> cl_array.Array:
+def scene_radiance(engine: Engine, radiance: cl_array.Array, exposure: float, buffer: DeviceBuffer) -> cl_array.Array:
     """[h, w] float4: a picture's radiance, as in Measurement, in the units of the first picture; `radiance` itself for
-    exposure 1. Clipped pixels are marked AT_LEAST (include/radiance_marks.clh). `buffer` names the array.
+    exposure 1. Clipped pixels are marked AT_LEAST (include/radiance_marks.clh). `buffer` (float4) holds the result.
     """
     if exposure == 1.0:
         return radiance
-    scene = engine.workspace.array(buffer, radiance.shape, cl_types.float4)
+    scene = buffer.array(radiance.shape)
     engine.launch(
         engine.kernel("exposure.cl", "scale_radiance"),
         (scene.size,),

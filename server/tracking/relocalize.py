@@ -13,7 +13,7 @@ from protocol.frames import CameraModel, RgbdFrame
 from server.maths.registration import angle_between, distance_between
 from server.opencl.buffers import BufferGroup, StageBuffers
 from server.opencl.engine import Engine
-from server.tracking.track import Pyramid, Registration, register, view_model
+from server.tracking.track import Pyramid, Registration, ViewBuffers, register, view_model
 from server.volume.raycast import SurfaceBuffers, raycast
 from server.volume.volume import Volume
 
@@ -29,6 +29,7 @@ _REACH_M, _REACH_RAD = 0.5, np.radians(30.0)
 
 class _Buffers(StageBuffers):
     surface = BufferGroup(SurfaceBuffers)
+    view = BufferGroup(ViewBuffers)
 
 
 @dataclass(frozen=True)
@@ -134,8 +135,9 @@ def fit_near(
     pose: NDArray[np.float64],
 ) -> Registration | None:
     volume.bring_back(camera, pose)
-    seen = raycast(engine, camera, pose, volume, engine.buffers(_Buffers).surface)
-    view = view_model(engine, camera, pose, seen, "relocalize")
+    buffers = engine.buffers(_Buffers)
+    seen = raycast(engine, camera, pose, volume, buffers.surface)
+    view = view_model(engine, camera, pose, seen, buffers.view)
     return register(engine, camera, view, pyramid, pose, 0.25 * volume.voxel_m)
 
 

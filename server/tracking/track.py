@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.maths.registration import Scale, least_information, motion_of_twist, solve_where_fixed, symmetric
 from server.maths.rigid import inverse_rigid, repaired_pose
+from server.opencl.buffers import KeyedBufferDescription, StageBuffers
 from server.opencl.engine import Engine, float4, float16
 from server.volume.raycast import Surface
 
@@ -46,6 +47,20 @@ CORRELATED_PIXELS = 64.0
 """Noise of a depth picture is alike over patches: only one pixel in so many is evidence of its own."""
 NORMAL_NOISE_RAD = 0.03
 """Of the predicted surface's normals, which otherwise would look like structure."""
+
+
+class ViewBuffers(StageBuffers):
+    """Device buffers of one model view. A caller that keeps a view owns them."""
+
+    levels = KeyedBufferDescription(np.float32)
+    """By pyramid level, [4, h, pitch] as in ModelView."""
+
+
+class _Buffers(StageBuffers):
+    depth_m = KeyedBufferDescription(np.float32)
+    """By pyramid level, [h, w] metres, 0 = none."""
+    sums = KeyedBufferDescription(np.float32)
+    """By pyramid level, [work-item, 32] as sum_equations of track.cl writes them."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +108,7 @@ def depth_pyramid(engine: Engine, camera: CameraModel, depth_m: cl_array.Array) 
     finest, levels = finest_level(camera), [depth_m]
     for level in range(1, finest + _LEVELS):
         width, height = _size(camera, level)
-        halved = engine.workspace.array(f"track_depth_{level}", (height, width), np.float32)
+        halved = engine.buffers(_Buffers).depth_m[level].array((height, width))
         engine.launch(
             engine.kernel("track.cl", "halve_depth", ROWS=_ROWS),
             (width, height),
@@ -109,14 +124,14 @@ def depth_pyramid(engine: Engine, camera: CameraModel, depth_m: cl_array.Array) 
 
 
 def view_model(
-    engine: Engine, camera: CameraModel, volume_from_camera: NDArray[np.float64], model: Surface, name: str = "track"
+    engine: Engine, camera: CameraModel, volume_from_camera: NDArray[np.float64], model: Surface, buffers: ViewBuffers
 ) -> ModelView:
-    """A copy of the surface predicted at `volume_from_camera`, as `register` wants it; `name`: of its memory."""
+    """A copy of the surface predicted at `volume_from_camera`, for `register`. Valid until `buffers` are used again."""
     levels = []
     for level in range(finest_level(camera), finest_level(camera) + _LEVELS):
         width, height = _size(camera, level)
         pitch = _pitch(width)
-        planes = engine.workspace.array(f"{name}_view_{level}", (4, height, pitch), np.float32)
+        planes = buffers.levels[level].array((4, height, pitch))
         engine.launch(
             engine.kernel("track.cl", "view_model", ROWS=_ROWS),
             (pitch, height),
@@ -234,7 +249,7 @@ def _sum_equations(
 ) -> _Equations:
     width, height = _size(camera, level)
     columns, strips = _pitch(width) // _LANES, -(-height // _ROWS)
-    partial = engine.workspace.array(f"track_sums_{level}", (columns * strips, _SUMS), np.float32)
+    partial = engine.buffers(_Buffers).sums[level].array((columns * strips, _SUMS))
     scale = 0.5**level
     engine.launch(
         engine.kernel("track.cl", "sum_equations", ROWS=_ROWS),

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.volume.brick_pool import BRICK_BYTES, BRICK_VOXELS, BrickPool, upload_list
 from server.volume.brick_store import BrickStore
@@ -26,11 +27,24 @@ _SPARE_SHARE = 1 / 16
 """Part of the budget that is released beyond what is asked, so that not every frame has to."""
 
 
+class _Buffers(StageBuffers):
+    slots = BufferDescription(np.int32)
+    """[z, y, x] slot of each brick, AWAY_SLOT, or NO_SLOT."""
+    resident_bricks = BufferDescription(np.int32)
+    """[n or more] in the order of their slots."""
+    restored_bricks = BufferDescription(np.int32)
+    """[n or more]"""
+    placed_bricks = BufferDescription(np.int32)
+    """[n or more] bricks that get another slot."""
+    placed_slots = BufferDescription(np.int32)
+    """[n or more] their slots."""
+
+
 class Residency:
     """Allocates and frees slots of the pool."""
 
     def __init__(self, engine: Engine, tables: RayTables, voxel_m: float, budget_bytes: int, host_bytes: int) -> None:
-        self._engine = engine
+        self._engine, self._buffers = engine, _Buffers(engine.workspace)
         self._tables = tables
         self._voxel_m = voxel_m
         self._table = BrickTable(tables.bricks)
@@ -39,8 +53,8 @@ class Residency:
         """Bricks that the budget has room for."""
         self.pool = BrickPool(engine)
         self.store = BrickStore(host_bytes // (_VOXEL_BYTES * BRICK_VOXELS))
-        self.slots_device = engine.workspace.upload("brick_slots", self._table.slots)
-        self.resident_device = upload_list(engine, "resident_bricks", self._table.resident())
+        self.slots_device = self._buffers.slots.upload(self._table.slots)
+        self.resident_device = upload_list(engine, self._buffers.resident_bricks, self._table.resident())
         self.resident_count = 0
         self.changes = 0
         """Counts what changes bricks' voxels."""
@@ -175,7 +189,7 @@ class Residency:
             return
         self.pool.upload(self._table.take(bricks), *self.store.take(bricks))
         self._place(bricks)
-        listed = upload_list(self._engine, "restored_bricks", bricks)
+        listed = upload_list(self._engine, self._buffers.restored_bricks, bricks)
         self._tables.find_solid(listed, len(bricks), self.slots_device, self.pool)
 
     def _release(self, bricks: Indices) -> None:
@@ -199,10 +213,10 @@ class Residency:
         """Tell the device the new slots of bricks."""
         if not bricks.size:
             return
-        slots = upload_list(self._engine, "placed_slots", self._table.slots_of(bricks))
-        placed = upload_list(self._engine, "placed_bricks", bricks)
+        slots = upload_list(self._engine, self._buffers.placed_slots, self._table.slots_of(bricks))
+        placed = upload_list(self._engine, self._buffers.placed_bricks, bricks)
         kernel = self._engine.kernel("brick_pool.cl", "place_bricks")
         self._engine.launch(kernel, (len(bricks),), len(bricks), placed, slots, self.slots_device, self._tables.solid)
         resident = self._table.resident()
         self.resident_count = len(resident)
-        self.resident_device = upload_list(self._engine, "resident_bricks", resident)
+        self.resident_device = upload_list(self._engine, self._buffers.resident_bricks, resident)

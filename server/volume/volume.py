@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.input.measure import intrinsics
 from server.maths.rigid import translation
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, KernelArgument, float16, int4
 from server.opencl.structs import VOLUME_SHAPE
 from server.opencl.transfer import fill_bytes
@@ -31,6 +32,11 @@ __all__ = ["BRICK", "BRICK_VOXELS", "TRUNCATION_VOXELS", "Bricks", "Volume", "Vo
 TRUNCATION_VOXELS = 4.0
 _GREATEST_BRICKS = 1 << 22
 _TILE = 4
+
+
+class _Buffers(StageBuffers):
+    wanted_bricks = BufferDescription(np.uint8)
+    """[brick] 1 for bricks near the measured surface."""
 
 
 class VolumeSizeError(ValueError):
@@ -59,7 +65,7 @@ class Volume:
         self.truncation_m = TRUNCATION_VOXELS * self.voxel_m
         self.frames = 0
         self.is_full = False
-        self._engine = engine
+        self._engine, self._buffers = engine, _Buffers(engine.workspace)
         self._tables = RayTables(engine, self.bricks)
         budget_bytes = engine.device.volume_bytes if budget_bytes is None else budget_bytes
         host_bytes = 4 * budget_bytes if host_budget_bytes is None else host_budget_bytes
@@ -209,7 +215,7 @@ class Volume:
         return Bricks.joined(list(self.download_batches()))
 
     def _mark(self, camera: CameraModel, volume_from_camera: NDArray[np.float64], depth_m: cl_array.Array) -> Indices:
-        wanted = self._engine.workspace.array("wanted_bricks", (self.solid.size,), np.uint8)
+        wanted = self._buffers.wanted_bricks.array((self.solid.size,))
         fill_bytes(self._engine.queue, wanted, 0)
         self._engine.launch(
             self._engine.kernel("volume.cl", "mark_bricks"),

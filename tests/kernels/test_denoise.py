@@ -16,6 +16,7 @@ from server.input.measure import Measurement
 from server.opencl.engine import Engine
 from tests.reference import denoise as twin
 from tests.scenes.tolerance import relative_tolerance
+from tests.scenes.tv_l1_depth import tv_l1_depth
 from tests.scenes.volumes import vectors
 
 SIZES = [(8, 8), (16, 9), (23, 41), (97, 71), (160, 130)]
@@ -180,7 +181,7 @@ def test_bilateral_keeps_an_edge_exactly_and_halves_noise(engine: Engine) -> Non
     assert (found - exact).std() < 0.5 * (noisy - exact).std()
 
 
-@pytest.mark.parametrize("smooth", [denoise.bilateral_depth, denoise.tv_l1_depth])
+@pytest.mark.parametrize("smooth", [denoise.bilateral_depth, tv_l1_depth])
 def test_no_depth_stays_none_and_gives_nothing(engine: Engine, smooth: Any) -> None:
     rng = np.random.default_rng(7)
     exact = rng.uniform(0.4, 9.9, (30, 50))
@@ -196,7 +197,7 @@ def test_no_depth_stays_none_and_gives_nothing(engine: Engine, smooth: Any) -> N
     assert not engine.download(smooth(engine, upload(engine, np.zeros((30, 50))))).any()
 
 
-@pytest.mark.parametrize("smooth", [denoise.bilateral_depth, denoise.tv_l1_depth])
+@pytest.mark.parametrize("smooth", [denoise.bilateral_depth, tv_l1_depth])
 @pytest.mark.parametrize("metres", [1e-6, 1e-3, 10.0, 1.7e7])
 def test_extreme_depth_stays_finite(engine: Engine, smooth: Any, metres: float) -> None:
     depth = np.full((30, 50), metres)

@@ -12,6 +12,7 @@ from server.maths.registration import angle_between, distance_between, motion_of
 from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine, float4, float16
 from server.tracking.track import (
+    ViewBuffers,
     depth_pyramid,
     finest_level,
     level_intrinsics,
@@ -61,7 +62,7 @@ def test_the_view_of_the_model_matches_twin(engine: Engine, camera: CameraModel)
     position, normal = (
         vectors(engine.download(a)).astype(np.float64) for a in (scene.model.positions, scene.model.normals)
     )
-    view = view_model(engine, camera, scene.pose, scene.model)
+    view = view_model(engine, camera, scene.pose, scene.model, ViewBuffers(engine.workspace))
     assert finest_level(camera) == 0
     for rung, planes in enumerate(view.levels):
         got = engine.download(planes)

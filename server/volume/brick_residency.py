@@ -92,21 +92,11 @@ class Residency:
         self._claim(asked[chosen[chosen >= len(back)]])
         return room >= len(asked)
 
-    def provide_all(self) -> None:
-        """A slot for every brick there is; the budget must have room."""
-        self._grow(self._table.slots.size)
-        self._restore(self.store.indices())
-        self._claim(np.flatnonzero(self._table.slots.ravel() == NO_SLOT).astype(np.int32))
-
     def note_picture(self, camera: CameraModel, volume_from_camera: NDArray[np.float64]) -> None:
         """A picture was integrated: bricks in view, and near what it measured, may have changed."""
         resident = self._table.resident()
         self._note_change(resident[self._in_view(camera, volume_from_camera, resident)])
         self._changed[self._wanted] = self.changes
-
-    def note_all(self) -> None:
-        """Any brick with a slot may have changed."""
-        self._note_change(self._table.resident())
 
     def held(self) -> Indices:
         """All bricks that hold voxels, released ones too, in order."""

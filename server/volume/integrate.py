@@ -51,4 +51,4 @@ def integrate(
     )
     volume.count_frame()
     volume.note_picture(camera, volume_from_camera)
-    volume.summarize(all=False)
+    volume.update_tables()

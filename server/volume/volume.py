@@ -190,19 +190,8 @@ class Volume:
         """Bring back released bricks that a camera sees, before casting rays from where nothing is measured."""
         self._residency.provide(camera, volume_from_camera, np.empty(0, np.int32))
 
-    def allocate_everywhere(self) -> None:
-        """Give a slot to every brick there is; a dense volume. Raises VolumeSizeError past the budget."""
-        count, limit = int(np.prod(self.bricks)), self._residency.limit
-        if count > limit:
-            raise VolumeSizeError(f"a dense volume of {count} bricks is more than the budget's {limit}")
-        self._residency.provide_all()
-
-    def summarize(self, all: bool = True) -> None:
-        """After integration: how far rays may jump. `all`: look for solid voxels first; else integration did so."""
-        if all:
-            pool = self._residency.pool
-            self._residency.note_all()
-            self._tables.find_solid(self.allocated_device, self.allocated_bricks, self.slots_device, pool)
+    def update_tables(self) -> None:
+        """Renew the tables for empty-space skipping, after integration has changed the solid cells."""
         self._tables.update()
 
     def download_batches(self) -> Iterator[Bricks]:

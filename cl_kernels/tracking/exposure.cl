@@ -20,7 +20,7 @@ typedef struct {
     int seen;         // by enough pictures, all eight voxels
     float luminance;
     float brightest;  // channel of any voxel
-    float looks;      // that the colour is a mean of
+    float observations; // that the colour is a mean of
     float colored;    // share of the weights
 } Around;
 
@@ -50,12 +50,12 @@ static Around look_around(const int4 bricks, global const int *slots, global con
                                           corner.z ? share.x * share.y : -share.x * share.y);
         result.luminance += colored * dot(color.xyz, LUMINANCE);
         result.brightest = fmax(result.brightest, fmax(color.x, fmax(color.y, color.z)));
-        result.looks += colored * color.w;
+        result.observations += colored * color.w;
         result.colored += colored;
     }
     const float scale = result.colored > 0.0f ? 1.0f / result.colored : 0.0f;
     result.luminance *= scale;
-    result.looks *= scale;
+    result.observations *= scale;
     return result;
 }
 
@@ -80,7 +80,7 @@ static inline float even_luminance(const int width, const int height, global con
 
 // One item a sample: the middle pixel of each block of stride x stride.
 // radiance, depth_m [h][w] as measured; slots, voxels, colors: of the volume before this picture is folded in
-// -> samples [rows][cols]: luminance of the picture, luminance that the volume predicts, looks that the prediction is a mean of,
+// -> samples [rows][cols]: luminance of the picture, luminance that the volume predicts, number of observations behind the prediction,
 // 0; all 0 where the picture does not show again, evenly, facing and neither clipped nor black, what the volume has a colour of.
 kernel void compare_exposure(const int cols, const int rows, const int stride, const int width, const int height,
                              global const float4 *radiance, global const float *depth_m, const float4 intrinsics,
@@ -107,7 +107,7 @@ kernel void compare_exposure(const int cols, const int rows, const int stride, c
             const Around surface = look_around(bricks, slots, voxels, colors, on_surface / voxel_m, least_weight);
             const int known = surface.seen && surface.colored >= LEAST_COLORED && surface.brightest < MOST_PREDICTED &&
                               surface.luminance > LEAST_PREDICTED;
-            if (known) sample = (float4)(seen, surface.luminance, surface.looks, 0.0f);
+            if (known) sample = (float4)(seen, surface.luminance, surface.observations, 0.0f);
         }
     }
     samples[row * cols + col] = sample;

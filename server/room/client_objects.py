@@ -33,7 +33,7 @@ class ClientObjects:
         check_size(mesh, placement)
         self._waiting.pop(object_id, None)
         self._waiting[object_id] = mesh, placement
-        objects.owe(object_id)
+        objects.add_pending(object_id)
         return (*mesh.notes, "it is placed once this client is aligned with the room")
 
     def move(self, object_id: str, placement: Placement) -> None:
@@ -49,7 +49,7 @@ class ClientObjects:
     def remove(self, object_id: str) -> None:
         """Take an object away. Raises KeyError if there is none of that id."""
         if self._waiting.pop(object_id, None) is not None:
-            self._room.objects.forgive(object_id)
+            self._room.objects.remove_pending(object_id)
             return
         self._room.objects.remove(object_id)
         self._room.changes += 1

@@ -35,7 +35,7 @@ LEAST_SAMPLES = 100
 """Fewer surface points seen again say nothing: the last factor is kept."""
 LEAST_SHARE = 0.25
 """Of the samples that must agree on a factor."""
-LEAST_LOOKS = 2.0
+LEAST_OBSERVATIONS = 2.0
 """Pictures that must have seen a surface, or all of them while there are fewer."""
 _MOST_SAMPLES = 2304
 _LEAST_SCALE = 0.005
@@ -56,7 +56,7 @@ class Samples:
     """[n] luminance in the picture."""
     predicted: NDArray[np.float64]
     """[n] luminance that the volume has of it."""
-    looks: NDArray[np.float64]
+    observations: NDArray[np.float64]
     """[n] pictures that the prediction is a mean of."""
     groups: NDArray[np.int64]
     """[n] number of the part of the picture."""
@@ -93,7 +93,7 @@ def compare_exposure(
         volume.colors,
         volume.voxel_m,
         volume.truncation_m,
-        min(LEAST_LOOKS, float(volume.frames)),
+        min(LEAST_OBSERVATIONS, float(volume.frames)),
         samples,
     )
     found = engine.download(samples).view(np.float32).reshape(-1, 4).astype(np.float64)
@@ -110,7 +110,7 @@ def locate_exposure(samples: Samples, last: float) -> Location | None:
     ratios = np.log(samples.seen / samples.predicted)
     # A camera's noise goes about with the root of what it sees; its part of a mean of n looks is one in n.
     brightness = samples.predicted * math.exp(last)
-    weights = brightness / (brightness + _NOISE_FLOOR) * samples.looks / (samples.looks + 1)
+    weights = brightness / (brightness + _NOISE_FLOOR) * samples.observations / (samples.observations + 1)
     found = robust_location(ratios, weights, samples.groups, last, _LEAST_SCALE)
     return found if found.share >= LEAST_SHARE else None
 

@@ -69,8 +69,8 @@ def volume(engine: Engine) -> Volume:
 
 def dense(engine: Engine, volume: Volume) -> twin.DenseVolume:
     tsdf, weight, _ = dense_voxels(engine, volume)
-    color, looks = dense_colors(volume)
-    return twin.DenseVolume(VOXEL_M, tsdf.astype(np.float64), weight.astype(np.float64), color, looks)
+    color, observations = dense_colors(volume)
+    return twin.DenseVolume(VOXEL_M, tsdf.astype(np.float64), weight.astype(np.float64), color, observations)
 
 
 @pytest.mark.parametrize("most", [300, 2304])
@@ -162,7 +162,7 @@ class Wandering:
         self.noise = float(np.hypot(noise, texture))
         self.points = points
         self.true = self.random.uniform(0.05, 0.8, 4 * points)
-        self.kept, self.looks = self.true.copy(), np.ones(4 * points)
+        self.kept, self.observations = self.true.copy(), np.ones(4 * points)
         self.log = 0.0
 
     def frame(self, number: int, exposure: float, darker: float = 1.0) -> float:
@@ -171,11 +171,11 @@ class Wandering:
         seen = self.true[here] * exposure * np.exp(self.random.normal(0, self.noise, self.points))
         seen[here // 40 % 3 == 0] *= darker
         groups = np.arange(self.points) // 40
-        found = locate_exposure(Samples(seen, self.kept[here], self.looks[here], groups), self.log)
+        found = locate_exposure(Samples(seen, self.kept[here], self.observations[here], groups), self.log)
         assert found is not None
         self.log = followed(self.log, found)
-        self.looks[here] = np.minimum(self.looks[here] + 1, 63)
-        self.kept[here] += (seen / math.exp(self.log) - self.kept[here]) / self.looks[here]
+        self.observations[here] = np.minimum(self.observations[here] + 1, 63)
+        self.kept[here] += (seen / math.exp(self.log) - self.kept[here]) / self.observations[here]
         return self.log
 
 

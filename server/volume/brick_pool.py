@@ -18,9 +18,9 @@ from server.opencl.transfer import copy_beginning, fill_bytes
 BRICK_VOXELS = 512
 BRICK_CELLS = 64
 BRICK_BYTES = 12 * BRICK_VOXELS + BRICK_CELLS
-"""Of one brick in the pool: tsdf and weight, colour, octets."""
+"""Device memory of one brick: tsdf and weight, colour, octets."""
 _BATCH = 1024
-"""Bricks that are copied between device and host at once."""
+"""Bricks per copy between device and host."""
 
 
 class _Buffers(StageBuffers):
@@ -43,7 +43,7 @@ class _Buffers(StageBuffers):
 
 
 class BrickPool:
-    """Slots 1 to `capacity`; slot 0 stands for all bricks that are not on the device."""
+    """Slots 1 to `capacity`; slot 0 represents all bricks that are on the host."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine, self._buffers = engine, _Buffers(engine.workspace)
@@ -53,7 +53,7 @@ class BrickPool:
         self.octets: cl_array.Array = self._buffers.octets.array((1, BRICK_CELLS))
         fill_bytes(engine.queue, self.voxels, 0)
         fill_bytes(engine.queue, self.colors, 0)
-        fill_bytes(engine.queue, self.octets, 255)  # rays stop at what is away, but nothing is interpolated
+        fill_bytes(engine.queue, self.octets, 255)  # bricks on the host block rays, but are not interpolated
 
     @property
     def bytes_held(self) -> int:
@@ -61,19 +61,19 @@ class BrickPool:
         return int(self.voxels.nbytes + self.colors.nbytes + self.octets.nbytes)
 
     def grow(self, capacity: int) -> None:
-        """Have `capacity` slots; contents stay. One array at a time lies there twice for a moment."""
+        """Grow to `capacity` slots and keep the contents. At most one array at a time exists twice."""
         self.capacity = capacity
         self.voxels = self._grown(self._buffers.voxels, self.voxels)
         self.colors = self._grown(self._buffers.colors, self.colors)
         self.octets = self._grown(self._buffers.octets, self.octets)
 
     def clear(self, slots: NDArray[np.int32]) -> None:
-        """Make voxels unseen and colourless."""
+        """Reset the voxels of slots: never seen, without colour."""
         claimed = upload_list(self._engine, self._buffers.claimed_slots, slots)
         self._over_rows("claim_bricks", len(slots), claimed, self.voxels, self.colors)
 
     def download(self, slots: NDArray[np.int32]) -> Iterator[tuple[slice, NDArray[Any], NDArray[np.uint32]]]:
-        """In batches: which of `slots`, their voxels [k, 512] float2, their colours [k, 512]."""
+        """Batches: slice of `slots`, voxels [k, 512] float2, colours [k, 512]."""
         for batch in _batches(len(slots)):
             voxels, colors, rows = self._staging(batch)
             chosen = upload_list(self._engine, self._buffers.copied_slots, slots[batch])
@@ -101,7 +101,7 @@ class BrickPool:
         return new
 
     def _staging(self, batch: slice) -> tuple[cl_array.Array, cl_array.Array, cl_array.Array]:
-        """Voxels and colours of one batch between device and host, and the rows of it that are used."""
+        """Staged voxels and colours of one batch, and the numbers of their rows."""
         rows = min(_BATCH, rounded(batch.stop - batch.start))
         return (
             self._buffers.staged_voxels.array((rows, BRICK_VOXELS)),
@@ -116,14 +116,14 @@ class BrickPool:
 
 
 def upload_list(engine: Engine, buffer: DeviceBuffer, values: NDArray[np.int32]) -> cl_array.Array:
-    """[n or more] int32 on the device, the first n of them `values`: a list whose length changes keeps its memory."""
+    """Copy `values` into the first elements of an int32 buffer, whose length rarely changes."""
     array = buffer.array((rounded(len(values)),))
     copy_beginning(engine.queue, array, values)
     return array
 
 
 def rounded(count: int) -> int:
-    """Length of a buffer for a list of about `count`: only now and then another."""
+    """Length of a buffer for a list of `count`: a power of two, so that it rarely changes."""
     return 1 << max(10, (count - 1).bit_length())
 
 

@@ -49,7 +49,7 @@ class RayTables:
         self._occupied = self._buffers.occupied.array((count,))
         self._inner = [self._buffers.inner_gaps[axis].array(((2 << axis) * count + 16,)) for axis in range(2)]
         self._changed = self._buffers.changed.array((6,))
-        for array, value in ((self.solid, 0), (self._occupied, 255)):  # 255: each differs from what it was
+        for array, value in ((self.solid, 0), (self._occupied, 255)):  # 255: every brick counts as changed
             fill_bytes(engine.queue, array, value)
 
     @property
@@ -58,7 +58,7 @@ class RayTables:
         return sum(a.nbytes for a in (self.memory, self._occupied, self._changed, *self._inner))
 
     def find_solid(self, listed: cl_array.Array, count: int, slots: cl_array.Array, pool: BrickPool) -> None:
-        """Look through the voxels of the first `count` listed bricks."""
+        """Compute solid cells and octets of the first `count` listed bricks."""
         self._engine.launch(
             self._engine.kernel("volume.cl", "find_solid"),
             (_CELL_ROWS * count,),
@@ -71,7 +71,7 @@ class RayTables:
         )
 
     def near_solid(self, indices: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """[n] whether there is a solid voxel in a brick, or within some 4 voxels of it, as far as is known."""
+        """[n] whether a brick, or the 4 voxels around it, contain a known solid voxel."""
         near = self._buffers.near_solid.array((rounded(len(indices)),))
         listed = upload_list(self._engine, self._buffers.idle_bricks, indices)
         kernel = self._engine.kernel("volume.cl", "find_near_solid")
@@ -80,7 +80,7 @@ class RayTables:
         return found
 
     def update(self) -> None:
-        """Renew the gaps around bricks that have become solid, or are no longer."""
+        """Recompute the gaps around bricks that have become solid or empty."""
         engine, (x, y, z), bricks = self._engine, self.bricks, int4(*self.bricks, 0)
         copy_beginning(engine.queue, self._changed, _UNCHANGED)
         engine.launch(

@@ -18,7 +18,7 @@ class _Buffers(StageBuffers):
 
 
 def view_colors(engine: Engine, camera: CameraModel, surface: Surface, volume: Volume) -> cl_array.Array:
-    """[h, w] float4: radiance that the volume has of the surface, in units of its first picture; w = 0 where none."""
+    """[h, w] float4: the volume's radiance on the surface, in units of the first picture; w = 0: unknown."""
     radiance = engine.buffers(_Buffers).radiance.array((camera.height, camera.width))
     engine.launch(
         engine.kernel("view_colors.cl", "view_colors"),

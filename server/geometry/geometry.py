@@ -30,25 +30,25 @@ class _Buffers(StageBuffers):
 
 @dataclass(frozen=True)
 class GeometryFrame:
-    """Geometry of one frame; arrays are the session's and valid until its next frame."""
+    """Geometry of one frame. Its arrays are valid until the session's next frame."""
 
     measurement: Measurement
     exposure: float
-    """Of the picture relative to the session's first."""
+    """Exposure of the picture relative to the session's first."""
     scene_radiance: cl_array.Array
-    """`measurement.radiance` in the units of the first picture: that over `exposure`."""
+    """`measurement.radiance` over `exposure`: in the units of the first picture."""
     model: Surface
-    """The volume alone, as the camera sees it."""
+    """The volume's surface as seen by the camera."""
     surface: Surface
-    """The hybrid geometry buffer: the volume, and what changed too fast for it."""
+    """The hybrid geometry buffer: the volume's surface merged with the measured depth."""
     world_from_camera: NDArray[np.float64]
     volume_from_camera: NDArray[np.float64]
     tracking: Tracking
-    """Where it is lost, the pose and the surfaces are the last good frame's."""
+    """If it is lost, pose and surfaces are those of the last good frame."""
     notes: tuple[str, ...]
-    """What was wrong with this frame, one line each."""
+    """Problems with this frame, one line each."""
     is_held: bool = False
-    """Whether pose and surfaces are those of the frame before, since nothing has changed."""
+    """Whether pose and surfaces were kept from the frame before, since nothing has changed."""
 
 
 class Geometry:
@@ -57,7 +57,7 @@ class Geometry:
     def __init__(
         self, engine: Engine, camera: CameraModel, wishes: Wishes, reconstruction: Reconstruction | None = None
     ) -> None:
-        """`reconstruction`: what others scan too; None: one of its own."""
+        """`reconstruction`: shared with other cameras; None: one of its own."""
         self._engine, self._buffers = engine, _Buffers(engine.workspace)
         self._camera = camera
         self._wishes = wishes
@@ -72,7 +72,7 @@ class Geometry:
         return self._reconstruction.volume
 
     def scan(self, frame: RgbdFrame) -> GeometryFrame:
-        """All steps for one frame of a camera that scans alone. Raises ValueError for one that is refused."""
+        """All steps for one frame of a camera that scans alone. Raises ValueError for a frame that is refused."""
         check_size(self._camera, frame)
         volume = self.volume_for(frame)
         with self._engine.profile.stage("input"):
@@ -80,16 +80,16 @@ class Geometry:
         return self.update(frame, measurement, volume)
 
     def volume_for(self, frame: RgbdFrame) -> Volume:
-        """The volume that a frame belongs into, made by the first one. frame: with its pose in the room's world.
+        """The volume into which to fuse a frame; created by the first frame. frame: its pose is in the room's world.
 
-        Raises ValueError, one line, for a frame that is refused; nothing has changed then.
+        Raises ValueError, one line, for a frame that is refused; the state is then unchanged.
         """
         guess = self._tracking.first_guess(frame)
         return self._reconstruction.volume_for(self._wishes, self._camera, frame, guess)
 
     def keep(self, frame: RgbdFrame, measurement: Measurement, volume: Volume) -> GeometryFrame:
-        """The geometry of the frame before, for a still view. The frame is fused all the same: when the view changes,
-        the volume is to be what it would have become."""
+        """The geometry of the frame before, for a still view. The frame is fused nevertheless, so that the volume does
+        not depend on reuse."""
         assert self._last is not None
         last = self._last
         with self._engine.profile.stage("reconstruct"):
@@ -101,7 +101,7 @@ class Geometry:
     def update(
         self, frame: RgbdFrame, measurement: Measurement, volume: Volume, unaligned: str | None = None
     ) -> GeometryFrame:
-        """Locate, fuse, predict, merge. unaligned: why the frame does not belong into the room; None: it does."""
+        """Locate, fuse, ray cast, merge. unaligned: why the frame is not aligned with the room; None: it is."""
         engine, camera, stage = self._engine, self._camera, self._engine.profile.stage
         with stage("reconstruct"):  # 4.2.1
             located = self._locate(frame, measurement, volume, unaligned)
@@ -155,7 +155,7 @@ class Geometry:
 
 
 def check_size(camera: CameraModel, frame: RgbdFrame) -> None:
-    """Raises ValueError, one line, for pictures that are not of the camera's size."""
+    """Raises ValueError, one line, for images that do not have the camera's size."""
     depth = camera.depth_lens
     if frame.color.shape != (camera.height, camera.width, 3) or frame.depth.shape != (depth.height, depth.width):
         raise ValueError(
@@ -165,9 +165,9 @@ def check_size(camera: CameraModel, frame: RgbdFrame) -> None:
 
 
 def input_notes(camera: CameraModel, frame: RgbdFrame, volume: Volume) -> tuple[str, ...]:
-    """What is wrong with a frame's depth, or with the room for it, one line each."""
+    """Problems with a frame's depth or the volume's memory, one line each."""
     notes = []
-    sparse = frame.depth[::16, ::16]  # mostly a few pixels say enough
+    sparse = frame.depth[::16, ::16]  # mostly a few pixels are enough
     if frame.has_depth and not any(_is_usable(camera, depth).any() for depth in (sparse, frame.depth)):
         notes.append("the depth picture has no usable value: is the sensor covered?")
     if volume.is_full:

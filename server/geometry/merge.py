@@ -1,18 +1,18 @@
-"""The hybrid geometry buffer (thesis 4.2.2, eq. 4.1-4.5): the volume's surface, and what changed too fast for it.
+"""The hybrid geometry buffer (thesis 4.2.2, eq. 4.1-4.5): the volume's surface merged with the measured depth.
 
-Kernels: merge.cl, geometry_buffer.cl. Depth runs through three passes: D' takes the volume where the sensor agrees
-with it and the sensor elsewhere, and fills the sensor's holes; D'' is a joint bilateral median, D''' a median. What the
-thesis leaves open:
+Kernels: merge.cl, geometry_buffer.cl. Three passes compute the depth: D' takes the volume where the sensor agrees with
+it and the sensor elsewhere, and fills the sensor's holes; D'' is a joint bilateral median, D''' a median. Choices that
+the thesis leaves open:
 
-- lambda_D, the depths that agree: 1.5 voxels and four deviations of the sensor's noise (agreement.clh).
+- lambda_D, the difference of depths that agree: 1.5 voxels plus four deviations of the sensor's noise (agreement.clh).
 - lambda_I: LAMBDA_INTENSITY. k: 17 pixels for holes (a hole up to 16 pixels wide is filled), 5 for D'', 3 for D'''.
-- Where the volume knows nothing, the sensor is taken. A hole that too few neighbours support (LEAST_SUPPORT in
+- Where the volume is unknown, the sensor's depth is used. A hole with too few supporting neighbours (LEAST_SUPPORT in
   merge.cl) keeps the volume's surface; without one it stays a hole.
 - The median of an even count is the lower one. D'' and D''' fill no holes.
-- D'' and D''' take noise of the sensor away. Where all that their window knows is the volume's there is none, and the
-  volume's depth is kept: no filter runs where measured and fused depth agree.
-- Where the final depth agrees with the volume, the volume's own surface is taken, unfiltered: the medians would put
-  voxel-exact surface back by up to the slope of their windows, and never by more than lambda_D.
+- D'' and D''' remove noise of the sensor. Where all known depth in their window is the volume's, they keep it: no
+  filter runs where measured and fused depth agree.
+- Where the final depth agrees with the volume, the volume's own surface is used, unfiltered: the medians would shift it
+  by up to the slope across their windows, at most lambda_D.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from server.volume.raycast import Surface, SurfaceBuffers
 from server.volume.volume import Volume
 
 LAMBDA_INTENSITY = 0.04
-"""Intensities that may belong to one surface (eq. 4.1), in square roots of linear luminance, in which noise is about
-the same at every brightness. Three deviations of a difference (times sqrt 2) at a deviation of 0.01, a camera's 2.5
-codes of 255 indoors; the JPEG pictures of the public data sets have 0.001 to 0.004."""
+"""Greatest difference of intensities of one surface (eq. 4.1), in square roots of linear luminance, in which noise is
+about the same at every brightness. Three deviations of a difference (times sqrt 2) at a deviation of 0.01: 2.5 codes
+of 255, a camera's noise indoors; the JPEG pictures of the public data sets have 0.001 to 0.004."""
 
 TRUSTED_WEIGHT = 15.0
-"""Frames that must have seen a surface of the volume before it fills holes of the sensor, or half of all while there
-are fewer than twice as many. A sparse volume keeps no memory of free space, so that what moves through it becomes
-surface at once; where the sensor is blind, as beside a hand, nothing else would tell it from the room."""
+"""Frames that must have seen a surface of the volume before it fills holes of the sensor, at most half of all frames.
+A sparse volume does not store free space, so that a moving object becomes surface at once; in a hole of the sensor, as
+beside a hand, only this number distinguishes it from the room."""
 
 STILL_WEIGHT = 5.0
-"""Frames, likewise, that must have seen a surface before it is called static: what moves agrees with a volume that it
-was fused into just now."""
+"""Frames that must have seen a surface before it counts as static, with the same limit: a moving object agrees with a
+volume into which it was just fused."""
 
 _BORDER = 8  # as in planes.clh
 
@@ -60,7 +60,7 @@ class _Buffers(StageBuffers):
     merged = BufferDescription(np.float32)
     """D'; then D''', which does not read D'."""
     aligned = BufferDescription(np.float32)
-    """D_X with marks of where it may not fill holes, until D' is known; then D''."""
+    """D_X, negative where it may not fill holes, until D' is known; then D''."""
     surface = BufferGroup(SurfaceBuffers)
 
     def planes(self, shape: tuple[int, int]) -> tuple[cl_array.Array, ...]:
@@ -82,8 +82,8 @@ def merge_depth(
 
     smooth: whether the median D''' is computed from D''.
 
-    Labels: static where it is the volume's surface; dynamic where the sensor says otherwise, or the volume nothing;
-    filled where the depth is neither's but the neighbourhood's median; none where nothing is known.
+    Labels: static: the volume's surface; dynamic: the sensor's depth, where it disagrees with the volume or the volume
+    is unknown; filled: the median of neighbours; none: unknown.
     """
     merge = _Merge(engine, camera, volume_from_camera, model, volume)
     merge.lay_out(measurement)

@@ -21,14 +21,14 @@ from server.opencl.engine import Engine, float4
 DenoiseMethod = Literal["none", "bilateral", "tv_l1"]
 
 NO_LIGHTNESS = -1.0
-"""Lightness where there is none: a pixel outside the picture, black or clipped."""
+"""Lightness of pixels without a usable colour: outside the picture, black or clipped."""
 PRIMAL_STEP = 0.01
-"""Step of the picture relative to its contrast: of 0.01 to 0.2 it leaves the least energy in 5 to 100 iterations."""
+"""Primal step relative to the contrast: of 0.01 to 0.2, the one with the least energy after 5 to 100 iterations."""
 LIGHTNESS_WEIGHT = 0.8
 RADIUS_PX = 3
 _CLOSENESS_PX = 2.0
-_DEPTH_REACH_M = (8 * 0.0012, 8 * 0.0019, 0.4)
-_LIGHTNESS_REACH = 0.08  # four deviations of a noisy camera, 2 of 100
+_DEPTH_WIDTH = (8 * 0.0012, 8 * 0.0019, 0.4)
+_LIGHTNESS_WIDTH = 0.08  # four deviations of a noisy camera, 0.02
 _STRIPS_PER_CORE, _LEAST_STRIP_ROWS, _STEPS = 3, 16, 6
 _MARGIN_PX = 8  # as in the kernel
 
@@ -100,11 +100,10 @@ def tv_l1(
 ) -> cl_array.Array:
     """[h, w] float32 with less of TV(u) + weight |u - image|_1 after each of `iterations` (Chambolle and Pock 2011).
 
-    image: [h, w] float32, finite; nothing is known of pixels at or below `none`: they stay as they are, and nothing
-    spreads across them, nor between neighbours that differ by more than `edge`. `contrast`: difference across the
-    picture's edges, in its unit; sets how fast, not where to.
-    `strips`: the kernel for processors with caches, or the one for GPUs; None: what fits the device. The result is
-    valid until the next call.
+    image: [h, w] float32, finite. Pixels at or below `none` are unknown: they stay unchanged, and nothing spreads
+    across them, nor between neighbours that differ by more than `edge`. `contrast`: difference across the picture's
+    edges, in its unit; changes the speed of convergence only. `strips`: use the kernel for CPUs, else the ones for
+    GPUs; None: chosen by the device. The result is valid until the next call.
     """
     height, width = image.shape
     stride = 8 * (width // 8 + 1)
@@ -156,9 +155,11 @@ def _iterate_in_passes(
     return u
 
 
-def bilateral(engine: Engine, image: cl_array.Array, reach: tuple[float, float, float], none: float) -> cl_array.Array:
-    """[h, w] float32: weighted mean of 7 x 7 pixels, of those that differ by less than the reach at a pixel's value v,
-    reach[0] + reach[1] (v - reach[2])^2, and less than half its distance from `none`, the value of no measurement.
+def bilateral(
+    engine: Engine, image: cl_array.Array, range_width: tuple[float, float, float], none: float
+) -> cl_array.Array:
+    """[h, w] float32: weighted mean of those of 7 x 7 pixels that differ from a pixel's value v by less than
+    w[0] + w[1] (v - w[2])^2, w = range_width, and by less than half of v - none. none: the value of no measurement.
 
     image: [h, w] float32, nowhere below `none`. The result is valid until the next call.
     """
@@ -177,7 +178,7 @@ def bilateral(engine: Engine, image: cl_array.Array, reach: tuple[float, float, 
         stride,
         padded,
         buffers.closeness.constant(closeness()),
-        float4(*reach, 0),
+        float4(*range_width, 0),
         float(none),
         filtered,
     )
@@ -194,9 +195,9 @@ def closeness() -> NDArray[np.float32]:
 def bilateral_depth(engine: Engine, depth_m: cl_array.Array) -> cl_array.Array:
     """Depth [h, w] metres, 0 = none, averaged within eight deviations of the sensor's noise (Nguyen et al. 2012, 3).
 
-    None stays none. The result is valid until the next filter.
+    0 stays 0. The result is valid until the next bilateral filter.
     """
-    return bilateral(engine, depth_m, _DEPTH_REACH_M, 0.0)
+    return bilateral(engine, depth_m, _DEPTH_WIDTH, 0.0)
 
 
 def measure_lightness(engine: Engine, radiance: cl_array.Array) -> cl_array.Array:
@@ -208,7 +209,7 @@ def measure_lightness(engine: Engine, radiance: cl_array.Array) -> cl_array.Arra
 
 
 def relight(engine: Engine, radiance: cl_array.Array, lightness: cl_array.Array) -> cl_array.Array:
-    """`radiance` [h, w] float4 with its usable colours scaled to `lightness` [h, w].
+    """`radiance` [h, w] float4 with its usable colours scaled to the lightness [h, w].
 
     The result is valid until the next call.
     """
@@ -223,14 +224,14 @@ def denoise_radiance(
 ) -> cl_array.Array:
     """Radiance [h, w] float4 like `measurement.radiance`, its lightness denoised, the ratios of its colours kept.
 
-    Pixels that are not usable stay as they are and give nothing to others. The result is valid until the next call;
-    with method "none" it is the measurement's own array.
+    Unusable pixels stay unchanged and do not affect others. The result is valid until the next call; with method "none"
+    it is the measurement's own array.
     """
     if method == "none":
         return measurement.radiance
     lightness = measure_lightness(engine, measurement.radiance)
     if method == "bilateral":
-        smooth = bilateral(engine, lightness, (_LIGHTNESS_REACH, 0.0, 0.0), NO_LIGHTNESS)
+        smooth = bilateral(engine, lightness, (_LIGHTNESS_WIDTH, 0.0, 0.0), NO_LIGHTNESS)
     else:
         smooth = tv_l1(engine, lightness, iterations, LIGHTNESS_WEIGHT, NO_LIGHTNESS)
     return relight(engine, measurement.radiance, smooth)

@@ -1,6 +1,6 @@
-"""Measure the input (thesis 5.1.1): undistort colour and depth, remove the gamma, bring depth to the colour picture.
+"""Surface measurement (thesis 5.1.1): undistorts colour and depth, linearises colour, registers depth to colour.
 
-Kernels: measure.cl, and register.cl where depth has a lens of its own.
+Kernels: measure.cl, and register.cl if depth has a lens of its own.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, float4
 
 GREATEST_DEPTH_M = 10.0
-"""Beyond it no depth camera for rooms measures anything; larger values are taken as no measurement."""
+"""Range of depth cameras for rooms; larger values are treated as no measurement."""
 
 
 class _Buffers(StageBuffers):
     srgb8_codes = BufferDescription(np.uint8)
     """[h, w, 3] colour as received."""
     linear16_codes = BufferDescription(np.uint16)
-    """[h, w, 3] likewise."""
+    """[h, w, 3] colour as received."""
     linear_values = BufferDescription(np.float32)
     """[256 or 65536] radiance of each code value."""
     depth_units = BufferDescription(np.uint16)
@@ -47,7 +47,7 @@ class Measurement:
 
 @cache
 def linear_values(encoding: ColorEncoding) -> NDArray[np.float32]:
-    """Linear radiance in [0, 1] of every code value: 256 of sRGB (IEC 61966-2-1) or 65536 of linear16."""
+    """Linear radiance in [0, 1] of each code value: [256] for sRGB (IEC 61966-2-1), [65536] for linear16."""
     if encoding == "linear16":
         return (np.arange(65536) / 65535).astype(np.float32)
     code = np.arange(256) / 255

@@ -1,6 +1,6 @@
-"""Depth of another lens brought to the colour picture (thesis 5.1.1). Kernel: register.cl.
+"""Registration of depth from another lens to the colour picture (thesis 5.1.1). Kernel: register.cl.
 
-Each depth pixel's own ray is looked up, not the depth picture resampled, so that no measurement moves or is lost.
+Each depth pixel is projected along its own ray. The depth picture is not resampled, so that no measurement is lost.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from server.opencl.engine import Engine, float4, float16
 _NEWTON_STEPS = 20
 _CLOSE = 1e-9
 _SPREAD = 4.0
-"""A triangle between neighbouring depth pixels may be this many times larger than one seen from the front."""
+"""Greatest size of a triangle between neighbouring depth pixels, relative to one seen from the front."""
 
 
 class _Buffers(StageBuffers):
@@ -42,8 +42,8 @@ def register_depth(
 ) -> cl_array.Array:
     """[h, w] float32 of the colour picture: metres along its axis of the nearest surface measured there, 0 = none.
 
-    units: [h, w] uint16 of `camera.depth`, which must be set; 0 and 65535: none. Surfaces are filled between their
-    measurements, not across the edges of depth. The result is valid until the next call.
+    units: [h, w] uint16 of `camera.depth`, which must be set; 0 and 65535: none. Surfaces are interpolated between
+    measurements, but not across depth edges. The result is valid until the next call.
     """
     lens = camera.depth
     assert lens is not None
@@ -99,22 +99,24 @@ def _greatest_px(camera: CameraModel, lens: DepthCamera) -> int:
 
 @lru_cache(maxsize=8)
 def rays_of(lens: DepthCamera) -> NDArray[np.float32]:
-    """[h, w, 4] (x, y, 1, 0): the ray at z = 1 that every pixel of the distorted picture sees, z = 0 where it has none.
+    """[h, w, 4] (x, y, 1, 0): the ray at z = 1 of every pixel of the distorted picture; z = 0: no ray.
 
-    Newton's method on Brown's polynomial, from the distorted place. Where the polynomial folds back there is no ray.
+    Newton's method on Brown's polynomial, from the distorted point. Where the polynomial folds back there is no ray.
     """
     v, u = np.mgrid[: lens.height, : lens.width].astype(np.float64)
-    wanted = np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy], axis=-1)
-    found = wanted.copy()
-    with np.errstate(all="ignore"):  # beyond the fold it may run away; what did not arrive is dropped
+    distorted = np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy], axis=-1)
+    found = distorted.copy()
+    with np.errstate(all="ignore"):  # may diverge beyond the fold; such pixels get no ray
         for _ in range(_NEWTON_STEPS):
             off, jacobian = _distorted(lens, found)
-            found -= _solve_2x2(jacobian, off - wanted)
+            found -= _solve_2x2(jacobian, off - distorted)
         off, jacobian = _distorted(lens, found)
-        arrived = (np.abs(off - wanted).max(-1) < _CLOSE) & (_determinant(jacobian) > 0) & (jacobian[..., 0, 0] > 0)
-    rays = np.zeros((*arrived.shape, 4), np.float32)
-    rays[arrived, :2] = found[arrived]
-    rays[arrived, 2] = 1.0
+        converged = (
+            (np.abs(off - distorted).max(-1) < _CLOSE) & (_determinant(jacobian) > 0) & (jacobian[..., 0, 0] > 0)
+        )
+    rays = np.zeros((*converged.shape, 4), np.float32)
+    rays[converged, :2] = found[converged]
+    rays[converged, 2] = 1.0
     return rays
 
 

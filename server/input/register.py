@@ -28,7 +28,7 @@ class _Buffers(StageBuffers):
     rays = KeyedBufferDescription(np.float32)
     """By depth lens, [h, w, 4] as rays_of returns them."""
     projected = BufferDescription(cl_types.float4)
-    """[h, w] of the depth lens: pixel in the colour picture, 1 / z there, z here; 0 = none."""
+    """[h, w] of the depth lens: pixel in the colour picture, 1 / z there, z in the depth camera; 0 = none."""
     surface = BufferDescription(np.uint32)
     """[h, w] bits of the depth of triangles between measurements."""
     points = BufferDescription(np.uint32)
@@ -74,7 +74,7 @@ def register_depth(
 def _project(
     engine: Engine, camera: CameraModel, lens: DepthCamera, units: cl_array.Array, greatest_depth_m: float
 ) -> cl_array.Array:
-    """[h, w] float4 of the depth lens: pixel in the colour picture, 1 / z there, z here; 0 = none."""
+    """[h, w] float4 of the depth lens: pixel in the colour picture, 1 / z there, z in the depth camera; 0 = none."""
     buffers = engine.buffers(_Buffers)
     projected = buffers.projected.array((lens.height, lens.width))
     engine.launch(

@@ -93,7 +93,7 @@ class Alignment:
         """[3, 3] rotation into axes with +y up and the first view as close to -z as possible; None before a frame."""
 
     def in_room(self, frame: RgbdFrame) -> RgbdFrame:
-        """The frame with its pose in the room's world; a missing pose is computed from a visible marker, if possible."""
+        """The frame with its pose in the room's world; a missing pose is computed from a marker if one is seen."""
         if frame.world_from_camera is not None:
             if self._is_alone:
                 return frame

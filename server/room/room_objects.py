@@ -26,7 +26,7 @@ MAX_PENDING = 256
 
 @dataclass(frozen=True)
 class ObjectRecord:
-    """What is needed to recreate an object."""
+    """Data to recreate an object."""
 
     object_id: str
     mesh: Mesh
@@ -151,7 +151,7 @@ class RoomObjects:
                 del self._waiting[self._waiting_index(object_id)]
 
     def add_pending(self, object_id: str) -> None:
-        """Note an acknowledged object that cannot be placed yet, since its client is not aligned with the room."""
+        """Note an object that was acknowledged, but cannot be placed before its client is aligned with the room."""
         with self._change():
             self._pending[object_id] = None
             while len(self._pending) > MAX_PENDING:

@@ -85,7 +85,7 @@ def extract_surface(bricks: Bricks, progress: Callable[[int, int], None] = lambd
             pieces.append(piece)
     progress(len(chunks), len(chunks))
     if not pieces:
-        raise MeshingError("there is no surface to mesh: no voxel next to one was seen from the front")
+        raise MeshingError("there is no surface to mesh: no voxels on both sides of a surface were observed")
     return _weld(pieces)
 
 

@@ -169,8 +169,8 @@ class RoomObjects:
             return ()
         return (
             one_line(
-                "not placed, since whoever asked was not aligned with the room; place or remove again what nobody "
-                f"here waits for: {', '.join(names)}"
+                "objects that were not placed, because their client was not aligned with the room; place them again or "
+                f"remove them: {', '.join(names)}"
             ),
         )
 

@@ -184,7 +184,7 @@ class Alignment:
                 return None  # the camera looks elsewhere: nothing contradicts its pose
             fits = found.share > LEAST_SHARE and found.deviation_m < GREATEST_DEVIATION_M
             if not fits or not is_near(found.volume_from_camera, pose, GREATEST_CORRECTION_M, GREATEST_CORRECTION_RAD):
-                return "its depth does not fit what the room has seen where it says that it is"
+                return "its depth does not fit the room's surface at the given pose"
         else:
             seen = thumbnail(frame, engine.download(pyramid[0]))
             places = [pose, *self._reconstruction.keyframes.most_similar(seen, count=3)]

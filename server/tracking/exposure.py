@@ -197,7 +197,7 @@ class ExposureTracking:
         step = max(relative / self._exposure, self._exposure / relative) if relative > 0 else math.inf
         if step > GREATEST_STEP or not 1 / GREATEST_EXPOSURE <= relative <= GREATEST_EXPOSURE:
             return None, (
-                f"the frame's exposure of {given:g} is {step:.3g} times another than the last frame's, which no camera "
-                "does: it is estimated",
+                f"the frame's exposure of {given:g} differs from the last frame's by a factor of {step:.3g}, more than "
+                "a camera's range: it is estimated",
             )
         return given, ()

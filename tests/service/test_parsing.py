@@ -145,7 +145,7 @@ LIES = {
 
 @pytest.mark.parametrize("lie", LIES)
 def test_what_a_child_says_is_not_believed(lie: str) -> None:
-    with pytest.raises(MeshError, match="what was read of the mesh is not one"):
+    with pytest.raises(MeshError, match="the mesh reader's answer is not a valid mesh"):
         mesh_from_bytes(mesh_to_bytes(replace(textured(), **LIES[lie])))
 
 

@@ -103,8 +103,8 @@ def test_tv_l1_matches_twin(engine: Engine, size: tuple[int, int], iterations: i
 
 
 def test_tv_l1_in_strips_of_any_height_is_the_same(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also of fewer rows than iterations in a pass, where a strip needs rows of strips beyond its neighbours; and of
-    so many strips that several threads work on them, when none may need what another one has yet to write."""
+    """Also with fewer rows than iterations in a pass, where a strip reads rows beyond its neighbours; and with so many
+    strips that several threads work on them, none of which may read values that another one writes."""
     image = upload(engine, picture((41, 667)))
     expected = engine.download(denoise.tv_l1(engine, image, 13, 0.8, strips=False))
     monkeypatch.setattr(denoise, "_STRIPS_PER_CORE", 1000)
@@ -116,7 +116,7 @@ def test_tv_l1_in_strips_of_any_height_is_the_same(engine: Engine, monkeypatch: 
 
 @pytest.mark.parametrize("weight", [0.5, 1.0, 1.5])
 def test_tv_l1_leaves_less_energy_than_opencv(engine: Engine, weight: float) -> None:
-    """After the same number of iterations; by far, as OpenCV's scheme still goes up in the first hundred."""
+    """After the same number of iterations, since the energy of OpenCV's scheme rises in the first hundred."""
     image = np.rint(255 * picture((160, 130)))
     f = image / 255
     for iterations in (5, 10, 30, 100):
@@ -148,7 +148,7 @@ def test_tv_l1_removes_specks_and_keeps_edges(engine: Engine) -> None:
 
 @pytest.mark.parametrize("strips", [True, False])
 def test_tv_l1_does_not_spread_across_what_is_unknown(engine: Engine, strips: bool) -> None:
-    """Two halves behind a column without values: each is as it would be alone, and the column as it was."""
+    """Two halves beside an unknown column: each is filtered as if alone, and the column is unchanged."""
     image = picture((33, 30))
     image[:, 16] = -1
     both = engine.download(denoise.tv_l1(engine, upload(engine, image), 30, 0.7, 0.0, strips=strips)).copy()

@@ -1,4 +1,4 @@
-"""Exposure: what the kernel compares against its float64 twin, and what becomes of it over frames."""
+"""Exposure: the comparison kernel against its float64 twin, and the estimate over frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tracker's kernels against their float64 twin, and poses that are known recovered."""
+"""The tracker's kernels against their float64 twin, and recovery of known poses."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_equations_match_twin(engine: Engine, size: tuple[int, int], motion: Flo
     expected = twin.sum_equations(view, depth, lens, lens, transform, *noise)
     got = device_sums(engine, view, depth, camera, transform, noise)
     assert expected[28] > 0.1 * expected[30] > 0
-    # A model point that falls between two pixels may be given to either; each has a share of 1 / pairs.
+    # A model point between two pixels may be associated with either; each has a share of 1 / pairs.
     *_, measured, pixel = twin.pairs(view, depth, lens, lens, transform)
     ties = (np.abs(pixel % 1 - 0.5).min(-1) < 1e-3)[measured].sum()
     diagonal = np.sqrt(np.diag(full(expected)))

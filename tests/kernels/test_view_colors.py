@@ -1,4 +1,4 @@
-"""The picture of somebody who only looks, against its float64 twin and a painted wall."""
+"""The volume's colours as a camera sees them, against the float64 twin and a painted wall."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def looked_at(
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_colors_match_twin(engine: Engine, share: float) -> None:
-    """To what 8 or 9 bits of a root leave, and float32."""
+    """Within the quantisation of colours (8 or 9 bits of a root) and float32 rounding."""
     rng = np.random.default_rng(3)
     volume = Volume(engine, (0, 0, 0, *[SIZE * VOXEL_M] * 3), VOXEL_M)
     allocate_everywhere(volume)

@@ -52,7 +52,7 @@ class ClientSession:
         self._pipeline = Pipeline(
             self._engine, camera, wishes, self._quality.settings, self._room, self._alignment, self._objects
         )
-        self._is_told_what_is_owed = False
+        self._has_told_pending = False
         self.device_name = device.name
 
     def process(self, frame: RgbdFrame | Viewpoint, *, watched: bool = False) -> FrameResult:
@@ -73,7 +73,7 @@ class ClientSession:
                 point = self._quality.observe(result.timings, is_reused=result.is_reused)
                 self._pipeline.use(self._quality.settings)
                 plan = structs.replace(plan, point=point)
-            return replace(result, plan=plan, notes=(*result.notes, *self._differences, *self._owed_notes()))
+            return replace(result, plan=plan, notes=(*result.notes, *self._differences, *self._pending_notes()))
 
     def place_object(self, object_id: str, mesh: Mesh, placement: Placement) -> tuple[str, ...]:
         """Put a mesh into the room, in place of one with the same id; returns notes. Raises ValueError."""
@@ -122,9 +122,9 @@ class ClientSession:
         if self._owns_room:
             self._room.close()
 
-    def _owed_notes(self) -> tuple[str, ...]:
+    def _pending_notes(self) -> tuple[str, ...]:
         """Once: the objects that were acknowledged before and stand nowhere."""
-        if self._is_told_what_is_owed:
+        if self._has_told_pending:
             return ()
-        self._is_told_what_is_owed = True
-        return self._room.objects.owed_notes(besides=set(self._objects.waiting))
+        self._has_told_pending = True
+        return self._room.objects.pending_notes(besides=set(self._objects.waiting))

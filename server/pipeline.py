@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
+import pyopencl.cltypes as cl_types
 from msgspec import structs
 from numpy.typing import NDArray
 from pyopencl.array import Array
@@ -24,6 +25,7 @@ from server.light.light_estimation import LightEstimate
 from server.light.light_message import light_message, seen_from
 from server.light.near_light import remove_lamps
 from server.objects.rasterize import Placed
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.quality.settings import Settings
 from server.reuse.frame_cache import FrameCache
@@ -56,6 +58,11 @@ class FrameResult:
     """What is virtual in it; None: the client does not want it apart."""
     is_reused: bool = False
     """Whether the geometry of the frame before was kept."""
+
+
+class _Buffers(StageBuffers):
+    smooth_radiance = BufferDescription(cl_types.float4)
+    """[h, w] denoised, in the first picture's units."""
 
 
 class Pipeline:
@@ -217,7 +224,7 @@ class Pipeline:
             return context.scene_radiance
         method, iterations = settings.denoise, settings.denoise_iterations
         smooth = denoise_radiance(self._engine, context.measurement, method, iterations)
-        return scene_radiance(self._engine, smooth, context.exposure, "smooth_scene_radiance")
+        return scene_radiance(self._engine, smooth, context.exposure, self._engine.buffers(_Buffers).smooth_radiance)
 
     def _spine_outputs(
         self,

@@ -1,4 +1,4 @@
-// The geometry buffer of the hybrid depth picture (thesis 4.2.2): positions, normals, and whose word each pixel is.
+// The geometry buffer of the hybrid depth picture (thesis 4.2.2): positions, normals and labels.
 // Provides label_surface, fit_normals.
 #include "agreement.clh"
 #include "camera.clh"
@@ -10,8 +10,8 @@
 #define LABEL_FILLED 3
 
 // depth, sensed, predicted: planes (see merge.cl; sensed is negative where sensor and volume agree); model_positions,
-// model_normals [h][w]: the volume's surface -> positions, normals, labels [h][w]: the volume's own surface where the
-// filtered depth agrees with it, else a point of that depth, labelled by whether the sensor agrees; its normal is left 0.
+// model_normals [h][w]: the volume's surface -> positions, normals, labels [h][w]: the volume's surface where the filtered
+// depth agrees with it, else the point at the filtered depth, labelled by whether the sensor agrees, with normal 0.
 kernel void label_surface(const int width, const int height, const int pitch, global const float *depth,
                           global const float *sensed, global const float *predicted, const float4 intrinsics,
                           const float16 volume_from_camera, const float voxel_m, global const float4 *model_positions,
@@ -24,7 +24,7 @@ kernel void label_surface(const int width, const int height, const int pitch, gl
     const int at = plane_index(pitch, x, y);
     const float z = depth[at], volume = fabs(predicted[at]), sensor = fabs(sensed[at]);
     const float near = AGREEMENT_M(z, voxel_m);
-    const int has_shifted = sensed[at] > 0.0f && fabs(sensor - volume) < near;  // by little, and all around
+    const int has_shifted = sensed[at] > 0.0f && fabs(sensor - volume) < near;  // by less than lambda_D, but everywhere around
     if (z > 0.0f && volume > 0.0f && fabs(z - volume) < near && !has_shifted) {
         positions[pixel] = model_positions[pixel];
         normals[pixel] = model_normals[pixel];
@@ -40,21 +40,21 @@ kernel void label_surface(const int width, const int height, const int pitch, gl
     }
 }
 
-// Slopes of eight planes: how much the inverse depth changes a pixel, as a share of its own, along x and y.
+// Slopes of eight planes: relative change of the inverse depth per pixel along x and y.
 typedef struct {
     float8 x;
     float8 y;
-    int8 valid;  // -1 where at least three pixels lie on the same surface
+    int8 valid;  // -1 where at least three pixels are on the same surface
 } Slopes;
 
-// A plane's inverse depth is linear in the pixel: least squares over 5 x 5 pixels, STEP apart, of the same surface. A ridge
-// of half a pixel keeps a surface one pixel wide flat across; of a whole window it takes 1 %.
+// A plane's inverse depth is linear in the pixel: least squares over 5 x 5 pixels, STEP apart, of the same surface. The ridge
+// term makes the slope across a surface one pixel wide 0; in a whole window it reduces slopes by 1 %.
 #define STEP 2
 #define RIDGE 0.5f
 static Slopes fit_slopes(global const float *depth, const int pitch, const int at, const float focal_px) {
     const float8 here = vload8(0, depth + at);
     const int8 known = here > 0.0f;
-    // Two pixels of a surface apart: 2 % and 5 mm, or the step of one seen at a slope of 3 across half the window.
+    // Depths of one surface differ by at most 5 mm plus 2 % or, if greater, a slope of 3 across half the window.
     const float8 near = fmax(0.02f, 6.0f * STEP / focal_px) * here + 0.005f;
     float8 n = 0.0f, sx = 0.0f, sy = 0.0f, sxx = 0.0f, sxy = 0.0f, syy = 0.0f, sr = 0.0f, sxr = 0.0f, syr = 0.0f;
 #pragma unroll

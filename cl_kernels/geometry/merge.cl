@@ -8,15 +8,15 @@
 #include "volume.clh"
 
 #define HOLE_STEP 4      // k = 17: Omega_k of eq. 4.3 is 17 x 17 pixels, subsampled to 5 x 5
-#define LEAST_SUPPORT 4  // as many samples as a straight line through the window meets: less is no evidence
-#define OUTSIDE -1000.0f // an intensity like no other
+#define LEAST_SUPPORT 4  // samples on a straight line through the window; fewer are no evidence
+#define OUTSIDE -1000.0f // an intensity similar to no other
 
-// Eq. 4.1 for eight pixels: -1 where the neighbour is about as bright, else 0.
+// Eq. 4.1 for eight pixels: -1 where the neighbour has a similar intensity, else 0.
 static inline int8 is_similar(const float8 shade, const float8 here, const float lambda_intensity) {
     return fabs(shade - here) < lambda_intensity;
 }
 
-// In how many frames the voxel around a point of the volume was seen.
+// Weight of the voxel at a point of the volume: number of frames that have seen it.
 static float weight_at(const int4 bricks, global const int *slots, global const float2 *voxels, const float3 point) {
     const int3 voxel = convert_int3(point);
     const int3 brick = voxel >> 3;
@@ -27,8 +27,8 @@ static float weight_at(const int4 bricks, global const int *slots, global const 
 }
 
 // Over the bordered planes. depth_m, radiance, positions (of the volume's surface, w = 0 none) [h][w] -> measured: D_C;
-// predicted: D_X; shade: intensity, the square root of the luminance. Borders are 0, like those that sensed, merged and
-// aligned get, which later kernels write inside only.
+// predicted: D_X; shade: intensity, the square root of the luminance. Borders are 0, also those of sensed, merged and
+// aligned, whose inside later kernels write.
 kernel void lay_out(const int width, const int height, const int pitch, global const float *depth_m,
                     global const float4 *radiance, global const float4 *positions, const float16 camera_from_volume,
                     global float *measured, global float *predicted, global float *shade, global float *sensed,
@@ -50,8 +50,8 @@ kernel void lay_out(const int width, const int height, const int pitch, global c
     shade[at] = sqrt(fmax(0.2126f * color.x + 0.7152f * color.y + 0.0722f * color.z, 0.0f));
 }
 
-// -1 where eight pixels mix two surfaces, as sensors do on rims: at most two of the eight neighbours are on a pixel's own
-// surface, and there are both nearer and farther ones.
+// -1 where one of eight pixels mixes two surfaces, as sensors do at silhouettes: at most two of its eight neighbours are on its
+// own surface, and there are both nearer and farther ones.
 static int8 is_mixed(global const float *measured, const int pitch, const int at, const float8 here) {
     const float8 near = SAME_SURFACE_M(here);
     int8 own = 0, nearer = 0, farther = 0;
@@ -66,8 +66,8 @@ static int8 is_mixed(global const float *measured, const int pitch, const int at
     return (own <= 3) & nearer & farther;
 }
 
-// -1 where the sensor agrees with the volume: at the pixel to within lambda_D, and on the average of all pixels around that
-// do so by much less, as noise does not last there. Else what moves slowly would be static, with the normals of a while ago.
+// -1 where the sensor agrees with the volume: at the pixel within lambda_D, and on the mean of the agreeing pixels around it
+// within much less, since a mean has less noise. Otherwise a slow object would be static, with outdated normals.
 static int8 agrees_with_volume(global const float *measured, global const float *predicted, const int pitch, const int at,
                                const float8 sensor, const float8 volume, const float voxel_m) {
     const int8 here = (volume > 0.0f) & (fabs(sensor - volume) < AGREEMENT_M(sensor, voxel_m));
@@ -85,20 +85,20 @@ static int8 agrees_with_volume(global const float *measured, global const float 
     return here & (fabs(sum) < MEAN_AGREEMENT_M(sensor, voxel_m) * count);
 }
 
-// In how many frames the volume's surface at eight pixels was seen, of those `asked` for; the others get 0.
+// Number of frames that have seen the volume's surface at eight pixels, where `needed`; elsewhere 0.
 static float8 ages_of_surface(global const float4 *positions, const int4 bricks, global const int *slots,
-                              global const float2 *voxels, const float voxel_m, const int8 asked, const int count) {
-    int wanted[8];
+                              global const float2 *voxels, const float voxel_m, const int8 needed, const int count) {
+    int is_needed[8];
     float ages[8];
-    vstore8(asked, 0, wanted);
+    vstore8(needed, 0, is_needed);
     for (int i = 0; i < 8; i++)
-        ages[i] = i < count && wanted[i] ? weight_at(bricks, slots, voxels, positions[i].xyz / voxel_m) : 0.0f;
+        ages[i] = i < count && is_needed[i] ? weight_at(bricks, slots, voxels, positions[i].xyz / voxel_m) : 0.0f;
     return vload8(0, ages);
 }
 
 // measured, predicted, positions and the volume -> sensed: D_C, negative where it agrees with the volume, 0 also where
-// two surfaces are mixed; trusted: predicted, negative where sensed is 0 and under `least_filling` frames have seen the
-// volume's surface. With a surface that under `least_still` frames have seen nothing agrees: it may be what moves, fused just now.
+// two surfaces are mixed; trusted: predicted, negative where sensed is 0 and fewer than `least_filling` frames have seen the
+// volume's surface. Nothing agrees with surface seen by fewer than `least_still` frames: it may be a moving object, just fused.
 kernel void compare_depth(const int width, const int height, const int pitch, global const float *measured,
                           global const float *predicted, global const float4 *positions, const int4 bricks, global const int *slots,
                           global const float2 *voxels, const float voxel_m, const float least_still,
@@ -110,41 +110,41 @@ kernel void compare_depth(const int width, const int height, const int pitch, gl
     const float8 sensor = vload8(0, measured + at), volume = vload8(0, predicted + at);
     const int8 hole = (sensor <= 0.0f) | is_mixed(measured, pitch, at, sensor);
     int8 agrees = agrees_with_volume(measured, predicted, pitch, at, sensor, volume, voxel_m);
-    const int8 asked = (volume > 0.0f) & (hole | agrees);
+    const int8 needed = (volume > 0.0f) & (hole | agrees);
     float8 marked = volume;
-    if (any(asked)) {
-        const float8 age = ages_of_surface(positions + y * width + x, bricks, slots, voxels, voxel_m, asked, min(8, width - x));
+    if (any(needed)) {
+        const float8 age = ages_of_surface(positions + y * width + x, bricks, slots, voxels, voxel_m, needed, min(8, width - x));
         agrees &= age >= least_still;
-        marked = select(volume, -volume, asked & hole & (age < least_filling));
+        marked = select(volume, -volume, needed & hole & (age < least_filling));
     }
     vstore8(marked, 0, trusted + at);
     vstore8(select(select(sensor, -sensor, agrees), (float8)(0.0f), hole), 0, sensed + at);
 }
 
-// How many samples around eight pixels, `step` apart, say that the volume's surface there is still where it was, less those
-// through which the sensor sees farther. Only samples of that same surface have a say; one hidden by something nearer has none.
-static int8 word_of_surface(global const float *sensed, global const float *predicted, const int pitch, const int at,
+// Votes of the samples around eight pixels, `step` apart, on the volume's surface: +1 where the sensor agrees with it, -1 where
+// the sensor sees farther. Only samples of the same surface vote, and none that is occluded by something nearer.
+static int8 votes_for_surface(global const float *sensed, global const float *predicted, const int pitch, const int at,
                             const int step, const float8 surface, const float8 near) {
-    int8 agreeing = 0;
+    int8 votes = 0;
 #pragma unroll
     for (int i = 0; i < 25; i++) {
         const int there = at + (i / 5 - 2) * step * pitch + (i % 5 - 2) * step;
         const int8 key = as_int8(vload8(0, sensed + there));
         const float8 expected = vload8(0, predicted + there);
         const int8 same = (fabs(expected - surface) < near) & (key != 0);
-        agreeing += (same & (as_float8(key) > expected)) - (same & (key < 0));  // masks are -1
+        votes += (same & (as_float8(key) > expected)) - (same & (key < 0));  // masks are -1
     }
-    return agreeing;
+    return votes;
 }
 
-// What fills eight holes (third and fourth case of eq. 4.3). The median of the supporting neighbours where they are enough,
-// and most of them say that the scene has changed, or the volume has no word. It has none where it has not seen its surface
-// for long, or where the sensor contradicts most of that same surface around the pixel. Else the volume.
+// Depth of eight holes (third and fourth case of eq. 4.3): the median of the supporting neighbours if there are enough, and if
+// most of them disagree with the volume or the volume is not reliable; else the volume. It is not reliable where too few frames
+// have seen its surface, or where the sensor contradicts most of that surface around the pixel.
 static int8 fill_holes(global const float *sensed, global const float *predicted, global const float *shade, const int pitch,
                        const int at, const float voxel_m, const float lambda_intensity) {
     const float8 here = vload8(0, shade + at), surface = vload8(0, predicted + at);
     const float8 near = AGREEMENT_M(surface, voxel_m);
-    int8 values[25], pad = FIRST_PAD, count = 0, votes = 0;
+    int8 values[25], pad = FIRST_PAD, count = 0, agreeing = 0;
 #pragma unroll
     for (int i = 0; i < 25; i++) {
         const int there = at + (i / 5 - 2) * HOLE_STEP * pitch + (i % 5 - 2) * HOLE_STEP;
@@ -152,12 +152,12 @@ static int8 fill_holes(global const float *sensed, global const float *predicted
         const int8 support = is_similar(vload8(0, shade + there), here, lambda_intensity) & (key != 0);
         values[i] = pad_unless(support, key & INT_MAX, &pad);
         count -= support;
-        votes -= support & (key < 0);
+        agreeing -= support & (key < 0);
     }
-    const int8 word = word_of_surface(sensed, predicted, pitch, at, HOLE_STEP, surface, near) +
-                      word_of_surface(sensed, predicted, pitch, at, HOLE_STEP / 2, surface, near);
-    const int8 known = (surface > 0.0f) & (word >= 0);
-    const int8 filled = (count >= LEAST_SUPPORT) & ((2 * votes < count) | ~known);
+    const int8 votes = votes_for_surface(sensed, predicted, pitch, at, HOLE_STEP, surface, near) +
+                       votes_for_surface(sensed, predicted, pitch, at, HOLE_STEP / 2, surface, near);
+    const int8 known = (surface > 0.0f) & (votes >= 0);
+    const int8 filled = (count >= LEAST_SUPPORT) & ((2 * agreeing < count) | ~known);
     return select(known & as_int8(surface), middle_of(values, 25), filled);
 }
 
@@ -178,7 +178,7 @@ kernel void merge_depth(const int width, const int height, const int pitch, glob
     vstore8(as_float8(result), 0, merged + at);
 }
 
-// Whether a depth in the rows within `radius` pixels of eight pixels, and up to four beside them, is not the volume's.
+// Whether any depth within `radius` rows of eight pixels, and up to four pixels beside them, is not the volume's.
 static inline int any_others(global const float *depths, global const float *predicted, const int pitch, const int at,
                              const int radius) {
     int16 others = 0;
@@ -202,8 +202,8 @@ static int8 has_others(global const float *depths, global const float *predicted
     return others;
 }
 
-// D'' (eq. 4.4), a joint bilateral median over 5 x 5 pixels: merged, shade -> aligned. Unknown stays unknown. Where all of the
-// window is the volume's there is no sensor's noise to take away, and it is kept.
+// D'' (eq. 4.4), a joint bilateral median over 5 x 5 pixels: merged, shade -> aligned. Unknown stays unknown. Where the whole
+// window is the volume's, it has no sensor noise and is kept.
 kernel void align_depth(const int width, const int height, const int pitch, global const float *merged,
                         global const float *predicted, global const float *shade, const float lambda_intensity,
                         global float *aligned) {
@@ -215,7 +215,7 @@ kernel void align_depth(const int width, const int height, const int pitch, glob
         vstore8(vload8(0, merged + at), 0, aligned + at);
         return;
     }
-    const int8 wanted = has_others(merged, predicted, pitch, at, 2);
+    const int8 is_filtered = has_others(merged, predicted, pitch, at, 2);
     const float8 here = vload8(0, shade + at);
     int8 values[25], pad = FIRST_PAD;
 #pragma unroll
@@ -226,12 +226,12 @@ kernel void align_depth(const int width, const int height, const int pitch, glob
         values[i] = pad_unless(member, key, &pad);
     }
     const int8 own = as_int8(vload8(0, merged + at));
-    vstore8(as_float8(select(own, (own != 0) & middle_of(values, 25), wanted)), 0, aligned + at);
+    vstore8(as_float8(select(own, (own != 0) & middle_of(values, 25), is_filtered)), 0, aligned + at);
 }
 
-// D''' (eq. 4.5), a median over 3 x 3 pixels: aligned -> smoothed. Unknown stays unknown. Where at least two neighbours are
-// on the pixel's own surface the median is theirs alone: of all it would round corners and take away what is a pixel wide.
-// What is the volume's all around is kept, as by D''.
+// D''' (eq. 4.5), a median over 3 x 3 pixels: aligned -> smoothed. Unknown stays unknown. Where at least two neighbours are on
+// the pixel's own surface, the median is over these only: over all, it would round corners and remove details a pixel wide.
+// Windows of the volume's depth are kept, as in D''.
 kernel void smooth_depth(const int width, const int height, const int pitch, global const float *aligned,
                          global const float *predicted, global float *smoothed) {
     const int x = 8 * get_global_id(0);
@@ -243,7 +243,7 @@ kernel void smooth_depth(const int width, const int height, const int pitch, glo
         vstore8(here, 0, smoothed + at);
         return;
     }
-    const int8 wanted = has_others(aligned, predicted, pitch, at, 1);
+    const int8 is_filtered = has_others(aligned, predicted, pitch, at, 1);
     const float8 near = SAME_SURFACE_M(here);
     int8 values[9], own[9], pad = FIRST_PAD, count = 0;
 #pragma unroll
@@ -255,5 +255,5 @@ kernel void smooth_depth(const int width, const int height, const int pitch, glo
     }
 #pragma unroll
     for (int i = 0; i < 9; i++) values[i] = pad_unless((values[i] != 0) & (own[i] | (count < 3)), values[i], &pad);
-    vstore8(as_float8(select(as_int8(here), (here > 0.0f) & middle_of(values, 9), wanted)), 0, smoothed + at);
+    vstore8(as_float8(select(as_int8(here), (here > 0.0f) & middle_of(values, 9), is_filtered)), 0, smoothed + at);
 }

@@ -1,7 +1,7 @@
-// Noise out of lightness and depth (thesis 5.1.1): CIE L*, TV-L1 (its [120]) and a bilateral filter.
-// Provides measure_lightness, relight, tv_l1_prepare, tv_l1_strips, tv_l1_dual, tv_l1_primal, tv_l1_finish, pad, bilateral,
-// invert.
-// Eight pixels of a row are one float8: PoCL vectorises little else. Pictures in work are [rows][stride], stride a multiple of 8.
+// Denoising of lightness and depth (thesis 5.1.1): CIE L*, TV-L1 (its [120]) and a bilateral filter.
+// Provides measure_lightness, relight, tv_l1_prepare, tv_l1_strips, tv_l1_dual, tv_l1_primal, tv_l1_finish, pad, bilateral.
+// Eight pixels of a row are one float8: PoCL vectorises little else. Intermediate images are [rows][stride], stride a multiple
+// of 8.
 #include "portability.clh"
 
 #define KNEE (6.0f / 29.0f)  // CIE 15: L* is a cube root above KNEE^3 and a line below
@@ -34,7 +34,7 @@ static inline float8 luminance_from(const float8 lightness) {
     return cube + 3.0f * KNEE * KNEE * min(root - KNEE, 0.0f);
 }
 
-// One item 8 of the `count` (8 or more) pixels; the last item's begin earlier if need be, and are those of the item before.
+// One item 8 of the `count` (8 or more) pixels; the last item may overlap the one before.
 // radiance [count] (rgb linear, w > 0 usable) -> lightness [count]: L* / 100, -1 where not usable.
 kernel void measure_lightness(const int count, global const float4 *radiance, global float *lightness) {
     if (8 * (int)get_global_id(0) >= count) return;
@@ -44,7 +44,7 @@ kernel void measure_lightness(const int count, global const float4 *radiance, gl
     vstore8(select((float8)(-1.0f), lightness_of(luminance_of(r)), usable > 0.0f), 0, lightness + first);
 }
 
-// Items as above. radiance [count] with the lightness given where it is usable: its colour keeps its ratios. -> relit [count].
+// Items as above. radiance [count], lightness [count] -> relit [count]: usable colours scaled to the lightness.
 kernel void relight(const int count, global const float4 *radiance, global const float *lightness, global float4 *relit) {
     if (8 * (int)get_global_id(0) >= count) return;
     const int first = min(8 * (int)get_global_id(0), count - 8);
@@ -67,8 +67,8 @@ typedef struct {
     global float *u, *ahead, *px, *py;
 } State;
 
-// One item a pixel of [height][stride]. image [height][width], at or below `none` where it holds nothing; neighbours that differ
-// by more than `edge` are not joined -> f, joined, the first state.
+// One item a pixel of [height][stride]. image [height][width], unknown at or below `none`; neighbours that differ by more than
+// `edge` are not joined -> f, joined, the first state.
 kernel void tv_l1_prepare(const int width, const int height, const int stride, global const float *image, const float none,
                           const float edge, global float *f, global uchar *joined,
                           global float *u, global float *ahead, global float *px, global float *py) {
@@ -96,8 +96,8 @@ static inline float8 where_joined(const uchar8 joined, const int bit, const floa
     return as_float8(((convert_int8(joined) & bit) != 0) & as_int8(v));
 }
 
-// One iteration over rows [first, last) of `from` into `to`, which may be the same: what is replaced has been read.
-// The dual field of the row above, which belongs to a neighbour, is renewed in `margin`.
+// One iteration over rows [first, last) of `from` into `to`, which may be the same: values are read before they are replaced.
+// The dual field of the row above, which belongs to a neighbour, is computed in `margin`.
 static inline void iterate(const int stride, const int height, const int first, const int last, global const float *f,
                            global const uchar *joined, const float tau, const float sigma, const float limit,
                            const State from, const State to, const State margin) {
@@ -135,9 +135,9 @@ static inline void iterate(const int stride, const int height, const int first, 
     }
 }
 
-// `steps` iterations in one pass over memory, for processors with caches: one item a strip of `rows` rows, whose state stays in
-// its own part of `scratch` [strips][4][rows + 2 steps + 1][stride] between the first and the last. The rows that `steps`
-// iterations reach from the strip's are worked twice. Arrays are [height + 1][stride]; what follows the last row is read, not used.
+// `steps` iterations in one pass over memory, for CPUs: one item a strip of `rows` rows, whose state between the first and the
+// last iteration is in its own part of `scratch` [strips][4][rows + 2 steps + 1][stride]. Rows within `steps` of a strip's edge
+// are computed by both strips. Arrays are [height + 1][stride]; the row after the last is read, but not used.
 kernel void tv_l1_strips(const int stride, const int height, const int rows, const int steps, global const float *f,
                          global const uchar *joined, const float tau, const float sigma, const float limit,
                          global float *u, global float *ahead, global float *px, global float *py, global float *scratch,
@@ -194,8 +194,8 @@ kernel void tv_l1_finish(const int width, const int height, const int stride, gl
     if (x < width && y < height) image[y * width + x] = u[y * stride + x];
 }
 
-// Bilateral filter (Tomasi and Manduchi 1998) with weights that end: Tukey's (1 - r^2)^2 of the difference instead of a
-// Gaussian. Beyond its reach nothing counts at all, so that no edge leaks, and a value that means none needs no test.
+// Bilateral filter (Tomasi and Manduchi 1998) with Tukey's weight (1 - r^2)^2 of the difference instead of a Gaussian. The
+// weight is 0 beyond a finite width, so that edges do not leak and the value of no measurement needs no test.
 #define RADIUS 3
 #define MARGIN 8
 
@@ -210,18 +210,18 @@ kernel void pad(const int width, const int height, const int stride, global cons
     padded[y * stride + x] = inside ? image[v * width + u] : none;
 }
 
-// One item 8 pixels of a row. reach.s0 + reach.s1 (value - reach.s2)^2: the difference at which the weight has fallen to 0.
-// closeness [2 RADIUS + 1][2 RADIUS + 1]: weight by place. padded: see pad -> filtered [height][width]. At `none` the reach
-// is next to nothing, so that it stays none.
+// One item 8 pixels of a row. range_width.s0 + range_width.s1 (value - range_width.s2)^2: the difference at which the weight
+// becomes 0. closeness [2 RADIUS + 1][2 RADIUS + 1]: weight by position. padded: see pad -> filtered [height][width]. At `none`
+// the width is almost 0, so that it stays `none`.
 kernel void bilateral(const int width, const int height, const int stride, global const float *padded,
-                      constant float *closeness, const float4 reach, const float none, global float *filtered) {
+                      constant float *closeness, const float4 range_width, const float none, global float *filtered) {
     const int x = 8 * get_global_id(0);
     const int y = get_global_id(1);
     if (x >= width || y >= height) return;
     global const float *center = padded + (y + RADIUS) * stride + MARGIN + x;
     const float8 here = vload8(0, center);
-    const float8 away = here - reach.s2;
-    const float8 inverse = 1.0f / max(min(reach.s0 + reach.s1 * away * away, 0.5f * (here - none)), 1e-6f);
+    const float8 away = here - range_width.s2;
+    const float8 inverse = 1.0f / max(min(range_width.s0 + range_width.s1 * away * away, 0.5f * (here - none)), 1e-6f);
     float8 moved = 0.0f, total = 0.0f;
     for (int dy = -RADIUS; dy <= RADIUS; dy++) {
         for (int dx = -RADIUS; dx <= RADIUS; dx++) {
@@ -236,11 +236,4 @@ kernel void bilateral(const int width, const int height, const int stride, globa
     float result[8];
     vstore8(here + moved / total, 0, result);
     for (int k = 0; k < min(8, width - x); k++) filtered[y * width + x + k] = result[k];
-}
-
-// Depth to inverse depth and back, 1/m and m; 0 = none stays 0.
-kernel void invert(const int count, global const float *image, global float *inverse) {
-    const int i = get_global_id(0);
-    if (i >= count) return;
-    inverse[i] = image[i] > 0.0f ? 1.0f / image[i] : 0.0f;
 }

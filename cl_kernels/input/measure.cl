@@ -8,7 +8,7 @@ typedef ushort color_t;
 typedef uchar color_t;
 #endif
 
-// Usable radiance lies above the sensor's black and below clipping; outside it a pixel says nothing linear about light.
+// Usable radiance is above the sensor's black level and below clipping, where pixels are linear in light.
 #define BLACK 0.0015f
 #define CLIPPED 0.985f
 
@@ -21,7 +21,7 @@ static inline float brightest(const float3 rgb) {
     return fmax(fmax(rgb.x, rgb.y), rgb.z);
 }
 
-// Where a rectified pixel lies in the distorted picture (Brown's polynomial, third degree in r^2).
+// Position of a rectified pixel in the distorted picture (Brown's polynomial, third degree in r^2).
 static inline float2 distort(const float4 intrinsics, const float8 k, const float u, const float v) {
     const float3 p = unproject(intrinsics, u, v);
     const float r2 = p.x * p.x + p.y * p.y;
@@ -54,7 +54,7 @@ kernel void measure_color(const int width, const int height, global const color_
     const float3 a = linear_color(color, to_linear, corner), b = linear_color(color, to_linear, corner + 1);
     const float3 c = linear_color(color, to_linear, corner + width), d = linear_color(color, to_linear, corner + width + 1);
     const float3 rgb = mix(mix(a, b, fx), mix(c, d, fx), fy);
-    const float3 peak = fmax(fmax(a, b), fmax(c, d));  // a mean that a clipped pixel takes part in is no radiance
+    const float3 peak = fmax(fmax(a, b), fmax(c, d));  // a mean with a clipped pixel is not usable
 #else
     const int inside = 1;
     const float3 rgb = linear_color(color, to_linear, pixel);
@@ -64,7 +64,7 @@ kernel void measure_color(const int width, const int height, global const color_
     radiance[pixel] = inside ? (float4)(rgb, usable) : (float4)(0.0f, 0.0f, 0.0f, -1.0f);
 }
 
-// depth [h][w] in units of depth_scale_m (0 and 65535: none) -> depth_m [h][w] metres, 0 = none. Never a mean of two depths.
+// depth [h][w] in units of depth_scale_m (0 and 65535: none) -> depth_m [h][w] metres, 0 = none. Depths are not interpolated.
 kernel void measure_depth(const int width, const int height, global const ushort *depth, const float4 intrinsics,
                           const float8 distortion, const float depth_scale_m, const float greatest_depth_m,
                           global float *depth_m) {

@@ -1,12 +1,14 @@
-// Depth of another lens brought to the colour picture (thesis 5.1.1): what of the measured surface the colour lens sees.
+// Registration of depth from another lens to the colour picture (thesis 5.1.1): the measured surface as the colour lens sees it.
 // Provides clear_depth, project_depth, splat_surface, splat_points, resolve_depth.
-// The nearest wins by an integer minimum over the bits of positive floats, which are ordered as they are: in any order the same.
+// The nearest depth wins by an integer minimum over the bits of positive floats, which compare like the floats; the result does
+// not depend on the order.
 #include "camera.clh"
 
 #define NOTHING 0xffffffffu
 #define LEAST_Z 0.01f
 
-// Depths of neighbouring pixels at `z` are of one surface if they differ by less: a slope of 3, 2 % for a sensor's steps, 5 mm.
+// Depths of neighbouring pixels at `z` are of one surface if they differ by less: a slope of 3, but at least 2 % for a sensor's
+// quantisation, plus 5 mm.
 static inline float same_surface_m(const float z, const float focal_px) {
     return fmax(0.02f, 3.0f / focal_px) * z + 0.005f;
 }
@@ -19,7 +21,7 @@ kernel void clear_depth(const int count, global uint *surface, global uint *poin
 }
 
 // depth [h][w] in units of depth_scale_m (0 and 65535: none), rays [h][w]: (x, y, 1 if it has a ray, -) at z = 1 of each pixel
-// -> projected [h][w]: pixel (u, v) in the colour picture, 1 / z there and z here; all 0 = none.
+// -> projected [h][w]: pixel (u, v) in the colour picture, 1 / z in its camera, z in the depth camera; all 0 = none.
 kernel void project_depth(const int width, const int height, global const ushort *depth, global const float4 *rays,
                           const float depth_scale_m, const float greatest_depth_m, const float16 color_from_depth,
                           const float4 intrinsics, global float4 *projected) {
@@ -45,13 +47,13 @@ static inline int is_surface(const float4 a, const float4 b, const float4 c, con
     return nearest > 0.0f && farthest - nearest < same_surface_m(nearest, focal_px);
 }
 
-// The first pixel of the picture at or after x; ceil() takes PoCL many times as long.
+// The first pixel of the picture at or after x; ceil() is much slower in PoCL.
 static inline int next_pixel(const float x) {
     const int whole = (int)x;
     return x > 0.0f ? whole + (whole < x) : 0;
 }
 
-// The depth of a triangle at the pixel centres that it covers; 1 / z is linear in a picture. Seen from behind: nothing.
+// Writes the depth of a triangle at the pixel centres that it covers; 1 / z is linear in the picture. Back faces are skipped.
 static void splat_triangle(const float4 a, const float4 b, const float4 c, const int width, const int height,
                            const int greatest_px, global uint *surface) {
     const float whole = area(a, b, c.xy);
@@ -72,8 +74,8 @@ static void splat_triangle(const float4 a, const float4 b, const float4 c, const
     }
 }
 
-// One item a square of four neighbours of projected [h][w]: its two triangles, or the one that is left where a corner is of
-// another surface. -> surface [height][width], bits of metres.
+// One item a square of four neighbours of projected [h][w]: its two triangles, or one if a corner belongs to another surface.
+// -> surface [height][width], bits of metres.
 kernel void splat_surface(const int depth_width, const int depth_height, global const float4 *projected,
                           const float focal_px, const int width, const int height, const int greatest_px,
                           global uint *surface) {
@@ -83,8 +85,8 @@ kernel void splat_surface(const int depth_width, const int depth_height, global 
     const int pixel = y * depth_width + x;
     const float4 a = projected[pixel], b = projected[pixel + 1];
     const float4 c = projected[pixel + depth_width], d = projected[pixel + depth_width + 1];
-    const int falling = is_surface(a, b, d, focal_px) + is_surface(a, d, c, focal_px);  // cut from a to d
-    const int rising = is_surface(a, b, c, focal_px) + is_surface(b, d, c, focal_px);  // cut from b to c
+    const int falling = is_surface(a, b, d, focal_px) + is_surface(a, d, c, focal_px);  // split from a to d
+    const int rising = is_surface(a, b, c, focal_px) + is_surface(b, d, c, focal_px);  // split from b to c
     if (falling >= rising) {
         if (is_surface(a, b, d, focal_px)) splat_triangle(a, b, d, width, height, greatest_px, surface);
         if (is_surface(a, d, c, focal_px)) splat_triangle(a, d, c, width, height, greatest_px, surface);
@@ -94,7 +96,8 @@ kernel void splat_surface(const int depth_width, const int depth_height, global 
     }
 }
 
-// Every measurement at the pixel nearest to it: what is too thin for a triangle. -> points [height][width], bits of metres.
+// Writes every measurement to its nearest pixel, for surface that is too thin for a triangle.
+// -> points [height][width], bits of metres.
 kernel void splat_points(const int count, global const float4 *projected, const int width, const int height,
                          global uint *points) {
     const int i = get_global_id(0);
@@ -104,8 +107,8 @@ kernel void splat_points(const int count, global const float4 *projected, const 
     if (inside) atomic_min(points + (int)(p.y + 0.5f) * width + (int)(p.x + 0.5f), as_uint(1.0f / p.z));
 }
 
-// The surface's own depth at a pixel, which lies beside the measured point; the point only where there is no surface, or one
-// behind it. -> depth_m [count] metres, 0 = none.
+// The interpolated surface's depth at a pixel; the single measurement only where there is no surface, or one behind it.
+// -> depth_m [count] metres, 0 = none.
 kernel void resolve_depth(const int count, global const uint *surface, global const uint *points, const float focal_px,
                           const float greatest_depth_m, global float *depth_m) {
     const int i = get_global_id(0);

@@ -1,4 +1,4 @@
-// Exposure of a picture against those before it: the brightness of surface that the volume has a colour of, seen again.
+// Exposure of a picture relative to earlier ones: its brightness on surface whose colour the volume knows.
 // Provides compare_exposure, scale_radiance.
 #include "agreement.clh"
 #include "camera.clh"
@@ -7,24 +7,24 @@
 #include "voxel_color.clh"
 
 #define LUMINANCE (float3)(0.2126f, 0.7152f, 0.0722f)
-#define MOST_UNEVEN 0.25f    // of the mean: beside an edge a pixel out of register is another surface
-#define LEAST_COSINE 0.3f    // to the surface's normal
+#define MOST_UNEVEN 0.25f    // of the mean: beside an edge, a small registration error shows another surface
+#define LEAST_COSINE 0.3f    // of the angle between the ray and the surface's normal
 #define MOST_PREDICTED 0.9f  // of the greatest colour a voxel can hold
 #define LEAST_PREDICTED 0.002f
-#define LEAST_COLORED 0.5f   // share of the interpolation that has a colour
+#define LEAST_COLORED 0.5f   // share of the interpolation weights with a colour
 
-// The volume around a point, interpolated: tsdf in truncations and its slope; the colour that voxels have.
+// The volume interpolated at a point: tsdf in truncations, its gradient, and the colour of the voxels that have one.
 typedef struct {
     float tsdf;
     float3 slope;
-    int seen;         // by enough pictures, all eight voxels
+    int seen;         // whether enough pictures have seen all eight voxels
     float luminance;
-    float brightest;  // channel of any voxel
-    float looks;      // that the colour is a mean of
-    float colored;    // share of the weights
+    float brightest;  // greatest channel of any voxel
+    float observations; // mean number behind the colours
+    float colored;    // share of the weights with a colour
 } Around;
 
-static Around look_around(const int4 bricks, global const int *slots, global const float2 *voxels, global const uint *colors,
+static Around interpolate_around(const int4 bricks, global const int *slots, global const float2 *voxels, global const uint *colors,
                           const float3 at, const float least_weight) {
     Around result = {0.0f, (float3)(0.0f), 1, 0.0f, 0.0f, 0.0f, 0.0f};
     const float3 cell = floor(at - 0.5f);
@@ -50,16 +50,16 @@ static Around look_around(const int4 bricks, global const int *slots, global con
                                           corner.z ? share.x * share.y : -share.x * share.y);
         result.luminance += colored * dot(color.xyz, LUMINANCE);
         result.brightest = fmax(result.brightest, fmax(color.x, fmax(color.y, color.z)));
-        result.looks += colored * color.w;
+        result.observations += colored * color.w;
         result.colored += colored;
     }
     const float scale = result.colored > 0.0f ? 1.0f / result.colored : 0.0f;
     result.luminance *= scale;
-    result.looks *= scale;
+    result.observations *= scale;
     return result;
 }
 
-// Mean luminance of the 3 x 3 pixels around one; 0 where not all are usable, or they are too uneven.
+// Mean luminance of the 3 x 3 pixels around a pixel; 0 where one is not usable, or they vary too much.
 static inline float even_luminance(const int width, const int height, global const float4 *radiance, const int x, const int y) {
     if (x < 1 || y < 1 || x >= width - 1 || y >= height - 1) return 0.0f;
     float sum = 0.0f, least = 1e9f, most = 0.0f;
@@ -79,9 +79,9 @@ static inline float even_luminance(const int width, const int height, global con
 }
 
 // One item a sample: the middle pixel of each block of stride x stride.
-// radiance, depth_m [h][w] as measured; slots, voxels, colors: of the volume before this picture is folded in
-// -> samples [rows][cols]: luminance of the picture, luminance that the volume predicts, looks that the prediction is a mean of,
-// 0; all 0 where the picture does not show again, evenly, facing and neither clipped nor black, what the volume has a colour of.
+// radiance, depth_m [h][w] as measured; slots, voxels, colors: the volume before this picture is integrated
+// -> samples [rows][cols]: luminance of the picture, luminance that the volume predicts, number of observations behind the prediction,
+// 0; all 0 where the picture is clipped, black or uneven, or where the volume has no coloured surface that faces the camera.
 kernel void compare_exposure(const int cols, const int rows, const int stride, const int width, const int height,
                              global const float4 *radiance, global const float *depth_m, const float4 intrinsics,
                              const float16 volume_from_camera, const int4 bricks, global const int *slots,
@@ -98,16 +98,16 @@ kernel void compare_exposure(const int cols, const int rows, const int stride, c
         const float3 ray = unproject(intrinsics, x, y);
         const float3 direction = normalize(transform_vector(volume_from_camera, ray));
         const float3 point = transform_point(volume_from_camera, z * ray);
-        const Around there = look_around(bricks, slots, voxels, colors, point / voxel_m, least_weight);
+        const Around there = interpolate_around(bricks, slots, voxels, colors, point / voxel_m, least_weight);
         const float off_m = there.tsdf * truncation_m;
         const float steepness = fmax(length(there.slope), 1e-6f);
         const int faces = -dot(there.slope, direction) > LEAST_COSINE * steepness;
         if (there.seen && faces && fabs(off_m) < fmin(AGREEMENT_M(z, voxel_m), 0.9f * truncation_m)) {
-            const float3 on_surface = point + off_m * direction;  // the field falls by a truncation a truncation along a ray
-            const Around surface = look_around(bricks, slots, voxels, colors, on_surface / voxel_m, least_weight);
+            const float3 on_surface = point + off_m * direction;  // along a ray, the field falls by 1 per truncation
+            const Around surface = interpolate_around(bricks, slots, voxels, colors, on_surface / voxel_m, least_weight);
             const int known = surface.seen && surface.colored >= LEAST_COLORED && surface.brightest < MOST_PREDICTED &&
                               surface.luminance > LEAST_PREDICTED;
-            if (known) sample = (float4)(seen, surface.luminance, surface.looks, 0.0f);
+            if (known) sample = (float4)(seen, surface.luminance, surface.observations, 0.0f);
         }
     }
     samples[row * cols + col] = sample;

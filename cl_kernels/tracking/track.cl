@@ -2,8 +2,8 @@
 // Provides halve_depth, view_model, sum_equations. Eight pixels of a row are one float8: PoCL vectorises nothing else here.
 #include "camera.clh"
 
-// Depth [fine_height][fine_width] (0 = none) -> [height][width], sizes halved: the mean of those of four pixels that lie
-// within `edge` times the depth of the nearest one.
+// Depth [fine_height][fine_width] (0 = none) -> [height][width], sizes halved: the mean of those of four pixels whose depth
+// is at most 1 + `edge` times that of the nearest one.
 kernel void halve_depth(const int width, const int height, const int fine_width, global const float *depth_m,
                         const float edge, global float *halved_m) {
     const int x = get_global_id(0);
@@ -18,8 +18,8 @@ kernel void halve_depth(const int width, const int height, const int fine_width,
     halved_m[y * width + x] = count > 0.0f ? dot(used, four) / count : 0.0f;
 }
 
-// Every stride-th pixel of the predicted surface (positions, normals [..][model_width], volume space) as its own camera
-// has it -> view: planes [4][height][pitch] of depth (metres, 0 = none) and the normal's x, y, z; padding is 0.
+// Every stride-th pixel of the predicted surface (positions, normals [..][model_width], volume space), in the axes of its
+// camera -> view: planes [4][height][pitch] of depth (metres, 0 = none) and the normal's x, y, z; padding is 0.
 kernel void view_model(const int width, const int height, const int pitch, const int stride, const int model_width,
                        global const float4 *positions, global const float4 *normals, const float16 camera_from_volume,
                        global float *view) {
@@ -44,8 +44,8 @@ static inline float sum8(const float8 v) {
 }
 
 // One work-item sums 8 x ROWS pixels of the model's view. Both pictures have `size`; T = model_from_current.
-// A pixel's residual e = n.(T p - v) / noise_m with v, n the model's point and normal, p the measured point that v is seen
-// at; its weight is Tukey's with this cut-off. Pairs farther than `gate_m` apart are none.
+// Residual of a pixel: e = n.(T p - v) / noise_m, where v, n are the model's point and normal, and p is the measured point at
+// the pixel onto which v projects. Its weight is Tukey's with this cut-off. Pairs farther apart than `gate_m` are rejected.
 // -> sums [item][32]: 21 of w J J^T (upper triangle by rows, J = (Tp x n, n) / noise_m), 6 of w J e, then the sums of w e^2,
 // w, w z, pairs measured, model pixels in view.
 kernel void sum_equations(const int2 size, const int pitch, global const float *view, global const float *depth_m,

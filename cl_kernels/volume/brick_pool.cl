@@ -1,8 +1,8 @@
-// The pool of bricks: emptying, placing and copying them. Slot 0 is everybody's who is away, see server/volume/brick_pool.py.
+// The pool of bricks: clearing, placing and copying. Slot 0 represents all bricks on the host, see server/volume/brick_pool.py.
 // Provides claim_bricks, place_bricks, copy_bricks.
 #include "volume.clh"
 
-// slots [count] -> those bricks' voxels never seen, without colour. One item a row of 8 voxels.
+// slots [count] -> their voxels are never seen and without colour. One item a row of 8 voxels.
 kernel void claim_bricks(const int count, global const int *slots, global float2 *voxels, global uint *colors) {
     const int item = get_global_id(0);
     if (item >= count * BRICK * BRICK) return;
@@ -11,7 +11,7 @@ kernel void claim_bricks(const int count, global const int *slots, global float2
     vstore8((uint8)(0), row, colors);
 }
 
-// bricks [count] and their new slots [count] -> table [z][y][x]; a brick that has left for good is not solid.
+// bricks [count] and their new slots [count] -> table [z][y][x]; a brick with NO_SLOT is not solid.
 kernel void place_bricks(const int count, global const int *bricks, global const int *slots, global int *table,
                          global ulong *solid) {
     const int item = get_global_id(0);

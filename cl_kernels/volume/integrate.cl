@@ -5,9 +5,9 @@
 #include "radiance_marks.clh"
 #include "volume.clh"
 
-#define COLOR_REACH 1.5f  // voxels from the surface: those that its colour is ever interpolated from
+#define COLOR_REACH 1.5f  // voxels from the surface: interpolation on the surface reads no colour farther away
 
-// What a voxel's row shares: the picture and where it was taken from.
+// The measured picture.
 typedef struct {
     int width;
     int height;
@@ -16,8 +16,8 @@ typedef struct {
     float4 intrinsics;
 } Picture;
 
-// Measured depth around pixels (coordinates + 0.5, inside the picture): bilinear where the four pixels around are one
-// surface, whose slope would else become noise of the normals; `nearest` where they are `edge_m` apart or not all known.
+// Measured depth at pixel coordinates + 0.5, inside the picture: bilinear where the four pixels are one surface, because
+// steps between pixels would become noise of the normals; `nearest` where they differ by `edge_m` or not all are known.
 static inline floatn depth_between(const Picture picture, const floatn u, const floatn v, const floatn nearest, const float edge_m) {
     const intn x = clamp(CONVERT_INTN(u + 0.5f) - 1, 0, picture.width - 2);
     const intn y = clamp(CONVERT_INTN(v + 0.5f) - 1, 0, picture.height - 2);
@@ -31,8 +31,8 @@ static inline floatn depth_between(const Picture picture, const floatn u, const 
     return (MASK(low > 0.0f) & MASK(high - low < edge_m)) ? top + down * (bottom - top) : nearest;
 }
 
-// Running mean of one channel that is kept as sqrt(c) * most in whole steps: rounded up as often as the fraction says, so
-// that changes below a step are not lost. Where the colour is a bound it only raises. `dice`: uniform in [0, 1).
+// Running mean of one channel, stored as sqrt(c) * most in integers: stochastic rounding, so that changes below one step are
+// not lost. A colour that is a lower bound only raises the mean. `dice`: uniform in [0, 1).
 static inline intn mean_channel(const intn code, const float most, const floatn color, const intn is_bound, const floatn rate,
                                 const floatn dice) {
     const floatn root = CONVERT_FLOATN(code) * (1.0f / most);
@@ -42,7 +42,7 @@ static inline intn mean_channel(const intn code, const float most, const floatn 
     return CONVERT_INTN(fmin(next + dice, most));
 }
 
-// Colours of a row of voxels after one more look, see bricks.py for the packing.
+// Colours of a row of voxels after one more observation, see bricks.py for the packing.
 static inline intn mean_color(const Picture picture, const intn old, const intn pixel, const intn voxel, const int frame) {
     const floatn mark = GATHER_FLOATN(picture.radiance, 4 * pixel + 3);
     const intn is_bound = MASK(mark == AT_LEAST);
@@ -65,8 +65,8 @@ static inline intn mean_color(const Picture picture, const intn old, const intn 
 }
 
 // One work-group a brick; its items share the rows of LANES voxels along x.
-// allocated [count] brick indices, slots [z][y][x], picture -> voxels, colors, updated in place, and of the bricks that the
-// camera's view touches: solid, octets (volume.clh).
+// allocated [count] brick indices, slots [z][y][x], picture -> voxels and colors, updated in place; solid and octets
+// (volume.clh) of the bricks in the view frustum.
 kernel void integrate(const int count, const int width, const int height, const int4 bricks, global const int *allocated,
                       global const int *slots, global const float *depth_m, global const float *radiance,
                       const float4 intrinsics, const float16 camera_from_volume, const float voxel_m,
@@ -104,7 +104,7 @@ kernel void integrate(const int count, const int width, const int height, const 
         const intn pixel = CONVERT_INTN(seen ? v : 0.0f) * width + CONVERT_INTN(seen ? u : 0.0f);
         const floatn nearest = seen ? GATHER_FLOATN(depth_m, pixel) : 0.0f;
         const floatn slant = sqrt(x * x + y * y + z * z) * inverse_z;
-        // Neighbours differ by less than a truncation, or are not used: farther off, the nearest pixel decides as well.
+        // Interpolation uses neighbours within a truncation only: farther from the surface, the nearest pixel decides as well.
         const intn close = MASK(nearest > 0.0f) & MASK(fabs(nearest - z) * slant < truncation_m * (1.0f + slant));
         floatn depth = nearest;
         if (ANY(close)) depth = close ? depth_between(picture, seen ? u : 0.5f, seen ? v : 0.5f, nearest, truncation_m) : nearest;
@@ -122,7 +122,7 @@ kernel void integrate(const int count, const int width, const int height, const 
             if (ANY(colored)) {
                 global int *packed = (global int *)colors + pool + first;
                 const intn old = LOAD_LANES(packed);
-                const int voxel = index * BRICK_VOXELS + first;  // not its slot, which depends on the budget
+                const int voxel = index * BRICK_VOXELS + first;  // not the slot, which depends on the budget
                 const intn mean = mean_color(picture, old, pixel, voxel + CONVERT_INTN(LANE_NUMBERS), frame);
                 STORE_LANES(colored ? mean : old, packed);
             }

@@ -6,7 +6,7 @@
 
 #define TILE 8
 
-// First and last of four layers of cells that hold one of `cells`: layer i of those shifted by i steps.
+// First and last of four layers of cells that contain one of `cells`; layer i is `first_layer` shifted by i steps.
 static inline float2 layers(const ulong cells, const ulong first_layer, const int step) {
     int low = 3, high = 0;
     for (int i = 0; i < 4; i++) {
@@ -25,9 +25,9 @@ static inline void solid_box(const ulong cells, const int3 brick, const float vo
     *size_m = cell_m * (float3)(x.s1 - x.s0, y.s1 - y.s0, z.s1 - z.s0);
 }
 
-// Between which depths each tile of TILE x TILE pixels can see a solid voxel: what lies outside a ray need not look at.
-// One item a brick of allocated [count]; nearest, farthest [tile row][tile column]: bits of float metres, which order as
-// they do; start as +infinity and 0.
+// Range of depths in which a tile of TILE x TILE pixels can see a solid voxel: rays are marched only there. One item a
+// brick of allocated [count]; nearest, farthest [tile row][tile column]: bits of float metres, which compare like the
+// floats; they start as +infinity and 0.
 kernel void bound_rays(const int count, const int width, const int height, const int4 bricks, global const int *allocated,
                        global const ulong *solid, const float voxel_m, const float4 intrinsics,
                        const float16 camera_from_volume, global int *nearest, global int *farthest) {
@@ -51,7 +51,7 @@ kernel void bound_rays(const int count, const int width, const int height, const
         least = fmin(least, pixel);
         most = fmax(most, pixel);
     }
-    const int around = near < 1e-2f;  // reaches behind the camera: its corners' pixels say nothing
+    const int around = near < 1e-2f;  // reaches behind the camera: the pixels of its corners are undefined
     const int2 size = (int2)(width, height);
     const int2 first = around ? (int2)(0) : convert_int2(clamp(least, 0.0f, 1e5f)) / TILE;
     const int2 last = around ? (size - 1) / TILE : min(convert_int2(clamp(most + 1.0f, -1.0f, 1e5f)), size - 1) / TILE;

@@ -1,9 +1,9 @@
-// What of the volume's colours a camera sees: the picture of somebody who only looks. Provides view_colors.
+// The volume's colours as seen by a camera, for viewers without a camera of their own. Provides view_colors.
 #include "volume.clh"
 #include "voxel_color.clh"
 
-// positions [h][w] (volume space, w = 1 where there is surface) -> radiance [h][w]: the mean of the eight voxels around each
-// point that have a colour, by their trilinear weights (rgb, w = 1), or 0 where none has one.
+// positions [h][w] (volume space, w = 1: surface) -> radiance [h][w]: trilinear mean of those of the eight voxels around each
+// point that have a colour (rgb, w = 1), or 0 if none has one.
 kernel void view_colors(const int width, const int height, const int4 bricks, global const int *slots, global const uint *colors,
                         const float voxel_m, global const float4 *positions, global float4 *radiance) {
     const int x = get_global_id(0);
@@ -12,7 +12,7 @@ kernel void view_colors(const int width, const int height, const int4 bricks, gl
     const float4 position = positions[y * width + x];
     float4 sum = (float4)(0.0f);
     if (position.w > 0.0f) {
-        const float3 at = position.xyz / voxel_m - 0.5f;  // in voxels, whose values are of their middles
+        const float3 at = position.xyz / voxel_m - 0.5f;  // in voxels, measured from the centre of the first
         const float3 low = floor(at);
         const int3 top = bricks.xyz * BRICK - 1;
         for (int corner = 0; corner < 8; corner++) {

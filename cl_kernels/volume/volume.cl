@@ -1,11 +1,11 @@
-// The brick volume's table: which bricks the measured surface needs, where they are solid, and how far apart those are.
+// Tables of the brick volume: bricks near the measured surface, solid cells, and gaps between solid bricks.
 // Provides mark_bricks, find_solid, find_near_solid, gaps_along_x, gap_along_axis.
 #include "camera.clh"
 #include "volume.clh"
 
 #define TILE 4
 
-// Beyond this a point is outside any volume, and its brick may not fit an int.
+// Beyond this a point is outside any volume, and its brick index may overflow an int.
 #define FAR_BRICKS 1e6f
 
 static inline int floor_of(const float x) {
@@ -13,17 +13,17 @@ static inline int floor_of(const float x) {
     return truncated - (x < truncated);
 }
 
-// What of the measured surface lies around one ray of the camera: a piece of a frustum.
+// Frustum around one ray of the camera that contains a piece of the measured surface.
 typedef struct {
     float3 origin;  // of the camera, in bricks
     float3 onward;  // along the ray, bricks a metre of depth
     float3 beside;  // half the frustum's width along the volume's axes, bricks a metre of depth
-    float near;     // depths it reaches over, metres
+    float near;     // range of depths, metres
     float far;
 } Frustum;
 
-// wanted [z][y][x] = 1 for every brick that the frustum touches: slice by slice of at most half a brick, the box around each.
-static void mark_frustum(const int4 bricks, const Frustum piece, global uchar *wanted) {
+// marked [z][y][x] = 1 for every brick that the frustum touches: in slices of at most half a brick, the box around each slice.
+static void mark_frustum(const int4 bricks, const Frustum piece, global uchar *marked) {
     const float span = piece.far - piece.near;
     const int steps = min((int)(2.0f * span * length(piece.onward)), 1000) + 1;
     const float3 step = span / steps * piece.onward;
@@ -37,16 +37,16 @@ static void mark_frustum(const int4 bricks, const Frustum piece, global uchar *w
         const int low_z = max(floor_of(p.z - pad.z), 0), high_z = min(floor_of(p.z + pad.z), bricks.z - 1);
         for (int bz = low_z; bz <= high_z; bz++)
             for (int by = low_y; by <= high_y; by++)
-                for (int bx = low_x; bx <= high_x; bx++) wanted[(bz * bricks.y + by) * bricks.x + bx] = 1;  // all write 1
+                for (int bx = low_x; bx <= high_x; bx++) marked[(bz * bricks.y + by) * bricks.x + bx] = 1;  // all write 1
     }
 }
 
-// depth_m [h][w], 0 = none -> wanted [z][y][x] = 1 for every brick that holds a voxel within `reach_m`, along its ray, of
-// the surface that its pixel measured, and a few more. One item a tile of TILE x TILE pixels; its depths are taken together as
-// far as they lie within half a brick.
+// depth_m [h][w], 0 = none -> marked [z][y][x] = 1 for every brick with a voxel within `reach_m` of the measured surface
+// along the ray, and a few more. One item a tile of TILE x TILE pixels; depths within half a brick are treated as one piece of
+// surface.
 kernel void mark_bricks(const int width, const int height, const int4 bricks, global const float *depth_m,
                         const float4 intrinsics, const float16 volume_from_camera, const float voxel_m, const float reach_m,
-                        global uchar *wanted) {
+                        global uchar *marked) {
     const int x = get_global_id(0) * TILE;
     const int y = get_global_id(1) * TILE;
     if (x >= width || y >= height) return;
@@ -67,7 +67,7 @@ kernel void mark_bricks(const int width, const int height, const int4 bricks, gl
 
     const float brick_m = BRICK * voxel_m;
     const float3 ray = unproject(intrinsics, x + 0.5f * (TILE - 1), y + 0.5f * (TILE - 1));
-    // Half a pixel beyond the tile are its pixels' own voxels, and up to one and a half those it lends its depth to.
+    // The tile's own voxels extend half a pixel beyond it; interpolation uses its depth up to one and a half pixels beyond.
     const float2 beside = (0.5f * TILE + 1.0f) / intrinsics.lo;
     const float least_slant = length(fmax(fabs(ray) - (float3)(beside, 0.0f), 0.0f));
     const float reach_z = reach_m / least_slant;
@@ -75,8 +75,8 @@ kernel void mark_bricks(const int width, const int height, const int4 bricks, gl
     piece.origin = volume_from_camera.s37b / brick_m;
     piece.onward = transform_vector(volume_from_camera, ray) / brick_m;
     piece.beside = (fabs(volume_from_camera.s048) * beside.x + fabs(volume_from_camera.s159) * beside.y) / brick_m;
-    while (near < MAXFLOAT) {  // a tile on an edge holds several surfaces
-        const float edge = fmax(near + 0.5f * brick_m, 1.001f * near);  // more than near, whatever the voxels
+    while (near < MAXFLOAT) {  // a tile on an edge contains several surfaces
+        const float edge = fmax(near + 0.5f * brick_m, 1.001f * near);  // more than near, with any voxel size
         float4 far = (float4)(near), next = (float4)(MAXFLOAT);
         for (int row = 0; row < TILE; row++) {
             const float4 four = vload4(row, depth);
@@ -85,21 +85,20 @@ kernel void mark_bricks(const int width, const int height, const int4 bricks, gl
         }
         piece.near = near - reach_z;
         piece.far = fmax(fmax(far.x, far.y), fmax(far.z, far.w)) + reach_z;
-        mark_frustum(bricks, piece, wanted);
+        mark_frustum(bricks, piece, marked);
         near = fmin(fmin(next.x, next.y), fmin(next.z, next.w));
     }
 }
 
-// Bit 2 k + 0 or 1 of element 2 n + 0 or 1 of `octets`: whether that voxel of a row of 8 is solid (seen, tsdf < 0), k the row's
-// place in its cells.
+// Element i: bit 2 k + i % 2 where voxel i of a row of 8 is solid (seen, tsdf < 0); k: the row's number in its cells.
 static inline int8 solid_bits(global const float2 *row, const int k) {
     const float16 voxels = vload16(0, (global const float *)row);
     const int8 bits = (int8)(1, 2, 1, 2, 1, 2, 1, 2) << (int8)(2 * k);
     return (voxels.odd > 0.0f && voxels.even < 0.0f) & bits;
 }
 
-// listed [count] brick indices -> solid [z][y][x]: bit (z 4 + y) 4 + x where a cell of 2x2x2 voxels holds a solid voxel;
-// octets [slot][64]: which of the cell's voxels are. 16 items a brick, 4 bricks a work-group; an item is a row of 4 cells.
+// listed [count] brick indices -> solid [z][y][x]: bit (z 4 + y) 4 + x where a cell of 2x2x2 voxels contains a solid voxel;
+// octets [slot][64]: the solid voxels of each cell. 16 items a brick, 4 bricks a work-group; an item is a row of 4 cells.
 kernel void find_solid(const int count, global const int *listed, global const int *slots, global const float2 *voxels,
                        global ulong *solid, global uchar *octets) {
     local uint cells[64];
@@ -123,14 +122,14 @@ kernel void find_solid(const int count, global const int *listed, global const i
     }
 }
 
-// Cells of the brick `offset` (-1, 0, 1) bricks away along an axis that lie within two of this one; `low` and `high` are
-// the halves of a brick along it.
+// Cells of the brick at `offset` (-1, 0, 1) along an axis that lie within two cells of this brick; `low` and `high` are the
+// halves of a brick along the axis.
 static inline ulong facing_half(const int offset, const ulong low, const ulong high) {
     return offset > 0 ? low : offset < 0 ? high : (low | high);
 }
 
-// listed [count] brick indices -> near [count]: 1 where the brick holds a solid voxel, or a brick beside it does within two
-// cells, 4 voxels. Elsewhere, no voxel of the brick is interpolated where a ray looks for a surface.
+// listed [count] brick indices -> near [count]: 1 where the brick, or a neighbour within two cells (4 voxels), contains a
+// solid voxel. Other bricks are never interpolated by a ray that searches for a surface.
 kernel void find_near_solid(const int count, global const int *listed, const int4 bricks, global const ulong *solid,
                             global uchar *near) {
     const int item = get_global_id(0);
@@ -148,11 +147,11 @@ kernel void find_near_solid(const int count, global const int *listed, const int
     near[item] = any != 0;
 }
 
-// Which of the bricks have changed between solid and not: corners of the box around them, in bricks; low > high = none.
+// Corners of the box around the bricks that have become solid or empty, in bricks; low > high = none.
 #define CHANGED_LOW 0
 #define CHANGED_HIGH 3
 
-// solid [z][y][x], occupied [z][y][x] (1 where a brick holds a solid voxel, from the last time) -> occupied, changed [6], and
+// solid [z][y][x], occupied [z][y][x] (1: the brick had a solid voxel at the last update) -> occupied, changed [6], and
 // gap [2][z][y][x]: bricks to the nearest occupied one of the row, at most `limit`, towards lower x and towards higher. One item a row.
 kernel void gaps_along_x(const int4 bricks, global const ulong *solid, const int limit, global uchar *occupied,
                          global int *changed, global uchar *gap) {
@@ -187,9 +186,9 @@ kernel void gaps_along_x(const int4 bricks, global const ulong *solid, const int
     atomic_max(changed + CHANGED_HIGH + 2, z);
 }
 
-// One more axis (1 = y, 2 = z) of the one-sided Chebyshev distance: the least, over bricks `offset` ahead, of max(offset, their
-// distance so far). inner [variants][z][y][x] and 16 bytes more -> gap [2 variants][z][y][x]: towards lower indices, then towards
-// higher ones; only where `changed` may have had an effect. One item 16 bricks of a row.
+// Adds one axis (1 = y, 2 = z) to the one-sided Chebyshev distance: the minimum, over bricks `offset` ahead, of max(offset,
+// their distance so far). inner [variants][z][y][x] and 16 bytes more -> gap [2 variants][z][y][x]: towards lower indices, then towards
+// higher ones; only near the `changed` box. One item 16 bricks of a row.
 kernel void gap_along_axis(const int4 bricks, const int variants, global const uchar *inner, const int axis, const int limit,
                            global const int *changed, global uchar *gap) {
     const int x = max(min(16 * (int)get_global_id(0), bricks.x - 16), 0);

@@ -6,12 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Tracking, Wishes
 from server.geometry.merge import merge_depth
 from server.input.measure import GREATEST_DEPTH_M, Measurement, measure
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.tracking.camera_tracking import CameraTracking, PoseEstimate
 from server.tracking.exposure import ExposureTracking, scene_radiance
@@ -21,27 +23,32 @@ from server.volume.raycast import Surface, raycast
 from server.volume.volume import Volume
 
 
+class _Buffers(StageBuffers):
+    scene_radiance = BufferDescription(cl_types.float4)
+    """[h, w] as in GeometryFrame."""
+
+
 @dataclass(frozen=True)
 class GeometryFrame:
-    """Geometry of one frame; arrays are the session's and valid until its next frame."""
+    """Geometry of one frame. Its arrays are valid until the session's next frame."""
 
     measurement: Measurement
     exposure: float
-    """Of the picture relative to the session's first."""
+    """Exposure of the picture relative to the session's first."""
     scene_radiance: cl_array.Array
-    """`measurement.radiance` in the units of the first picture: that over `exposure`."""
+    """`measurement.radiance` over `exposure`: in the units of the first picture."""
     model: Surface
-    """The volume alone, as the camera sees it."""
+    """The volume's surface as seen by the camera."""
     surface: Surface
-    """The hybrid geometry buffer: the volume, and what changed too fast for it."""
+    """The hybrid geometry buffer: the volume's surface merged with the measured depth."""
     world_from_camera: NDArray[np.float64]
     volume_from_camera: NDArray[np.float64]
     tracking: Tracking
-    """Where it is lost, the pose and the surfaces are the last good frame's."""
+    """If it is lost, pose and surfaces are those of the last good frame."""
     notes: tuple[str, ...]
-    """What was wrong with this frame, one line each."""
+    """Problems with this frame, one line each."""
     is_held: bool = False
-    """Whether pose and surfaces are those of the frame before, since nothing has changed."""
+    """Whether pose and surfaces were kept from the frame before, since nothing has changed."""
 
 
 class Geometry:
@@ -50,8 +57,8 @@ class Geometry:
     def __init__(
         self, engine: Engine, camera: CameraModel, wishes: Wishes, reconstruction: Reconstruction | None = None
     ) -> None:
-        """`reconstruction`: what others scan too; None: one of its own."""
-        self._engine = engine
+        """`reconstruction`: shared with other cameras; None: one of its own."""
+        self._engine, self._buffers = engine, _Buffers(engine.workspace)
         self._camera = camera
         self._wishes = wishes
         self._reconstruction = reconstruction or Reconstruction(engine)
@@ -65,7 +72,7 @@ class Geometry:
         return self._reconstruction.volume
 
     def scan(self, frame: RgbdFrame) -> GeometryFrame:
-        """All steps for one frame of a camera that scans alone. Raises ValueError for one that is refused."""
+        """All steps for one frame of a camera that scans alone. Raises ValueError for a frame that is refused."""
         check_size(self._camera, frame)
         volume = self.volume_for(frame)
         with self._engine.profile.stage("input"):
@@ -73,20 +80,20 @@ class Geometry:
         return self.update(frame, measurement, volume)
 
     def volume_for(self, frame: RgbdFrame) -> Volume:
-        """The volume that a frame belongs into, made by the first one. frame: with its pose in the room's world.
+        """The volume into which to fuse a frame; created by the first frame. frame: its pose is in the room's world.
 
-        Raises ValueError, one line, for a frame that is refused; nothing has changed then.
+        Raises ValueError, one line, for a frame that is refused; the state is then unchanged.
         """
         guess = self._tracking.first_guess(frame)
         return self._reconstruction.volume_for(self._wishes, self._camera, frame, guess)
 
     def keep(self, frame: RgbdFrame, measurement: Measurement, volume: Volume) -> GeometryFrame:
-        """The geometry of the frame before, for a still view. The frame is fused all the same: when the view changes,
-        the volume is to be what it would have become."""
+        """The geometry of the frame before, for a still view. The frame is fused nevertheless, so that the volume does
+        not depend on reuse."""
         assert self._last is not None
         last = self._last
         with self._engine.profile.stage("reconstruct"):
-            scene = scene_radiance(self._engine, measurement.radiance, last.exposure)
+            scene = self._scene_radiance(measurement, last.exposure)
             self._fuse(volume, last.volume_from_camera, Measurement(scene, measurement.depth_m), last.exposure)
         notes = input_notes(self._camera, frame, volume)
         return replace(last, measurement=measurement, scene_radiance=scene, notes=notes, is_held=True)
@@ -94,14 +101,14 @@ class Geometry:
     def update(
         self, frame: RgbdFrame, measurement: Measurement, volume: Volume, unaligned: str | None = None
     ) -> GeometryFrame:
-        """Locate, fuse, predict, merge. unaligned: why the frame does not belong into the room; None: it does."""
+        """Locate, fuse, ray cast, merge. unaligned: why the frame is not aligned with the room; None: it is."""
         engine, camera, stage = self._engine, self._camera, self._engine.profile.stage
         with stage("reconstruct"):  # 4.2.1
             located = self._locate(frame, measurement, volume, unaligned)
             volume_from_camera = volume.volume_from_world() @ located.world_from_camera
             place = volume_from_camera if located.fuse else None
             exposure, doubts = self._exposure.update(frame, measurement, volume, place)  # B3
-            scene = scene_radiance(engine, measurement.radiance, exposure)
+            scene = self._scene_radiance(measurement, exposure)
             notes = (*located.notes, *doubts, *input_notes(camera, frame, volume))
             if self._last is not None and not located.fuse:
                 lost = replace(self._last, measurement=measurement, exposure=exposure, scene_radiance=scene)
@@ -136,6 +143,9 @@ class Geometry:
             return self._tracking.locate(frame, measurement, volume)
         return PoseEstimate(self._tracking.first_guess(frame), "lost", (unaligned,))
 
+    def _scene_radiance(self, measurement: Measurement, exposure: float) -> cl_array.Array:
+        return scene_radiance(self._engine, measurement.radiance, exposure, self._buffers.scene_radiance)
+
     def _fuse(
         self, volume: Volume, volume_from_camera: NDArray[np.float64], measured: Measurement, exposure: float
     ) -> None:
@@ -145,7 +155,7 @@ class Geometry:
 
 
 def check_size(camera: CameraModel, frame: RgbdFrame) -> None:
-    """Raises ValueError, one line, for pictures that are not of the camera's size."""
+    """Raises ValueError, one line, for images that do not have the camera's size."""
     depth = camera.depth_lens
     if frame.color.shape != (camera.height, camera.width, 3) or frame.depth.shape != (depth.height, depth.width):
         raise ValueError(
@@ -155,9 +165,9 @@ def check_size(camera: CameraModel, frame: RgbdFrame) -> None:
 
 
 def input_notes(camera: CameraModel, frame: RgbdFrame, volume: Volume) -> tuple[str, ...]:
-    """What is wrong with a frame's depth, or with the room for it, one line each."""
+    """Problems with a frame's depth or the volume's memory, one line each."""
     notes = []
-    sparse = frame.depth[::16, ::16]  # mostly a few pixels say enough
+    sparse = frame.depth[::16, ::16]  # mostly a few pixels are enough
     if frame.has_depth and not any(_is_usable(camera, depth).any() for depth in (sparse, frame.depth)):
         notes.append("the depth picture has no usable value: is the sensor covered?")
     if volume.is_full:

@@ -1,6 +1,6 @@
-"""Measure the input (thesis 5.1.1): undistort colour and depth, remove the gamma, bring depth to the colour picture.
+"""Surface measurement (thesis 5.1.1): undistorts colour and depth, linearises colour, registers depth to colour.
 
-Kernels: measure.cl, and register.cl where depth has a lens of its own.
+Kernels: measure.cl, and register.cl if depth has a lens of its own.
 """
 
 from __future__ import annotations
@@ -15,10 +15,24 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, ColorEncoding, DepthCamera, RgbdFrame
 from server.input.register import register_depth
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, float4
 
 GREATEST_DEPTH_M = 10.0
-"""Beyond it no depth camera for rooms measures anything; larger values are taken as no measurement."""
+"""Range of depth cameras for rooms; larger values are treated as no measurement."""
+
+
+class _Buffers(StageBuffers):
+    srgb8_codes = BufferDescription(np.uint8)
+    """[h, w, 3] colour as received."""
+    linear16_codes = BufferDescription(np.uint16)
+    """[h, w, 3] colour as received."""
+    linear_values = BufferDescription(np.float32)
+    """[256 or 65536] radiance of each code value."""
+    depth_units = BufferDescription(np.uint16)
+    """[h, w] depth as received."""
+    radiance = BufferDescription(cl_types.float4)
+    depth_m = BufferDescription(np.float32)
 
 
 @dataclass(frozen=True)
@@ -33,7 +47,7 @@ class Measurement:
 
 @cache
 def linear_values(encoding: ColorEncoding) -> NDArray[np.float32]:
-    """Linear radiance in [0, 1] of every code value: 256 of sRGB (IEC 61966-2-1) or 65536 of linear16."""
+    """Linear radiance in [0, 1] of each code value: [256] for sRGB (IEC 61966-2-1), [65536] for linear16."""
     if encoding == "linear16":
         return (np.arange(65536) / 65535).astype(np.float32)
     code = np.arange(256) / 255
@@ -48,7 +62,7 @@ def intrinsics(lens: CameraModel | DepthCamera) -> np.generic:
 def measure(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> Measurement:
     """Upload `frame` and rectify it. Its pictures must have the sizes of the camera's lenses."""
     radiance = _measure_color(engine, camera, frame)
-    units = engine.workspace.upload("depth_units", frame.depth)
+    units = engine.buffers(_Buffers).depth_units.upload(frame.depth)
     if camera.depth is None:
         depth_m = _measure_depth(engine, camera, units)
     else:
@@ -57,16 +71,17 @@ def measure(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> Measuremen
 
 
 def _measure_color(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> cl_array.Array:
-    space = engine.workspace
-    radiance = space.array("radiance", (camera.height, camera.width), cl_types.float4)
+    buffers = engine.buffers(_Buffers)
+    radiance = buffers.radiance.array((camera.height, camera.width))
     is_linear = camera.color_encoding == "linear16"
+    codes = buffers.linear16_codes if is_linear else buffers.srgb8_codes
     engine.launch(
         engine.kernel("measure.cl", "measure_color", LINEAR16=is_linear, DISTORTED=camera.is_distorted),
         (camera.width, camera.height),
         camera.width,
         camera.height,
-        space.upload("color_codes", frame.color),
-        space.constant("linear_values", linear_values(camera.color_encoding)),
+        codes.upload(frame.color),
+        buffers.linear_values.constant(linear_values(camera.color_encoding)),
         intrinsics(camera),
         _distortion(camera),
         radiance,
@@ -75,7 +90,7 @@ def _measure_color(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> cl_
 
 
 def _measure_depth(engine: Engine, camera: CameraModel, units: cl_array.Array) -> cl_array.Array:
-    depth_m = engine.workspace.array("depth_m", (camera.height, camera.width), np.float32)
+    depth_m = engine.buffers(_Buffers).depth_m.array((camera.height, camera.width))
     engine.launch(
         engine.kernel("measure.cl", "measure_depth", DISTORTED=camera.is_distorted),
         (camera.width, camera.height),

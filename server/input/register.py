@@ -1,6 +1,6 @@
-"""Depth of another lens brought to the colour picture (thesis 5.1.1). Kernel: register.cl.
+"""Registration of depth from another lens to the colour picture (thesis 5.1.1). Kernel: register.cl.
 
-Each depth pixel's own ray is looked up, not the depth picture resampled, so that no measurement moves or is lost.
+Each depth pixel is projected along its own ray. The depth picture is not resampled, so that no measurement is lost.
 """
 
 from __future__ import annotations
@@ -15,12 +15,26 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, DepthCamera
 from protocol.limits import MAX_IMAGE_SIDE_PX
+from server.opencl.buffers import BufferDescription, KeyedBufferDescription, StageBuffers
 from server.opencl.engine import Engine, float4, float16
 
 _NEWTON_STEPS = 20
 _CLOSE = 1e-9
 _SPREAD = 4.0
-"""A triangle between neighbouring depth pixels may be this many times larger than one seen from the front."""
+"""Greatest size of a triangle between neighbouring depth pixels, relative to one seen from the front."""
+
+
+class _Buffers(StageBuffers):
+    rays = KeyedBufferDescription(np.float32)
+    """By depth lens, [h, w, 4] as rays_of returns them."""
+    projected = BufferDescription(cl_types.float4)
+    """[h, w] of the depth lens: pixel in the colour picture, 1 / z there, z in the depth camera; 0 = none."""
+    surface = BufferDescription(np.uint32)
+    """[h, w] bits of the depth of triangles between measurements."""
+    points = BufferDescription(np.uint32)
+    """[h, w] bits of the depth of single measurements."""
+    depth_m = BufferDescription(np.float32)
+    """[h, w] the result."""
 
 
 def register_depth(
@@ -28,14 +42,14 @@ def register_depth(
 ) -> cl_array.Array:
     """[h, w] float32 of the colour picture: metres along its axis of the nearest surface measured there, 0 = none.
 
-    units: [h, w] uint16 of `camera.depth`, which must be set; 0 and 65535: none. Surfaces are filled between their
-    measurements, not across the edges of depth. The result is valid until the next call.
+    units: [h, w] uint16 of `camera.depth`, which must be set; 0 and 65535: none. Surfaces are interpolated between
+    measurements, but not across depth edges. The result is valid until the next call.
     """
     lens = camera.depth
     assert lens is not None
     projected = _project(engine, camera, lens, units, greatest_depth_m)
-    size, space = (camera.height, camera.width), engine.workspace
-    surface, points = space.array("register_surface", size, np.uint32), space.array("register_points", size, np.uint32)
+    size, buffers = (camera.height, camera.width), engine.buffers(_Buffers)
+    surface, points = buffers.surface.array(size), buffers.points.array(size)
     count, focal_px = camera.width * camera.height, math.sqrt(lens.fx * lens.fy)
     engine.launch(engine.kernel("register.cl", "clear_depth"), (count,), count, surface, points)
     engine.launch(
@@ -52,7 +66,7 @@ def register_depth(
     )
     splat_points, resolve = (engine.kernel("register.cl", name) for name in ("splat_points", "resolve_depth"))
     engine.launch(splat_points, (projected.size,), projected.size, projected, camera.width, camera.height, points)
-    depth_m = space.array("depth_m", size, np.float32)
+    depth_m = buffers.depth_m.array(size)
     engine.launch(resolve, (count,), count, surface, points, focal_px, greatest_depth_m, depth_m)
     return depth_m
 
@@ -60,16 +74,16 @@ def register_depth(
 def _project(
     engine: Engine, camera: CameraModel, lens: DepthCamera, units: cl_array.Array, greatest_depth_m: float
 ) -> cl_array.Array:
-    """[h, w] float4 of the depth lens: pixel in the colour picture, 1 / z there, z here; 0 = none."""
-    space, shape = engine.workspace, (lens.height, lens.width)
-    projected = space.array("projected_depth", shape, cl_types.float4)
+    """[h, w] float4 of the depth lens: pixel in the colour picture, 1 / z there, z in the depth camera; 0 = none."""
+    buffers = engine.buffers(_Buffers)
+    projected = buffers.projected.array((lens.height, lens.width))
     engine.launch(
         engine.kernel("register.cl", "project_depth"),
         (lens.width, lens.height),
         lens.width,
         lens.height,
         units,
-        space.constant(f"rays of {lens}", rays_of(lens)),
+        buffers.rays[lens].constant(rays_of(lens)),
         camera.depth_scale_m,
         greatest_depth_m,
         float16(camera.color_from_depth),
@@ -85,22 +99,24 @@ def _greatest_px(camera: CameraModel, lens: DepthCamera) -> int:
 
 @lru_cache(maxsize=8)
 def rays_of(lens: DepthCamera) -> NDArray[np.float32]:
-    """[h, w, 4] (x, y, 1, 0): the ray at z = 1 that every pixel of the distorted picture sees, z = 0 where it has none.
+    """[h, w, 4] (x, y, 1, 0): the ray at z = 1 of every pixel of the distorted picture; z = 0: no ray.
 
-    Newton's method on Brown's polynomial, from the distorted place. Where the polynomial folds back there is no ray.
+    Newton's method on Brown's polynomial, from the distorted point. Where the polynomial folds back there is no ray.
     """
     v, u = np.mgrid[: lens.height, : lens.width].astype(np.float64)
-    wanted = np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy], axis=-1)
-    found = wanted.copy()
-    with np.errstate(all="ignore"):  # beyond the fold it may run away; what did not arrive is dropped
+    distorted = np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy], axis=-1)
+    found = distorted.copy()
+    with np.errstate(all="ignore"):  # may diverge beyond the fold; such pixels get no ray
         for _ in range(_NEWTON_STEPS):
             off, jacobian = _distorted(lens, found)
-            found -= _solve_2x2(jacobian, off - wanted)
+            found -= _solve_2x2(jacobian, off - distorted)
         off, jacobian = _distorted(lens, found)
-        arrived = (np.abs(off - wanted).max(-1) < _CLOSE) & (_determinant(jacobian) > 0) & (jacobian[..., 0, 0] > 0)
-    rays = np.zeros((*arrived.shape, 4), np.float32)
-    rays[arrived, :2] = found[arrived]
-    rays[arrived, 2] = 1.0
+        converged = (
+            (np.abs(off - distorted).max(-1) < _CLOSE) & (_determinant(jacobian) > 0) & (jacobian[..., 0, 0] > 0)
+        )
+    rays = np.zeros((*converged.shape, 4), np.float32)
+    rays[converged, :2] = found[converged]
+    rays[converged, 2] = 1.0
     return rays
 
 

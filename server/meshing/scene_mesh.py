@@ -71,7 +71,7 @@ def without_specks(mesh: VoxelMesh, least_voxels: float) -> VoxelMesh:
     extent = np.maximum.reduceat(sorted_vertices, starts) - np.minimum.reduceat(sorted_vertices, starts)
     kept: NDArray[np.bool_] = (extent.max(axis=1) >= least_voxels)[label]
     if not kept.any():
-        raise MeshingError("there is no surface to mesh: all that was fused are specks smaller than a brick of voxels")
+        raise MeshingError("there is no surface to mesh: every piece is smaller than a brick of voxels")
     number = np.cumsum(kept) - 1
     return VoxelMesh(
         vertices=mesh.vertices[kept],

@@ -20,11 +20,11 @@ from server.volume.volume import BRICK, Bricks
 LEAST_TSDF = 1e-3
 """Values closer to zero are moved to this distance, so that a crossing is never a grid point shared by six edges."""
 GREATEST_STEP = 1.5
-"""Truncations between two neighbouring voxels, beyond which a change of sign is no surface but the space behind one
-beside the open space in front of another: curtains that hang from silhouettes. Surfaces seen at a grazing angle step
-by up to 1. Measured on the Mitsuba sequences, exact and noisy, as area more than a voxel from the truth, and share of
-the surface seen that the mesh has: no limit 0.8 and 1.0 %, 99.6 and 99.8 %; 1.5: 0.2 and 0.4 %, 99.4 and 99.7 %;
-1.0: 0.01 and 0.02 %, 97.4 and 97.7 %."""
+"""Greatest difference of two neighbouring voxels, in truncations, for a change of sign to be a surface. A greater one
+is a curtain at a silhouette: space behind one surface beside open space in front of another. At grazing angles the
+difference is up to 1. Measured on the Mitsuba sequences (exact, noisy) as share of the area more than a voxel from
+the truth, and as share of the visible surface that is meshed: no limit 0.8 and 1.0 %, 99.6 and 99.8 %; 1.5: 0.2 and
+0.4 %, 99.4 and 99.7 %; 1.0: 0.01 and 0.02 %, 97.4 and 97.7 %."""
 _CELL = 3
 """Used instead of an edge's axis for the vertex that Lewiner's tables place inside an ambiguous cell."""
 
@@ -85,7 +85,7 @@ def extract_surface(bricks: Bricks, progress: Callable[[int, int], None] = lambd
             pieces.append(piece)
     progress(len(chunks), len(chunks))
     if not pieces:
-        raise MeshingError("there is no surface to mesh: no voxel next to one was seen from the front")
+        raise MeshingError("there is no surface to mesh: no voxels on both sides of a surface were observed")
     return _weld(pieces)
 
 
@@ -122,7 +122,7 @@ def _mesh_chunk(
 
 
 def _surface_cells(tsdf: NDArray[np.float32], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """[SIDE - 1] * 3: the cells through which a surface goes, by their lowest corner."""
+    """[SIDE - 1] * 3: whether a surface crosses a cell, by its lowest corner."""
     highest, lowest = np.full((SIDE - 1,) * 3, -np.inf, np.float32), np.full((SIDE - 1,) * 3, np.inf, np.float32)
     whole = np.ones((SIDE - 1,) * 3, np.bool_)
     for z in (0, 1):
@@ -136,7 +136,7 @@ def _surface_cells(tsdf: NDArray[np.float32], seen: NDArray[np.bool_]) -> NDArra
 
 
 def _is_torn(tsdf: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """[SIDE - 1] * 3: cells with an edge along which the sign changes by more than GREATEST_STEP."""
+    """[SIDE - 1] * 3: whether the sign changes along an edge of the cell by more than GREATEST_STEP."""
     torn = np.zeros((SIDE - 1,) * 3, np.bool_)
     for axis in range(3):
         near, far = np.moveaxis(tsdf, axis, 0)[:-1], np.moveaxis(tsdf, axis, 0)[1:]
@@ -147,14 +147,14 @@ def _is_torn(tsdf: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def _grid_edges(places: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The lower end [v, 3] (z, y, x) of the grid edge on which each place [v, 3] lies, and its axis [v] (0 = z)."""
+    """Lower end [v, 3] (z, y, x) and axis [v] (0 = z) of the grid edge on which each vertex [v, 3] lies."""
     low = np.floor(places).astype(np.int64)
     between = places > low
     return low, np.where(between.sum(axis=1) == 1, between.argmax(axis=1), _CELL)
 
 
 def _keys(low: NDArray[np.int64], axis: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """One number for each grid edge or cell of the volume, from its lowest voxel [v, 3] x, y, z."""
+    """Unique number of each grid edge or cell of the volume, from its lowest voxel [v, 3] x, y, z."""
     keys: NDArray[np.int64] = ((low[:, 2] * rows[1] + low[:, 1]) * rows[0] + low[:, 0]) * 4 + axis
     return keys
 
@@ -162,9 +162,9 @@ def _keys(low: NDArray[np.int64], axis: NDArray[np.int64], rows: NDArray[np.int6
 def _crossings(
     tsdf: NDArray[np.float32], places: NDArray[np.float64], low: NDArray[np.int64], axis: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], Voxels, Voxels, NDArray[np.float64]]:
-    """Exact places [v, 3] (z, y, x), the two voxels of each, and [v, 1] how far from the first to the second it lies.
+    """Exact vertices [v, 3] (z, y, x), the two voxels of each, and its position [v, 1] from 0 at the first to 1.
 
-    A vertex inside a cell stays where the library put it and counts as its lowest corner's.
+    A vertex inside a cell keeps the library's position and gets the values of the cell's lowest corner.
     """
     step = np.eye(4, 3, dtype=np.int64)[axis]
     near, far = tuple(low.T), tuple((low + step).T)
@@ -177,7 +177,7 @@ def _crossings(
 def _mixed_colors(
     chunk: Chunk, near: Voxels, far: Voxels, share: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """[v, 3] between the two voxels' colours, or of the one that has any; and [v] whether one has."""
+    """Colours [v, 3] interpolated between those of the two voxels that have one, and whether any has one [v]."""
     w_near, w_far = (1 - share) * chunk.colored[near][:, None], share * chunk.colored[far][:, None]
     total = w_near + w_far
     mixed = w_near * chunk.colors[near] + w_far * chunk.colors[far]
@@ -185,7 +185,7 @@ def _mixed_colors(
 
 
 def _weld(pieces: list[_Piece]) -> VoxelMesh:
-    """All pieces as one mesh: vertices in the order of their keys, each once."""
+    """Merge all pieces: unique vertices in the order of their keys."""
     keys = np.concatenate([piece.keys for piece in pieces])
     _, first, number = np.unique(keys, return_index=True, return_inverse=True)
     starts = np.cumsum([0, *(len(piece.keys) for piece in pieces[:-1])])

@@ -82,7 +82,7 @@ def mesh_from_bytes(data: bytes | bytearray) -> Mesh:
         packed = msgspec.msgpack.decode(data, type=_Mesh)
         return _unpacked(packed)
     except (msgspec.MsgspecError, UnicodeDecodeError, ValueError) as error:
-        raise MeshError(f"what was read of the mesh is not one: {error}") from error
+        raise MeshError(f"the mesh reader's answer is not a valid mesh: {error}") from error
 
 
 def _packed(material: Material, numbers: dict[Texture, int]) -> _Material:
@@ -176,7 +176,7 @@ def _floats(name: str, data: memoryview, columns: int, most: float, count: int |
 
 
 def _require_numbers(name: str, numbers: NDArray[np.int32], count: int) -> None:
-    _require(bool(numbers.min() >= 0 and numbers.max() < count), f"{name} name what does not exist")
+    _require(bool(numbers.min() >= 0 and numbers.max() < count), f"{name} refer to elements that do not exist")
 
 
 def _require(holds: bool, wrong: str) -> None:

@@ -198,15 +198,15 @@ class ProcessPool:
             raise ChildDied(STOPPED)
         return new
 
-    def ask(self, request: bytes, take: Callable[[bytearray, mmap.mmap | None], object] | None = None) -> object:
-        """The answer, or the result of `take(answer, shared memory)`. Raises ValueError, ChildDied."""
+    def ask(self, request: bytes, read: Callable[[bytearray, mmap.mmap | None], object] | None = None) -> object:
+        """Returns the answer, or `read(answer, shared memory)`. Raises ValueError, ChildDied."""
         with self._borrowed() as child:
             try:
                 answer = child.ask(request)
             except ChildDied:
                 self._on_death()
                 raise
-            return answer if take is None else take(answer, child.shared)
+            return answer if read is None else read(answer, child.shared)
 
     def stop(self) -> None:
         """Kill all children. Requests in progress raise ChildDied."""

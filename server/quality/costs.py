@@ -15,8 +15,9 @@ WINDOW = 9
 SMALL_MS = 1.0
 """Rows below it are not scaled but added as measured."""
 SPREAD_WINDOW = 40
-"""Frames from which the spread about the median is taken."""
+"""Number of frames for the spread about the median."""
 USUAL_SPREAD = 1.1
+"""Spread before enough frames are known."""
 
 
 def rows_of(timings: Timings) -> dict[str, float]:
@@ -27,8 +28,8 @@ def rows_of(timings: Timings) -> dict[str, float]:
 
 
 class CostModel:
-    """Of one session. For each row there is one factor between this scene and the scene of the front, the same at all
-    operating points. It covers ray lengths, the share of virtual pixels and the load of the machine."""
+    """Costs of one session. Each row has one factor between this scene and the scene of the front, for all operating
+    points. It covers ray lengths, the share of virtual pixels and the load of the machine."""
 
     def __init__(self) -> None:
         self._recent: deque[dict[str, float]] = deque(maxlen=WINDOW)

@@ -13,27 +13,29 @@ from server.quality.costs import CostModel
 from server.quality.pareto_front import ParetoFront, ParetoPoint, read_front
 
 TOLERANCE = 1.1
-"""Share of the budget that frames may take."""
+"""Tolerated frame time, relative to the budget."""
 UP_TO = 0.92
-"""Share of the budget that a better point may be expected to take, with its spread, before it is chosen."""
+"""Greatest expected time of a better point, with its spread and relative to the budget, to step up to it."""
 CALM_FRAMES, MOST_CALM_FRAMES = 15, 240
+"""Frames within the budget before a step up: at first, and at most."""
 FIRST_CALM_FRAMES = 4
-"""Before the first step up: a session starts low, and its first frames show what the scene costs."""
+"""The same before the first step up, since a session starts with a fast point."""
 TAKEN_BACK_FRAMES = 45
-"""A step up that lasts less was a mistake."""
+"""A step up that is taken back within this number of frames counts as failed."""
 BEGIN = 0.75
-"""Share of the budget that the first point may be expected to take: the scene is not known yet."""
+"""Greatest expected time of the first point, relative to the budget: the scene is not known yet."""
 SETTLING_FRAMES = 2
-"""Frames ignored after a change, while arrays are made and caches fill, unless they are far too slow."""
+"""Frames ignored after a change, while buffers are allocated and caches fill, unless they are far too slow."""
 BADLY = 1.5
+"""Frame time relative to the tolerated one beyond which a frame counts twice."""
 LEAST_KNOWN_FRAMES = 5
-"""Before the expected time is trusted."""
+"""Frames at a point before its expected time is used."""
 GOOD_ENOUGH_DEG = 1.0
-"""Allowed above the least light error where neither budget nor error is given."""
+"""Tolerated light error above the least one if neither budget nor error is given."""
 
 
 class OperatingPointControl:
-    """Of one session. Call `observe` after every frame; `chosen` holds for the next."""
+    """Controller of one session. Call `observe` after every frame; `chosen` is the point of the next one."""
 
     def __init__(
         self, front: ParetoFront, budget_ms: float | None = None, max_light_error_deg: float | None = None
@@ -55,8 +57,8 @@ class OperatingPointControl:
         return self._ladder[self._index]
 
     @property
-    def said(self) -> OperatingPoint:
-        """As the message of a frame describes it."""
+    def operating_point(self) -> OperatingPoint:
+        """The point as described in the message of a frame."""
         chosen = self.chosen
         return OperatingPoint(
             settings=chosen.point.settings,
@@ -142,9 +144,9 @@ class OperatingPointControl:
         self._costs.changed()
 
     def _most_accurate(self, below_ms: float) -> int:
-        """The most accurate point expected to take less, with its spread; the fastest where there is none.
+        """Index of the most accurate point expected to take less, with its spread; the fastest if there is none.
 
-        With a greatest light error, the fastest point that keeps it.
+        With a limit of the light error: the fastest point within it.
         """
         spread = self._costs.spread
         fitting = [i for i, p in enumerate(self._ladder) if self._costs.expected_ms(p) * spread <= below_ms * TOLERANCE]

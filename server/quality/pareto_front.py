@@ -16,7 +16,7 @@ from server.quality.sampling_settings import SamplingSettings
 SAME_ERROR_DEG = 0.1
 """Light errors that differ by less count as equal: frames vary by more."""
 SAME_PICTURE_ERROR = 0.02
-"""Relative difference of picture errors that count as equal."""
+"""Picture errors with a smaller relative difference count as equal."""
 
 
 class ParetoPoint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -24,9 +24,9 @@ class ParetoPoint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
     point: SamplingSettings
     ms: dict[str, float]
-    """Median milliseconds of a frame, under the rows of `Timings` without `total`, and `other`."""
+    """Median milliseconds of a frame by row of `Timings`, without `total`, and `other`."""
     light_error_deg: float
-    """Of the dominant direction, median over frames."""
+    """Error of the dominant direction, median over frames."""
     picture_error: float
     """Mean difference from the true composite where virtual objects change it, in display units (1 is 1/255)."""
 
@@ -48,7 +48,7 @@ class ParetoFront(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     """All measured points, dominated ones too."""
 
     def best(self) -> tuple[ParetoPoint, ...]:
-        """The Pareto front: points that no faster point equals in accuracy, fastest first."""
+        """The Pareto front: points more accurate than all faster ones, fastest first."""
         found: list[ParetoPoint] = []
         for point in sorted(self.points, key=lambda p: (p.total_ms, p.light_error_deg)):
             if not found or _is_better(point, found[-1]):
@@ -67,7 +67,7 @@ def _is_better(a: ParetoPoint, b: ParetoPoint) -> bool:
 
 
 def own_version() -> str:
-    """Version of the program: a front of another version is not used."""
+    """Version of the program; fronts of other versions are not used."""
     try:
         return version("probeless")
     except PackageNotFoundError:
@@ -93,7 +93,7 @@ def write_front(front: ParetoFront) -> Path:
 
 
 def read_front(device: str) -> ParetoFront:
-    """Read the device's front. Raises NoFrontError where it is missing or unreadable."""
+    """Read the device's front. Raises NoFrontError if it is missing or unreadable."""
     path = front_path(device)
     advice = "run `probeless tune`, or choose a --preset"
     try:

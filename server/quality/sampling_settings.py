@@ -1,4 +1,4 @@
-"""Sampling settings: where and how finely transfer is sampled. A time budget chooses among them."""
+"""Sampling settings: where and how densely radiance transfer is sampled. Chosen by the client or by a time budget."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class SamplingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return cls(**{name: getattr(wishes, name) for name in cls.__struct_fields__})
 
     def wishes(self, others: Wishes) -> Wishes:
-        """`others` with these settings, and nothing left to choose."""
+        """`others` with these settings and without a budget or limit of the light error."""
         return structs.replace(others, **structs.asdict(self), budget_ms=None, max_light_error_deg=None)
 
     @property
     def settings(self) -> str:
-        """As options of the command line, without those that the preset implies."""
+        """The settings as command-line options, without those that the preset implies."""
         words = [f"--preset {self.preset}", f"--rays {self.rays}"]
         for name, value in structs.asdict(self).items():
             if name not in ("preset", "rays") and value is not None:
@@ -47,6 +47,6 @@ def option_of(name: str, value: Any) -> str:
     return f"{flag} {value:g}" if isinstance(value, float) else f"{flag} {value}"
 
 
-def asked_for(wishes: Wishes) -> OperatingPoint:
+def requested_point(wishes: Wishes) -> OperatingPoint:
     """Operating point of a frame whose settings were given by the client."""
     return OperatingPoint(settings=SamplingSettings.of(wishes).settings, reason="asked for")

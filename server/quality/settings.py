@@ -1,4 +1,4 @@
-"""Resolves a session's wishes into settings, and refuses those that this server cannot meet."""
+"""Resolves a session's wishes into settings, and refuses unsupported ones."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ class Settings:
     reach_m: float
     as_thesis: bool
     robustness: frozenset[str]
-    """P3: enabled measures out of `openness`, `normals`, `normals_printed`, `memory`, `outliers`."""
+    """P3: enabled measures, of `openness`, `normals`, `normals_printed`, `memory`, `outliers`."""
     edges: Literal["smooth", "hard"]
     tone_mapping: Literal["auto", "light", "average"]
-    """Brightness of virtual objects: from the scale of the light, or from the averages of picture and shading."""
+    """Brightness of virtual objects: by the scale of the light, or by the averages of picture and shading."""
     light_color: Literal["estimated", "white"]
     albedo: Literal["constant", "estimated"]
     indirect: Literal["none", "observed"]
     denoise: DenoiseMethod
     denoise_iterations: int
     plan: Literal["needed", "everything"]
-    """Whether effects that would hardly be seen are left out."""
+    """Whether to leave out effects whose change is bounded by less than a display unit."""
     smooth_depth: bool
-    """Whether merged depth gets the last median (D''')."""
+    """Whether merged depth is filtered by the last median (D''')."""
 
 
 def read_wishes(wishes: Wishes) -> Settings:
-    """Settings for `wishes`. Raises ValueError, one line, for what this server cannot do."""
+    """Settings for `wishes`. Raises ValueError, one line, for unsupported wishes."""
     reach_m = WHOLE_ROOM_M if wishes.ray_length_m is None else wishes.ray_length_m
     return Settings(
         sampling=sampling_of(wishes),
@@ -67,9 +67,9 @@ def read_wishes(wishes: Wishes) -> Settings:
 
 
 def sampling_of(wishes: Wishes) -> Sampling:
-    """How the preset samples transfer, with what is wished otherwise.
+    """Sampling of the preset, with the wishes that override it.
 
-    Raises ValueError for a preset that does not exist, and for wishes that mean nothing to it.
+    Raises ValueError for an unknown preset, and for wishes that it does not support.
     """
     if wishes.preset not in PRESETS:
         raise ValueError(f"preset {wishes.preset!r} is not available: use one of {', '.join(PRESETS)}")
@@ -88,5 +88,5 @@ def sampling_of(wishes: Wishes) -> Sampling:
     )
 
 
-def _or(wished: T | None, usual: T) -> T:
-    return usual if wished is None else wished
+def _or(value: T | None, default: T) -> T:
+    return default if value is None else value

@@ -1,4 +1,4 @@
-"""The virtual objects of one client: those that it places before it is aligned with its room wait."""
+"""The virtual objects of one client. Objects placed before it is aligned with its room wait."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class ClientObjects:
 
     @property
     def waiting(self) -> frozenset[str]:
-        """Names of the objects that wait."""
+        """Names of the waiting objects."""
         return frozenset(self._waiting)
 
     def place(self, object_id: str, mesh: Mesh, placement: Placement) -> tuple[str, ...]:
-        """Put a mesh into the room, in place of one with the same id; returns notes. Raises ValueError, one line."""
+        """Place a mesh in the room; replaces an object with the same id. Returns notes. Raises ValueError, one line."""
         objects = self._room.objects
         if self._alignment.is_settled or not objects.has_begun:
             objects.place(object_id, mesh, self._alignment.placed(placement))
@@ -33,11 +33,11 @@ class ClientObjects:
         check_size(mesh, placement)
         self._waiting.pop(object_id, None)
         self._waiting[object_id] = mesh, placement
-        objects.owe(object_id)
+        objects.add_pending(object_id)
         return (*mesh.notes, "it is placed once this client is aligned with the room")
 
     def move(self, object_id: str, placement: Placement) -> None:
-        """Give an object another place. Raises KeyError if there is none of that id, ValueError as place()."""
+        """Move an object. Raises KeyError for an unknown id, ValueError as place()."""
         if object_id not in self._waiting:
             self._room.objects.move(object_id, self._alignment.placed(placement))
             return
@@ -47,15 +47,15 @@ class ClientObjects:
         self._waiting[object_id] = mesh, placement
 
     def remove(self, object_id: str) -> None:
-        """Take an object away. Raises KeyError if there is none of that id."""
+        """Remove an object. Raises KeyError for an unknown id."""
         if self._waiting.pop(object_id, None) is not None:
-            self._room.objects.forgive(object_id)
+            self._room.objects.remove_pending(object_id)
             return
         self._room.objects.remove(object_id)
         self._room.changes += 1
 
     def place_waiting(self) -> tuple[str, ...]:
-        """Place what has waited, once the client is aligned; what was wrong with it, one line each."""
+        """Place the waiting objects once the client is aligned. Returns problems, one line each."""
         if not self._waiting or not (self._alignment.is_settled and self._room.objects.has_begun):
             return ()
         problems = []

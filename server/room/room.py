@@ -39,15 +39,15 @@ SHARED = (
     "lamps",
     "robustness",
 )
-"""Wishes that all clients of a room share: the values of the client that opened it."""
+"""Wishes that all clients of a room share, with the values of the client that opened it."""
 
 
 class Room:
     """The caller must hold `lock` while using the room. One frame at a time, from any client."""
 
     def __init__(self, device: Device, wishes: Wishes, name: str | None = None) -> None:
-        """`wishes`: of the client that opens it. `name`: None for the room of one session alone."""
-        # Where transfer is sampled is for each client to choose, or to have chosen.
+        """`wishes`: those of the client that opens the room. `name`: None for the room of a single session."""
+        # Each client has sampling settings of its own.
         settings = read_wishes(SamplingSettings().wishes(wishes) if wishes.preset == "auto" else wishes)
         self.name = name
         self.lock = threading.Lock()
@@ -58,7 +58,7 @@ class Room:
         self.objects = RoomObjects(self.engine)
         self.markers = Markers()
         self.changes = 0
-        """Counts the frames of all clients, and objects that came or went."""
+        """Counts the frames of all clients, and objects placed or removed."""
         self.key_digest: bytes | None = None
         """Digest of the room's key (room_registry.py); empty without a key, None until the first client enters."""
         self._wishes = wishes
@@ -81,7 +81,7 @@ class Room:
         )
 
     def begin(self, world_from_camera: NDArray[np.float64], bands: int) -> None:
-        """The first frame says what is up, unless the wishes do, and in which axes a light was given (S2)."""
+        """The first frame gives the up direction, unless the wishes do, and the axes of a given light (S2)."""
         if self.objects.has_begun:
             return
         up = np.array(self._wishes.up or -world_from_camera[:3, 1], np.float64)
@@ -98,7 +98,7 @@ class Room:
     ) -> SceneMesh:
         """The surface fused so far as triangles. Takes the lock while the volume is copied.
 
-        gltf_from_world: [3, 3], None before the first frame. Raises MeshingError, one line, where there is no surface.
+        gltf_from_world: [3, 3], None before the first frame. Raises MeshingError, one line, if there is no surface.
         """
         with self.lock:
             volume, exposure = self.reconstruction.volume, self.reconstruction.usual_exposure

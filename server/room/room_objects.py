@@ -20,12 +20,13 @@ from server.scene.placement import Placement, check_size
 Place = NDArray[np.float64] | Placement
 """world_from_model [4, 4], or the requested placement while the up direction is unknown."""
 
-MOST_OWED = 256
+MAX_PENDING = 256
+"""Beyond it, the oldest pending names are forgotten."""
 
 
 @dataclass(frozen=True)
 class ObjectRecord:
-    """What is needed to recreate an object."""
+    """Data to recreate an object."""
 
     object_id: str
     mesh: Mesh
@@ -41,7 +42,7 @@ class Inventory:
     objects: tuple[ObjectRecord, ...]
     """Includes waiting objects, in order of placement."""
     has_begun: bool
-    owed: tuple[str, ...]
+    pending: tuple[str, ...]
     """Names of objects that were acknowledged but are not placed yet, since their client is not aligned."""
 
 
@@ -52,7 +53,7 @@ class RoomObjects:
         self._engine = engine
         self._objects: SceneObjects | None = None
         self._waiting: list[tuple[str, Mesh, Placement]] = []
-        self._owed: dict[str, None] = {}
+        self._pending: dict[str, None] = {}
         self._revision = 0
         self._changing = threading.Lock()
         """Guards against `inventory`, which is called without the room's lock."""
@@ -84,7 +85,7 @@ class RoomObjects:
                 *(ObjectRecord(name, entry.mesh, entry.world_from_model) for name, entry in standing.items()),
                 *(ObjectRecord(name, mesh, placement) for name, mesh, placement in self._waiting),
             )
-            return Inventory(self._revision, objects, self._objects is not None, tuple(self._owed))
+            return Inventory(self._revision, objects, self._objects is not None, tuple(self._pending))
 
     def kept(self) -> list[ObjectRecord]:
         """All objects, including waiting ones, in order of placement."""
@@ -111,9 +112,9 @@ class RoomObjects:
             with self._change():
                 self._objects.move_to(object_id, place)
 
-    def resume(self, revision: int, owed: tuple[str, ...]) -> None:
-        """Restore revision and owed names after all objects were recreated."""
-        self._revision, self._owed = revision, dict.fromkeys(owed)
+    def resume(self, revision: int, pending: tuple[str, ...]) -> None:
+        """Restore the revision and the pending names after all objects were recreated."""
+        self._revision, self._pending = revision, dict.fromkeys(pending)
 
     def place(self, object_id: str, mesh: Mesh, placement: Placement) -> None:
         """Place a mesh; replaces an object with the same id. Raises ValueError."""
@@ -125,7 +126,7 @@ class RoomObjects:
                 self._waiting = [*others, (object_id, mesh, placement)]
             else:
                 self._objects.place(object_id, mesh, placement)
-            self._owed.pop(object_id, None)
+            self._pending.pop(object_id, None)
 
     def move(self, object_id: str, placement: Placement) -> None:
         """Move an object. Raises KeyError for an unknown id."""
@@ -138,38 +139,38 @@ class RoomObjects:
             self._waiting[index] = (object_id, self._waiting[index][1], placement)
 
     def remove(self, object_id: str) -> None:
-        """Remove an object, placed or owed. Raises KeyError for an unknown id."""
+        """Remove an object, placed or pending. Raises KeyError for an unknown id."""
         with self._change():
-            is_owed = object_id in self._owed
-            self._owed.pop(object_id, None)
-            if is_owed and not self._is_there(object_id):
+            is_pending = object_id in self._pending
+            self._pending.pop(object_id, None)
+            if is_pending and not self._is_there(object_id):
                 return
             if self._objects is not None:
                 self._objects.remove(object_id)
             else:
                 del self._waiting[self._waiting_index(object_id)]
 
-    def owe(self, object_id: str) -> None:
-        """Note an acknowledged object that cannot be placed yet, since its client is not aligned with the room."""
+    def add_pending(self, object_id: str) -> None:
+        """Note an object that was acknowledged, but cannot be placed before its client is aligned with the room."""
         with self._change():
-            self._owed[object_id] = None
-            while len(self._owed) > MOST_OWED:
-                del self._owed[next(iter(self._owed))]
+            self._pending[object_id] = None
+            while len(self._pending) > MAX_PENDING:
+                del self._pending[next(iter(self._pending))]
 
-    def forgive(self, object_id: str) -> None:
-        """Remove an owed object: it is no longer wanted."""
+    def remove_pending(self, object_id: str) -> None:
+        """Forget a pending object."""
         with self._change():
-            self._owed.pop(object_id, None)
+            self._pending.pop(object_id, None)
 
-    def owed_notes(self, besides: set[str]) -> tuple[str, ...]:
-        """A note that lists owed objects other than `besides`, if there are any."""
-        names = [repr(name) for name in self._owed if name not in besides]
+    def pending_notes(self, besides: set[str]) -> tuple[str, ...]:
+        """A note that lists pending objects other than `besides`, if there are any."""
+        names = [repr(name) for name in self._pending if name not in besides]
         if not names:
             return ()
         return (
             one_line(
-                "not placed, since whoever asked was not aligned with the room; place or remove again what nobody "
-                f"here waits for: {', '.join(names)}"
+                "objects that were not placed, because their client was not aligned with the room; place them again or "
+                f"remove them: {', '.join(names)}"
             ),
         )
 

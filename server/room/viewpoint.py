@@ -1,4 +1,4 @@
-"""A frame for a client without a camera: what a camera there would see of what others have scanned."""
+"""A frame for a client without a camera: the scanned surface as a camera at its viewpoint would see it."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Aligns a client's world with the room's: by a given transform, a marker or relocalisation, then refined by depth.
 
-The world of a room is that of the client whose frame was fused first. A client that contradicts the room is not fused.
+The world of a room is that of the client whose frame was fused first. Frames of a client whose depth contradicts the
+room are not fused.
 """
 
 from __future__ import annotations
@@ -28,40 +29,41 @@ from server.volume.volume import Volume
 Floats = NDArray[np.float64]
 
 LEAST_OVERLAP = 0.15
-"""Share of the picture that must show what the room has seen for the two to be compared."""
+"""Least share of the picture that must show the room's surface for a comparison."""
 LEAST_SHARE, GREATEST_DEVIATION_M = 0.4, 0.015
-"""Of what is compared, what must fit, and how well: else it is a contradiction. As tracking has it."""
-REACH_M, REACH_RAD = 0.3, np.radians(15.0)
-"""By so much depth may correct what the client or a marker says."""
+"""Least share of the compared pixels that must fit, and the greatest deviation, as in tracking; else the frame
+contradicts the room."""
+GREATEST_CORRECTION_M, GREATEST_CORRECTION_RAD = 0.3, np.radians(15.0)
+"""Greatest correction by depth of a pose that the client or a marker gives."""
 CERTAIN_FRAMES = 5
-"""Corrections that are averaged, of frames that fix all motions."""
+"""Number of corrections that are averaged, from frames that fix all motions."""
 
 
 class Markers:
-    """Markers of one room, by dictionary and number."""
+    """Poses of the markers of one room, by dictionary and number."""
 
     def __init__(self) -> None:
         self._places: dict[tuple[str, int], Floats] = {}
 
     def place_of(self, marker: Marker) -> Floats | None:
-        """room_from_marker [4, 4]; None where nobody that is aligned has seen it."""
+        """room_from_marker [4, 4]; None if no aligned client has seen the marker."""
         return self._places.get((marker.dictionary, marker.id))
 
     def places(self) -> dict[tuple[str, int], Floats]:
-        """room_from_marker [4, 4] of all, by dictionary and number."""
+        """room_from_marker [4, 4] of all markers, by dictionary and number."""
         return dict(self._places)
 
     def resume(self, places: dict[tuple[str, int], Floats]) -> None:
-        """These hold from the beginning."""
+        """Restore saved poses."""
         self._places = dict(places)
 
     def note(self, marker: Marker, room_from_marker: Floats) -> None:
-        """What the first client sees holds."""
+        """Add a marker's pose; the first one is kept."""
         self._places.setdefault((marker.dictionary, marker.id), room_from_marker)
 
 
 class Alignment:
-    """One client's."""
+    """Alignment of one client."""
 
     def __init__(
         self,
@@ -69,29 +71,29 @@ class Alignment:
         camera: CameraModel,
         reconstruction: Reconstruction,
         markers: Markers,
-        asked: Hello | None = None,
+        hello: Hello | None = None,
     ) -> None:
-        """`asked`: what the client said of its world; None: it is the room's."""
+        """`hello`: says where the client's world lies in the room; None: it is the room's."""
         self._engine = engine
         self._camera = camera
         self._reconstruction = reconstruction
         self._markers = markers
-        self._marker = asked.marker if asked else None
-        given = asked.room_from_world if asked else None
+        self._marker = hello.marker if hello else None
+        given = hello.room_from_world if hello else None
         self._given = None if given is None else np.array(given, np.float64).reshape(4, 4)
         self._is_first = False
-        """Whether its world is the room's."""
+        """Whether its world became the room's."""
         self._corrections = 0
         self._sightings = 0
         self.room_from_client: Floats = np.eye(4) if self._given is None else self._given
-        self._is_alone = asked is None or asked.room is None
+        self._is_alone = hello is None or hello.room is None
         self.is_settled = self._is_alone
-        """Whether the client's frames belong into the volume."""
+        """Whether to fuse the client's frames."""
         self.webxr_from_client: Floats | None = None
-        """[3, 3] rotation into axes with up as +y and the first view as near to -z as it goes; None before a frame."""
+        """[3, 3] rotation into axes with +y up and the first view as close to -z as possible; None before a frame."""
 
     def in_room(self, frame: RgbdFrame) -> RgbdFrame:
-        """The frame with its pose in the room's world; where it has none, by the marker if that says it."""
+        """The frame with its pose in the room's world; a missing pose is computed from a marker if one is seen."""
         if frame.world_from_camera is not None:
             if self._is_alone:
                 return frame
@@ -123,21 +125,21 @@ class Alignment:
     def note_view(self, up: Floats, room_from_camera: Floats) -> None:
         """Derive `webxr_from_client` from a view, until the client's place in the room is settled. up: [3] unit."""
         if self.webxr_from_client is None or not self.is_settled:
-            turn = self.client_from_room[:3, :3]
-            self.webxr_from_client = webxr_from_world(turn @ up, turn @ room_from_camera[:3, 2])
+            rotation = self.client_from_room[:3, :3]
+            self.webxr_from_client = webxr_from_world(rotation @ up, rotation @ room_from_camera[:3, 2])
 
     def in_client(self, room_from_camera: Floats) -> Floats:
-        """A pose as the client has it."""
+        """A camera pose in the client's world."""
         return room_from_camera if self.is_identity else self.client_from_room @ room_from_camera
 
     def placed(self, placement: Placement) -> Placement:
-        """A placement that the client says in its own world."""
+        """A placement given in the client's world, for the room."""
         return placement if self.is_identity else replace(placement, room_from_client=self.room_from_client)
 
     def settle(self, frame: RgbdFrame, measurement: Measurement) -> str | None:
-        """Align by one frame; why that failed, one line, None where the client is aligned.
+        """Align by one frame. Returns why that failed, one line; None if the client is aligned.
 
-        A frame without a pose of its own is located in the room by tracking, and needs none of this.
+        A frame without a pose is located in the room by tracking and needs no alignment.
         """
         if self._is_alone or frame.world_from_camera is None:
             return None
@@ -156,9 +158,9 @@ class Alignment:
         return None
 
     def _settle_without_depth(self, frame: RgbdFrame, measurement: Measurement) -> str | None:
-        """Nothing can be compared: what is said has to do."""
+        """Align by the given transform or a marker alone."""
         try:
-            self.is_settled = self._is_said(frame, measurement) or self.is_settled
+            self.is_settled = self._is_given(frame, measurement) or self.is_settled
         except ValueError as error:
             if not self.is_settled:
                 return f"not aligned with the room: {error}"
@@ -167,22 +169,22 @@ class Alignment:
         return "not aligned with the room: without depth, say where its world lies, or show a common marker"
 
     def _fit(self, frame: RgbdFrame, measurement: Measurement, volume: Volume) -> str | None:
-        """Learn from a frame; why it does not belong into the room, if so."""
+        """Refine the alignment by a frame's depth. Returns why the frame contradicts the room; None if it does not."""
         assert frame.world_from_camera is not None
         engine, camera, to_volume = self._engine, self._camera, volume.volume_from_world()
         try:
-            is_said = self._corrections > 0 or self._is_said(frame, measurement)
+            is_given = self._corrections > 0 or self._is_given(frame, measurement)
         except ValueError as error:
             return str(error)
         pyramid = depth_pyramid(engine, camera, bilateral_depth(engine, measurement.depth_m))
         pose = to_volume @ self.room_from_client @ frame.world_from_camera
-        if is_said:
+        if is_given:
             found = fit_near(engine, camera, volume, pyramid, pose)
             if found is None or found.overlap < LEAST_OVERLAP:
-                return None  # it looks elsewhere: nothing contradicts what it says
+                return None  # the camera looks elsewhere: nothing contradicts its pose
             fits = found.share > LEAST_SHARE and found.deviation_m < GREATEST_DEVIATION_M
-            if not fits or not is_near(found.volume_from_camera, pose, REACH_M, REACH_RAD):
-                return "its depth does not fit what the room has seen where it says that it is"
+            if not fits or not is_near(found.volume_from_camera, pose, GREATEST_CORRECTION_M, GREATEST_CORRECTION_RAD):
+                return "its depth does not fit the room's surface at the given pose"
         else:
             seen = thumbnail(frame, engine.download(pyramid[0]))
             places = [pose, *self._reconstruction.keyframes.most_similar(seen, count=3)]
@@ -195,21 +197,21 @@ class Alignment:
             self._average(room_from_camera @ inverse_rigid(frame.world_from_camera), self._corrections)
         return None
 
-    def _is_said(self, frame: RgbdFrame, measurement: Measurement) -> bool:
-        """Whether it is said where the client's world lies. Raises ValueError where its marker is not there."""
+    def _is_given(self, frame: RgbdFrame, measurement: Measurement) -> bool:
+        """Whether a transform or marker gives the alignment. Raises ValueError if the marker is hidden or unknown."""
         place = self._markers.place_of(self._marker) if self._marker else None
         if self._marker is None or (place is None and self._given is not None):
             return self._given is not None
         if place is None:
             raise ValueError(f"nobody in the room has seen marker {self._marker.id}")
-        said = place @ inverse_rigid(self._world_from_marker(frame, measurement, self._marker))
+        measured = place @ inverse_rigid(self._world_from_marker(frame, measurement, self._marker))
         self._sightings += 1
-        self._average(said, self._sightings)
+        self._average(measured, self._sightings)
         return True
 
-    def _average(self, said: Floats, count: int) -> None:
-        """The mean of what `count` frames say of room_from_client, of which `said` is the newest."""
-        mixed = self.room_from_client + (said - self.room_from_client) / count
+    def _average(self, measured: Floats, count: int) -> None:
+        """Update room_from_client to the mean of `count` measurements, of which `measured` is the newest."""
+        mixed = self.room_from_client + (measured - self.room_from_client) / count
         u, _, vt = np.linalg.svd(mixed[:3, :3])
         mixed[:3, :3] = u @ vt
         self.room_from_client = mixed
@@ -221,7 +223,7 @@ class Alignment:
             return  # not in this picture
 
     def _world_from_marker(self, frame: RgbdFrame, measurement: Measurement, marker: Marker) -> Floats:
-        """In the client's world. Raises ValueError, one line, where the picture does not show it."""
+        """In the client's world. Raises ValueError, one line, unless the picture shows the marker."""
         assert frame.world_from_camera is not None
         depth_m = self._engine.download(measurement.depth_m)
         return np.asarray(frame.world_from_camera @ find_marker(_gray(frame), self._camera, marker, depth_m))

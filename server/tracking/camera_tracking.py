@@ -20,6 +20,7 @@ from server.tracking.track import (
     ModelView,
     Pyramid,
     Registration,
+    ViewBuffers,
     depth_pyramid,
     finest_level,
     level_intrinsics,
@@ -32,22 +33,22 @@ from server.volume.volume import BRICK, Volume
 Floats = NDArray[np.float64]
 
 TOLERANCE_VOXELS = 0.25
-"""A motion that the scene fixes less well than this is not taken from it."""
+"""A motion that the scene fixes less accurately is not estimated."""
 _LEAST_SHARE, _LEAST_OVERLAP, _GREATEST_DEVIATION_M = 0.4, 0.05, 0.015
-"""Measured on four sets: registrations that are right have shares of 0.76 and more, wrong ones up to 0.32."""
+"""Measured on four data sets: correct registrations have shares of 0.76 and more, wrong ones up to 0.32."""
 _GREATEST_STEP_M, _GREATEST_TURN_RAD = 0.25, np.radians(20.0)
-"""Between two frames, beside what was predicted."""
+"""Greatest deviation from the predicted motion between two frames."""
 _GREATEST_CORRECTION_M, _GREATEST_CORRECTION_RAD = 0.1, np.radians(10.0)
-"""Of a client's motion between two frames."""
+"""Greatest correction of a client's motion between two frames."""
 _KEPT_M, _KEPT_RAD, _KEPT_FIT = 0.05, np.radians(3.0), 0.95
-"""A view of the volume is kept while the camera stays this near and fits it about as well as at first. With a new one
-every frame the least bias of a registration would add up, and a camera that stands still would drift."""
+"""A view of the volume is kept while the camera stays this near and fits it about as well as at first. With a new view
+in every frame, the bias of registrations would add up and a still camera would drift."""
 _SETTLING_FRAMES = 32
-"""The same view is renewed after 1, 2, 4, ... frames up to this: until then fusion makes it better."""
+"""The same view is renewed after 1, 2, 4, ... frames up to this number, while fusion improves it."""
 _NEAREST_DEPTH_M = 0.1
-"""A lens that is covered measures less."""
+"""A covered sensor measures less."""
 _LEAST_START = 0.05
-"""Share of the picture that must hold surface inside the volume for a world to begin with it."""
+"""Share of the first picture that must show surface inside the volume."""
 
 _LOST = "the camera is lost, nothing is fused: "
 
@@ -57,13 +58,13 @@ class PoseEstimate:
     """Camera pose of one frame."""
 
     world_from_camera: Floats
-    """The last good one where it is lost."""
+    """The last good pose if tracking is lost."""
     tracking: Tracking
     notes: tuple[str, ...] = ()
 
     @property
     def fuse(self) -> bool:
-        """Whether the frame belongs into the volume."""
+        """Whether to fuse the frame."""
         return self.tracking != "lost"
 
 
@@ -74,10 +75,10 @@ class _Place:
     volume_from_camera: Floats
     frames: int = 0
     fit: float = 0.0
-    """Best share of the picture that agreed with the volume."""
+    """Best share of measured pixels that agreed with the volume."""
 
     def holds(self, volume_from_camera: Floats, fit: float) -> bool:
-        """Whether the camera is still there, and the scene as it was."""
+        """Whether the camera is still there and the scene unchanged."""
         return (
             distance_between(self.volume_from_camera, volume_from_camera) < _KEPT_M
             and angle_between(self.volume_from_camera, volume_from_camera) < _KEPT_RAD
@@ -86,19 +87,20 @@ class _Place:
 
 
 class CameraTracking:
-    """One camera's pose from frame to frame. `locate` a frame, fuse it, `remember` what the volume then shows.
+    """One camera's pose from frame to frame. `locate` a frame, fuse it, then `remember` the volume's surface.
 
     given: the client's poses. track: tracking against the volume. refine: the client's frame-to-frame motion, corrected
-    by tracking; if the two do not agree, the client's.
+    by tracking if the two agree.
     """
 
     def __init__(
         self, engine: Engine, camera: CameraModel, mode: Poses, reconstruction: Reconstruction | None = None
     ) -> None:
-        """`reconstruction`: what others scan too, whose views this one helps to remember and is found again by."""
+        """`reconstruction`: shared with other cameras, with common keyframes; None: keyframes of its own."""
         self._engine = engine
         self._camera = camera
         self._mode = mode
+        self._view_buffers = ViewBuffers(engine.workspace)
         self._view: ModelView | None = None
         self._pose: Floats | None = None
         self._given: Floats | None = None
@@ -110,7 +112,7 @@ class CameraTracking:
         self._is_remembered = mode == "track" or (reconstruction is not None and reconstruction.is_shared)
 
     def first_guess(self, frame: RgbdFrame) -> Floats:
-        """world_from_camera before anything is measured. Raises ValueError, one line, for a pose that is none."""
+        """world_from_camera before tracking. Raises ValueError, one line, for an invalid or missing pose."""
         if self._mode == "track" and self._pose is not None:
             return self._pose
         if frame.world_from_camera is not None:
@@ -120,7 +122,7 @@ class CameraTracking:
         raise ValueError("the frame has no pose: use a source with poses, or --poses track")
 
     def locate(self, frame: RgbdFrame, measurement: Measurement, volume: Volume) -> PoseEstimate:
-        """Pose of a frame that was measured. Raises ValueError as `first_guess` does."""
+        """Pose of a frame. Raises ValueError as `first_guess` does."""
         guess = self.first_guess(frame)
         engine, camera = self._engine, self._camera
         if self._mode == "given":
@@ -129,21 +131,21 @@ class CameraTracking:
             return PoseEstimate(guess, "given")
         self._pyramid = depth_pyramid(engine, camera, bilateral_depth(engine, measurement.depth_m))
         if self._pose is None or self._view is None:
-            return self._join(frame, guess, volume) if self._is_known(volume) else self._start(guess, volume)
+            return self._join(frame, guess, volume) if self._must_join(volume) else self._start(guess, volume)
         return self._follow(frame, guess, volume) if self._mode == "track" else self._refine(guess, volume)
 
     def remember(self, frame: RgbdFrame, located: PoseEstimate, model: Surface, volume_from_camera: Floats) -> None:
-        """What the volume shows from where the frame was located: the next one is compared with it."""
+        """Keep the predicted surface, with which the next frame is compared, and a keyframe if the view is new."""
         if self._mode != "given":
             if self._needs_view(volume_from_camera):
-                self._view = view_model(self._engine, self._camera, volume_from_camera, model)
+                self._view = view_model(self._engine, self._camera, volume_from_camera, model, self._view_buffers)
             self._pose, self._given = located.world_from_camera, frame.world_from_camera
             self._is_lost = False
         if self._is_remembered and self._keyframes.is_new(volume_from_camera):
             self._keyframes.add(thumbnail(frame, self._engine.download(self._pyramid[0])), volume_from_camera)
 
     def _needs_view(self, volume_from_camera: Floats) -> bool:
-        """Whether the next frame is to be compared with what the volume shows now, instead of some frames ago."""
+        """Whether to compare the next frame with a new view of the volume instead of the last one kept."""
         place = self._place
         if place is None or self._is_lost or not place.holds(volume_from_camera, self._fit):
             place = self._place = _Place(volume_from_camera)
@@ -152,15 +154,15 @@ class CameraTracking:
         return place.frames <= _SETTLING_FRAMES and place.frames.bit_count() == 1
 
     def _start(self, guess: Floats, volume: Volume) -> PoseEstimate:
-        """The first frame makes the world, if there is enough in it to find the next one's place by."""
+        """The first frame defines the world, if it shows enough surface to track the next one."""
         if self._mode == "refine":
             return PoseEstimate(guess, "given")
         if self._starting_share(guess, volume) < _LEAST_START:
             return PoseEstimate(guess, "lost", (_LOST + "there is too little depth inside the volume to begin with",))
         return PoseEstimate(guess, "tracked")
 
-    def _is_known(self, volume: Volume) -> bool:
-        """Whether a world is there already, which this camera has to find its place in."""
+    def _must_join(self, volume: Volume) -> bool:
+        """Whether other cameras have scanned the volume, so that this one has to relocalise in it."""
         return self._mode == "track" and volume.frames > 0
 
     def _join(self, frame: RgbdFrame, guess: Floats, volume: Volume) -> PoseEstimate:
@@ -202,11 +204,11 @@ class CameraTracking:
         tolerance_m = TOLERANCE_VOXELS * volume.voxel_m
         return register(self._engine, self._camera, self._view, self._pyramid, guess, tolerance_m)
 
-    def _tracked(self, found: Registration | None, volume: Volume, instead: str) -> PoseEstimate:
+    def _tracked(self, found: Registration | None, volume: Volume, fallback: str) -> PoseEstimate:
         assert found is not None
         self._fit = found.share
         pose = inverse_rigid(volume.volume_from_world()) @ found.volume_from_camera
-        notes = (f"the scene does not fix {motions_in_words(found.free)}: {instead}",) if len(found.free) else ()
+        notes = (f"the scene does not fix {motions_in_words(found.free)}: {fallback}",) if len(found.free) else ()
         return PoseEstimate(pose, "tracked", notes)
 
     def _starting_share(self, world_from_camera: Floats, volume: Volume) -> float:
@@ -252,7 +254,7 @@ def _why_lost(
     greatest_step_m: float = _GREATEST_STEP_M,
     greatest_turn_rad: float = _GREATEST_TURN_RAD,
 ) -> str | None:
-    """None where the registration is to be believed."""
+    """Reason to reject a registration; None to accept it."""
     if found is None or found.overlap < _LEAST_OVERLAP:
         return "hardly any of its depth meets the volume's surface"
     if found.share < _LEAST_SHARE or found.deviation_m > _GREATEST_DEVIATION_M:

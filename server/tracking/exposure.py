@@ -1,8 +1,8 @@
-"""Exposure of each picture relative to the session's first (B3): as the source gives it, else estimated as one factor.
+"""Exposure of each picture relative to the session's first (B3): given by the source, or estimated as one factor.
 
-Kernel: exposure.cl. The volume holds what surfaces send in the units of the first picture; a picture's factor is where
-the ratios of its own brightness to that lie. A light change that is equal on all surfaces is treated as exposure: in
-the units of the frame's own image, in which light is reported, both are the same.
+Kernel: exposure.cl. The volume stores radiance in the units of the first picture; the exposure is a robust location of
+the ratios between the picture and the volume. A light change that is equal on all surfaces is treated as exposure:
+light is reported in the units of the frame's own image, where both are the same.
 """
 
 from __future__ import annotations
@@ -19,41 +19,47 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel, RgbdFrame
 from server.input.measure import Measurement, intrinsics
 from server.maths.robust_location import Location, robust_location
+from server.opencl.buffers import BufferDescription, DeviceBuffer, StageBuffers
 from server.opencl.engine import Engine, float16, int4
 from server.volume.volume import Volume
 
 DEAD_BAND = 0.01
-"""Of the logarithm, or a standard deviation where that is more: what registration and a camera's tone curve make of one
-exposure. Nearer than this the last factor is kept to the last bit, beyond it is followed at this distance: a constant
-exposure stays constant, and noise does not show."""
+"""Dead band of the logarithm (or one standard deviation, if greater): errors of registration and of a camera's tone
+curve. Within it the last factor is kept exactly; beyond it the factor follows at this distance. So a constant exposure
+stays constant."""
 GREATEST_STEP = 64.0
-"""Between two frames; a camera's whole range within a room is less."""
+"""Greatest factor between two frames; a camera's range within a room is less."""
 GREATEST_EXPOSURE = 1e6
-"""Relative to the first frame, and one over it the least."""
+"""Greatest exposure relative to the first frame; the least is its inverse."""
 LEAST_SAMPLES = 100
-"""Fewer surface points seen again say nothing: the last factor is kept."""
+"""With fewer surface points in common the last factor is kept."""
 LEAST_SHARE = 0.25
-"""Of the samples that must agree on a factor."""
-LEAST_LOOKS = 2.0
-"""Pictures that must have seen a surface, or all of them while there are fewer."""
+"""Least share of the samples that must agree on a factor."""
+LEAST_OBSERVATIONS = 2.0
+"""Least number of pictures that must have seen a surface, or all pictures if there are fewer."""
 _MOST_SAMPLES = 2304
 _LEAST_SCALE = 0.005
-_GROUP_SAMPLES = 8  # to a side, of a part of the picture that shares its errors
-_NOISE_FLOOR = 0.02  # luminance under which the noise of a camera is not in proportion to the root of it
+_GROUP_SAMPLES = 8  # per side of a block of samples with common errors
+_NOISE_FLOOR = 0.02  # luminance below which a camera's noise is not proportional to its root
+
+
+class _Buffers(StageBuffers):
+    samples = BufferDescription(cl_types.float4)
+    """[rows, cols] as compare_exposure of exposure.cl writes them."""
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Surface seen before and seen again."""
+    """Surface that both the picture and the volume show."""
 
     seen: NDArray[np.float64]
     """[n] luminance in the picture."""
     predicted: NDArray[np.float64]
-    """[n] luminance that the volume has of it."""
-    looks: NDArray[np.float64]
-    """[n] pictures that the prediction is a mean of."""
+    """[n] luminance in the volume."""
+    observations: NDArray[np.float64]
+    """[n] observations that `predicted` is a mean of."""
     groups: NDArray[np.int64]
-    """[n] number of the part of the picture."""
+    """[n] number of the block of samples."""
 
     def __len__(self) -> int:
         return len(self.seen)
@@ -66,10 +72,10 @@ def compare_exposure(
     volume: Volume,
     volume_from_camera: NDArray[np.float64],
 ) -> Samples:
-    """What a picture, not yet integrated, shows again of surface that the volume has a colour of."""
+    """Compare a picture, before it is integrated, with the volume's colours."""
     stride = max(1, math.ceil(math.sqrt(camera.width * camera.height / _MOST_SAMPLES)))
     shape = (camera.height // stride, camera.width // stride)
-    samples = engine.workspace.array("exposure_samples", shape, cl_types.float4)
+    samples = engine.buffers(_Buffers).samples.array(shape)
     engine.launch(
         engine.kernel("exposure.cl", "compare_exposure"),
         shape[::-1],
@@ -87,7 +93,7 @@ def compare_exposure(
         volume.colors,
         volume.voxel_m,
         volume.truncation_m,
-        min(LEAST_LOOKS, float(volume.frames)),
+        min(LEAST_OBSERVATIONS, float(volume.frames)),
         samples,
     )
     found = engine.download(samples).view(np.float32).reshape(-1, 4).astype(np.float64)
@@ -98,32 +104,30 @@ def compare_exposure(
 
 
 def locate_exposure(samples: Samples, last: float) -> Location | None:
-    """Logarithm of the picture's exposure; None where too little was seen again. last: of the frame before."""
+    """Logarithm of the picture's exposure; None with too few samples in common. last: that of the frame before."""
     if len(samples) < LEAST_SAMPLES:
         return None
     ratios = np.log(samples.seen / samples.predicted)
-    # A camera's noise goes about with the root of what it sees; its part of a mean of n looks is one in n.
+    # A camera's variance is proportional to luminance; that of a mean of n observations is 1 / n of it.
     brightness = samples.predicted * math.exp(last)
-    weights = brightness / (brightness + _NOISE_FLOOR) * samples.looks / (samples.looks + 1)
+    weights = brightness / (brightness + _NOISE_FLOOR) * samples.observations / (samples.observations + 1)
     found = robust_location(ratios, weights, samples.groups, last, _LEAST_SCALE)
     return found if found.share >= LEAST_SHARE else None
 
 
 def followed(last: float, found: Location) -> float:
-    """The logarithm to go on with: `last` where what was found does not contradict it."""
+    """The next logarithm: `last` if the measured one does not contradict it."""
     band = max(DEAD_BAND, found.std)
     return min(max(last, found.value - band), found.value + band)
 
 
-def scene_radiance(
-    engine: Engine, radiance: cl_array.Array, exposure: float, buffer: str = "scene_radiance"
-) -> cl_array.Array:
-    """[h, w] float4: a picture's radiance, as in Measurement, in the units of the first picture; `radiance` itself for
-    exposure 1. Clipped pixels are marked AT_LEAST (include/radiance_marks.clh). `buffer` names the array.
+def scene_radiance(engine: Engine, radiance: cl_array.Array, exposure: float, buffer: DeviceBuffer) -> cl_array.Array:
+    """[h, w] float4: a picture's radiance, as in Measurement, in the units of the first picture; `radiance` itself at
+    exposure 1. Clipped pixels are marked AT_LEAST (include/radiance_marks.clh). `buffer` (float4) holds the result.
     """
     if exposure == 1.0:
         return radiance
-    scene = engine.workspace.array(buffer, radiance.shape, cl_types.float4)
+    scene = buffer.array(radiance.shape)
     engine.launch(
         engine.kernel("exposure.cl", "scale_radiance"),
         (scene.size,),
@@ -136,7 +140,7 @@ def scene_radiance(
 
 
 class ExposureTracking:
-    """Exposures of one camera's frames, one after the other; that of the first one in the volume is 1."""
+    """Exposures of one camera's frames in order; that of the first integrated frame is 1."""
 
     def __init__(self, engine: Engine, camera: CameraModel, mode: Literal["auto", "constant"]) -> None:
         self._engine = engine
@@ -144,7 +148,7 @@ class ExposureTracking:
         self._mode = mode
         self._exposure: float | None = None
         self._given_of_first: float | None = None
-        """What the source would have said of the first frame."""
+        """Exposure of the first frame in the source's units."""
 
     def update(
         self,
@@ -153,9 +157,9 @@ class ExposureTracking:
         volume: Volume,
         volume_from_camera: NDArray[np.float64] | None,
     ) -> tuple[float, tuple[str, ...]]:
-        """Exposure of a frame before it is integrated, and what was wrong with the one it came with, one line each.
+        """Exposure of a frame before it is integrated, and notes, one line each, if the given exposure is invalid.
 
-        volume_from_camera: None where it is not known, and nothing can be compared.
+        volume_from_camera: None if it is not known; then nothing is compared.
         """
         if self._mode == "constant":
             return 1.0, ()
@@ -182,7 +186,7 @@ class ExposureTracking:
         return math.exp(logarithm)
 
     def _checked(self, given: float | None) -> tuple[float | None, tuple[str, ...]]:
-        """A given exposure, None for one that cannot be; and why."""
+        """A given exposure, or None and a note if it is invalid."""
         if given is None:
             return None, ()
         if not (math.isfinite(given) and given > 0):
@@ -193,7 +197,7 @@ class ExposureTracking:
         step = max(relative / self._exposure, self._exposure / relative) if relative > 0 else math.inf
         if step > GREATEST_STEP or not 1 / GREATEST_EXPOSURE <= relative <= GREATEST_EXPOSURE:
             return None, (
-                f"the frame's exposure of {given:g} is {step:.3g} times another than the last frame's, which no camera "
-                "does: it is estimated",
+                f"the frame's exposure of {given:g} differs from the last frame's by a factor of {step:.3g}, more than "
+                "a camera's range: it is estimated",
             )
         return given, ()

@@ -19,9 +19,10 @@ DICTIONARIES = {
     "apriltag_36h11": cv2.aruco.DICT_APRILTAG_36h11,
 }
 LEAST_POINTS = 24
-"""Of depth on the marker, to lay a plane through."""
+"""Least number of depth samples on the marker to fit a plane."""
 GREATEST_MISFIT = 0.1
-"""Of the sides that the corners have on that plane, from the marker's: more is depth of something else."""
+"""Greatest relative difference between the sides on that plane and the marker's; beyond it the depth is of another
+surface."""
 
 
 def find_marker(
@@ -29,8 +30,8 @@ def find_marker(
 ) -> Floats:
     """camera_from_marker [4, 4], metres: x right and y up on the sheet, z out of it, origin in its middle.
 
-    gray: [h, w] as the camera took it. depth_m: [h, w], 0 = none: four corners that are seen from the front say little
-    of how the sheet is turned, and the depth on it does. Raises ValueError, one line, where it is not seen just once.
+    gray: [h, w], distorted as the camera's. depth_m: [h, w] rectified, 0 = none; improves the orientation, which four
+    corners seen from the front fix badly. Raises ValueError, one line, unless the marker is seen exactly once.
     """
     detector = cv2.aruco.ArucoDetector(
         cv2.aruco.getPredefinedDictionary(DICTIONARIES[marker.dictionary]), _sharp_corners()
@@ -44,7 +45,7 @@ def find_marker(
     if on_plane is not None:
         sides = np.linalg.norm(on_plane - np.roll(on_plane, 1, axis=0), axis=1)
         if np.abs(sides / marker.side_m - 1.0).max() < GREATEST_MISFIT:
-            return _laid_on(_square(marker), on_plane)
+            return _fitted(_square(marker), on_plane)
     return _by_corners(corners, camera, marker)
 
 
@@ -55,17 +56,17 @@ def _square(marker: Marker) -> Floats:
 
 def _by_corners(corners: Floats, camera: CameraModel, marker: Marker) -> Floats:
     lens, distortion = _lens(camera)
-    solved, turn, shift = cv2.solvePnP(_square(marker), corners, lens, distortion, flags=cv2.SOLVEPNP_IPPE_SQUARE)
+    solved, rotation, shift = cv2.solvePnP(_square(marker), corners, lens, distortion, flags=cv2.SOLVEPNP_IPPE_SQUARE)
     if not solved:
         raise ValueError(f"the pose of marker {marker.id} is not found")
     camera_from_marker = np.eye(4)
-    camera_from_marker[:3, :3] = cv2.Rodrigues(turn)[0]
+    camera_from_marker[:3, :3] = cv2.Rodrigues(rotation)[0]
     camera_from_marker[:3, 3] = np.asarray(shift, np.float64).ravel()
     return camera_from_marker
 
 
 def _corners_on_depth(corners: Floats, camera: CameraModel, depth_m: NDArray[np.float32]) -> Floats | None:
-    """[4, 3] camera axes: where the corners' rays meet the plane of the depth between them; None: there is none."""
+    """[4, 3] camera axes: where the corners' rays meet the plane of the depth between them; None: no plane."""
     inside = cv2.fillConvexPoly(np.zeros(depth_m.shape, np.uint8), np.rint(corners).astype(np.int32), 1) > 0
     rows, columns = np.nonzero(inside & (depth_m > 0))
     if len(rows) < LEAST_POINTS:
@@ -83,7 +84,7 @@ def _corners_on_depth(corners: Floats, camera: CameraModel, depth_m: NDArray[np.
 
 
 def _rays(pixels: Floats, camera: CameraModel) -> Floats:
-    """[n, 3] with z = 1."""
+    """[n, 3] rays with z = 1."""
     flat = cv2.undistortPoints(pixels[:, None], *_lens(camera))[:, 0]
     return np.column_stack([flat, np.ones(len(flat))]).astype(np.float64)
 
@@ -93,13 +94,13 @@ def _lens(camera: CameraModel) -> tuple[Floats, Floats]:
     return matrix, np.array(camera.distortion, np.float64)
 
 
-def _laid_on(points: Floats, places: Floats) -> Floats:
-    """Rigid [4, 4] that brings `points` [n, 3] nearest to `places` [n, 3] (Kabsch)."""
+def _fitted(points: Floats, places: Floats) -> Floats:
+    """Rigid [4, 4] that maps `points` [n, 3] to `places` [n, 3] with least squared error (Kabsch)."""
     from_middle, to_middle = points.mean(axis=0), places.mean(axis=0)
     u, _, vt = np.linalg.svd((places - to_middle).T @ (points - from_middle))
-    turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = turn, to_middle - turn @ from_middle
+    matrix[:3, :3], matrix[:3, 3] = rotation, to_middle - rotation @ from_middle
     return matrix
 
 

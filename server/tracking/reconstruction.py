@@ -15,7 +15,7 @@ from server.volume.bounds import Bounds, bounds_seen, default_voxel_m
 from server.volume.volume import Volume
 
 MARGIN_M = 1.5
-"""How far a shared volume goes beyond what its first camera sees: others look elsewhere."""
+"""Margin of a shared volume around the surface that its first camera sees, since other cameras look elsewhere."""
 
 
 class Reconstruction:
@@ -24,19 +24,19 @@ class Reconstruction:
     def __init__(self, engine: Engine, *, is_shared: bool = False) -> None:
         self._engine = engine
         self.exposure_logarithms = 0.0
-        """Their sum over the frames that were fused."""
+        """Sum over all fused frames."""
         self.is_shared = is_shared
-        """Whether several cameras scan it."""
+        """Whether several cameras scan this volume."""
         self.volume: Volume | None = None
         self.keyframes = Keyframes()
-        """Of cameras that are tracked."""
+        """Views of all tracked cameras."""
 
     def volume_for(
         self, wishes: Wishes, camera: CameraModel, frame: RgbdFrame, world_from_camera: NDArray[np.float64]
     ) -> Volume:
-        """The volume; made by the first frame, which says where the scene is unless the wishes do.
+        """The volume; created by the first frame, around what it sees unless the wishes give the bounds.
 
-        Raises ValueError, one line, where it says nothing.
+        Raises ValueError, one line, for a first frame without depth.
         """
         if self.volume is None:
             if not frame.has_depth:
@@ -48,12 +48,12 @@ class Reconstruction:
         return self.volume
 
     def count_exposure(self, exposure: float) -> None:
-        """Note the exposure of a frame that was fused, relative to the first's."""
+        """Add the exposure of a fused frame, relative to the first frame."""
         self.exposure_logarithms += math.log(exposure)
 
     @property
     def usual_exposure(self) -> float:
-        """Geometric mean over the frames that were fused: under it the volume's colours look as in most pictures."""
+        """Geometric mean over all fused frames: with it the volume's colours look as in most pictures."""
         frames = self.volume.frames if self.volume else 0
         return math.exp(self.exposure_logarithms / frames) if frames else 1.0
 

@@ -13,22 +13,23 @@ from protocol.frames import CameraModel, RgbdFrame
 from server.maths.registration import angle_between, distance_between
 from server.opencl.buffers import BufferGroup, StageBuffers
 from server.opencl.engine import Engine
-from server.tracking.track import Pyramid, Registration, register, view_model
+from server.tracking.track import Pyramid, Registration, ViewBuffers, register, view_model
 from server.volume.raycast import SurfaceBuffers, raycast
 from server.volume.volume import Volume
 
 THUMB = (40, 30)
 GREATEST_COUNT = 200
 NEW_DISTANCE_M, NEW_ANGLE_RAD = 0.2, np.radians(12.0)
-"""A view this far from every keyframe becomes one."""
+"""A view this far from every keyframe becomes a keyframe."""
 _CANDIDATES = 3
 _LEAST_SHARE, _LEAST_OVERLAP, _GREATEST_DEVIATION_M = 0.6, 0.2, 0.012
-_REACH_M, _REACH_RAD = 0.5, np.radians(30.0)
-"""A keyframe this far from where registration ends was not the same view."""
+_SAME_VIEW_M, _SAME_VIEW_RAD = 0.5, np.radians(30.0)
+"""A keyframe farther than this from the registered pose is not the same view."""
 
 
 class _Buffers(StageBuffers):
     surface = BufferGroup(SurfaceBuffers)
+    view = BufferGroup(ViewBuffers)
 
 
 @dataclass(frozen=True)
@@ -36,11 +37,11 @@ class Thumbnail:
     """A small image for comparison with all keyframes."""
 
     intensity: NDArray[np.float32]
-    """[30, 40] of mean 0 and deviation 1, whatever the exposure."""
+    """[30, 40] normalised to mean 0 and deviation 1."""
     log_depth: NDArray[np.float32]
-    """[30, 40] log of metres, 0 where there is none."""
+    """[30, 40] logarithm of metres, 0 = none."""
     is_deep: NDArray[np.bool_]
-    """[30, 40] where there is depth."""
+    """[30, 40] whether there is depth."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def thumbnail(frame: RgbdFrame, depth_m: NDArray[np.float32]) -> Thumbnail:
 
 
 def dissimilarity(a: Thumbnail, b: Thumbnail) -> float:
-    """Mean difference of intensity and of log depth; where only one has depth it counts as a factor of two."""
+    """Mean difference of intensity plus twice that of log depth; depth in only one counts as a factor of two."""
     both, one = a.is_deep & b.is_deep, a.is_deep ^ b.is_deep
     depth = np.abs(a.log_depth - b.log_depth)[both].sum() + np.log(2) * one.sum()
     return float(np.abs(a.intensity - b.intensity).mean() + 2 * depth / max(int((both | one).sum()), 1))
@@ -81,21 +82,21 @@ class Keyframes:
         return len(self._kept)
 
     def kept(self) -> list[Keyframe]:
-        """All of them, in the order in which they came."""
+        """All keyframes, oldest first."""
         return list(self._kept)
 
     def is_new(self, volume_from_camera: NDArray[np.float64]) -> bool:
-        """Whether a view is far enough from all others to be worth keeping."""
+        """Whether a view is far enough from all keyframes to become one."""
         return not any(is_near(kept.volume_from_camera, volume_from_camera) for kept in self._kept)
 
     def add(self, seen: Thumbnail, volume_from_camera: NDArray[np.float64]) -> None:
-        """Keep a view; past the greatest count, one of the two nearest to each other goes."""
+        """Keep a view; beyond GREATEST_COUNT, one of the two nearest to each other is removed."""
         self._kept.append(Keyframe(seen, volume_from_camera))
         if len(self._kept) > GREATEST_COUNT:
             del self._kept[self._most_crowded()]
 
     def most_similar(self, seen: Thumbnail, count: int) -> list[NDArray[np.float64]]:
-        """Poses (volume_from_camera) of the `count` views most like `seen`, the most similar first."""
+        """volume_from_camera of the `count` keyframes most similar to `seen`, the most similar first."""
         ranked = sorted(self._kept, key=lambda kept: dissimilarity(kept.thumbnail, seen))
         return [kept.volume_from_camera for kept in ranked[:count]]
 
@@ -112,13 +113,13 @@ def relocalize(
     pyramid: Pyramid,
     poses: list[NDArray[np.float64]],
 ) -> Registration | None:
-    """Where the depth fits the volume, near one of the `poses` (volume_from_camera); None if it fits nowhere for sure.
+    """Register the depth with the volume near one of the `poses` (volume_from_camera); None without a certain result.
 
-    What is found is verified against the surface as seen from there.
+    A result is verified against the surface seen from its own pose.
     """
     for pose in poses[:_CANDIDATES]:
         found = fit_near(engine, camera, volume, pyramid, pose)
-        if found is None or not is_near(found.volume_from_camera, pose, _REACH_M, _REACH_RAD):
+        if found is None or not is_near(found.volume_from_camera, pose, _SAME_VIEW_M, _SAME_VIEW_RAD):
             continue
         verified = fit_near(engine, camera, volume, pyramid, found.volume_from_camera)
         if verified is not None and is_certain(verified):
@@ -133,13 +134,16 @@ def fit_near(
     pyramid: Pyramid,
     pose: NDArray[np.float64],
 ) -> Registration | None:
+    """Register the depth with the surface seen from `pose` (volume_from_camera); None without overlap."""
     volume.bring_back(camera, pose)
-    seen = raycast(engine, camera, pose, volume, engine.buffers(_Buffers).surface)
-    view = view_model(engine, camera, pose, seen, "relocalize")
+    buffers = engine.buffers(_Buffers)
+    seen = raycast(engine, camera, pose, volume, buffers.surface)
+    view = view_model(engine, camera, pose, seen, buffers.view)
     return register(engine, camera, view, pyramid, pose, 0.25 * volume.voxel_m)
 
 
 def is_certain(found: Registration) -> bool:
+    """Whether a registration fits well, overlaps enough and fixes all motions."""
     fits = found.share > _LEAST_SHARE and found.overlap > _LEAST_OVERLAP and found.deviation_m < _GREATEST_DEVIATION_M
     return fits and not len(found.free)
 
@@ -150,4 +154,5 @@ def is_near(
     distance_m: float = NEW_DISTANCE_M,
     angle_rad: float = NEW_ANGLE_RAD,
 ) -> bool:
+    """Whether two poses are nearer than both limits."""
     return distance_between(a, b) < distance_m and angle_between(a, b) < angle_rad

@@ -1,9 +1,9 @@
 """Frame-to-model tracking (KinectFusion 3.5; thesis 4.2.1): point-to-plane ICP of the measured depth against the
 surface that the volume predicts. Kernels: track.cl.
 
-Projective data association: every model pixel reads its measured point, which is a sample and never interpolated; the
-model surface is smooth. All images are relative to the camera, so float32 suffices at any distance from the volume's
-origin; poses and equations are float64.
+Projective data association: every model pixel reads the measured depth of one pixel without interpolation. All images
+are relative to the camera, so that float32 suffices at any distance from the volume's origin; poses and equations are
+float64.
 """
 
 from __future__ import annotations
@@ -18,39 +18,54 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.maths.registration import Scale, least_information, motion_of_twist, solve_where_fixed, symmetric
 from server.maths.rigid import inverse_rigid, repaired_pose
+from server.opencl.buffers import KeyedBufferDescription, StageBuffers
 from server.opencl.engine import Engine, float4, float16
 from server.volume.raycast import Surface
 
 Pyramid = tuple[cl_array.Array, ...]
-"""Depth pictures of the levels that are used, finest first."""
+"""Depth pictures of the levels used, finest first."""
 
 _FINEST_WIDTH_PX = 160
-"""Halving averages noise and quantisation away: on 640x480 pictures, ending at 160x120 erred a third as much as ending
-at full size, in a fifth of the time."""
+"""Halving averages noise and quantisation: on 640x480 pictures, the error with 160x120 as the finest level was a third
+of that at full size, in a fifth of the time."""
 _LEVELS = 3
 _LANES, _ROWS, _SUMS = 8, 16, 32
 _EDGE = 0.05
-"""Share of the depth within which pixels of a coarser level are one surface."""
+"""Relative depth difference up to which pixels are averaged into a coarser level."""
 
 NOISE_M = 0.002
-"""Standard deviation of a depth. One that grows with depth, as a sensor's does, erred more: what is near is too little
-to turn by."""
+"""Standard deviation of a depth, constant: with one that grows with depth, as a sensor's does, rotations erred more,
+because near surface alone fixes them badly."""
 _GATES_M = (0.05, 0.08, 0.15)
-"""Per level, finest first: farther apart is another surface."""
+"""Per level, finest first: pairs of points farther apart are rejected."""
 _ITERATIONS = (8, 4, 4)
 _WIDEST_CUTOFF, _CLOSEST_CUTOFF = 30.0, 1.0
-"""Tukey's cut-off in standard deviations; between the two it is 4.685 times the residuals' own."""
+"""Limits of Tukey's cut-off, in multiples of NOISE_M; between them it is 4.685 times the residuals' deviation."""
 _CONVERGED_M = 2e-5
 
 CORRELATED_PIXELS = 64.0
-"""Noise of a depth picture is alike over patches: only one pixel in so many is evidence of its own."""
+"""Noise of a depth picture is correlated over patches: one pixel in this many is an independent measurement."""
 NORMAL_NOISE_RAD = 0.03
-"""Of the predicted surface's normals, which otherwise would look like structure."""
+"""Noise of the predicted normals, which would otherwise count as structure."""
+
+
+class ViewBuffers(StageBuffers):
+    """Device buffers of one model view. A caller that keeps a view owns them."""
+
+    levels = KeyedBufferDescription(np.float32)
+    """By pyramid level, [4, h, pitch] as in ModelView."""
+
+
+class _Buffers(StageBuffers):
+    depth_m = KeyedBufferDescription(np.float32)
+    """By pyramid level, [h, w] metres, 0 = none."""
+    sums = KeyedBufferDescription(np.float32)
+    """By pyramid level, [work-item, 32] as sum_equations of track.cl writes them."""
 
 
 @dataclass(frozen=True)
 class ModelView:
-    """The predicted surface in the axes of the camera it was predicted for."""
+    """The predicted surface, in the axes of the camera for which it was predicted."""
 
     levels: tuple[cl_array.Array, ...]
     """Per level, finest first, planes [4, h, pitch] float32: depth (metres, 0 = none), normal x, y, z. Pixel (x, y) of
@@ -68,11 +83,11 @@ class Registration:
     depth_m: float
     """Mean depth of the surface compared."""
     share: float
-    """Of the measured pixels where the model has surface: how many agree with it, 0 to 1."""
+    """Share of the measured pixels with model surface that agree with it, 0 to 1."""
     overlap: float
     """Share of the picture that was compared."""
     free: NDArray[np.float64]
-    """[k, 6] directions (turn * radius, shift; world axes) that the scene does not fix: they were not moved."""
+    """[k, 6] directions (rotation * radius, translation; world axes) that the scene does not fix: not moved."""
     iterations: int
 
 
@@ -89,11 +104,11 @@ def level_intrinsics(camera: CameraModel, level: int) -> tuple[float, float, flo
 
 
 def depth_pyramid(engine: Engine, camera: CameraModel, depth_m: cl_array.Array) -> Pyramid:
-    """The used levels of depth [h, w] (0 = none), halved without mixing surfaces."""
+    """The levels used of depth [h, w] (0 = none), halved without mixing surfaces. Valid until the next call."""
     finest, levels = finest_level(camera), [depth_m]
     for level in range(1, finest + _LEVELS):
         width, height = _size(camera, level)
-        halved = engine.workspace.array(f"track_depth_{level}", (height, width), np.float32)
+        halved = engine.buffers(_Buffers).depth_m[level].array((height, width))
         engine.launch(
             engine.kernel("track.cl", "halve_depth", ROWS=_ROWS),
             (width, height),
@@ -109,14 +124,14 @@ def depth_pyramid(engine: Engine, camera: CameraModel, depth_m: cl_array.Array) 
 
 
 def view_model(
-    engine: Engine, camera: CameraModel, volume_from_camera: NDArray[np.float64], model: Surface, name: str = "track"
+    engine: Engine, camera: CameraModel, volume_from_camera: NDArray[np.float64], model: Surface, buffers: ViewBuffers
 ) -> ModelView:
-    """A copy of the surface predicted at `volume_from_camera`, as `register` wants it; `name`: of its memory."""
+    """A copy of the surface predicted at `volume_from_camera`, for `register`. Valid until `buffers` are used again."""
     levels = []
     for level in range(finest_level(camera), finest_level(camera) + _LEVELS):
         width, height = _size(camera, level)
         pitch = _pitch(width)
-        planes = engine.workspace.array(f"{name}_view_{level}", (4, height, pitch), np.float32)
+        planes = buffers.levels[level].array((4, height, pitch))
         engine.launch(
             engine.kernel("track.cl", "view_model", ROWS=_ROWS),
             (pitch, height),
@@ -144,7 +159,7 @@ def register(
 ) -> Registration | None:
     """Register the measured depth with the model, starting at `guess` (volume_from_camera); None without overlap.
 
-    `tolerance_m`: directions that the scene fixes less well than this stay where the guess has them.
+    `tolerance_m`: directions that the scene fixes less accurately stay as in the guess.
     """
     model_from_current = inverse_rigid(view.volume_from_camera) @ guess
     cutoff, sums, iterations = _WIDEST_CUTOFF, None, 0
@@ -168,16 +183,22 @@ def register(
             if solution.step_m < _CONVERGED_M * 4**rung:
                 break
     assert sums is not None
-    pose = repaired_pose(view.volume_from_camera @ model_from_current)  # products of rotations wander from them
-    turned = np.kron(np.eye(2), view.volume_from_camera[:3, :3])
+    pose = repaired_pose(view.volume_from_camera @ model_from_current)  # products of rotations drift from rotations
+    world_from_view = np.kron(np.eye(2), view.volume_from_camera[:3, :3])
     return Registration(
-        pose, NOISE_M * sums.deviation, sums.depth_m, sums.share, sums.overlap(camera), free @ turned.T, iterations
+        pose,
+        NOISE_M * sums.deviation,
+        sums.depth_m,
+        sums.share,
+        sums.overlap(camera),
+        free @ world_from_view.T,
+        iterations,
     )
 
 
 @dataclass(frozen=True)
 class _Equations:
-    """What sum_equations of track.cl summed."""
+    """Sums of sum_equations in track.cl."""
 
     values: NDArray[np.float64]
     level: int
@@ -216,7 +237,7 @@ class _Equations:
         return float(self.values[30] / (width * height))
 
     def scale(self, camera: CameraModel) -> Scale:
-        """Centre and radius of what a picture at this mean depth holds."""
+        """Centre and radius of the surface that a picture at this mean depth shows."""
         depth_m = self.depth_m
         half_diagonal = 0.5 * np.hypot(camera.width / camera.fx, camera.height / camera.fy)
         return Scale(np.array([0.0, 0.0, depth_m]), max(depth_m * half_diagonal / np.sqrt(3), 1e-3))
@@ -234,7 +255,7 @@ def _sum_equations(
 ) -> _Equations:
     width, height = _size(camera, level)
     columns, strips = _pitch(width) // _LANES, -(-height // _ROWS)
-    partial = engine.workspace.array(f"track_sums_{level}", (columns * strips, _SUMS), np.float32)
+    partial = engine.buffers(_Buffers).sums[level].array((columns * strips, _SUMS))
     scale = 0.5**level
     engine.launch(
         engine.kernel("track.cl", "sum_equations", ROWS=_ROWS),

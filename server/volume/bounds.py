@@ -18,9 +18,9 @@ Bounds = tuple[float, float, float, float, float, float]
 
 
 def bounds_seen(camera: CameraModel, frame: RgbdFrame, world_from_camera: NDArray[np.float64]) -> Bounds:
-    """World box around what one frame sees within 5 m, for a live session that names no volume.
+    """World box around the surface that one frame measures within 5 m: the default volume.
 
-    Raises ValueError where the frame has no depth.
+    Raises ValueError for a frame without depth.
     """
     depth = frame.depth[::4, ::4] * camera.depth_scale_m
     v, u = np.nonzero((depth > 0) & (depth <= _TRUSTED_DEPTH_M) & (frame.depth[::4, ::4] != 65535))

@@ -24,7 +24,7 @@ class BrickStore:
 
     @property
     def room(self) -> int:
-        """How many bricks more fit into the host's budget."""
+        """Bricks for which the host's budget still has room."""
         return self._capacity - len(self._bricks)
 
     @property
@@ -33,7 +33,7 @@ class BrickStore:
         return sum(voxels.nbytes + colors.nbytes for voxels, colors in self._bricks.values())
 
     def indices(self) -> NDArray[np.int32]:
-        """[n] places of all bricks held."""
+        """[n] indices of all bricks."""
         if self._indices is None:
             self._indices = np.fromiter(self._bricks, np.int32, len(self._bricks))
         return self._indices
@@ -47,20 +47,20 @@ class BrickStore:
     def batches(
         self, indices: NDArray[np.int32] | None = None
     ) -> Iterator[tuple[NDArray[np.int32], NDArray[Any], NDArray[np.uint32]]]:
-        """All bricks, or those asked for, some at a time: places, voxels [k, 512] float2, colours [k, 512]."""
+        """All or the given bricks in batches: indices, voxels [k, 512] float2, colours [k, 512]."""
         indices = self.indices() if indices is None else indices
         for start in range(0, len(indices), _BATCH):
             chosen = indices[start : start + _BATCH]
             yield chosen, *_stacked([self._bricks[index] for index in chosen.tolist()])
 
     def forget(self, indices: NDArray[np.int32]) -> None:
-        """Give the memory of bricks back."""
+        """Free bricks."""
         for index in indices.tolist():
             del self._bricks[index]
         self._indices = None
 
     def take(self, indices: NDArray[np.int32]) -> tuple[NDArray[Any], NDArray[np.uint32]]:
-        """[n, 512] voxels and colours of bricks that are held; they are held no longer."""
+        """Remove bricks. Returns their voxels and colours [n, 512]."""
         self._indices = None
         return _stacked([self._bricks.pop(index) for index in indices.tolist()])
 

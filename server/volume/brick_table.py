@@ -11,10 +11,10 @@ from server.input.measure import GREATEST_DEPTH_M
 BRICK = 8
 NO_SLOT = -1
 AWAY_SLOT = 0
-"""Slot of every brick that is released to the host: its voxels are never seen, all its cells' octets are solid."""
+"""Slot of every brick that is released to the host: its voxels are never seen, all its octets solid."""
 
 Indices = NDArray[np.int32]
-"""[n] places of bricks in the table, x fastest."""
+"""[n] indices of bricks in the grid, x fastest."""
 
 
 class BrickTable:
@@ -24,11 +24,11 @@ class BrickTable:
         self.slots = np.full(bricks[::-1], NO_SLOT, np.int32)
         """[z, y, x]"""
         self._brick_of_slot = np.empty(0, np.int32)
-        self._last_wanted = np.zeros(self.slots.size, np.int32)
+        self._last_requested = np.zeros(self.slots.size, np.int32)
         self._is_settled = np.zeros(self.slots.size, np.bool_)
 
     def grow(self, capacity: int) -> None:
-        """Have `capacity` slots, at least as many as before."""
+        """Grow to `capacity` slots."""
         added = np.full(capacity - len(self._brick_of_slot), NO_SLOT, np.int32)
         self._brick_of_slot = np.concatenate([self._brick_of_slot, added])
 
@@ -41,30 +41,30 @@ class BrickTable:
         return self.slots.ravel()[indices]
 
     def take(self, indices: Indices) -> Indices:
-        """Give each brick the lowest free slot; returns the slots."""
+        """Give each brick the lowest free slot. Returns the slots."""
         free = np.flatnonzero(self._brick_of_slot < 0)[: len(indices)].astype(np.int32)
         self._brick_of_slot[free] = indices
         self.slots.ravel()[indices] = free + 1
         return free + 1
 
     def leave(self, indices: Indices, slot: int) -> None:
-        """Take the slots of bricks away, as far as they have any; they go to AWAY_SLOT or NO_SLOT."""
+        """Free the slots of bricks that have one; `slot`: AWAY_SLOT or NO_SLOT."""
         slots = self.slots_of(indices)
         self._brick_of_slot[slots[slots > AWAY_SLOT] - 1] = NO_SLOT
         self.slots.ravel()[indices] = slot
 
     def touch(self, indices: Indices, frame: int) -> None:
-        """Say that these bricks are wanted now."""
-        self._last_wanted[indices] = frame
+        """Note that a frame has requested these bricks."""
+        self._last_requested[indices] = frame
         self._is_settled[indices] = False
 
-    def last_wanted(self, indices: Indices) -> NDArray[np.int32]:
-        """[n] frames in which bricks were wanted last."""
-        return self._last_wanted[indices]
+    def last_requested(self, indices: Indices) -> NDArray[np.int32]:
+        """[n] frames that requested the bricks last."""
+        return self._last_requested[indices]
 
     def settle(self, indices: Indices, before: int) -> Indices:
-        """Those of the bricks that were wanted last before a frame; each only once, until it is wanted again."""
-        idle = indices[(self._last_wanted[indices] < before) & ~self._is_settled[indices]]
+        """Bricks that no frame has requested since `before`; each once, until it is requested again."""
+        idle = indices[(self._last_requested[indices] < before) & ~self._is_settled[indices]]
         self._is_settled[idle] = True
         return idle
 
@@ -83,7 +83,7 @@ class BrickTable:
 
 
 def in_view(camera: CameraModel, centers: NDArray[np.float64], voxel_m: float) -> NDArray[np.bool_]:
-    """[n] whether bricks around `centers` [n, 3], camera space, reach into what the camera may measure, or nearly."""
+    """[n] whether bricks with centres [n, 3] in camera space touch the camera's view frustum, or nearly."""
     radius = 0.5 * np.sqrt(3) * (BRICK + 2) * voxel_m  # of the brick and the voxels that interpolation reads around it
     x, y, z = np.abs(centers[:, 0]), np.abs(centers[:, 1]), centers[:, 2]
     side_x = (max(camera.cx, camera.width - 1 - camera.cx) + 0.5) / camera.fx  # farthest pixel from the axis

@@ -29,13 +29,13 @@ class Bricks:
 
     @classmethod
     def joined(cls, parts: Sequence[Bricks]) -> Bricks:
-        """All bricks of the parts."""
+        """The bricks of all parts."""
         everything = [unpack_bricks(np.empty((0, 3), np.int32), *_no_voxels()), *parts]
         return cls(*(np.concatenate([getattr(part, field.name) for part in everything]) for field in fields(cls)))
 
 
 def unpack_bricks(indices: NDArray[np.int32], voxels: NDArray[Any], packed: NDArray[np.uint32]) -> Bricks:
-    """Bricks from the pool's layout: voxels [n, 512] float2 (tsdf, weight) and colours [n, 512]."""
+    """Bricks in the layout of the pool: voxels [n, 512] float2 (tsdf, weight) and colours [n, 512]."""
     shape = (len(indices), _SIDE, _SIDE, _SIDE)
     pairs = voxels.view(np.float32).reshape(*shape, 2)
     colors, color_weight = unpack_colors(packed.reshape(shape))

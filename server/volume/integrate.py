@@ -12,7 +12,7 @@ from server.opencl.engine import Engine, float16, int4
 from server.volume.volume import Volume
 
 GREATEST_WEIGHT = 64.0
-"""Where the running mean's weight saturates: it then forgets with a time constant of as many frames."""
+"""Limit of a voxel's weight: beyond it, the running mean has a time constant of as many frames."""
 
 
 def integrate(
@@ -22,10 +22,10 @@ def integrate(
     volume_from_camera: NDArray[np.float64],
     measurement: Measurement,
 ) -> None:
-    """Fuse a rectified depth image into the allocated bricks."""
+    """Fuse a rectified depth image and its colours into the allocated bricks."""
     if not volume.allocated_bricks:
         return
-    items = 64 if engine.lanes == 1 else 1  # a processor's core has a brick to itself
+    items = 64 if engine.lanes == 1 else 1  # on a CPU, one work-item does a whole brick
     engine.launch(
         engine.kernel("integrate.cl", "integrate", LANES=engine.lanes),
         (items * volume.allocated_bricks,),
@@ -51,4 +51,4 @@ def integrate(
     )
     volume.count_frame()
     volume.note_picture(camera, volume_from_camera)
-    volume.summarize(all=False)
+    volume.update_tables()

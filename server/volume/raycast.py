@@ -23,7 +23,7 @@ _FARTHEST = int(np.float32(np.inf).view(np.int32))
 
 
 class SurfaceBuffers(StageBuffers):
-    """Of one surface. Whoever needs two surfaces at a time declares a `BufferGroup` of its own for each."""
+    """Device buffers of one surface. A caller that needs two surfaces at once declares a `BufferGroup` for each."""
 
     positions = BufferDescription(cl_types.float4)
     normals = BufferDescription(cl_types.float4)
@@ -34,19 +34,19 @@ class _RayBuffers(StageBuffers):
     nearest = BufferDescription(np.int32)
     """[tile row, tile column] depth at which rays begin, as bits of float metres."""
     farthest = BufferDescription(np.int32)
-    """[tile row, tile column] depth at which rays end, likewise."""
+    """[tile row, tile column] depth at which rays end, in the same form."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Real geometry seen by the camera, on the device, [h, w]."""
+    """Real geometry as seen by the camera, on the device, [h, w]."""
 
     positions: cl_array.Array
     """float4: volume space metres, w = 1 where there is surface, else 0."""
     normals: cl_array.Array
-    """float4: unit, world axes, towards the camera, w likewise."""
+    """float4: unit, world axes, towards the camera; w as in `positions`."""
     labels: cl_array.Array
-    """uint8: LABEL_NONE, LABEL_STATIC (from the volume), LABEL_DYNAMIC (from the sensor), LABEL_FILLED (from its
+    """uint8: LABEL_NONE, LABEL_STATIC (from the volume), LABEL_DYNAMIC (from the sensor), LABEL_FILLED (from
     neighbours)."""
 
 

@@ -7,14 +7,19 @@ import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
 
 from protocol.frames import CameraModel
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, int4
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
 
 
+class _Buffers(StageBuffers):
+    radiance = BufferDescription(cl_types.float4)
+
+
 def view_colors(engine: Engine, camera: CameraModel, surface: Surface, volume: Volume) -> cl_array.Array:
-    """[h, w] float4: radiance that the volume has of the surface, in units of its first picture; w = 0 where none."""
-    radiance = engine.workspace.array("view_colors", (camera.height, camera.width), cl_types.float4)
+    """[h, w] float4: the volume's radiance on the surface, in units of the first picture; w = 0: unknown."""
+    radiance = engine.buffers(_Buffers).radiance.array((camera.height, camera.width))
     engine.launch(
         engine.kernel("view_colors.cl", "view_colors"),
         (camera.width, camera.height),

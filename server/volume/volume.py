@@ -1,8 +1,8 @@
 """The brick volume: a TSDF whose memory follows the surface. Kernels: volume.cl, layout: include/volume.clh.
 
-Space is a regular grid of bricks of 8x8x8 voxels; a brick gets a slot of the pool when a measured surface comes
-near it. Beyond the budget, bricks out of view move to the host, least recently used first, and return unchanged when a
-camera sees them again. Meanwhile they still block rays, as cells of 2x2x2 voxels.
+Space is a regular grid of bricks of 8x8x8 voxels. A brick gets a slot of the pool when a measured surface is near it.
+Beyond the budget, bricks out of view move to the host, least recently used first, and return unchanged when a camera
+sees them again. Meanwhile they still block rays, as cells of 2x2x2 voxels.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.input.measure import intrinsics
 from server.maths.rigid import translation
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, KernelArgument, float16, int4
 from server.opencl.structs import VOLUME_SHAPE
 from server.opencl.transfer import fill_bytes
@@ -33,15 +34,20 @@ _GREATEST_BRICKS = 1 << 22
 _TILE = 4
 
 
+class _Buffers(StageBuffers):
+    near_surface = BufferDescription(np.uint8)
+    """[brick] 1 for bricks near the measured surface."""
+
+
 class VolumeSizeError(ValueError):
-    """The requested volume is empty or too fine; one line with a remedy."""
+    """The requested volume is empty or too fine; one line that says what to change."""
 
 
 class Volume:
-    """TSDF of one session. World axes; volume space has its origin at the volume's lower corner.
+    """TSDF of one scene. Volume space has world axes and its origin at the volume's lower corner.
 
-    `budget_bytes` is device memory of the pool (default: what the device gives a volume), `host_budget_bytes` (default
-    four times that) of released bricks.
+    `budget_bytes`: device memory of the pool (default: the device's limit for a volume). `host_budget_bytes`: host
+    memory of released bricks (default: four times that).
     """
 
     def __init__(
@@ -59,7 +65,7 @@ class Volume:
         self.truncation_m = TRUNCATION_VOXELS * self.voxel_m
         self.frames = 0
         self.is_full = False
-        self._engine = engine
+        self._engine, self._buffers = engine, _Buffers(engine.workspace)
         self._tables = RayTables(engine, self.bricks)
         budget_bytes = engine.device.volume_bytes if budget_bytes is None else budget_bytes
         host_bytes = 4 * budget_bytes if host_budget_bytes is None else host_budget_bytes
@@ -93,22 +99,22 @@ class Volume:
 
     @property
     def allocated_device(self) -> cl_array.Array:
-        """[allocated_bricks and more] int32: the bricks that have a slot of their own, in the order of the slots."""
+        """[allocated_bricks or more] int32: indices of the bricks with a slot, in the order of the slots."""
         return self._residency.resident_device
 
     @property
     def allocated_bricks(self) -> int:
-        """Bricks that have a slot of their own."""
+        """Bricks with a slot of the pool."""
         return self._residency.resident_count
 
     @property
     def released_bricks(self) -> int:
-        """Bricks that the host keeps."""
+        """Bricks on the host."""
         return len(self._residency.store)
 
     @property
     def capacity(self) -> int:
-        """Bricks that the pool has slots for now; it grows up to the budget."""
+        """Slots of the pool; it grows up to the budget."""
         return self._residency.pool.capacity
 
     @property
@@ -122,39 +128,39 @@ class Volume:
         return self._residency.store.bytes_held
 
     def count_frame(self) -> None:
-        """Say that one more picture was integrated."""
+        """Count an integrated frame."""
         self.frames += 1
 
     def note_picture(self, camera: CameraModel, volume_from_camera: NDArray[np.float64]) -> None:
-        """Say where a picture was taken whose integration may have changed bricks."""
+        """Mark bricks as changed by the integration of a frame from this pose."""
         self._residency.note_picture(camera, volume_from_camera)
 
     @property
     def changes(self) -> int:
-        """Grows whenever voxels change."""
+        """Increases whenever voxels change."""
         return self._residency.changes
 
     def places(self) -> Indices:
-        """[n] all bricks that hold voxels, released ones too: their places in the grid, x fastest, in order."""
-        return self._residency.held()
+        """[n] indices in the grid (x fastest, sorted) of all bricks with voxels, including released ones."""
+        return self._residency.existing()
 
     def changed_since(self, change: int) -> Indices:
-        """[n] those of `places` whose voxels may have changed after `changes` was `change`; -1: all."""
+        """[n] those of `places` that may have changed since `changes` was `change`; -1: all."""
         return self._residency.changed_since(change)
 
     def copies(self, places: Indices) -> Iterator[tuple[Indices, NDArray[Any], NDArray[np.uint32]]]:
-        """The bricks at `places`, bit for bit, some at a time: places [k], voxels [k, 512] float2, colours [k, 512]."""
+        """The bricks at `places` in batches, bit for bit: places [k], voxels [k, 512] float2, colours [k, 512]."""
         return self._residency.copies(places)
 
     def fill(self, batches: Iterable[tuple[Indices, NDArray[Any], NDArray[np.uint32]]], frames: int) -> None:
-        """Make an empty volume one of which these are the `copies`, after `frames` pictures."""
+        """Fill an empty volume with the `copies` of another one that has integrated `frames` frames."""
         for places, voxels, colors in batches:
             self._residency.fill(places, voxels, colors)
         self.frames = frames
         self._tables.update()
 
     def volume_from_world(self) -> NDArray[np.float64]:
-        """4x4 that moves world coordinates to the volume's origin."""
+        """[4, 4] translation to the volume's origin."""
         return translation(-self.origin_world)
 
     def arguments(self) -> tuple[KernelArgument, ...]:
@@ -172,45 +178,36 @@ class Volume:
         )
 
     def allocate(self, camera: CameraModel, volume_from_camera: NDArray[np.float64], depth_m: cl_array.Array) -> None:
-        """Give a slot to every brick near the measured surface, and bring back what the camera sees.
+        """Give a slot to every brick near the measured surface, and restore released bricks in view.
 
-        Where the budget has no room for all of them, the ones nearest the camera win, and `is_full` says so.
+        If the budget has no room for all of them, the ones nearest to the camera get a slot and `is_full` is set.
         """
-        wanted = self._mark(camera, volume_from_camera, depth_m)
-        self._residency.begin_frame(wanted)
-        self.is_full = not self._residency.provide(camera, volume_from_camera, wanted)
+        bricks = self._bricks_near(camera, volume_from_camera, depth_m)
+        self._residency.begin_frame(bricks)
+        self.is_full = not self._residency.provide(camera, volume_from_camera, bricks)
 
     def bring_back(self, camera: CameraModel, volume_from_camera: NDArray[np.float64]) -> None:
-        """Bring back released bricks that a camera sees, before casting rays from where nothing is measured."""
+        """Restore released bricks in view. Needed before ray casting from a pose without a measurement."""
         self._residency.provide(camera, volume_from_camera, np.empty(0, np.int32))
 
-    def allocate_everywhere(self) -> None:
-        """Give a slot to every brick there is; a dense volume. Raises VolumeSizeError past the budget."""
-        count, limit = int(np.prod(self.bricks)), self._residency.limit
-        if count > limit:
-            raise VolumeSizeError(f"a dense volume of {count} bricks is more than the budget's {limit}")
-        self._residency.provide_all()
-
-    def summarize(self, all: bool = True) -> None:
-        """After integration: how far rays may jump. `all`: look for solid voxels first; else integration did so."""
-        if all:
-            pool = self._residency.pool
-            self._residency.note_all()
-            self._tables.find_solid(self.allocated_device, self.allocated_bricks, self.slots_device, pool)
+    def update_tables(self) -> None:
+        """Renew the tables for empty-space skipping, after integration has changed the solid cells."""
         self._tables.update()
 
     def download_batches(self) -> Iterator[Bricks]:
-        """All bricks that hold voxels, released ones too, some at a time."""
-        for places, voxels, colors in self._residency.everything():
+        """All bricks with voxels in batches, including released ones."""
+        for places, voxels, colors in self._residency.batches():
             yield unpack_bricks(places, voxels, colors)
 
     def download_bricks(self) -> Bricks:
-        """All bricks that hold voxels, released ones too."""
+        """All bricks with voxels, including released ones."""
         return Bricks.joined(list(self.download_batches()))
 
-    def _mark(self, camera: CameraModel, volume_from_camera: NDArray[np.float64], depth_m: cl_array.Array) -> Indices:
-        wanted = self._engine.workspace.array("wanted_bricks", (self.solid.size,), np.uint8)
-        fill_bytes(self._engine.queue, wanted, 0)
+    def _bricks_near(
+        self, camera: CameraModel, volume_from_camera: NDArray[np.float64], depth_m: cl_array.Array
+    ) -> Indices:
+        marked = self._buffers.near_surface.array((self.solid.size,))
+        fill_bytes(self._engine.queue, marked, 0)
         self._engine.launch(
             self._engine.kernel("volume.cl", "mark_bricks"),
             (-(-camera.width // _TILE), -(-camera.height // _TILE)),
@@ -222,9 +219,9 @@ class Volume:
             float16(volume_from_camera),
             self.voxel_m,
             self.truncation_m + self.voxel_m,
-            wanted,
+            marked,
         )
-        return np.flatnonzero(self._engine.download(wanted).view(np.bool_)).astype(np.int32)
+        return np.flatnonzero(self._engine.download(marked).view(np.bool_)).astype(np.int32)
 
 
 def _brick_counts(extent_m: NDArray[np.float64], voxel_m: float) -> tuple[int, int, int]:

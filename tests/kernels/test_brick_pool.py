@@ -1,4 +1,4 @@
-"""The pool of bricks: its kernels move bits, so they are exact."""
+"""The pool of bricks: its kernels only copy, so results are exact."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_bricks_survive_growth_and_the_way_to_the_host_and_back(engine: Engine) 
     pool.upload(first, as_pairs(voxels), colors)
     pool.grow(3000)
     assert pool.capacity == 3000
-    slots = rng.permutation(np.arange(41, 3001, dtype=np.int32))[:1500]  # more than are copied at once
+    slots = rng.permutation(np.arange(41, 3001, dtype=np.int32))[:1500]  # more than one batch
     more_voxels, more_colors = random_pool(rng, 1500)
     pool.upload(slots, as_pairs(more_voxels), more_colors)
     everything = np.concatenate([slots, first])

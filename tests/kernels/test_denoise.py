@@ -16,6 +16,7 @@ from server.input.measure import Measurement
 from server.opencl.engine import Engine
 from tests.reference import denoise as twin
 from tests.scenes.tolerance import relative_tolerance
+from tests.scenes.tv_l1_depth import tv_l1_depth
 from tests.scenes.volumes import vectors
 
 SIZES = [(8, 8), (16, 9), (23, 41), (97, 71), (160, 130)]
@@ -102,8 +103,8 @@ def test_tv_l1_matches_twin(engine: Engine, size: tuple[int, int], iterations: i
 
 
 def test_tv_l1_in_strips_of_any_height_is_the_same(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also of fewer rows than iterations in a pass, where a strip needs rows of strips beyond its neighbours; and of
-    so many strips that several threads work on them, when none may need what another one has yet to write."""
+    """Also with fewer rows than iterations in a pass, where a strip reads rows beyond its neighbours; and with so many
+    strips that several threads work on them, none of which may read values that another one writes."""
     image = upload(engine, picture((41, 667)))
     expected = engine.download(denoise.tv_l1(engine, image, 13, 0.8, strips=False))
     monkeypatch.setattr(denoise, "_STRIPS_PER_CORE", 1000)
@@ -115,7 +116,7 @@ def test_tv_l1_in_strips_of_any_height_is_the_same(engine: Engine, monkeypatch: 
 
 @pytest.mark.parametrize("weight", [0.5, 1.0, 1.5])
 def test_tv_l1_leaves_less_energy_than_opencv(engine: Engine, weight: float) -> None:
-    """After the same number of iterations; by far, as OpenCV's scheme still goes up in the first hundred."""
+    """After the same number of iterations, since the energy of OpenCV's scheme rises in the first hundred."""
     image = np.rint(255 * picture((160, 130)))
     f = image / 255
     for iterations in (5, 10, 30, 100):
@@ -147,7 +148,7 @@ def test_tv_l1_removes_specks_and_keeps_edges(engine: Engine) -> None:
 
 @pytest.mark.parametrize("strips", [True, False])
 def test_tv_l1_does_not_spread_across_what_is_unknown(engine: Engine, strips: bool) -> None:
-    """Two halves behind a column without values: each is as it would be alone, and the column as it was."""
+    """Two halves beside an unknown column: each is filtered as if alone, and the column is unchanged."""
     image = picture((33, 30))
     image[:, 16] = -1
     both = engine.download(denoise.tv_l1(engine, upload(engine, image), 30, 0.7, 0.0, strips=strips)).copy()
@@ -180,7 +181,7 @@ def test_bilateral_keeps_an_edge_exactly_and_halves_noise(engine: Engine) -> Non
     assert (found - exact).std() < 0.5 * (noisy - exact).std()
 
 
-@pytest.mark.parametrize("smooth", [denoise.bilateral_depth, denoise.tv_l1_depth])
+@pytest.mark.parametrize("smooth", [denoise.bilateral_depth, tv_l1_depth])
 def test_no_depth_stays_none_and_gives_nothing(engine: Engine, smooth: Any) -> None:
     rng = np.random.default_rng(7)
     exact = rng.uniform(0.4, 9.9, (30, 50))
@@ -196,7 +197,7 @@ def test_no_depth_stays_none_and_gives_nothing(engine: Engine, smooth: Any) -> N
     assert not engine.download(smooth(engine, upload(engine, np.zeros((30, 50))))).any()
 
 
-@pytest.mark.parametrize("smooth", [denoise.bilateral_depth, denoise.tv_l1_depth])
+@pytest.mark.parametrize("smooth", [denoise.bilateral_depth, tv_l1_depth])
 @pytest.mark.parametrize("metres", [1e-6, 1e-3, 10.0, 1.7e7])
 def test_extreme_depth_stays_finite(engine: Engine, smooth: Any, metres: float) -> None:
     depth = np.full((30, 50), metres)

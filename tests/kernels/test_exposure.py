@@ -1,4 +1,4 @@
-"""Exposure: what the kernel compares against its float64 twin, and what becomes of it over frames."""
+"""Exposure: the comparison kernel against its float64 twin, and the estimate over frames."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from server.input.measure import Measurement
+from server.opencl.buffers import DeviceBuffer
 from server.opencl.engine import Engine
 from server.tracking import exposure as stage
 from server.tracking.exposure import (
@@ -68,8 +69,8 @@ def volume(engine: Engine) -> Volume:
 
 def dense(engine: Engine, volume: Volume) -> twin.DenseVolume:
     tsdf, weight, _ = dense_voxels(engine, volume)
-    color, looks = dense_colors(volume)
-    return twin.DenseVolume(VOXEL_M, tsdf.astype(np.float64), weight.astype(np.float64), color, looks)
+    color, observations = dense_colors(volume)
+    return twin.DenseVolume(VOXEL_M, tsdf.astype(np.float64), weight.astype(np.float64), color, observations)
 
 
 @pytest.mark.parametrize("most", [300, 2304])
@@ -79,8 +80,9 @@ def test_samples_match_the_twin(engine: Engine, volume: Volume, most: int, monke
     pose = volume.volume_from_world() @ VIEWS[2]
     compare_exposure(engine, CAMERA, measurement, volume, pose)
     stride = math.ceil(math.sqrt(CAMERA.width * CAMERA.height / most))
-    shape = (CAMERA.height // stride, CAMERA.width // stride)
-    found = vectors(engine.download(engine.workspace.array("exposure_samples", shape, cl_types.float4)))
+    samples = engine.buffers(stage._Buffers).samples.current
+    assert samples is not None
+    found = vectors(engine.download(samples))
     expected = twin.compare_exposure(
         CAMERA, pose, radiance, depth, dense(engine, volume), volume.truncation_m, min(2.0, volume.frames), stride
     )
@@ -134,7 +136,9 @@ def test_scene_radiance_matches_the_twin(engine: Engine, exposure: float) -> Non
     radiance = np.concatenate([rng.random((71, 97, 3)), rng.integers(-1, 2, (71, 97, 1))], -1).astype(np.float32)
     radiance[::3, ..., :3] *= np.where(radiance[::3, ..., 3:] == 0, 0.001, 1)  # black ones
     device = engine.workspace.upload("other_radiance", radiance.view(cl_types.float4)[..., 0])
-    found = vectors(engine.download(scene_radiance(engine, device, exposure)))
+    found = vectors(
+        engine.download(scene_radiance(engine, device, exposure, DeviceBuffer(engine.workspace, cl_types.float4)))
+    )
     expected = twin.scale_radiance(radiance.astype(np.float64), 1 / exposure)
     np.testing.assert_array_equal(found[..., 3], expected[..., 3])
     np.testing.assert_allclose(found, expected, rtol=relative_tolerance(engine.device))
@@ -143,7 +147,8 @@ def test_scene_radiance_matches_the_twin(engine: Engine, exposure: float) -> Non
 
 def test_exposure_1_is_the_very_picture(engine: Engine) -> None:
     measurement, *_ = picture(engine, VIEWS[0], 1.0)
-    assert scene_radiance(engine, measurement.radiance, 1.0) is measurement.radiance
+    unused = DeviceBuffer(engine.workspace, cl_types.float4)
+    assert scene_radiance(engine, measurement.radiance, 1.0, unused) is measurement.radiance
 
 
 # ---- over frames, without a device -------------------------------------------------------------------------------
@@ -157,7 +162,7 @@ class Wandering:
         self.noise = float(np.hypot(noise, texture))
         self.points = points
         self.true = self.random.uniform(0.05, 0.8, 4 * points)
-        self.kept, self.looks = self.true.copy(), np.ones(4 * points)
+        self.kept, self.observations = self.true.copy(), np.ones(4 * points)
         self.log = 0.0
 
     def frame(self, number: int, exposure: float, darker: float = 1.0) -> float:
@@ -166,11 +171,11 @@ class Wandering:
         seen = self.true[here] * exposure * np.exp(self.random.normal(0, self.noise, self.points))
         seen[here // 40 % 3 == 0] *= darker
         groups = np.arange(self.points) // 40
-        found = locate_exposure(Samples(seen, self.kept[here], self.looks[here], groups), self.log)
+        found = locate_exposure(Samples(seen, self.kept[here], self.observations[here], groups), self.log)
         assert found is not None
         self.log = followed(self.log, found)
-        self.looks[here] = np.minimum(self.looks[here] + 1, 63)
-        self.kept[here] += (seen / math.exp(self.log) - self.kept[here]) / self.looks[here]
+        self.observations[here] = np.minimum(self.observations[here] + 1, 63)
+        self.kept[here] += (seen / math.exp(self.log) - self.kept[here]) / self.observations[here]
         return self.log
 
 

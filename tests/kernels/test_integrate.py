@@ -55,7 +55,7 @@ def compare(engine: Engine, expected: Twin) -> None:
 
 
 def sensor_depth(depth: Floats, seed: int) -> Floats:
-    """With holes, noise and whole millimetres, as a sensor has it."""
+    """Depth with holes, noise and whole millimetres, as a sensor gives it."""
     rng = np.random.default_rng(seed)
     noisy = np.rint(1000 * (depth + 0.003 * rng.normal(size=depth.shape))) / 1000
     return np.where(rng.random(depth.shape) < 0.1, 0, noisy)
@@ -88,7 +88,7 @@ def test_matches_twin(engine: Engine, name: str) -> None:
 
 
 def test_color_matches_twin(engine: Engine) -> None:
-    """Within the steps that colour is kept in: sqrt(c) in 1/511 (blue 1/255), rounded at each of the frames."""
+    """Within the quantisation of colour: sqrt(c) in steps of 1/511 (blue 1/255), rounded in every frame."""
     volume = Volume(engine, BOUNDS, VOXEL_M)
     color, count = (
         np.zeros((*(8 * c for c in reversed(volume.bricks)), 3)),
@@ -107,7 +107,7 @@ def test_color_matches_twin(engine: Engine) -> None:
     assert set(np.unique(weight)) == {0, 1, 2, 3}
     same = seen & (weight == count)
     error = np.abs(np.sqrt(found) - np.sqrt(color))[same] / np.array([1 / 511, 1 / 511, 1 / 255])
-    # A step of the root each frame; a dark mean after a bright look loses a step of the brighter root.
+    # A step of the root each frame; a dark mean after a bright observation loses a step of the brighter root.
     assert np.quantile(error, 0.999) < 3
     assert error.mean() < 1
     assert np.abs((np.sqrt(found) - np.sqrt(color))[same].mean(0)).max() < 5e-5  # rounding is unbiased; seen: 1e-5
@@ -115,7 +115,7 @@ def test_color_matches_twin(engine: Engine) -> None:
 
 @pytest.mark.parametrize(("before", "after"), [(0.25, 0.252), (0.25, 0.248), (0.01, 0.0104)])
 def test_a_change_below_one_step_is_not_lost(engine: Engine, before: float, after: float) -> None:
-    """A mean of 63 looks moves by 1/63 of a change, here less than half a step of how colour is kept."""
+    """A mean of 63 observations moves by 1/63 of a change, here less than half a step of the stored colour."""
     volume = Volume(engine, (-0.16, -0.16, 1.0, 0.16, 0.16, 1.32), 0.02)
     depth = np.full((CAMERA.height, CAMERA.width), 1.16)
 
@@ -146,7 +146,7 @@ def test_no_color_from_outside_the_camera_s_picture(engine: Engine) -> None:
 
 
 def test_a_bound_only_raises_a_color(engine: Engine) -> None:
-    """A pixel that is clipped says that the surface is at least so bright."""
+    """A clipped pixel is a lower bound of the radiance."""
     volume = Volume(engine, (-0.16, -0.16, 1.0, 0.16, 0.16, 1.32), 0.02)
     depth = np.full((CAMERA.height, CAMERA.width), 1.16)
 
@@ -209,7 +209,7 @@ def test_constant_depth_gives_an_exact_mean_and_a_full_weight(engine: Engine) ->
 
 
 def test_mean_of_a_noisy_sensor(engine: Engine) -> None:
-    """The plain mean of what a voxel was told until its weight is full, and then one that forgets, as the twin's."""
+    """The plain mean until the weight is at its limit, then an exponential one, as in the twin."""
     bounds, camera = (-0.16, -0.16, 1.0, 0.16, 0.16, 1.32), CAMERAS["usual"]
     volume = Volume(engine, bounds, 0.02)
     expected = Twin(volume)

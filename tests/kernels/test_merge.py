@@ -28,7 +28,7 @@ VIEW = look_at((0.4, -0.3, -0.2), (-0.2, 0.2, 1.4))
 FLIPS = 1e-3
 """Share of pixels where two depths or intensities are so near to a threshold that float32 decides otherwise."""
 GREY, WHITE = 0.25, 0.8
-"""Linear radiance of two things whose intensities are far apart."""
+"""Linear radiance of two surfaces with different intensities."""
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -99,7 +99,7 @@ def merge(
 
 @pytest.mark.parametrize("size", [(97, 71), (64, 64), (8, 8), (17, 130)])
 def test_matches_twin(engine: Engine, size: tuple[int, int]) -> None:
-    """A scene with holes, noise, things that moved, and places where either knows nothing or the volume is new."""
+    """A scene with holes, noise, moved objects, and pixels unknown to sensor or volume or with few observations."""
     camera = replace(CAMERA, width=size[0], height=size[1], cx=size[0] / 2.1, cy=size[1] / 1.9)
     rng = np.random.default_rng(size[0])
     walls = room((-1.3, -1.0, -1.3), (1.4, 1.1, 2.6))
@@ -261,7 +261,7 @@ def test_a_hole_beside_a_hand_is_the_volume(engine: Engine) -> None:
 
 
 def test_a_hole_unlike_all_around_it_is_the_volume_or_stays(engine: Engine) -> None:
-    """Too little support for a median: what stands there could be anything."""
+    """Too few supporting neighbours for a median."""
     hole = block(slice(30, 38), slice(40, 50))
     depth, radiance = np.where(hole, 0, BEFORE_WALL), np.where(hole, GREY / 4, BRIGHT_HAND)
     merged = merge(engine, depth, *surface_from(FLAT), radiance=radiance)
@@ -284,7 +284,7 @@ def test_without_a_volume_a_hole_is_filled_as_far_as_support_reaches(engine: Eng
     ("weight", "frames", "label"), [(14, 40, LABEL_NONE), (15, 40, LABEL_STATIC), (3, 6, LABEL_STATIC)]
 )
 def test_surface_that_is_new_does_not_fill_holes(engine: Engine, weight: float, frames: int, label: int) -> None:
-    """A hand that moved on left surface behind; where the sensor is blind, only age tells. In a new volume all is."""
+    """A hand that moved on left surface behind; in a hole of the sensor only its age distinguishes it."""
     hole = block(slice(15, 60), slice(20, 70))
     merged = merge(
         engine, np.where(hole, 0, FLAT), *surface_from(np.where(hole, HAND_M, FLAT)), weight=weight, frames=frames

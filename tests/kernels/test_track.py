@@ -1,4 +1,4 @@
-"""The tracker's kernels against their float64 twin, and poses that are known recovered."""
+"""The tracker's kernels against their float64 twin, and recovery of known poses."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from server.maths.registration import angle_between, distance_between, motion_of
 from server.maths.rigid import inverse_rigid
 from server.opencl.engine import Engine, float4, float16
 from server.tracking.track import (
+    ViewBuffers,
     depth_pyramid,
     finest_level,
     level_intrinsics,
@@ -61,7 +62,7 @@ def test_the_view_of_the_model_matches_twin(engine: Engine, camera: CameraModel)
     position, normal = (
         vectors(engine.download(a)).astype(np.float64) for a in (scene.model.positions, scene.model.normals)
     )
-    view = view_model(engine, camera, scene.pose, scene.model)
+    view = view_model(engine, camera, scene.pose, scene.model, ViewBuffers(engine.workspace))
     assert finest_level(camera) == 0
     for rung, planes in enumerate(view.levels):
         got = engine.download(planes)
@@ -126,7 +127,7 @@ def test_equations_match_twin(engine: Engine, size: tuple[int, int], motion: Flo
     expected = twin.sum_equations(view, depth, lens, lens, transform, *noise)
     got = device_sums(engine, view, depth, camera, transform, noise)
     assert expected[28] > 0.1 * expected[30] > 0
-    # A model point that falls between two pixels may be given to either; each has a share of 1 / pairs.
+    # A model point between two pixels may be associated with either; each has a share of 1 / pairs.
     *_, measured, pixel = twin.pairs(view, depth, lens, lens, transform)
     ties = (np.abs(pixel % 1 - 0.5).min(-1) < 1e-3)[measured].sum()
     diagonal = np.sqrt(np.diag(full(expected)))

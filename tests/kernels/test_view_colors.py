@@ -1,4 +1,4 @@
-"""The picture of somebody who only looks, against its float64 twin and a painted wall."""
+"""The volume's colours as a camera sees them, against the float64 twin and a painted wall."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from server.volume.volume import Volume
 from tests.reference.view_colors import view_colors as twin
 from tests.scenes.painted_walls import paint
 from tests.scenes.solids import download4, float4
+from tests.scenes.volumes import allocate_everywhere
 
 VOXEL_M = 0.02
 SIZE = 5 * 8
@@ -29,10 +30,10 @@ def looked_at(
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_colors_match_twin(engine: Engine, share: float) -> None:
-    """To what 8 or 9 bits of a root leave, and float32."""
+    """Within the quantisation of colours (8 or 9 bits of a root) and float32 rounding."""
     rng = np.random.default_rng(3)
     volume = Volume(engine, (0, 0, 0, *[SIZE * VOXEL_M] * 3), VOXEL_M)
-    volume.allocate_everywhere()
+    allocate_everywhere(volume)
     colors = rng.random((SIZE, SIZE, SIZE, 3))
     has_color = rng.random((SIZE, SIZE, SIZE)) < share
     paint(engine, volume, colors, has_color)

@@ -1,4 +1,4 @@
-"""The brick table: nothing that is measured lacks a brick, and the tables that rays jump by are exact."""
+"""The brick table: every measured surface has its bricks, and the tables for empty-space skipping are exact."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LIMIT = 15
 
 
 def volume_of(engine: Engine, voxel_m: float = VOXEL_M, bricks: int = 10**6) -> Volume:
-    """With a budget of so many bricks, and none on the host."""
+    """A volume with this budget of bricks, and none on the host."""
     return Volume(engine, BOUNDS[voxel_m], voxel_m, budget_bytes=bricks * BRICK_BYTES, host_budget_bytes=0)
 
 
@@ -45,7 +45,7 @@ VIEWS = {
 
 
 def assert_enough_bricks(engine: Engine, volume: Volume, view: NDArray[np.float64], depth: NDArray[np.float64]) -> None:
-    """Every voxel that this picture puts within truncation of a surface has a brick, and few bricks are idle."""
+    """Every voxel within truncation of the measured surface has a brick, and few bricks are unused."""
     pose = volume.volume_from_world() @ view
     volume.allocate(CAMERA, pose, upload_depth(engine, depth))
     allocated = engine.download(volume.slots_device) >= 0
@@ -235,7 +235,7 @@ def test_gaps_stop_at_their_limit(engine: Engine) -> None:
 
 @pytest.mark.parametrize("shape", [(20, 18, 40), (5, 40, 7)])
 def test_gaps_follow_single_changes(engine: Engine, shape: tuple[int, int, int]) -> None:
-    """Only what is near a change is computed anew; it is all there is to compute."""
+    """Recomputing only near a change gives the same tables as computing all."""
     rng = np.random.default_rng(7)
     gaps, solid = Gaps(engine, shape, LIMIT), np.zeros(shape, np.uint64)
     solid.ravel()[rng.integers(0, solid.size, 6)] = 1 << 41
@@ -250,7 +250,7 @@ def test_gaps_follow_single_changes(engine: Engine, shape: tuple[int, int, int])
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.05, 1.0])
 def test_solid_cells_match_brute_force(engine: Engine, share: float) -> None:
-    """Solid is seen and negative; also where only some bricks have slots, in any order."""
+    """A voxel is solid if it was seen and is negative; also if only some bricks have slots, in any order."""
     rng = np.random.default_rng(3)
     shape = (3 * BRICK, 2 * BRICK, 4 * BRICK)
     solid = rng.random(shape) < share
@@ -295,7 +295,7 @@ def test_bricks_near_solid_match_their_twin(engine: Engine, share: float) -> Non
 
 
 def test_summary_follows_the_voxels(engine: Engine) -> None:
-    """A brick that was solid and is no longer leaves no trace in the tables."""
+    """A brick that is no longer solid leaves no trace in the tables."""
     volume = volume_of(engine)
     shape = tuple(BRICK * count for count in reversed(volume.bricks))
     rng = np.random.default_rng(5)

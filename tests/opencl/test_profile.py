@@ -68,14 +68,14 @@ def test_host_time_counts_under_its_row() -> None:
 def test_launched_kernels_are_counted(engine: Engine) -> None:
     depth = engine.workspace.upload("depth", np.ones((16, 16), np.float32))
     halved = engine.workspace.array("halved", (8, 8), np.float32)
-    inverse = engine.workspace.array("inverse", (16, 16), np.float32)
+    depths = [engine.workspace.array(name, (256,), np.uint32) for name in ("surface", "points")]
     with engine.profile.stage("reconstruct"):
         for _ in range(3):
             engine.launch(engine.kernel("track.cl", "halve_depth", ROWS=16), (8, 8), 8, 8, 16, depth, 0.05, halved)
     with engine.profile.stage("surface"):
-        engine.launch(engine.kernel("denoise.cl", "invert"), (256,), 256, depth, inverse)
+        engine.launch(engine.kernel("register.cl", "clear_depth"), (256,), 256, *depths)
     engine.queue.finish()
     rows, kernels = engine.profile.collect()
     assert set(rows) == {"reconstruct", "surface"}
     assert rows["reconstruct"] == pytest.approx(kernels["halve_depth"]) != 0
-    assert rows["surface"] == pytest.approx(kernels["invert"]) != 0
+    assert rows["surface"] == pytest.approx(kernels["clear_depth"]) != 0

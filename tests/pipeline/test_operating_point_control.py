@@ -27,7 +27,7 @@ from server.quality.pareto_front import (
     read_front,
     write_front,
 )
-from server.quality.sampling_settings import SamplingSettings, asked_for
+from server.quality.sampling_settings import SamplingSettings, requested_point
 
 DEVICE = "Some Platform / Some Device"
 SPINE_MS = {"input": 2.0, "reconstruct": 8.0, "surface": 20.0, "light_estimation": 10.0, "other": 5.0}
@@ -86,7 +86,7 @@ def test_the_most_accurate_point_that_fits(budget_ms: float, preset: str) -> Non
     assert scene.presets[-1] == preset
     assert within(scene.totals, budget_ms) >= 0.95 or preset == "gr15fast"
     assert scene.changes <= 4
-    assert f"budget of {budget_ms:g} ms" in scene.control.said.reason
+    assert f"budget of {budget_ms:g} ms" in scene.control.operating_point.reason
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.7, 3.0])
@@ -146,9 +146,9 @@ def test_climbing_takes_one_point_at_a_time_after_calm() -> None:
 
 def test_a_greatest_light_error_takes_the_fastest_that_keeps_it() -> None:
     control = OperatingPointControl(front(), max_light_error_deg=5.5)
-    assert (control.chosen.point.preset, control.said.light_error_deg) == ("reg4", 5.0)
+    assert (control.chosen.point.preset, control.operating_point.light_error_deg) == ("reg4", 5.0)
     assert OperatingPointControl(front(), max_light_error_deg=1.0).chosen.point.preset == "rm"
-    assert "no point" in OperatingPointControl(front(), max_light_error_deg=1.0).said.reason
+    assert "no point" in OperatingPointControl(front(), max_light_error_deg=1.0).operating_point.reason
     both = Scene(OperatingPointControl(front(), 5000.0, 5.5), lambda _: 1.0).run(150)
     assert both.presets[-1] == "reg4"  # a better one would cost more for nothing that was asked for
 
@@ -204,4 +204,4 @@ def test_points_as_wishes_and_as_options() -> None:
     assert (wishes.preset, wishes.rays, wishes.stride, wishes.bands, wishes.budget_ms) == ("rm", 49, 2, 3, None)
     assert SamplingSettings.of(wishes) == point
     words = "--preset rm --rays 49 --stride 2 --interleave 4 --upsampling bicubic --no-visibility-state"
-    assert point.settings == asked_for(wishes).settings == words
+    assert point.settings == requested_point(wishes).settings == words

@@ -17,11 +17,11 @@ from server.transfer.radiance_transfer import direction_sets, transfer_radiance
 from server.volume.brick_pool import BRICK_BYTES
 from server.volume.brick_table import AWAY_SLOT, BRICK, NO_SLOT
 from server.volume.raycast import raycast
-from server.volume.volume import Volume, VolumeSizeError
+from server.volume.volume import Volume
 from tests.bench.geometry.memory import room_memory
 from tests.bench.truth.rooms import LIVING_ROOM, walk
 from tests.scenes.analytic import look, look_at, plane, room, sphere
-from tests.scenes.volumes import cast, fuse, upload_depth
+from tests.scenes.volumes import allocate_everywhere, cast, fuse, upload_depth
 
 CAMERA = CameraModel(width=160, height=120, fx=131.0, fy=131.0, cx=79.5, cy=59.5)
 ROOM_BOUNDS = (-0.1, -0.1, -0.1, 6.1, 3.1, 6.1)
@@ -145,12 +145,12 @@ def test_a_released_wall_still_stops_rays(engine: Engine) -> None:
     behind = resident[~residency._in_view(CAMERA, volume_from_camera, resident)]
     assert len(behind) > len(resident) / 4
     residency._release(behind)
-    volume.summarize(all=False)
+    volume.update_tables()
     away = blocked_share()
     residency.store.forget(behind)
     residency._table.leave(behind, NO_SLOT)
     residency._place(behind)
-    volume.summarize(all=False)
+    volume.update_tables()
     opened = blocked_share()
     assert closed > 0.9
     assert away == pytest.approx(closed, abs=0.01)
@@ -254,7 +254,7 @@ def depths_of_both(engine: Engine, views: Sequence[Floats], voxel_m: float) -> t
     """[n, h, w] depth in voxels of views of the scene fused into a sparse and a dense volume; the same pixels hit."""
     sparse, other = Volume(engine, DENSE_BOUNDS, voxel_m), Engine(engine.device)
     dense = Volume(other, DENSE_BOUNDS, voxel_m)
-    dense.allocate_everywhere()
+    allocate_everywhere(dense)
     for view in views:
         depth = look(DENSE_SCENE, CAMERA, view).depth_m
         fuse(engine, sparse, CAMERA, view, depth)
@@ -289,16 +289,12 @@ def test_dense_and_sparse_all_round(engine: Engine, voxel_m: float) -> None:
     assert (differs > 0.1).mean() < 1e-4
 
 
-def test_a_dense_volume_needs_its_memory(engine: Engine) -> None:
-    volume = room_volume(engine, 100)
-    with pytest.raises(VolumeSizeError, match="more than the budget's 100"):
-        volume.allocate_everywhere()
-
-
 def test_a_volume_has_what_its_device_gives_one(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engine.device, "volume_bytes", 120 * BRICK_BYTES)
-    with pytest.raises(VolumeSizeError, match="more than the budget's 120"):
-        Volume(engine, ROOM_BOUNDS, VOXEL_M).allocate_everywhere()
+    volume = Volume(engine, ROOM_BOUNDS, VOXEL_M)
+    allocate_everywhere(volume)
+    assert (volume.capacity, volume.allocated_bricks) == (120, 120)
+    assert volume.released_bricks == np.prod(volume.bricks) - 120
 
 
 # ---- a room ------------------------------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ from server.service.saving import save_slot as slots
 from tests.scenes.faulty_disk import FaultyDisk, PowerCut, full
 from tests.scenes.kept_rooms import CUBE, PLACE, client_of, found, layout_of, print_of, scan
 from tests.scenes.rooms import wishes
+from tests.scenes.volumes import renew_tables
 
 
 @pytest.fixture
@@ -44,7 +45,7 @@ def change(room: Room, number: int) -> None:
     volume = room.reconstruction.volume
     assert volume is not None
     volume.colors[1 + number : 3 + number].fill(np.uint32(number))
-    volume.summarize()
+    renew_tables(volume)
     volume.count_frame()
     room.markers.note(Marker(id=number, side_m=0.1), number * np.eye(4))
     mesh = replace(CUBE, notes=(f"number {number}",))  # a file of its own, and for the device the same

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 
 def claim_bricks(slots: NDArray[Any], voxels: NDArray[Any], colors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Voxels and colours after the bricks in `slots` were emptied."""
+    """Voxels and colours after the bricks in `slots` were cleared."""
     voxels, colors = voxels.copy(), colors.copy()
     voxels[slots], colors[slots] = 0, 0
     return voxels, colors

@@ -36,7 +36,7 @@ def relight(radiance: Floats, wanted: Floats) -> Floats:
 
 
 def joined(image: Floats, none: float, edge: float = np.inf) -> tuple[Bools, Bools]:
-    """[h, w - 1] and [h - 1, w]: the pixels to the right and below hold a value, too, and differ by `edge` at most."""
+    """[h, w - 1] and [h - 1, w]: whether both neighbours are known and differ by at most `edge`."""
     valid = image > none
     right = valid[:, 1:] & valid[:, :-1] & (np.abs(np.diff(image, axis=1)) <= edge)
     return right, valid[1:] & valid[:-1] & (np.abs(np.diff(image, axis=0)) <= edge)
@@ -51,7 +51,7 @@ def gradient(u: Floats, links: tuple[Bools, Bools]) -> tuple[Floats, Floats]:
 
 
 def divergence(px: Floats, py: Floats) -> Floats:
-    """Minus the adjoint of `gradient`, for fields that are 0 where it is."""
+    """Divergence: minus the adjoint of `gradient`, for fields that are 0 where the gradient is."""
     result = px + py
     result[:, 1:] -= px[:, :-1]
     result[1:] -= py[:-1]

@@ -34,9 +34,9 @@ def even_luminance(radiance: Floats, x: int, y: int) -> float:
 class DenseVolume:
     """Voxels of a whole volume, [z, y, x]; outside it nothing was seen."""
 
-    def __init__(self, voxel_m: float, tsdf: Floats, weight: Floats, color: Floats, looks: Floats) -> None:
+    def __init__(self, voxel_m: float, tsdf: Floats, weight: Floats, color: Floats, observations: Floats) -> None:
         self.voxel_m = voxel_m
-        self.tsdf, self.weight, self.color, self.looks = tsdf, weight, color, looks
+        self.tsdf, self.weight, self.color, self.observations = tsdf, weight, color, observations
 
     def cell(self, point: Floats) -> tuple[tuple[NDArray[np.int64], ...], Floats, Floats]:
         """Indices of the eight voxels around a point (metres), their weights, and the weights' slopes [8, 3]."""
@@ -80,15 +80,19 @@ def surface_point(
 
 
 def prediction(volume: DenseVolume, point: Floats, least_weight: float) -> tuple[float, float] | None:
-    """Luminance that the volume has at a point, and of how many looks; None where that is not to be relied on."""
+    """Luminance of the volume at a point, and number of observations; None where it is not reliable."""
     indices, weights, _ = volume.cell(point)
     if not volume.is_known(indices, least_weight):
         return None
-    colored = weights * (volume.looks[indices] > 0)
+    colored = weights * (volume.observations[indices] > 0)
     if colored.sum() < LEAST_COLORED or volume.color[indices].max() >= MOST_PREDICTED:
         return None
     luminance = float(colored @ (volume.color[indices] @ LUMINANCE) / colored.sum())
-    return (luminance, float(colored @ volume.looks[indices] / colored.sum())) if luminance > LEAST_PREDICTED else None
+    return (
+        (luminance, float(colored @ volume.observations[indices] / colored.sum()))
+        if luminance > LEAST_PREDICTED
+        else None
+    )
 
 
 def compare_exposure(
@@ -101,7 +105,7 @@ def compare_exposure(
     least_weight: float,
     stride: int,
 ) -> Floats:
-    """[rows, cols, 3] (seen, predicted, looks) at the middle pixel of each block. radiance: [h, w, 4]."""
+    """[rows, cols, 3] (seen, predicted, observations) at the middle pixel of each block. radiance: [h, w, 4]."""
     rows, cols = camera.height // stride, camera.width // stride
     result = np.zeros((rows, cols, 3))
     for row, col in np.ndindex(rows, cols):

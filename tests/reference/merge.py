@@ -43,12 +43,12 @@ def agreement(sensor_m: Floats, volume_m: Floats, voxel_m: float) -> Bools:
 
 
 def same_surface_m(depth_m: Floats) -> Floats:
-    """What neighbouring pixels of one surface may differ by, metres."""
+    """Greatest difference of neighbouring depths of one surface, metres."""
     return 0.02 * depth_m + 0.005
 
 
 def unmixed(sensor_m: Floats) -> Floats:
-    """[h, w] depth without pixels that mix two surfaces: between nearer and farther ones, at most two alike."""
+    """[h, w] depth without pixels that mix two surfaces: at most two neighbours alike, others nearer and farther."""
     depths, near = around(sensor_m, SMOOTH_OFFSETS), same_surface_m(sensor_m)
     known = depths > 0
     own = (known & (np.abs(depths - sensor_m) < near)).sum(axis=0)
@@ -77,12 +77,12 @@ def lower_median(values: Floats, chosen: Bools) -> Floats:
 
 
 def similar(shade: Floats, offsets: Offsets) -> Bools:
-    """Eq. 4.1: [n, h, w] whether the neighbour is about as bright as the pixel."""
+    """Eq. 4.1: [n, h, w] whether the neighbour has a similar intensity."""
     return np.abs(around(shade, offsets) - shade) < LAMBDA_INTENSITY
 
 
 def merge(sensor_m: Floats, volume_m: Floats, agrees: Bools, trusted: Bools, shade: Floats, voxel_m: float) -> Floats:
-    """D' (eq. 4.1-4.3): the volume where both agree, else the sensor; holes by the vote of the neighbourhood.
+    """D' (eq. 4.1-4.3): the volume where both agree, else the sensor; holes by a vote of the neighbours.
 
     agrees: see agreement; trusted: [h, w] whether the volume has seen its surface for long. In a hole it has no word if
     not, or if the sensor sees through most of that surface within the window. Without any word and enough support the
@@ -107,7 +107,7 @@ def has_others(depth_m: Floats, volume_m: Floats, offsets: Offsets) -> Bools:
 
 
 def align(merged_m: Floats, volume_m: Floats, shade: Floats) -> Floats:
-    """D'' (eq. 4.4): joint bilateral median; unknown stays unknown, and a window of the volume's depths what it is."""
+    """D'' (eq. 4.4): joint bilateral median; unknown depth and windows of the volume's depth are unchanged."""
     depths = around(merged_m, ALIGN_OFFSETS)
     aligned = lower_median(depths, similar(shade, ALIGN_OFFSETS) & (depths > 0))
     return np.where((merged_m > 0) & has_others(merged_m, volume_m, ALIGN_OFFSETS), aligned, merged_m)
@@ -123,7 +123,7 @@ def smooth(aligned_m: Floats, volume_m: Floats) -> Floats:
 
 
 def label(depth_m: Floats, sensor_m: Floats, volume_m: Floats, agrees: Bools, voxel_m: float) -> NDArray[np.int64]:
-    """[h, w] whose word the depth is: the volume's, else the sensor's own, else the neighbourhood's."""
+    """[h, w] labels: static if the depth is the volume's, else dynamic if it is the sensor's, else filled."""
     near = agreement_m(depth_m, voxel_m)
     has_shifted = (sensor_m > 0) & ~agrees & (np.abs(sensor_m - volume_m) < near)
     of_volume = (volume_m > 0) & (np.abs(depth_m - volume_m) < near) & ~has_shifted

@@ -1,4 +1,4 @@
-"""Float64 twin of cl_kernels/raycast.cl: what the predicted surface is (Newcombe et al. 2011, 3.3; thesis 4.2.1).
+"""Float64 twin of cl_kernels/raycast.cl: definition of the predicted surface (Newcombe et al. 2011, 3.3; thesis 4.2.1).
 
 The surface is where the trilinear field first falls through zero along a ray. It is looked for in tiny fixed steps and
 narrowed down by bisection: no bricks, no solid cells, no jumps.

@@ -1,4 +1,4 @@
-"""Float64 twin of cl_kernels/register.cl: depth of one lens as another sees it, by triangles between its neighbours.
+"""Float64 twin of cl_kernels/register.cl: registers depth to another lens, by triangles between neighbouring pixels.
 
 For each colour pixel, the nearest triangle over it; a measured point only where no triangle is near it or in front.
 """
@@ -18,7 +18,7 @@ LEAST_Z_M = 0.01
 
 
 def same_surface_m(z: Floats | float, focal_px: float) -> Floats:
-    """Depths of neighbours at `z` belong together if they differ by less."""
+    """Greatest difference of neighbouring depths of one surface."""
     return np.asarray(max(0.02, 3 / focal_px) * z + 0.005)
 
 
@@ -42,7 +42,7 @@ def is_surface(corners: tuple[Floats, Floats, Floats], focal_px: float) -> bool:
 
 
 def triangles(projected: Floats, focal_px: float) -> Iterator[tuple[Floats, Floats, Floats]]:
-    """Of every square of neighbours the two triangles of the cut that keeps more of them, of those that are surface."""
+    """Surface triangles of every square of neighbours, for the diagonal that gives more of them."""
     for y in range(projected.shape[0] - 1):
         for x in range(projected.shape[1] - 1):
             a, b, c, d = projected[y, x], projected[y, x + 1], projected[y + 1, x], projected[y + 1, x + 1]

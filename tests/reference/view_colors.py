@@ -9,7 +9,7 @@ Floats = NDArray[np.float64]
 
 
 def view_colors(positions: Floats, colors: Floats, has_color: NDArray[np.bool_], voxel_m: float) -> Floats:
-    """[n, 4]: the trilinear mean of what has a colour, w = 1, or 0.
+    """[n, 4]: the trilinear mean of the voxels with a colour, w = 1, or 0.
 
     positions [n, 3]; colors [z, y, x, 3]; has_color [z, y, x].
     """

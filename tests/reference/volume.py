@@ -1,4 +1,4 @@
-"""Float64 twins of cl_kernels/volume.cl: which bricks a depth picture needs, where they are solid, the gaps between."""
+"""Float64 twins of cl_kernels/volume.cl: bricks near a measured surface, solid cells, gaps between solid bricks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def mark_bricks(
     voxel_m: float,
     reach_m: float,
 ) -> Bools:
-    """[z, y, x] bricks that hold a voxel whose own pixel measured a surface within `reach_m` of it along the ray."""
+    """[z, y, x] bricks with a voxel within `reach_m`, along its ray, of the surface measured at its pixel."""
     centers = voxel_centers(tuple(BRICK * count for count in reversed(bricks)), voxel_m)
     points = (centers - volume_from_camera[:3, 3]) @ volume_from_camera[:3, :3]
     return by_bricks(np.abs(signed_distance(camera, points, depth_m, reach_m)) <= reach_m)
@@ -47,7 +47,7 @@ def find_solid(tsdf: Floats, weight: Floats) -> tuple[NDArray[np.uint64], NDArra
 
 
 def near_solid(solid: NDArray[np.uint64]) -> Bools:
-    """[z, y, x] whether there is a solid cell in a brick, or within two cells of it."""
+    """[z, y, x] whether a brick, or the two cells around it, contain a solid cell."""
     z, y, x = solid.shape
     cells = (solid[..., None] >> np.arange(64, dtype=np.uint64)) & np.uint64(1)
     dense = cells.astype(bool).reshape(z, y, x, 4, 4, 4).transpose(0, 3, 1, 4, 2, 5).reshape(4 * z, 4 * y, 4 * x)
@@ -56,7 +56,7 @@ def near_solid(solid: NDArray[np.uint64]) -> Bools:
 
 
 def start_gaps(solid: NDArray[np.uint64], limit: int) -> NDArray[np.uint8]:
-    """0 where a brick holds a solid voxel, else `limit`."""
+    """0 where a brick has a solid voxel, else `limit`."""
     return np.where(solid != 0, 0, limit).astype(np.uint8)
 
 

@@ -11,6 +11,7 @@ from server.maths.registration import motion_of_twist
 from server.opencl.engine import Engine
 from server.tracking.track import (
     Registration,
+    ViewBuffers,
     depth_pyramid,
     register,
     view_model,
@@ -44,7 +45,7 @@ class World:
 
     def register(self, depth_m: Floats, guess: Floats) -> Registration | None:
         """Depth [h, w] laid on the model from world_from_camera."""
-        view = view_model(self.engine, self.camera, self.pose, self.model)
+        view = view_model(self.engine, self.camera, self.pose, self.model, ViewBuffers(self.engine.workspace))
         pyramid = depth_pyramid(self.engine, self.camera, upload_depth(self.engine, depth_m))
         start = self.volume.volume_from_world() @ guess
         return register(self.engine, self.camera, view, pyramid, start, 0.25 * VOXEL_M)

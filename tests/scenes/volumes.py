@@ -53,15 +53,30 @@ def in_bricks(dense: NDArray[Any]) -> NDArray[Any]:
     return dense.reshape(z, BRICK, y, BRICK, x, BRICK).transpose(0, 2, 4, 1, 3, 5).reshape(-1, BRICK_VOXELS)
 
 
+def allocate_everywhere(volume: Volume) -> None:
+    """Allocate every brick, as far as the budget has room; new ones were never seen."""
+    missing = np.setdiff1d(np.arange(np.prod(volume.bricks), dtype=np.int32), volume.places())
+    shape = len(missing), BRICK_VOXELS
+    volume.fill([(missing, np.zeros(shape, cl_types.float2), np.zeros(shape, np.uint32))], volume.frames)
+
+
+def renew_tables(volume: Volume) -> None:
+    """After voxels were written by hand: every brick counts as changed, and the tables for rays are computed anew."""
+    residency = volume._residency
+    residency._note_change(residency._table.resident())
+    volume._tables.find_solid(volume.allocated_device, volume.allocated_bricks, volume.slots_device, residency.pool)
+    volume.update_tables()
+
+
 def fill(engine: Engine, volume: Volume, tsdf: Floats, weight: Floats) -> None:
-    """Put tsdf and weight [z, y, x] into the volume, every brick allocated, and summarize it."""
-    volume.allocate_everywhere()
+    """Put tsdf and weight [z, y, x] into the volume, every brick allocated."""
+    allocate_everywhere(volume)
     slots = engine.download(volume.slots_device).ravel()
     pool = engine.download(volume.voxels)
     pairs = np.stack([in_bricks(tsdf), in_bricks(weight)], axis=-1).astype(np.float32)
     pool[slots] = np.ascontiguousarray(pairs).view(cl_types.float2)[..., 0]
     volume.voxels.set(pool, engine.queue)
-    volume.summarize()
+    renew_tables(volume)
 
 
 def upload_depth(engine: Engine, depth_m: NDArray[Any]) -> cl_array.Array:

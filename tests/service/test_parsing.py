@@ -145,7 +145,7 @@ LIES = {
 
 @pytest.mark.parametrize("lie", LIES)
 def test_what_a_child_says_is_not_believed(lie: str) -> None:
-    with pytest.raises(MeshError, match="what was read of the mesh is not one"):
+    with pytest.raises(MeshError, match="the mesh reader's answer is not a valid mesh"):
         mesh_from_bytes(mesh_to_bytes(replace(textured(), **LIES[lie])))
 
 
@@ -153,7 +153,7 @@ def test_a_childs_textures_are_not_believed() -> None:
     fields = msgspec.msgpack.decode(mesh_to_bytes(textured()))
     for wrong in ((5, 4), (0, 3), (-5, -3), (15, 2), (5000, 1)):
         fields[9][0][:2] = wrong
-        with pytest.raises(MeshError, match="is not one"):
+        with pytest.raises(MeshError, match="is not a valid mesh"):
             mesh_from_bytes(msgspec.msgpack.encode(fields))
 
 
@@ -253,7 +253,7 @@ def test_a_reader_killed_while_idle_costs_nobody_a_mesh(stubborn: Parsers) -> No
 
 
 def test_a_reader_that_lies_is_not_believed(stubborn: Parsers) -> None:
-    assert "is not one" in told(stubborn, b"lie")
+    assert "is not a valid mesh" in told(stubborn, b"lie")
     talkative = Parsers(replace(STUBBORN_MESHES, max_answer_bytes=100_000))
     assert "its answer was too large" in told(talkative, b"talk")
     talkative.stop()

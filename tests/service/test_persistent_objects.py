@@ -151,24 +151,24 @@ def test_an_object_of_a_client_that_is_not_aligned_is_told_after_a_crash(
         wire.hang_up()
 
 
-def test_what_is_owed_may_be_taken_back(server: BackgroundServer, folder: Path, device: Device) -> None:
+def test_pending_objects_can_be_removed(server: BackgroundServer, folder: Path, device: Device) -> None:
     first = enter(server)
     answered(first, 0)
     lost = enter(server)
     assert place(lost, 1, "vase").error is None
     with found(folder, device) as room:
         assert room is not None
-        assert room.objects.inventory().owed == ("vase",)
+        assert room.objects.inventory().pending == ("vase",)
     first.say(RemoveObject(request=1, object="vase"))
     assert first.hear_until(Acknowledged)[-1].error is None
     with found(folder, device) as room:
         assert room is not None
-        assert room.objects.inventory().owed == ()
+        assert room.objects.inventory().pending == ()
     for wire in (first, lost):
         wire.hang_up()
 
 
-def test_once_its_client_is_aligned_nothing_is_owed(server: BackgroundServer, folder: Path, device: Device) -> None:
+def test_once_its_client_is_aligned_nothing_is_pending(server: BackgroundServer, folder: Path, device: Device) -> None:
     first = enter(server)
     for step in range(3):
         answered(first, step)
@@ -180,7 +180,7 @@ def test_once_its_client_is_aligned_nothing_is_owed(server: BackgroundServer, fo
     assert kept(folder, device) == {"vase", "other"}
     with found(folder, device) as room:
         assert room is not None
-        assert room.objects.inventory().owed == ()
+        assert room.objects.inventory().pending == ()
     for wire in (first, second):
         wire.hang_up()
 

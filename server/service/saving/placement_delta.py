@@ -48,7 +48,7 @@ class PlacementDelta(Struct, frozen=True, forbid_unknown_fields=True):
 
 def delta_since(saved: Inventory, now: Inventory) -> PlacementDelta | None:
     """The moves between two inventories; None if anything but placements has changed."""
-    if saved.has_begun != now.has_begun or saved.owed != now.owed or len(saved.objects) != len(now.objects):
+    if saved.has_begun != now.has_begun or saved.pending != now.pending or len(saved.objects) != len(now.objects):
         return None
     pairs = list(zip(saved.objects, now.objects, strict=True))
     if any(was.object_id != kept.object_id or was.mesh is not kept.mesh for was, kept in pairs):

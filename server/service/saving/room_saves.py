@@ -75,7 +75,7 @@ class RoomSaves:
 
     def _header(self, taken: Snapshot) -> Header:
         objects = taken.inventory
-        return Header(VERSION, self.name, self._next, taken.state.key_digest, objects.revision, objects.owed)
+        return Header(VERSION, self.name, self._next, taken.state.key_digest, objects.revision, objects.pending)
 
     def save_placements(self, room: Room) -> bool:
         """Save placements only. False if other things have changed since the last save, so that a full one is needed.
@@ -160,7 +160,11 @@ def header_of(slot: SaveSlot) -> Header | None:
 def _is_same(a: Snapshot, b: Snapshot) -> bool:
     """Whether two snapshots of one room are equal except for voxels."""
     of_a, of_b = ([(kept.object_id, id(kept.mesh), id(kept.place)) for kept in taken.objects] for taken in (a, b))
-    return of_a == of_b and a.inventory.owed == b.inventory.owed and state_to_bytes(a.state) == state_to_bytes(b.state)
+    return (
+        of_a == of_b
+        and a.inventory.pending == b.inventory.pending
+        and state_to_bytes(a.state) == state_to_bytes(b.state)
+    )
 
 
 def _with_delta(room: Room, header: Header, delta: PlacementDelta | None) -> Room:

@@ -11,9 +11,10 @@ import pyopencl.array as cl_array
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.input.denoise import bilateral_depth, tv_l1_depth
+from server.input.denoise import bilateral_depth
 from server.opencl.device import Device
 from server.opencl.engine import Engine
+from tests.scenes.tv_l1_depth import tv_l1_depth
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -162,16 +162,6 @@ class Workspace:
         """As `DeviceBuffer.constant`, for the buffer of that name."""
         return self._by_name(name, values.dtype).constant(values)
 
-    def find(self, name: str) -> cl_array.Array | None:  # until every stage declares its buffers
-        found = [b.current for (n, _), b in self._named.items() if n == name]
-        return found[0] if found else None
-
-    def parts(self, name: str, shapes: Mapping[str, tuple[tuple[int, ...], DTypeLike]]) -> Parts:
-        return self._by_name(name, np.uint8).parts(shapes)
-
-    def upload_parts(self, name: str, arrays: Mapping[str, NDArray[Any]], *, is_constant: bool = False) -> Parts:
-        return self._by_name(name, np.uint8).upload_parts(arrays, is_constant=is_constant)
-
     def _by_name(self, name: str, dtype: DTypeLike) -> DeviceBuffer:
         key = (name, np.dtype(dtype))
         if key not in self._named:

@@ -111,8 +111,7 @@ class Room:
     @property
     def device_bytes(self) -> int:
         """Device memory of the shared state, in bytes."""
-        volume = self.reconstruction.volume
-        return self.engine.workspace.bytes_held + (volume.device_bytes if volume else 0)
+        return self.engine.workspace.bytes_held
 
     def close(self) -> None:
         """Free the device memory."""

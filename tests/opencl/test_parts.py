@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.opencl.parts import pack, part_alignment_bytes, place
 
@@ -16,8 +17,15 @@ ARRAYS = {
 }
 
 
+class _Buffers(StageBuffers):
+    """Of these tests."""
+
+    one = BufferDescription(np.uint8)
+    other = BufferDescription(np.uint8)
+
+
 def test_each_part_holds_its_values_and_begins_where_it_says(engine: Engine) -> None:
-    parts = engine.workspace.upload_parts("several", ARRAYS)
+    parts = engine.buffers(_Buffers).one.upload_parts(ARRAYS)
     alignment = part_alignment_bytes(engine.device.cl_device)
     whole = engine.download(parts.memory)
     for name, values in ARRAYS.items():
@@ -29,7 +37,7 @@ def test_each_part_holds_its_values_and_begins_where_it_says(engine: Engine) -> 
 
 
 def test_what_is_written_to_a_part_is_read_from_the_whole(engine: Engine) -> None:
-    parts = engine.workspace.parts("room", {"first": ((5,), np.int32), "second": ((2, 3), np.float32)})
+    parts = engine.buffers(_Buffers).one.parts({"first": ((5,), np.int32), "second": ((2, 3), np.float32)})
     parts.array("first").fill(np.int32(-3))
     parts.array("second").fill(np.float32(0.25))
     whole, start = engine.download(parts.memory), parts.starts["second"]
@@ -38,12 +46,12 @@ def test_what_is_written_to_a_part_is_read_from_the_whole(engine: Engine) -> Non
 
 
 def test_the_same_shapes_are_the_same_memory(engine: Engine) -> None:
-    first = engine.workspace.upload_parts("steady", ARRAYS)
-    again = engine.workspace.upload_parts("steady", ARRAYS | {"codes": np.ones(9, np.uint8)})
+    one, other = engine.buffers(_Buffers).one, engine.buffers(_Buffers).other
+    first = one.upload_parts(ARRAYS)
+    again = one.upload_parts(ARRAYS | {"codes": np.ones(9, np.uint8)})
     assert again.memory is first.memory, "a part that grows by little took new memory"
-    assert engine.workspace.upload_parts("once", ARRAYS, is_constant=True).memory is (
-        engine.workspace.upload_parts("once", ARRAYS, is_constant=True).memory
-    )
+    constant = other.upload_parts(ARRAYS, is_constant=True)
+    assert other.upload_parts(ARRAYS, is_constant=True).memory is constant.memory
 
 
 @pytest.mark.parametrize("alignment", [64, 128, 512])

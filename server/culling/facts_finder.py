@@ -1,4 +1,4 @@
-"""Gathers the facts of the frames of one session (scene_facts.py): what is cheap to know before anything is drawn."""
+"""Finds the facts about each frame of a session (scene_facts.py) that are cheap to find before anything is drawn."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from server.transfer.samples import TransferSamples
 Floats = NDArray[np.float64]
 
 ROUNDING = 1.01
-"""By which the volume's colours may exceed what was put in: they have few bits."""
+"""Factor by which rounding may raise the volume's colours, which have few bits."""
 
 
 class FactsFinder:
     """Remembers the brightest picture of a session."""
 
     def __init__(self, *, everything: bool) -> None:
-        """`everything`: nothing is culled by a bound, so bounds are not looked for."""
+        """`everything`: nothing is culled by a bound, so no bounds are computed."""
         self._everything = everything
         self._brightest = 0.0  # of the pictures so far, in units of the first
 
@@ -44,7 +44,8 @@ class FactsFinder:
         shown: NDArray[np.uint8],
         gain: float,
     ) -> SceneFacts:
-        """Facts of a frame. sh: [bands^2, 3] of all of `light`, in the first picture's units; shown: [h, w, 3] sRGB."""
+        """Facts about a frame. sh: [bands^2, 3] of the whole `light`, in the first picture's units; shown: [h, w, 3]
+        sRGB."""
         exposure, has_indirect = context.exposure, samples.indirect is not None
         picture_most = _most_shown(shown)
         self._brightest = max(self._brightest, picture_most / exposure)
@@ -87,7 +88,7 @@ class FactsFinder:
         light: DeviceLight,
         most: MostSent,
     ) -> InfluenceBound:
-        """Of the objects on real surface in view."""
+        """Bound on the influence of the objects on real surface in view."""
         if self._everything or samples.transfer is None:
             return UNKNOWN
         return bound_influence(

@@ -43,11 +43,11 @@ class InfluenceBound:
     """Bounds for every pixel of real surface; infinite where they were not computed."""
 
     change: float
-    """Of |R' / R - 1| (eq. 7.1) by what objects hide and send, less bounced light."""
+    """Bound on |R' / R - 1| (eq. 7.1) by light that objects block and send, without bounced light."""
     sent: float
-    """Of the same by what objects send."""
+    """Bound on the part of it by light that objects send."""
     bounced: float
-    """Of what bounced light changes, over what it bounces off changes."""
+    """Bound on the change by bounced light over the change of the surfaces that it bounces off."""
 
 
 NOWHERE = InfluenceBound(0.0, 0.0, 0.0)
@@ -56,7 +56,7 @@ UNKNOWN = InfluenceBound(np.inf, np.inf, np.inf)
 
 @dataclass(frozen=True)
 class MostSent:
-    """The most radiance that leaves any surface, [3] each, in the picture's units."""
+    """Bounds on the radiance that leaves surfaces, [3] each, in the picture's units."""
 
     objects: Floats
     real: Floats
@@ -77,8 +77,8 @@ def bound_influence(
     seen_from: float,
     upsampling: Upsampling = "bilateral",
 ) -> InfluenceBound:
-    """Reach of `objects`, of which there is one at least. seen_from: changes of at least so much need no bound: what is
-    found to be more is given back as infinite. Waits for the device."""
+    """Bounds for `objects`, of which there is at least one. seen_from: larger changes are visible anyway and are
+    returned as infinite. Waits for the device."""
     balls = balls_around(objects)
 
     def at_samples(every: int, those: NDArray[np.float32]) -> cl_array.Array:
@@ -88,7 +88,7 @@ def bound_influence(
     is_seen = few.change > WINDOW * seen_from
     if is_seen and few.bounced > seen_from:
         return UNKNOWN
-    if is_seen:  # what is left to know needs no directions
+    if is_seen:  # the rest needs no directions
         return replace(_greatest(engine, at_samples(1, balls[:0])), change=np.inf)
     bounds = at_samples(1, balls)
     found = _greatest(engine, bounds)
@@ -115,7 +115,7 @@ class _Buffers(StageBuffers):
 
 
 def balls_around(objects: Sequence[Placed]) -> NDArray[np.float32]:
-    """[n] float4: centre (volume space) and radius in metres of balls that hold what rays take the objects to be."""
+    """[n] float4: centre (volume space) and radius in metres of balls around the objects as rays see them."""
     groups = [[item] for item in objects] if len(objects) <= MOST_BALLS else [objects]
     balls = np.array([ball_around(group).tolist() for group in groups], np.float32)
     balls[:, 3] *= WIDER

@@ -1,14 +1,14 @@
-"""When a scene does not call for an effect, and what leaving it out changes at most.
+"""Culling rules: when a scene does not need an effect, and a bound on the change by leaving it out.
 
 Bounds are in display units, codes of 1/255 before rounding. Two inequalities turn radiance into them; f is sRGB's
 encoding times 255, which is concave with f(0) = 0:
 
-- of a radiance that changes by no more than d: |f(x + d) - f(x)| <= f(d);
-- of one that is multiplied by 1 + b or 1 - b, and is at most 1, the brightest that is shown:
+- for a radiance that changes by at most d: |f(x + d) - f(x)| <= f(d);
+- for a radiance of at most 1 (display white) that is multiplied by 1 + b or 1 - b:
   |f(x (1 +- b)) - f(x)| <= f(1) - f(1 - b). Where f is 269 x^(1/2.4) - 14 the difference grows with x; where it is
   straight, too; and by concavity it is greater downwards than upwards.
 
-A picture's pixel that an object covers in part mixes the two surfaces; what it changes by lies between theirs.
+A pixel that an object partly covers mixes two surfaces; its change lies between theirs.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from server.culling.scene_facts import SceneFacts
 from server.shading.adaptive import LEAST_CHANGE
 
 SHOWN = 255.0
-"""The most that any pixel can change by: what was asked for is left out whatever it changes."""
+"""Bound of an effect that a setting switches off: any change."""
 
 
 def codes(radiance: float) -> float:
@@ -37,15 +37,15 @@ def codes_of_share(share: float) -> float:
 
 
 ELSEWHERE = 0.5
-"""Display units that a pixel may change by where virtual things are taken not to change it."""
+"""Allowed change, in display units, of pixels that are treated as unchanged by virtual objects."""
 
 
 ELSEWHERE_BOUNCED = 0.25
-"""Share of that which may be of light that bounces off real surface."""
+"""Share of it that is allowed for light that bounces off real surface."""
 
 
 def share_of_codes(bound: float) -> float:
-    """The greatest share whose codes_of_share is no more than `bound` (0 to 255, where f is not straight)."""
+    """The greatest share whose codes_of_share is at most `bound` (0 to 255, where f is not straight)."""
     return float(1.0 - ((1.0 - bound / SHOWN + 0.055) / 1.055) ** 2.4)
 
 
@@ -58,7 +58,7 @@ TRACED = CullReason("the preset traces rays through the volume", 0.0)
 OWN_SCALE = CullReason("asked for: virtual things keep the light's own scale", SHOWN)
 NOTHING_TO_MATCH = CullReason("the picture or its shading is empty or black: the light's own scale holds", SHOWN)
 SOFT = CullReason("the light is soft", 0.0)
-"""The whole light is in what rays bring: there is nothing to make a shadow map of."""
+"""Rays carry the whole light: nothing is left for a shadow map."""
 
 # ---- what was switched off ---------------------------------------------------------------------------------------
 
@@ -82,7 +82,7 @@ def not_refined(facts: SceneFacts) -> CullReason | None:
 
 
 def out_of_view(facts: SceneFacts) -> CullReason | None:
-    """The box of pixels that holds all of an object that is in view is empty: no pixel shows any of it."""
+    """The pixel boxes of all objects are empty: no pixel shows an object."""
     return None if facts.objects_in_view else CullReason("no virtual object is in view", 0.0)
 
 
@@ -125,12 +125,12 @@ def faint_shadows(_facts: SceneFacts) -> CullReason:
 
 
 def faint_pixel_share() -> float:
-    """Of R'/R of a pixel."""
+    """Allowed change of a pixel's R'/R."""
     return (1.0 - ELSEWHERE_BOUNCED) * share_of_codes(ELSEWHERE)
 
 
 def faint_sample_share() -> float:
-    """Of R'/R of a sample."""
+    """Allowed change of a sample's R'/R."""
     return ELSEWHERE_BOUNCED * share_of_codes(ELSEWHERE)
 
 
@@ -172,5 +172,5 @@ def _codes_of_ratio(facts: SceneFacts, share: float) -> float:
 
 
 def _if_bounded(reason: str, bound: float, at_most: float = ALLOWANCE) -> CullReason | None:
-    """What is more than may change at all is no reason; ALLOWANCE - ELSEWHERE leaves faint_shadows its part."""
+    """A bound above the allowance is no reason; ALLOWANCE - ELSEWHERE leaves faint_shadows its part."""
     return CullReason(reason, bound) if bound <= at_most else None

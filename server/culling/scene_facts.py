@@ -1,4 +1,4 @@
-"""Cheap facts about a frame, which decide the effects that it calls for."""
+"""Cheap facts about a frame, which decide the effects that it needs."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Brightness:
-    """The most radiance that there can be, in the picture's units and of its brightest channel; bounds, not means."""
+    """Upper bounds on radiance, in the picture's units and of its brightest channel."""
 
     picture: float = math.inf
     """In the camera's picture."""
     arriving: float = math.inf
-    """From any direction at any surface."""
+    """Arriving from any direction at any surface."""
     shading: float = math.inf
-    """Of a white surface of any normal."""
+    """Shading of a white surface of any normal."""
     object_sent: float = math.inf
-    """By objects."""
+    """Sent by objects."""
     real_sent: float = math.inf
-    """By real surface to others."""
+    """Sent by real surface to other surfaces."""
 
 
 @dataclass(frozen=True)
@@ -44,26 +44,26 @@ class SceneFacts:
     glossy: bool = False
     """Whether any virtual surface in view is not matt."""
     reflected: float = 1.0
-    """Greatest share of what arrives that any of it reflects, or keeps from its diffuse light."""
+    """Greatest share of arriving light that any virtual surface reflects, or loses from its diffuse light."""
     gain: float = 1.0
-    """By which virtual surface is brighter than the light makes it."""
+    """Factor on the shading of virtual surface."""
     brightness: Brightness = field(default_factory=Brightness)
     reach: InfluenceBound = UNKNOWN
-    """Of objects on real surface in view."""
+    """Bound on the influence of objects on real surface in view."""
 
     @property
     def returned(self) -> float:
-        """The most radiance by which what real surface sends can change: all of it can be hidden."""
+        """Bound on the change of the radiance that real surface sends: all of it can be blocked."""
         change = min(self.reach.change, 1.0 + self.reach.sent)
         return change * self.brightness.real_sent if self.brightness.real_sent > 0 else 0.0
 
 
 SPREAD = 1.1
-"""Directions' shares of a surface's shading add up to 1, but for what error lattices of few directions have."""
+"""The weights of the directions of a surface's shading add up to 1, apart from the error of coarse lattices."""
 
 
 def most_radiance(sh: Floats) -> Floats:
-    """[3] no less than the radiance of `sh` [bands^2, 3] from any direction.
+    """[3] upper bound on the radiance of `sh` [bands^2, 3] from any direction.
 
     By Cauchy and Schwarz, and as the sum over m of Y_lm^2 is (2 l + 1) / (4 pi): |L| is no more than the sum over l of
     |c_l| sqrt((2 l + 1) / (4 pi)).
@@ -72,7 +72,7 @@ def most_radiance(sh: Floats) -> Floats:
 
 
 def most_shading(sh: Floats) -> Floats:
-    """[3] no less than the shading by `sh` [bands^2, 3] of an open white surface of any normal: as most_radiance."""
+    """[3] upper bound on the shading by `sh` [bands^2, 3] of an open white surface of any normal, as most_radiance."""
     sizes = _band_sizes(sh)
     return np.asarray(np.abs(LAMBERT_BANDS[: len(sizes)]) @ sizes)
 
@@ -85,6 +85,6 @@ def _band_sizes(sh: Floats) -> Floats:
 
 
 def most_albedo(objects: Sequence[Placed]) -> Floats:
-    """[3] of the points that objects send from."""
+    """[3] greatest values at the points that objects send from."""
     tops = [thing.surface_points.albedos.max(axis=0, initial=0.0) for thing, _ in objects]
     return np.asarray(np.max(tops, axis=0, initial=0.0)) if tops else np.zeros(3)

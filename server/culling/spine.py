@@ -1,4 +1,4 @@
-"""What of the spine is left out of a frame: light estimation, and what a still view keeps."""
+"""Stages of the spine that a frame leaves out: light estimation, and what a still view keeps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ NO_DEPTH = CullReason("a client without depth adds nothing to the room's light",
 LOST = CullReason("the camera is lost", 255.0)
 
 GEOMETRY_STAGES = ("locate", "raycast", "merge_depth")
-"""Of the geometry, what is not done where nothing has changed."""
+"""Stages of geometry that are not run where nothing has changed."""
 
 
 def spine_left_out(
@@ -22,10 +22,10 @@ def spine_left_out(
     denoises: bool,
     has_depth: bool,
 ) -> dict[str, CullReason]:
-    """Stages of the spine that a frame does without, each with its reason.
+    """Stages of the spine that a frame leaves out, each with its reason.
 
-    reason: why a still view is kept; None where it is not. echo: what earlier frames left out of the light.
-    light_is_given: and nothing else would be learnt from the picture.
+    reason: why a still view is kept; None if it is not. echo: frames that the light has not used.
+    light_is_given: the light is known, and nothing else is learnt from the picture.
     """
     left_out: dict[str, CullReason] = {}
     if not has_depth:

@@ -61,15 +61,15 @@ class _Buffers(StageBuffers):
 
 
 class _LastArena:
-    """The arena of an engine's frame before."""
+    """The arena of the last frame."""
 
     arena: Arena | None = None
 
 
 def gather(engine: Engine, things: Sequence[VirtualObject]) -> Arena:
-    """The arena of `things`, in which one that is named several times is kept once; copied only when the set changes.
+    """The arena of `things`, with each mesh once; copied only when the set of meshes changes.
 
-    A single mesh is not copied: its own arrays are the arena's.
+    The arrays of a single mesh are used as they are.
     """
     unique = tuple({id(thing): thing for thing in things}.values())
     kept = engine.state(_LastArena)
@@ -142,6 +142,6 @@ def _joined_tables(
 
 
 def _filled(parts: list[NDArray[Any]]) -> NDArray[Any]:
-    """All rows; one of zeros where there are none, for there is no buffer of no bytes."""
+    """All rows; one row of zeros without any, because a buffer cannot be empty."""
     rows = np.concatenate(parts)
     return rows if len(rows) else np.zeros((1, 4), rows.dtype)

@@ -36,13 +36,14 @@ class ObjectTable:
     rows: Parts
     """`grid_from_volume` and `dims`, in one buffer."""
     distances: cl_array.Array
-    """All distance grids one after the other, each once, float32, cells."""
+    """All distance grids, each once, one after the other; float32, cells."""
     cell_m: tuple[float, ...]
-    """Side of each object's cells in volume metres: how far off its surface a ray must start."""
+    """Side of each object's cells in volume metres: the distance from its surface at which a ray must start."""
 
     @property
     def grid_from_volume(self) -> cl_array.Array:
-        """[count] float16: row-major 4x4, volume metres to cells; where there are many, then a tree of their boxes."""
+        """[count] float16: row-major 4x4, volume metres to cells; for many objects followed by a tree of their
+        boxes."""
         return self.rows.array("grid_from_volume")
 
     @property
@@ -54,7 +55,7 @@ class ObjectTable:
 def object_table(engine: Engine, objects: Sequence[tuple[VirtualObject, Matrix]]) -> ObjectTable:
     """The table of `objects`, each with its `volume_from_model` [4, 4]: rotation, uniform scale and translation.
 
-    A mesh that is placed several times is kept once; distances are copied only when the set of meshes changes.
+    A mesh that is placed several times is stored once; distances are copied only when the set of meshes changes.
     """
     count = len(objects)
     grids = [thing.grid for thing, _ in objects]
@@ -83,7 +84,7 @@ class _PooledGrids:
 
 
 def _gather_distances(engine: Engine, grids: list[cl_array.Array]) -> tuple[cl_array.Array, dict[int, int]]:
-    """Each of the `grids` once, one after the other, and by a grid's id where it begins; a single one is not copied."""
+    """All `grids`, each once, one after the other, and where each begins, by its id; a single one is not copied."""
     unique = tuple({id(grid): grid for grid in grids}.values())
     first = accumulate((grid.size for grid in unique), initial=0)
     starts = {id(grid): start for grid, start in zip(unique, first, strict=False)}

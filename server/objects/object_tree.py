@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 FEW_OBJECTS = 8
-"""Up to so many, rays look at every object. The number of virtual_objects.clh."""
+"""Up to this number, rays test every object, as in virtual_objects.clh."""
 _NOWHERE = 1e30
-"""Low corner of an empty box, beyond its high one."""
+"""Low corner of an empty box, above its high corner."""
 
 Floats = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ def grid_boxes(grid_from_volume: Floats, dims: NDArray[np.int32]) -> tuple[Float
 def tree_rows(low: Floats, high: Floats) -> Floats:
     """[m, 16] the nodes of a tree around boxes [n, 3] (n > 0), depth first; the columns of virtual_objects.clh.
 
-    A full binary tree, its leaves in Morton order of their centres; places that are left over are empty.
+    A full binary tree, its leaves in Morton order of their centres; unused leaves are empty boxes.
     """
     count = len(low)
     height = (count - 1).bit_length()
@@ -35,7 +35,7 @@ def tree_rows(low: Floats, high: Floats) -> Floats:
     lows[:count], highs[:count] = low[order], high[order]
     rows = np.zeros((2 * len(lows) - 1, 16))
     for level in range(height, -1, -1):
-        under = (2 << (height - level)) - 1  # nodes in the tree of a node of this level, itself included
+        under = (2 << (height - level)) - 1  # nodes of the subtree of a node of this level
         at = _depth_first(level, height)
         rows[at, :3], rows[at, 3:6], rows[at, 6], rows[at, 7] = lows, highs, at + under, -1
         if level == height:
@@ -46,7 +46,7 @@ def tree_rows(low: Floats, high: Floats) -> Floats:
 
 
 def _depth_first(level: int, height: int) -> NDArray[np.int64]:
-    """Depth-first numbers of a level's nodes from the left: each turn to the right skips the tree on its left."""
+    """Depth-first indices of a level's nodes, left to right: a step to the right child skips the left subtree."""
     place = np.arange(1 << level)
     number = np.full(len(place), level, np.int64)
     for bit in range(level):
@@ -55,7 +55,7 @@ def _depth_first(level: int, height: int) -> NDArray[np.int64]:
 
 
 def _morton(points: Floats) -> NDArray[np.int64]:
-    """[n] 10 bits each of x, y and z in turn."""
+    """[n] Morton codes: 10 bits each of x, y and z, interleaved."""
     extent = np.ptp(points, axis=0)
     cells = ((points - points.min(axis=0)) / np.where(extent > 0, extent, 1) * 1023).astype(np.int64)
     bits = (cells[:, :, None] >> np.arange(10)) & 1

@@ -11,7 +11,7 @@ from protocol.frames import CameraModel
 from server.objects.pinhole import Pinhole
 
 NEAR_M = 0.05
-"""Nothing nearer to the camera's plane is drawn."""
+"""Distance of the near plane."""
 
 Floats = NDArray[np.float64]
 PixelBox = tuple[int, int, int, int]
@@ -24,7 +24,7 @@ _EDGES = np.array([(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i 
 def pixel_boxes(
     camera: CameraModel | Pinhole, camera_from_model: Floats, low: Floats, high: Floats
 ) -> tuple[PixelBox | None, ...]:
-    """Box of pixels that holds everything of each model box `low` to `high` that is in view; None if nothing is.
+    """For each model box `low` to `high` the bounds of its visible part in pixels; None if it is not in view.
 
     Matrices [n, 4, 4], corners [n, 3]. x0, y0, x1, y1, half-open, inside the picture.
     """

@@ -57,12 +57,12 @@ class Picture:
 
     @property
     def size(self) -> np.generic:
-        """Width and height."""
+        """Width and height of the picture."""
         return int2(self.camera.width, self.camera.height)
 
     @property
     def tiles(self) -> int:
-        """Tiles that cover the picture."""
+        """Number of tiles of the picture."""
         return -(-self.camera.width // TILE) * -(-self.camera.height // TILE)
 
 
@@ -114,14 +114,14 @@ def _matrices(
     camera_from_pixel[:3, 3] = 0.0
     camera_from_model = camera_from_volume @ volume_from_model
     model_from_pixel = np.linalg.inv(camera_from_model) @ camera_from_pixel
-    model_from_pixel[:, 3] = camera_from_model[:, 2]  # not part of the ray: it takes a model point to its depth
+    model_from_pixel[:, 3] = camera_from_model[:, 2]  # not part of the ray: maps a model point to its depth
     matrices = np.stack([pixel_from_camera @ camera_from_model, model_from_pixel, volume_from_model], axis=1)
     rows = matrices.reshape(-1, 16).astype(np.float32)
     return (rows if len(rows) else np.zeros((1, 16), np.float32)).view(cl_types.float16)[:, 0]
 
 
 def _chunks(sizes: NDArray[np.int64]) -> NDArray[np.int32]:
-    """[n] int2: object and first item of each work-group that goes over `sizes` items of the objects."""
+    """[n] int2: object and first item of each work-group, where the objects have `sizes` items."""
     groups = -(-sizes // CHUNK)
     index = np.repeat(np.arange(len(sizes)), groups)
     first = (np.arange(len(index)) - np.repeat(np.cumsum(groups) - groups, groups)) * CHUNK

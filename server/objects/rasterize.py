@@ -1,8 +1,8 @@
 """Virtual geometry buffer (thesis 7.2, fig. 7.5): meshes drawn as position, normal, base colour and material.
 
-Kernels: rasterize.cl. A pixel belongs to the nearest triangle that covers its centre; where two are equally near, to
-the one with the lower number (objects in their order, triangles in the mesh's). The result does not depend on how work
-is scheduled. All objects are drawn together: the number of launches does not depend on theirs.
+Kernels: rasterize.cl. A pixel shows the nearest triangle that covers its centre; of two equally near ones, the one with
+the lower index (by object, then by triangle). The result does not depend on scheduling. All objects are drawn together:
+the number of launches does not depend on the number of objects.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ __all__ = [
 ]
 
 SUBPIXELS = 2
-"""Parts of a pixel along either side, for how much of it objects cover."""
+"""Subpixels along each side of a pixel, for coverage."""
 _SCAN_ITEMS = 256
 _LEAST_ENTRIES = 1 << 16
 _LEAST_ROOM = 1 << 10
 _PIECES_PER_PIXEL = 4
-"""Room for so many at first, if there are triangles for them; made larger when they need it."""
+"""Initial capacity, limited by the number of triangles; grows when needed."""
 _FRAGMENTS_PER_PIXEL = 2
-"""Room for so many; where there are more, their triangles are gone through a second time."""
+"""Capacity; if there are more, the triangles are processed a second time."""
 _FRAGMENTS_PER_TRIANGLE = 40
-"""More than a triangle in a square of 8 pixels covers."""
+"""More fragments than a triangle in a square of 8 pixels can have."""
 _MOST_ENTRIES = 1 << 27
-"""Of all tiles together: 512 MiB."""
+"""Most entries of all tiles together: 512 MiB."""
 
 Matrix = NDArray[np.float64]
 Placed = tuple[VirtualObject, Matrix]
@@ -79,7 +79,7 @@ class RasterBuffers(StageBuffers):
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
         self.drawn: DirtyRegion = DirtyRegion()
-        """Of `nearest`."""
+        """The region of `nearest`."""
 
 
 class VirtualSurfaceBuffers(StageBuffers):
@@ -99,7 +99,7 @@ class VirtualSurfaceBuffers(StageBuffers):
 class _Buffers(StageBuffers):
     lists = BufferGroup(RasterBuffers)
     fine_lists = BufferGroup(RasterBuffers)
-    """Of nearest_depths."""
+    """Lists of nearest_depths."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class VirtualSurface:
 
 @dataclass(frozen=True)
 class _Lists:
-    """Device lists of one picture's triangles: of some size as pieces, sorted into tiles; small ones as fragments."""
+    """Device lists of one picture's triangles: large ones as pieces, sorted into tiles; small ones as fragments."""
 
     projected: cl_array.Array
     corners: cl_array.Array
@@ -132,7 +132,7 @@ class _Lists:
     nearest: cl_array.Array
     fragments: cl_array.Array
     fragment_count: int
-    """Also of those that had no room."""
+    """Includes fragments beyond the capacity."""
 
 
 def rasterize(
@@ -159,8 +159,8 @@ def rasterize(
 def nearest_depths(
     engine: Engine, camera: CameraModel, camera_from_volume: Matrix, objects: Sequence[Placed]
 ) -> cl_array.Array:
-    """[SUBPIXELS h, SUBPIXELS w] uint32: bits of 1 / depth (1/metre) of the nearest object at the middles of the parts
-    of each pixel, 0 where there is none."""
+    """[SUBPIXELS h, SUBPIXELS w] uint32: bits of 1 / depth (1/metre) of the nearest object at the centres of subpixels;
+    0 where there is none."""
     return drawn_depths(
         engine, finer(camera, SUBPIXELS), camera_from_volume, objects, engine.buffers(_Buffers).fine_lists
     )
@@ -173,7 +173,7 @@ def drawn_depths(
     objects: Sequence[Placed],
     buffers: RasterBuffers,
 ) -> cl_array.Array:
-    """[h, w] uint32: bits of 1 / depth (1/metre) of the nearest object at the pixels' middles, 0 where there is none.
+    """[h, w] uint32: bits of 1 / depth (1/metre) of the nearest object at the pixels' centres, 0 where there is none.
 
     The array is valid until the next call with the same `buffers`.
     """
@@ -184,7 +184,7 @@ def drawn_depths(
 def boxes_in_view(
     camera: CameraModel | Pinhole, camera_from_volume: Matrix, objects: Sequence[Placed]
 ) -> tuple[PixelBox | None, ...]:
-    """For each object the box of pixels that holds all of it that is in view, as VirtualSurface has it."""
+    """For each object the bounds of its visible part in pixels, as in VirtualSurface."""
     matrices = np.array([matrix for _, matrix in objects], np.float64).reshape(-1, 4, 4)
     low, high = (np.array([thing.bounds[k] for thing, _ in objects], np.float64).reshape(-1, 3) for k in (0, 1))
     return pixel_boxes(camera, camera_from_volume @ matrices, low, high)
@@ -209,7 +209,7 @@ def _draw(engine: Engine, picture: Picture, buffers: RasterBuffers) -> tuple[cl_
 def _make_lists(
     engine: Engine, picture: Picture, buffers: RasterBuffers, nearest: cl_array.Array, cleared: PixelBox
 ) -> _Lists:
-    """Project, clip and sort; what is too small is made larger, so nothing is lost. cleared: tiles of `nearest`."""
+    """Project, clip and sort the triangles. Buffers grow until everything fits. cleared: tiles of `nearest`."""
     tiles, shape = picture.tiles, (picture.camera.height, picture.camera.width)
     projected = _project(engine, picture, buffers)
     starts = buffers.starts.array((tiles + 3,))
@@ -266,7 +266,7 @@ def _setup(
     nearest: cl_array.Array,
     fragments: cl_array.Array,
 ) -> None:
-    """Fill the lists of pieces and fragments, as far as there is room, and count them."""
+    """Fill the lists of pieces and fragments up to their capacity, and count all."""
     engine.launch(
         _kernel(engine, "setup_triangles"),
         (len(picture.triangle_chunks) * CHUNK if picture.triangles else 0,),
@@ -289,7 +289,7 @@ def _setup(
 
 
 def _raster(engine: Engine, picture: Picture, lists: _Lists, buffers: RasterBuffers) -> cl_array.Array:
-    """Number of the triangle that each pixel shows, [h, w] int32, 2^31 - 1 where there is none; in `region` only."""
+    """Index of the triangle that each pixel shows, [h, w] int32, 2^31 - 1 without one; only in `region`."""
     x0, y0, x1, y1 = picture.region
     visible = buffers.visible.array(lists.nearest.shape)
     engine.launch(

@@ -20,7 +20,7 @@ from server.scene.mesh import Mesh
 from server.scene.placement import Placement, world_from_model
 
 CELLS, FEWER_CELLS = 64, 24
-"""Along the longest side of an object's distance grid; the fewer once FINE_GRIDS different meshes have the more."""
+"""Cells along the longest side of an object's distance grid: the coarser number after FINE_GRIDS different meshes."""
 FINE_GRIDS = 64
 
 
@@ -35,7 +35,7 @@ class SceneObject:
 
 
 class SceneObjects:
-    """Objects by id, in the order in which they came. Meshes that are equal are on the device once."""
+    """Objects by id, in order of arrival. Equal meshes are stored on the device once."""
 
     def __init__(self, engine: Engine, up: NDArray[np.float64]) -> None:
         self._engine = engine
@@ -45,14 +45,14 @@ class SceneObjects:
         self._uses: Counter[bytes] = Counter()
 
     def place(self, object_id: str, mesh: Mesh, placement: Placement) -> None:
-        """Add a mesh, in the place of one with the same id.
+        """Add a mesh; it replaces one with the same id.
 
-        Raises ValueError, one line, where it cannot stand there or the scene is full; the scene is then as it was.
+        Raises ValueError, one line, for an impossible placement or a full scene; the scene is then unchanged.
         """
         self.put(object_id, mesh, world_from_model(mesh, placement, self.up))
 
     def put(self, object_id: str, mesh: Mesh, matrix: NDArray[np.float64]) -> None:
-        """The same where world_from_model `matrix` [4, 4] is known. Raises MeshError where the scene is full."""
+        """As place(), with world_from_model `matrix` [4, 4]. Raises MeshError if the scene is full."""
         others = (entry.mesh for name, entry in self._entries.items() if name != object_id)
         check_room(others, mesh)
         digest = mesh_digest(mesh)
@@ -68,15 +68,15 @@ class SceneObjects:
         self._entries[object_id] = SceneObject(mesh, digest, matrix)
 
     def move(self, object_id: str, placement: Placement) -> None:
-        """Give an object another place. Raises KeyError if there is none of that id, ValueError as place() does."""
+        """Move an object. Raises KeyError for an unknown id, ValueError as place() does."""
         self.move_to(object_id, world_from_model(self._entries[object_id].mesh, placement, self.up))
 
     def move_to(self, object_id: str, matrix: NDArray[np.float64]) -> None:
-        """The same where world_from_model `matrix` [4, 4] is known."""
+        """As move(), with world_from_model `matrix` [4, 4]."""
         self._entries[object_id] = replace(self._entries[object_id], world_from_model=matrix)
 
     def remove(self, object_id: str) -> None:
-        """Take an object away. Raises KeyError if there is none of that id."""
+        """Remove an object. Raises KeyError for an unknown id."""
         digest = self._entries.pop(object_id).digest
         self._uses[digest] -= 1
         if self._uses[digest] == 0:
@@ -84,11 +84,11 @@ class SceneObjects:
             self._things.pop(digest).release()
 
     def entries(self) -> dict[str, SceneObject]:
-        """All of them, in the order in which they came."""
+        """All objects, in order of arrival."""
         return dict(self._entries)
 
     def clear(self) -> None:
-        """Take all objects away."""
+        """Remove all objects."""
         for object_id in list(self._entries):
             self.remove(object_id)
 
@@ -99,7 +99,7 @@ class SceneObjects:
 
 
 def check_room(others: Iterable[Mesh], mesh: Mesh) -> None:
-    """Raises MeshError, one line, if `mesh` is too much beside `others`, the meshes of a scene's other objects."""
+    """Raises MeshError, one line, if `mesh` and `others`, the scene's other meshes, exceed the limits together."""
     meshes = tuple(others)
     counts = [len(other.triangles) for other in meshes]
     if len(counts) >= MAX_OBJECTS:

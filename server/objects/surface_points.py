@@ -17,7 +17,7 @@ from server.scene.coarse_colors import colors_at
 from server.scene.mesh import Mesh
 
 POINTS = 128
-"""Places on an object; at each, a point on either side."""
+"""Positions on an object; each has a point on both sides of the surface."""
 CELLS = 8
 """Cells of the table of nearest points along the longest side of an object's grid, as in virtual_point_lights.clh."""
 SIDES = 6
@@ -42,7 +42,7 @@ class SurfacePoints:
     points: Floats
     """[n <= 2 POINTS, 3] in cells of the object's distance grid."""
     normals: Floats
-    """[n, 3] unit, model axes, which are the grid's."""
+    """[n, 3] unit, in model axes (the same as the grid's)."""
     albedos: Floats
     """[n, 3] linear base colour."""
     nearest: NDArray[np.int32]
@@ -50,7 +50,8 @@ class SurfacePoints:
 
 
 def deal_points(engine: Engine, mesh: Mesh, grid: DistanceGrid) -> SurfacePoints:
-    """Points at POINTS places evenly over the mesh's area, the same for the same mesh; none inside what is closed."""
+    """Points at POINTS positions spread evenly over the mesh's area; deterministic. Points inside closed meshes are
+    dropped."""
     corners = mesh.vertices[mesh.triangles].astype(np.float64)
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     upto = np.cumsum(areas)
@@ -73,7 +74,7 @@ def deal_points(engine: Engine, mesh: Mesh, grid: DistanceGrid) -> SurfacePoints
 
 
 def _count_open(engine: Engine, points: Floats, normals: Floats, grid: DistanceGrid) -> NDArray[np.int32]:
-    """[n] directions, out of a lattice, in which the object does not hide the outside from its own points."""
+    """[n] for each point the number of lattice directions that the object itself does not block."""
     buffers, lattice = engine.buffers(_Buffers), spherical_fibonacci(_LATTICE)
     found = buffers.open_counts.array((len(points),))
     kernel = engine.kernel("surface_points.cl", "count_open", LANES=engine.lanes)

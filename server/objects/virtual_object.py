@@ -33,12 +33,12 @@ class VirtualObject:
     texels: cl_array.Array
     """[n, 4] uint8: all mip levels of all textures."""
     tables: MaterialTables
-    """Materials and textures, on the host, less their texels."""
+    """Materials and textures without their texels, on the host."""
     bounds: tuple[NDArray[np.float64], NDArray[np.float64]]
     """Lowest and highest corner of the box around the vertices, model metres."""
     grid: DistanceGrid
     surface_points: SurfacePoints
-    """Where what it sends is known."""
+    """Points at which the light that it reflects is computed."""
 
     @classmethod
     def upload(cls, engine: Engine, mesh: Mesh, cells: int = 64) -> VirtualObject:
@@ -70,7 +70,7 @@ class VirtualObject:
         return int(sum(array.nbytes for array in self._arrays))
 
     def release(self) -> None:
-        """Give the device memory back; the object must not be drawn any more."""
+        """Free the device memory. The object must not be drawn afterwards."""
         for array in self._arrays:
             if isinstance(array.base_data, cl.MemoryObject):
                 array.base_data.release()

@@ -15,7 +15,7 @@ from server.opencl.engine import Engine, float16, int4
 MARGIN_CELLS = 2
 """Free cells around the mesh, on every side."""
 NEAR_CELLS = 1.65
-"""Distances up to here are measured to the triangles."""
+"""Distances up to this many cells are measured to the triangles."""
 LEAST_CELLS = 8
 MOST_CELLS = 256
 _SLAB = 8
@@ -38,11 +38,11 @@ class VoxelizeBuffers(StageBuffers):
 
 @dataclass(frozen=True)
 class DistanceGrid:
-    """How far the centre of each cell is from the mesh."""
+    """Distance of each cell's centre from the mesh."""
 
     distance: cl_array.Array
-    """[z, y, x] float32, cells: up to NEAR_CELLS to the nearest triangle; beyond, to the centre of the nearest cell
-    that a triangle touches, which is exact to half a cell's diagonal.
+    """[z, y, x] float32, cells: up to NEAR_CELLS to the nearest triangle; farther away to the centre of the nearest
+    cell that a triangle touches, which is exact to half a cell's diagonal.
     """
     grid_from_model: Matrix
     """[4, 4] model metres to cells; the centre of cell i lies at i + 0.5."""
@@ -94,8 +94,8 @@ def _kernel(engine: Engine, name: str) -> cl.Kernel:
 def place_grid(low: Vector, high: Vector, cells: int) -> tuple[tuple[int, int, int], Matrix]:
     """Cells in x, y, z of the grid around the box `low` to `high`, and `grid_from_model` [4, 4].
 
-    The box begins at the centre of cell MARGIN_CELLS on each axis and, on its longest, ends at the centre of another:
-    walls along the axes then mark one layer of cells, not the two that share a face.
+    The box begins at the centre of cell MARGIN_CELLS on each axis and ends at the centre of a cell on its longest axis:
+    walls along the axes then mark one layer of cells instead of two.
     """
     if not LEAST_CELLS <= cells <= MOST_CELLS:
         raise ValueError(f"a distance grid of {cells} cells is not possible: {LEAST_CELLS} to {MOST_CELLS} are")

@@ -1,6 +1,6 @@
-"""What a still view needs again: values of earlier frames, in memory that later frames do not write.
+"""Cache of a still view: values of earlier frames, in memory that later frames do not write.
 
-One cache for a session. A value is stored under the version of what it was made from; it is found only by the same.
+One cache per session. A value is stored under the version of its inputs and is found only by the same version.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Version:
-    """What a cached value was made from."""
+    """Version of the inputs of a cached value."""
 
     view: int
-    """Counts the views: a still camera and scene are one view until the surface is taken anew."""
+    """Counts the views: a still camera and scene are one view until the surface is raycast again."""
     objects: int = 0
     """Counts the changes of the virtual objects; 0 where the value does not depend on them."""
     slot: int = 0

@@ -1,15 +1,15 @@
-"""Temporal reuse: what of earlier frames stands for this one, because the view stands still but for noise.
+"""Temporal reuse: which results of earlier frames are used again while the view is still, apart from noise.
 
 Change detection (change_detection.py) says how many frames have been alike. Volume, light and everything drawn from
 them are means over these frames. By the law of errors the mean of n frames differs from the mean of n / 2 about as much
-as from the mean of endlessly many. So a view has settled once its picture after n frames is the one after n / 2. Both
-are composed over the camera picture with which the view began, and sample the same directions. The light is compared in
-the same way.
+as from the mean of endlessly many. So a view has settled once its picture after n frames equals the one after n / 2.
+Both are composed over the camera picture with which the view began, and use the same directions. The light is compared
+in the same way.
 
-Where frames are the same to the byte, the steps of the light say how far it can still go: an estimate moves the mean by
-no less than a tenth of what lies between them (AVERAGE of lobe_estimator.py; a memory that forgets a tenth a frame), so
-the light is at most ten steps from its end. If the radiance of no direction is off by more than the share e, no shading
-is, and R'/R of eq. 7.1 by no more than (1 + e) / (1 - e).
+Where frames are equal byte for byte, the steps of the light bound its remaining change: each estimate moves the mean by
+at least a tenth of their difference (AVERAGE of lobe_estimator.py; a memory that forgets a tenth a frame), so the light
+is at most ten steps from its limit. If the radiance of every direction has a relative error of at most e, so has
+shading, and R'/R of eq. 7.1 one of at most (1 + e) / (1 - e).
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ from server.reuse.frame_cache import FIRST_VERSION, Version
 from server.transfer.radiance_transfer import TURNS
 
 ROUND = 2 * TURNS
-"""Frames that must be alike: twice the direction sets that samples take turns with."""
+"""Equal frames before reuse begins: twice the number of direction sets that samples cycle through."""
 NOISY = 2 * ROUND
-"""The same where they are alike but for noise: the light's running mean is then of ten frames, not all."""
+"""The same for frames that are equal apart from noise: the light's running mean is then over ten frames, not all."""
 MOST_FRAMES = 64
-"""After which a view that has not settled begins anew."""
+"""Frames after which a view that has not settled starts again."""
 RATE = 1.0 - FORGETTING
 SHARE = 0.5
-"""Of the allowance: the most that a light which has not settled may take while nothing else changes."""
+"""Share of the allowance for a light that has not settled, while nothing else changes."""
 ROUNDING = 0.01
 """Display units: rounding of sums in another order, for equal frames."""
 OUTLIERS = 5e-4
-"""Share of the pixels that may have changed by more than one code: half of what may not be seen."""
+"""Share of the pixels that may have changed by more than one code: half of what is allowed in all."""
 _DIRECTIONS = 1024
 
 ECHO_FRAMES = 30
-"""Frames after which the running mean of the light holds 0.9^30, 4 %, of what it missed while frames were reused."""
+"""Frames after which the running mean of the light has caught up with frames that were reused, but for 0.9^30 = 4 %."""
 
 # Reasons. Bounds under noise hold for all but a thousandth of the pixels.
 SAME = "neither the picture nor the geometry has changed, and the light has settled"
@@ -67,7 +67,7 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class SceneVersion:
-    """What pictures do not show and a view depends on. A change of any begins a new view."""
+    """Inputs of a view that the pictures do not show. A change of any of them begins a new view."""
 
     others: int = 0
     """Counts the frames of other clients, and objects that came or went."""
@@ -86,48 +86,48 @@ class SceneVersion:
 
 @dataclass(frozen=True)
 class ReuseDecision:
-    """What of earlier frames stands for one frame. Decided once, after its input was measured."""
+    """Which results of earlier frames one frame uses again. Decided once, after the frame's input was measured."""
 
     reason: CullReason | None = None
-    """Why light, transfer and effects need not be found anew where they are cached; None: all are."""
+    """Why cached light, transfer and effects are used; None: everything is computed again."""
     keeps_geometry: bool = False
-    """Whether pose and surfaces of the frame before hold."""
+    """Whether pose and surfaces of the last frame are used again."""
     version: Version = FIRST_VERSION
-    """Of what this frame caches or finds."""
+    """Version of the values that this frame caches or finds."""
     is_checkpoint: bool = False
-    """Whether this frame's picture tells whether the view has settled."""
+    """Whether this frame's picture is compared to see whether the view has settled."""
     echo: CullReason | None = None
-    """What frames left out of the light, and still shows in this one."""
+    """Frames that the light has not used yet, while their effect can still be seen."""
 
     @property
     def samples_version(self) -> Version:
-        """Of transfer, which does not depend on the virtual objects."""
+        """Version of transfer, which does not depend on the virtual objects."""
         return Version(self.version.view, 0, self.version.slot)
 
     @property
     def view_version(self) -> Version:
-        """Of what the camera saw when the view began."""
+        """Version of the camera picture with which the view began."""
         return Version(self.version.view)
 
 
 NO_REUSE = ReuseDecision()
-"""Where everything is to be simulated."""
+"""The decision where everything is computed."""
 
 
 @dataclass(frozen=True)
 class _State:
-    """What had been made of some frames."""
+    """Results after some frames."""
 
     sh: Floats
     picture: Picture | None
 
 
 class TemporalReuse:
-    """One session's. `decide` for each frame, then `observe` what was made of it."""
+    """Temporal reuse of one session. Call `decide` for each frame, then `observe` with its results."""
 
     def __init__(self, engine: Engine, camera: CameraModel, *, poses: Poses = "given") -> None:
-        """A pose that is tracked moves by parts of a pixel though the camera does not, and the edges of virtual things
-        with it: by more than may be seen. With objects such a view never settles.
+        """A tracked pose moves by parts of a pixel even if the camera does not, and visibly moves the edges of virtual
+        objects. With objects such a view never settles.
         """
         self._is_tracked = poses != "given"
         self._changes = ChangeDetection(engine, camera, poses_are_given=poses != "track")
@@ -163,10 +163,10 @@ class TemporalReuse:
         )
 
     def observe(self, decision: ReuseDecision, sh: Floats, planes: PlaneArrays, picture: Picture | None) -> None:
-        """Learn from a frame that was made whole, whether the view has settled.
+        """Learn from a fully computed frame whether the view has settled.
 
-        sh: the light [bands^2, 3]. planes: what is taken to hide it. picture: at a checkpoint, the virtual things over
-        what the camera saw when the view began; None where nothing is virtual.
+        sh: the light [bands^2, 3]. planes: the planes that block it. picture: at a checkpoint, the virtual objects over
+        the camera picture with which the view began; None without objects.
         """
         if decision.reason is not None:
             return
@@ -196,7 +196,7 @@ class TemporalReuse:
         self._reason = None
 
     def _renews(self) -> bool:
-        """Whether to take the surface from the volume again: it has seen twice as many frames as the last time."""
+        """Whether to raycast the surface again: the volume has twice as many frames as the last time."""
         count = self._changes.count
         if self._changes.is_exact or count != 2 * self._settled_after or count > MOST_FRAMES:
             return False
@@ -205,7 +205,7 @@ class TemporalReuse:
         return True
 
     def _note_places(self, objects: Sequence[Placed]) -> None:
-        """Pictures of an object at two places cannot be compared, and one does not stand for the other."""
+        """Start to compare again: pictures of an object at two places cannot be compared."""
         places = tuple((id(thing), matrix.tobytes()) for thing, matrix in objects)
         if places != self._places:
             self._states.clear()
@@ -213,7 +213,7 @@ class TemporalReuse:
         self._places = places
 
     def _found(self, half: _State, now: _State) -> CullReason | None:
-        """What may be left out from now on."""
+        """Decide what is used again from now on."""
         if (half.picture is None) != (now.picture is None) or (self._is_tracked and now.picture is not None):
             return None
         light = self._light_bound(half.sh, now.sh)
@@ -229,7 +229,7 @@ class TemporalReuse:
         return CullReason(reason, light + ROUNDING if is_same else ALLOWANCE)
 
     def _light_bound(self, half: Floats, now: Floats) -> float | None:
-        """Display units that white surface may still change by; None where that is too much."""
+        """Bound on the remaining change of white surface in display units; None if it is too large."""
         if self._changes.is_exact:
             share = self._unsettled()
             bound = codes_of_share((1 + share) / (1 - share) - 1) if share < 1 else math.inf
@@ -239,7 +239,7 @@ class TemporalReuse:
         return bound if bound <= ALLOWANCE else None
 
     def _unsettled(self) -> float:
-        """Greatest share by which the light from any direction may still change."""
+        """Bound on the remaining relative change of the light from any direction."""
         lights = np.array(self._lights)
         if (lights == lights[-1]).all():
             return 0.0

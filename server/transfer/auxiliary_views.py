@@ -1,8 +1,8 @@
 """Depth views of the volume from all around it (thesis 7.3.2): surfaces outside of the camera's view cast shadows too.
 
 Kernels: auxiliary_views.cl. The thesis uses four views (left, right, above, along the dominant light) and marches
-through them. Here there are so many that each direction has a view nearly along it, so that one look-up is enough. The
-views are small and the volume changes little between frames, so only some are redrawn in each frame.
+through them. Here there are many more, so that each direction has a view nearly along it and needs only one look-up.
+The views are small and the volume changes little between frames, so only some are redrawn in each frame.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ _SET_STEP = 8  # samples so far apart along an axis have the same directions
 LEAST_TURN = float(np.cos(np.deg2rad(3.0)))
 """The view from the dominant light is drawn anew once the light has turned by 3 degrees."""
 GROWTH = 0.03
-"""A view is out of date once the volume has so many more bricks than it was drawn of, as a share.
+"""A view is redrawn when the number of the volume's bricks has grown by this share since it was drawn.
 
-Whoever enters a room sees much of it for the first time within a second, and light would come through it."""
+A camera that enters a room sees most of it within a second; light would leak through outdated views."""
 YOUNG_FRAMES = 16
-"""Likewise a view of a volume of fewer frames, once there are twice as many: a few noisy frames leave holes."""
+"""A view of a volume of fewer frames is redrawn when the number of frames has doubled: few noisy frames leave holes."""
 MOST_PER_FRAME = 96
-"""Views that a frame draws at the most, where many are out of date."""
+"""Most views that one frame redraws."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ class AuxiliaryViews:
     depths: cl_array.Array
     """[views, side, side] float32 metres along the forward axis to the first solid voxel, 0 = none."""
     center: Floats
-    """[3] volume space: what all views look at."""
+    """[3] volume space: the point that all views look at."""
     distance_m: float
-    """From every eye to the centre."""
+    """Distance from every view's eye to the centre."""
     per_pixel: float
     """Slope between neighbouring lines of sight."""
 
@@ -70,7 +70,7 @@ class AuxiliaryViews:
 
     @property
     def pixel_m(self) -> float:
-        """Size of a pixel where the scene is."""
+        """Size of a pixel at the scene's distance."""
         return self.per_pixel * self.distance_m
 
 
@@ -94,8 +94,8 @@ class ViewsAround:
     """The views of one session and volume. Owned by one thread."""
 
     def __init__(self, engine: Engine, count: int = VIEWS, per_frame: int | None = None) -> None:
-        """`per_frame`: views drawn anew each frame, in turn, after the first, and more while the volume grows; None
-        draws all."""
+        """`per_frame`: views that each frame after the first redraws, in turn; more while the volume grows. None:
+        all."""
         self.lattice = spherical_fibonacci(count)
         self._engine, self._buffers = engine, _ViewBuffers(engine.workspace)
         scattered = np.argsort(np.arange(count) * GOLDEN_TURN % 1)
@@ -108,7 +108,8 @@ class ViewsAround:
         self._drawn_of = np.zeros((2, count + 1), np.int64)  # bricks and frames, by view
 
     def update(self, volume: Volume, dominant_direction: Floats | None = None) -> AuxiliaryViews:
-        """The views, as of this frame. dominant_direction: world, unit, towards the light; None or zeros: not known."""
+        """Redraw views that are due and return all views. dominant_direction: world, unit, towards the light; None or
+        zeros: not known."""
         if (
             dominant_direction is not None
             and dominant_direction @ self._light < LEAST_TURN
@@ -125,7 +126,7 @@ class ViewsAround:
         return views
 
     def _due(self, volume: Volume) -> NDArray[np.int64]:
-        """The views whose turn it is, the light's after the others; the oldest come first."""
+        """Indices of the views to redraw in this frame, the light's view after the others, the oldest first."""
         count = len(self.lattice)
         if self._next is None:
             self._next = 0

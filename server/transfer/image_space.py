@@ -42,23 +42,23 @@ from server.volume.volume import Volume
 Floats = NDArray[np.float64]
 
 VIEWS_PER_FRAME = 32
-"""Auxiliary views drawn anew each frame: all in 32 frames."""
+"""Auxiliary views redrawn in each frame: all of them in 32 frames."""
 NEAR_STEPS = 4
 """Samples along a direction in the camera's picture."""
 NEAR_PIXELS = 4.0
-"""How far they reach, in pixels of the auxiliary views. Farther, what merely stands beside a direction in the picture
-darkens more than it corrects: at 38 cm the lights around the synthetic table are off by 14 degrees, at 10 cm by 3."""
+"""Length of the near part in pixels of the auxiliary views. In a longer one, surfaces beside a direction in the picture
+darken more than they correct: at 38 cm the lights around the synthetic table are off by 14 degrees, at 10 cm by 3."""
 FURTHER_STEPS = 8
-"""Samples where something in the picture is unknown to the volume (a hand); it alone counts beyond the near part."""
+"""Further samples where the volume does not contain what the picture shows (a hand); only that counts beyond the
+near part."""
 LEAST_RATIO = 1.3
-"""Between a sample's distance and the next's: 8 samples reach 8 times as far as the first."""
+"""Least ratio of the distances of neighbouring samples: 8 samples extend to 8 times the first distance."""
 FIRST_VOXELS = 2.0
-"""Distance of the first of them from the ray's origin, which is one voxel off the surface."""
+"""Distance of the first sample from the ray's origin, which lies one voxel off the surface, in voxels."""
 SLACK = 0.15
-"""How much deeper than it looks a surface may be, as a share of a sample's distance: about what passes unseen between
-two samples."""
+"""Assumed thickness of a surface, as a share of a sample's distance: about the gap between two samples."""
 LIFT_VOXELS = 1.5
-"""What stands less than this above a point's tangent plane is the point's own surface: voxels are taken whole."""
+"""Surface less than this many voxels above a point's tangent plane is the point's own surface."""
 
 
 class _Buffers(StageBuffers):
@@ -98,12 +98,13 @@ class ImageSpaceTransfer:
         threshold: float | None = None,
         turn: int = 0,
     ) -> Transfer:
-        """Transfer of the real world alone at every `stride`-th pixel, in the arrays that `transfer_radiance` gives.
+        """Transfer of the real world without virtual objects at every `stride`-th pixel, in arrays as
+        `transfer_radiance` has.
 
-        surface: the hybrid geometry buffer. dominant_direction: world, unit, towards the light so far, which gets a
-        view of its own; None or zeros: not known. threshold: chi of eq. 6.3, None: 1 - cos of half the median angle. Of
-        what lies beyond the near part only what is first seen from the light counts: with a `reach_m` that ends
-        inside the scene, a thing behind which another is out of reach may be missed. turn: as in `transfer_radiance`.
+        surface: the hybrid geometry buffer. dominant_direction: world, unit, towards the last estimated light, which
+        gets a view of its own; None or zeros: not known. threshold: chi of eq. 6.3, None: 1 - cos of half the median
+        angle. Beyond the near part, only the first surface that the light meets counts: if `reach_m` ends inside the
+        scene, a nearer surface behind it may be missed. turn: as in `transfer_radiance`.
         """
         views = self._around.update(volume, dominant_direction)
         view_of = self._views_for(views)
@@ -135,7 +136,7 @@ class ImageSpaceTransfer:
         )
 
     def _views_for(self, views: AuxiliaryViews) -> NDArray[np.int32]:
-        """[SETS, count] the view that looks most nearly along each direction."""
+        """[SETS, count] the view whose axis is nearest to each direction."""
         if not views.has_light_view:
             return self._nearest
         to_light = self._rays.directions[..., :3] @ views.toward[-1].astype(np.float32)
@@ -143,7 +144,8 @@ class ImageSpaceTransfer:
 
 
 def nearest_views(rays: Directions, toward: Floats) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Of the views from `toward` [views, 3] the nearest to each direction [SETS, count]: cosine between them, index."""
+    """For each direction [SETS, count] the nearest of the views from `toward` [views, 3]: cosine of the angle,
+    index."""
     views = toward.T.astype(np.float32)
     cosines, nearest = np.empty(rays.directions.shape[:2], np.float32), np.empty(rays.directions.shape[:2], np.int32)
     for number, of_set in enumerate(rays.directions):  # all at once would take hundreds of megabytes
@@ -153,7 +155,7 @@ def nearest_views(rays: Directions, toward: Floats) -> tuple[NDArray[np.float32]
 
 
 def sample_phases(count: int) -> Floats:
-    """[4, count] in [0, 1): how far into its first step a direction's samples begin, for a pattern of 2 x 2 samples."""
+    """[4, count] in [0, 1): where in its first step each direction's samples begin, for a pattern of 2 x 2 samples."""
     pattern = np.array([0.0, 0.5, 0.75, 0.25])
     phases: Floats = (pattern[:, None] + np.arange(count) * GOLDEN_TURN) % 1.0
     return phases
@@ -167,20 +169,20 @@ def near_distances(rays: int, voxel_m: float, near_m: float) -> tuple[NDArray[np
 
 
 def near_reach_m(views: AuxiliaryViews, reach_m: float) -> float:
-    """Up to where the camera's own picture is looked into."""
+    """Length of the near part, which looks into the camera's own picture."""
     return min(NEAR_PIXELS * views.pixel_m, reach_m)
 
 
 def depth_room(engine: Engine, camera: CameraModel) -> cl_array.Array:
-    """[h, w] float32 that `camera_depths` fills."""
+    """The array [h, w] float32 that `camera_depths` fills."""
     return engine.buffers(_Buffers).camera_depths.array((camera.height, camera.width))
 
 
 def camera_depths(
     engine: Engine, camera: CameraModel, volume_from_camera: Floats, surface: Surface, defines: dict[str, int]
 ) -> tuple[cl_array.Array, cl_array.Array]:
-    """[h, w] float32 metres along the optical axis of the geometry buffer, 0 = no surface or one guessed from its
-    neighbours, negative where the sensor alone knows it; [1] int32: 1 if there is such a pixel."""
+    """[h, w] float32 metres along the optical axis of the geometry buffer, 0 = no surface or one filled from its
+    neighbours, negative where only the sensor knows it; [1] int32: 1 if there is such a pixel."""
     depths = depth_room(engine, camera)
     any_unknown = engine.buffers(_Buffers).any_unknown.array((1,))
     any_unknown.fill(np.int32(0))
@@ -212,7 +214,7 @@ def transfer_from_views(
     threshold: float,
     turn: int = 0,
 ) -> Transfer:
-    """The same for given views. view_of [SETS, count]: the view for each direction."""
+    """As ImageSpaceTransfer.transfer, for given views. view_of [SETS, count]: the view for each direction."""
     cols, rows = camera.width // stride, camera.height // stride
     result = room_for_transfer(engine, rows, cols, stride, rays, own_sets(engine, rows, cols, turn))
     near_m = near_reach_m(views, reach_m)
@@ -259,7 +261,7 @@ def transfer_from_views(
 def smooth_normals(
     engine: Engine, camera: CameraModel, surface: Surface, stride: int, voxel_m: float, defines: dict[str, int]
 ) -> cl_array.Array:
-    """[rows, cols] float4: the normals that samples stand for, volume space, w: flatness; 0 without surface."""
+    """[rows, cols] float4: mean normals around the samples, volume space, w: flatness; 0 without surface."""
     cols, rows = camera.width // stride, camera.height // stride
     normals = engine.buffers(_Buffers).normals.array((rows, cols))
     engine.launch(

@@ -20,9 +20,9 @@ from server.volume.raycast import Surface
 from server.volume.volume import Volume
 
 EVERY = 4
-"""Of how many hidden directions a sample follows one; its neighbours follow the others."""
+"""A sample traces every EVERY-th of its blocked directions; its neighbours trace the others."""
 LEAST_COSINE = 0.05
-"""Of directions that count, as in cell_transfer.cl."""
+"""Least cosine of a direction that is used, as in cell_transfer.cl."""
 
 
 class _Buffers(StageBuffers):
@@ -39,7 +39,7 @@ class Indirect:
     hits: cl_array.Array
     """[rows, cols] float4, see gather_hits."""
     mean: NDArray[np.float64]
-    """[3] radiance: the mean of what was met, taken for surface that no picture shows."""
+    """[3] mean radiance of the surfaces that were met; used for surface that no picture shows."""
 
 
 def observe_indirect(
@@ -51,7 +51,7 @@ def observe_indirect(
     rays: Directions,
     reach_m: float,
 ) -> Indirect:
-    """What the surfaces that hide directions from `transfer`'s samples send."""
+    """Indirect light at the samples of `transfer`, from the surfaces that block their directions."""
     hits = gather_hits(engine, camera, volume, surface, transfer, rays, reach_m)
     return Indirect(hits, mean_sent(engine, hits))
 
@@ -66,8 +66,8 @@ def gather_hits(
     reach_m: float,
     every: int = EVERY,
 ) -> cl_array.Array:
-    """[rows, cols] float4: over a sample's hidden directions that meet surface with a colour, the sum of cosine times
-    radiance (rgb) and of cosine (w), both times `every`."""
+    """[rows, cols] float4: sums over a sample's blocked directions that meet surface with a colour: cosine times
+    radiance (rgb) and cosine (w), both times `every`."""
     hits = engine.buffers(_Buffers).hits.array((transfer.rows, transfer.cols))
     words = transfer.free_mask.shape[2]
     defines = {"MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": transfer.interleave}
@@ -95,11 +95,11 @@ def gather_hits(
 
 
 def no_hits(engine: Engine, transfer: Transfer) -> cl_array.Array:
-    """The same where indirect light is left out."""
+    """Zeros in place of gather_hits, where indirect light is left out."""
     return engine.buffers(_Buffers).no_hits.constant(np.zeros((transfer.rows, transfer.cols), cl_types.float4))
 
 
 def mean_sent(engine: Engine, hits: cl_array.Array) -> NDArray[np.float64]:
-    """[3] mean radiance of what `hits` met; 0 where nothing was."""
+    """[3] mean radiance of all surfaces in `hits`; 0 without any."""
     total = engine.download(hits).view(np.float32).reshape(-1, 4).sum(axis=0, dtype=np.float64)
     return np.asarray(total[:3] / total[3] if total[3] > 0 else np.zeros(3))

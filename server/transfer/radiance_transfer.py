@@ -26,15 +26,16 @@ from server.volume.volume import Volume
 SETS_A_FRAME = 64
 """Direction sets of one frame, interleaved over 8 x 8 samples, so that neighbours fill each other's gaps."""
 TURNS = 4
-"""So many frames may take turns with sets of their own: what error the lattices have left is then not always the same,
-and a light that is estimated from several frames is better off (tests/pipeline/test_presets.py)."""
+"""Groups of direction sets that successive frames may cycle through. The error of the lattices then differs from frame
+to frame, which improves a light estimated from several frames (tests/pipeline/test_presets.py)."""
 SETS = TURNS * SETS_A_FRAME
-"""Direction sets; a byte tells them apart."""
+"""Number of direction sets; fits a byte."""
 _SEED = 1
 _DEALT = 16
 _WHOLE_TURNS = {1: 10, 2: 29, 4: 44, 8: 83}
-"""By the number of subsets: of 0 to 16 times that, one that leaves subsets, sets and the lattice of all sets even."""
-_WINDOW = 1 / 160  # half the window that a sample's normal is the mean of, in picture widths
+"""Whole turns per advance, by the number of subsets k: chosen from 0 to 16 k so that subsets, sets and all sets
+together are evenly spread."""
+_WINDOW = 1 / 160  # half the window of a sample's mean normal, in picture widths
 
 
 class _DirectionBuffers(StageBuffers):
@@ -67,7 +68,7 @@ class Directions:
     basis: NDArray[np.float32]
     """[SETS, count, bands^2]."""
     interleave: int = 1
-    """Subset i of a set is every `interleave`-th direction from i; each is as even as a set of its own size."""
+    """Subset i of a set is every `interleave`-th direction from i on; each is as evenly spread as a set of its size."""
 
     @property
     def count(self) -> int:
@@ -87,13 +88,13 @@ class Directions:
 
 @cache
 def direction_sets(count: int, bands: int, interleave: int = 1) -> Directions:
-    """SETS sets of `count` directions of equal solid angle: lattices, four a frame, each turned at random and dealt to
-    16 sets in turn; each set likewise dealt to `interleave` subsets. Raises KeyError unless that is 1, 2, 4 or 8.
+    """SETS sets of `count` directions of equal solid angle. Four fine lattices a frame, each rotated at random, are
+    each split into 16 sets, and each set into `interleave` subsets. Raises KeyError unless interleave is 1, 2, 4 or 8.
 
-    A lattice advances by a sixteenth of a golden turn and of whole turns, so that every sixteenth point advances by a
-    golden turn: each set is a spherical Fibonacci lattice, and 16 together are an even, fine one; with k subsets 16 k
-    stands for 16. What error a lattice has left is the same wherever it is used, so blocks of samples take turns with
-    four of them.
+    A fine lattice advances by a sixteenth of (a golden turn plus whole turns), so that every sixteenth point advances
+    by a golden turn: each set is a spherical Fibonacci lattice, and 16 of them together are a finer one. With k
+    subsets, 16 k replaces 16. Since the error of a lattice is the same wherever it is used, blocks of samples use four
+    different ones.
     """
     generator = np.random.default_rng(_SEED)
     advance = (GOLDEN_TURN + _WHOLE_TURNS[interleave]) / (_DEALT * interleave)
@@ -143,11 +144,11 @@ def transfer_radiance(
     turn: int = 0,
     chosen: NDArray[np.int32] | None = None,
 ) -> Transfer:
-    """Transfer of the real world alone at every `stride`-th pixel; visibility rays of at most `reach_m`.
+    """Transfer of the real world without virtual objects at every `stride`-th pixel, by rays of at most `reach_m`.
 
-    `caches`: what earlier frames know, needed where `rays` are interleaved; this frame's visibility is added to it.
-    `state`: voxels that are known to be open, where no ray is traced. `turn`: of the direction sets, modulo TURNS.
-    `chosen` [k]: the only samples that are traced, row * cols + col; what the arrays hold of the others stays.
+    `caches`: visibility from earlier frames, needed where `rays` are interleaved; this frame's is added.
+    `state`: voxels that are known to be open, where no ray is traced. `turn`: selects the direction sets, modulo TURNS.
+    `chosen` [k]: only these samples (row * cols + col) are traced; the others keep their values.
     """
     cols, rows = camera.width // stride, camera.height // stride
     buffers = engine.buffers(TransferBuffers)
@@ -195,7 +196,7 @@ def transfer_radiance(
 def room_for_transfer(
     engine: Engine, rows: int, cols: int, stride: int, rays: Directions, sets: cl_array.Array
 ) -> Transfer:
-    """The arrays of a transfer, their contents undefined, kept by their number of samples; `sets` as given."""
+    """The arrays of a transfer, with undefined contents; one set of arrays for each number of samples."""
     buffers, coefficients, size = engine.buffers(TransferBuffers), rays.basis.shape[2], (rows, cols)
     return Transfer(
         stride,
@@ -211,23 +212,23 @@ def room_for_transfer(
 
 
 def window_arguments(camera: CameraModel, surface: Surface, stride: int) -> tuple[KernelArgument, ...]:
-    """Where samples lie, and the window that the normal of each is the mean of (smooth_normal.clh)."""
+    """Kernel arguments: where samples lie, and the window of their mean normals (smooth_normal.clh)."""
     cols, rows = camera.width // stride, camera.height // stride
     return cols, rows, stride, camera.width, camera.height, window_px(camera), surface.positions, surface.normals
 
 
 def window_px(camera: CameraModel) -> int:
-    """Half the side of that window, pixels."""
+    """Half the side of the window of a mean normal, pixels."""
     return max(1, round(camera.width * _WINDOW))
 
 
 def first_set(turn: int) -> int:
-    """Of the sets that frames of that turn take."""
+    """Index of the first direction set of a frame with this turn."""
     return SETS_A_FRAME * (turn % TURNS)
 
 
 def own_sets(engine: Engine, rows: int, cols: int, turn: int = 0) -> cl_array.Array:
-    """[rows, cols, 1] uint8: the set of each sample where nothing is taken from other frames (direction_sets.clh)."""
+    """[rows, cols, 1] uint8: each sample's direction set if no other frames contribute (direction_sets.clh)."""
     kept = engine.buffers(TransferBuffers).own_sets[turn % TURNS, rows, cols]
     return kept.constant(_sets_of(rows, cols, turn % TURNS))
 

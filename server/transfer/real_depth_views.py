@@ -21,16 +21,16 @@ class RealDepthViews:
 
     views: AuxiliaryViews
     view_of: NDArray[np.int32]
-    """[SETS, count] the view that looks most nearly along each direction."""
+    """[SETS, count] the view whose axis is nearest to each direction."""
     camera: CameraModel
     camera_from_volume: Floats
     surface: Surface
-    """As the camera sees it."""
+    """The surface that the camera sees."""
     depths: cl_array.Array
     """[h, w] float32: of `surface`, see `camera_depths` of image_space.py."""
     near_m: float
-    """Up to where the camera's picture knows better than the views."""
+    """Up to this distance the camera's picture is used, which is finer than the views."""
     ratio: float
-    """Between the distances of one sample in it and the next."""
+    """Ratio of the distances of neighbouring samples in the camera's picture."""
     threshold: float
     """chi of eq. 6.3."""

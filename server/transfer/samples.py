@@ -1,4 +1,4 @@
-"""The radiance transfer of one frame at its samples, and what their surroundings send (thesis 5.1.2, 7.3.3)."""
+"""The radiance transfer of one frame at its samples, and the indirect light there (thesis 5.1.2, 7.3.3)."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TransferSamples:
-    """Of one frame."""
+    """Transfer and indirect light of one frame."""
 
     transfer: Transfer | None
-    """None: nothing asked for it."""
+    """None: nothing needs it."""
     indirect: Indirect | None
     """None: not modelled."""
 
@@ -33,7 +33,7 @@ NO_SAMPLES = TransferSamples(None, None)
 
 
 class SampledTransfer:
-    """Radiance transfer of one session, with what surfaces send to the samples."""
+    """Radiance transfer of one session, with the indirect light at the samples."""
 
     def __init__(self, engine: Engine, camera: CameraModel, sampling: Sampling, rays: int, bands: int) -> None:
         self._engine = engine
@@ -43,12 +43,12 @@ class SampledTransfer:
         self._mean_sent = np.zeros(3)
 
     def use(self, sampling: Sampling, rays: int) -> None:
-        """Sample in another way from now on; what was traced before is forgotten."""
+        """Change the sampling. Visibility of earlier frames is forgotten."""
         self._sampler = TransferSampler(self._engine, self._camera, sampling, rays, self._bands)
 
     @property
     def sampling(self) -> Sampling:
-        """As it is used now."""
+        """The current sampling."""
         return self._sampler.sampling
 
     @property
@@ -58,16 +58,16 @@ class SampledTransfer:
 
     @property
     def depth_views(self) -> RealDepthViews | None:
-        """What the last transfer was looked up in; None where rays are traced."""
+        """The depth views of the last transfer; None if it traced rays."""
         return self._sampler.depth_views
 
     @property
     def period(self) -> int:
-        """Frames after which a still view is sampled the same again."""
+        """Number of frames after which a still view gets the same samples again."""
         return self._sampler.period
 
     def skip_frame(self) -> None:
-        """A frame without transfer counts in the sequence of direction sets all the same."""
+        """Advance the sequence of direction sets for a frame without transfer."""
         self._sampler.pass_frame()
 
     def sample(
@@ -80,12 +80,12 @@ class SampledTransfer:
         *,
         with_indirect: bool,
     ) -> TransferSamples:
-        """Transfer of the real world alone (eq. 5.2). up: [3] unit, world axes."""
+        """Transfer of the real world without virtual objects (eq. 5.2). up: [3] unit, world axes."""
         transfer = self._sampler.transfer(volume, surface, volume_from_camera, up, ray_length_m)
         if not with_indirect:
             return TransferSamples(transfer, None)
         rays = self._sampler.rays
         sent = observe_indirect(self._engine, self._camera, volume, surface, transfer, rays, ray_length_m)
-        if sent.mean.any():  # where next to nothing is hidden, noise decides whether anything is met
+        if sent.mean.any():  # where almost nothing is blocked, whether a surface is met is noise
             self._mean_sent = sent.mean
         return TransferSamples(transfer, replace(sent, mean=self._mean_sent))

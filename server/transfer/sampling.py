@@ -28,31 +28,31 @@ class Sampling:
     """The accelerations of thesis ch. 6 that a session uses."""
 
     stride: int
-    """A1: every how many pixels transfer is sampled, for the light and for shading."""
+    """A1: spacing of the transfer's samples in pixels, for the light and for shading."""
     interleave: int = 1
-    """A3, A4: a frame traces one of so many subsets of the directions, the others come from earlier frames."""
+    """A3, A4: number of subsets of the directions. A frame traces one; the others come from earlier frames."""
     rays_per_frame: bool = False
-    """Whether a session's `rays` are those of a frame, so that a sample has `interleave` times as many."""
+    """Whether `rays` counts the directions of one frame, so that a sample has `interleave` times as many."""
     adaptive: bool = False
     """A2: shading is sampled at every pixel where virtual objects make it change from pixel to pixel."""
     upsampling: Upsampling = "bilateral"
-    """A5: how shading comes from samples to pixels; bicubic is the thesis's."""
+    """A5: interpolation of shading from samples to pixels; the thesis uses bicubic."""
     visibility_state: bool = False
-    """A6: no rays where the volume is known to be open; pays where rays are short."""
+    """A6: no rays where the volume is known to be open; useful with short rays."""
     turning: bool = True
-    """Frames take turns with direction sets, after one round of the subsets, so that what error they have left is not
-    always the same: light from several frames is nearer to the truth, shading of a still view is not quite still."""
+    """Frames cycle through direction sets after each round of the subsets, so that their errors differ: a light from
+    several frames is more accurate, but the shading of a still view flickers slightly."""
     image_space: bool = False
-    """A7, A8: visibility is looked up in depth pictures, not traced; A3, A4 and A6 are about rays, and do not apply."""
+    """A7, A8: visibility is looked up in depth views instead of traced; A3, A4 and A6 do not apply."""
     views: int = VIEWS
-    """Of these depth pictures, besides the camera's own."""
+    """Number of depth views besides the camera's own."""
 
     def __post_init__(self) -> None:
         if self.image_space and (self.interleave > 1 or self.visibility_state):
             raise ValueError("image-space visibility has no rays to interleave or to leave out")
 
     def directions(self, rays: int) -> int:
-        """Of a sample, in a session of so many `rays`."""
+        """Directions of one sample, for a session with this `rays` setting."""
         return max(rays, min(rays * self.interleave, _MOST_DIRECTIONS)) if self.rays_per_frame else rays
 
 
@@ -66,16 +66,16 @@ PRESETS = {
     "gr15": Sampling(stride=1, image_space=True),
     "gr15fast": Sampling(stride=4, image_space=True),
 }
-"""Thesis 6.1.3.1 and 6.2.3; RM is its GR12, ART4 its GR14. The number is the spacing in the picture; ART traces a
-fourth of the directions a frame. In the thesis these are a fourth of RM's; ART4 and ART8 take as many as RM has, and so
-have four times as many in all: still several times faster, and their light is nearer to RM's."""
+"""Thesis 6.1.3.1 and 6.2.3; RM is its GR12, ART4 its GR14. The number is the spacing in pixels. ART traces a fourth of
+its directions in each frame. In the thesis a frame traces a fourth of RM's; here it traces as many as RM, so a sample
+has four times as many: still several times faster, with a light nearer to RM's."""
 
 
 class TransferSampler:
-    """Radiance transfer of one session, and what it remembers from frame to frame."""
+    """Radiance transfer of one session, with its caches from earlier frames."""
 
     def __init__(self, engine: Engine, camera: CameraModel, sampling: Sampling, rays: int, bands: int) -> None:
-        """`rays`: directions of a sample, over all its subsets; or of one subset, see `Sampling.rays_per_frame`."""
+        """`rays`: directions of a sample in all subsets, or in one, see `Sampling.rays_per_frame`."""
         self._engine = engine
         self._camera = camera
         self.sampling = sampling
@@ -87,16 +87,16 @@ class TransferSampler:
 
     @property
     def depth_views(self) -> RealDepthViews | None:
-        """What the last transfer looked into; None where rays are traced."""
+        """The depth views of the last transfer; None if it traced rays."""
         return self._image_space.depth_views if self._image_space else None
 
     @property
     def period(self) -> int:
-        """Frames after which a still view is sampled the same again; one of subsets needs as many for itself."""
+        """Number of frames after which a still view gets the same samples again."""
         return (TURNS if self.sampling.turning else 1) * self.sampling.interleave
 
     def pass_frame(self) -> None:
-        """A frame that does without transfer has its turn all the same."""
+        """Advance the sequence of direction sets for a frame without transfer."""
         self._frame += 1
 
     def transfer(
@@ -107,10 +107,12 @@ class TransferSampler:
         up: NDArray[np.float64],
         reach_m: float,
     ) -> Transfer:
-        """Transfer of the real world alone at the samples; rays of at most `reach_m`; `up` unit, world axes."""
+        """Transfer of the real world without virtual objects; rays of at most `reach_m`; `up` unit, world axes."""
         engine, camera, sampling = self._engine, self._camera, self.sampling
         self._frame += 1
-        turn = self._frame // sampling.interleave if sampling.turning else 0  # subsets are most even in one set
+        turn = (
+            self._frame // sampling.interleave if sampling.turning else 0
+        )  # subsets of the same set are the most evenly spread
         if self._image_space:
             return self._image_space.transfer(
                 camera, volume_from_camera, volume, surface, sampling.stride, reach_m, turn=turn

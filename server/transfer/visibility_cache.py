@@ -44,7 +44,7 @@ class VisibilityCaches:
         self._lens: np.generic | None = None
 
     def forget(self) -> None:
-        """Take nothing from earlier frames."""
+        """Forget earlier frames."""
         self._known = 0
 
     def begin_frame(
@@ -55,9 +55,9 @@ class VisibilityCaches:
         count: int,
         reach_m: float,
     ) -> None:
-        """Open a layer for a frame seen from `volume_from_camera` [4, 4]; the oldest one's place is taken.
+        """Open a layer for a frame seen from `volume_from_camera` [4, 4], in place of the oldest layer.
 
-        What was found for another camera, stride, number of directions or reach is forgotten.
+        Layers of another camera, stride, number of directions or ray length are forgotten.
         """
         asked = (camera.width, camera.height, stride, count, reach_m)
         known = min(self._known + 1, self._interleave) if asked == self._asked else 1
@@ -84,7 +84,7 @@ class VisibilityCaches:
         return self._buffers.surface.parts({"points": shape, "normals": shape})
 
     def buffers(self) -> tuple[KernelArgument, ...]:
-        """What transfer_radiance of radiance_transfer.cl takes, in its order."""
+        """The buffers for transfer_radiance of radiance_transfer.cl, in its order."""
         k, (rows, cols, words) = self._interleave, self._shape
         return (
             self._buffers.cameras.upload(self._cameras.reshape(k, 16).view(cl_types.float16)),

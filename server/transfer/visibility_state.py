@@ -24,9 +24,9 @@ from server.volume.raycast import Surface, SurfaceBuffers, raycast
 from server.volume.volume import BRICK, Volume
 
 LEAST_OPEN = 0.99
-"""Free share of the cosine-weighted sky from which on surface counts as open: the rest is what it gets wrong."""
+"""Surface counts as open if at least this share of its cosine-weighted sky is free. The rest bounds its error."""
 CHANGE_VOXELS = 2.0
-"""A surface that moved less, as all do while they are refined, has not changed."""
+"""A surface that moved by fewer voxels has not changed: all surfaces move slightly while they are refined."""
 MOST_VOXELS = 1 << 28
 _FOLLOWING_PX = 160
 _ABOVE_PX = 128
@@ -54,7 +54,7 @@ class _Buffers(StageBuffers):
 
 @dataclass
 class _Watch:
-    """A validation camera and what it saw last."""
+    """A validation camera and its last view."""
 
     buffers: _WatchBuffers
     camera: CameraModel
@@ -78,7 +78,7 @@ class VisibilityState:
         self.forget()
 
     def forget(self) -> None:
-        """Nothing is known to be open."""
+        """Forget all open voxels."""
         fill_bytes(self._engine.queue, self.bits, 0)
 
     def validate(self, volume_from_camera: NDArray[np.float64], reach_m: float) -> NDArray[np.bool_]:
@@ -105,7 +105,7 @@ class VisibilityState:
         return stale
 
     def learn(self, surface: Surface, camera: CameraModel, stride: int, openness: cl_array.Array) -> None:
-        """Take in what was traced: openness [rows, cols] of the samples of a transfer."""
+        """Update the voxels from the openness [rows, cols] of a transfer's samples."""
         rows, cols = openness.shape
         for value in (1, 0):
             self._engine.launch(
@@ -126,7 +126,7 @@ class VisibilityState:
             )
 
     def _look(self, watch: _Watch) -> cl_array.Array:
-        """[h, w] float4 what `watch` sees now; kept as what it saw last."""
+        """[h, w] float4 the current view of `watch`, which becomes its last view."""
         view = raycast(self._engine, watch.camera, watch.volume_from_camera, self._volume, watch.buffers.surface)
         shape = (watch.camera.height, watch.camera.width)
         watch.seen = watch.buffers.seen.array(shape)
@@ -185,7 +185,7 @@ def _camera_above(volume: Volume, up: NDArray[np.float64]) -> tuple[CameraModel,
 
 
 def _grown(bricks: NDArray[np.bool_], reach: float) -> NDArray[np.bool_]:
-    """[z, y, x] all bricks that a ray of `reach` bricks' sides may connect with one of `bricks`."""
+    """[z, y, x] all bricks within a ray of `reach` bricks of one of `bricks`."""
     if not bricks.any():
         return bricks
     steps = int(np.ceil(reach))

@@ -10,10 +10,10 @@ from typing import Annotated
 
 import typer
 
-from client import capture_options as o
-from client.capture_options import CaptureOptions, capturing
-from client.laptop.errors import OptionError
-from client.options import prepare, refuse_depth_noise, refuse_video
+from client.errors import OptionError
+from client.options import capture_options as o
+from client.options.capture import prepare, refuse_depth_noise, refuse_video
+from client.options.capture_options import CaptureOptions, capturing
 from client.progress import Stopwatch, note, progress_bar, say, track
 
 USAGE_STATUS, FAILURE_STATUS, INTERRUPTED_STATUS = 2, 1, 130
@@ -77,8 +77,8 @@ def run(
 ) -> None:
     """The pipeline in one process, no network."""
     capture = prepare(options)
-    from client.laptop.output import OutputWriter
-    from client.laptop.run import Run
+    from client.commands.run import Run
+    from client.display.output_folder import OutputWriter
 
     if mesh:
         from server.meshing.surface import find_library
@@ -104,7 +104,7 @@ def explain(
 ) -> None:
     """The plan of a frame in words: what runs and what for, what is left out and why."""
     capture = prepare(options)
-    from client.explain import explain as explain_frame
+    from client.commands.explain import explain as explain_frame
 
     for line in explain_frame(capture, frame, device):
         say(line)
@@ -150,10 +150,10 @@ def stream(
     refuse_depth_noise(depth_noise, lossless)
     refuse_video(video, lossless)
     capture = prepare(options, lossless=lossless, answer=answer)
-    from client.client import Access
-    from client.laptop.stream import Sending
-    from client.laptop.stream import stream as send
-    from client.room_options import room_place
+    from client.commands.stream import Sending
+    from client.commands.stream import stream as send
+    from client.options.room_options import room_place
+    from client.streaming.client import Access
 
     place = room_place(room, room_from_world, marker, room_key)
     access = Access(token, tls_fingerprint, tls_ca)
@@ -196,7 +196,7 @@ def serve(
     log: Annotated[str, typer.Option(metavar="text|json", help="how events are written to standard error")] = "text",
 ) -> int:
     """The server. It asks for a token, which the URL that it prints brings along."""
-    from client.serving import (
+    from client.options.serve_options import (
         ServeOptions,
         authenticator_of,
         certificate_of,
@@ -246,7 +246,7 @@ def demo(
     device: o.DeviceOption = None,
 ) -> None:
     """Server and client together on a synthetic scene; pictures in out/demo."""
-    from client.laptop.demo import run_demo
+    from client.commands.demo import run_demo
 
     run_demo(out, device, keep, port)
 
@@ -259,7 +259,7 @@ def model(
     voxel: o.Voxel = None,
 ) -> None:
     """A static scene's posed frames as one triangle mesh, made offline from a point cloud."""
-    from client.laptop.static_model import check_output, model_of_source, open_posed, write_model
+    from client.static_model.model import check_output, model_of_source, open_posed, write_model
 
     check_output(out)
     opened, chosen, cell_m = open_posed(source, frames, voxel)
@@ -272,7 +272,7 @@ def model(
 @app.command()
 def devices() -> None:
     """OpenCL devices, and which one would be used."""
-    from client.laptop.devices import show_devices
+    from client.commands.devices import show_devices
 
     show_devices()
 
@@ -280,8 +280,8 @@ def devices() -> None:
 @app.command()
 def tune(device: o.DeviceOption = None) -> None:
     """This device's front of accuracy against time, measured once and kept for --budget-ms and --preset auto."""
-    from client.laptop.tune import lines_of
-    from client.laptop.tune import tune as measure
+    from client.tuning.tune import lines_of
+    from client.tuning.tune import tune as measure
     from server.opencl.device import open_device
     from server.quality.pareto_front import write_front
 
@@ -303,6 +303,6 @@ def bench(
     device: o.DeviceOption = None,
 ) -> None:
     """Measure, and compare with the goals."""
-    from client.bench import run_bench
+    from client.commands.bench import run_bench
 
     run_bench(suite, json, quick, {"scenes": scenes, "engine": engine, "out": out, "device": device})

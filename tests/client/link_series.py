@@ -1,4 +1,4 @@
-"""What `client.adaptive` decides over simulated links of every kind, for the page's port of it to be held to."""
+"""What `client.streaming.adaptive` decides over simulated links; the port of the page must decide the same."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from client.adaptive import Adaptive, Measured
+from client.streaming.adaptive import Adaptive, Measured
 
 SERIES, STEPS = 24, 400
 LOST_SHARE = 0.004

@@ -9,7 +9,7 @@ from statistics import median
 
 import pytest
 
-from client.adaptive import LADDER, Adaptive, Measured
+from client.streaming.adaptive import LADDER, Adaptive, Measured
 
 FPS = 15
 DEPTH_BYTES = 80_000

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from client.cli import run_command
-from client.explain import PURPOSES, lines
-from client.laptop.errors import SourceError
-from client.laptop.gallery.scenes import GALLERY
-from client.laptop.source import open_source
+from client.commands.explain import PURPOSES, lines
+from client.errors import SourceError
+from client.gallery.scenes import GALLERY
+from client.options.source import open_source
 from protocol.messages import LeftOut, Plan
 from server.effects.table import effect_names
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from client.laptop.errors import OptionError, SourceError
-from client.laptop.volume import default_volume, default_voxel, with_room_to_move
-from client.options import CaptureOptions, parse_frames, parse_ray_length, prepare
+from client.errors import OptionError, SourceError
+from client.options.capture import CaptureOptions, parse_frames, parse_ray_length, prepare
+from client.sources.volume import default_volume, default_voxel, with_room_to_move
 from tests.client import folders
 
 

@@ -16,7 +16,9 @@ import pytest
 import trimesh
 
 from client.cli import run_command
-from client.laptop.cloud_normals import (
+from client.errors import RunError, SourceError
+from client.options.source import open_source
+from client.static_model.cloud_normals import (
     GREATEST_RADIUS,
     LEAST_RADIUS,
     NORMAL_ERROR_RAD,
@@ -26,10 +28,8 @@ from client.laptop.cloud_normals import (
     spacing_m,
     turned_outwards,
 )
-from client.laptop.errors import RunError, SourceError
-from client.laptop.point_cloud import CloudFusion, PointCloud, depth_noise_m, pixel_rays, usable_pixels
-from client.laptop.source import open_source
-from client.laptop.static_model import StaticModel, model_of_fusion
+from client.static_model.model import StaticModel, model_of_fusion
+from client.static_model.point_cloud import CloudFusion, PointCloud, depth_noise_m, pixel_rays, usable_pixels
 from protocol.frames import IDENTITY, CameraModel, DepthCamera, RgbdFrame
 from tests.data import data_folder
 from tests.scenes.analytic import Shape, look, look_at, plane, room, sphere

@@ -10,9 +10,9 @@ import pytest
 from rich.console import Console
 from rich.progress import Progress
 
-from client.coding import Coding
-from client.laptop.stream_figures import StreamFigures
-from client.laptop.stream_view import StreamView, coding_line, half_blocks, light_line
+from client.display.stream_statistics import StreamFigures
+from client.display.stream_view import StreamView, coding_line, half_blocks, light_line
+from client.streaming.coding import Coding
 from tests.protocol.samples import SERVER
 
 LIGHT, COMPOSITE = SERVER["light"], SERVER["composite"]

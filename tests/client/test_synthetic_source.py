@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from client.laptop.errors import SourceError
-from client.laptop.source import open_source
-from client.laptop.synthetic.hand import GOES, capsules
-from client.laptop.synthetic.noise import kinect_like
-from client.laptop.synthetic.source import SyntheticSource, open_synthetic, to_srgb8
+from client.errors import SourceError
+from client.options.source import open_source
+from client.synthetic.scenes.hand import GOES, capsules
+from client.synthetic.sensor_noise import kinect_like
+from client.synthetic.source import SyntheticSource, open_synthetic, to_srgb8
 
 SMALL = "size=96x72"
 SCENES = ("table", "room", "hand", "light")

@@ -7,14 +7,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from client.laptop.errors import SourceError
-from client.laptop.synthetic.guests import GUESTS
-from client.laptop.synthetic.harmonics import basis, sphere_directions
-from client.laptop.synthetic.looks import LOOKS, Covering, along_surface
-from client.laptop.synthetic.rounds import Cylinder
-from client.laptop.synthetic.shapes import Polyhedron, Solid
-from client.laptop.synthetic.source import SyntheticSource, open_synthetic
-from client.laptop.synthetic.tessellate import TOLERANCE_M, triangles_of
+from client.errors import SourceError
+from client.synthetic.lighting.harmonics import basis, sphere_directions
+from client.synthetic.scenes.appearance import LOOKS, Covering, along_surface
+from client.synthetic.scenes.guests import GUESTS
+from client.synthetic.solids.polyhedra import Polyhedron, Solid
+from client.synthetic.solids.round import Cylinder
+from client.synthetic.solids.tessellate import TOLERANCE_M, triangles_of
+from client.synthetic.source import SyntheticSource, open_synthetic
 
 ROUND = 360
 """Frames of one walk around."""

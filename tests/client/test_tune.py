@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from client.cli import run_command
-from client.laptop import tune as tuning
-from client.laptop import tune_scenes
-from client.laptop.tune import lines_of, tune
+from client.tuning import scenes as tune_scenes
+from client.tuning import tune as tuning
+from client.tuning.tune import lines_of, tune
 from server.opencl.device import Device
 from server.quality.pareto_front import read_front, write_front
 from server.quality.sampling_settings import SamplingSettings
@@ -62,7 +62,7 @@ def test_a_first_budget_measures_the_device(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_without_a_front_the_server_says_what_to_do(device: Device) -> None:
-    from client.laptop.synthetic.source import open_synthetic
+    from client.synthetic.source import open_synthetic
     from protocol.messages import Wishes
     from server.client_session import ClientSession
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from client.laptop.gallery.play import play, wishes_of
-from client.laptop.gallery.scenes import CHANGE_FRAME, GALLERY
-from client.laptop.gallery.source import GallerySource
-from client.laptop.gallery.things import Thing
+from client.gallery.objects import Thing
+from client.gallery.play import play, wishes_of
+from client.gallery.scenes import CHANGE_FRAME, GALLERY
+from client.gallery.source import GallerySource
 from protocol.frames import RgbdFrame
 from protocol.messages import LeftOut, Plan
 from server.client_session import ClientSession

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-from client.laptop.gallery.source import GallerySource
+from client.gallery.source import GallerySource
 from protocol.messages import Wishes
 from server.client_session import ClientSession
 from server.opencl.device import Device

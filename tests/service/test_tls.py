@@ -14,8 +14,8 @@ import httpx
 import pytest
 from cryptography import x509
 
-from client.access import AccessError, entrance, fingerprint_bytes
-from client.client import Access
+from client.streaming.access import AccessError, entrance, fingerprint_bytes
+from client.streaming.client import Access
 from server.service import tls
 from server.service.authenticator import Authenticator
 from server.service.serve import BackgroundServer

@@ -1,4 +1,4 @@
-"""How well one operating point finds a known light (E1, thesis 5.3.1, 6.1.3); pictures: client.laptop.known_light."""
+"""How well one operating point finds a known light (E1, thesis 5.3.1, 6.1.3); pictures: client.tuning.known_light."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.known_light import LitFrame, found_lights
+from client.tuning.known_light import LitFrame, found_lights
 from protocol.frames import CameraModel
 from protocol.messages import Wishes
 from server.maths.light_direction import direction_dot, direction_error_deg

@@ -1,6 +1,6 @@
 """`probeless bench plan`: does each frame run what its scene calls for, and is what is left out not seen (U3).
 
-Every scene of the gallery (client/laptop/gallery) goes through the pipeline twice: as planned, and with everything
+Every scene of the gallery (client/gallery) goes through the pipeline twice: as planned, and with everything
 simulated that can be. Time is processor time over all cores, which other load distorts least.
 """
 
@@ -21,10 +21,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from client.explain import is_of_noise
-from client.laptop.gallery.play import play, wishes_of
-from client.laptop.gallery.scenes import GALLERY
-from client.laptop.gallery.source import GallerySource
+from client.commands.explain import is_of_noise
+from client.gallery.play import play, wishes_of
+from client.gallery.scenes import GALLERY
+from client.gallery.source import GallerySource
 from protocol.messages import Plan
 from server.opencl.device import Device, open_device
 from tests.bench.rendering.flip import flip_map

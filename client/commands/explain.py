@@ -1,0 +1,111 @@
+"""`probeless explain`: the plan of one frame as a person would say it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from client.commands.run import Run
+from client.errors import OptionError
+from client.gallery.play import play, wishes_of
+from client.gallery.source import GallerySource
+from client.options.capture import Capture
+from protocol.messages import LeftOut, Plan, Wishes
+from server.opencl.device import open_device
+from server.reuse.temporal_reuse import ECHO, NOISE
+
+PURPOSES = {
+    "rasterize": "draws the virtual objects",
+    "cover": "finds how much of each pixel they cover, for smooth edges",
+    "draw_depth_views": "draws the depth pictures that visibility is looked up in",
+    "prepare_rays": "brings together what rays are traced through",
+    "shadow_map": "draws the objects as the light's sharp parts see them",
+    "light_objects": "lights the objects, for what they send to real things and to one another",
+    "light_samples": "finds what the light's sharp parts bring to real things",
+    "shadow_real": "shadows real things by virtual ones",
+    "bounce_real": "follows how that changes what real things send one another",
+    "add_objects": "lets virtual things see the room as they have changed it",
+    "reflect": "finds what glossy virtual things reflect",
+    "shade_virtual": "shadows virtual things by real ones and by one another",
+    "refine_virtual": "sharpens shadows on virtual things near their edges",
+    "refine_real": "sharpens the rims of shadows on real things",
+    "mark_changes": "finds the parts of the picture in which virtual things change real ones",
+    "direct_virtual": "lights virtual things by the light's sharp parts",
+    "direct_real": "throws the sharp shadows of virtual things on real ones",
+    "match_average": "makes virtual things as bright beside the picture as real ones",
+    "composite": "puts the picture together",
+    "compose_layer": "puts together what is virtual, apart from the camera's picture",
+}
+LEAD_FRAMES = 4
+"""Before the frame that is explained: so many are processed for there to be a light."""
+
+
+def explain(capture: Capture, frame: int | None, device_name: str | None) -> Iterator[str]:
+    """Lines that say the plan of a frame: the one at position `frame`, by default the fifth or the last.
+
+    Raises OptionError for a frame that there is not, and as Run does.
+    """
+    frames = capture.frames
+    chosen = min(frames.start + LEAD_FRAMES, frames[-1]) if frame is None else frame
+    if chosen not in frames:
+        raise OptionError(f"--frame {chosen}: the source has frames {frames.start}:{frames.stop}")
+    yield from lines(f"{capture.source.name}, frame {chosen}", _plan_of(capture, chosen, device_name))
+
+
+def _plan_of(capture: Capture, chosen: int, device_name: str | None) -> Plan:
+    if isinstance(capture.source, GallerySource) and not capture.objects:
+        return _gallery_plan(capture.source, capture.wishes, chosen, device_name)
+    notes: list[str] = []
+    led = range(max(capture.frames.start, chosen - LEAD_FRAMES), chosen + 1)
+    with Run(replace(capture, frames=led), device_name, notes.append) as run:
+        *_, last = run.outputs()
+    return last.plan
+
+
+def _gallery_plan(source: GallerySource, asked: Wishes, chosen: int, device_name: str | None) -> Plan:
+    """With the scene's own objects and light."""
+    wishes = wishes_of(source, preset=asked.preset, plan=asked.plan, indirect=asked.indirect, edges=asked.edges)
+    results = play(open_device(device_name), source, wishes)
+    plans = [result.plan for _, (_, result) in zip(range(chosen + 1), results, strict=False)]
+    results.close()
+    return plans[-1]
+
+
+def lines(title: str, plan: Plan) -> Iterator[str]:
+    """A plan, an effect a line."""
+    unseen = {(left.reason, left.error_bound) for left in plan.left_out if is_unseen(left)}  # one reason counts once
+    most = sum(bound or 0.0 for _, bound in unseen)
+    yield f"{title}: {len(plan.run)} effects run, {len(plan.left_out)} are left out."
+    width = max(map(len, (*plan.run, *(left.effect for left in plan.left_out))))
+    if plan.point is not None:
+        yield f"Sampled with {plan.point.settings}: {plan.point.reason}."
+    yield "Runs:"
+    for name in plan.run:
+        yield f"  {name:{width}}  {PURPOSES.get(name, '')}".rstrip()
+    if plan.left_out:
+        yield "Left out:"
+    for left in plan.left_out:
+        yield f"  {left.effect:{width}}  {left.reason} ({_bound(left)})"
+    which = "in a thousand hardly one pixel" if any(map(is_of_noise, plan.left_out)) else "no pixel"
+    yield f"By all that would hardly be seen {which} changes by more than {most:.2f}/255, before rounding."
+
+
+def is_unseen(left: LeftOut) -> bool:
+    """Whether it was left out for what it changes, and not because it was asked for or could not run."""
+    return left.error_bound is not None and left.error_bound <= 1.0
+
+
+def is_of_noise(left: LeftOut) -> bool:
+    """Whether its bound is not of every pixel, but of all but a thousandth."""
+    return left.reason in (NOISE, ECHO)
+
+
+def _bound(left: LeftOut) -> str:
+    if left.error_bound is None:
+        return "what that changes is not known"
+    if left.error_bound == 0:
+        return "changes nothing"
+    if not is_unseen(left):
+        return "what that changes is not bounded"
+    which = "in a thousand hardly one pixel" if is_of_noise(left) else "no pixel"
+    return f"changes {which} by more than {left.error_bound:.2f}/255"

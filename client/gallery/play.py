@@ -1,0 +1,48 @@
+"""A gallery scene through the pipeline, its things placed and moved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from client.gallery.source import GallerySource
+from client.sources.volume import default_volume
+from protocol.messages import Wishes
+from server.client_session import ClientSession
+from server.opencl.device import Device
+from server.pipeline import FrameResult
+from server.scene.mesh import load_mesh
+from server.scene.placement import Placement
+
+VOXEL_M = 0.02
+
+
+def wishes_of(source: GallerySource, **others: object) -> Wishes:
+    """What a session of this scene asks for; `others` besides, which count more."""
+    asked = {
+        "volume_m": default_volume(source, range(len(source))),
+        "voxel_m": VOXEL_M,
+        "up": source.up,
+        "albedo": "estimated",
+        "indirect": "observed",
+        "light": source.light,
+        "lamps": "off",
+        **source.scene.wishes,
+        **others,
+    }
+    return Wishes(**asked)  # type: ignore[arg-type]
+
+
+def play(device: Device, source: GallerySource, wishes: Wishes) -> Iterator[tuple[ClientSession, FrameResult]]:
+    """Every frame's result, and the pipeline that it is of, which is closed after the last."""
+    pipeline = ClientSession(device, source.camera, wishes)
+    try:
+        for number, thing in enumerate(source.scene.things):
+            mesh = load_mesh(thing.glb(), "glb")
+            pipeline.place_object(f"object-{number}", mesh, Placement(position_m=thing.place(0)))
+        for index in range(len(source)):
+            for number, thing in enumerate(source.scene.things):
+                if index and thing.place(index) != thing.place(index - 1):
+                    pipeline.move_object(f"object-{number}", Placement(position_m=thing.place(index)))
+            yield pipeline, pipeline.process(source[index])
+    finally:
+        pipeline.close()

@@ -1,0 +1,324 @@
+"""The gallery: what stands in each scene, what lights it, and which effects it calls for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.gallery.objects import Rgb, Thing
+from client.synthetic.solids.polyhedra import Solid, box
+from client.synthetic.solids.round import Sphere
+from client.synthetic.solids.shell import Opening, Shell
+from server.maths.directional_fit import directional_sh
+
+Floats = NDArray[np.float64]
+Effects = frozenset[str]
+
+COEFFICIENTS = 16
+FRAMES = 6
+STILL_FRAMES = 46
+"""Of a camera that stands still: under two seconds."""
+CHANGE_FRAME = 36
+"""In which something happens before it."""
+SETTLED, HELD = 8, 4
+"""Frames after which a still view without noise rests, and then until a round of direction sets is held."""
+GRAY: Rgb = (0.5, 0.5, 0.5)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Something real, of one colour."""
+
+    solid: Solid
+    albedo: Rgb
+    step_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """From frame to frame; of balls."""
+    stays: int = 0
+    """Frames before it begins to move."""
+
+    def steps(self, index: int) -> int:
+        """That it has moved until a frame."""
+        return max(index - self.stays, 0) if any(self.step_m) else 0
+
+    def at(self, index: int) -> Solid:
+        """Where it is in a frame."""
+        if not self.steps(index):
+            return self.solid
+        assert isinstance(self.solid, Sphere)
+        return Sphere(self.solid.center + self.steps(index) * np.array(self.step_m), self.solid.radius)
+
+
+@dataclass(frozen=True)
+class GalleryScene:
+    """A scene and what it calls for."""
+
+    says: str
+    parts: tuple[Part, ...]
+    sh: Floats
+    """[16, 3] radiance."""
+    calls_for: Callable[[int], Effects]
+    """The effects of a frame, by its index."""
+    things: tuple[Thing, ...] = ()
+    eye: tuple[float, float, float] = (0.0, 0.9, 1.5)
+    target: tuple[float, float, float] = (0.0, 0.1, 0.0)
+    walk_m: float = 0.01
+    """Of the camera to the right, from frame to frame."""
+    frames: int = FRAMES
+    noise_codes: float = 0.0
+    """Deviation of the picture's."""
+    depth_noise: float = 0.0
+    """Deviation of depth over that of a structured-light sensor (Nguyen et al. 2012)."""
+    is_light_given: bool = True
+    lit_later: tuple[int, Floats] | None = None
+    """From which frame on it is lit by another light, and that: [16, 3]."""
+    rests: range = range(0)
+    """Frames that are known to tell the spine nothing new."""
+    holds: range = range(0)
+    """Of these, those in which effects have nothing new to draw either."""
+    changes: float = 1.0
+    """Greatest share of the picture that its things are seen to change of real ones, sharp shadows aside."""
+    hangs: Effects = frozenset()
+    """Effects that it hangs on the noise whether a frame calls for."""
+    settles: range = range(0)
+    """Frames in which it hangs on the noise whether it rests."""
+    wishes: Mapping[str, Any] = field(default_factory=dict)
+
+
+def sky(brightness: float) -> Floats:
+    """[16, 3] even."""
+    sh = np.zeros((COEFFICIENTS, 3))
+    sh[0] = brightness * np.sqrt(4 * np.pi)
+    return sh
+
+
+def sun(x: float, y: float, z: float, brightness: float, color: Rgb = (1.0, 0.95, 0.85)) -> Floats:
+    """[16, 3] a small light; brightness: shading of a white surface that faces it."""
+    direction = np.array([x, y, z]) / np.linalg.norm([x, y, z])
+    return np.outer(directional_sh(direction, 0.12, 4), brightness * np.array(color))
+
+
+_FLOOR = (Part(box((0, -0.05, 0), (3.0, 0.1, 3.0)), (0.8, 0.8, 0.8)),)
+_DARK_FLOOR = (Part(box((0, -0.05, 0), (3.0, 0.1, 3.0)), (0.08, 0.08, 0.08)),)
+_HALL = (Part(box((0, -0.05, 0), (6.0, 0.1, 6.0)), (0.8, 0.8, 0.8)),)
+_FROM_AFAR: dict[str, Any] = {"eye": (0.0, 1.6, 2.6), "target": (0.0, 0.0, 0.2)}
+_WALL = Part(box((0, 0.6, -0.65), (3.0, 1.4, 0.1)), GRAY)
+_ROOM = Part(Shell(np.array([-1.5, 0, -1.5]), np.array([1.5, 2.2, 2.0]), (Opening(3, (-1.0, -1.0), (1.0, 1.0)),)), GRAY)
+_SOFT = sky(0.7)
+_SUN = sky(0.25) + sun(0.9, 0.7, 0.3, 0.7)
+_BALL = Thing(0.24, (0.0, 0.0, 0.0))
+_BOX = Thing(0.2, (0.0, 0.0, 0.0), is_box=True)
+_HAND = Part(Sphere(np.array([0.9, 0.3, 0.1]), 0.12), (0.68, 0.44, 0.34), (-0.12, 0.0, 0.0))
+SETTLED_NOISY = 36
+_NOISE: dict[str, Any] = {
+    "walk_m": 0.0,
+    "frames": STILL_FRAMES,
+    "noise_codes": 2.5,
+    "depth_noise": 1.0,
+    "settles": range(SETTLED, SETTLED_NOISY),
+    "hangs": frozenset({"bounce_real"}),
+}
+
+_DRAWN = {"rasterize", "cover", "composite"}
+_SHADED = _DRAWN | {"prepare_rays", "add_objects", "shade_virtual"}
+_STANDS = _SHADED | {"light_objects", "shadow_real", "mark_changes"}
+_MAPPED = {"shadow_map", "light_samples", "direct_real"}
+
+
+def _always(*effects: set[str]) -> Callable[[int], Effects]:
+    wanted = frozenset(set().union(*effects))
+    return lambda _index: wanted
+
+
+GALLERY: dict[str, GalleryScene] = {
+    "nothing": GalleryScene("nothing virtual", _FLOOR, _SOFT, _always({"composite"})),
+    "elsewhere": GalleryScene(
+        "a ball behind the camera, on the floor below",
+        _FLOOR,
+        _SUN,
+        _always({"composite"}),
+        (Thing(0.2, (0.0, -1.2, 2.5)),),
+    ),
+    "shadow-falls-in": GalleryScene(
+        "a ball beside the picture, whose shadow the sun throws into it",
+        _FLOOR,
+        _SUN,
+        _always({"composite", "prepare_rays", "light_objects", "shadow_real", "mark_changes", "bounce_real"}, _MAPPED),
+        (Thing(0.3, (1.15, 0.35, 0.2)),),
+    ),
+    "floating": GalleryScene(
+        "a marble in the air, far from the wall behind",
+        (Part(box((0, 0.6, -2.65), (6.0, 5.0, 0.1)), GRAY),),
+        _SOFT,
+        _always(_SHADED, {"light_objects"}),
+        (Thing(0.03, (0.0, 0.9, 0.9)),),
+        target=(0.0, 0.9, 0.0),
+    ),
+    "closed-room": GalleryScene(
+        "a matt ball in a room that is open above only", (_ROOM,), sky(1.6), _always(_STANDS, {"bounce_real"}), (_BALL,)
+    ),
+    "glossy": GalleryScene(
+        "a polished metal ball on a floor",
+        _FLOOR,
+        _SOFT,
+        _always(_STANDS, {"reflect", "bounce_real"}),
+        (Thing(0.24, (0.0, 0.0, 0.0), roughness=0.15, metalness=1.0),),
+    ),
+    "soft-sky": GalleryScene(
+        "a matt box on a floor under an even sky",
+        _FLOOR,
+        _SOFT,
+        _always(_STANDS, {"bounce_real"}),
+        (Thing(0.2, (0.0, 0.0, 0.0), is_box=True),),
+    ),
+    "dark-floor": GalleryScene(
+        "a matt ball on a floor that sends next to nothing, seen from above",
+        _DARK_FLOOR,
+        _SOFT,
+        _always(_STANDS),
+        (_BALL,),
+        eye=(0.0, 1.5, 0.6),
+        target=(0.0, 0.0, 0.1),
+    ),
+    "sharp-sun": GalleryScene(
+        "a matt ball on a floor in the sun",
+        _FLOOR,
+        _SUN,
+        _always(_STANDS, _MAPPED, {"direct_virtual", "bounce_real"}),
+        (_BALL,),
+    ),
+    "far-away": GalleryScene(
+        "a small matt box on the floor of a hall, seen from afar",
+        _HALL,
+        _SOFT,
+        _always(_STANDS, {"bounce_real"}),
+        (replace(_BOX, size_m=0.1),),
+        **_FROM_AFAR,
+        changes=0.2,
+    ),
+    "long-shadow": GalleryScene(
+        "a small matt ball in the air of a hall, whose shadow falls far away in a low sun",
+        _HALL,
+        sky(0.25) + sun(0.93, 0.35, 0.1, 0.7),
+        _always(_STANDS, _MAPPED, {"direct_virtual", "bounce_real"}),
+        (Thing(0.16, (0.5, 0.2, 0.0)),),
+        **_FROM_AFAR,
+        changes=0.35,
+    ),
+    "two-suns": GalleryScene(
+        "a matt ball on a floor in two lights",
+        _FLOOR,
+        sky(0.2) + sun(0.9, 0.7, 0.3, 0.45) + sun(-0.8, 0.8, 0.2, 0.4, (0.7, 0.85, 1.0)),
+        _always(_STANDS, _MAPPED, {"direct_virtual", "bounce_real"}),
+        (_BALL,),
+    ),
+    "black-room": GalleryScene(
+        "a ball in a room without any light", (_ROOM,), sky(0.0), _always(_DRAWN), (_BALL,), is_light_given=False
+    ),
+    "red-wall": GalleryScene(
+        "a white ball beside a saturated wall",
+        (*_FLOOR, Part(box((-0.25, 0.5, 0), (0.1, 1.2, 1.4)), (0.7, 0.04, 0.03))),
+        _SOFT,
+        _always(_STANDS, {"bounce_real"}),
+        (Thing(0.24, (0.0, 0.0, 0.0), color=(0.95, 0.95, 0.95)),),
+    ),
+    "soot": GalleryScene(
+        "a ball as black as soot, off the floor",
+        _FLOOR,
+        _SOFT,
+        _always(_STANDS - {"light_objects"}, {"bounce_real"}),
+        (Thing(0.24, (0.0, 0.0, 0.0), color=(0.0, 0.0, 0.0)),),
+    ),
+    "comes-in": GalleryScene(
+        "a ball that floats into the picture along the far wall's side",
+        (Part(box((0, 0.6, -2.65), (6.0, 5.0, 0.1)), GRAY),),
+        _SOFT,
+        lambda index: frozenset({"composite"} if index < 3 else _SHADED | {"light_objects"}),
+        (Thing(0.03, (-0.62, 0.9, 0.9), (0.1, 0.0, 0.0)),),
+        target=(0.0, 0.9, 0.0),
+        walk_m=0.0,
+    ),
+    "still": GalleryScene(
+        "a matt ball on a floor in the sun, before a camera that stands still",
+        _FLOOR,
+        _SUN,
+        _always(_STANDS, _MAPPED, {"direct_virtual", "bounce_real"}),
+        (_BALL,),
+        walk_m=0.0,
+        frames=STILL_FRAMES,
+        rests=range(SETTLED, STILL_FRAMES),
+        holds=range(SETTLED + HELD, STILL_FRAMES),
+    ),
+    "still-and-empty": GalleryScene(
+        "nothing virtual, before a camera that stands still",
+        _FLOOR,
+        _SUN,
+        _always({"composite"}),
+        walk_m=0.0,
+        frames=STILL_FRAMES,
+        rests=range(SETTLED, STILL_FRAMES),
+    ),
+    "still-noisy": GalleryScene(
+        "a matt box on a floor, before a camera that stands still and has a sensor's noise",
+        _FLOOR,
+        _SOFT,
+        _always(_STANDS, {"bounce_real"}),
+        (_BOX,),
+        **_NOISE,
+        rests=range(SETTLED_NOISY, STILL_FRAMES),
+        holds=range(SETTLED_NOISY, STILL_FRAMES),
+    ),
+    "still-tracked": GalleryScene(
+        "nothing virtual, before a camera that stands still, with noise, and nobody tells where it is",
+        _FLOOR,
+        _SOFT,
+        _always({"composite"}),
+        **_NOISE,
+        rests=range(SETTLED_NOISY, STILL_FRAMES),
+        wishes={"poses": "track"},
+    ),
+    "moved-while-still": GalleryScene(
+        "the same box, which is moved after a while",
+        _FLOOR,
+        _SOFT,
+        _always(_STANDS, {"bounce_real"}),
+        (replace(_BOX, step_m=(0.01, 0.0, 0.005), stays=CHANGE_FRAME),),
+        **_NOISE,
+        rests=range(SETTLED_NOISY, STILL_FRAMES),
+        holds=range(SETTLED_NOISY, CHANGE_FRAME + 1),
+    ),
+    "lamp-switches-while-still": GalleryScene(
+        "the same box in a light that is to be found, of which a part goes out",
+        _FLOOR,
+        _SUN,
+        _always(_STANDS, {"match_average", "bounce_real"}),
+        (_BOX,),
+        **_NOISE,
+        is_light_given=False,
+        lit_later=(CHANGE_FRAME, sky(0.25) + sun(0.9, 0.7, 0.3, 0.63)),
+        rests=range(SETTLED_NOISY, CHANGE_FRAME),
+        holds=range(SETTLED_NOISY, CHANGE_FRAME),
+    ),
+    "hand-enters-while-still": GalleryScene(
+        "the same box, above which a real ball moves in after a while",
+        (*_FLOOR, replace(_HAND, stays=CHANGE_FRAME - 1)),
+        _SOFT,
+        _always(_STANDS, {"bounce_real"}),
+        (_BOX,),
+        **_NOISE,
+        rests=range(SETTLED_NOISY, CHANGE_FRAME),
+        holds=range(SETTLED_NOISY, CHANGE_FRAME),
+    ),
+    "hand": GalleryScene(
+        "a real ball moves in above a virtual one, which shall be as bright beside the picture",
+        (*_FLOOR, _HAND),
+        _SOFT,
+        _always(_STANDS, {"match_average", "bounce_real"}),
+        (_BALL,),
+        walk_m=0.0,
+        wishes={"tone_mapping": "average"},
+    ),
+}

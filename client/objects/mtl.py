@@ -1,0 +1,130 @@
+"""Material libraries of OBJ files (MTL), with the names for roughness and metalness that came later (Pr, Pm)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from client.errors import ObjectError
+
+
+@dataclass(frozen=True)
+class TextureMap:
+    """A picture of a material, and where it is read."""
+
+    file: Path
+    scale: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+    clamp: bool = False
+
+
+@dataclass(frozen=True)
+class Material:
+    """What is kept of an MTL material."""
+
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """sRGB, 0 to 1."""
+    texture: TextureMap | None = None
+    specular: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    exponent: float | None = None
+    """Of Phong's highlight."""
+    given_roughness: float | None = None
+    given_metalness: float | None = None
+    roughness_map: TextureMap | None = None
+    """Its red multiplies the roughness, which is 1 where none is given."""
+    metalness_map: TextureMap | None = None
+    """Likewise."""
+    unread: frozenset[str] = frozenset()
+    """Maps it has that are not read."""
+
+    @property
+    def roughness(self) -> float:
+        """Perceptual, 0 to 1. A highlight of exponent n is that of microfacets with alpha^2 = 2 / (n + 2) (Karis 2013).
+
+        Without one, or where it is black: 1, which a map then multiplies.
+        """
+        if self.given_roughness is not None:
+            return self.given_roughness
+        if self.roughness_map is not None:
+            return 1.0
+        shines = self.exponent is not None and any(self.specular)
+        return (2 / (max(self.exponent or 0.0, 0.0) + 2)) ** 0.25 if shines else 1.0
+
+    @property
+    def metalness(self) -> float:
+        """0 to 1: what is given, else 0; a map without it multiplies 1."""
+        if self.given_metalness is not None:
+            return self.given_metalness
+        return 0.0 if self.metalness_map is None else 1.0
+
+
+def read_materials(path: Path) -> dict[str, Material]:
+    """A library's materials by name. Raises ObjectError naming the file and line."""
+    materials: dict[str, Material] = {}
+    name = ""
+    for number, line in enumerate(path.read_text("utf-8", errors="replace").splitlines(), 1):
+        match line.split("#")[0].split():
+            case ["newmtl", *words]:
+                name = " ".join(words)
+                materials[name] = Material()
+            case [key, *words] if name in materials and key in _MAPS and words:
+                materials[name] = replace(materials[name], **{_MAPS[key]: _texture_map(path, words)})  # type: ignore[arg-type]
+            case [
+                ("map_Ns" | "map_Ks" | "map_d" | "map_Bump" | "map_bump" | "norm") as key,
+                *_,
+            ] if name in materials:
+                materials[name] = replace(materials[name], unread=materials[name].unread | {key})
+            case [key, *words] if name in materials and key in _FIELDS:
+                field, count = _FIELDS[key]
+                values = _numbers(path, number, key, words, count)
+                if key != "Ns":
+                    values = [min(max(value, 0.0), 1.0) for value in values]
+                change = {field: tuple(values) if count > 1 else values[0]}
+                materials[name] = replace(materials[name], **change)  # type: ignore[arg-type]
+    return materials
+
+
+_FIELDS = {
+    "Kd": ("color", 3),
+    "Ks": ("specular", 3),
+    "Ns": ("exponent", 1),
+    "Pr": ("given_roughness", 1),
+    "Pm": ("given_metalness", 1),
+}
+"""By the MTL's name: the field of Material, and how many numbers it has."""
+_MAPS = {"map_Kd": "texture", "map_Pr": "roughness_map", "map_Pm": "metalness_map"}
+
+
+def _numbers(path: Path, number: int, key: str, words: list[str], count: int) -> list[float]:
+    try:
+        values = [float(word) for word in words[:count]]
+    except ValueError:
+        values = []
+    if len(values) < count or not np.isfinite(values).all():
+        counted = {1: "one number", 2: "two numbers", 3: "three numbers"}[count]
+        raise ObjectError(f"{path}, line {number}: {key} needs {counted}")
+    return values
+
+
+def _texture_map(path: Path, words: list[str]) -> TextureMap:
+    """The file after a map's options; file names may have spaces, so the longest tail that exists wins."""
+    for start in range(len(words)):
+        file = path.parent / " ".join(words[start:]).replace("\\", "/")
+        if file.is_file():
+            scale, offset = (_option(words[:start], name, default) for name, default in (("-s", 1.0), ("-o", 0.0)))
+            return TextureMap(file, scale, offset, clamp="-clamp on" in " ".join(words[:start]).lower())
+    raise ObjectError(f"{path.parent / words[-1]}: the texture that {path.name} names is missing")
+
+
+def _option(words: list[str], name: str, default: float) -> tuple[float, float]:
+    """The first two numbers after an option that has up to three."""
+    values = [default, default]
+    if name in words:
+        for k, word in enumerate(words[words.index(name) + 1 :][:2]):
+            try:
+                values[k] = float(word)
+            except ValueError:
+                break
+    return values[0], values[1]

@@ -1,0 +1,233 @@
+"""What the stage set is covered with: textures that follow each surface, all linear albedo from 0.03 to 0.8.
+
+A pattern lies in two coordinates along the surface, so that it goes around columns and up roofs; its lines are some
+millimetres wide with soft edges, so that pictures of 320x240 do not alias.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.synthetic.scenes.textures import Texture
+from client.synthetic.solids.carved import Carved
+from client.synthetic.solids.polyhedra import Polyhedron
+from client.synthetic.solids.round import Cylinder, Sphere
+
+SOFT_M = 0.0012
+"""Half of an edge's width."""
+
+Values = NDArray[np.floating]
+Color = tuple[float, float, float]
+Convex = Polyhedron | Cylinder | Sphere
+
+
+@dataclass(frozen=True)
+class Covering:
+    """Which surface is covered."""
+
+    role: str
+    """ground, wall, stone, roof or dome."""
+    building: int
+    """From 1; 0 is the ground."""
+    solid: Convex | Carved
+    turn: NDArray[np.float64]
+    """[3, 3] of the building's frame."""
+
+
+Look = Callable[[Covering], Texture]
+
+
+def along_surface(covering: Covering, points: Values) -> tuple[Values, Values]:
+    """[n] metres across and up the surface at its points [n, 3]; on what lies flat, along the building's axes."""
+    local = points @ covering.turn
+    normals = covering.solid.normals(points) @ covering.turn
+    center = covering.solid.bounds[0] @ covering.turn
+    level = np.hypot(normals[:, 0], normals[:, 2])
+    facing = np.arctan2(normals[:, 0], normals[:, 2])
+    sideways = local - center
+    across = sideways[:, 0] * np.cos(facing) - sideways[:, 2] * np.sin(facing) + _radius(covering.solid) * facing
+    is_flat = level < 0.1
+    up = local[:, 1] / np.maximum(level, 0.1)
+    return np.where(is_flat, local[:, 0], across), np.where(is_flat, local[:, 2], up)
+
+
+def _radius(solid: Convex | Carved) -> float:
+    match solid:
+        case Cylinder() | Sphere():
+            return solid.radius
+        case Carved():
+            return _radius(solid.outer)
+        case _:
+            return 0.0
+
+
+def paper(_covering: Covering) -> Texture:
+    """White throughout."""
+    return lambda points: np.full((len(points), 3), 0.78)
+
+
+def checker(covering: Covering) -> Texture:
+    """Squares of black and white on everything: nothing is without an edge, and no two neighbours are alike."""
+    side = 0.04 if covering.role == "ground" else 0.02
+
+    def texture(points: Values) -> Values:
+        u, v = along_surface(covering, points)
+        sign = _waves(u, side) * _waves(v, side)
+        return (0.41 + 0.35 * sign)[:, None] * np.ones(3)
+
+    return texture
+
+
+def brick(covering: Covering) -> Texture:
+    """Bricks and ashlar, slates, lead; slabs on the ground."""
+    match covering.role:
+        case "wall":
+            return _courses(covering, (0.036, 0.014), (0.42, 0.13, 0.07), (0.55, 0.5, 0.42), 0.25)
+        case "stone":
+            return _courses(covering, (0.05, 0.022), (0.58, 0.47, 0.3), (0.34, 0.28, 0.2), 0.12)
+        case "roof":
+            return _courses(covering, (0.018, 0.012), (0.1, 0.12, 0.16), (0.05, 0.05, 0.06), 0.3)
+        case "dome":
+            return _courses(covering, (0.026, 0.024), (0.2, 0.36, 0.3), (0.12, 0.22, 0.18), 0.1)
+        case _:
+            return _courses(covering, (0.06, 0.06), (0.36, 0.34, 0.31), (0.2, 0.19, 0.17), 0.2)
+
+
+def market(covering: Covering) -> Texture:
+    """Saturated paint, awnings for roofs, a carpet of many colours."""
+    hue = _HUES[covering.building % len(_HUES)]
+    match covering.role:
+        case "ground":
+            return _patches(covering)
+        case "roof":
+            return _stripes(covering, hue, (0.75, 0.72, 0.66), 0.012)
+        case "stone":
+            return _stripes(covering, hue, _HUES[(covering.building + 3) % len(_HUES)], 0.03)
+        case _:
+            return _plain(hue)
+
+
+def town(covering: Covering) -> Texture:
+    """Plaster with windows, tiled roofs, sandstone, a copper dome; cobbles and grass."""
+    match covering.role:
+        case "wall":
+            return _windows(covering, _PLASTER[covering.building % len(_PLASTER)])
+        case "stone":
+            return _courses(covering, (0.044, 0.018), (0.62, 0.52, 0.36), (0.5, 0.41, 0.28), 0.08)
+        case "roof":
+            return _courses(covering, (0.014, 0.01), (0.45, 0.16, 0.08), (0.3, 0.1, 0.06), 0.2)
+        case "dome":
+            return _courses(covering, (0.026, 0.2), (0.22, 0.5, 0.4), (0.14, 0.34, 0.28), 0.0)
+        case _:
+            return _square_and_grass(covering)
+
+
+LOOKS: dict[str, Look] = {"paper": paper, "brick": brick, "market": market, "checker": checker, "town": town}
+
+_HUES: tuple[Color, ...] = (
+    (0.7, 0.05, 0.06),
+    (0.05, 0.2, 0.62),
+    (0.75, 0.5, 0.04),
+    (0.05, 0.42, 0.12),
+    (0.5, 0.06, 0.4),
+    (0.04, 0.45, 0.5),
+    (0.75, 0.25, 0.04),
+)
+_PLASTER: tuple[Color, ...] = ((0.7, 0.62, 0.46), (0.66, 0.46, 0.34), (0.72, 0.68, 0.6), (0.5, 0.56, 0.6))
+
+
+def _plain(color: Color) -> Texture:
+    return lambda points: np.ones((len(points), 1)) * np.array(color)
+
+
+def _courses(covering: Covering, size_m: tuple[float, float], face: Color, joint: Color, spread: float) -> Texture:
+    """Rows of bricks `size_m` long and high, each row half a brick on, of shades that differ by up to `spread`."""
+
+    def texture(points: Values) -> Values:
+        u, v = along_surface(covering, points)
+        row = np.floor(v / size_m[1])
+        u = u + row % 2 * size_m[0] / 2
+        column = np.floor(u / size_m[0])
+        edge_m = np.minimum(_to_edge(u, size_m[0]), _to_edge(v, size_m[1]))
+        shade = 1 + spread * (2 * _random(row, column, covering.building) - 1)
+        return _mix(joint, shade[:, None] * np.array(face), _step(edge_m - 0.0016))
+
+    return texture
+
+
+def _stripes(covering: Covering, one: Color, other: Color, width_m: float) -> Texture:
+    def texture(points: Values) -> Values:
+        u, _ = along_surface(covering, points)
+        return _mix(one, other, 0.5 + 0.5 * _waves(u, width_m))
+
+    return texture
+
+
+def _patches(covering: Covering) -> Texture:
+    """Squares of 5 cm, each of one hue."""
+
+    def texture(points: Values) -> Values:
+        u, v = along_surface(covering, points)
+        row, column = np.floor(v / 0.05), np.floor(u / 0.05)
+        colors = np.array(_HUES)[(_random(row, column, 7) * len(_HUES)).astype(int)]
+        return _mix((0.72, 0.66, 0.55), colors, _step(np.minimum(_to_edge(u, 0.05), _to_edge(v, 0.05)) - 0.003))
+
+    return texture
+
+
+def _windows(covering: Covering, plaster: Color) -> Texture:
+    """Rows of dark windows, 10 mm wide and 14 mm high."""
+
+    def texture(points: Values) -> Values:
+        u, v = along_surface(covering, points)
+        inside_m = np.minimum(_to_edge(u, 0.022) - 0.006, _to_edge(v, 0.026) - 0.006)
+        is_wall = np.abs(covering.solid.normals(points)[:, 1]) < 0.5
+        return _mix(plaster, (0.05, 0.07, 0.1), _step(inside_m) * is_wall)
+
+    return texture
+
+
+def _square_and_grass(covering: Covering) -> Texture:
+    """Cobbles, lighter on an oval square in the middle, grass outside of the roads around it."""
+    cobbles = _courses(covering, (0.02, 0.016), (0.42, 0.4, 0.37), (0.3, 0.28, 0.26), 0.15)
+
+    def texture(points: Values) -> Values:
+        x, _, z = points.T
+        away = np.hypot(x / 1.3, z) + 0.008 * np.sin(5 * np.arctan2(x, z))
+        grass = np.array([0.14, 0.26, 0.06]) * (1 + 0.15 * np.sin(70 * x) * np.sin(80 * z + 2))[:, None]
+        square = cobbles(points) * (1 + 0.4 * _step(0.12 - away))[:, None]
+        return square + (grass - square) * _step(away - 0.24)[:, None]
+
+    return texture
+
+
+def _mix(one: Color | Values, other: Color | Values, share: Values) -> Values:
+    return np.asarray(one) + (np.asarray(other) - np.asarray(one)) * share[:, None]
+
+
+def _step(distance_m: Values) -> Values:
+    """0 to 1 where `distance_m` passes 0, softly."""
+    return 0.5 + 0.5 * np.tanh(distance_m / SOFT_M)
+
+
+def _to_edge(position_m: Values, period_m: float) -> Values:
+    """How far inside its cell a position lies."""
+    within = position_m % period_m
+    return np.minimum(within, period_m - within)
+
+
+def _waves(position_m: Values, width_m: float) -> Values:
+    """-1 and 1 in turn, each `width_m` wide, with soft edges."""
+    return np.tanh(np.sin(np.pi * position_m / width_m) * width_m / (np.pi * SOFT_M))
+
+
+def _random(row: Values, column: Values, seed: int) -> Values:
+    """[n] in [0, 1), the same for the same cell: whole numbers hashed, so that every machine agrees."""
+    mixed = row.astype(np.int64) * 73_856_093 ^ column.astype(np.int64) * 19_349_663 ^ seed * 83_492_791
+    mixed &= 0xFFFF_FFFF
+    mixed = (mixed ^ mixed >> 13) * 1_274_126_177 & 0xFFFF_FFFF
+    return ((mixed ^ mixed >> 16) & 0xFFFF) / 65536

@@ -1,0 +1,105 @@
+"""Things that stand on the stage set on request: real in one sequence, so that they can be virtual in another.
+
+What a guest takes of the light is kept apart from the set's own shadows: a pixel that no guest touches is the same
+with it and without, bit for bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.synthetic.lighting.bake import (
+    bake,
+    blocked_directions,
+    buried_samples,
+    directions_near,
+    fill_buried,
+    seen_samples,
+    table_size,
+    tiles,
+)
+from client.synthetic.lighting.harmonics import COEFFICIENTS, basis
+from client.synthetic.solids.charts import Grid, atlas
+from client.synthetic.solids.polyhedra import Polyhedron, Solid, box, rotation_about
+from client.synthetic.solids.round import Sphere
+
+Floats = NDArray[np.float32]
+STEP_M = 0.002
+"""Between samples of the shadows on guests."""
+
+
+@dataclass(frozen=True)
+class Guest:
+    """A thing of one colour."""
+
+    name: str
+    solid: Sphere | Polyhedron
+    srgb: tuple[int, int, int]
+    """Eight bits, as a mesh file keeps its colour."""
+
+    @property
+    def albedo(self) -> NDArray[np.float64]:
+        """[3] linear."""
+        encoded = np.array(self.srgb) / 255
+        return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+    def texture(self, points: NDArray) -> NDArray:
+        """[n, 3] linear albedo."""
+        return np.broadcast_to(self.albedo, points.shape)
+
+
+_BALL = Guest("ball", Sphere(np.array([0.05, 0.045, 0.2]), 0.045), (212, 178, 120))
+_CRATE = Guest("crate", box((-0.07, 0.03, 0.19), (0.06, 0.06, 0.06), rotation_about("y", 25)), (190, 62, 48))
+
+GUESTS: dict[str, tuple[Guest, ...]] = {"none": (), "ball": (_BALL,), "crate": (_CRATE,), "both": (_BALL, _CRATE)}
+
+
+def guest_grids(guests: tuple[Guest, ...]) -> list[list[Grid]]:
+    """Over the guests themselves."""
+    return atlas([guest.solid.charts for guest in guests], STEP_M)
+
+
+def bake_guests(
+    guests: tuple[Guest, ...], solids: list[Solid], grids: list[list[Grid]], directions: Floats
+) -> dict[str, NDArray]:
+    """Occluded Lambert transfer: `around` [total, 16] what guests alone take from the set, `on` [total, 16] on guests.
+
+    `grids` lie over `solids`; `directions` [n, 3] float32, unit, evenly spread over the sphere.
+    """
+    things: list[Solid] = [guest.solid for guest in guests]
+    around = np.zeros((table_size(grids), COEFFICIENTS), np.float32)
+    for own, of_solid in enumerate(grids):
+        for part, grid in enumerate(of_solid):
+            around[grid.offset : grid.offset + grid.size] = _taken(things, solids, own, part, grid, directions)
+    return {"around": around, "on": bake([*things, *solids], guest_grids(guests), directions)}
+
+
+def _taken(things: list[Solid], solids: list[Solid], own: int, part: int, grid: Grid, directions: Floats) -> Floats:
+    """[samples, 16] of one grid: zero where no guest stands between it and light that nothing else keeps away."""
+    positions, normals, skip = seen_samples(solids[own], part, grid)
+    values = np.zeros((grid.rows, grid.columns, COEFFICIENTS), np.float32)
+    for piece in tiles(grid, len(directions)):
+        points, up = (of[piece].reshape(-1, 3).astype(np.float32) for of in (positions, normals))
+        near = directions[_towards(things, points, up, directions)]
+        taken = blocked_directions(things, None, points, near)
+        taken[:, taken.any(axis=0)] &= ~blocked_directions(solids, skip, points, near[taken.any(axis=0)])
+        if taken.any():
+            lost = taken * np.maximum(up @ near.T, 0)
+            values[piece] = (lost @ basis(near)).reshape(values[piece].shape) * np.float32(4 / len(directions))
+    if values.any():
+        fill_buried(values, buried_samples([*solids, *things], own, part, grid), grid.chart.wraps)
+    return values.reshape(-1, COEFFICIENTS)
+
+
+def _towards(things: list[Solid], points: Floats, up: Floats, directions: Floats) -> NDArray[np.bool_]:
+    """[directions] which of them may meet a guest above the horizon of some of the points."""
+    middle = points.mean(axis=0)
+    reach = float(np.linalg.norm(points - middle, axis=1).max())
+    near = np.zeros(len(directions), bool)
+    for thing in things:
+        near |= directions_near(thing, middle, directions, reach)
+    near[near] = (up @ directions[near].T > 0).any(axis=0)
+    return near

@@ -155,11 +155,20 @@ def stream(
     from client.options.room_options import room_place
     from client.streaming.client import Access
 
-    place = room_place(room, room_from_world, marker, room_key)
-    access = Access(token, tls_fingerprint, tls_ca)
-    others = {"frames": capture.frames, "mesh": mesh, "room": place, "access": access}
-    others["sending"] = Sending(adapt, depth_noise, view, video is not None)
-    done = send(capture.source, server, capture.objects, capture.wishes, out, lossless, record, **others)
+    done = send(
+        capture.source,
+        server,
+        capture.objects,
+        capture.wishes,
+        out,
+        lossless,
+        record,
+        frames=capture.frames,
+        mesh=mesh,
+        room=room_place(room, room_from_world, marker, room_key),
+        access=Access(token, tls_fingerprint, tls_ca),
+        sending=Sending(adapt, depth_noise, view, video is not None),
+    )
     written = f", written to {out}" if out is not None else ""
     speed = done.answered / done.seconds if done.seconds > 0 else 0.0
     say(
@@ -226,14 +235,16 @@ def serve(
     limits, authenticator, log_format = limits_of(options), authenticator_of(options), log_format_of(log)
     certificate = certificate_of(options)
     log_events(log_format)
-    kept_in = data_folder(data)
-    others = {
-        "limits": limits,
-        "authenticator": authenticator,
-        "certificate": certificate,
-        "objects": objects_folder(objects),
-    }
-    status = serve_forever(host, port, device, data=kept_in, **others)
+    status = serve_forever(
+        host,
+        port,
+        device,
+        data=data_folder(data),
+        limits=limits,
+        authenticator=authenticator,
+        certificate=certificate,
+        objects=objects_folder(objects),
+    )
     leave_soon(status)
     return status
 

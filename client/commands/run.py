@@ -70,6 +70,7 @@ def process_frames(pipeline: Processor, frames: Iterable[RgbdFrame]) -> Iterator
             result = pipeline.process(frame)
         except ValueError as error:
             raise RunError(f"frame {frame.index}: {error}") from error
+        assert result.color is not None  # `Wishes.answer` is picture
         yield FrameOutput(
             frame=frame.index,
             timestamp_s=frame.timestamp_s,

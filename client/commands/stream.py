@@ -31,7 +31,17 @@ from client.streaming.coding import Coding, picture_bytes
 from client.streaming.video import IS_POSSIBLE, VideoEncoder
 from protocol.frames import CameraModel
 from protocol.images import Color, decode_color
-from protocol.messages import ClientMessage, Dropped, Error, Layer, MeshFormat, ServerMessage, Welcome, Wishes
+from protocol.messages import (
+    ClientMessage,
+    Dropped,
+    Error,
+    Layer,
+    MeshFormat,
+    ObjectFormat,
+    ServerMessage,
+    Welcome,
+    Wishes,
+)
 from protocol.recording import write_message
 
 LOOK_S = 0.002
@@ -182,7 +192,7 @@ class _Stream:
         self._summary.server, self._summary.device = welcome.server, welcome.device
         self._summary.session = welcome.session
 
-    async def _place_objects(self, client: StreamClient, meshes: list[tuple[str, bytes]]) -> None:
+    async def _place_objects(self, client: StreamClient, meshes: list[tuple[ObjectFormat, bytes]]) -> None:
         for number, (item, (format_, data)) in enumerate(zip(self._job.objects, meshes, strict=True)):
             name = f"object-{number}" if self._job.room is None else f"{self._summary.session}-object-{number}"
             done = await client.place_object(name, format_, data, item.position_m, item.scale, item.yaw_deg)
@@ -379,7 +389,7 @@ def frame_output(answer: Answer, camera: CameraModel, own: Color | None = None) 
         assert own is not None
         color = put_over(decode_layer(drawn, camera), shown_picture(own, camera), camera)
     else:
-        color = decode_color(drawn.color, camera, "srgb8")
+        color = np.asarray(decode_color(drawn.color, camera, "srgb8"), np.uint8)
     return FrameOutput(
         frame=drawn.frame,
         timestamp_s=drawn.timestamp_s,

@@ -64,11 +64,12 @@ def decode_layer(layer: Layer, camera: CameraModel) -> DecodedLayer:
     if layer.virtual is not None:
         codes, depth_m = _read(layer.virtual, 4, camera, layer.depth_scale_m)
         coverage = np.float32(1 / 255) * codes[..., 3:]
-        values = np.concatenate([coverage * _LINEAR[codes[..., :3]], coverage], axis=-1)
+        values: Floats = np.concatenate([coverage * _LINEAR[codes[..., :3]], coverage], axis=-1)
         virtual = Part(layer.virtual.x, layer.virtual.y, values, depth_m)
     if layer.ratio is not None:
         codes, depth_m = _read(layer.ratio, 3, camera, layer.depth_scale_m)
-        ratio = Part(layer.ratio.x, layer.ratio.y, (codes.astype(np.float32) / NEUTRAL) ** 2 - 1, depth_m)
+        change = (codes.astype(np.float32) / np.float32(NEUTRAL)) ** 2 - np.float32(1)
+        ratio = Part(layer.ratio.x, layer.ratio.y, change, depth_m)
     return DecodedLayer(virtual, ratio, pose)
 
 
@@ -97,12 +98,13 @@ def shown_picture(color: NDArray[np.uint8] | NDArray[np.uint16], camera: CameraM
     """[h, w, 3] a frame's picture as layers are put over it: sRGB, as a camera without distortion sees it."""
     if not camera.is_distorted and color.dtype == np.uint8:
         return color.astype(np.uint8, copy=False)
-    linear = _LINEAR[color] if color.dtype == np.uint8 else color.astype(np.float32) / 65535
+    linear = _LINEAR[color] if color.dtype == np.uint8 else color.astype(np.float32) / np.float32(65535)
     if camera.is_distorted:
         matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
         size, lens = (camera.width, camera.height), np.array(camera.distortion)
         maps = cv2.initUndistortRectifyMap(matrix, lens, None, matrix, size, cv2.CV_32FC1)
-        linear = cv2.remap(linear, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        remapped = cv2.remap(linear, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        linear = np.asarray(remapped, np.float32)
     return _srgb_codes(linear)
 
 
@@ -185,7 +187,8 @@ def _corner_depths(depth_m: Floats) -> Floats:
         goes_on = np.stack([(goes_on[k][:, None] & goes_on).any(axis=0) for k in range(4)])
     inverse = np.divide(1, z, out=np.zeros_like(z), where=z > 0)
     total = np.where(goes_on, inverse[None], 0).sum(axis=1)
-    return np.divide(goes_on.sum(axis=1), total, out=np.zeros_like(z), where=total > 0)
+    means: Floats = np.divide(goes_on.sum(axis=1), total, out=np.zeros_like(z), where=total > 0)
+    return means
 
 
 def _drawn(corners: Floats, places: Floats, camera: CameraModel) -> tuple[Floats, Floats]:

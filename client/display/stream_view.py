@@ -95,7 +95,8 @@ class StreamView:
     def _columns(self, picture: NDArray[np.uint8]) -> int:
         """As many as leave room for the table below."""
         rows = max(self._live.console.height - TABLE_ROWS, 4)
-        return max(min(PICTURE_COLUMNS, self._live.console.width, 2 * rows * picture.shape[1] // picture.shape[0]), 8)
+        fitting: int = 2 * rows * picture.shape[1] // picture.shape[0]
+        return max(min(PICTURE_COLUMNS, self._live.console.width, fitting), 8)
 
     def _table(self, light: Light, drawn: Composite | Layer | None) -> Table:
         table = Table.grid(padding=(0, 2))

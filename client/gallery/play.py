@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
+from typing import Any
+
+from msgspec import structs
 
 from client.gallery.source import GallerySource
 from client.sources.volume import default_volume
@@ -16,23 +19,23 @@ from server.scene.placement import Placement
 VOXEL_M = 0.02
 
 
-def wishes_of(source: GallerySource, **others: object) -> Wishes:
-    """What a session of this scene asks for; `others` besides, which count more."""
-    asked = {
-        "volume_m": default_volume(source, range(len(source))),
-        "voxel_m": VOXEL_M,
-        "up": source.up,
-        "albedo": "estimated",
-        "indirect": "observed",
-        "light": source.light,
-        "lamps": "off",
-        **source.scene.wishes,
-        **others,
-    }
-    return Wishes(**asked)  # type: ignore[arg-type]
+def wishes_of(source: GallerySource, **changes: Any) -> Wishes:
+    """Wishes of a session that shows this scene, with `changes` to single fields."""
+    wishes = Wishes(
+        volume_m=default_volume(source, range(len(source))),
+        voxel_m=VOXEL_M,
+        up=source.up,
+        albedo="estimated",
+        indirect="observed",
+        light=source.light,
+        lamps="off",
+        poses=source.scene.poses,
+        tone_mapping=source.scene.tone_mapping,
+    )
+    return structs.replace(wishes, **changes)
 
 
-def play(device: Device, source: GallerySource, wishes: Wishes) -> Iterator[tuple[ClientSession, FrameResult]]:
+def play(device: Device, source: GallerySource, wishes: Wishes) -> Generator[tuple[ClientSession, FrameResult]]:
     """Every frame's result, and the pipeline that it is of, which is closed after the last."""
     pipeline = ClientSession(device, source.camera, wishes)
     try:

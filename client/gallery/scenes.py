@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from client.gallery.objects import Rgb, Thing
 from client.synthetic.solids.polyhedra import Solid, box
 from client.synthetic.solids.round import Sphere
 from client.synthetic.solids.shell import Opening, Shell
+from protocol.messages import Poses
 from server.maths.directional_fit import directional_sh
 
 Floats = NDArray[np.float64]
@@ -85,7 +86,8 @@ class GalleryScene:
     """Effects that it hangs on the noise whether a frame calls for."""
     settles: range = range(0)
     """Frames in which it hangs on the noise whether it rests."""
-    wishes: Mapping[str, Any] = field(default_factory=dict)
+    poses: Poses = "given"
+    tone_mapping: Literal["auto", "light", "average"] = "auto"
 
 
 def sky(brightness: float) -> Floats:
@@ -278,7 +280,7 @@ GALLERY: dict[str, GalleryScene] = {
         _always({"composite"}),
         **_NOISE,
         rests=range(SETTLED_NOISY, STILL_FRAMES),
-        wishes={"poses": "track"},
+        poses="track",
     ),
     "moved-while-still": GalleryScene(
         "the same box, which is moved after a while",
@@ -319,6 +321,6 @@ GALLERY: dict[str, GalleryScene] = {
         _always(_STANDS, {"match_average", "bounce_real"}),
         (_BALL,),
         walk_m=0.0,
-        wishes={"tone_mapping": "average"},
+        tone_mapping="average",
     ),
 }

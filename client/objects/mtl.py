@@ -69,32 +69,42 @@ def read_materials(path: Path) -> dict[str, Material]:
             case ["newmtl", *words]:
                 name = " ".join(words)
                 materials[name] = Material()
-            case [key, *words] if name in materials and key in _MAPS and words:
-                materials[name] = replace(materials[name], **{_MAPS[key]: _texture_map(path, words)})  # type: ignore[arg-type]
-            case [
-                ("map_Ns" | "map_Ks" | "map_d" | "map_Bump" | "map_bump" | "norm") as key,
-                *_,
-            ] if name in materials:
-                materials[name] = replace(materials[name], unread=materials[name].unread | {key})
-            case [key, *words] if name in materials and key in _FIELDS:
-                field, count = _FIELDS[key]
-                values = _numbers(path, number, key, words, count)
-                if key != "Ns":
-                    values = [min(max(value, 0.0), 1.0) for value in values]
-                change = {field: tuple(values) if count > 1 else values[0]}
-                materials[name] = replace(materials[name], **change)  # type: ignore[arg-type]
+            case [key, *words] if name in materials:
+                materials[name] = _with_entry(materials[name], path, number, key, words)
     return materials
 
 
-_FIELDS = {
-    "Kd": ("color", 3),
-    "Ks": ("specular", 3),
-    "Ns": ("exponent", 1),
-    "Pr": ("given_roughness", 1),
-    "Pm": ("given_metalness", 1),
-}
-"""By the MTL's name: the field of Material, and how many numbers it has."""
-_MAPS = {"map_Kd": "texture", "map_Pr": "roughness_map", "map_Pm": "metalness_map"}
+def _with_entry(material: Material, path: Path, number: int, key: str, words: list[str]) -> Material:
+    """The material with one line of the library added. Raises ObjectError."""
+    match key:
+        case "Kd":
+            material = replace(material, color=_rgb(path, number, key, words))
+        case "Ks":
+            material = replace(material, specular=_rgb(path, number, key, words))
+        case "Ns":
+            material = replace(material, exponent=_numbers(path, number, key, words, 1)[0])
+        case "Pr":
+            material = replace(material, given_roughness=_clipped(_numbers(path, number, key, words, 1)[0]))
+        case "Pm":
+            material = replace(material, given_metalness=_clipped(_numbers(path, number, key, words, 1)[0]))
+        case "map_Kd" if words:
+            material = replace(material, texture=_texture_map(path, words))
+        case "map_Pr" if words:
+            material = replace(material, roughness_map=_texture_map(path, words))
+        case "map_Pm" if words:
+            material = replace(material, metalness_map=_texture_map(path, words))
+        case "map_Ns" | "map_Ks" | "map_d" | "map_Bump" | "map_bump" | "norm":
+            material = replace(material, unread=material.unread | {key})
+    return material
+
+
+def _rgb(path: Path, number: int, key: str, words: list[str]) -> tuple[float, float, float]:
+    red, green, blue = (_clipped(value) for value in _numbers(path, number, key, words, 3))
+    return red, green, blue
+
+
+def _clipped(value: float) -> float:
+    return min(max(value, 0.0), 1.0)
 
 
 def _numbers(path: Path, number: int, key: str, words: list[str], count: int) -> list[float]:
@@ -103,7 +113,7 @@ def _numbers(path: Path, number: int, key: str, words: list[str], count: int) ->
     except ValueError:
         values = []
     if len(values) < count or not np.isfinite(values).all():
-        counted = {1: "one number", 2: "two numbers", 3: "three numbers"}[count]
+        counted = {1: "one number", 3: "three numbers"}[count]
         raise ObjectError(f"{path}, line {number}: {key} needs {counted}")
     return values
 

@@ -144,7 +144,8 @@ def _primitive(document: dict[str, Any], body: bytearray, model: _Model, group: 
     if (corners[:, 1] >= 0).all():
         uv = _floats([model.coordinates[i] for i in corners[:, 1]], 2)
         # OBJ counts v from the bottom, glTF from the top.
-        attributes["TEXCOORD_0"] = glb.add_array(document, body, uv * np.float32([1, -1]) + np.float32([0, 1]))
+        flipped = uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)
+        attributes["TEXCOORD_0"] = glb.add_array(document, body, flipped)
     indices = np.array(group.triangles, np.uint32).ravel()
     return {"attributes": attributes, "indices": glb.add_array(document, body, indices)}
 

@@ -10,6 +10,7 @@ from client.errors import ObjectError
 from client.objects import obj_to_glb
 from client.objects.glb import check_glb, gltf_to_glb
 from protocol.limits import MAX_MESH_BYTES
+from protocol.messages import ObjectFormat
 
 FORMATS = ("glb", "gltf", "obj", "ply", "stl")
 LARGEST_SCALE = 1000.0
@@ -40,7 +41,7 @@ def parse_object(text: str) -> ObjectFile:
     return ObjectFile(_existing(name), (numbers[0], numbers[1], numbers[2]), scale, yaw_deg)
 
 
-def pack_mesh(path: Path) -> tuple[str, bytes]:
+def pack_mesh(path: Path) -> tuple[ObjectFormat, bytes]:
     """(format, bytes) of a mesh file for one message: glb, obj, ply or stl.
 
     GLB, PLY, STL and an OBJ without materials go as they are; glTF and an OBJ with its materials and textures become
@@ -84,16 +85,16 @@ def _numbers(text: str, place: str) -> list[float]:
     return numbers
 
 
-def _pack_glb(path: Path, data: bytes) -> tuple[str, bytes]:
+def _pack_glb(path: Path, data: bytes) -> tuple[ObjectFormat, bytes]:
     check_glb(path, data)
     return "glb", data
 
 
-def _pack_gltf(path: Path, data: bytes) -> tuple[str, bytes]:
+def _pack_gltf(path: Path, data: bytes) -> tuple[ObjectFormat, bytes]:
     return "glb", gltf_to_glb(path, data)
 
 
-def _pack_obj(path: Path, data: bytes) -> tuple[str, bytes]:
+def _pack_obj(path: Path, data: bytes) -> tuple[ObjectFormat, bytes]:
     text = data.decode("utf-8", errors="replace")
     kinds = {line.split(maxsplit=1)[0] for line in text.splitlines() if line.strip()}
     if not {"v", "f"} <= kinds:
@@ -105,14 +106,14 @@ def _pack_obj(path: Path, data: bytes) -> tuple[str, bytes]:
     return "obj", data
 
 
-def _pack_ply(path: Path, data: bytes) -> tuple[str, bytes]:
+def _pack_ply(path: Path, data: bytes) -> tuple[ObjectFormat, bytes]:
     header = data[:65536]
     if not header.startswith(b"ply") or b"end_header" not in header or b"element vertex" not in header:
         raise ObjectError(f"{path}: is no PLY mesh, its header is not PLY's")
     return "ply", data
 
 
-def _pack_stl(path: Path, data: bytes) -> tuple[str, bytes]:
+def _pack_stl(path: Path, data: bytes) -> tuple[ObjectFormat, bytes]:
     triangles = int.from_bytes(data[80:84], "little") if len(data) >= 84 else 0
     binary = triangles > 0 and len(data) >= 84 + 50 * triangles
     text = data.lstrip().startswith(b"solid") and b"facet" in data

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import typer
 
@@ -13,9 +13,9 @@ from protocol.limits import MAX_SH_BANDS
 from protocol.messages import Preset as PresetName
 from protocol.messages import Robustness as RobustnessName
 
-PRESETS = get_args(PresetName)
-DENOISE = ("none", "bilateral", "tv_l1")
-ROBUSTNESS = get_args(RobustnessName)
+PRESETS: tuple[PresetName, ...] = get_args(PresetName)
+DENOISE: tuple[Literal["none", "bilateral", "tv_l1"], ...] = ("none", "bilateral", "tv_l1")
+ROBUSTNESS: tuple[RobustnessName, ...] = get_args(RobustnessName)
 
 SourceArgument = Annotated[
     str, typer.Argument(metavar="SOURCE", help="data-set folder, synthetic:NAME, recording or oak[?vio=off]")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import zlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -39,7 +40,7 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
     return picture
 
 
-def _decode(path: Path, flags: int) -> NDArray:
+def _decode(path: Path, flags: int) -> NDArray[Any]:
     data = _read_bytes(path)
     _require_complete(data, path)
     try:
@@ -62,7 +63,7 @@ def _read_bytes(path: Path) -> bytes:
     return data
 
 
-def _require_size(picture: NDArray, path: Path) -> None:
+def _require_size(picture: NDArray[Any], path: Path) -> None:
     height, width = picture.shape[:2]
     if max(height, width) > MAX_IMAGE_SIDE_PX or height * width > MAX_IMAGE_PIXELS:
         raise SourceError(f"{path}: {width}x{height} is more than the {MAX_IMAGE_PIXELS} pixels a frame may have")

@@ -78,7 +78,8 @@ def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     )
     best = candidates[np.argmax(np.diag(candidates))]
     leading = next(x for x in best[[3, 0, 1, 2]] if x != 0)
-    return best / np.copysign(np.linalg.norm(best), leading)
+    unit: NDArray[np.float64] = best / np.copysign(np.linalg.norm(best), leading)
+    return unit
 
 
 def read_text(path: Path) -> str:
@@ -105,7 +106,7 @@ def float_of(word: str, where: str) -> float:
         raise SourceError(f"{where}: {word!r} is not a number") from None
 
 
-def _from_quaternion(translation: NDArray, xyzw: NDArray, where: str) -> NDArray[np.float64]:
+def _from_quaternion(translation: NDArray[np.float64], xyzw: NDArray[np.float64], where: str) -> NDArray[np.float64]:
     norm = np.linalg.norm(xyzw)
     if not np.isfinite((*translation, norm)).all() or abs(norm - 1) > 0.01:
         raise SourceError(f"{where}: the pose has NaN or its quaternion is not of length 1")

@@ -57,7 +57,7 @@ def spacing_m(points: Floats) -> float:
         raise RunError(f"{len(points)} points are too few for a model: give more --frames or a smaller --voxel")
     chosen = points[:: max(len(points) // 20_000, 1)]
     distances, _ = _tree(points).query(chosen, k=[DENSITY_NEIGHBOURS + 1])
-    return float(np.median(distances)) * np.sqrt(np.pi / DENSITY_NEIGHBOURS)
+    return float(np.median(distances) * np.sqrt(np.pi / DENSITY_NEIGHBOURS))
 
 
 def chosen_radius_m(spacing: float, noise: float) -> float:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from client.errors import SourceError
 from client.sources.volume import TRUSTED_DEPTH_M
 from protocol.frames import CameraModel, DepthCamera, RgbdFrame
+from protocol.images import Color
 
 Floats = NDArray[np.float64]
 
@@ -63,7 +64,7 @@ class CloudFusion:
         if frame.world_from_camera is None:
             raise SourceError(f"frame {frame.index} has no pose; a model needs a source with poses")
         self.frames += 1
-        depth_m = frame.depth * self._camera.depth_scale_m
+        depth_m = frame.depth.astype(np.float64) * self._camera.depth_scale_m
         usable = usable_pixels(depth_m)
         if not usable.any():
             return
@@ -99,9 +100,7 @@ class CloudFusion:
         towards = means[:, 6:] / np.where(lengths > 0, lengths, 1.0)
         return PointCloud(means[:, :3], means[:, 3:6], towards, sums[:, _COLUMNS], frames)
 
-    def _colors(
-        self, frame: RgbdFrame, usable: NDArray[np.bool_], in_lens: Floats
-    ) -> tuple[NDArray, NDArray[np.bool_]]:
+    def _colors(self, frame: RgbdFrame, usable: NDArray[np.bool_], in_lens: Floats) -> tuple[Color, NDArray[np.bool_]]:
         """The pixel [n, 3] that shows each point [n, 3] of the depth lens's space, and [n] whether there is one."""
         if self._camera.depth is None:
             return frame.color[usable], np.ones(len(in_lens), np.bool_)
@@ -159,7 +158,7 @@ def usable_pixels(depth_m: Floats) -> NDArray[np.bool_]:
     return usable
 
 
-def linear_colors(color: NDArray, camera: CameraModel) -> Floats:
+def linear_colors(color: Color, camera: CameraModel) -> Floats:
     """Linear RGB in [0, 1] of pixels [n, 3] in the camera's encoding."""
     if camera.color_encoding == "linear16":
         return color / 65535.0

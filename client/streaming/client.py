@@ -34,6 +34,7 @@ from protocol.messages import (
     MeshFormat,
     MeshPart,
     MoveObject,
+    ObjectFormat,
     PlaceObject,
     Preset,
     Quality,
@@ -245,7 +246,7 @@ class StreamClient:
     async def place_object(
         self,
         name: str,
-        format_: str,
+        format_: ObjectFormat,
         data: bytes,
         position_m: Vector3 | None = None,
         scale: float = 1.0,
@@ -475,8 +476,12 @@ class StreamClient:
     def _ends_answer(self, message: ServerMessage) -> TypeGuard[Composite | Layer | Light | Dropped]:
         """Whether nothing else comes for its frame."""
         if isinstance(message, Light):
-            return self._hello is not None and self._hello.wishes.answer == "light"
+            return self._expects_light_only
         return isinstance(message, Composite | Layer | Dropped)
+
+    @property
+    def _expects_light_only(self) -> bool:
+        return self._hello is not None and self._hello.wishes.answer == "light"
 
     async def _take(self, message: ServerMessage) -> None:
         if self._tap is not None:
@@ -490,16 +495,14 @@ class StreamClient:
                 self._max_inflight = message.max_inflight
             case Light():
                 self._light = message
-                if self._ends_answer(message):
-                    await self._deliver(Answer(message))
-                    self._unanswered.pop(message.frame, None)
-            case Composite() | Layer() if self._light is not None:
-                drawn = {"layer" if isinstance(message, Layer) else "composite": message}
-                await self._deliver(Answer(self._light, **drawn))
-                self._unanswered.pop(message.frame, None)
+                if self._expects_light_only:
+                    await self._finish(message.frame, Answer(message))
+            case Composite() if self._light is not None:
+                await self._finish(message.frame, Answer(self._light, composite=message))
+            case Layer() if self._light is not None:
+                await self._finish(message.frame, Answer(self._light, layer=message))
             case Dropped():
-                await self._deliver(message)
-                self._unanswered.pop(message.frame, None)
+                await self._finish(message.frame, message)
             case MeshPart() if self._mesh is not None:
                 self._mesh.add(message)
             case Acknowledged() if message.request in self._unacknowledged:
@@ -509,6 +512,11 @@ class StreamClient:
                 await self._deliver(message)
             case Error() | Bye():
                 self._reason_given = message.reason
+
+    async def _finish(self, frame: int, answer: Answer | Dropped) -> None:
+        """Deliver the last message about a frame."""
+        await self._deliver(answer)
+        self._unanswered.pop(frame, None)
 
     async def _deliver(self, answer: Answer | Dropped | Error) -> None:
         """Keep an answer for `answers`, once there is room for it."""

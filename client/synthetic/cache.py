@@ -11,6 +11,7 @@ import zipfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from platformdirs import user_cache_dir
 
 from client.progress import note
 
-Tables = dict[str, NDArray]
+Tables = dict[str, NDArray[Any]]
 KEPT_VERSIONS = 4
 _UNUSABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 
@@ -65,7 +66,7 @@ def _load(path: Path) -> Tables:
 def _store(path: Path, tables: Tables) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-        np.savez(file, digest=np.frombuffer(_digest(tables), np.uint8), **tables)
+        np.savez(file, allow_pickle=False, digest=np.frombuffer(_digest(tables), np.uint8), **tables)
     os.replace(file.name, path)
     versions = sorted(path.parent.glob(f"{path.name.rpartition('-')[0]}-*.npz"), key=lambda p: p.stat().st_mtime)
     for old in versions[:-KEPT_VERSIONS]:

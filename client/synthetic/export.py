@@ -80,7 +80,9 @@ def _ply(mesh: Triangles, srgb: tuple[int, int, int] | None = None) -> bytes:
     made = trimesh.Trimesh(
         mesh.vertices, mesh.faces, vertex_normals=mesh.normals, vertex_colors=colors, process=False, validate=False
     )
-    return bytes(made.export(file_type="ply", vertex_normal=True))
+    data = made.export(file_type="ply", vertex_normal=True)
+    assert isinstance(data, bytes)
+    return data
 
 
 def _meta(source: SyntheticSource, frames: int) -> dict[str, Any]:
@@ -103,7 +105,7 @@ def _meta(source: SyntheticSource, frames: int) -> dict[str, Any]:
 
 
 def _write_truth(folder: Path, source: SyntheticSource, bare: list[Truth], with_guests: list[Truth]) -> None:
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "depth_m": np.stack([truth.depth_m for truth in bare]),
         "normal_in_world": np.stack([truth.normals for truth in bare]).astype(_NORMAL),
         "albedo_textured": np.stack([truth.albedo for truth in bare]).astype(_ALBEDO),
@@ -116,7 +118,7 @@ def _write_truth(folder: Path, source: SyntheticSource, bare: list[Truth], with_
             "virtual_albedo": (albedo * masks[..., None]).astype(_ALBEDO),
             "depth_with_virtual_m": np.stack([truth.depth_m for truth in with_guests]),
         }
-    np.savez_compressed(folder / "geometry.npz", **arrays)
+    np.savez_compressed(folder / "geometry.npz", allow_pickle=False, **arrays)
     guests = [{"name": guest.name, "srgb": guest.srgb, "albedo": guest.albedo.tolist()} for guest in source.guests]
     _write_json(folder / "scene.json", {"synthetic": asdict(source.options), "guests": guests})
     if can_tessellate(source.scene.solids):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+Floats = NDArray[np.float64]
+
 JITTER_PX = 0.5
 DISPARITY_NOISE_PX = 0.06
 DISPARITY_STEP_PX = 1 / 8
@@ -14,7 +16,7 @@ DROPOUT_FROM_COSINE, DROPOUT_ALWAYS_COSINE = 0.35, 0.1
 SEED = 20150923
 
 
-def kinect_like(depth_m: NDArray[np.float64], cosines: NDArray[np.float64], focal_px: float, index: int) -> NDArray:
+def kinect_like(depth_m: Floats, cosines: Floats, focal_px: float, index: int) -> Floats:
     """[h, w] metres with 0 = none, from exact depth (0 = none) and the cosine between surface and ray.
 
     The same for the same frame `index`.

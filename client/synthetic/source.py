@@ -129,7 +129,7 @@ class SyntheticSource:
             lamplight=exposure * rendering.lamplight,
         )
 
-    def _bake(self) -> dict[str, NDArray]:
+    def _bake(self) -> dict[str, NDArray[np.float32]]:
         directions = sphere_directions(self.scene.directions).astype(np.float32)
         return {"occluded": bake(self.scene.solids, self._grids, directions)}
 
@@ -139,7 +139,7 @@ class SyntheticSource:
         return cached(self.scene.name, self._bake)["occluded"]
 
     @cached_property
-    def _guest_transfer(self) -> dict[str, NDArray]:
+    def _guest_transfer(self) -> dict[str, NDArray[np.float32]]:
         """Occluded transfer that the guests cause, and on them, see bake_guests."""
         directions = sphere_directions(self.scene.directions).astype(np.float32)
         return cached(
@@ -201,7 +201,8 @@ class SyntheticSource:
         """[h, w] cosine between the surface and the ray."""
         rays = self._rays @ pose[:3, :3].T
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        return -(rays.reshape(rendering.normals.shape) * rendering.normals).sum(axis=-1)
+        cosines: NDArray[np.float64] = -(rays.reshape(rendering.normals.shape) * rendering.normals).sum(axis=-1)
+        return cosines
 
 
 def to_srgb8(radiance: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -92,7 +92,8 @@ class Stage:
             pipeline.close()
         return found
 
-    def _difference(self, index: int, shown: NDArray[np.uint8]) -> float:
+    def _difference(self, index: int, shown: NDArray[np.uint8] | None) -> float:
+        assert shown is not None  # `Wishes.answer` is picture
         mask = self._changed[index]
         return float(np.abs(shown[mask].astype(np.float64) - self._composites[index][mask]).mean())
 

@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Protocol
 
 from client.errors import SourceError
 from client.sources.datasets import ground_truth, redwood, seven_scenes, tum
 from client.sources.datasets.folder import FolderSource
 
-LAYOUTS = (ground_truth, tum, seven_scenes, redwood)
-"""Each has LOOKED_FOR (words for the user), `recognises(folder)` and `open_folder(folder)`."""
+
+class Layout(Protocol):
+    """Interface of a module that reads one layout."""
+
+    LOOKED_FOR: str
+    """Files that identify the layout, for error messages."""
+
+    def recognises(self, folder: Path) -> bool: ...
+
+    def open_folder(self, folder: Path) -> FolderSource: ...
+
+
+LAYOUTS: tuple[Layout, ...] = (ground_truth, tum, seven_scenes, redwood)
 
 
 def open_folder(folder: Path) -> FolderSource:

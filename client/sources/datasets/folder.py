@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,7 @@ class FolderSource:
         number = range(len(self))[index]
         return RgbdFrame(number, files.timestamp_s, color, depth, pose, files.exposure)
 
-    def _require_match(self, files: FrameFiles, color: NDArray, depth: NDArray) -> None:
+    def _require_match(self, files: FrameFiles, color: NDArray[Any], depth: NDArray[Any]) -> None:
         camera, lens = self.camera, self.camera.depth_lens
         if camera.depth is None and color.shape[:2] != depth.shape:
             raise SourceError(f"{files.color}: colour is {_size(color)} but {files.depth.name} is {_size(depth)}")
@@ -84,5 +85,5 @@ def is_numbered_folder(folder: Path, suffixes: tuple[str, ...]) -> bool:
     return folder.is_dir() and any(p.suffix.lower() in suffixes and p.stem.isdecimal() for p in folder.iterdir())
 
 
-def _size(picture: NDArray) -> str:
+def _size(picture: NDArray[Any]) -> str:
     return f"{picture.shape[1]}x{picture.shape[0]}"

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from client.errors import SourceError
 from client.sources.datasets import intrinsics
 from client.sources.datasets.folder import COLOR_SUFFIXES, FolderSource, FrameFiles, is_numbered_folder, numbered
@@ -39,7 +42,7 @@ def open_folder(folder: Path) -> FolderSource:
     return FolderSource(folder.resolve().name, camera, FPS, bool(poses), None, frames)
 
 
-def _poses(folder: Path, count: int) -> dict:
+def _poses(folder: Path, count: int) -> dict[int, NDArray[np.float64]]:
     path = folder / "trajectory.log"
     if not path.is_file():
         return {}

@@ -7,6 +7,7 @@ minus this. So whatever sees its whole hemisphere is exact, and only shadows car
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from client.synthetic.lighting.harmonics import COEFFICIENTS, basis
 from client.synthetic.solids.carved import CLEARANCE_M, Carved
 from client.synthetic.solids.charts import Grid
-from client.synthetic.solids.polyhedra import Solid
+from client.synthetic.solids.polyhedra import Points, Solid
 from client.synthetic.solids.shell import Shell
 
 RAYS_AT_ONCE = 65536
@@ -46,7 +47,11 @@ def table_size(atlas: list[list[Grid]]) -> int:
 
 
 def blocked_directions(
-    solids: list[Solid], skip: Solid | None, points: Floats, directions: Floats, wanted: NDArray[np.bool_] | None = None
+    solids: Sequence[Solid],
+    skip: Solid | None,
+    points: Floats,
+    directions: Floats,
+    wanted: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.bool_]:
     """[points, directions] True where any solid but `skip` stands in the way of unit `directions`.
 
@@ -79,10 +84,11 @@ def directions_near(solid: Solid, middle: Floats, directions: Floats, reach: flo
     if distance <= radius + reach:
         return everything
     cone = np.sqrt(1 - ((radius + reach) / distance) ** 2)
-    return directions @ (offset / distance).astype(np.float32) > cone - 1e-4
+    near: NDArray[np.bool_] = directions @ (offset / distance).astype(np.float32) > cone - 1e-4
+    return near
 
 
-def seen_samples(solid: Solid, part: int, grid: Grid) -> tuple[NDArray, NDArray, Solid | None]:
+def seen_samples(solid: Solid, part: int, grid: Grid) -> tuple[Points, Points, Solid | None]:
     """Where shadow rays from a chart's grid start, the surface's normals there, and which solid they cannot meet."""
     positions, normals = grid.samples()
     if isinstance(solid, Carved):
@@ -111,7 +117,7 @@ def _bake_grid(solids: list[Solid], own: int, part: int, grid: Grid, directions:
     return values.reshape(-1, COEFFICIENTS)
 
 
-def _rises_above(solid: Solid, point: NDArray, normal: NDArray) -> bool:
+def _rises_above(solid: Solid, point: Points, normal: Points) -> bool:
     """Some of it may be above the horizon of a flat face."""
     return solid.bounds is None or bool((solid.bounds[0] - point) @ normal > -solid.bounds[1])
 
@@ -120,8 +126,8 @@ def _lost(
     solids: list[Solid],
     skip: Solid | None,
     grid: Grid,
-    positions: list[NDArray],
-    normals: list[NDArray],
+    positions: list[Points],
+    normals: list[Points],
     directions: Floats,
 ) -> Floats:
     """[samples, directions] 1 where a direction is blocked, times the cosine on surfaces that are not flat."""
@@ -132,7 +138,7 @@ def _lost(
             lost.append(blocked_directions(solids, skip, points, directions).astype(np.float32))
         else:
             cosines = ups.reshape(-1, 3).astype(np.float32) @ directions.T
-            facing = (cosines > 0).any(axis=0)
+            facing: NDArray[np.bool_] = np.any(cosines > 0, axis=0)
             lost.append(blocked_directions(solids, skip, points, directions, facing) * np.maximum(cosines, 0))
     return np.concatenate(lost)
 
@@ -160,7 +166,7 @@ def buried_samples(solids: list[Solid], own: int, part: int, grid: Grid) -> NDAr
     return inside.reshape(positions.shape[:2])
 
 
-def fill_buried(values: NDArray, buried: NDArray[np.bool_], wraps: bool) -> None:
+def fill_buried(values: Floats, buried: NDArray[np.bool_], wraps: bool) -> None:
     """Give buried samples, in place, the mean of their neighbours that are not: interpolation near them reads both."""
     unknown = buried.copy()
     for _ in range(FILL_PASSES):
@@ -171,9 +177,12 @@ def fill_buried(values: NDArray, buried: NDArray[np.bool_], wraps: bool) -> None
         unknown &= ~fresh
 
 
-def _around(values: NDArray, wraps: bool) -> NDArray:
+def _around(values: Floats, wraps: bool) -> Floats:
     """The sum over the 3x3 neighbourhood."""
     padded = np.pad(values, ((0, 0), (1, 1), (0, 0)), mode="wrap" if wraps else "constant")
     padded = np.pad(padded, ((1, 1), (0, 0), (0, 0)))
     rows, columns = values.shape[:2]
-    return sum(padded[r : r + rows, c : c + columns] for r in range(3) for c in range(3))
+    total = np.zeros_like(values)
+    for row, column in np.ndindex(3, 3):
+        total += padded[row : row + rows, column : column + columns]
+    return total

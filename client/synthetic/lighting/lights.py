@@ -76,7 +76,7 @@ def _disc_zonal() -> NDArray[np.float64]:
     facing_disc = disc @ (np.array([1, 2 / 3, 1 / 4, 0]) * _ZONAL_NORM)
     floor = 0.5 * AMBIENT_SHARE / (1 - AMBIENT_SHARE) * facing_disc
     for strength in np.linspace(0, 2, 401):
-        windowed = disc / (1 + strength * (_BANDS * (_BANDS + 1)) ** 2 / 36)
+        windowed: NDArray[np.float64] = disc / (1 + strength * (_BANDS * (_BANDS + 1)) ** 2 / 36)
         if (legendre @ windowed).min() >= -floor:
             return windowed
     raise AssertionError("no window makes the light positive")

@@ -200,29 +200,34 @@ def _square_and_grass(covering: Covering) -> Texture:
         away = np.hypot(x / 1.3, z) + 0.008 * np.sin(5 * np.arctan2(x, z))
         grass = np.array([0.14, 0.26, 0.06]) * (1 + 0.15 * np.sin(70 * x) * np.sin(80 * z + 2))[:, None]
         square = cobbles(points) * (1 + 0.4 * _step(0.12 - away))[:, None]
-        return square + (grass - square) * _step(away - 0.24)[:, None]
+        mixed: Values = square + (grass - square) * _step(away - 0.24)[:, None]
+        return mixed
 
     return texture
 
 
 def _mix(one: Color | Values, other: Color | Values, share: Values) -> Values:
-    return np.asarray(one) + (np.asarray(other) - np.asarray(one)) * share[:, None]
+    mixed: Values = np.asarray(one) + (np.asarray(other) - np.asarray(one)) * share[:, None]
+    return mixed
 
 
 def _step(distance_m: Values) -> Values:
     """0 to 1 where `distance_m` passes 0, softly."""
-    return 0.5 + 0.5 * np.tanh(distance_m / SOFT_M)
+    share: Values = 0.5 + 0.5 * np.tanh(distance_m / SOFT_M)
+    return share
 
 
 def _to_edge(position_m: Values, period_m: float) -> Values:
     """How far inside its cell a position lies."""
     within = position_m % period_m
-    return np.minimum(within, period_m - within)
+    distance: Values = np.minimum(within, period_m - within)
+    return distance
 
 
 def _waves(position_m: Values, width_m: float) -> Values:
     """-1 and 1 in turn, each `width_m` wide, with soft edges."""
-    return np.tanh(np.sin(np.pi * position_m / width_m) * width_m / (np.pi * SOFT_M))
+    wave: Values = np.tanh(np.sin(np.pi * position_m / width_m) * width_m / (np.pi * SOFT_M))
+    return wave
 
 
 def _random(row: Values, column: Values, seed: int) -> Values:
@@ -230,4 +235,5 @@ def _random(row: Values, column: Values, seed: int) -> Values:
     mixed = row.astype(np.int64) * 73_856_093 ^ column.astype(np.int64) * 19_349_663 ^ seed * 83_492_791
     mixed &= 0xFFFF_FFFF
     mixed = (mixed ^ mixed >> 13) * 1_274_126_177 & 0xFFFF_FFFF
-    return ((mixed ^ mixed >> 16) & 0xFFFF) / 65536
+    numbers: Values = ((mixed ^ mixed >> 16) & 0xFFFF) / 65536
+    return numbers

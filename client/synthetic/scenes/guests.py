@@ -46,7 +46,7 @@ class Guest:
         encoded = np.array(self.srgb) / 255
         return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
-    def texture(self, points: NDArray) -> NDArray:
+    def texture(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
         """[n, 3] linear albedo."""
         return np.broadcast_to(self.albedo, points.shape)
 
@@ -64,7 +64,7 @@ def guest_grids(guests: tuple[Guest, ...]) -> list[list[Grid]]:
 
 def bake_guests(
     guests: tuple[Guest, ...], solids: list[Solid], grids: list[list[Grid]], directions: Floats
-) -> dict[str, NDArray]:
+) -> dict[str, Floats]:
     """Occluded Lambert transfer: `around` [total, 16] what guests alone take from the set, `on` [total, 16] on guests.
 
     `grids` lie over `solids`; `directions` [n, 3] float32, unit, evenly spread over the sphere.

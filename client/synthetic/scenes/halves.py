@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from client.synthetic.scenes import textures
 from client.synthetic.scenes.scene import Body, Scene
 from client.synthetic.solids.polyhedra import Solid, box, rotation_about, wedge
 from client.synthetic.solids.round import Cylinder, Sphere
@@ -35,7 +36,7 @@ def halves() -> Scene:
     return Scene("halves", tuple(bodies), 0.025, 4096, _walk_along_front)
 
 
-def half_black(points: NDArray) -> NDArray:
+def half_black(points: textures.Values) -> textures.Values:
     """Albedo [n, 3] of world points [n, 3]."""
     return np.where(points[:, :1] < 0, BLACK, WHITE) * np.ones(3)
 

@@ -111,4 +111,5 @@ def _walk_in_room(time_s: float) -> tuple[NDArray[np.float64], NDArray[np.float6
 
 def _unit(x: float, y: float, z: float) -> NDArray[np.float64]:
     vector = np.array([x, y, z], float)
-    return vector / np.linalg.norm(vector)
+    unit: NDArray[np.float64] = vector / np.linalg.norm(vector)
+    return unit

@@ -192,7 +192,8 @@ class Grid:
         fx, fy = ((x - np.floor(x)).astype(np.float32)[:, None], (y - np.floor(y)).astype(np.float32)[:, None])
         upper = values[above * self.columns + left] * (1 - fx) + values[above * self.columns + right] * fx
         lower = values[below * self.columns + left] * (1 - fx) + values[below * self.columns + right] * fx
-        return upper * (1 - fy) + lower * fy
+        mixed: NDArray[np.float32] = upper * (1 - fy) + lower * fy
+        return mixed
 
 
 def atlas(charts: list[list[Chart]], step_m: float) -> list[list[Grid]]:

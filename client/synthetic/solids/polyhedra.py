@@ -82,7 +82,8 @@ class Polyhedron:
         return np.where((near < far) & (near > NEAREST), near, np.inf)
 
     def part(self, points: Points) -> NDArray[np.intp]:
-        return np.argmax(points @ self.plane_normals.T - self.plane_offsets, axis=1)
+        planes: NDArray[np.intp] = np.argmax(points @ self.plane_normals.T - self.plane_offsets, axis=1)
+        return planes
 
     def normals(self, points: Points) -> Points:
         return self.plane_normals[self.part(points)]
@@ -109,10 +110,11 @@ class Polyhedron:
         return near, far
 
     def contains(self, points: Points) -> NDArray[np.bool_]:
-        return (points @ self.plane_normals.T < self.plane_offsets - 1e-9).all(axis=1)
+        inside: NDArray[np.bool_] = np.all(points @ self.plane_normals.T < self.plane_offsets - 1e-9, axis=1)
+        return inside
 
 
-def clip(near: Points, far: Points, gap: float, slope: Points) -> None:
+def clip(near: Points, far: Points, gap: float | Points, slope: Points) -> None:
     """Narrow the stretch [near, far] of each ray to where `slope * t <= gap`, in place."""
     t = gap / no_zero(slope)
     entering = slope < 0

@@ -40,7 +40,8 @@ class Sphere:
         return _sphere_blocks(points - self.center.astype(points.dtype), directions, self.radius)
 
     def contains(self, points: Points) -> NDArray[np.bool_]:
-        return np.linalg.norm(points - self.center, axis=1) < self.radius - 1e-9
+        inside: NDArray[np.bool_] = np.linalg.norm(points - self.center, axis=1) < self.radius - 1e-9
+        return inside
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +80,8 @@ class Cylinder:
     def part(self, points: Points) -> NDArray[np.intp]:
         height = (points - self.base) @ self.axis
         outside = np.stack([self._off_axis(points) - self.radius, -height, height - self.length], axis=1)
-        return np.argmax(outside, axis=1)
+        charts: NDArray[np.intp] = np.argmax(outside, axis=1)
+        return charts
 
     def normals(self, points: Points) -> Points:
         offset = points - self.base
@@ -107,11 +109,14 @@ class Cylinder:
     def outside_m(self, points: Points) -> NDArray[np.float64]:
         """[n] how far points are out of the side or of an end, whichever is more; negative inside."""
         height = (points - self.base) @ self.axis
-        return np.max([self._off_axis(points) - self.radius, -height, height - self.length], axis=0)
+        distances = [self._off_axis(points) - self.radius, -height, height - self.length]
+        outside: NDArray[np.float64] = np.max(distances, axis=0)
+        return outside
 
     def _off_axis(self, points: Points) -> Points:
         offset = points - self.base
-        return np.linalg.norm(offset - (offset @ self.axis)[:, None] * self.axis, axis=1)
+        distance: Points = np.linalg.norm(offset - (offset @ self.axis)[:, None] * self.axis, axis=1)
+        return distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +174,8 @@ class Capsule:
         return hit | _sphere_blocks(points - self.end.astype(dtype), directions, self.radius)
 
     def contains(self, points: Points) -> NDArray[np.bool_]:
-        return np.linalg.norm(points - self._nearest(points), axis=1) < self.radius - 1e-9
+        inside: NDArray[np.bool_] = np.linalg.norm(points - self._nearest(points), axis=1) < self.radius - 1e-9
+        return inside
 
     def _nearest(self, points: Points) -> Points:
         """[n, 3] the segment's closest points."""
@@ -201,4 +207,5 @@ def _sphere_hit(start: Points, directions: Points, radius: float) -> Points:
 def _sphere_blocks(start: Points, directions: Points, radius: float) -> NDArray[np.bool_]:
     b = start @ directions.T
     c = ((start * start).sum(axis=1) - start.dtype.type(radius * radius))[:, None]
-    return (b * b > c) & ((b < 0) | (c < 0))
+    blocked: NDArray[np.bool_] = (b * b > c) & ((b < 0) | (c < 0))
+    return blocked

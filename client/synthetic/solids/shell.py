@@ -58,7 +58,8 @@ class Shell:
 
     def part(self, points: Points) -> NDArray[np.intp]:
         outside = [points[:, a] - self.high[a] if side > 0 else self.low[a] - points[:, a] for a, side in WALLS]
-        return np.argmax(np.stack(outside, axis=1), axis=1)
+        walls: NDArray[np.intp] = np.argmax(np.stack(outside, axis=1), axis=1)
+        return walls
 
     def normals(self, points: Points) -> Points:
         inward = np.array([-side * np.eye(3)[axis] for axis, side in WALLS])
@@ -78,7 +79,8 @@ class Shell:
 
     def contains(self, points: Points) -> NDArray[np.bool_]:
         """True outside the room, where nothing can be seen."""
-        return ~((points > self.low) & (points < self.high)).all(axis=1)
+        inside: NDArray[np.bool_] = np.all((points > self.low) & (points < self.high), axis=1)
+        return ~inside
 
     def absent(self, points: Points) -> NDArray[np.bool_]:
         """[n] True where a point of the walls lies in an opening."""
@@ -101,7 +103,8 @@ class Shell:
         slope = directions[:, axis]
         slope = np.where(np.abs(slope) < 1e-9, np.copysign(slope.dtype.type(1e-9), slope), slope)
         bound = np.where(slope > 0, self.high[axis], self.low[axis]).astype(slope.dtype)
-        return (bound - points[:, axis, None]) / slope
+        distance: Points = (bound - points[:, axis, None]) / slope
+        return distance
 
 
 def _within(opening: Opening, u: Points, v: Points) -> NDArray[np.bool_]:

@@ -58,8 +58,8 @@ def _pieces(solid: Solid) -> list[Triangles]:
         case Sphere():
             return [_ball(solid)]
         case Cylinder():
-            rims = [_rim(solid, end, _angles(solid.radius)) for end in (0.0, solid.length)]
-            return [_side(solid, *rims), _face(rims[0], -solid.axis), _face(rims[1], solid.axis)]
+            low, high = (_rim(solid, end, _angles(solid.radius)) for end in (0.0, solid.length))
+            return [_side(solid, low, high), _face(low, -solid.axis), _face(high, solid.axis)]
         case Carved(outer=Cylinder() as outer, hole=hole):
             return _bowl(outer, hole)
         case Carved(outer=Polyhedron() as outer, hole=hole):
@@ -74,7 +74,8 @@ def _outline(solid: Polyhedron, plane: int) -> Floats:
     face = solid.corners[np.abs(solid.corners @ normal - solid.plane_offsets[plane]) < 1e-9]
     u, v = frame_around(normal)
     offset = face - face.mean(axis=0)
-    return face[np.argsort(np.arctan2(offset @ v, offset @ u))]
+    outline: Floats = face[np.argsort(np.arctan2(offset @ v, offset @ u))]
+    return outline
 
 
 def _face(outline: Floats, normal: Floats) -> Triangles:
@@ -86,7 +87,8 @@ def _face(outline: Floats, normal: Floats) -> Triangles:
 def _angles(radius: float) -> Floats:
     """A whole turn in steps whose chords stay within the tolerance of the circle."""
     step = 2 * math.acos(max(1 - TOLERANCE_M / radius, 0.0))
-    return np.linspace(0, 2 * np.pi, max(math.ceil(2 * np.pi / step), 12) + 1)
+    angles: Floats = np.linspace(0, 2 * np.pi, max(math.ceil(2 * np.pi / step), 12) + 1)
+    return angles
 
 
 def _rim(solid: Cylinder, height: float, angles: Floats) -> Floats:
@@ -139,9 +141,9 @@ def _bowl(outer: Cylinder, hole: Cylinder) -> list[Triangles]:
     inside = [_rim(hole, height, angles) for height in (0.0, top - depth)]
     up = np.broadcast_to(outer.axis, outside[1].shape)
     return [
-        _side(outer, *outside),
+        _side(outer, outside[0], outside[1]),
         _face(outside[0], -outer.axis),
-        _side(hole, *inside, outward=-1.0),
+        _side(hole, inside[0], inside[1], outward=-1.0),
         _face(inside[0], outer.axis),
         _strip(inside[1], outside[1], up),
     ]
@@ -164,7 +166,7 @@ def _arch(outer: Polyhedron, hole: Cylinder) -> list[Triangles]:
         elif number != bottom:
             pieces.append(_face(_outline(outer, number), normal))
     (first, normals), (second, _) = arcs
-    return [*pieces, _strip(first, second, normals), *_feet(first, second, outer, bottom)]
+    return [*pieces, _strip(first, second, normals), *_feet(first, second, outer, int(bottom))]
 
 
 def _around_hole(

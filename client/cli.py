@@ -210,7 +210,7 @@ def serve(
         authenticator_of,
         certificate_of,
         data_folder,
-        leave_soon,
+        exit_soon,
         limits_of,
         log_format_of,
         objects_folder,
@@ -245,7 +245,7 @@ def serve(
         certificate=certificate,
         objects=objects_folder(objects),
     )
-    leave_soon(status)
+    exit_soon(status)
     return status
 
 
@@ -277,7 +277,7 @@ def model(
     done = model_of_source(opened, chosen, cell_m, track)
     write_model(done.mesh, out)
     counts = f"{len(chosen)} frames, {done.points} points, {len(done.mesh.triangles)} triangles"
-    say(f"{counts}, {done.turned} normals turned to the camera, written to {out}")
+    say(f"{counts}, {done.flipped} normals flipped to the camera, written to {out}")
 
 
 @app.command()

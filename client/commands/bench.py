@@ -1,4 +1,4 @@
-"""`probeless bench SUITE`: finds the suite, runs it, prints its rows.
+"""`probeless bench SUITE`: find a suite, run it and print its rows.
 
 Suites are part of a source checkout, not of the installed package. A suite is the module `tests.bench.NAME.suite`, with
 `run_suite(quick: bool, progress: Callable[[str], None]) -> dict`: `device`, `commit`, `rows`, `unmeasured`.
@@ -29,10 +29,9 @@ Suite = Callable[..., dict[str, Any]]
 
 
 def run_bench(name: str, as_json: bool, quick: bool, options: Mapping[str, Any] | None = None) -> None:
-    """Run a suite and print what it measured. `options`: those that only some suites take; None where not given.
+    """Run a suite and print its results. `options`: options of single suites; None: not given.
 
-    Raises OptionError for an unknown suite and for an option that the suite does not take. Raises RunError where the
-    suite's files or a package that it needs are missing.
+    Raises OptionError for an unknown suite or an option that it lacks; RunError if its files or a package are missing.
     """
     suite = find_suite(name)
     given = {option: value for option, value in (options or {}).items() if value is not None}
@@ -50,10 +49,10 @@ def run_bench(name: str, as_json: bool, quick: bool, options: Mapping[str, Any] 
 
 
 def find_suite(name: str) -> Suite:
-    """The suite's function. Raises OptionError for an unknown name, RunError where something is not installed."""
+    """The suite's function. Raises OptionError for an unknown name; RunError if it is not installed."""
     if name not in SUITES:
         raise OptionError(f"there is no suite {name!r}; there are: {', '.join(SUITES)}")
-    if str(_CHECKOUT) not in sys.path:  # the suites lie beside the packages, not in them
+    if str(_CHECKOUT) not in sys.path:  # suites lie in the checkout, outside the packages
         sys.path.append(str(_CHECKOUT))
     if not _exists(f"tests.bench.{name}.suite"):
         raise RunError(f"bench {name}: suites are part of the source checkout; run make install-bench and bench there")
@@ -65,7 +64,7 @@ def find_suite(name: str) -> Suite:
 
 
 def _missing(name: str, error: ModuleNotFoundError) -> Exception:
-    """The user's error where another project's package is missing. One of our own is a defect: the error itself."""
+    """A RunError for a missing third-party package; `error` itself for a missing module of this project (a bug)."""
     package = (error.name or "").split(".")[0]
     if package in OWN_PACKAGES:
         return error
@@ -73,7 +72,7 @@ def _missing(name: str, error: ModuleNotFoundError) -> Exception:
 
 
 def _exists(module: str) -> bool:
-    """True if the module can be found; the benchmarks are not part of every installation."""
+    """Whether the module can be found; an installed package has no benchmarks."""
     try:
         return find_spec(module) is not None
     except ModuleNotFoundError:

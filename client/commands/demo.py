@@ -1,4 +1,4 @@
-"""`probeless demo`: a server in this process, a client that streams a synthetic scene to it over the real socket."""
+"""`probeless demo`: a server in this process, and a client that streams a synthetic scene to it over a socket."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from server.service.serve import BackgroundServer, open_service
 
 SOURCE = "synthetic:table?light=7&frames="
 FRAMES, FRAMES_TO_WATCH = 30, 300
-"""The same path, walked in one second of pictures to keep, or in ten for somebody who watches."""
+"""Frames on the same path: one second for the saved pictures, ten seconds for watching."""
 VASE_STANDS_AT_M = (0.1, 0.0, 0.12)
 
 
 @dataclass(frozen=True)
 class Demo:
-    """What the demo streams."""
+    """Source, objects and wishes of the demo."""
 
     source: Source
     objects: tuple[ObjectFile, ...]
@@ -35,7 +35,7 @@ class Demo:
 
 
 def run_demo(out: Path, device_name: str | None, keep: bool, port: int = 0) -> None:
-    """Stream once and write `out`; with `keep` go on streaming, for the page, until interrupted.
+    """Stream once and write `out`; with `keep`, continue to stream for the page until interrupted.
 
     Raises ServeError, ClientError or UserError, each with one line.
     """
@@ -57,7 +57,7 @@ def _stream(demo: Demo, url: str, out: Path | None) -> StreamSummary:
 
 @contextmanager
 def _prepared(frames: int) -> Iterator[Demo]:
-    """The scene, its volume, and the vase as a file."""
+    """The demo with a temporary file of the vase."""
     source = open_source(f"{SOURCE}{frames}")
     volume = default_volume(source, range(len(source)))
     wishes = Wishes(volume_m=volume, voxel_m=default_voxel(volume), up=source.up)

@@ -1,4 +1,4 @@
-"""`probeless devices`: what OpenCL devices there are, which would be used, and why."""
+"""`probeless devices`: list the OpenCL devices, with the one that is used by default and the reason."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def show_devices(console: Console | None = None) -> None:
 
 
 def why(info: DeviceInfo, chosen: DeviceInfo | None, infos: list[DeviceInfo]) -> str:
-    """Why this device would be used, or not."""
+    """Reason why this device is or is not used by default."""
     if info.usable is not None:
         return info.usable
     if info is not chosen:

@@ -1,4 +1,4 @@
-"""`probeless explain`: the plan of one frame as a person would say it."""
+"""`probeless explain`: the plan of one frame in words."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ PURPOSES = {
     "compose_layer": "puts together what is virtual, apart from the camera's picture",
 }
 LEAD_FRAMES = 4
-"""Before the frame that is explained: so many are processed for there to be a light."""
+"""Frames processed before the explained one, so that a light is estimated."""
 
 
 def explain(capture: Capture, frame: int | None, device_name: str | None) -> Iterator[str]:
-    """Lines that say the plan of a frame: the one at position `frame`, by default the fifth or the last.
+    """Lines that describe the plan of the frame at position `frame`; default: the fifth, or the last of fewer.
 
-    Raises OptionError for a frame that there is not, and as Run does.
+    Raises OptionError for a frame outside of the source, and the errors of Run.
     """
     frames = capture.frames
     chosen = min(frames.start + LEAD_FRAMES, frames[-1]) if frame is None else frame
@@ -62,9 +62,11 @@ def _plan_of(capture: Capture, chosen: int, device_name: str | None) -> Plan:
     return last.plan
 
 
-def _gallery_plan(source: GallerySource, asked: Wishes, chosen: int, device_name: str | None) -> Plan:
-    """With the scene's own objects and light."""
-    wishes = wishes_of(source, preset=asked.preset, plan=asked.plan, indirect=asked.indirect, edges=asked.edges)
+def _gallery_plan(source: GallerySource, requested: Wishes, chosen: int, device_name: str | None) -> Plan:
+    """The plan of a gallery scene with its own objects and light."""
+    wishes = wishes_of(
+        source, preset=requested.preset, plan=requested.plan, indirect=requested.indirect, edges=requested.edges
+    )
     results = play(open_device(device_name), source, wishes)
     plans = [result.plan for _, (_, result) in zip(range(chosen + 1), results, strict=False)]
     results.close()
@@ -72,8 +74,8 @@ def _gallery_plan(source: GallerySource, asked: Wishes, chosen: int, device_name
 
 
 def lines(title: str, plan: Plan) -> Iterator[str]:
-    """A plan, an effect a line."""
-    unseen = {(left.reason, left.error_bound) for left in plan.left_out if is_unseen(left)}  # one reason counts once
+    """A plan as lines, one per effect."""
+    unseen = {(left.reason, left.error_bound) for left in plan.left_out if is_unseen(left)}  # each reason counts once
     most = sum(bound or 0.0 for _, bound in unseen)
     yield f"{title}: {len(plan.run)} effects run, {len(plan.left_out)} are left out."
     width = max(map(len, (*plan.run, *(left.effect for left in plan.left_out))))
@@ -91,12 +93,12 @@ def lines(title: str, plan: Plan) -> Iterator[str]:
 
 
 def is_unseen(left: LeftOut) -> bool:
-    """Whether it was left out for what it changes, and not because it was asked for or could not run."""
+    """Whether the effect was left out because its change is invisible, not by an option or a missing resource."""
     return left.error_bound is not None and left.error_bound <= 1.0
 
 
 def is_of_noise(left: LeftOut) -> bool:
-    """Whether its bound is not of every pixel, but of all but a thousandth."""
+    """Whether its bound holds for all but a thousandth of the pixels."""
     return left.reason in (NOISE, ECHO)
 
 

@@ -1,4 +1,4 @@
-"""`probeless run`: a source through the pipeline in this process, without a network."""
+"""`probeless run`: process a source in this process, without a network."""
 
 from __future__ import annotations
 
@@ -22,19 +22,16 @@ from server.pipeline import FrameResult
 
 
 class Processor(Protocol):
-    """What `run` needs of the pipeline."""
+    """The part of ClientSession that `process_frames` uses."""
 
     def process(self, frame: RgbdFrame) -> FrameResult: ...
 
 
 class Run:
-    """A capture's pipeline, open; a context manager."""
+    """An open pipeline for a capture; a context manager."""
 
     def __init__(self, capture: Capture, device_name: str | None, note: Callable[[str], None]) -> None:
-        """`note` gets what the pipeline says about objects.
-
-        Raises UserError, DeviceError or MeshError, each with one clear line.
-        """
+        """`note` receives notes on objects. Raises UserError, DeviceError or MeshError, each with one line."""
         self._capture = capture
         self._pipeline = _open_pipeline(device_name, capture.source.camera, capture.wishes, note)
         try:
@@ -44,14 +41,14 @@ class Run:
             raise
 
     def outputs(self) -> Iterator[FrameOutput]:
-        """One output per frame, in order; of a camera until Ctrl-C. Raises UserError."""
+        """One output per frame, in order; a live source ends with Ctrl-C. Raises UserError."""
         source = self._capture.source
         with stop_on_interrupt(is_live(source)) as stopping:
             positions = takewhile(lambda _: not stopping.is_set(), self._capture.frames)
             yield from process_frames(self._pipeline, (source[i] for i in positions))
 
     def mesh(self, progress: Callable[[int, int], None]) -> dict[MeshFormat, bytes]:
-        """The files of the surface fused so far; `progress` is told parts done and in all. Raises MeshingError."""
+        """Mesh files of the surface fused so far; `progress` receives parts done and total. Raises MeshingError."""
         return mesh_files(self._pipeline.scene_mesh(progress))
 
     def __enter__(self) -> Run:
@@ -64,7 +61,7 @@ class Run:
 
 
 def process_frames(pipeline: Processor, frames: Iterable[RgbdFrame]) -> Iterator[FrameOutput]:
-    """Each frame's output. Raises RunError naming the frame that the pipeline refuses."""
+    """The output of each frame. Raises RunError with the number of a frame that the pipeline refuses."""
     for frame in frames:
         try:
             result = pipeline.process(frame)

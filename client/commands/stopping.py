@@ -1,4 +1,4 @@
-"""Ctrl-C as a wish to end in order, for sources that have no end: the first is noted, the second interrupts."""
+"""Orderly end on Ctrl-C for live sources: the first sets an event, the second interrupts."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from types import FrameType
 
 
 @contextmanager
-def stop_on_interrupt(wanted: bool = True) -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; the second raises KeyboardInterrupt, as every one does unless `wanted`."""
+def stop_on_interrupt(enabled: bool = True) -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets; the second raises KeyboardInterrupt. Not `enabled`: every one raises it."""
     stopping = threading.Event()
-    if not wanted or threading.current_thread() is not threading.main_thread():
+    if not enabled or threading.current_thread() is not threading.main_thread():
         yield stopping
         return
 

@@ -1,4 +1,4 @@
-"""`probeless stream`: a source over the socket at its own frame rate, and what comes back into a folder."""
+"""`probeless stream`: send a source to a server at its frame rate, show and write the answers."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from client.commands.stopping import stop_on_interrupt
 from client.display.layers import decode_layer, put_over, shown_picture
 from client.display.output_folder import FrameOutput, OutputWriter
-from client.display.stream_statistics import STAGES, StreamFigures
+from client.display.stream_statistics import STAGES, StreamStatistics
 from client.display.stream_view import StreamView
 from client.errors import OutputError, SourceError
 from client.objects.object_file import ObjectFile, pack_mesh
 from client.sources.frame_source import ENDLESS, Source, is_live
-from client.streaming.adaptive import Adaptive, Measured
+from client.streaming.adaptive import Adaptive, AnsweredFrame
 from client.streaming.client import Access, Answer, ClientError, RoomPlace, StreamClient
 from client.streaming.coding import Coding, picture_bytes
 from client.streaming.video import IS_POSSIBLE, VideoEncoder
@@ -44,13 +44,13 @@ from protocol.messages import (
 )
 from protocol.recording import write_message
 
-LOOK_S = 0.002
-"""Between looks whether a camera's next frame may go."""
+POLL_S = 0.002
+"""Interval of checking whether the next frame of a live source may be sent."""
 
 
 @dataclass
 class StreamSummary:
-    """What became of a source's frames."""
+    """Result of a stream: counts of frames and times."""
 
     server: str = ""
     device: str = ""
@@ -58,16 +58,16 @@ class StreamSummary:
     sent: int = 0
     answered: int = 0
     skipped: int = 0
-    """Not sent: the server was busy with earlier ones when their time came."""
+    """Not sent, because the server was busy with earlier frames."""
     dropped: int = 0
-    """Sent, and refused or replaced by the server."""
+    """Sent, but refused or replaced by the server."""
     seconds: float = 0.0
-    """From the first frame's sending to the last answer."""
+    """From sending the first frame to the last answer."""
     first_picture_s: float = math.nan
-    """From connecting until the first answer was shown."""
+    """From connecting to showing the first answer."""
     reconnected: int = 0
     latency_ms: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """p50 and p99 of the last frames, by `stream_figures.STAGES`."""
+    """p50 and p99 over the last frames, by stage of `stream_statistics.STAGES`."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +75,13 @@ class Sending:
     """How frames are sent and shown."""
 
     adapts: bool = True
-    """Quality, size and rate follow the link; of `realtime` only."""
+    """Adapt quality, size and rate to the link; only with `realtime`."""
     depth_noise_per_m: float | None = None
-    """Depth may be moved by this times z^2 (metres); None: it is sent bit for bit."""
+    """Depth may change by up to this times z^2 (metres); None: depth is exact."""
     view: bool = False
-    """The picture in the terminal."""
+    """Show the picture in the terminal."""
     video: bool = False
-    """Colour goes as H.264; not in a lossless session."""
+    """Send colour as H.264; ignored in a lossless session."""
 
 
 def stream(
@@ -101,14 +101,13 @@ def stream(
     sending: Sending | None = None,
     console: Console | None = None,
 ) -> StreamSummary:
-    """Send `frames` of the source (default: all) to the server and write its answers into `out`, where one is given.
+    """Send `frames` of the source (default: all) to the server and write the answers into the folder `out`, if given.
 
-    `realtime` keeps the source's frame rate and skips frames while the server is busy; without it every frame is sent
-    as soon as there is room. `lossless` sends raw colour and waits for each answer, so that every frame is answered
-    with the very pixels of the server's picture. `mesh` asks for the scene's mesh after the last answer and writes it
-    into `out`. `record` gets every message sent and received. `room`: to share with others. `access`: what lets the
-    client in, if not the URL. `sending`: what may be left out on the way.
-    Raises ClientError, UserError, each with one clear line. Progress goes to `console` (default: standard error).
+    `realtime` keeps the source's frame rate and skips frames while the server is busy; otherwise every frame is sent as
+    soon as the window has room. `lossless` sends raw colour, waits for each answer, and receives exact pictures.
+    `mesh` requests the scene's mesh after the last answer and writes it into `out`. `record`: file for all messages.
+    `room`: the room to share. `access`: access options that the URL does not contain. `console`: default stderr.
+    Raises ClientError, UserError, each with one line.
     """
     wishes = msgspec.structs.replace(wishes or Wishes(), lossless=lossless)
     others = (realtime and not lossless, mesh, room, access, sending or Sending())
@@ -117,14 +116,14 @@ def stream(
     with _recorder(record) as tap, contextlib.ExitStack() as stack:
         stopping = stack.enter_context(stop_on_interrupt(is_live(source)))
         writer = stack.enter_context(OutputWriter(out)) if out is not None else None
-        figures, progress = StreamFigures(), _progress(console)
-        view = stack.enter_context(StreamView(console, progress, figures, job.sending.view))
-        return asyncio.run(_Stream(job, writer, progress, stopping, figures, view).run(tap))
+        statistics, progress = StreamStatistics(), _progress(console)
+        view = stack.enter_context(StreamView(console, progress, statistics, job.sending.view))
+        return asyncio.run(_Stream(job, writer, progress, stopping, statistics, view).run(tap))
 
 
 @dataclass(frozen=True)
 class _Job:
-    """What is to be sent, where and how."""
+    """Parameters of `stream`."""
 
     source: Source
     frames: range
@@ -139,7 +138,7 @@ class _Job:
 
 
 class _Stream:
-    """One connection's sending and receiving, side by side on one event loop."""
+    """Sends frames and receives answers concurrently on one event loop."""
 
     def __init__(
         self,
@@ -147,28 +146,28 @@ class _Stream:
         writer: OutputWriter | None,
         progress: Progress,
         stopping: threading.Event,
-        figures: StreamFigures,
+        statistics: StreamStatistics,
         view: StreamView,
     ) -> None:
         self._job = job
         self._writer = writer
         self._progress = progress
-        self._stopping, self._figures, self._view = stopping, figures, view
+        self._stopping, self._statistics, self._view = stopping, statistics, view
         self._adaptive = _adaptive(job, math.inf)
         self._fixed = Coding(depth_noise_per_m=job.sending.depth_noise_per_m)
-        self._out: dict[int, tuple[float, int]] = {}
-        """When each frame without an answer was sent, and its bytes."""
+        self._in_flight: dict[int, tuple[float, int]] = {}
+        """Frame number -> time of sending and bytes, for unanswered frames."""
         self._pictures: dict[int, Color] = {}
-        """Of frames without an answer, for what is put over them here."""
+        """Camera pictures of unanswered frames; layers are composed over them."""
         self._last_sent_s = -math.inf
         self._began_s = 0.0
         total = None if job.frames.stop >= ENDLESS else len(job.frames)
         self._bar = progress.add_task(job.source.name, total=total, note="connecting")
         self._summary = StreamSummary()
-        self._told: set[str] = set()
+        self._printed: set[str] = set()
 
     async def run(self, tap: Callable[[ClientMessage | ServerMessage], None] | None) -> StreamSummary:
-        meshes = [pack_mesh(item.path) for item in self._job.objects]  # a bad file is told before anything is sent
+        meshes = [pack_mesh(item.path) for item in self._job.objects]  # a bad file is an error before anything is sent
         self._began_s = time.perf_counter()
         client = await StreamClient.connect(self._job.server_url, tap, self._job.access)
         try:
@@ -184,7 +183,7 @@ class _Stream:
             await self._exchange(client)
         finally:
             await client.close("the source has ended")
-        found = {stage: self._figures.percentiles(stage) for stage in STAGES}
+        found = {stage: self._statistics.percentiles(stage) for stage in STAGES}
         self._summary.latency_ms = {stage: pair for stage, pair in found.items() if pair is not None}
         return self._summary
 
@@ -199,7 +198,7 @@ class _Stream:
             if done.error is not None:
                 raise ClientError(f"{item.path}: {done.error}")
             for note in done.notes:
-                self._tell(f"{item.path.name}: {note}")
+                self._print_once(f"{item.path.name}: {note}")
 
     async def _exchange(self, client: StreamClient) -> None:
         """Send all frames while reading answers; ends when the last frame is answered."""
@@ -219,7 +218,7 @@ class _Stream:
         self._summary.seconds = time.perf_counter() - start_s
 
     async def _send(self, client: StreamClient) -> None:
-        """Send all frames and wait for the last answer; also where the source is damaged on the way."""
+        """Send all frames and wait for the last answer, also if reading the source fails."""
         try:
             await (self._send_live(client) if is_live(self._job.source) else self._send_frames(client))
         except SourceError:
@@ -241,7 +240,7 @@ class _Stream:
             await self._send_one(client, position)
 
     def _may_send(self, client: StreamClient) -> bool:
-        """Whether the server and the link are free for a frame: it would grow old waiting for them."""
+        """Whether a frame sent now would not wait for the server or the link."""
         if self._adaptive is None or not client.has_room:
             return client.has_room
         return self._adaptive.may_send(time.perf_counter(), self._last_sent_s, client.unanswered)
@@ -253,28 +252,28 @@ class _Stream:
         message = await client.encode_frame(frame, coding)
         sent_s = self._last_sent_s = time.perf_counter()
         size = picture_bytes(message)
-        self._out[frame.index] = sent_s, size
+        self._in_flight[frame.index] = sent_s, size
         if self._job.wishes.answer == "layer":
             self._pictures[frame.index] = frame.color
-        self._figures.note_sent(frame.index, captured_s, sent_s, size)
+        self._statistics.note_sent(frame.index, captured_s, sent_s, size)
         await client.send_encoded(message)
         self._summary.sent += 1
         if self._job.wishes.lossless:
             await client.wait_until_answered()
 
     async def _send_live(self, client: StreamClient) -> None:
-        """Whenever there is room, the newest frame of a camera, until Ctrl-C or the last that was asked for."""
+        """Send the newest frame of a camera whenever there is room, until Ctrl-C or the last requested frame."""
         for position in self._job.frames:
             await client.wait_for_room()
             if self._stopping.is_set():
                 return
             while not self._may_send(client) and not self._stopping.is_set():
-                await asyncio.sleep(LOOK_S)
+                await asyncio.sleep(POLL_S)
             await self._send_one(client, position)
             self._summary.skipped = getattr(self._job.source, "missed", 0)
 
     async def _fetch_mesh(self, client: StreamClient) -> None:
-        bar = self._progress.add_task("mesh", total=None, note="the server makes it")
+        bar = self._progress.add_task("mesh", total=None, note="the server computes it")
 
         def show(done: int, total: int) -> None:
             self._progress.update(bar, completed=done, total=total, note="bytes of each file")
@@ -287,35 +286,35 @@ class _Stream:
         async for answer in client.answers():
             match answer:
                 case Answer():
-                    await self._keep(answer, client.reconnected)
+                    await self._handle_answer(answer, client.reconnected)
                 case Dropped():
                     self._note_dropped(answer)
                 case Error():
-                    self._tell(answer.reason)
+                    self._print_once(answer.reason)
 
-    async def _keep(self, answer: Answer, reconnected: int) -> None:
+    async def _handle_answer(self, answer: Answer, reconnected: int) -> None:
         returned_s = time.perf_counter()
         drawn, size = answer.drawn, answer_bytes(answer)
         computed_s = 0.0 if drawn is None else drawn.timings.total / 1e3
         if self._adaptive is not None:
             waited_s = None if drawn is None or not drawn.waited_ms else drawn.waited_ms / 1e3
-            measured = Measured(0.0, returned_s, computed_s, 0, bytes_down=size, waited_s=waited_s)
+            measured = AnsweredFrame(0.0, returned_s, computed_s, 0, bytes_down=size, waited_s=waited_s)
             self._measure(answer.light.frame, measured, reconnected)
-        picture = await asyncio.to_thread(self._kept_picture, answer)
+        picture = await asyncio.to_thread(self._write_answer, answer)
         coding = self._fixed if self._adaptive is None else self._adaptive.coding
         shown_s = time.perf_counter()
         if not self._summary.answered:
             self._summary.first_picture_s = shown_s - self._began_s
         self._view.show(shown_s, answer.light, drawn, picture, coding, reconnected)
         waited_ms = 0.0 if drawn is None else drawn.waited_ms
-        self._figures.note_answer(answer.light.frame, returned_s, shown_s, computed_s, size, waited_ms / 1e3)
+        self._statistics.note_answer(answer.light.frame, returned_s, shown_s, computed_s, size, waited_ms / 1e3)
         for note in () if drawn is None else drawn.notes:
-            self._tell(note)
+            self._print_once(note)
         self._summary.answered += 1
         self._advance()
 
-    def _kept_picture(self, answer: Answer) -> NDArray[np.uint8] | None:
-        """Write an answer where there is a folder; its picture, where it has one that is wanted."""
+    def _write_answer(self, answer: Answer) -> NDArray[np.uint8] | None:
+        """Write an answer if there is a folder. Returns its picture if that was decoded."""
         own = self._pictures.pop(answer.light.frame, None)
         if answer.drawn is None:
             if self._writer is not None:
@@ -328,14 +327,14 @@ class _Stream:
             self._writer.write(output)
         return output.color
 
-    def _measure(self, number: int, answered: Measured, reconnected: int) -> None:
-        """Tell what the frame's way was like; when and with how many bytes it was sent is known here."""
+    def _measure(self, number: int, answered: AnsweredFrame, reconnected: int) -> None:
+        """Pass a measurement to the adaptation, completed by the time of sending and the bytes sent."""
         assert self._adaptive is not None
         if reconnected != self._summary.reconnected:
             self._summary.reconnected = reconnected
-            self._adaptive.note_lost()
-            self._out.clear()
-        sent = self._out.pop(number, None)
+            self._adaptive.note_reconnection()
+            self._in_flight.clear()
+        sent = self._in_flight.pop(number, None)
         if sent is not None:
             self._adaptive.note(replace(answered, sent_s=sent[0], bytes_up=sent[1]))
 
@@ -343,10 +342,10 @@ class _Stream:
         if self._job.wishes.lossless:
             raise ClientError(f"frame {dropped.frame}: {dropped.reason}")
         self._summary.dropped += 1
-        self._out.pop(dropped.frame, None)
+        self._in_flight.pop(dropped.frame, None)
         self._pictures.pop(dropped.frame, None)
-        self._figures.forget(dropped.frame)
-        self._tell(f"frame {dropped.frame}: {dropped.reason}")
+        self._statistics.forget(dropped.frame)
+        self._print_once(f"frame {dropped.frame}: {dropped.reason}")
         self._advance()
 
     def _advance(self) -> None:
@@ -354,14 +353,14 @@ class _Stream:
         note = f"{done.answered} answered, {done.skipped} skipped, {done.dropped} dropped"
         self._progress.update(self._bar, advance=1, note=note)
 
-    def _tell(self, line: str) -> None:
-        if line not in self._told:
-            self._told.add(line)
+    def _print_once(self, line: str) -> None:
+        if line not in self._printed:
+            self._printed.add(line)
             self._progress.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def open_video(welcome: Welcome) -> VideoEncoder:
-    """What colour is sent with. Raises ClientError where either side has no PyAV."""
+    """Encoder of colour. Raises ClientError if the server or this client lacks PyAV."""
     if "h264" not in welcome.codecs:
         raise ClientError(
             f"{welcome.server} reads no H.264 (it lacks PyAV: make install-video there); leave out --video"
@@ -372,16 +371,16 @@ def open_video(welcome: Welcome) -> VideoEncoder:
 
 
 def _adaptive(job: _Job, delay_s: float) -> Adaptive | None:
-    """What follows the link, where quality may. A light alone does not say how long the server took for it."""
+    """The adaptation to the link, if enabled; not for lights alone, which do not report the computing time."""
     if not job.realtime or not job.sending.adapts or job.wishes.answer == "light":
         return None
     return Adaptive(1 / job.source.fps, delay_s, job.sending.depth_noise_per_m)
 
 
 def frame_output(answer: Answer, camera: CameraModel, own: Color | None = None) -> FrameOutput:
-    """An answer as the output writer takes it: its picture decoded, or its layer put over the frame's `own` picture.
+    """An answer for the output folder: its decoded picture, or its layer composed over the frame's picture `own`.
 
-    Raises ProtocolError for what cannot be decoded.
+    Raises ProtocolError if it cannot be decoded.
     """
     drawn = answer.drawn
     assert drawn is not None
@@ -413,16 +412,16 @@ def answer_bytes(answer: Answer) -> int:
 
 @contextlib.contextmanager
 def _recorder(path: Path | None) -> Iterator[Callable[[ClientMessage | ServerMessage], None] | None]:
-    """A function that appends each message to the file, or None where there is no file. Raises OutputError."""
+    """A function that appends a message to the file; None without a file. Raises OutputError."""
     if path is None:
         yield None
         return
-    with _told_as_output_error(path):
+    with _as_output_error(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         file = path.open("wb")
 
     def record(message: ClientMessage | ServerMessage) -> None:
-        with _told_as_output_error(path):
+        with _as_output_error(path):
             write_message(file, message)
 
     with file:
@@ -430,7 +429,7 @@ def _recorder(path: Path | None) -> Iterator[Callable[[ClientMessage | ServerMes
 
 
 @contextlib.contextmanager
-def _told_as_output_error(path: Path) -> Iterator[None]:
+def _as_output_error(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:

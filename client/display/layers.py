@@ -1,8 +1,8 @@
-"""Layers: what is virtual in a frame, read and put over a camera picture, of that frame or of a later one.
+"""Layers: decode the virtual content of a frame and compose it over a camera picture of that frame or a later one.
 
-A later camera sees the layer's surfaces elsewhere. Each pixel that has a depth is a small square of surface; its
-corners lie between the pixels around them, at the mean of those that are of one surface: where depth jumps, the surface
-is cut. The squares are drawn as the camera sees them, and say for each of its pixels which place of the layer is there.
+For a later camera pose the layer is reprojected. Each pixel with depth is a small square of surface. A corner gets the
+mean depth of those of its four pixels that belong to one surface; where depth jumps, the surface is cut. The squares
+are rasterized for the new pose and give, for each of its pixels, the position in the layer to sample.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from protocol.picture_headers import png_size
 NEUTRAL = 128
 """Code of a ratio of 1."""
 JUMP = 0.05
-"""Neighbours that are farther apart than this share of their depth are of two surfaces,"""
+"""Neighbours whose depths differ by more than this share belong to two surfaces,"""
 ALIKE_PER_M = 0.004
-"""unless their inverse depths differ by no more than this: they are so far away that both move alike. It is more than a
-step in which servers send depth."""
+"""unless their inverse depths differ by at most this: then both are so far away that they move alike. It is larger than
+the quantisation step of depth."""
 NEAREST_M = 0.01
-"""Before the camera; what comes nearer is not drawn."""
+"""Near plane; nearer surfaces are not drawn."""
 NOWHERE = np.float32(-1e6)
 
 Codes = NDArray[np.uint8]
@@ -36,29 +36,29 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a layer: pixels from column x and row y of the camera's picture on."""
+    """A part of a layer; its first pixel is column x, row y of the camera's picture."""
 
     x: int
     y: int
     values: Floats
-    """[h, w, channels] of what it does to a linear picture, 0 for nothing: of what is virtual, radiance times coverage
-    (three) and coverage; of ratios, what each is more than 1."""
+    """[h, w, channels] linear, 0: no change. Virtual content: RGB radiance times coverage, and coverage; ratios: RGB
+    ratio minus 1."""
     depth_m: Floats
-    """[h, w] along the camera's z, 0: the pixel says nothing."""
+    """[h, w] along the camera's z; 0: empty pixel."""
 
 
 @dataclass(frozen=True)
 class DecodedLayer:
-    """What a layer message holds."""
+    """Content of a layer message."""
 
     virtual: Part | None
     ratio: Part | None
     world_from_camera: NDArray[np.float64]
-    """[4, 4] of the camera that it was made for."""
+    """[4, 4] camera pose of the layer."""
 
 
 def decode_layer(layer: Layer, camera: CameraModel) -> DecodedLayer:
-    """Read a layer of a session with this camera. Raises ProtocolError for one that is not what it declares."""
+    """Decode a layer of a session with this camera. Raises ProtocolError if it contradicts its header."""
     pose = np.array(layer.world_from_camera, np.float64).reshape(4, 4)
     virtual = ratio = None
     if layer.virtual is not None:
@@ -76,10 +76,10 @@ def decode_layer(layer: Layer, camera: CameraModel) -> DecodedLayer:
 def put_over(
     layer: DecodedLayer, picture: Codes, camera: CameraModel, world_from_camera: NDArray[np.float64] | None = None
 ) -> Codes:
-    """The picture [h, w, 3] sRGB of a camera at `world_from_camera` with what is virtual in it, elsewhere unchanged.
+    """Compose a layer over `picture` [h, w, 3] sRGB of a camera at `world_from_camera`; empty pixels stay unchanged.
 
-    All linear: coverage * virtual + (1 - coverage) * ratio * picture (thesis 7.2.1). `world_from_camera`: rigid, None
-    for that of the layer. `picture` is as a pinhole sees it (`shown_picture`).
+    In linear radiance: coverage * virtual + (1 - coverage) * ratio * picture (thesis 7.2.1). `world_from_camera`:
+    rigid; None: the pose of the layer. `picture` must be without distortion (`shown_picture`).
     """
     moved = None
     if world_from_camera is not None and not np.array_equal(world_from_camera, layer.world_from_camera):
@@ -95,7 +95,7 @@ def put_over(
 
 
 def shown_picture(color: NDArray[np.uint8] | NDArray[np.uint16], camera: CameraModel) -> Codes:
-    """[h, w, 3] a frame's picture as layers are put over it: sRGB, as a camera without distortion sees it."""
+    """[h, w, 3] a frame's picture for `put_over`: sRGB without lens distortion."""
     if not camera.is_distorted and color.dtype == np.uint8:
         return color.astype(np.uint8, copy=False)
     linear = _LINEAR[color] if color.dtype == np.uint8 else color.astype(np.float32) / np.float32(65535)
@@ -136,13 +136,13 @@ def _units(depth: DepthImage) -> NDArray[np.uint16]:
     return unfilter_depth(decompress(depth.data, count), depth.width, depth.height)
 
 
-# ---- as another camera sees it -----------------------------------------------------------------------------------
+# ---- reprojection ------------------------------------------------------------------------------------------------
 
 
 def _seen(part: Part | None, channels: int, camera: CameraModel, moved: NDArray[np.float64] | None) -> Floats:
-    """[height, width, channels] a part's values at the pixels of a camera, 0 where it is not seen.
+    """[height, width, channels] values of a part at the pixels of a camera, 0 where it is not visible.
 
-    moved: from the layer's camera to that one, None where they are one.
+    moved: [4, 4] camera_from_layer_camera; None: the same pose.
     """
     whole: Floats = np.zeros((camera.height, camera.width, channels), np.float32)
     if part is None:
@@ -157,9 +157,9 @@ def _seen(part: Part | None, channels: int, camera: CameraModel, moved: NDArray[
 
 
 def _squares(part: Part, camera: CameraModel, moved: NDArray[np.float64]) -> tuple[Floats, Floats]:
-    """Of each pixel that says something and stays before the camera, its corners: above left and right, below left
-    and right. Where the camera sees them and how far away [n, 4, 3], where the layer's camera does [n, 4, 2]; pixels,
-    metres.
+    """Corners of the squares of all pixels in front of the camera: upper left, upper right, lower left, lower right.
+
+    [n, 4, 3] pixels and depth (metres) in the camera, [n, 4, 2] pixels in the layer's camera.
     """
     depths = _corner_depths(part.depth_m)
     y, x = np.nonzero(part.depth_m)
@@ -169,31 +169,31 @@ def _squares(part: Part, camera: CameraModel, moved: NDArray[np.float64]) -> tup
     focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     points = np.concatenate([(places - center) / focal, np.ones((*z.shape, 1))], axis=-1) * z[..., None]
     points = points @ moved[:3, :3].T + moved[:3, 3]
-    is_ahead = (points[..., 2] > NEAREST_M).all(axis=-1)
-    points, places = points[is_ahead], places[is_ahead]
+    is_in_front = (points[..., 2] > NEAREST_M).all(axis=-1)
+    points, places = points[is_in_front], places[is_in_front]
     seen = points[..., :2] / points[..., 2:] * focal + center
     return np.concatenate([seen, points[..., 2:]], axis=-1).astype(np.float32), places.astype(np.float32)
 
 
 def _corner_depths(depth_m: Floats) -> Floats:
-    """[4, h + 1, w + 1] there of the surface of each pixel around each corner: above left and right, below left and
-    right. The harmonic mean of the pixels that it goes on in, as 1 / z of a plane is linear in the picture."""
+    """[4, h + 1, w + 1] depth at each corner for the surface of its upper left, upper right, lower left and lower right
+    pixel: the harmonic mean over the pixels of that surface, because 1 / z of a plane is linear in the image."""
     height, width = depth_m.shape
     padded = np.pad(depth_m, 1)
     z = np.stack([padded[k >> 1 : (k >> 1) + height + 1, k & 1 : (k & 1) + width + 1] for k in range(4)])
     near, far = np.minimum(z[:, None], z[None]), np.maximum(z[:, None], z[None])
-    goes_on = (near > 0) & (far - near <= near * np.maximum(JUMP, ALIKE_PER_M * far))
-    for _ in range(2):  # from one to the next and the one after that, up to all four
-        goes_on = np.stack([(goes_on[k][:, None] & goes_on).any(axis=0) for k in range(4)])
+    is_connected = (near > 0) & (far - near <= near * np.maximum(JUMP, ALIKE_PER_M * far))
+    for _ in range(2):  # connections over one and two neighbours reach all four
+        is_connected = np.stack([(is_connected[k][:, None] & is_connected).any(axis=0) for k in range(4)])
     inverse = np.divide(1, z, out=np.zeros_like(z), where=z > 0)
-    total = np.where(goes_on, inverse[None], 0).sum(axis=1)
-    means: Floats = np.divide(goes_on.sum(axis=1), total, out=np.zeros_like(z), where=total > 0)
+    total = np.where(is_connected, inverse[None], 0).sum(axis=1)
+    means: Floats = np.divide(is_connected.sum(axis=1), total, out=np.zeros_like(z), where=total > 0)
     return means
 
 
 def _drawn(corners: Floats, places: Floats, camera: CameraModel) -> tuple[Floats, Floats]:
-    """The place that the nearest of squares has at each pixel: columns and rows [height, width] in the layer's camera's
-    picture, NOWHERE without any. See _squares."""
+    """Rasterize squares of `_squares`: columns and rows [height, width] in the layer's picture of the nearest square at
+    each pixel; NOWHERE without any."""
     order = np.array([[0, 1, 2], [1, 3, 2]])
     triangles, places = corners[:, order].reshape(-1, 3, 3), places[:, order].reshape(-1, 3, 2)
     low = np.ceil(triangles[..., :2].min(axis=1)).clip(0, None).astype(np.int64)
@@ -206,7 +206,7 @@ def _drawn(corners: Floats, places: Floats, camera: CameraModel) -> tuple[Floats
     weights = _barycentric(triangles, of, x, y)
     is_inside = (weights >= -1e-5).all(axis=-1)
     of, pixels = of[is_inside], (x + y * camera.width)[is_inside]
-    weights = weights[is_inside] / triangles[of, :, 2]  # what is linear on the surface is so over z in the picture
+    weights = weights[is_inside] / triangles[of, :, 2]  # perspective-correct interpolation
     inverse_z = weights.sum(axis=-1)
     nearest_last = np.argsort(inverse_z, kind="stable")
     chosen = np.full(camera.width * camera.height, -1)
@@ -237,7 +237,7 @@ def _barycentric(
 
 _CODES = np.arange(256) / 255
 _LINEAR = np.where(_CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) ** 2.4).astype(np.float32)
-"""[256] radiance of each code."""
+"""[256] linear radiance of each sRGB code."""
 
 
 def _srgb_codes(linear: Floats) -> Codes:

@@ -1,6 +1,6 @@
-"""What `run` and `stream` write into their folder: pictures, lights, trajectory, timings, the scene's mesh.
+"""Output folder of `run` and `stream`: pictures, lights, trajectory, timings and the scene's mesh.
 
-Equal inputs give equal bytes: PNG parameters are fixed, JSON has fixed separators and Python's shortest floats.
+Equal inputs give equal bytes: PNG parameters and JSON separators are fixed, floats are the shortest of Python.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ _OWN_PICTURE = re.compile(r"\d{6,}\.png")
 
 @dataclass(frozen=True)
 class FrameOutput:
-    """Everything one frame gave."""
+    """Results of one frame."""
 
     frame: int
     """Position in the source; names the picture."""
     timestamp_s: float
     color: NDArray[np.uint8]
-    """[height, width, 3] RGB, sRGB 8-bit composite."""
+    """[height, width, 3] composite, 8-bit sRGB."""
     light: Light
     world_from_camera: NDArray[np.float64]
     """[4, 4] metres."""
@@ -48,7 +48,7 @@ class FrameOutput:
 
 
 class OutputWriter:
-    """Writes frames as they come; a context manager. What an earlier run left in the folder is replaced."""
+    """Writes frames as they arrive; a context manager. Results of an earlier run in the folder are replaced."""
 
     def __init__(self, folder: Path) -> None:
         """Raises OutputError if the folder cannot be written."""
@@ -61,7 +61,7 @@ class OutputWriter:
             raise _unwritable(folder, error) from error
 
     def write(self, output: FrameOutput) -> None:
-        """Write one frame. Raises OutputError: the disk refuses, or a number is not finite."""
+        """Write one frame. Raises OutputError if the disk refuses or a number is not finite."""
         try:
             picture = self.folder / "frames" / f"{output.frame:06d}.png"
             picture.write_bytes(encode_png(output.color))
@@ -72,7 +72,7 @@ class OutputWriter:
             raise _unwritable(self.folder, error) from error
 
     def write_light(self, light: Light) -> None:
-        """Write the light alone of a frame without a picture. Raises OutputError."""
+        """Write the light of a frame without a picture. Raises OutputError."""
         try:
             self._line("light.jsonl", _json(light_row(light), light.frame))
         except OSError as error:
@@ -105,7 +105,7 @@ class OutputWriter:
 
 
 def encode_png(color: NDArray[np.uint8]) -> bytes:
-    """PNG bytes of [height, width, 3] RGB; the same for the same picture."""
+    """PNG bytes of [height, width, 3] RGB; deterministic."""
     done, data = cv2.imencode(".png", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), _PNG)
     if not done:
         raise OutputError(f"a picture of shape {color.shape} could not be encoded as PNG")
@@ -113,7 +113,7 @@ def encode_png(color: NDArray[np.uint8]) -> bytes:
 
 
 def light_row(light: Light) -> dict[str, Any]:
-    """A line of light.jsonl; `sh_all` only where there are more than 16 coefficients."""
+    """A line of light.jsonl; `sh_all` only with more than 16 coefficients."""
     row = {
         "frame": light.frame,
         "timestamp_s": light.timestamp_s,
@@ -135,7 +135,7 @@ def light_row(light: Light) -> dict[str, Any]:
 
 
 def trajectory_row(timestamp_s: float, world_from_camera: NDArray[np.float64]) -> str:
-    """`timestamp tx ty tz qx qy qz qw`. Raises OutputError if a number is not finite."""
+    """A line `timestamp tx ty tz qx qy qz qw`. Raises OutputError if a number is not finite."""
     numbers = np.array([*world_from_camera[:3, 3], *quaternion(world_from_camera[:3, :3])])
     if not np.isfinite(numbers).all():
         raise OutputError("a pose has NaN or infinity and was not written")
@@ -143,7 +143,7 @@ def trajectory_row(timestamp_s: float, world_from_camera: NDArray[np.float64]) -
 
 
 def timings_row(output: FrameOutput) -> dict[str, Any]:
-    """A line of timings.jsonl: the rows in milliseconds, then tracking, plan, and notes where there are any."""
+    """A line of timings.jsonl: times in milliseconds, tracking, plan, and notes if any."""
     row = {
         "frame": output.frame,
         **msgspec.structs.asdict(output.timings),
@@ -163,7 +163,7 @@ def _json(row: dict[str, Any], frame: int) -> str:
 
 
 def _remove_earlier_run(folder: Path) -> None:
-    """Pictures of an earlier, perhaps longer run would pass for this one's, and so would its mesh."""
+    """Remove pictures and meshes of an earlier, perhaps longer run, which could be mistaken for new ones."""
     if not (folder / "light.jsonl").is_file():
         return
     for name in _MESH_FILES:

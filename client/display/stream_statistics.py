@@ -1,6 +1,6 @@
-"""What a stream is like while it runs: frames and bits a second, and milliseconds of each stage of a frame's way.
+"""Statistics of a running stream: frames and bits per second, and the latency of each stage of a frame.
 
-All by the client's clock. `way` is the round trip less what the server says of its own: there and back.
+All times are of the client's clock. `way` is the round trip minus the times that the server reports.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 STAGES = ("encode", "way", "wait", "compute", "show", "whole")
-"""Captured to sent; sent to returned, less the next two; received to computing, and computing, as the server says;
-returned to shown; captured to shown."""
+"""encode: captured to sent. way: sent to returned, minus wait and compute. wait, compute: reported by the server.
+show: returned to shown. whole: captured to shown."""
 KEPT = 512
 RATE_S = 5.0
 
@@ -24,17 +24,17 @@ class _Frame:
 
 
 @dataclass
-class StreamFigures:
-    """Told of each frame as it passes; times in seconds of one clock."""
+class StreamStatistics:
+    """Collects times of frames, in seconds of one clock."""
 
     milliseconds: dict[str, deque[float]] = field(default_factory=lambda: {name: deque(maxlen=KEPT) for name in STAGES})
-    _under_way: dict[int, _Frame] = field(default_factory=dict)
+    _in_flight: dict[int, _Frame] = field(default_factory=dict)
     _sent: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=KEPT))
     _answered: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=KEPT))
 
     def note_sent(self, number: int, captured_s: float, sent_s: float, size_bytes: int) -> None:
-        """A frame went out; `sent_s`: as its first byte did."""
-        self._under_way[number] = _Frame(captured_s, sent_s)
+        """A frame was sent; `sent_s`: time of its first byte."""
+        self._in_flight[number] = _Frame(captured_s, sent_s)
         self._sent.append((sent_s, size_bytes))
 
     def note_answer(
@@ -46,9 +46,9 @@ class StreamFigures:
         size_bytes: int,
         waited_s: float = 0.0,
     ) -> None:
-        """Its answer is here, and on show. `waited_s`: at the server, before it was computed."""
+        """An answer was shown. `waited_s`: waiting on the server before computing."""
         self._answered.append((returned_s, size_bytes))
-        frame = self._under_way.pop(number, None)
+        frame = self._in_flight.pop(number, None)
         if frame is None:
             return
         way_s = max(returned_s - frame.sent_s - waited_s - computed_s, 0.0)
@@ -58,21 +58,21 @@ class StreamFigures:
             self.milliseconds[name].append(1e3 * seconds)
 
     def forget(self, number: int) -> None:
-        """It was dropped."""
-        self._under_way.pop(number, None)
+        """The frame was dropped."""
+        self._in_flight.pop(number, None)
 
     def percentiles(self, stage: str) -> tuple[float, float] | None:
-        """p50 and p99 in milliseconds of the last frames; None before the first."""
+        """p50 and p99 over the last frames in milliseconds; None without frames."""
         values = self.milliseconds[stage]
         return (float(np.percentile(values, 50)), float(np.percentile(values, 99))) if values else None
 
     def rates(self, now_s: float) -> tuple[float, float, float, float]:
-        """Frames sent and answered a second, Mbit/s up and down, over the last seconds."""
+        """Sent frames/s and Mbit/s, answered frames/s and Mbit/s, over the last RATE_S seconds."""
         return *_rates(self._sent, now_s), *_rates(self._answered, now_s)
 
 
 def _rates(events: deque[tuple[float, int]], now_s: float) -> tuple[float, float]:
-    """Frames and Mbit a second."""
+    """Frames/s and Mbit/s."""
     recent = [(at_s, size) for at_s, size in events if now_s - at_s < RATE_S]
     if len(recent) < 2:
         return 0.0, 0.0

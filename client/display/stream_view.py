@@ -1,6 +1,6 @@
-"""What `stream` shows in a terminal: rates, latency by stage, light, plan; with `--view` the picture in half blocks.
+"""Terminal view of `stream`: rates, latency by stage, light, plan; with `--view` the picture in half blocks.
 
-There is no window: the OpenCV that the program installs is the headless one, which runs everywhere.
+There is no window, because the headless OpenCV is installed, which runs everywhere.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
-from client.display.stream_statistics import STAGES, StreamFigures
+from client.display.stream_statistics import STAGES, StreamStatistics
 from client.streaming.coding import Coding
 from protocol.messages import Composite, Layer, Light
 
@@ -32,18 +32,18 @@ LABELS = {
     "show": "returned to shown",
     "whole": "captured to shown",
 }
-TOLD_BY_SERVER = ("wait", "compute")
-"""A light alone does not say them: they are part of the way then."""
+REPORTED_BY_SERVER = ("wait", "compute")
+"""A light alone does not report them; they are then part of `way`."""
 
 
 class StreamView:
-    """Redrawn a few times a second where the console is a terminal, else not at all. A context manager."""
+    """Redrawn a few times per second if the console is a terminal, else disabled. A context manager."""
 
-    def __init__(self, console: Console, progress: Progress, figures: StreamFigures, with_picture: bool) -> None:
-        self._progress, self._figures = progress, figures
+    def __init__(self, console: Console, progress: Progress, statistics: StreamStatistics, with_picture: bool) -> None:
+        self._progress, self._statistics = progress, statistics
         self._with_picture = with_picture
         self.codec = "JPEG"
-        """By which colour is sent, in words."""
+        """Name of the colour codec."""
         self.is_on = console.is_terminal
         self._light: Light | None = None
         self._drawn: Composite | Layer | None = None
@@ -55,7 +55,7 @@ class StreamView:
 
     @property
     def wants_pictures(self) -> bool:
-        """Whether `show` is to be given the picture."""
+        """Whether `show` needs the picture."""
         return self.is_on and self._with_picture
 
     def show(
@@ -67,14 +67,14 @@ class StreamView:
         coding: Coding | None,
         reconnected: int,
     ) -> None:
-        """The newest answer; it is drawn with the next refresh. `coding`: how frames are sent now."""
+        """Set the newest answer, drawn at the next refresh. `coding`: current coding of frames."""
         self._now_s, self._light, self._drawn = now_s, light, drawn
         self._coding, self._reconnected = coding, reconnected
         if picture is not None and self.wants_pictures:
             self._picture = half_blocks(picture, self._columns(picture))
 
     def render(self) -> RenderableType:
-        """All of it."""
+        """The whole view."""
         parts: list[RenderableType] = [self._progress.get_renderable()]
         if self._picture is not None:
             parts.append(self._picture)
@@ -93,7 +93,7 @@ class StreamView:
         self._live.stop()
 
     def _columns(self, picture: NDArray[np.uint8]) -> int:
-        """As many as leave room for the table below."""
+        """Columns of the picture that leave room for the table below."""
         rows = max(self._live.console.height - TABLE_ROWS, 4)
         fitting: int = 2 * rows * picture.shape[1] // picture.shape[0]
         return max(min(PICTURE_COLUMNS, self._live.console.width, fitting), 8)
@@ -101,12 +101,12 @@ class StreamView:
     def _table(self, light: Light, drawn: Composite | Layer | None) -> Table:
         table = Table.grid(padding=(0, 2))
         table.add_column(style="dim")
-        sent, up, answered, down = self._figures.rates(self._now_s)
+        sent, up, answered, down = self._statistics.rates(self._now_s)
         table.add_row("rate", f"{sent:.1f} sent, {answered:.1f} answered a second; {up:.1f} Mbit/s up, {down:.1f} down")
         for stage in STAGES:
-            found = self._figures.percentiles(stage)
-            is_told = drawn is not None or stage not in TOLD_BY_SERVER
-            if found is not None and is_told:
+            found = self._statistics.percentiles(stage)
+            is_reported = drawn is not None or stage not in REPORTED_BY_SERVER
+            if found is not None and is_reported:
                 table.add_row(LABELS[stage], f"p50 {found[0]:.0f} ms, p99 {found[1]:.0f} ms")
         table.add_row("light", light_line(light))
         if drawn is not None:
@@ -118,7 +118,7 @@ class StreamView:
 
 
 def light_line(light: Light) -> str:
-    """Where the light comes from, in words and numbers."""
+    """Direction and intensity of the light."""
     x, y, z = light.dominant_direction
     sure = "" if light.valid else ", not fixed by the pictures so far"
     lamps = f", lamps in the room: {len(light.lamps)}" if light.lamps else ""
@@ -126,7 +126,7 @@ def light_line(light: Light) -> str:
 
 
 def plan_line(drawn: Composite | Layer) -> str:
-    """What ran, what did not, and where it was sampled."""
+    """Effects that ran and that were left out, and the operating point."""
     plan = drawn.plan
     left_out = f"; left out: {', '.join(item.effect for item in plan.left_out)}" if plan.left_out else ""
     point = f"; {plan.point.settings} ({plan.point.reason})" if plan.point is not None else ""
@@ -134,7 +134,7 @@ def plan_line(drawn: Composite | Layer) -> str:
 
 
 def coding_line(coding: Coding, codec: str = "JPEG") -> str:
-    """How frames are sent."""
+    """Coding of frames in words."""
     size = f" at 1/{coding.divisor} of the size" if coding.divisor > 1 else ""
     noise_per_m = coding.depth_noise_per_m
     depth = "exact depth" if noise_per_m is None else f"depth to within {1e3 * noise_per_m:g} mm at 1 m"
@@ -142,7 +142,7 @@ def coding_line(coding: Coding, codec: str = "JPEG") -> str:
 
 
 def half_blocks(picture: NDArray[np.uint8], columns: int) -> Text:
-    """[h, w, 3] sRGB -> lines of `columns` characters, two pixels each: the upper in front, the lower behind."""
+    """[h, w, 3] sRGB -> lines of `columns` characters; each shows two pixels, as foreground and background colour."""
     height, width = picture.shape[:2]
     rows = max(round(columns * height / width / 2), 1)
     small = cv2.resize(picture, (columns, 2 * rows), interpolation=cv2.INTER_AREA)

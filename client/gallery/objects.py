@@ -15,7 +15,7 @@ CLAY: Rgb = (0.75, 0.55, 0.4)
 
 
 @dataclass(frozen=True)
-class Thing:
+class GalleryObject:
     """A ball or a box of one material."""
 
     size_m: float
@@ -24,7 +24,7 @@ class Thing:
     """World, of its bottom's middle, in frame 0."""
     step_m: Place = (0.0, 0.0, 0.0)
     """From frame to frame."""
-    stays: int = 0
+    start_frame: int = 0
     """Frames before it begins to move."""
     is_box: bool = False
     color: Rgb = CLAY
@@ -34,7 +34,7 @@ class Thing:
 
     def place(self, index: int) -> Place:
         """Where it stands in a frame."""
-        moved = max(index - self.stays, 0)
+        moved = max(index - self.start_frame, 0)
         x, y, z = (a + moved * b for a, b in zip(self.place_m, self.step_m, strict=True))
         return x, y, z
 

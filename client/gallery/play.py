@@ -1,4 +1,4 @@
-"""A gallery scene through the pipeline, its things placed and moved."""
+"""A gallery scene through the pipeline, its objects placed and moved."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def play(device: Device, source: GallerySource, wishes: Wishes) -> Generator[tup
     """Every frame's result, and the pipeline that it is of, which is closed after the last."""
     pipeline = ClientSession(device, source.camera, wishes)
     try:
-        for number, thing in enumerate(source.scene.things):
-            mesh = load_mesh(thing.glb(), "glb")
-            pipeline.place_object(f"object-{number}", mesh, Placement(position_m=thing.place(0)))
+        for number, item in enumerate(source.scene.objects):
+            mesh = load_mesh(item.glb(), "glb")
+            pipeline.place_object(f"object-{number}", mesh, Placement(position_m=item.place(0)))
         for index in range(len(source)):
-            for number, thing in enumerate(source.scene.things):
-                if index and thing.place(index) != thing.place(index - 1):
-                    pipeline.move_object(f"object-{number}", Placement(position_m=thing.place(index)))
+            for number, item in enumerate(source.scene.objects):
+                if index and item.place(index) != item.place(index - 1):
+                    pipeline.move_object(f"object-{number}", Placement(position_m=item.place(index)))
             yield pipeline, pipeline.process(source[index])
     finally:
         pipeline.close()

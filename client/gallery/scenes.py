@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from client.gallery.objects import Rgb, Thing
+from client.gallery.objects import GalleryObject, Rgb
 from client.synthetic.solids.polyhedra import Solid, box
 from client.synthetic.solids.round import Sphere
 from client.synthetic.solids.shell import Opening, Shell
@@ -38,12 +38,12 @@ class Part:
     albedo: Rgb
     step_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """From frame to frame; of balls."""
-    stays: int = 0
+    start_frame: int = 0
     """Frames before it begins to move."""
 
     def steps(self, index: int) -> int:
         """That it has moved until a frame."""
-        return max(index - self.stays, 0) if any(self.step_m) else 0
+        return max(index - self.start_frame, 0) if any(self.step_m) else 0
 
     def at(self, index: int) -> Solid:
         """Where it is in a frame."""
@@ -57,16 +57,16 @@ class Part:
 class GalleryScene:
     """A scene and what it calls for."""
 
-    says: str
+    description: str
     parts: tuple[Part, ...]
     sh: Floats
     """[16, 3] radiance."""
-    calls_for: Callable[[int], Effects]
+    expected_effects: Callable[[int], Effects]
     """The effects of a frame, by its index."""
-    things: tuple[Thing, ...] = ()
+    objects: tuple[GalleryObject, ...] = ()
     eye: tuple[float, float, float] = (0.0, 0.9, 1.5)
     target: tuple[float, float, float] = (0.0, 0.1, 0.0)
-    walk_m: float = 0.01
+    camera_step_m: float = 0.01
     """Of the camera to the right, from frame to frame."""
     frames: int = FRAMES
     noise_codes: float = 0.0
@@ -74,17 +74,17 @@ class GalleryScene:
     depth_noise: float = 0.0
     """Deviation of depth over that of a structured-light sensor (Nguyen et al. 2012)."""
     is_light_given: bool = True
-    lit_later: tuple[int, Floats] | None = None
+    later_light: tuple[int, Floats] | None = None
     """From which frame on it is lit by another light, and that: [16, 3]."""
-    rests: range = range(0)
+    resting_frames: range = range(0)
     """Frames that are known to tell the spine nothing new."""
-    holds: range = range(0)
+    held_frames: range = range(0)
     """Of these, those in which effects have nothing new to draw either."""
-    changes: float = 1.0
-    """Greatest share of the picture that its things are seen to change of real ones, sharp shadows aside."""
-    hangs: Effects = frozenset()
+    largest_changed_share: float = 1.0
+    """Greatest share of the picture that its objects are seen to change of real ones, sharp shadows aside."""
+    noise_dependent_effects: Effects = frozenset()
     """Effects that it hangs on the noise whether a frame calls for."""
-    settles: range = range(0)
+    settling_frames: range = range(0)
     """Frames in which it hangs on the noise whether it rests."""
     poses: Poses = "given"
     tone_mapping: Literal["auto", "light", "average"] = "auto"
@@ -111,17 +111,17 @@ _WALL = Part(box((0, 0.6, -0.65), (3.0, 1.4, 0.1)), GRAY)
 _ROOM = Part(Shell(np.array([-1.5, 0, -1.5]), np.array([1.5, 2.2, 2.0]), (Opening(3, (-1.0, -1.0), (1.0, 1.0)),)), GRAY)
 _SOFT = sky(0.7)
 _SUN = sky(0.25) + sun(0.9, 0.7, 0.3, 0.7)
-_BALL = Thing(0.24, (0.0, 0.0, 0.0))
-_BOX = Thing(0.2, (0.0, 0.0, 0.0), is_box=True)
+_BALL = GalleryObject(0.24, (0.0, 0.0, 0.0))
+_BOX = GalleryObject(0.2, (0.0, 0.0, 0.0), is_box=True)
 _HAND = Part(Sphere(np.array([0.9, 0.3, 0.1]), 0.12), (0.68, 0.44, 0.34), (-0.12, 0.0, 0.0))
 SETTLED_NOISY = 36
 _NOISE: dict[str, Any] = {
-    "walk_m": 0.0,
+    "camera_step_m": 0.0,
     "frames": STILL_FRAMES,
     "noise_codes": 2.5,
     "depth_noise": 1.0,
-    "settles": range(SETTLED, SETTLED_NOISY),
-    "hangs": frozenset({"bounce_real"}),
+    "settling_frames": range(SETTLED, SETTLED_NOISY),
+    "noise_dependent_effects": frozenset({"bounce_real"}),
 }
 
 _DRAWN = {"rasterize", "cover", "composite"}
@@ -142,21 +142,21 @@ GALLERY: dict[str, GalleryScene] = {
         _FLOOR,
         _SUN,
         _always({"composite"}),
-        (Thing(0.2, (0.0, -1.2, 2.5)),),
+        (GalleryObject(0.2, (0.0, -1.2, 2.5)),),
     ),
     "shadow-falls-in": GalleryScene(
         "a ball beside the picture, whose shadow the sun throws into it",
         _FLOOR,
         _SUN,
         _always({"composite", "prepare_rays", "light_objects", "shadow_real", "mark_changes", "bounce_real"}, _MAPPED),
-        (Thing(0.3, (1.15, 0.35, 0.2)),),
+        (GalleryObject(0.3, (1.15, 0.35, 0.2)),),
     ),
     "floating": GalleryScene(
         "a marble in the air, far from the wall behind",
         (Part(box((0, 0.6, -2.65), (6.0, 5.0, 0.1)), GRAY),),
         _SOFT,
         _always(_SHADED, {"light_objects"}),
-        (Thing(0.03, (0.0, 0.9, 0.9)),),
+        (GalleryObject(0.03, (0.0, 0.9, 0.9)),),
         target=(0.0, 0.9, 0.0),
     ),
     "closed-room": GalleryScene(
@@ -167,14 +167,14 @@ GALLERY: dict[str, GalleryScene] = {
         _FLOOR,
         _SOFT,
         _always(_STANDS, {"reflect", "bounce_real"}),
-        (Thing(0.24, (0.0, 0.0, 0.0), roughness=0.15, metalness=1.0),),
+        (GalleryObject(0.24, (0.0, 0.0, 0.0), roughness=0.15, metalness=1.0),),
     ),
     "soft-sky": GalleryScene(
         "a matt box on a floor under an even sky",
         _FLOOR,
         _SOFT,
         _always(_STANDS, {"bounce_real"}),
-        (Thing(0.2, (0.0, 0.0, 0.0), is_box=True),),
+        (GalleryObject(0.2, (0.0, 0.0, 0.0), is_box=True),),
     ),
     "dark-floor": GalleryScene(
         "a matt ball on a floor that sends next to nothing, seen from above",
@@ -199,16 +199,16 @@ GALLERY: dict[str, GalleryScene] = {
         _always(_STANDS, {"bounce_real"}),
         (replace(_BOX, size_m=0.1),),
         **_FROM_AFAR,
-        changes=0.2,
+        largest_changed_share=0.2,
     ),
     "long-shadow": GalleryScene(
         "a small matt ball in the air of a hall, whose shadow falls far away in a low sun",
         _HALL,
         sky(0.25) + sun(0.93, 0.35, 0.1, 0.7),
         _always(_STANDS, _MAPPED, {"direct_virtual", "bounce_real"}),
-        (Thing(0.16, (0.5, 0.2, 0.0)),),
+        (GalleryObject(0.16, (0.5, 0.2, 0.0)),),
         **_FROM_AFAR,
-        changes=0.35,
+        largest_changed_share=0.35,
     ),
     "two-suns": GalleryScene(
         "a matt ball on a floor in two lights",
@@ -225,23 +225,23 @@ GALLERY: dict[str, GalleryScene] = {
         (*_FLOOR, Part(box((-0.25, 0.5, 0), (0.1, 1.2, 1.4)), (0.7, 0.04, 0.03))),
         _SOFT,
         _always(_STANDS, {"bounce_real"}),
-        (Thing(0.24, (0.0, 0.0, 0.0), color=(0.95, 0.95, 0.95)),),
+        (GalleryObject(0.24, (0.0, 0.0, 0.0), color=(0.95, 0.95, 0.95)),),
     ),
     "soot": GalleryScene(
         "a ball as black as soot, off the floor",
         _FLOOR,
         _SOFT,
         _always(_STANDS - {"light_objects"}, {"bounce_real"}),
-        (Thing(0.24, (0.0, 0.0, 0.0), color=(0.0, 0.0, 0.0)),),
+        (GalleryObject(0.24, (0.0, 0.0, 0.0), color=(0.0, 0.0, 0.0)),),
     ),
     "comes-in": GalleryScene(
         "a ball that floats into the picture along the far wall's side",
         (Part(box((0, 0.6, -2.65), (6.0, 5.0, 0.1)), GRAY),),
         _SOFT,
         lambda index: frozenset({"composite"} if index < 3 else _SHADED | {"light_objects"}),
-        (Thing(0.03, (-0.62, 0.9, 0.9), (0.1, 0.0, 0.0)),),
+        (GalleryObject(0.03, (-0.62, 0.9, 0.9), (0.1, 0.0, 0.0)),),
         target=(0.0, 0.9, 0.0),
-        walk_m=0.0,
+        camera_step_m=0.0,
     ),
     "still": GalleryScene(
         "a matt ball on a floor in the sun, before a camera that stands still",
@@ -249,19 +249,19 @@ GALLERY: dict[str, GalleryScene] = {
         _SUN,
         _always(_STANDS, _MAPPED, {"direct_virtual", "bounce_real"}),
         (_BALL,),
-        walk_m=0.0,
+        camera_step_m=0.0,
         frames=STILL_FRAMES,
-        rests=range(SETTLED, STILL_FRAMES),
-        holds=range(SETTLED + HELD, STILL_FRAMES),
+        resting_frames=range(SETTLED, STILL_FRAMES),
+        held_frames=range(SETTLED + HELD, STILL_FRAMES),
     ),
     "still-and-empty": GalleryScene(
         "nothing virtual, before a camera that stands still",
         _FLOOR,
         _SUN,
         _always({"composite"}),
-        walk_m=0.0,
+        camera_step_m=0.0,
         frames=STILL_FRAMES,
-        rests=range(SETTLED, STILL_FRAMES),
+        resting_frames=range(SETTLED, STILL_FRAMES),
     ),
     "still-noisy": GalleryScene(
         "a matt box on a floor, before a camera that stands still and has a sensor's noise",
@@ -270,8 +270,8 @@ GALLERY: dict[str, GalleryScene] = {
         _always(_STANDS, {"bounce_real"}),
         (_BOX,),
         **_NOISE,
-        rests=range(SETTLED_NOISY, STILL_FRAMES),
-        holds=range(SETTLED_NOISY, STILL_FRAMES),
+        resting_frames=range(SETTLED_NOISY, STILL_FRAMES),
+        held_frames=range(SETTLED_NOISY, STILL_FRAMES),
     ),
     "still-tracked": GalleryScene(
         "nothing virtual, before a camera that stands still, with noise, and nobody tells where it is",
@@ -279,7 +279,7 @@ GALLERY: dict[str, GalleryScene] = {
         _SOFT,
         _always({"composite"}),
         **_NOISE,
-        rests=range(SETTLED_NOISY, STILL_FRAMES),
+        resting_frames=range(SETTLED_NOISY, STILL_FRAMES),
         poses="track",
     ),
     "moved-while-still": GalleryScene(
@@ -287,10 +287,10 @@ GALLERY: dict[str, GalleryScene] = {
         _FLOOR,
         _SOFT,
         _always(_STANDS, {"bounce_real"}),
-        (replace(_BOX, step_m=(0.01, 0.0, 0.005), stays=CHANGE_FRAME),),
+        (replace(_BOX, step_m=(0.01, 0.0, 0.005), start_frame=CHANGE_FRAME),),
         **_NOISE,
-        rests=range(SETTLED_NOISY, STILL_FRAMES),
-        holds=range(SETTLED_NOISY, CHANGE_FRAME + 1),
+        resting_frames=range(SETTLED_NOISY, STILL_FRAMES),
+        held_frames=range(SETTLED_NOISY, CHANGE_FRAME + 1),
     ),
     "lamp-switches-while-still": GalleryScene(
         "the same box in a light that is to be found, of which a part goes out",
@@ -300,19 +300,19 @@ GALLERY: dict[str, GalleryScene] = {
         (_BOX,),
         **_NOISE,
         is_light_given=False,
-        lit_later=(CHANGE_FRAME, sky(0.25) + sun(0.9, 0.7, 0.3, 0.63)),
-        rests=range(SETTLED_NOISY, CHANGE_FRAME),
-        holds=range(SETTLED_NOISY, CHANGE_FRAME),
+        later_light=(CHANGE_FRAME, sky(0.25) + sun(0.9, 0.7, 0.3, 0.63)),
+        resting_frames=range(SETTLED_NOISY, CHANGE_FRAME),
+        held_frames=range(SETTLED_NOISY, CHANGE_FRAME),
     ),
     "hand-enters-while-still": GalleryScene(
         "the same box, above which a real ball moves in after a while",
-        (*_FLOOR, replace(_HAND, stays=CHANGE_FRAME - 1)),
+        (*_FLOOR, replace(_HAND, start_frame=CHANGE_FRAME - 1)),
         _SOFT,
         _always(_STANDS, {"bounce_real"}),
         (_BOX,),
         **_NOISE,
-        rests=range(SETTLED_NOISY, CHANGE_FRAME),
-        holds=range(SETTLED_NOISY, CHANGE_FRAME),
+        resting_frames=range(SETTLED_NOISY, CHANGE_FRAME),
+        held_frames=range(SETTLED_NOISY, CHANGE_FRAME),
     ),
     "hand": GalleryScene(
         "a real ball moves in above a virtual one, which shall be as bright beside the picture",
@@ -320,7 +320,7 @@ GALLERY: dict[str, GalleryScene] = {
         _SOFT,
         _always(_STANDS, {"match_average", "bounce_real"}),
         (_BALL,),
-        walk_m=0.0,
+        camera_step_m=0.0,
         tone_mapping="average",
     ),
 }

@@ -11,7 +11,7 @@ from client.sources.frame_source import GALLERY_PREFIX as PREFIX
 from client.synthetic.lighting.bake import bake
 from client.synthetic.lighting.harmonics import sphere_directions
 from client.synthetic.lighting.lights import DistantLight
-from client.synthetic.render import Lit, camera_rays, look_at, render
+from client.synthetic.render import LitSolid, camera_rays, look_at, render
 from client.synthetic.scenes.textures import Texture
 from client.synthetic.solids.charts import atlas
 from client.synthetic.source import FOCAL_OF_WIDTH, FPS, to_srgb8
@@ -42,7 +42,7 @@ class GallerySource:
         )
         self._rays = camera_rays(self.camera)
         self._frames: dict[int, RgbdFrame] = {}  # rendered once: it takes longer than what they are for
-        self._bake: tuple[object, list[Lit]] | None = None
+        self._bake: tuple[object, list[LitSolid]] | None = None
         self._last: tuple[object, NDArray[np.uint8], NDArray[np.float64]] | None = None
 
     def __len__(self) -> int:
@@ -81,7 +81,7 @@ class GallerySource:
 
     def _sh(self, index: int) -> NDArray[np.float64]:
         """[16, 3] the radiance in a frame."""
-        later = self.scene.lit_later
+        later = self.scene.later_light
         return later[1] if later and index >= later[0] else self.scene.sh
 
     @property
@@ -92,21 +92,21 @@ class GallerySource:
 
     def pose(self, index: int) -> NDArray[np.float64]:
         """world_from_camera [4, 4]."""
-        aside = np.array([index * self.scene.walk_m, 0.0, 0.0])
+        aside = np.array([index * self.scene.camera_step_m, 0.0, 0.0])
         return look_at(np.array(self.scene.eye) + aside, np.array(self.scene.target), _UP)
 
-    def _lit(self, index: int) -> list[Lit]:
+    def _lit(self, index: int) -> list[LitSolid]:
         if self._bake is None or self._bake[0] != self._state(index):
             self._bake = self._state(index), self._baked(index)
         return self._bake[1]
 
-    def _baked(self, index: int) -> list[Lit]:
+    def _baked(self, index: int) -> list[LitSolid]:
         solids = [part.at(index) for part in self.scene.parts]
         grids = atlas([solid.charts for solid in solids], _STEP_M)
         directions = sphere_directions(_DIRECTIONS).astype(np.float32)
         taken = bake(solids, grids, directions) @ self._sh(index).astype(np.float32)
         return [
-            Lit(solid, _plain(part), own, ((own, taken),))
+            LitSolid(solid, _plain(part), own, ((own, taken),))
             for solid, part, own in zip(solids, self.scene.parts, grids, strict=True)
         ]
 

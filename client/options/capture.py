@@ -15,7 +15,7 @@ from client.options.light_file import Coefficients, read_light, read_panorama_li
 from client.options.source import open_source
 from client.sources.datasets.ground_truth import GroundTruthSource
 from client.sources.frame_source import ENDLESS, Source, is_live
-from client.sources.volume import Volume, default_volume, default_voxel, with_room_to_move
+from client.sources.volume import Volume, default_volume, default_voxel, enlarged_volume
 from protocol.messages import Poses, Preset, Robustness, Wishes
 
 THESIS_RAY_LENGTH_M = 0.1
@@ -79,7 +79,7 @@ def prepare(options: CaptureOptions, lossless: bool = False, answer: str | None 
     visible_volume = volume or default_volume(source, frames)
     voxel = options.voxel or default_voxel(visible_volume)
     is_path_known = source.has_poses and not is_live(source)
-    volume = volume or (visible_volume if is_path_known else with_room_to_move(visible_volume))
+    volume = volume or (visible_volume if is_path_known else enlarged_volume(visible_volume))
     wishes = Wishes(
         preset=sampling.preset,
         budget_ms=sampling.budget_ms,

@@ -22,7 +22,7 @@ from server.service.tls import Certificate, CertificateError, given_certificate,
 
 NO_TOKEN = "none"
 NO_DATA = "none"
-LEAVING_PATIENCE_S = 3.0
+EXIT_TIMEOUT_S = 3.0
 LEAST_VOLUME_MIB, MOST_VOLUME_MIB = 16, 1 << 20
 
 
@@ -133,7 +133,7 @@ def log_format_of(text: str) -> LogFormat:
     return cast(LogFormat, text)
 
 
-def leave_soon(status: int) -> None:
+def exit_soon(status: int) -> None:
     """End this process shortly with `status`, even where a device never comes back to the thread that waits for it."""
 
     def leave() -> None:
@@ -141,7 +141,7 @@ def leave_soon(status: int) -> None:
         sys.stderr.flush()
         os._exit(status)
 
-    timer = threading.Timer(LEAVING_PATIENCE_S, leave)
+    timer = threading.Timer(EXIT_TIMEOUT_S, leave)
     timer.daemon = True
     timer.start()
 

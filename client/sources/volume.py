@@ -46,7 +46,7 @@ def default_volume(source: Source, frames: range) -> Volume:
     return x0, y0, z0, x1, y1, z1
 
 
-def with_room_to_move(volume: Volume) -> Volume:
+def enlarged_volume(volume: Volume) -> Volume:
     """`volume` grown by half its longest side all around: what a camera may come to see whose way is not known.
 
     Costs little: memory is taken where there is surface.

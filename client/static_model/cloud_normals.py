@@ -1,4 +1,4 @@
-"""Normals of a point cloud by moving least squares, turned outwards by the viewing direction (thesis 4.1.1)."""
+"""Normals of a point cloud by moving least squares, flipped outwards by the viewing direction (thesis 4.1.1)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class SurfacePoints:
 
     cloud: PointCloud
     normals: Floats
-    """[n, 3] unit, world; their sign means nothing before `turned_outwards`."""
+    """[n, 3] unit, world; their sign means nothing before `oriented_outwards`."""
     residual_m: Floats
     """[n] root of the weighted mean square distance of the neighbours to the fitted plane."""
     radius_m: float
@@ -97,7 +97,7 @@ def fit_planes(cloud: PointCloud, radius_m: float) -> SurfacePoints:
     return SurfacePoints(kept, normals[enough], residuals[enough], radius_m)
 
 
-def turned_outwards(surface: SurfacePoints) -> tuple[SurfacePoints, NDArray[np.bool_]]:
+def oriented_outwards(surface: SurfacePoints) -> tuple[SurfacePoints, NDArray[np.bool_]]:
     """Normals that face away from the cameras inverted; and [n] which those were.
 
     A surface that was seen faces whoever saw it: the dot product with the viewing direction cannot be negative.

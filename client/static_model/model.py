@@ -22,7 +22,7 @@ from client.options.capture import parse_frames
 from client.options.source import open_source
 from client.sources.frame_source import Source
 from client.sources.volume import default_volume, default_voxel
-from client.static_model.cloud_normals import SurfacePoints, smooth, turned_outwards
+from client.static_model.cloud_normals import SurfacePoints, oriented_outwards, smooth
 from client.static_model.point_cloud import CloudFusion
 from server.maths.sh import webxr_from_world
 from server.meshing.files import mesh_files
@@ -40,7 +40,7 @@ class StaticModel:
 
     mesh: SceneMesh
     points: int
-    turned: int
+    flipped: int
     """Normals that pointed away from the cameras and were inverted."""
     radius_m: float
     """Within which the normals were smoothed."""
@@ -86,7 +86,7 @@ def model_of_source(
 
 def model_of_fusion(fusion: CloudFusion, cell_m: float, gltf_from_world: NDArray[np.float64]) -> StaticModel:
     """Normals, orientation and triangles of a fused cloud. Raises RunError where there is no surface."""
-    surface, turned = turned_outwards(smooth(fusion.cloud()))
+    surface, flipped = oriented_outwards(smooth(fusion.cloud()))
     triangles = triangulate(surface, cell_m)
     if not len(triangles):
         raise RunError("the points give no triangles: give more --frames or a larger --voxel")
@@ -105,7 +105,7 @@ def model_of_fusion(fusion: CloudFusion, cell_m: float, gltf_from_world: NDArray
             gltf_from_world=gltf_from_world,
         ),
         points=len(surface.normals),
-        turned=int(turned.sum()),
+        flipped=int(flipped.sum()),
         radius_m=surface.radius_m,
     )
 

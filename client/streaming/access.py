@@ -1,4 +1,4 @@
-"""How a program gets into a server: its token, and what vouches for its certificate."""
+"""Access to a server: token and verification of its TLS certificate."""
 
 from __future__ import annotations
 
@@ -17,64 +17,64 @@ LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
 class AccessError(ValueError):
-    """What was given cannot open anything; one line."""
+    """Access options are invalid; one line."""
 
 
 @dataclass(frozen=True)
 class Access:
-    """What a user gives besides the server's URL; each may be left out."""
+    """Access options besides the server's URL."""
 
     token: str | None = None
-    """None: the URL's own, else the one that a server of the same user on this machine has left."""
+    """None: the token of the URL, else the key file of a server of the same user on this machine."""
     tls_fingerprint: str | None = None
-    """SHA-256 of the certificate that the server must show, in hexadecimal."""
+    """SHA-256 of the server's certificate in hexadecimal."""
     tls_ca: Path | None = None
-    """PEM of who must have signed the server's certificate."""
+    """PEM file of the authority that signed the server's certificate."""
 
 
 @dataclass(frozen=True)
-class Entrance:
-    """What a connection is opened with."""
+class ConnectionParameters:
+    """Parameters of the WebSocket connection."""
 
     stream_url: str
     headers: dict[str, str]
     tls: ssl.SSLContext | None
 
 
-def entrance(server_url: str, access: Access) -> Entrance:
-    """Of a server given as `http(s)://host:port[/?token=...]`. Raises AccessError, ValueError where it is no URL."""
+def connection_parameters(server_url: str, access: Access) -> ConnectionParameters:
+    """Parameters for `http(s)://host:port[/?token=...]`. Raises AccessError; ValueError if it is not a URL."""
     parts = urlsplit(with_scheme(server_url))
-    left = _left_here(parts.hostname, parts.port or (443 if parts.scheme in TLS_SCHEMES else 80))
-    token = access.token or next(iter(parse_qs(parts.query).get("token", [])), None) or (left.token if left else None)
+    local = _local_key(parts.hostname, parts.port or (443 if parts.scheme in TLS_SCHEMES else 80))
+    token = access.token or next(iter(parse_qs(parts.query).get("token", [])), None) or (local.token if local else None)
     tls = None
     if parts.scheme in TLS_SCHEMES:
-        tls = tls_context(access, left.fingerprint if left else None)
+        tls = tls_context(access, local.fingerprint if local else None)
     elif access.tls_fingerprint is not None or access.tls_ca is not None:
         raise AccessError(f"{without_query(server_url)} is without TLS: give https:// to have its certificate checked")
     headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-    return Entrance(stream_url(server_url), headers, tls)
+    return ConnectionParameters(stream_url(server_url), headers, tls)
 
 
 def with_scheme(server_url: str) -> str:
-    """The URL of a server that may be given as `host:port`."""
+    """The URL with a scheme; `host:port` becomes `ws://host:port`."""
     return server_url if "://" in server_url else f"ws://{server_url}"
 
 
 def without_query(server_url: str) -> str:
-    """The URL less its token, as it may be told to anybody."""
+    """The URL without its token, for messages."""
     return server_url.partition("?")[0].removesuffix("/") if "?" in server_url else server_url
 
 
 def stream_url(server_url: str) -> str:
-    """The socket's URL of a server given as `http(s)://host:port`, `ws(s)://host:port[/v1/stream]` or `host:port`."""
+    """The WebSocket URL of a server given as `http(s)://host:port`, `ws(s)://host:port[/v1/stream]` or `host:port`."""
     parts = urlsplit(with_scheme(server_url))
     scheme = {"http": "ws", "https": "wss"}.get(parts.scheme, parts.scheme)
     return urlunsplit((scheme, parts.netloc, parts.path if parts.path.strip("/") else STREAM_PATH, "", ""))
 
 
-def tls_context(access: Access, left_fingerprint: str | None) -> ssl.SSLContext:
-    """What checks the server's certificate. Raises AccessError."""
-    pinned = access.tls_fingerprint or (left_fingerprint if access.tls_ca is None else None)
+def tls_context(access: Access, local_fingerprint: str | None) -> ssl.SSLContext:
+    """TLS context that verifies the server's certificate. Raises AccessError."""
+    pinned = access.tls_fingerprint or (local_fingerprint if access.tls_ca is None else None)
     if access.tls_fingerprint is not None and access.tls_ca is not None:
         raise AccessError("--tls-fingerprint and --tls-ca each say what to trust: leave one of the two out")
     if pinned is None:
@@ -85,13 +85,13 @@ def tls_context(access: Access, left_fingerprint: str | None) -> ssl.SSLContext:
             raise AccessError(f"--tls-ca {access.tls_ca}: cannot be read ({why}): give certificates as PEM") from error
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE  # by whoever it was made, only this one will do
+    context.verify_mode = ssl.CERT_NONE  # the pinned fingerprint is checked instead
     context.sslobject_class = _pinned(fingerprint_bytes(pinned))
     return context
 
 
 def fingerprint_bytes(text: str) -> bytes:
-    """32 bytes of a SHA-256 written in hexadecimal, with or without colons. Raises AccessError."""
+    """32 bytes of a SHA-256 in hexadecimal, with or without colons. Raises AccessError."""
     try:
         digest = bytes.fromhex(text.lower().removeprefix("sha256:").replace(":", ""))
     except ValueError:
@@ -102,18 +102,18 @@ def fingerprint_bytes(text: str) -> bytes:
 
 
 def _pinned(digest: bytes) -> type[ssl.SSLObject]:
-    """A TLS connection whose handshake fails, before anything is sent, unless the certificate has this SHA-256."""
+    """A TLS class whose handshake fails before any data is sent, unless the certificate has this SHA-256."""
 
     class Pinned(ssl.SSLObject):
         def do_handshake(self) -> None:
             super().do_handshake()
-            shown = self.getpeercert(binary_form=True)
-            if shown is None or not hmac.compare_digest(hashlib.sha256(shown).digest(), digest):
-                found = hashlib.sha256(shown or b"").digest().hex(":").upper()
+            certificate = self.getpeercert(binary_form=True)
+            if certificate is None or not hmac.compare_digest(hashlib.sha256(certificate).digest(), digest):
+                found = hashlib.sha256(certificate or b"").digest().hex(":").upper()
                 raise ssl.SSLCertVerificationError(f"its fingerprint is {found}")
 
     return Pinned
 
 
-def _left_here(host: str | None, port: int) -> LocalKey | None:
+def _local_key(host: str | None, port: int) -> LocalKey | None:
     return find_key(port) if host in LOOPBACK else None

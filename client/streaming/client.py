@@ -1,4 +1,4 @@
-"""The client's end of the socket: an async class that any capturing or watching program can use."""
+"""Asynchronous client of the protocol, for programs that capture or watch."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ from protocol.messages import (
 __all__ = ["Access", "Answer", "ClientError", "Coding", "RoomPlace", "StreamClient", "frame_message", "stream_url"]
 
 KEEP_S = 30.0
-"""For which the server keeps a session whose connection is lost, and a client tries to come back."""
+"""How long the server keeps a session without a connection, and the client tries to reconnect."""
 RETRY_S = (0.05, 0.1, 0.2, 0.4, 0.8)
-"""Between tries; the last again and again."""
+"""Delays between attempts to reconnect; the last is repeated."""
 GONE, TRY_LATER = 4410, 1013
 RESTART, KEEPALIVE = 1012, 1011
 UNREAD_ANSWERS = 16
@@ -60,40 +60,40 @@ UNREAD_ANSWERS = 16
 
 @dataclass(frozen=True)
 class Answer:
-    """What the server made of one frame."""
+    """The server's answer to one frame."""
 
     light: Light
     composite: Composite | None = None
-    """As `wishes.answer` is where nothing is said."""
+    """Set if `wishes.answer` is `picture`."""
     layer: Layer | None = None
-    """Where it is `layer`."""
+    """Set if `wishes.answer` is `layer`."""
 
     @property
     def drawn(self) -> Composite | Layer | None:
-        """None: the light is the whole answer."""
+        """The composite or layer; None if the answer is only a light."""
         return self.layer if self.composite is None else self.composite
 
 
 @dataclass
 class _MeshInbox:
-    """The files of a mesh as their parts arrive."""
+    """Collects the parts of requested mesh files."""
 
     request: int
     progress: Callable[[int, int], None]
     files: dict[MeshFormat, bytearray] = field(default_factory=dict)
     sizes: dict[MeshFormat, int] = field(default_factory=dict)
 
-    def begin_anew(self) -> None:
-        """The files are sent again."""
+    def restart(self) -> None:
+        """Discard all parts; the server sends the files again."""
         self.files.clear()
         self.sizes.clear()
 
     def add(self, part: MeshPart) -> None:
-        """Append a part. Raises ProtocolError for one that does not follow on."""
+        """Append a part. Raises ProtocolError if it is not the next one."""
         data = self.files.setdefault(part.format, bytearray())
         size = self.sizes.setdefault(part.format, part.size_bytes)
-        follows = part.request == self.request and part.size_bytes == size and part.offset == len(data)
-        if not follows or len(data) + len(part.data) > size:
+        is_next = part.request == self.request and part.size_bytes == size and part.offset == len(data)
+        if not is_next or len(data) + len(part.data) > size:
             raise ProtocolError(f"mesh_part at byte {part.offset} of {part.format} does not follow on")
         data += part.data
         self.progress(len(data), part.size_bytes)
@@ -105,7 +105,7 @@ Request = PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh
 
 @dataclass(frozen=True)
 class RoomPlace:
-    """The room that a client joins, and what it says of its world's place there (see `Hello`)."""
+    """The room to join and the pose of the client's world in it (see `Hello`)."""
 
     name: str
     key: str | None = None
@@ -114,11 +114,11 @@ class RoomPlace:
 
 
 class StreamClient:
-    """One session. Made by `connect`; then `hello` or `watch`; then read `answers` while sending.
+    """One session: `connect`, then `hello` or `watch`, then read `answers` while sending.
 
-    A task of its own reads the socket. Frames are to be sent by one task at a time. A capturing client whose connection
-    is lost comes back by itself and goes on: what it asked for is done once, and frames that were on the way are told
-    as dropped, or in a lossless session sent again.
+    A background task reads the socket. Only one task may send frames at a time. A capturing client reconnects after a
+    lost connection: each request is executed once; unanswered frames are reported as `Dropped`, or sent again in a
+    lossless session.
     """
 
     def __init__(self, socket: ClientConnection, server_url: str, access: Access, tap: Tap | None) -> None:
@@ -130,15 +130,15 @@ class StreamClient:
         self._hello: Hello | None = None
         self._is_connected = True
         self.reconnected = 0
-        """Times that a lost connection was restored."""
+        """Number of reconnections."""
         self.video: VideoEncoder | None = None
-        """By which colour is sent; to be set after `hello`, where `welcome.codecs` has `h264`."""
+        """Encoder of colour; set it after `hello`, if `welcome.codecs` contains `h264`."""
         self._requests = count()
         self._max_inflight = 1
         self._unanswered: dict[int, Frame | None] = {}
-        """By number; what was sent only where the session is lossless."""
+        """By frame number; the message is kept only in a lossless session."""
         self._lost: set[int] = set()
-        """Frames that a connection took along; late answers to them are none."""
+        """Frames lost with a connection; late answers to them are ignored."""
         self._unacknowledged: dict[int, Request] = {}
         self._unread: deque[Answer | Dropped | Error] = deque()
         self._acknowledged: dict[int, Acknowledged] = {}
@@ -154,7 +154,7 @@ class StreamClient:
 
     @classmethod
     async def connect(cls, server_url: str, tap: Tap | None = None, access: Access | None = None) -> StreamClient:
-        """Open the socket of a server given as `http(s)://host:port[/?token=...]`, `ws(s)://...` or `host:port`.
+        """Connect to a server given as `http(s)://host:port[/?token=...]`, `ws(s)://...` or `host:port`.
 
         `tap` is called with every message sent and received. Raises ClientError.
         """
@@ -171,7 +171,7 @@ class StreamClient:
     ) -> Welcome:
         """Begin to capture; returns when the server has prepared the session. Raises ClientError if it refuses.
 
-        `room`: to share with others. `keep_s`: for how long a lost connection may be restored.
+        `room`: the room to share; None: a room of its own. `keep_s`: how long the session survives a lost connection.
         """
         place = room or RoomPlace("")
         self._hello = Hello(
@@ -188,54 +188,54 @@ class StreamClient:
         return await self._wait_for_welcome()
 
     async def watch(self, session: str | None = None, room: str | None = None, room_key: str | None = None) -> Welcome:
-        """Begin to watch a session, or the one that streams now or next. Raises ClientError if it is refused."""
+        """Watch a session; default: the one that streams now or next. Raises ClientError if the server refuses."""
         await self._send(Watch(session=session, room=room, room_key=room_key))
         return await self._wait_for_welcome()
 
     @property
     def unanswered(self) -> int:
-        """Frames that were sent and have no answer yet."""
+        """Number of frames without an answer."""
         return len(self._unanswered)
 
     @property
     def has_room(self) -> bool:
-        """Another frame may be sent without exceeding the server's window."""
+        """Whether another frame fits the server's window."""
         return len(self._unanswered) < self._max_inflight
 
     async def wait_for_room(self) -> None:
-        """Wait until `has_room`. Raises ClientError when the server has gone."""
+        """Wait until `has_room`. Raises ClientError if the session ends."""
         await self._wait_until(lambda: self.has_room)
 
     async def wait_until_answered(self) -> None:
-        """Wait until no frame is unanswered. Raises ClientError when the server has gone."""
+        """Wait until all frames are answered. Raises ClientError if the session ends."""
         await self._wait_until(lambda: not self._unanswered)
 
     async def ping(self) -> float:
-        """Seconds that an empty message takes there and back. Raises ClientError."""
+        """Round trip of an empty message in seconds. Raises ClientError."""
         try:
             return await (await self._socket.ping())
         except ConnectionClosed as error:
             raise ClientError(f"the connection to {self._url} is closed") from error
 
     async def send_frame(self, frame: RgbdFrame, coding: Coding = DEFAULT_CODING) -> None:
-        """Encode and send one frame, waiting for room in the window first. Raises ClientError.
+        """Encode one frame, wait until it fits the window, and send it. Raises ClientError.
 
-        A session that wishes `lossless` sends raw colour and exact depth, any other JPEG and depth as `coding` says.
+        A lossless session sends raw colour and exact depth and ignores `coding`.
         """
         await self.wait_for_room()
         await self.send_encoded(await self.encode_frame(frame, coding))
 
     async def encode_frame(self, frame: RgbdFrame, coding: Coding = DEFAULT_CODING) -> Frame:
-        """A frame as `send_frame` sends it, encoded in a thread of its own. Raises ClientError before `hello`."""
+        """Encode a frame as `send_frame` does, in another thread. Raises ClientError before `hello`."""
         if self._hello is None:
             raise ClientError("a frame can only be sent after hello")
         lossless = self._hello.wishes.lossless
         if self._welcome is not None and coding.depth_codec not in self._welcome.depth_codecs:
-            coding = replace(coding, depth_codec="zstd-delta")  # a server of before
+            coding = replace(coding, depth_codec="zstd-delta")  # an earlier server
         return await asyncio.to_thread(frame_message, frame, self._hello.camera, lossless, coding, self.video)
 
     async def send_encoded(self, message: Frame) -> None:
-        """Send what `encode_frame` made, waiting for room in the window first. Raises ClientError."""
+        """Wait until the window has room, and send a message of `encode_frame`. Raises ClientError."""
         if self._hello is None:
             raise ClientError("a frame can only be sent after hello")
         await self.wait_for_room()
@@ -252,7 +252,7 @@ class StreamClient:
         scale: float = 1.0,
         yaw_deg: float = 0.0,
     ) -> Acknowledged:
-        """Put a mesh file's bytes into the scene; the acknowledgement says in `error` what was wrong with it."""
+        """Place the mesh file `data` in the scene; `error` of the acknowledgement says why it was refused."""
         request = next(self._requests)
         return await self._ask(
             PlaceObject(
@@ -269,29 +269,31 @@ class StreamClient:
     async def move_object(
         self, name: str, position_m: Vector3, scale: float = 1.0, yaw_deg: float = 0.0
     ) -> Acknowledged:
-        """Move an object that was placed."""
+        """Move a placed object."""
         request = next(self._requests)
         return await self._ask(
             MoveObject(request=request, object=name, position_m=position_m, scale=scale, yaw_deg=yaw_deg)
         )
 
     async def remove_object(self, name: str) -> Acknowledged:
-        """Take an object away."""
+        """Remove an object."""
         return await self._ask(RemoveObject(request=next(self._requests), object=name))
 
     async def set_quality(
         self, preset: Preset, budget_ms: float | None = None, max_light_error_deg: float | None = None
     ) -> Acknowledged:
-        """Change the preset of the running session; of `auto`, by what it is chosen. Raises ValueError."""
-        chosen_by = {"budget_ms": budget_ms, "max_light_error_deg": max_light_error_deg}
-        return await self._ask(Quality(request=next(self._requests), preset=preset, **chosen_by))
+        """Change the preset of the session; the limits are for `auto`. Raises ValueError."""
+        request = next(self._requests)
+        return await self._ask(
+            Quality(request=request, preset=preset, budget_ms=budget_ms, max_light_error_deg=max_light_error_deg)
+        )
 
     async def request_mesh(
         self, progress: Callable[[int, int], None] = lambda _done, _total: None
     ) -> Mapping[MeshFormat, bytes]:
-        """The files of the surface that the server has fused so far; `progress` is told bytes of each file.
+        """Mesh files of the surface fused so far; `progress` receives bytes done and total of each file.
 
-        Raises ClientError where the server has none, or one that is too large.
+        Raises ClientError if there is no surface, or if it is too large.
         """
         request = next(self._requests)
         self._mesh = inbox = _MeshInbox(request, progress)
@@ -304,9 +306,9 @@ class StreamClient:
         return {format_: bytes(data) for format_, data in inbox.files.items()}
 
     async def answers(self) -> AsyncIterator[Answer | Dropped | Error]:
-        """What comes back, in the order it came, until `close` or the server's end. Raises ClientError.
+        """Answers in the order of arrival, until `close` or the end of the session. Raises ClientError.
 
-        An `Error` here is not fatal. Unread answers hold up the socket after a while: keep reading.
+        An `Error` here is not fatal. Keep reading: too many unread answers block the socket.
         """
         while True:
             async with self._changed:
@@ -320,7 +322,7 @@ class StreamClient:
             raise self._failure
 
     async def close(self, reason: str = "") -> None:
-        """Say bye and close; what has not arrived yet is lost."""
+        """Send `Bye` and close; answers that have not arrived are lost."""
         self._leaving = True
         if not self._ended:
             with contextlib.suppress(ClientError):
@@ -330,25 +332,25 @@ class StreamClient:
         await self._listening
 
     async def _send(self, message: ClientMessage) -> None:
-        """Encode and send; while the connection is lost, once it is restored. Raises ClientError."""
+        """Encode and send, after reconnecting if the connection is lost. Raises ClientError."""
         try:
             data = encode(message)
         except ProtocolError as error:
             raise ClientError(str(error)) from error
         await self._wait_until(lambda: self._is_connected)
-        if isinstance(message, Frame) and self._hello is not None:  # from now on it is answered, or told to be lost
+        if isinstance(message, Frame) and self._hello is not None:  # from here on answered or reported as lost
             self._unanswered[message.frame] = message if self._hello.wishes.lossless else None
         socket = self._socket
         try:
             await socket.send(data)
         except ConnectionClosed as error:
-            if not await self._is_sent_again(socket):
+            if not await self._is_resent(socket):
                 raise self._failure or ClientError(f"the connection to {self._url} is closed") from error
         if self._tap is not None:
             self._tap(message)
 
-    async def _is_sent_again(self, socket: ClientConnection) -> bool:
-        """After a socket broke: whether another one took its place, by which all that matters is sent once more."""
+    async def _is_resent(self, socket: ClientConnection) -> bool:
+        """Wait for the reconnection after `socket` broke, which sends everything again; False if the session ended."""
         async with self._changed:
             await self._changed.wait_for(lambda: self._ended or (self._is_connected and self._socket is not socket))
         return not self._ended
@@ -375,12 +377,12 @@ class StreamClient:
             self._changed.notify_all()
 
     async def _listen(self) -> None:
-        """Take messages until the session ends, and keep how it ended."""
+        """Handle messages until the session ends, and store its failure."""
         try:
             while True:
                 try:
                     async for data in self._socket:
-                        await self._take(decode_server(data.encode() if isinstance(data, str) else data))
+                        await self._handle(decode_server(data.encode() if isinstance(data, str) else data))
                         await self._note_change()
                     break
                 except ConnectionClosed as error:
@@ -400,7 +402,7 @@ class StreamClient:
             await self._note_change()
 
     def _is_lost(self, error: ConnectionClosed) -> bool:
-        """Whether a session that is kept lost its connection."""
+        """Whether the connection broke in a way that allows to resume the session."""
         if self._hello is None or self._welcome is None or self._welcome.key is None:
             return False
         if error.rcvd is None or (error.rcvd.code == KEEPALIVE and "keepalive" in error.rcvd.reason):
@@ -408,7 +410,7 @@ class StreamClient:
         return error.rcvd.code == RESTART and self._hello.room is not None
 
     async def _restore(self, lost: ClientError) -> None:
-        """Come back by another connection. Raises ClientError where the server does not want that, or is not there."""
+        """Reconnect. Raises ClientError if the server refuses or stays unreachable."""
         assert self._hello is not None
         assert self._welcome is not None
         self._is_connected = False
@@ -419,21 +421,21 @@ class StreamClient:
                 raise ClientError(f"{lost}, and could not be restored")
             try:
                 socket = await open_client_socket(self._server_url, self._access)
-                welcome = await self._greeted(socket, hello)
+                welcome = await self._welcome_of(socket, hello)
             except ConnectionClosed as refused:
                 code = None if refused.rcvd is None else refused.rcvd.code
                 if code == GONE and self._hello.room is not None:
-                    hello = self._hello  # the room outlives its sessions
+                    hello = self._hello  # the session is gone, the room is not: join it anew
                 elif code is not None and code not in (TRY_LATER, RESTART):
                     raise self._explain(refused) from refused
             except (ClientError, TimeoutError):
-                pass  # not there yet
+                pass  # not reachable yet
             else:
-                await self._go_on(socket, welcome)
+                await self._resume(socket, welcome)
                 return
             await asyncio.sleep(RETRY_S[min(tries, len(RETRY_S) - 1)])
 
-    async def _greeted(self, socket: ClientConnection, hello: Hello) -> Welcome:
+    async def _welcome_of(self, socket: ClientConnection, hello: Hello) -> Welcome:
         """The answer to `hello`. Raises ConnectionClosed, TimeoutError, ProtocolError."""
         async with asyncio.timeout(KEEP_S):
             await socket.send(encode(hello))
@@ -445,13 +447,13 @@ class StreamClient:
                     case Error() as error:
                         self._reason_given = error.reason
 
-    async def _go_on(self, socket: ClientConnection, welcome: Welcome) -> None:
-        """Take the new connection, and send what has no answer yet again."""
+    async def _resume(self, socket: ClientConnection, welcome: Welcome) -> None:
+        """Use the new connection and send unanswered requests again."""
         self._socket, self._welcome, self._reason_given = socket, welcome, None
         if self.video is not None:
             self.video.need_key()
         if self._mesh is not None:
-            self._mesh.begin_anew()
+            self._mesh.restart()
         for request in self._unacknowledged.values():
             await socket.send(encode(request))
         for number, frame in list(self._unanswered.items()):
@@ -474,7 +476,7 @@ class StreamClient:
         return ClientError(f"the server at {self._url} closed the connection: {reason or f'code {error.rcvd.code}'}")
 
     def _ends_answer(self, message: ServerMessage) -> TypeGuard[Composite | Layer | Light | Dropped]:
-        """Whether nothing else comes for its frame."""
+        """Whether this is the last message about its frame."""
         if isinstance(message, Light):
             return self._expects_light_only
         return isinstance(message, Composite | Layer | Dropped)
@@ -483,11 +485,11 @@ class StreamClient:
     def _expects_light_only(self) -> bool:
         return self._hello is not None and self._hello.wishes.answer == "light"
 
-    async def _take(self, message: ServerMessage) -> None:
+    async def _handle(self, message: ServerMessage) -> None:
         if self._tap is not None:
             self._tap(message)
         if self._ends_answer(message) and message.frame in self._lost:
-            self._lost.discard(message.frame)  # it was still worked on, but is told to be lost already
+            self._lost.discard(message.frame)  # already reported as lost
             return
         match message:
             case Welcome():
@@ -519,7 +521,7 @@ class StreamClient:
         self._unanswered.pop(frame, None)
 
     async def _deliver(self, answer: Answer | Dropped | Error) -> None:
-        """Keep an answer for `answers`, once there is room for it."""
+        """Queue an answer for `answers`; waits while the queue is full."""
         if isinstance(answer, Dropped) and self.video is not None:
             self.video.need_key()
         async with self._changed:

@@ -1,4 +1,4 @@
-"""How a frame goes over the wire: quality and size of the colour picture, effort and rounding of depth."""
+"""Coding of a frame: quality and size of the colour picture, compression level and rounding of depth."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from protocol.messages import ColorImage, DepthCodec, DepthImage, Frame
 
 @dataclass(frozen=True)
 class Coding:
-    """The default is what a fast link gets."""
+    """Coding parameters; the defaults suit a fast link."""
 
     quality: int = DEFAULT_JPEG_QUALITY
-    """JPEG's, 0 to 100; video gets a rate factor in its place."""
+    """JPEG quality, 0 to 100; for video it is mapped to a rate factor."""
     divisor: int = 1
-    """1, 2 or 4: the colour picture is sent at 1/divisor of its width and height; the server enlarges it."""
+    """1, 2 or 4: colour is sent at 1/divisor of its width and height; the server enlarges it."""
     depth_level: int = 1
-    """zstd's: 6 takes a twentieth fewer bytes than 1, and 2 ms more for 640x480."""
+    """Level of zstd: 6 needs 5 % fewer bytes than 1, and 2 ms more for 640x480."""
     depth_noise_per_m: float | None = None
-    """Depth may be moved by this times z^2 (metres); None: it is sent bit for bit."""
+    """Depth may change by up to this times z^2 (metres); None: depth is exact."""
     depth_codec: DepthCodec = "zstd-ranks"
 
 
@@ -40,9 +40,9 @@ def frame_message(
     coding: Coding = DEFAULT_CODING,
     video: VideoEncoder | None = None,
 ) -> Frame:
-    """One frame as it goes over the wire. `lossless`: every bit of it, whatever `coding` says.
+    """Encode a frame as a message. `lossless`: raw colour and exact depth, `coding` is ignored.
 
-    `video`: colour is its next picture. Linear colour always goes raw, and pictures of odd sides as JPEG.
+    `video`: encoder for colour; None: JPEG. Linear colour is always raw, and pictures with an odd side are JPEG.
     """
     pose = frame.world_from_camera
     return Frame(
@@ -56,7 +56,7 @@ def frame_message(
 
 
 def picture_bytes(message: Frame) -> int:
-    """Bytes of a frame's pictures; the rest is small."""
+    """Bytes of colour and depth; the rest of the message is small."""
     return sum(len(picture.data) for picture in (message.color, message.depth) if picture is not None)
 
 

@@ -1,7 +1,7 @@
-"""Depth rounded below a sensor's own noise, so that it takes fewer bytes; exact unless somebody asks for it.
+"""Rounding of depth below the sensor's noise, so that it needs fewer bytes; off by default.
 
-Of stereo and structured light the noise grows with the square of depth, for disparity is what they measure. Depth is
-rounded to equal steps of 1/depth, which have that very spacing, and then goes through the same lossless codec.
+Stereo and structured light measure disparity, so their noise grows with the square of depth. Depth is therefore
+rounded to equal steps of 1/depth, and then compressed without loss.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from numpy.typing import NDArray
 
 
 def round_depth(depth: NDArray[np.uint16], noise_per_m: float, depth_scale_m: float) -> NDArray[np.uint16]:
-    """[h, w] uint16, 0 = none -> the same, each moved by no more than noise_per_m * z^2 metres. 0 stays 0.
+    """[h, w] uint16 -> the same shape, each value changed by at most noise_per_m * z^2 metres. 0 (no depth) stays 0.
 
-    `noise_per_m`: of the sensor at 1 m, in metres. `depth_scale_m`: metres per unit of depth.
+    `noise_per_m`: noise of the sensor at 1 m, in metres. `depth_scale_m`: metres per unit of depth.
     """
     return _table(noise_per_m, depth_scale_m)[depth]
 
 
 @lru_cache(maxsize=8)
 def _table(noise_per_m: float, depth_scale_m: float) -> NDArray[np.uint16]:
-    """[65536] uint16: what each value becomes. Where whole units are coarser than the noise it stays what it is."""
+    """[65536] uint16: rounded value of each depth. Unchanged where one unit is coarser than the noise."""
     units = np.arange(65536)
     z = np.maximum(units, 1) * depth_scale_m
-    step = 2 * noise_per_m  # in 1/m: half of it is noise_per_m * z^2 of depth
+    step = 2 * noise_per_m  # in 1/m; half a step changes depth by noise_per_m * z^2
     levels = np.maximum(np.rint(1 / (z * step)), 1)
     rounded = np.rint(1 / (levels * step) / depth_scale_m)
     fits = np.abs(rounded - units) * depth_scale_m <= noise_per_m * z**2

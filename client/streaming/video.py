@@ -1,4 +1,4 @@
-"""A camera's colour as H.264 video, through PyAV (x264): each picture at once, key pictures only where needed."""
+"""Colour as H.264 video through PyAV (x264): no delay between pictures, key pictures only where needed."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ IS_POSSIBLE = find_spec("av") is not None
 """Whether PyAV is installed."""
 PRESET = "superfast"
 RATE_FACTORS = ((50, 25.0), (65, 22.0), (75, 20.0), (80, 19.0), (90, 17.0), (100, 10.0))
-"""Of x264 in the place of JPEG's qualities: pictures err about as much, up to 80 (`probeless bench client`)."""
+"""(JPEG quality, x264 rate factor) with about the same error, up to quality 80 (`probeless bench client`)."""
 _ENDLESS = 1 << 30
 
 
 class VideoEncoder:
-    """Of one session. `encode` is called by one thread at a time, in the order in which pictures are sent."""
+    """Encoder of one session. Call `encode` from one thread at a time, in the order of sending."""
 
     def __init__(self) -> None:
         """Raises ImportError without PyAV."""
@@ -38,15 +38,15 @@ class VideoEncoder:
         self._needs_key = threading.Event()
 
     def need_key(self) -> None:
-        """A picture was lost on the way: the next one shall rest on none before it. Any thread."""
+        """Make the next picture a key picture, because an earlier one was lost. Thread-safe."""
         self._needs_key.set()
 
     def can_encode(self, width: int, height: int) -> bool:
-        """4:2:0 has pictures of even sides only."""
+        """4:2:0 requires even sides."""
         return width % 2 == 0 and height % 2 == 0
 
     def encode(self, rgb: NDArray[np.uint8], quality: int) -> ColorImage:
-        """[h, w, 3] sRGB -> the stream's next picture; `quality` as of JPEG. Another size or quality: a key picture."""
+        """Encode [h, w, 3] sRGB; `quality` as for JPEG. A new size or quality starts with a key picture."""
         height, width = rgb.shape[:2]
         setting = (width, height, rate_factor(quality))
         if setting != self._setting:
@@ -65,7 +65,7 @@ class VideoEncoder:
         encoder = self._av.CodecContext.create("libx264", "w")
         encoder.width, encoder.height, encoder.pix_fmt = width, height, "yuv420p"
         encoder.time_base, encoder.framerate = Fraction(1, 30), Fraction(30)
-        encoder.color_range, encoder.colorspace = 2, 6  # full, BT.601: as JPEG, and said so in the stream
+        encoder.color_range, encoder.colorspace = 2, 6  # full range, BT.601, as JPEG; written into the stream
         encoder.gop_size = _ENDLESS
         encoder.thread_count = 1
         encoder.options = {"preset": PRESET, "tune": "zerolatency", "crf": f"{factor:g}", "forced-idr": "1"}
@@ -73,6 +73,6 @@ class VideoEncoder:
 
 
 def rate_factor(quality: int) -> float:
-    """x264's in the place of a quality of JPEG."""
+    """Rate factor of x264 for a JPEG quality."""
     qualities, factors = zip(*RATE_FACTORS, strict=True)
     return round(float(np.interp(quality, qualities, factors)), 1)

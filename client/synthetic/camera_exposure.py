@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-UNIT = 1 / 60
+FIRST_EXPOSURE = 1 / 60
 """What the first frame says of its exposure, where it changes: it is relative, and need not begin with 1."""
 _WALK_FRAMES, _SWAY_FRAMES = 90, 23
 _STEP_FRAMES = 15
@@ -28,4 +28,4 @@ def steps(index: int) -> float:
     return _STEPS[index // _STEP_FRAMES % len(_STEPS)]
 
 
-WAYS: dict[str, Callable[[int], float]] = {"constant": constant, "walk": walk, "steps": steps}
+EXPOSURE_CURVES: dict[str, Callable[[int], float]] = {"constant": constant, "walk": walk, "steps": steps}

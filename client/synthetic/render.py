@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Lit:
+class LitSolid:
     """A solid with what is needed to colour it."""
 
     solid: Solid
@@ -88,7 +88,7 @@ def cast(solids: list[Solid], camera: CameraModel, rays: Floats, pose: Floats) -
 
 
 def render(
-    bodies: list[Lit],
+    bodies: list[LitSolid],
     camera: CameraModel,
     rays: Floats,
     pose: Floats,
@@ -129,7 +129,7 @@ def render(
     )
 
 
-def irradiance(body: Lit, points: Floats, normals: Floats, light: DistantLight) -> Floats:
+def irradiance(body: LitSolid, points: Floats, normals: Floats, light: DistantLight) -> Floats:
     """[n, 3] light arriving over pi: what white would show. Unshadowed part exact, shadows interpolated."""
     part = body.solid.part(points)
     arriving = np.empty((len(points), 3))

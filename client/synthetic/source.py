@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.synthetic.cache import cached
-from client.synthetic.camera_exposure import UNIT, WAYS
+from client.synthetic.camera_exposure import EXPOSURE_CURVES, FIRST_EXPOSURE
 from client.synthetic.lighting.bake import bake
 from client.synthetic.lighting.harmonics import sphere_directions
 from client.synthetic.lighting.lamps import Lamp, room_lamps
 from client.synthetic.lighting.lights import RING_SIZE, DistantLight, ring_light
-from client.synthetic.render import Lit, Rendering, camera_rays, look_at, render
+from client.synthetic.render import LitSolid, Rendering, camera_rays, look_at, render
 from client.synthetic.scenes import hand
 from client.synthetic.scenes.guests import GUESTS, bake_guests, guest_grids
 from client.synthetic.sensor_noise import kinect_like
@@ -95,12 +95,12 @@ class SyntheticSource:
         depth = (depth_m / self.camera.depth_scale_m).round().clip(0, 65535).astype(np.uint16)
         exposure = self.exposure(index)
         picture = to_srgb8(exposure * rendering.radiance)
-        said = (UNIT if self.options.exposure != "constant" else 1.0) * exposure
-        return RgbdFrame(index, index / FPS, picture, depth, pose, said if self.options.exposure_given else None)
+        reported = (FIRST_EXPOSURE if self.options.exposure != "constant" else 1.0) * exposure
+        return RgbdFrame(index, index / FPS, picture, depth, pose, reported if self.options.exposure_given else None)
 
     def exposure(self, index: int) -> float:
         """Of one frame's picture, relative to the first one's."""
-        return WAYS[self.options.exposure](index)
+        return EXPOSURE_CURVES[self.options.exposure](index)
 
     def pose(self, index: int) -> NDArray[np.float64]:
         """world_from_camera [4, 4], exact."""
@@ -161,7 +161,7 @@ class SyntheticSource:
         light = self.light(index)
         baked = self._texel_light(index if self.options.name == "light" else 0)
         bodies = [
-            Lit(body.solid, body.texture if self.options.texture else None, grids, ((grids, baked),))
+            LitSolid(body.solid, body.texture if self.options.texture else None, grids, ((grids, baked),))
             for body, grids in zip(self.scene.bodies, self._grids, strict=True)
         ]
         if self.options.name == "hand":
@@ -170,7 +170,7 @@ class SyntheticSource:
             bodies = self._with_guests(bodies, light)
         return render(bodies, self.camera, self._rays, self.pose(index), light, self.lamps)
 
-    def _with_hand(self, bodies: list[Lit], index: int, light: DistantLight) -> list[Lit]:
+    def _with_hand(self, bodies: list[LitSolid], index: int, light: DistantLight) -> list[LitSolid]:
         """The static bodies under the hand's shadow, then the hand's parts."""
         parts = hand.capsules(index / max(len(self) - 1, 1))
         if not parts:
@@ -181,21 +181,21 @@ class SyntheticSource:
             for body, grids in zip(bodies, self._static.grids, strict=True)
         ]
         grids, occluded = hand.skin_shadows(parts, self.scene.solids)
-        taken = occluded @ light.sh.astype(np.float32)
+        occluded_light = occluded @ light.sh.astype(np.float32)
         texture = hand.SKIN if self.options.texture else None
-        skin = [Lit(part, texture, own, ((own, taken),)) for part, own in zip(parts, grids, strict=True)]
+        skin = [LitSolid(part, texture, own, ((own, occluded_light),)) for part, own in zip(parts, grids, strict=True)]
         return [*shadowed, *skin]
 
-    def _with_guests(self, bodies: list[Lit], light: DistantLight) -> list[Lit]:
+    def _with_guests(self, bodies: list[LitSolid], light: DistantLight) -> list[LitSolid]:
         """The static bodies under the guests' shadows, then the guests."""
         sh = light.sh.astype(np.float32)
-        around, taken = self._guest_transfer["around"] @ sh, self._guest_transfer["on"] @ sh
+        occluded_on_set, occluded_light = self._guest_transfer["on_set"] @ sh, self._guest_transfer["on_guests"] @ sh
         shadowed = [
-            replace(body, occluded=(*body.occluded, (grids, around)))
+            replace(body, occluded=(*body.occluded, (grids, occluded_on_set)))
             for body, grids in zip(bodies, self._grids, strict=True)
         ]
         lit = zip(self.guests, guest_grids(self.guests), strict=True)
-        return [*shadowed, *(Lit(guest.solid, guest.texture, own, ((own, taken),)) for guest, own in lit)]
+        return [*shadowed, *(LitSolid(guest.solid, guest.texture, own, ((own, occluded_light),)) for guest, own in lit)]
 
     def _slant(self, rendering: Rendering, pose: NDArray[np.float64]) -> NDArray[np.float64]:
         """[h, w] cosine between the surface and the ray."""

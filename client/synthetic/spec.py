@@ -8,11 +8,11 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from client.errors import SourceError
-from client.synthetic.camera_exposure import WAYS
+from client.synthetic.camera_exposure import EXPOSURE_CURVES
 from client.synthetic.lighting.lamps import PLACES_M
 from client.synthetic.lighting.lights import RING_SIZE
 from client.synthetic.scenes import scene as scenes
-from client.synthetic.scenes.appearance import LOOKS
+from client.synthetic.scenes.appearance import APPEARANCES
 from client.synthetic.scenes.guests import GUESTS
 from client.synthetic.scenes.halves import halves
 from client.synthetic.scenes.stage import stage
@@ -124,8 +124,12 @@ _KEYS: dict[str, Callable[[str], Any]] = {
     "noise": _flag,
     "lamps": _count(0, LARGEST_LAMPS),
     "place": _count(0, len(PLACES_M) - 1),
-    "exposure": _one_of(WAYS),
+    "exposure": _one_of(EXPOSURE_CURVES),
     "exposure_given": _flag,
 }
-_STAGE_KEYS: dict[str, Callable[[str], Any]] = {"texture": _one_of(LOOKS), "with": _one_of(GUESTS), "still": _flag}
+_STAGE_KEYS: dict[str, Callable[[str], Any]] = {
+    "texture": _one_of(APPEARANCES),
+    "with": _one_of(GUESTS),
+    "still": _flag,
+}
 _STAGE_FIELDS = {"texture": "look", "with": "guest", "still": "is_still"}

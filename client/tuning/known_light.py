@@ -93,7 +93,7 @@ def moving_light(views: Iterable[ShadedView], light: Callable[[int], Floats]) ->
         yield view.lit(light(view.frame.index))
 
 
-def found_lights(
+def estimated_lights(
     device: Device, camera: CameraModel, frames: Iterable[LitFrame], wishes: Wishes
 ) -> Iterator[tuple[LitFrame, Floats]]:
     """Run the pipeline over `frames`: each of them, and the light [16, 3] that is found in it.

@@ -24,7 +24,7 @@ from client.sources.volume import default_volume, default_voxel
 from client.synthetic.export import write_guests
 from client.synthetic.lighting.lights import disc_light
 from client.synthetic.source import SyntheticSource, open_synthetic
-from client.tuning.known_light import LitFrame, found_lights, moving_light, shaded_views
+from client.tuning.known_light import LitFrame, estimated_lights, moving_light, shaded_views
 from protocol.messages import Wishes
 from server.client_session import ClientSession
 from server.maths.light_direction import direction_error_deg
@@ -35,7 +35,7 @@ from server.quality.costs import rows_of
 from server.quality.sampling_settings import SamplingSettings
 from server.shading.composite import srgb_codes
 
-Say = Callable[[int], None]
+Progress = Callable[[int], None]
 """Told how many frames of a point are done."""
 SIZE = "640x480"
 LIT_SIZE = "480x360"
@@ -69,14 +69,14 @@ class Stage:
         self._composites = [srgb_codes(self._guests.truth(i).radiance) for i in range(FRAMES)]
         self._changed = [(a != b).any(axis=-1) for a, b in zip(self._composites, bare, strict=True)]
 
-    def cost(self, device: Device, point: SamplingSettings, say: Say) -> Cost:
+    def cost(self, device: Device, point: SamplingSettings, progress: Progress) -> Cost:
         """Run the frames at a point."""
-        found = self._results(device, point, say)
+        found = self._results(device, point, progress)
         rows = [rows_of(result.timings) for result in found[SETTLING:]]
         errors = [self._difference(i, found[i].color) for i in range(SETTLING, FRAMES)]
         return Cost({name: median(row[name] for row in rows) for name in rows[0]}, median(errors))
 
-    def _results(self, device: Device, point: SamplingSettings, say: Say) -> list[FrameResult]:
+    def _results(self, device: Device, point: SamplingSettings, progress: Progress) -> list[FrameResult]:
         usual = _usual(self.source)
         wishes = structs.replace(point.wishes(usual), albedo="estimated", indirect="observed")
         pipeline = ClientSession(device, self.source.camera, wishes)
@@ -87,7 +87,7 @@ class Stage:
                 place_objects(pipeline, objects, lambda _: None)
             for frame in self._frames:
                 found.append(pipeline.process(frame))
-                say(len(found))
+                progress(len(found))
         finally:
             pipeline.close()
         return found
@@ -101,7 +101,7 @@ class Stage:
 class LitRoom:
     """The room, each frame of it under another known light."""
 
-    def __init__(self, device: Device, say: Say) -> None:
+    def __init__(self, device: Device, progress: Progress) -> None:
         self._source = open_synthetic(f"synthetic:room?size={LIT_SIZE}&frames={_WALK}&noise=1&texture=0")
         self._wishes = structs.replace(_usual(self._source), robustness=("openness", "outliers"))
         frames = (self._source[_STEP * i] for i in range(LIT_FRAMES))
@@ -111,15 +111,15 @@ class LitRoom:
         self._frames: list[LitFrame] = []
         for frame in moving_light(views, _light_of):
             self._frames.append(frame)
-            say(len(self._frames))
+            progress(len(self._frames))
 
-    def error_deg(self, device: Device, point: SamplingSettings, say: Say) -> float:
+    def error_deg(self, device: Device, point: SamplingSettings, progress: Progress) -> float:
         """Of the dominant direction, median over frames."""
-        lights = found_lights(device, self._source.camera, self._frames, point.wishes(self._wishes))
+        lights = estimated_lights(device, self._source.camera, self._frames, point.wishes(self._wishes))
         errors: list[float] = []
         for frame, found in lights:
             errors.append(direction_error_deg(found, frame.sh))
-            say(len(errors))
+            progress(len(errors))
         return median(errors[LIT_SETTLING:])
 
 

@@ -53,7 +53,9 @@ def test_a_frame_that_there_is_not_is_refused(capsys: pytest.CaptureFixture[str]
 
 def test_the_gallery_is_as_large_as_promised() -> None:
     assert len(GALLERY) >= 12
-    assert len({scene.calls_for(0) for scene in GALLERY.values()}) >= 8  # scenes differ in what they call for
-    called_for = set().union(*(scene.calls_for(index) for scene in GALLERY.values() for index in range(scene.frames)))
+    assert len({scene.expected_effects(0) for scene in GALLERY.values()}) >= 8  # scenes differ in what they call for
+    called_for = set().union(
+        *(scene.expected_effects(index) for scene in GALLERY.values() for index in range(scene.frames))
+    )
     presets = {"draw_depth_views", "refine_virtual", "refine_real"}
     assert {*effect_names("picture")} - presets <= called_for

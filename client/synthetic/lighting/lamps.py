@@ -71,12 +71,12 @@ def lamplight(lamps: Sequence[Lamp], solids: Sequence[Solid], points: Floats, no
         away = points - lamp.position
         squared = (away * away).sum(axis=1)
         cosine = np.maximum(-(away * normals).sum(axis=1), 0) / np.sqrt(squared)
-        share = cosine / (np.pi * squared) * _reaches(lamp, obstacles, away)
+        share = cosine / (np.pi * squared) * _is_visible(lamp, obstacles, away)
         arriving += share[:, None] * lamp.intensity
     return arriving
 
 
-def _reaches(lamp: Lamp, solids: Sequence[Solid], away: Floats) -> NDArray[np.bool_]:
+def _is_visible(lamp: Lamp, solids: Sequence[Solid], away: Floats) -> NDArray[np.bool_]:
     """[n] whether nothing stands between the lamp and the points that are `away` [n, 3] from it."""
     nearest = np.full(len(away), np.inf)
     for solid in solids:

@@ -26,7 +26,7 @@ Convex = Polyhedron | Cylinder | Sphere
 
 
 @dataclass(frozen=True)
-class Covering:
+class StageSurface:
     """Which surface is covered."""
 
     role: str
@@ -38,18 +38,18 @@ class Covering:
     """[3, 3] of the building's frame."""
 
 
-Look = Callable[[Covering], Texture]
+Appearance = Callable[[StageSurface], Texture]
 
 
-def along_surface(covering: Covering, points: Values) -> tuple[Values, Values]:
+def along_surface(surface: StageSurface, points: Values) -> tuple[Values, Values]:
     """[n] metres across and up the surface at its points [n, 3]; on what lies flat, along the building's axes."""
-    local = points @ covering.turn
-    normals = covering.solid.normals(points) @ covering.turn
-    center = covering.solid.bounds[0] @ covering.turn
+    local = points @ surface.turn
+    normals = surface.solid.normals(points) @ surface.turn
+    center = surface.solid.bounds[0] @ surface.turn
     level = np.hypot(normals[:, 0], normals[:, 2])
     facing = np.arctan2(normals[:, 0], normals[:, 2])
     sideways = local - center
-    across = sideways[:, 0] * np.cos(facing) - sideways[:, 2] * np.sin(facing) + _radius(covering.solid) * facing
+    across = sideways[:, 0] * np.cos(facing) - sideways[:, 2] * np.sin(facing) + _radius(surface.solid) * facing
     is_flat = level < 0.1
     up = local[:, 1] / np.maximum(level, 0.1)
     return np.where(is_flat, local[:, 0], across), np.where(is_flat, local[:, 2], up)
@@ -65,68 +65,74 @@ def _radius(solid: Convex | Carved) -> float:
             return 0.0
 
 
-def paper(_covering: Covering) -> Texture:
+def paper(_surface: StageSurface) -> Texture:
     """White throughout."""
     return lambda points: np.full((len(points), 3), 0.78)
 
 
-def checker(covering: Covering) -> Texture:
+def checker(surface: StageSurface) -> Texture:
     """Squares of black and white on everything: nothing is without an edge, and no two neighbours are alike."""
-    side = 0.04 if covering.role == "ground" else 0.02
+    side = 0.04 if surface.role == "ground" else 0.02
 
     def texture(points: Values) -> Values:
-        u, v = along_surface(covering, points)
+        u, v = along_surface(surface, points)
         sign = _waves(u, side) * _waves(v, side)
         return (0.41 + 0.35 * sign)[:, None] * np.ones(3)
 
     return texture
 
 
-def brick(covering: Covering) -> Texture:
+def brick(surface: StageSurface) -> Texture:
     """Bricks and ashlar, slates, lead; slabs on the ground."""
-    match covering.role:
+    match surface.role:
         case "wall":
-            return _courses(covering, (0.036, 0.014), (0.42, 0.13, 0.07), (0.55, 0.5, 0.42), 0.25)
+            return _courses(surface, (0.036, 0.014), (0.42, 0.13, 0.07), (0.55, 0.5, 0.42), 0.25)
         case "stone":
-            return _courses(covering, (0.05, 0.022), (0.58, 0.47, 0.3), (0.34, 0.28, 0.2), 0.12)
+            return _courses(surface, (0.05, 0.022), (0.58, 0.47, 0.3), (0.34, 0.28, 0.2), 0.12)
         case "roof":
-            return _courses(covering, (0.018, 0.012), (0.1, 0.12, 0.16), (0.05, 0.05, 0.06), 0.3)
+            return _courses(surface, (0.018, 0.012), (0.1, 0.12, 0.16), (0.05, 0.05, 0.06), 0.3)
         case "dome":
-            return _courses(covering, (0.026, 0.024), (0.2, 0.36, 0.3), (0.12, 0.22, 0.18), 0.1)
+            return _courses(surface, (0.026, 0.024), (0.2, 0.36, 0.3), (0.12, 0.22, 0.18), 0.1)
         case _:
-            return _courses(covering, (0.06, 0.06), (0.36, 0.34, 0.31), (0.2, 0.19, 0.17), 0.2)
+            return _courses(surface, (0.06, 0.06), (0.36, 0.34, 0.31), (0.2, 0.19, 0.17), 0.2)
 
 
-def market(covering: Covering) -> Texture:
+def market(surface: StageSurface) -> Texture:
     """Saturated paint, awnings for roofs, a carpet of many colours."""
-    hue = _HUES[covering.building % len(_HUES)]
-    match covering.role:
+    hue = _HUES[surface.building % len(_HUES)]
+    match surface.role:
         case "ground":
-            return _patches(covering)
+            return _patches(surface)
         case "roof":
-            return _stripes(covering, hue, (0.75, 0.72, 0.66), 0.012)
+            return _stripes(surface, hue, (0.75, 0.72, 0.66), 0.012)
         case "stone":
-            return _stripes(covering, hue, _HUES[(covering.building + 3) % len(_HUES)], 0.03)
+            return _stripes(surface, hue, _HUES[(surface.building + 3) % len(_HUES)], 0.03)
         case _:
             return _plain(hue)
 
 
-def town(covering: Covering) -> Texture:
+def town(surface: StageSurface) -> Texture:
     """Plaster with windows, tiled roofs, sandstone, a copper dome; cobbles and grass."""
-    match covering.role:
+    match surface.role:
         case "wall":
-            return _windows(covering, _PLASTER[covering.building % len(_PLASTER)])
+            return _windows(surface, _PLASTER[surface.building % len(_PLASTER)])
         case "stone":
-            return _courses(covering, (0.044, 0.018), (0.62, 0.52, 0.36), (0.5, 0.41, 0.28), 0.08)
+            return _courses(surface, (0.044, 0.018), (0.62, 0.52, 0.36), (0.5, 0.41, 0.28), 0.08)
         case "roof":
-            return _courses(covering, (0.014, 0.01), (0.45, 0.16, 0.08), (0.3, 0.1, 0.06), 0.2)
+            return _courses(surface, (0.014, 0.01), (0.45, 0.16, 0.08), (0.3, 0.1, 0.06), 0.2)
         case "dome":
-            return _courses(covering, (0.026, 0.2), (0.22, 0.5, 0.4), (0.14, 0.34, 0.28), 0.0)
+            return _courses(surface, (0.026, 0.2), (0.22, 0.5, 0.4), (0.14, 0.34, 0.28), 0.0)
         case _:
-            return _square_and_grass(covering)
+            return _square_and_grass(surface)
 
 
-LOOKS: dict[str, Look] = {"paper": paper, "brick": brick, "market": market, "checker": checker, "town": town}
+APPEARANCES: dict[str, Appearance] = {
+    "paper": paper,
+    "brick": brick,
+    "market": market,
+    "checker": checker,
+    "town": town,
+}
 
 _HUES: tuple[Color, ...] = (
     (0.7, 0.05, 0.06),
@@ -144,34 +150,34 @@ def _plain(color: Color) -> Texture:
     return lambda points: np.ones((len(points), 1)) * np.array(color)
 
 
-def _courses(covering: Covering, size_m: tuple[float, float], face: Color, joint: Color, spread: float) -> Texture:
+def _courses(surface: StageSurface, size_m: tuple[float, float], face: Color, joint: Color, spread: float) -> Texture:
     """Rows of bricks `size_m` long and high, each row half a brick on, of shades that differ by up to `spread`."""
 
     def texture(points: Values) -> Values:
-        u, v = along_surface(covering, points)
+        u, v = along_surface(surface, points)
         row = np.floor(v / size_m[1])
         u = u + row % 2 * size_m[0] / 2
         column = np.floor(u / size_m[0])
         edge_m = np.minimum(_to_edge(u, size_m[0]), _to_edge(v, size_m[1]))
-        shade = 1 + spread * (2 * _random(row, column, covering.building) - 1)
+        shade = 1 + spread * (2 * _random(row, column, surface.building) - 1)
         return _mix(joint, shade[:, None] * np.array(face), _step(edge_m - 0.0016))
 
     return texture
 
 
-def _stripes(covering: Covering, one: Color, other: Color, width_m: float) -> Texture:
+def _stripes(surface: StageSurface, one: Color, other: Color, width_m: float) -> Texture:
     def texture(points: Values) -> Values:
-        u, _ = along_surface(covering, points)
+        u, _ = along_surface(surface, points)
         return _mix(one, other, 0.5 + 0.5 * _waves(u, width_m))
 
     return texture
 
 
-def _patches(covering: Covering) -> Texture:
+def _patches(surface: StageSurface) -> Texture:
     """Squares of 5 cm, each of one hue."""
 
     def texture(points: Values) -> Values:
-        u, v = along_surface(covering, points)
+        u, v = along_surface(surface, points)
         row, column = np.floor(v / 0.05), np.floor(u / 0.05)
         colors = np.array(_HUES)[(_random(row, column, 7) * len(_HUES)).astype(int)]
         return _mix((0.72, 0.66, 0.55), colors, _step(np.minimum(_to_edge(u, 0.05), _to_edge(v, 0.05)) - 0.003))
@@ -179,21 +185,21 @@ def _patches(covering: Covering) -> Texture:
     return texture
 
 
-def _windows(covering: Covering, plaster: Color) -> Texture:
+def _windows(surface: StageSurface, plaster: Color) -> Texture:
     """Rows of dark windows, 10 mm wide and 14 mm high."""
 
     def texture(points: Values) -> Values:
-        u, v = along_surface(covering, points)
+        u, v = along_surface(surface, points)
         inside_m = np.minimum(_to_edge(u, 0.022) - 0.006, _to_edge(v, 0.026) - 0.006)
-        is_wall = np.abs(covering.solid.normals(points)[:, 1]) < 0.5
+        is_wall = np.abs(surface.solid.normals(points)[:, 1]) < 0.5
         return _mix(plaster, (0.05, 0.07, 0.1), _step(inside_m) * is_wall)
 
     return texture
 
 
-def _square_and_grass(covering: Covering) -> Texture:
+def _square_and_grass(surface: StageSurface) -> Texture:
     """Cobbles, lighter on an oval square in the middle, grass outside of the roads around it."""
-    cobbles = _courses(covering, (0.02, 0.016), (0.42, 0.4, 0.37), (0.3, 0.28, 0.26), 0.15)
+    cobbles = _courses(surface, (0.02, 0.016), (0.42, 0.4, 0.37), (0.3, 0.28, 0.26), 0.15)
 
     def texture(points: Values) -> Values:
         x, _, z = points.T

@@ -33,7 +33,7 @@ STEP_M = 0.002
 
 @dataclass(frozen=True)
 class Guest:
-    """A thing of one colour."""
+    """A solid_of_guest of one colour."""
 
     name: str
     solid: Sphere | Polyhedron
@@ -69,37 +69,41 @@ def bake_guests(
 
     `grids` lie over `solids`; `directions` [n, 3] float32, unit, evenly spread over the sphere.
     """
-    things: list[Solid] = [guest.solid for guest in guests]
+    guest_solids: list[Solid] = [guest.solid for guest in guests]
     around = np.zeros((table_size(grids), COEFFICIENTS), np.float32)
     for own, of_solid in enumerate(grids):
         for part, grid in enumerate(of_solid):
-            around[grid.offset : grid.offset + grid.size] = _taken(things, solids, own, part, grid, directions)
-    return {"around": around, "on": bake([*things, *solids], guest_grids(guests), directions)}
+            around[grid.offset : grid.offset + grid.size] = _occluded_by_guests(
+                guest_solids, solids, own, part, grid, directions
+            )
+    return {"around": around, "on": bake([*guest_solids, *solids], guest_grids(guests), directions)}
 
 
-def _taken(things: list[Solid], solids: list[Solid], own: int, part: int, grid: Grid, directions: Floats) -> Floats:
+def _occluded_by_guests(
+    guest_solids: list[Solid], solids: list[Solid], own: int, part: int, grid: Grid, directions: Floats
+) -> Floats:
     """[samples, 16] of one grid: zero where no guest stands between it and light that nothing else keeps away."""
     positions, normals, skip = seen_samples(solids[own], part, grid)
     values = np.zeros((grid.rows, grid.columns, COEFFICIENTS), np.float32)
     for piece in tiles(grid, len(directions)):
         points, up = (of[piece].reshape(-1, 3).astype(np.float32) for of in (positions, normals))
-        near = directions[_towards(things, points, up, directions)]
-        taken = blocked_directions(things, None, points, near)
-        taken[:, taken.any(axis=0)] &= ~blocked_directions(solids, skip, points, near[taken.any(axis=0)])
-        if taken.any():
-            lost = taken * np.maximum(up @ near.T, 0)
+        near = directions[_may_meet_guest(guest_solids, points, up, directions)]
+        blocked = blocked_directions(guest_solids, None, points, near)
+        blocked[:, blocked.any(axis=0)] &= ~blocked_directions(solids, skip, points, near[blocked.any(axis=0)])
+        if blocked.any():
+            lost = blocked * np.maximum(up @ near.T, 0)
             values[piece] = (lost @ basis(near)).reshape(values[piece].shape) * np.float32(4 / len(directions))
     if values.any():
-        fill_buried(values, buried_samples([*solids, *things], own, part, grid), grid.chart.wraps)
+        fill_buried(values, buried_samples([*solids, *guest_solids], own, part, grid), grid.chart.wraps)
     return values.reshape(-1, COEFFICIENTS)
 
 
-def _towards(things: list[Solid], points: Floats, up: Floats, directions: Floats) -> NDArray[np.bool_]:
+def _may_meet_guest(guest_solids: list[Solid], points: Floats, up: Floats, directions: Floats) -> NDArray[np.bool_]:
     """[directions] which of them may meet a guest above the horizon of some of the points."""
     middle = points.mean(axis=0)
     reach = float(np.linalg.norm(points - middle, axis=1).max())
     near = np.zeros(len(directions), bool)
-    for thing in things:
-        near |= directions_near(thing, middle, directions, reach)
+    for solid_of_guest in guest_solids:
+        near |= directions_near(solid_of_guest, middle, directions, reach)
     near[near] = (up @ directions[near].T > 0).any(axis=0)
     return near

@@ -32,9 +32,9 @@ COMES, STAYS, GOES, IS_GONE = 0.15, 0.35, 0.7, 0.9
 """Parts of the sequence."""
 WAVES = 2.5
 """Times it waves while it stays."""
-REST = np.array([0.12, 0.25, 0.2])
+STAY_POSITION = np.array([0.12, 0.25, 0.2])
 """Where the palm's middle stays, world metres."""
-AWAY = np.array([0.95, 0.06, 0.12])
+OUT_OF_SIGHT_OFFSET = np.array([0.95, 0.06, 0.12])
 """From there, out of sight."""
 
 _FINGERS = (  # of a right hand pointing to -x, palm down: root in the palm's frame, splay in degrees, length, radius
@@ -48,13 +48,13 @@ _FINGERS = (  # of a right hand pointing to -x, palm down: root in the palm's fr
 
 def capsules(progress: float) -> list[Capsule]:
     """The hand at `progress` (0 to 1) of the sequence; empty while it is out of sight."""
-    reach = _reach(progress)
-    if reach <= 0:
+    presence = _presence(progress)
+    if presence <= 0:
         return []
     staying = np.clip((progress - STAYS) / (GOES - STAYS), 0, 1)
     swing = np.sin(2 * np.pi * WAVES * staying) * np.sin(np.pi * staying)
     turn = rotation_about("y", 22 * swing) @ rotation_about("z", -8) @ rotation_about("x", 15 * swing)
-    palm = REST + (1 - reach) * AWAY + np.array([0.0, 0.015 * swing, 0.07 * swing])
+    palm = STAY_POSITION + (1 - presence) * OUT_OF_SIGHT_OFFSET + np.array([0.0, 0.015 * swing, 0.07 * swing])
 
     def part(start: tuple[float, float, float], end: tuple[float, float, float], radius: float) -> Capsule:
         return Capsule(palm + turn @ np.array(start), palm + turn @ np.array(end), radius)
@@ -64,11 +64,11 @@ def capsules(progress: float) -> list[Capsule]:
         away = rotation_about("y", splay) @ np.array([-length, -0.1 * length, 0])
         hand.append(part(root, tuple(np.array(root) + away), radius))
     wrist = palm + turn @ np.array([0.05, 0, 0])
-    elbow = wrist + np.array([0.55, 0.08, 0.06]) + 0.25 * (palm - REST) * np.array([0, 0, 1])
+    elbow = wrist + np.array([0.55, 0.08, 0.06]) + 0.25 * (palm - STAY_POSITION) * np.array([0, 0, 1])
     return [*hand, Capsule(wrist, elbow, 0.032)]
 
 
-def _reach(progress: float) -> float:
+def _presence(progress: float) -> float:
     """0 out of sight, 1 in place."""
     x = np.clip(min((progress - COMES) / (STAYS - COMES), (IS_GONE - progress) / (IS_GONE - GOES)), 0, 1)
     return float(x * x * (3 - 2 * x))
@@ -100,7 +100,7 @@ class StaticVisibility:
 
     def shadow(self, hand: list[Capsule], light: DistantLight) -> NDArray[np.float32]:
         """[total, 3] light, over pi, that the hand alone takes from every sample."""
-        taken = np.zeros((self.size, 3), np.float32)
+        blocked_light = np.zeros((self.size, 3), np.float32)
         weights = light.radiance(self.directions) * np.float32(4 / DIRECTIONS)
         for piece in self._pieces:
             cosines = np.maximum(piece.normals @ self.directions.T, 0)
@@ -109,8 +109,8 @@ class StaticVisibility:
             hit = np.flatnonzero(blocked.any(axis=0))
             if hit.size:
                 is_open = np.unpackbits(self.open_bits[piece.samples], axis=1)[:, hit]
-                taken[piece.samples] = (blocked[:, hit] * is_open * cosines[:, hit]) @ weights[hit]
-        return taken
+                blocked_light[piece.samples] = (blocked[:, hit] * is_open * cosines[:, hit]) @ weights[hit]
+        return blocked_light
 
     def _cut(self) -> Iterator[_Piece]:
         for solid, grids in zip(self.solids, self.grids, strict=True):

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from client.synthetic.scenes.appearance import LOOKS, Convex, Covering
+from client.synthetic.scenes.appearance import APPEARANCES, Convex, StageSurface
 from client.synthetic.scenes.scene import Body, Scene
 from client.synthetic.solids.carved import Carved
 from client.synthetic.solids.polyhedra import Polyhedron, box, rotation_about
@@ -30,12 +30,12 @@ Parts = Iterator[tuple[Convex | Carved, str]]
 
 
 def stage(look: str = "paper", is_still: bool = False) -> Scene:
-    """The set covered with `look`, one of LOOKS; the camera walks around it, or stands still at the walk's start."""
+    """The set with an appearance of APPEARANCES; the camera walks around it, or stays at the start of that path."""
     plate = box((0, -PLATE_M[1] / 2, 0), PLATE_M)
-    bodies = [Body(plate, LOOKS[look](Covering("ground", 0, plate, np.eye(3))))]
+    bodies = [Body(plate, APPEARANCES[look](StageSurface("ground", 0, plate, np.eye(3))))]
     for number, (site, building) in enumerate(BUILDINGS, 1):
         for solid, role in building(site):
-            bodies.append(Body(solid, LOOKS[look](Covering(role, number, solid, site.turn))))
+            bodies.append(Body(solid, APPEARANCES[look](StageSurface(role, number, solid, site.turn))))
     return Scene("stage", tuple(bodies), 0.0035, 3072, _stand if is_still else _walk_around)
 
 

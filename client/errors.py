@@ -1,8 +1,8 @@
-"""Errors a user can cause; each message is one line that says what was wrong and what to do."""
+"""Errors that a user can cause; each message is one line that says what was wrong and what to do."""
 
 
 class UserError(Exception):
-    """Base of all of them; the command line prints the message and ends with a status that is not 0."""
+    """Base class; the command line prints the message and exits with a status other than 0."""
 
 
 class SourceError(UserError):
@@ -10,7 +10,7 @@ class SourceError(UserError):
 
 
 class ObjectError(UserError):
-    """A virtual object's file or its place is unusable."""
+    """The file or the placement of a virtual object is invalid."""
 
 
 class OutputError(UserError):
@@ -18,8 +18,8 @@ class OutputError(UserError):
 
 
 class RunError(UserError):
-    """The pipeline refused what it was given."""
+    """The pipeline refused its input, or a needed package is missing."""
 
 
 class OptionError(UserError):
-    """An option of the command line has a value that cannot be used, or asks for what is not built."""
+    """An option of the command line has an invalid value or contradicts another."""

@@ -16,25 +16,25 @@ from server.reuse.temporal_reuse import ECHO, NOISE
 
 PURPOSES = {
     "rasterize": "draws the virtual objects",
-    "cover": "finds how much of each pixel they cover, for smooth edges",
-    "draw_depth_views": "draws the depth pictures that visibility is looked up in",
-    "prepare_rays": "brings together what rays are traced through",
-    "shadow_map": "draws the objects as the light's sharp parts see them",
-    "light_objects": "lights the objects, for what they send to real things and to one another",
-    "light_samples": "finds what the light's sharp parts bring to real things",
-    "shadow_real": "shadows real things by virtual ones",
-    "bounce_real": "follows how that changes what real things send one another",
-    "add_objects": "lets virtual things see the room as they have changed it",
-    "reflect": "finds what glossy virtual things reflect",
-    "shade_virtual": "shadows virtual things by real ones and by one another",
-    "refine_virtual": "sharpens shadows on virtual things near their edges",
-    "refine_real": "sharpens the rims of shadows on real things",
-    "mark_changes": "finds the parts of the picture in which virtual things change real ones",
-    "direct_virtual": "lights virtual things by the light's sharp parts",
-    "direct_real": "throws the sharp shadows of virtual things on real ones",
-    "match_average": "makes virtual things as bright beside the picture as real ones",
+    "cover": "computes their coverage of each pixel, for smooth edges",
+    "draw_depth_views": "draws the depth views for visibility look-up",
+    "prepare_rays": "prepares the geometry that rays are traced through",
+    "shadow_map": "draws shadow maps of the objects for the dominant lights",
+    "light_objects": "lights the objects, for bounced light on real surfaces and on each other",
+    "light_samples": "computes the dominant lights on real surfaces",
+    "shadow_real": "computes shadows of virtual objects on real surfaces",
+    "bounce_real": "computes how these shadows change bounced light between real surfaces",
+    "add_objects": "updates the room that virtual objects are lit by with their own effect on it",
+    "reflect": "computes reflections on glossy virtual objects",
+    "shade_virtual": "computes shadows on virtual objects, of real surfaces and of each other",
+    "refine_virtual": "refines shadows on virtual objects near edges",
+    "refine_real": "refines shadow edges on real surfaces",
+    "mark_changes": "finds the parts of the picture in which virtual objects change real surfaces",
+    "direct_virtual": "lights virtual objects by the dominant lights",
+    "direct_real": "adds sharp shadows of virtual objects on real surfaces",
+    "match_average": "matches the average brightness of virtual objects to the picture",
     "composite": "puts the picture together",
-    "compose_layer": "puts together what is virtual, apart from the camera's picture",
+    "compose_layer": "puts the virtual content together, without the camera's picture",
 }
 LEAD_FRAMES = 4
 """Frames processed before the explained one, so that a light is estimated."""
@@ -88,8 +88,8 @@ def lines(title: str, plan: Plan) -> Iterator[str]:
         yield "Left out:"
     for left in plan.left_out:
         yield f"  {left.effect:{width}}  {left.reason} ({_bound(left)})"
-    which = "in a thousand hardly one pixel" if any(map(is_of_noise, plan.left_out)) else "no pixel"
-    yield f"By all that would hardly be seen {which} changes by more than {most:.2f}/255, before rounding."
+    which = "at most one pixel in a thousand" if any(map(is_of_noise, plan.left_out)) else "no pixel"
+    yield f"Together, effects left out as invisible change {which} by more than {most:.2f}/255, before rounding."
 
 
 def is_unseen(left: LeftOut) -> bool:
@@ -104,10 +104,10 @@ def is_of_noise(left: LeftOut) -> bool:
 
 def _bound(left: LeftOut) -> str:
     if left.error_bound is None:
-        return "what that changes is not known"
+        return "change unknown"
     if left.error_bound == 0:
         return "changes nothing"
     if not is_unseen(left):
-        return "what that changes is not bounded"
-    which = "in a thousand hardly one pixel" if is_of_noise(left) else "no pixel"
+        return "change not bounded"
+    which = "at most one pixel in a thousand" if is_of_noise(left) else "no pixel"
     return f"changes {which} by more than {left.error_bound:.2f}/255"

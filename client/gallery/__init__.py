@@ -1,1 +1,1 @@
-"""Small scenes, each of which calls for a known set of effects: `synthetic:gallery/NAME`."""
+"""Small scenes, each of which needs a known set of effects: `synthetic:gallery/NAME`."""

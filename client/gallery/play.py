@@ -1,4 +1,4 @@
-"""A gallery scene through the pipeline, its objects placed and moved."""
+"""Runs a gallery scene through the pipeline, with its objects placed and moved."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ def wishes_of(source: GallerySource, **changes: Any) -> Wishes:
 
 
 def play(device: Device, source: GallerySource, wishes: Wishes) -> Generator[tuple[ClientSession, FrameResult]]:
-    """Every frame's result, and the pipeline that it is of, which is closed after the last."""
+    """The session and the result of every frame; the session is closed after the last."""
     pipeline = ClientSession(device, source.camera, wishes)
     try:
         for number, item in enumerate(source.scene.objects):
             mesh = load_mesh(item.glb(), "glb")
-            pipeline.place_object(f"object-{number}", mesh, Placement(position_m=item.place(0)))
+            pipeline.place_object(f"object-{number}", mesh, Placement(position_m=item.position(0)))
         for index in range(len(source)):
             for number, item in enumerate(source.scene.objects):
-                if index and item.place(index) != item.place(index - 1):
-                    pipeline.move_object(f"object-{number}", Placement(position_m=item.place(index)))
+                if index and item.position(index) != item.position(index - 1):
+                    pipeline.move_object(f"object-{number}", Placement(position_m=item.position(index)))
             yield pipeline, pipeline.process(source[index])
     finally:
         pipeline.close()

@@ -1,4 +1,4 @@
-"""The gallery: what stands in each scene, what lights it, and which effects it calls for."""
+"""The gallery: geometry, light, virtual objects and expected effects of each scene."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ Effects = frozenset[str]
 COEFFICIENTS = 16
 FRAMES = 6
 STILL_FRAMES = 46
-"""Of a camera that stands still: under two seconds."""
+"""Frames of scenes with a still camera: less than two seconds."""
 CHANGE_FRAME = 36
-"""In which something happens before it."""
+"""Frame of a change in front of a still camera."""
 SETTLED, HELD = 8, 4
-"""Frames after which a still view without noise rests, and then until a round of direction sets is held."""
+"""Frames until a still view without noise is at rest, and then until all direction sets are held."""
 GRAY: Rgb = (0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True)
 class Part:
-    """Something real, of one colour."""
+    """A real solid of one colour."""
 
     solid: Solid
     albedo: Rgb
     step_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """From frame to frame; of balls."""
+    """Movement from frame to frame; only for spheres."""
     start_frame: int = 0
-    """Frames before it begins to move."""
+    """Frame after which it moves."""
 
     def steps(self, index: int) -> int:
-        """That it has moved until a frame."""
+        """Number of steps until a frame."""
         return max(index - self.start_frame, 0) if any(self.step_m) else 0
 
     def at(self, index: int) -> Solid:
-        """Where it is in a frame."""
+        """The solid at its position in a frame."""
         if not self.steps(index):
             return self.solid
         assert isinstance(self.solid, Sphere)
@@ -55,50 +55,50 @@ class Part:
 
 @dataclass(frozen=True)
 class GalleryScene:
-    """A scene and what it calls for."""
+    """A scene and its expected plan."""
 
     description: str
     parts: tuple[Part, ...]
     sh: Floats
     """[16, 3] radiance."""
     expected_effects: Callable[[int], Effects]
-    """The effects of a frame, by its index."""
+    """Effects that a frame needs, by its index."""
     objects: tuple[GalleryObject, ...] = ()
     eye: tuple[float, float, float] = (0.0, 0.9, 1.5)
     target: tuple[float, float, float] = (0.0, 0.1, 0.0)
     camera_step_m: float = 0.01
-    """Of the camera to the right, from frame to frame."""
+    """Movement of the camera to the right, from frame to frame."""
     frames: int = FRAMES
     noise_codes: float = 0.0
-    """Deviation of the picture's."""
+    """Standard deviation of the picture's noise in codes."""
     depth_noise: float = 0.0
-    """Deviation of depth over that of a structured-light sensor (Nguyen et al. 2012)."""
+    """Depth noise relative to a structured-light sensor (Nguyen et al. 2012)."""
     is_light_given: bool = True
     later_light: tuple[int, Floats] | None = None
-    """From which frame on it is lit by another light, and that: [16, 3]."""
+    """(frame, SH [16, 3]): the light from this frame on."""
     resting_frames: range = range(0)
-    """Frames that are known to tell the spine nothing new."""
+    """Frames in which the spine has nothing new to compute."""
     held_frames: range = range(0)
-    """Of these, those in which effects have nothing new to draw either."""
+    """Resting frames in which effects have nothing new to draw either."""
     largest_changed_share: float = 1.0
-    """Greatest share of the picture that its objects are seen to change of real ones, sharp shadows aside."""
+    """Upper bound of the share of real pixels that virtual objects change visibly, without sharp shadows."""
     noise_dependent_effects: Effects = frozenset()
-    """Effects that it hangs on the noise whether a frame calls for."""
+    """Effects that frames may or may not need, depending on noise."""
     settling_frames: range = range(0)
-    """Frames in which it hangs on the noise whether it rests."""
+    """Frames that may or may not rest, depending on noise."""
     poses: Poses = "given"
     tone_mapping: Literal["auto", "light", "average"] = "auto"
 
 
 def sky(brightness: float) -> Floats:
-    """[16, 3] even."""
+    """[16, 3] uniform sky."""
     sh = np.zeros((COEFFICIENTS, 3))
     sh[0] = brightness * np.sqrt(4 * np.pi)
     return sh
 
 
 def sun(x: float, y: float, z: float, brightness: float, color: Rgb = (1.0, 0.95, 0.85)) -> Floats:
-    """[16, 3] a small light; brightness: shading of a white surface that faces it."""
+    """[16, 3] a small distant light; brightness: shading of a white surface that faces it."""
     direction = np.array([x, y, z]) / np.linalg.norm([x, y, z])
     return np.outer(directional_sh(direction, 0.12, 4), brightness * np.array(color))
 
@@ -131,8 +131,8 @@ _MAPPED = {"shadow_map", "light_samples", "direct_real"}
 
 
 def _always(*effects: set[str]) -> Callable[[int], Effects]:
-    wanted = frozenset(set().union(*effects))
-    return lambda _index: wanted
+    expected = frozenset(set().union(*effects))
+    return lambda _index: expected
 
 
 GALLERY: dict[str, GalleryScene] = {

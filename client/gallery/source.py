@@ -1,4 +1,4 @@
-"""`synthetic:gallery/NAME`: a gallery scene as a source of frames; see client.sources.frame_source.Source."""
+"""`synthetic:gallery/NAME`: a gallery scene as a `Source`."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Rgb
 
 WIDTH, HEIGHT = 160, 120
-_STEP_M, _DIRECTIONS = 0.05, 512  # of shadows
+_STEP_M, _DIRECTIONS = 0.05, 512  # sampling of shadows
 _UP = np.array([0.0, 1.0, 0.0])
 
 
 class GallerySource:
-    """A scene of the gallery, 4 by 3."""
+    """A gallery scene, rendered at 4:3."""
 
     fps = FPS
     has_poses = True
     up: tuple[float, float, float] | None = (0.0, 1.0, 0.0)
 
     def __init__(self, name: str, width: int = WIDTH) -> None:
-        """Raises SourceError if there is none of that name."""
+        """Raises SourceError for an unknown name."""
         if name not in GALLERY:
             raise SourceError(f"{PREFIX}{name}: there is no such scene; there are {', '.join(GALLERY)}")
         self.name = f"{PREFIX}{name}"
@@ -41,7 +41,7 @@ class GallerySource:
             width=width, height=height, fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2
         )
         self._rays = camera_rays(self.camera)
-        self._frames: dict[int, RgbdFrame] = {}  # rendered once: it takes longer than what they are for
+        self._frames: dict[int, RgbdFrame] = {}  # rendered once, as rendering is slower than processing
         self._bake: tuple[object, list[LitSolid]] | None = None
         self._last: tuple[object, NDArray[np.uint8], NDArray[np.float64]] | None = None
 
@@ -55,7 +55,7 @@ class GallerySource:
         return self._frames[index]
 
     def _frame(self, index: int) -> RgbdFrame:
-        picture, depth_m = self._seen(index)
+        picture, depth_m = self._clean_views(index)
         noise = np.random.default_rng(index)
         if self.scene.noise_codes:
             noisy = picture + noise.normal(0.0, self.scene.noise_codes, picture.shape)
@@ -66,8 +66,8 @@ class GallerySource:
         depth = np.rint(depth_m / self.camera.depth_scale_m).clip(0, 65534).astype(np.uint16)
         return RgbdFrame(index, index / FPS, picture, depth, self.pose(index), 1.0)
 
-    def _seen(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-        """sRGB picture and depth in metres, without noise; rendered again where they differ from the last frame's."""
+    def _clean_views(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        """sRGB picture and depth in metres without noise; rendered again only if scene, light or pose changed."""
         key = (self._state(index), self.pose(index).tobytes())
         if self._last is None or self._last[0] != key:
             light = DistantLight(_UP, self._sh(index))
@@ -76,17 +76,17 @@ class GallerySource:
         return self._last[1], self._last[2]
 
     def _state(self, index: int) -> tuple[object, ...]:
-        """What the scene is like in a frame, and lit by."""
+        """Key of the geometry and light of a frame."""
         return tuple(part.steps(index) for part in self.scene.parts), self._sh(index).tobytes()
 
     def _sh(self, index: int) -> NDArray[np.float64]:
-        """[16, 3] the radiance in a frame."""
+        """[16, 3] radiance of the light in a frame."""
         later = self.scene.later_light
         return later[1] if later and index >= later[0] else self.scene.sh
 
     @property
     def light(self) -> tuple[Rgb, ...] | None:
-        """What a session is told of the light; None: it is to be found."""
+        """The light to give to a session; None: to be estimated."""
         rows = self.scene.sh if self.scene.is_light_given else ()
         return tuple((float(r), float(g), float(b)) for r, g, b in rows) or None
 
@@ -104,9 +104,9 @@ class GallerySource:
         solids = [part.at(index) for part in self.scene.parts]
         grids = atlas([solid.charts for solid in solids], _STEP_M)
         directions = sphere_directions(_DIRECTIONS).astype(np.float32)
-        taken = bake(solids, grids, directions) @ self._sh(index).astype(np.float32)
+        occluded = bake(solids, grids, directions) @ self._sh(index).astype(np.float32)
         return [
-            LitSolid(solid, _plain(part), own, ((own, taken),))
+            LitSolid(solid, _plain(part), own, ((own, occluded),))
             for solid, part, own in zip(solids, self.scene.parts, grids, strict=True)
         ]
 

@@ -1,6 +1,6 @@
-"""GLB containers: checking one, packing a glTF with its files into one; how they are written is the server's too.
+"""GLB containers: checking, and packing of a glTF with its files.
 
-Bytes of images and vertices are carried over as they are; no axis, unit or colour is converted.
+Bytes of images and vertices are copied; axes, units and colours are not converted.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _JSON = 0x4E4F534A
 
 
 def check_glb(path: Path, data: bytes) -> dict[str, Any]:
-    """The JSON of a GLB. Raises ObjectError if `data` is none."""
+    """The JSON of a GLB. Raises ObjectError if `data` is not a GLB with a mesh."""
     if len(data) < 20 or data[:4] != b"glTF":
         raise ObjectError(f"{path}: is no GLB mesh, it does not begin with glTF")
     version, length, json_length, kind = struct.unpack_from("<IIII", data, 4)
@@ -40,7 +40,7 @@ def check_glb(path: Path, data: bytes) -> dict[str, Any]:
 
 
 def gltf_to_glb(path: Path, data: bytes) -> bytes:
-    """A .gltf and the buffers and images that it names, as one GLB. Raises ObjectError."""
+    """Pack a .gltf with its buffers and images as one GLB. Raises ObjectError."""
     document = _document(path, data)
     if not document.get("meshes"):
         raise ObjectError(f"{path}: the glTF holds no mesh")
@@ -56,7 +56,7 @@ def gltf_to_glb(path: Path, data: bytes) -> bytes:
 
 
 def add_image(document: dict[str, Any], body: bytearray, data: bytes, name: Path) -> int:
-    """Append an image (other formats than PNG and JPEG become PNG); returns its index. Raises ObjectError."""
+    """Append an image and return its index; formats other than PNG and JPEG become PNG. Raises ObjectError."""
     image: dict[str, Any] = {}
     if _mime_type(data) is None:
         data = _as_png(data, name)
@@ -94,7 +94,7 @@ def _document(path: Path, text: bytes) -> dict[str, Any]:
 
 
 def _fetch(path: Path, uri: object) -> bytes:
-    """What a glTF's `uri` names: inline base64 or a file beside it."""
+    """Bytes of a `uri`: inline base64, or a file relative to the glTF."""
     if not isinstance(uri, str):
         raise ObjectError(f"{path}: a buffer has no uri; export it as .glb")
     if uri.startswith("data:"):

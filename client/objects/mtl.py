@@ -1,4 +1,4 @@
-"""Material libraries of OBJ files (MTL), with the names for roughness and metalness that came later (Pr, Pm)."""
+"""Material libraries of OBJ files (MTL), with the later keys for roughness and metalness (Pr, Pm)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from client.errors import ObjectError
 
 @dataclass(frozen=True)
 class TextureMap:
-    """A picture of a material, and where it is read."""
+    """A texture file and its coordinate transform."""
 
     file: Path
     scale: tuple[float, float] = (1.0, 1.0)
@@ -22,28 +22,28 @@ class TextureMap:
 
 @dataclass(frozen=True)
 class Material:
-    """What is kept of an MTL material."""
+    """The used properties of an MTL material."""
 
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """sRGB, 0 to 1."""
     texture: TextureMap | None = None
     specular: tuple[float, float, float] = (0.0, 0.0, 0.0)
     exponent: float | None = None
-    """Of Phong's highlight."""
+    """Phong exponent."""
     given_roughness: float | None = None
     given_metalness: float | None = None
     roughness_map: TextureMap | None = None
-    """Its red multiplies the roughness, which is 1 where none is given."""
+    """Its red channel multiplies the roughness, which is 1 if not given."""
     metalness_map: TextureMap | None = None
-    """Likewise."""
+    """Its red channel multiplies the metalness, which is 1 if not given."""
     unread: frozenset[str] = frozenset()
-    """Maps it has that are not read."""
+    """Keys of maps that are not supported."""
 
     @property
     def roughness(self) -> float:
-        """Perceptual, 0 to 1. A highlight of exponent n is that of microfacets with alpha^2 = 2 / (n + 2) (Karis 2013).
+        """Perceptual roughness, 0 to 1. Phong exponent n corresponds to alpha^2 = 2 / (n + 2) (Karis 2013).
 
-        Without one, or where it is black: 1, which a map then multiplies.
+        1 without a highlight, or with a map.
         """
         if self.given_roughness is not None:
             return self.given_roughness
@@ -54,14 +54,14 @@ class Material:
 
     @property
     def metalness(self) -> float:
-        """0 to 1: what is given, else 0; a map without it multiplies 1."""
+        """0 to 1: the given value, else 1 with a map and 0 without."""
         if self.given_metalness is not None:
             return self.given_metalness
         return 0.0 if self.metalness_map is None else 1.0
 
 
 def read_materials(path: Path) -> dict[str, Material]:
-    """A library's materials by name. Raises ObjectError naming the file and line."""
+    """Materials by name. Raises ObjectError with file and line."""
     materials: dict[str, Material] = {}
     name = ""
     for number, line in enumerate(path.read_text("utf-8", errors="replace").splitlines(), 1):
@@ -119,7 +119,7 @@ def _numbers(path: Path, number: int, key: str, words: list[str], count: int) ->
 
 
 def _texture_map(path: Path, words: list[str]) -> TextureMap:
-    """The file after a map's options; file names may have spaces, so the longest tail that exists wins."""
+    """The file after the options of a map; names may contain spaces, so the longest existing tail is used."""
     for start in range(len(words)):
         file = path.parent / " ".join(words[start:]).replace("\\", "/")
         if file.is_file():
@@ -129,7 +129,7 @@ def _texture_map(path: Path, words: list[str]) -> TextureMap:
 
 
 def _option(words: list[str], name: str, default: float) -> tuple[float, float]:
-    """The first two numbers after an option that has up to three."""
+    """The first two of up to three numbers after an option."""
     values = [default, default]
     if name in words:
         for k, word in enumerate(words[words.index(name) + 1 :][:2]):

@@ -1,8 +1,7 @@
-"""An OBJ with its material libraries and textures as one GLB: the same vertices, axes and units.
+"""Conversion of an OBJ with material libraries and textures to one GLB with the same vertices, axes and units.
 
-`Kd` is taken as sRGB, as textures are; glTF's factors are linear. Roughness is `Pr`, or what shines as `Ns` does;
-metalness is `Pm`. Of the maps, `map_Kd`, `map_Pr` and `map_Pm` are read, with their options -s, -o and -clamp; others
-are told in a note.
+`Kd` is sRGB, like textures; glTF's factors are linear. Roughness is `Pr`, or follows from `Ns`; metalness is `Pm`.
+`map_Kd`, `map_Pr` and `map_Pm` are read with their options -s, -o and -clamp; a note names other maps.
 """
 
 from __future__ import annotations
@@ -42,18 +41,18 @@ class _Model:
 
 
 def libraries(path: Path, text: str) -> list[Path]:
-    """The material libraries of an OBJ that exist."""
+    """Existing material libraries of an OBJ."""
     names = [line.split(maxsplit=1)[1].strip() for line in text.splitlines() if line.startswith("mtllib ")]
     return [path.parent / name for name in names if (path.parent / name).is_file()]
 
 
-def counts_backwards(text: str) -> bool:
-    """True if a face names its corners from the last one on, with negative numbers."""
+def has_negative_indices(text: str) -> bool:
+    """Whether a face has negative indices, which count from the last vertex."""
     return any(line.startswith("f ") and "-" in line.split("#")[0] for line in text.splitlines())
 
 
 def convert(path: Path, text: str, mtl_files: list[Path]) -> bytes:
-    """GLB bytes; what was not found is told in `asset.extras.notes`. Raises ObjectError naming the file and line."""
+    """GLB bytes; `asset.extras.notes` names what was not found. Raises ObjectError with file and line."""
     materials = {name: m for file in mtl_files for name, m in read_materials(file).items()}
     unread = sorted({key for m in materials.values() for key in m.unread})
     model = _read_obj(path, text)
@@ -120,7 +119,7 @@ def _corner(model: _Model, word: str) -> Corner:
 
 
 def _index(part: str, count: int) -> int:
-    """0-based; OBJ counts from 1, or backwards from the last with negative numbers."""
+    """0-based index; OBJ counts from 1, and negative numbers from the last element."""
     if not part:
         return -1
     number = int(part)
@@ -143,7 +142,7 @@ def _primitive(document: dict[str, Any], body: bytearray, model: _Model, group: 
         attributes["NORMAL"] = glb.add_array(document, body, normals)
     if (corners[:, 1] >= 0).all():
         uv = _floats([model.coordinates[i] for i in corners[:, 1]], 2)
-        # OBJ counts v from the bottom, glTF from the top.
+        # v points up in OBJ, down in glTF.
         flipped = uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)
         attributes["TEXCOORD_0"] = glb.add_array(document, body, flipped)
     indices = np.array(group.triangles, np.uint32).ravel()
@@ -181,9 +180,9 @@ def _add_material(
 def _add_surface(
     document: dict[str, Any], body: bytearray, material: Material, images: dict[tuple[Path, ...], int]
 ) -> dict[str, Any]:
-    """A reference to one picture of both maps, as glTF has them: roughness green, metalness blue, white for none.
+    """A reference to one picture of both maps as in glTF: roughness in green, metalness in blue, 255 without a map.
 
-    Raises ObjectError where they are not read at the same places.
+    Raises ObjectError if the options of the two maps differ.
     """
     roughness, metalness = material.roughness_map, material.metalness_map
     if roughness and metalness and replace(roughness, file=metalness.file) != metalness:
@@ -200,13 +199,13 @@ def _add_surface(
             np.full((height, width), 255, np.uint8) if picture is None else cv2.resize(picture, (width, height))
             for picture in (blue, green, None)
         ]
-        data = cv2.imencode(".png", np.stack(channels, axis=-1))[1].tobytes()  # blue, green, red, as cv2 has them
+        data = cv2.imencode(".png", np.stack(channels, axis=-1))[1].tobytes()  # cv2 expects blue, green, red
         images[files] = glb.add_image(document, body, data, place.file)
     return _add_texture(document, place, images[files])
 
 
 def _read_grey(file: Path) -> NDArray[np.uint8]:
-    """[h, w] the red of a picture, as it is written. Raises ObjectError."""
+    """[h, w] red channel of a picture. Raises ObjectError."""
     picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
     if picture is None:
         raise ObjectError(f"{file}: the texture cannot be decoded; save it as PNG or JPEG")
@@ -214,7 +213,7 @@ def _read_grey(file: Path) -> NDArray[np.uint8]:
 
 
 def _add_texture(document: dict[str, Any], texture: TextureMap, image: int) -> dict[str, Any]:
-    """A reference to an image. OBJ's v counts from the bottom: v' = s v + o is 1 - v' = s (1 - v) + 1 - s - o."""
+    """A reference to an image. OBJ's v points up: v' = s v + o is 1 - v' = s (1 - v) + 1 - s - o in glTF."""
     entry = {"source": image}
     if texture.clamp:
         document.setdefault("samplers", []).append({"wrapS": 33071, "wrapT": 33071})

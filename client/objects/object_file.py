@@ -1,4 +1,4 @@
-"""Virtual objects as the command line names them, and as one message carries them."""
+"""Virtual objects of the command line, and their mesh files packed for one message."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ObjectFile:
 
 
 def parse_object(text: str) -> ObjectFile:
-    """`FILE[@x,y,z[,scale[,yaw_deg]]]`; a file whose own name has an @ is found too. Raises ObjectError."""
+    """Parse `FILE[@x,y,z[,scale[,yaw_deg]]]`; FILE may contain an @. Raises ObjectError."""
     if "@" not in text or Path(text).is_file():
         return ObjectFile(_existing(text), None)
     name, _, place = text.rpartition("@")
@@ -44,8 +44,8 @@ def parse_object(text: str) -> ObjectFile:
 def pack_mesh(path: Path) -> tuple[ObjectFormat, bytes]:
     """(format, bytes) of a mesh file for one message: glb, obj, ply or stl.
 
-    GLB, PLY, STL and an OBJ without materials go as they are; glTF and an OBJ with its materials and textures become
-    one GLB with the same vertices. Raises ObjectError if the file is no mesh or too big.
+    GLB, PLY, STL and OBJ without materials are unchanged; glTF, and OBJ with materials and textures, become one GLB
+    with the same vertices. Raises ObjectError if the file is not a mesh or too large.
     """
     suffix = path.suffix.lower().lstrip(".")
     if suffix not in FORMATS:
@@ -100,8 +100,8 @@ def _pack_obj(path: Path, data: bytes) -> tuple[ObjectFormat, bytes]:
     if not {"v", "f"} <= kinds:
         raise ObjectError(f"{path}: is no OBJ mesh, it has no vertices or no faces")
     libraries = obj_to_glb.libraries(path, text)
-    # Common readers misread indices that count backwards, so those are resolved here.
-    if libraries or obj_to_glb.counts_backwards(text):
+    # Common readers misread negative indices, so they are resolved here.
+    if libraries or obj_to_glb.has_negative_indices(text):
         return "glb", obj_to_glb.convert(path, text, libraries)
     return "obj", data
 

@@ -1,4 +1,4 @@
-"""Places the objects of `--object` in the pipeline of this process."""
+"""Placing of the objects of `--object` in a pipeline of this process."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from server.scene.placement import Placement
 
 
 def place_objects(pipeline: ClientSession, objects: tuple[ObjectFile, ...], note: Callable[[str], None]) -> None:
-    """Put every object into the pipeline, named by `object_id`. Raises ObjectError, MeshError or RunError."""
+    """Place all objects, named by `object_id`. Raises ObjectError, MeshError or RunError."""
     for number, item in enumerate(objects):
         format_, data = pack_mesh(item.path)
         placement = Placement(position_m=item.position_m, scale=item.scale, yaw_deg=item.yaw_deg)
@@ -25,5 +25,5 @@ def place_objects(pipeline: ClientSession, objects: tuple[ObjectFile, ...], note
 
 
 def object_id(number: int) -> str:
-    """The session's name of the n-th `--object`, the same in `run` and `stream`."""
+    """Name of the n-th `--object` in the session; the same in `run` and `stream`."""
     return f"object-{number}"

@@ -1,4 +1,4 @@
-"""Lights from files: `light.json` (ground truth), `light.jsonl` (what this program writes) and panoramas."""
+"""Lights from files: `light.json` (ground truth), `light.jsonl` (output of this program) and panoramas."""
 
 from __future__ import annotations
 
@@ -20,11 +20,10 @@ Coefficients = tuple[Rgb, ...]
 
 
 def read_light(path: Path, radiance_of_white: float = 1.0) -> Coefficients:
-    """SH of a light file, world axes: of `{"sh": [[r, g, b], ...]}`, or of the last line of a `light.jsonl`.
+    """Radiance SH in world axes of `{"sh": [[r, g, b], ...]}`, or of the last line of a `light.jsonl`.
 
-    `sh_all` is taken before `sh`. A line that says its frame's `exposure` is brought to the units of the first
-    picture of its session. Others are radiance, of which `radiance_of_white` is the picture's 1. Raises OptionError,
-    one line.
+    `sh_all` has precedence over `sh`. A line with `exposure` is divided by it, which gives the units of the session's
+    first picture. Other files are divided by `radiance_of_white`, the radiance of a white pixel. Raises OptionError.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -34,7 +33,7 @@ def read_light(path: Path, radiance_of_white: float = 1.0) -> Coefficients:
 
 
 def read_panorama_light(path: Path, bands: int) -> Coefficients:
-    """SH of a lat-long panorama, in WebXR's axes. Raises OptionError, one line."""
+    """Radiance SH of a lat-long panorama, in WebXR's axes. Raises OptionError."""
     try:
         light = panorama_sh(read_panorama(path), bands)
     except PanoramaError as error:
@@ -43,7 +42,7 @@ def read_panorama_light(path: Path, bands: int) -> Coefficients:
 
 
 def _document(path: Path, text: str) -> Any:
-    """The whole file, or its last line where every line is a document."""
+    """JSON of the whole file, or of its last line."""
     lines = [line for line in text.splitlines() if line.strip()]
     for candidate in (text, lines[-1] if lines else ""):
         try:

@@ -1,4 +1,4 @@
-"""The options that say which room a client joins, and where its world lies there."""
+"""Options of the room to join and of the pose of the client's world in it."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ SAME = "same"
 def room_place(
     room: str | None, room_from_world: str | None, marker: str | None, key: str | None = None
 ) -> RoomPlace | None:
-    """None where no room is named. Raises OptionError."""
+    """None without `--room`. Raises OptionError."""
     if room is None:
-        for option, said in (("--room-key", key), ("--room-from-world", room_from_world), ("--marker", marker)):
-            if said is not None:
+        for option, value in (("--room-key", key), ("--room-from-world", room_from_world), ("--marker", marker)):
+            if value is not None:
                 raise OptionError(f"{option} is of a room: name it with --room")
         return None
     return RoomPlace(
@@ -56,10 +56,10 @@ def _marker(text: str) -> Marker:
     words = text.split(",")
     try:
         number, side_m, *dictionary = words
-        said = {"id": int(number), "side_m": float(side_m)} | ({"dictionary": dictionary[0]} if dictionary else {})
+        fields = {"id": int(number), "side_m": float(side_m)} | ({"dictionary": dictionary[0]} if dictionary else {})
         if len(words) > 3:
             raise ValueError("more than three parts")
-        return msgspec.convert(said, Marker)
+        return msgspec.convert(fields, Marker)
     except (ValueError, msgspec.ValidationError) as error:
         raise OptionError(
             f"--marker {text}: expected ID,SIDE_M[,DICTIONARY], the last of {', '.join(get_args(Dictionary))} ({error})"

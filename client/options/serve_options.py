@@ -1,4 +1,4 @@
-"""What the options of `probeless serve` amount to: who may come in, by what certificate, and how much of it."""
+"""Options of `probeless serve`: access, TLS certificate, limits and folders."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LEAST_VOLUME_MIB, MOST_VOLUME_MIB = 16, 1 << 20
 
 @dataclass(frozen=True)
 class ServeOptions:
-    """As the user gave them."""
+    """Options as typed; None: not given."""
 
     host: str
     token: str | None = None
@@ -94,7 +94,7 @@ def limits_of(options: ServeOptions) -> Limits:
 
 
 def _retention_limits(options: ServeOptions) -> RetentionLimits:
-    """0 is no limit."""
+    """0: no limit."""
     retention = DEFAULT_LIMITS.room_retention
     if options.data_gib is not None:
         retention = replace(retention, space_bytes=int(options.data_gib * GIB) or None)
@@ -104,7 +104,7 @@ def _retention_limits(options: ServeOptions) -> RetentionLimits:
 
 
 def data_folder(text: str | None) -> Path | None:
-    """Where rooms are kept; None: nowhere. Raises RunError where nothing can be written there."""
+    """Folder of saved rooms; None: rooms are not saved. Raises RunError if it cannot be written."""
     if text == NO_DATA:
         return None
     folder = user_data_path("probeless") / "rooms" if text is None else Path(text)
@@ -120,7 +120,7 @@ def data_folder(text: str | None) -> Path | None:
 
 
 def objects_folder(path: Path | None) -> Path | None:
-    """Where models are that clients may place; None: nowhere. Raises OptionError."""
+    """Folder of models that clients may place. Raises OptionError if it does not exist."""
     if path is not None and not path.is_dir():
         raise OptionError(f"--objects {path}: no such folder; give one with .glb, .obj, .ply or .stl files in it")
     return path
@@ -134,20 +134,20 @@ def log_format_of(text: str) -> LogFormat:
 
 
 def exit_soon(status: int) -> None:
-    """End this process shortly with `status`, even where a device never comes back to the thread that waits for it."""
+    """End this process soon with `status`, even if a thread waits for a device that never answers."""
 
-    def leave() -> None:
+    def stop() -> None:
         sys.stderr.write("probeless: a session is stuck on the device and was given up\n")
         sys.stderr.flush()
         os._exit(status)
 
-    timer = threading.Timer(EXIT_TIMEOUT_S, leave)
+    timer = threading.Timer(EXIT_TIMEOUT_S, stop)
     timer.daemon = True
     timer.start()
 
 
 def _origin(text: str) -> str:
-    """As a browser writes it. Raises OptionError."""
+    """An origin in the form of a browser's header. Raises OptionError."""
     parts = urlsplit(text.lower().rstrip("/"))
     if parts.scheme not in ("http", "https") or not parts.netloc or parts.path or parts.query:
         raise OptionError(f"--allow-origin {text}: expected https://HOST or https://HOST:PORT, as a browser shows it")

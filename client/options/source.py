@@ -1,4 +1,4 @@
-"""Opens the source that the command line names."""
+"""The SOURCE argument of the command line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ OAK_PREFIX = "oak?"
 
 
 def open_source(spec: str) -> Source:
-    """The source that `spec` names: a folder, `synthetic:NAME[?key=value&...]`, a recording's file, `oak[?vio=off]`.
+    """Open a data-set folder, `synthetic:NAME[?key=value&...]`, a recording, or `oak[?vio=off]`.
 
     Raises SourceError.
     """

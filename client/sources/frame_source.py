@@ -1,4 +1,4 @@
-"""The interface of everything that frames come from: data-set folders, synthetic scenes, recordings and cameras."""
+"""Interface of all sources of frames: data-set folders, synthetic scenes, recordings and cameras."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from protocol.frames import CameraModel, RgbdFrame
 
 GALLERY_PREFIX = "synthetic:gallery/"
 ENDLESS = 2**31
-"""Length of a source that goes on until it is stopped: a camera."""
+"""Length of a live source, which runs until it is stopped."""
 
 
 class Source(Protocol):
-    """A sequence of RGB-D frames of one camera. Indexing may raise SourceError naming the damaged file."""
+    """A sequence of RGB-D frames of one camera. Indexing may raise SourceError with the name of a damaged file."""
 
     @property
     def name(self) -> str: ...
@@ -25,19 +25,19 @@ class Source(Protocol):
 
     @property
     def has_poses(self) -> bool:
-        """Every frame has its `world_from_camera`."""
+        """Whether every frame has `world_from_camera`."""
 
     @property
     def up(self) -> tuple[float, float, float] | None:
-        """World direction, where the source knows it."""
+        """Up direction in world axes; None: unknown."""
 
     def __len__(self) -> int:
-        """`ENDLESS` of a camera."""
+        """Number of frames; `ENDLESS` for a live source."""
 
     def __getitem__(self, index: int) -> RgbdFrame:
-        """The frame of that number; of a camera, its newest, given that number."""
+        """The frame with this number; a live source returns its newest frame, with this number."""
 
 
 def is_live(source: Source) -> bool:
-    """True of a camera: frames come when they come, and go on."""
+    """Whether the source is a camera, which sets the frame rate itself and has no last frame."""
     return len(source) == ENDLESS

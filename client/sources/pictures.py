@@ -1,6 +1,6 @@
-"""Reading colour and depth pictures, refusing damaged files by name.
+"""Reading of colour and depth pictures; damaged files are refused.
 
-A decoder alone does not do: libjpeg and libpng hand out the part of a truncated picture that they could read.
+Files are checked before decoding, because libjpeg and libpng return the readable part of a truncated picture.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from client.errors import SourceError
 from protocol.limits import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE_PX
 
 NO_DEPTH = 65535
-"""Some sensors' mark for a pixel without measurement; becomes 0."""
+"""Value of pixels without measurement in some data sets; becomes 0."""
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", 0xDA, b"\xff\xd9"
 
 
 def read_color(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """[height, width, 3] RGB, uint8 or uint16 as the file has it. Raises SourceError."""
+    """[height, width, 3] RGB, uint8 or uint16 as in the file. Raises SourceError."""
     picture = _decode(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
     if picture.dtype not in (np.uint8, np.uint16):
         raise SourceError(f"{path}: colour must have 8 or 16 bits, not {picture.dtype}")
@@ -32,7 +32,7 @@ def read_color(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
 
 
 def read_depth(path: Path) -> NDArray[np.uint16]:
-    """[height, width] uint16 in the data set's unit, 0 = no measurement (65535 becomes 0). Raises SourceError."""
+    """[height, width] uint16 in the unit of the data set, 0: no measurement (65535 becomes 0). Raises SourceError."""
     picture = _decode(path, cv2.IMREAD_UNCHANGED)
     if picture.dtype != np.uint16 or picture.ndim != 2:
         raise SourceError(f"{path}: depth must be one channel of 16 bits, not {picture.dtype} {picture.shape}")
@@ -81,7 +81,7 @@ def _require_complete(data: bytes, path: Path) -> None:
 
 
 def _png_is_complete(data: bytes) -> bool:
-    """Every chunk is there with its checksum, up to IEND."""
+    """Whether all chunks up to IEND exist and match their checksums."""
     at = len(_PNG_SIGNATURE)
     while at + 12 <= len(data):
         length = int.from_bytes(data[at : at + 4], "big")
@@ -97,7 +97,7 @@ def _png_is_complete(data: bytes) -> bool:
 
 
 def _jpeg_is_complete(data: bytes) -> bool:
-    """The end marker follows the scan; thumbnails in the header have their own, so the header is skipped first."""
+    """Whether the end marker follows the scan. The header is skipped, as its thumbnails have end markers too."""
     at = 2
     while at + 4 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]

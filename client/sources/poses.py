@@ -1,4 +1,4 @@
-"""Camera poses in the files of data sets: 4x4 text, TUM lines, Redwood logs. All are world_from_camera, metres."""
+"""Camera poses in data-set files: 4x4 text, TUM lines, Redwood logs. All are world_from_camera in metres."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from client.errors import SourceError
 
 ROTATION_TOLERANCE = 5e-3
-"""Largest entry of R^T R - I accepted: files with few digits and poses averaged by trackers stay below 1e-3."""
+"""Largest accepted entry of R^T R - I; rounded or averaged poses in files stay below 1e-3."""
 
 
 def rigid(matrix: NDArray[np.float64], where: str) -> NDArray[np.float64]:
-    """`matrix` [4, 4] with its rotation made exactly orthonormal. Raises SourceError naming `where` if it is none."""
+    """`matrix` [4, 4] with an orthonormalised rotation. Raises SourceError with `where` if it is not rigid."""
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise SourceError(f"{where}: the pose has NaN or is not a 4x4 matrix")
     rotation = matrix[:3, :3]
@@ -65,9 +65,9 @@ def read_log(path: Path) -> dict[int, NDArray[np.float64]]:
 
 
 def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit (x, y, z, w) of a [3, 3] rotation, w >= 0 (and the first non-zero component positive when w is 0)."""
+    """Unit quaternion (x, y, z, w) of a rotation [3, 3]; w >= 0, or the first non-zero component positive if w is 0."""
     r = rotation
-    # Of the four quadratic forms the largest is divided by, so that no small number ever is.
+    # Dividing by the largest of the four candidates avoids division by small numbers.
     candidates = np.array(
         [
             [1 + r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]],
@@ -93,13 +93,13 @@ def read_text(path: Path) -> str:
 
 
 def numbered_lines(path: Path) -> list[tuple[int, list[str]]]:
-    """[(line number, words)] without comments and empty lines."""
+    """[(line number, words)] of all lines except comments and empty lines."""
     lines = ((number, line.split("#")[0].split()) for number, line in enumerate(read_text(path).splitlines(), 1))
     return [(number, words) for number, words in lines if words]
 
 
 def float_of(word: str, where: str) -> float:
-    """The number `word` says. Raises SourceError naming `where`."""
+    """Parse a number. Raises SourceError with `where`."""
     try:
         return float(word)
     except ValueError:

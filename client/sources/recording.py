@@ -1,4 +1,4 @@
-"""A recording as a source: the frames that a client once sent, in their order."""
+"""A recording as a source: the frames that a client sent, in order."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ DEFAULT_FPS = 30.0
 
 
 @dataclass(frozen=True)
-class _Place:
-    """Where a frame lies."""
+class _FramePosition:
+    """Position of a frame in the file."""
 
     start: int
     length: int
-    """Of its message, bytes."""
+    """Length of its message in bytes."""
     first: int
-    """The frame with which decoding its colour begins: itself, or of video the key picture before it."""
+    """First frame to decode for its colour: itself, or the preceding key picture of a video."""
 
 
 class _Video:
-    """The video of a recording: forwards each picture is decoded once, a jump begins at the key picture before it."""
+    """Video of a recording. Sequential reading decodes each picture once; a jump starts at the previous key picture."""
 
     def __init__(self, camera: CameraModel) -> None:
         self._camera = camera
@@ -45,29 +45,29 @@ class _Video:
         self._reader = ColorReader(camera)
 
     def color(self, index: int, first: int, message: Callable[[int], Frame]) -> Color:
-        """Of a frame; `message` reads any. Raises ProtocolError."""
+        """Colour of frame `index`; `message` reads a frame. Raises ProtocolError."""
         newest = -1 if self._newest is None else self._newest[0]
         if not first <= newest <= index:
             self._reader, newest = ColorReader(self._camera), first - 1
-        for place in range(newest + 1, index + 1):
-            image = message(place).color
+        for position in range(newest + 1, index + 1):
+            image = message(position).color
             if image is not None and image.codec == "h264":
                 self._newest = None
-                self._newest = place, self._reader.decode(image)
+                self._newest = position, self._reader.decode(image)
         assert self._newest is not None
         return self._newest[1]
 
 
 @dataclass(frozen=True)
 class RecordedSource:
-    """See client.sources.frame_source.Source; frames are read from the file when asked for."""
+    """A recording as a `Source`; frames are read from the file on demand."""
 
     path: Path
     camera: CameraModel
     up: tuple[float, float, float] | None
     fps: float
     has_poses: bool
-    places: tuple[_Place, ...] = field(repr=False)
+    positions: tuple[_FramePosition, ...] = field(repr=False)
     video: _Video = field(repr=False, compare=False)
 
     @property
@@ -75,7 +75,7 @@ class RecordedSource:
         return self.path.name
 
     def __len__(self) -> int:
-        return len(self.places)
+        return len(self.positions)
 
     def __getitem__(self, index: int) -> RgbdFrame:
         index = range(len(self))[index]
@@ -93,30 +93,30 @@ class RecordedSource:
         return RgbdFrame(index, message.timestamp_s, color, depth, matrix, message.exposure)
 
     def _message(self, index: int) -> Frame:
-        return _read(self.path, self.places[index].start, self.places[index].length)
+        return _read(self.path, self.positions[index].start, self.positions[index].length)
 
     def _color(self, index: int, image: ColorImage) -> Color:
         if image.codec == "h264":
-            return self.video.color(index, self.places[index].first, self._message)
+            return self.video.color(index, self.positions[index].first, self._message)
         return decode_color(image, self.camera)
 
 
 def open_recording(path: Path) -> RecordedSource:
-    """Raises SourceError if `path` is no recording, or one without frames."""
-    hello, places, stamps = _scan(path)
-    if hello is None or not places:
+    """Raises SourceError if `path` is not a recording or has no frames."""
+    hello, positions, stamps = _scan(path)
+    if hello is None or not positions:
         raise SourceError(f"{path}: holds no captured frames; record with probeless stream SOURCE --record FILE")
     steps = np.diff([time_s for time_s, _ in stamps])
     step_s = median(steps) if len(steps) else 0.0
     fps = 1 / step_s if step_s > 0 else DEFAULT_FPS
     is_posed, video = all(posed for _, posed in stamps), _Video(hello.camera)
-    return RecordedSource(path, hello.camera, hello.wishes.up, fps, is_posed, tuple(places), video)
+    return RecordedSource(path, hello.camera, hello.wishes.up, fps, is_posed, tuple(positions), video)
 
 
-def _scan(path: Path) -> tuple[Hello | None, list[_Place], list[tuple[float, bool]]]:
-    """The hello, where the frames lie, and each frame's time and whether it has a pose. Raises SourceError."""
+def _scan(path: Path) -> tuple[Hello | None, list[_FramePosition], list[tuple[float, bool]]]:
+    """The hello, positions of the frames, and (time, has a pose) of each frame. Raises SourceError."""
     hello: Hello | None = None
-    places: list[_Place] = []
+    positions: list[_FramePosition] = []
     video = _VideoScan()
     stamps: list[tuple[float, bool]] = []
     with path.open("rb") as file:
@@ -130,9 +130,9 @@ def _scan(path: Path) -> tuple[Hello | None, list[_Place], list[tuple[float, boo
                     case {"type": "hello"}:
                         hello = msgspec.convert(message, Hello)
                     case {"type": "frame", "timestamp_s": time_s, "world_from_camera": pose}:
-                        first = video.first(message.get("color"), len(places))
+                        first = video.first(message.get("color"), len(positions))
                         if first is not None:
-                            places.append(_Place(start - length, length, first))
+                            positions.append(_FramePosition(start - length, length, first))
                             stamps.append((time_s, pose is not None))
                     case {"type": _}:
                         pass
@@ -148,11 +148,11 @@ def _scan(path: Path) -> tuple[Hello | None, list[_Place], list[tuple[float, boo
         note(f"{path}: ends inside a message; its {left_over} last bytes were left out")
     if video.unreadable:
         note(f"{path}: {video.unreadable} frames of video rest on pictures that were not sent; they were left out")
-    return hello, places, stamps
+    return hello, positions, stamps
 
 
 class _VideoScan:
-    """Told of each frame's colour, in order."""
+    """Finds key pictures; `first` must be called for each frame in order."""
 
     def __init__(self) -> None:
         self._order = VideoOrder()
@@ -160,7 +160,7 @@ class _VideoScan:
         self.unreadable = 0
 
     def first(self, color: Any, number: int) -> int | None:
-        """The frame with which decoding this one begins; None: it cannot be decoded."""
+        """First frame to decode for frame `number`; None: it cannot be decoded."""
         match color:
             case {"codec": "h264", "data": bytes(data), "width": int(width), "height": int(height)}:
                 try:

@@ -1,6 +1,6 @@
-"""The volume and voxel size that fit what a source sees, for users who name none.
+"""Default volume and voxel size for a source.
 
-Pure functions of the source's frames, so that every command that opens the same source chooses the same volume.
+They are functions of the source's frames only, so every command chooses the same volume for the same source.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Volume = tuple[float, float, float, float, float, float]
 FRAMES_LOOKED_AT = 12
 PIXEL_STEP = 4
 TRUSTED_DEPTH_M = 5.0
-"""Beyond this, structured light and stereo err by several centimetres."""
+"""Beyond this, errors of structured light and stereo are several centimetres."""
 PERCENTILES = (1, 99)
 MARGIN_M = 0.15
 SMALLEST_SIDE_M = 0.5
@@ -30,10 +30,9 @@ VOXEL_STEP_M = 0.0005
 
 
 def default_volume(source: Source, frames: range) -> Volume:
-    """x0, y0, z0, x1, y1, z1 in world metres around what `frames` of `source` see. Raises SourceError.
+    """x0, y0, z0, x1, y1, z1 in world metres: bounding box of the surfaces in `frames`. Raises SourceError.
 
-    Up to 12 frames spread over the range; only the first of a source without poses, whose camera is the world, and of
-    a camera, which has no more yet.
+    Uses up to 12 frames spread over the range, but only the first frame of a live source or one without poses.
     """
     chosen = _spread(frames) if source.has_poses and not is_live(source) else [frames[0]]
     points = np.concatenate([_points_in_world(source[i], source.camera) for i in chosen])
@@ -41,15 +40,15 @@ def default_volume(source: Source, frames: range) -> Volume:
         raise SourceError(f"{source.name}: no depth within {TRUSTED_DEPTH_M:g} m; give --volume")
     low, high = np.percentile(points, PERCENTILES, axis=0)
     centre, half = (low + high) / 2, np.maximum((high - low) / 2 + MARGIN_M, SMALLEST_SIDE_M / 2)
-    # Whole millimetres: exact in the command line and in the log.
+    # Whole millimetres, which print exactly.
     x0, y0, z0, x1, y1, z1 = (round(float(x), 3) for x in (*(centre - half), *(centre + half)))
     return x0, y0, z0, x1, y1, z1
 
 
 def enlarged_volume(volume: Volume) -> Volume:
-    """`volume` grown by half its longest side all around: what a camera may come to see whose way is not known.
+    """`volume` enlarged on all sides by half its longest side, for cameras with an unknown path.
 
-    Costs little: memory is taken where there is surface.
+    This needs little memory, as bricks are allocated only near surfaces.
     """
     more = round(max(volume[axis + 3] - volume[axis] for axis in range(3)) / 2, 3)
     x0, y0, z0, x1, y1, z1 = volume
@@ -59,7 +58,7 @@ def enlarged_volume(volume: Volume) -> Volume:
 
 
 def default_voxel(volume: Volume) -> float:
-    """Voxel side in metres: the longest side over 256, up to the next half millimetre, 4 mm at least."""
+    """Voxel size in metres: longest side / 256, rounded up to half millimetres, at least 4 mm."""
     longest_m = max(volume[axis + 3] - volume[axis] for axis in range(3))
     steps = math.ceil(round(longest_m / VOXELS_PER_SIDE / VOXEL_STEP_M, 6))
     return max(FINEST_VOXEL_M, round(steps * VOXEL_STEP_M, 4))
@@ -71,7 +70,7 @@ def _spread(frames: range) -> list[int]:
 
 
 def _points_in_world(frame: RgbdFrame, camera: CameraModel) -> NDArray[np.float64]:
-    """[n, 3] metres. Lens distortion moves the borders by less than the margin and is left out."""
+    """[n, 3] metres. Lens distortion is ignored; its effect is smaller than the margin."""
     depth = frame.depth[::PIXEL_STEP, ::PIXEL_STEP] * camera.depth_scale_m
     v, u = np.nonzero((depth > 0) & (depth <= TRUSTED_DEPTH_M))
     z = depth[v, u]

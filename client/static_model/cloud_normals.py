@@ -1,4 +1,4 @@
-"""Normals of a point cloud by moving least squares, flipped outwards by the viewing direction (thesis 4.1.1)."""
+"""Normals of a point cloud by moving least squares, oriented by the viewing direction (thesis 4.1.1)."""
 
 from __future__ import annotations
 
@@ -12,46 +12,46 @@ from client.errors import RunError
 from client.static_model.point_cloud import Floats, PointCloud
 
 NORMAL_ERROR_RAD = 0.0175
-"""What the radius is chosen for: one degree, from noise alone."""
+"""Target error of normals due to noise: one degree."""
 LEAST_RADIUS, GREATEST_RADIUS = 2.5, 6.0
-"""In spacings of the points: below, a plane is fitted to a handful of them; above, edges are lost."""
+"""Radius in multiples of the point spacing: smaller has too few points for a plane, larger loses edges."""
 LEAST_NEIGHBOURS = 6
 DENSITY_NEIGHBOURS = 8
 MOST_NEIGHBOURS = 48
-"""The nearest ones are taken."""
+"""The nearest ones are used."""
 _BATCH = 1 << 15
 
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """A cloud moved onto its smooth surface, with the surface's normals. Points with too few neighbours are gone."""
+    """A cloud projected onto its smooth surface, with normals. Points with too few neighbours are removed."""
 
     cloud: PointCloud
     normals: Floats
-    """[n, 3] unit, world; their sign means nothing before `oriented_outwards`."""
+    """[n, 3] unit, world; the sign is arbitrary before `oriented_outwards`."""
     residual_m: Floats
-    """[n] root of the weighted mean square distance of the neighbours to the fitted plane."""
+    """[n] weighted RMS distance of the neighbours to the fitted plane."""
     radius_m: float
 
 
 def smooth(cloud: PointCloud, radius_m: float | None = None) -> SurfacePoints:
-    """Fit a plane around every point and move the point onto it; `radius_m` None: chosen from density and noise.
+    """Fit a plane around every point and project the point onto it; `radius_m` None: chosen from density and noise.
 
-    Raises RunError where the points are too few or too far apart for planes.
+    Raises RunError if there are too few points, or if they are too far apart.
     """
     spacing = spacing_m(cloud.points)
     if radius_m is None:
         first = fit_planes(cloud, 3.0 * spacing)
         radius_m = chosen_radius_m(spacing, float(np.median(first.residual_m)))
     moved = fit_planes(cloud, radius_m)
-    # Once more over the moved points: their normals are the smoothed surface's, not the noise's.
+    # Again with the projected points: these normals are of the smooth surface.
     return fit_planes(moved.cloud, radius_m)
 
 
 def spacing_m(points: Floats) -> float:
-    """Root of the area that one point has of its surface, the median over the points. Raises RunError for a handful.
+    """Square root of the surface area per point, median over the points. Raises RunError for fewer than 16 points.
 
-    k points in a disc of radius d have pi d^2 / k each; the nearest neighbour alone would see pairs, not density.
+    With k points in a disc of radius d the area is pi d^2 / k. One neighbour is not enough, because of close pairs.
     """
     if len(points) < 16:
         raise RunError(f"{len(points)} points are too few for a model: give more --frames or a smaller --voxel")
@@ -61,9 +61,9 @@ def spacing_m(points: Floats) -> float:
 
 
 def chosen_radius_m(spacing: float, noise: float) -> float:
-    """Radius within which points `spacing` apart with `noise` off their plane fix its normal to NORMAL_ERROR_RAD.
+    """Radius at which points with this spacing and noise give normals with an error of NORMAL_ERROR_RAD.
 
-    n points in a disc of radius r fix a slope to noise / sqrt(n r^2 / 4), and n = pi r^2 / spacing^2.
+    n points in a disc of radius r give a slope error of noise / sqrt(n r^2 / 4), with n = pi r^2 / spacing^2.
     """
     radius = np.sqrt(2 * noise * spacing / (np.sqrt(np.pi) * NORMAL_ERROR_RAD))
     return float(np.clip(radius, LEAST_RADIUS * spacing, GREATEST_RADIUS * spacing))
@@ -72,8 +72,8 @@ def chosen_radius_m(spacing: float, noise: float) -> float:
 def fit_planes(cloud: PointCloud, radius_m: float) -> SurfacePoints:
     """One step of moving least squares (Levin 2003) with planes.
 
-    Neighbours within `radius_m` weigh by their information and by a Gaussian of half the radius; the plane goes through
-    their mean, its normal is the direction in which they spread least. Raises RunError where no point has neighbours.
+    Neighbours within `radius_m` are weighted by inverse variance and a Gaussian of half the radius. The plane contains
+    their mean; its normal is the direction of least variance. Raises RunError if no point has enough neighbours.
     """
     tree = _tree(cloud.points)
     parts = []
@@ -98,9 +98,9 @@ def fit_planes(cloud: PointCloud, radius_m: float) -> SurfacePoints:
 
 
 def oriented_outwards(surface: SurfacePoints) -> tuple[SurfacePoints, NDArray[np.bool_]]:
-    """Normals that face away from the cameras inverted; and [n] which those were.
+    """The surface with normals towards the cameras, and [n] which normals were flipped.
 
-    A surface that was seen faces whoever saw it: the dot product with the viewing direction cannot be negative.
+    A visible surface faces its camera: the dot product with the direction to the camera is not negative.
     """
     away = (surface.normals * surface.cloud.towards_camera).sum(axis=1) < 0
     return replace(surface, normals=np.where(away[:, None], -surface.normals, surface.normals)), away
@@ -109,10 +109,10 @@ def oriented_outwards(surface: SurfacePoints) -> tuple[SurfacePoints, NDArray[np
 def _plane(
     places: Floats, cloud: PointCloud, neighbours: NDArray[np.intp], weights: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Places moved onto their planes [n, 3], unit normals [n, 3], residuals [n]."""
+    """Points projected onto their planes [n, 3], unit normals [n, 3], residuals [n]."""
     weights = weights * cloud.weights[neighbours]
     total = np.maximum(weights.sum(axis=1), 1e-300)
-    offsets = cloud.points[neighbours] - places[:, None]  # small numbers: a world far from its origin loses nothing
+    offsets = cloud.points[neighbours] - places[:, None]  # small numbers keep precision far from the origin
     mean = np.einsum("nk,nki->ni", weights, offsets) / total[:, None]
     offsets -= mean[:, None]
     covariance = np.einsum("nk,nki,nkj->nij", weights, offsets, offsets) / total[:, None, None]

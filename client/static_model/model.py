@@ -1,9 +1,9 @@
 """`probeless model`: the static pipeline (thesis 4.1), from posed depth pictures to a triangle mesh.
 
-Depth fusion into a point cloud, smoothed normals, orientation by the viewing direction, triangulation. The last is ball
-pivoting (Bernardini et al. 1999) by Open3D, in the place of the thesis's greedy projection (Marton et al. 2009): both
-join the points themselves, so that the smoothed positions, normals and colours are the mesh's. Screened Poisson,
-trimmed to the points, was tried: farther from the truth by half to many times, and slower.
+Depth fusion into a point cloud, smoothing of normals, orientation by the viewing direction, triangulation. The last is
+ball pivoting (Bernardini et al. 1999) of Open3D instead of the thesis's greedy projection (Marton et al. 2009). Both
+connect the points themselves, so the mesh keeps their positions, normals and colours. Screened Poisson reconstruction,
+trimmed to the points, had 1.5 to many times the error and was slower.
 """
 
 from __future__ import annotations
@@ -30,31 +30,31 @@ from server.meshing.scene_mesh import LEAST_PIECE_VOXELS, SceneMesh, srgb8_from_
 from server.meshing.surface import VoxelMesh
 
 BALL_RADII = (1.0, 1.5, 2.5)
-"""In cells of the cloud. The first fits where every cell has its point; the others roll over gaps."""
+"""Ball radii in cells of the cloud. The first fits where every cell has a point; the others close gaps."""
 FORMATS = (".ply", ".glb")
 
 
 @dataclass(frozen=True)
 class StaticModel:
-    """The mesh, and what became of the points."""
+    """The mesh, and statistics of the points."""
 
     mesh: SceneMesh
     points: int
     flipped: int
-    """Normals that pointed away from the cameras and were inverted."""
+    """Number of normals that pointed away from the cameras and were flipped."""
     radius_m: float
-    """Within which the normals were smoothed."""
+    """Radius of normal smoothing."""
 
 
 def check_output(out: Path) -> None:
-    """Raises OptionError for a format that is not written, RunError where Open3D is absent: before the frames."""
+    """Check before reading frames. Raises OptionError for an unknown format, RunError without Open3D."""
     if out.suffix.lower() not in FORMATS:
         raise OptionError(f"--out {out}: a model is written as {' or '.join(FORMATS)}")
     _open3d()
 
 
 def open_posed(spec: str, frames: str | None, cell_m: float | None) -> tuple[Source, range, float]:
-    """The source, which of its frames, and the cell's side, as the options `--frames` and `--voxel` say them.
+    """The source, its selected frames and the cell size, from the options `--frames` and `--voxel`.
 
     Raises OptionError, SourceError.
     """
@@ -70,7 +70,7 @@ def open_posed(spec: str, frames: str | None, cell_m: float | None) -> tuple[Sou
 def model_of_source(
     source: Source, frames: range, cell_m: float, track: Callable[[Iterable[int], int], Iterable[int]]
 ) -> StaticModel:
-    """The model of `frames`, with at most one point in every cell of side `cell_m`; `track` shows progress over frames.
+    """The model of `frames` with at most one point per cell of size `cell_m`; `track` shows progress over frames.
 
     Raises UserError.
     """
@@ -80,12 +80,12 @@ def model_of_source(
         frame = source[position]
         fusion.add(frame)
         first_pose = frame.world_from_camera if first_pose is None else first_pose
-    assert first_pose is not None  # a frame without a pose was refused
+    assert first_pose is not None  # CloudFusion.add refuses frames without a pose
     return model_of_fusion(fusion, cell_m, upright(source.up, first_pose))
 
 
 def model_of_fusion(fusion: CloudFusion, cell_m: float, gltf_from_world: NDArray[np.float64]) -> StaticModel:
-    """Normals, orientation and triangles of a fused cloud. Raises RunError where there is no surface."""
+    """Compute normals, orientation and triangles of a fused cloud. Raises RunError if there is no surface."""
     surface, flipped = oriented_outwards(smooth(fusion.cloud()))
     triangles = triangulate(surface, cell_m)
     if not len(triangles):
@@ -111,7 +111,7 @@ def model_of_fusion(fusion: CloudFusion, cell_m: float, gltf_from_world: NDArray
 
 
 def triangulate(surface: SurfacePoints, cell_m: float) -> NDArray[np.int64]:
-    """[t, 3] triangles over the points, counter-clockwise seen from where their normals point."""
+    """[t, 3] triangles of the points, counter-clockwise seen from the side of the normals."""
     open3d = _open3d()
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(surface.cloud.points))
     cloud.normals = open3d.utility.Vector3dVector(surface.normals)
@@ -121,13 +121,13 @@ def triangulate(surface: SurfacePoints, cell_m: float) -> NDArray[np.int64]:
 
 
 def upright(up: tuple[float, float, float] | None, world_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation [3, 3] into glTF's axes, from the source's up or else the first camera's."""
+    """Rotation [3, 3] gltf_from_world; up is that of the source, else of the first camera."""
     direction = np.array(up if up is not None else -world_from_camera[:3, 1], np.float64)
     return webxr_from_world(direction / np.linalg.norm(direction), world_from_camera[:3, 2])
 
 
 def write_model(mesh: SceneMesh, out: Path) -> None:
-    """Write the file whose suffix says the format. Raises OutputError."""
+    """Write the mesh in the format of the suffix. Raises OutputError."""
     data = mesh_files(mesh)["ply" if out.suffix.lower() == ".ply" else "glb"]
     try:
         out.parent.mkdir(parents=True, exist_ok=True)

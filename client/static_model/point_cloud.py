@@ -1,6 +1,6 @@
-"""Posed depth pictures as one point cloud (thesis 4.1.1, depth fusion): a weighted mean in every cell of a grid.
+"""Fusion of posed depth pictures into a point cloud (thesis 4.1.1): a weighted mean in every cell of a grid.
 
-Each point keeps the mean direction towards the cameras that saw it, which later says which side of it is outside.
+Each point keeps the mean direction to its cameras, which later determines the outside.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from protocol.images import Color
 Floats = NDArray[np.float64]
 
 EDGE_OF_DEPTH = 0.03
-"""Depth steps to a neighbouring pixel beyond this share are edges; the pixels at them mix two surfaces."""
+"""Relative depth step between neighbours that is an edge; pixels at edges mix two surfaces."""
 _COLUMNS = 3 + 3 + 3
 _MERGE_EVERY = 8
 _CELL_BITS = 21
@@ -27,31 +27,31 @@ _CELL_BITS = 21
 
 @dataclass(frozen=True)
 class PointCloud:
-    """n points, in the order of their cells."""
+    """n points, ordered by cell."""
 
     points: Floats
     """[n, 3] world metres."""
     colors: Floats
     """[n, 3] linear RGB."""
     towards_camera: Floats
-    """[n, 3] unit, world: the mean direction to the cameras that saw the point."""
+    """[n, 3] unit, world: mean direction to the cameras that measured the point."""
     weights: Floats
-    """[n] 1 / m^2: the information of all measurements along their rays."""
+    """[n] 1 / m^2: sum of inverse variances of the measurements."""
     frames: NDArray[np.int64]
-    """[n] how many frames measured it."""
+    """[n] number of frames that measured the point."""
 
 
 def depth_noise_m(depth_m: Floats) -> Floats:
-    """One standard deviation of a structured-light sensor along its ray (Nguyen, Izadi and Lovell 2012, eq. 3)."""
+    """Standard deviation of a structured-light sensor along its ray (Nguyen, Izadi and Lovell 2012, eq. 3)."""
     noise: Floats = 0.0012 + 0.0019 * (depth_m - 0.4) ** 2
     return noise
 
 
 class CloudFusion:
-    """Adds frames one at a time; memory follows the surface."""
+    """Fuses frames one at a time; memory is proportional to the surface."""
 
     def __init__(self, camera: CameraModel, cell_m: float) -> None:
-        """`cell_m`: side of the grid's cells, each of which gives at most one point."""
+        """`cell_m`: cell size; each cell gives at most one point."""
         self._camera = camera
         self._cell_m = cell_m
         self._rays = pixel_rays(camera.depth_lens)
@@ -60,7 +60,7 @@ class CloudFusion:
         self.frames = 0
 
     def add(self, frame: RgbdFrame) -> None:
-        """Fuse one frame. Raises SourceError for one without a pose."""
+        """Fuse one frame. Raises SourceError if it has no pose."""
         if frame.world_from_camera is None:
             raise SourceError(f"frame {frame.index} has no pose; a model needs a source with poses")
         self.frames += 1
@@ -83,9 +83,9 @@ class CloudFusion:
             self._merge()
 
     def cloud(self) -> PointCloud:
-        """The cloud so far; where ten frames or more were added, points that only one of them saw are left out.
+        """The cloud so far; from ten frames on, without points that only one frame measured.
 
-        Raises SourceError where there is nothing.
+        Raises SourceError if there are no points.
         """
         if not self._pending:
             raise SourceError(f"no depth within {TRUSTED_DEPTH_M:g} m: there is nothing to model")
@@ -101,7 +101,7 @@ class CloudFusion:
         return PointCloud(means[:, :3], means[:, 3:6], towards, sums[:, _COLUMNS], frames)
 
     def _colors(self, frame: RgbdFrame, usable: NDArray[np.bool_], in_lens: Floats) -> tuple[Color, NDArray[np.bool_]]:
-        """The pixel [n, 3] that shows each point [n, 3] of the depth lens's space, and [n] whether there is one."""
+        """Colours [n, 3] of points [n, 3] in the space of the depth lens, and [n] whether the colour lens sees them."""
         if self._camera.depth is None:
             return frame.color[usable], np.ones(len(in_lens), np.bool_)
         color_from_depth, lens = self._camera.color_from_depth, self._camera
@@ -115,7 +115,7 @@ class CloudFusion:
         return frame.color[v, u], seen
 
     def _keys(self, points: Floats) -> NDArray[np.int64]:
-        """One number for the cell of each point."""
+        """[n] number of the cell of each point."""
         if not len(points):
             return np.empty(0, np.int64)
         if self._origin is None:
@@ -136,7 +136,7 @@ class CloudFusion:
 
 
 def pixel_rays(lens: CameraModel | DepthCamera) -> Floats:
-    """[h, w, 3] directions in the lens's space with z = 1, its distortion undone."""
+    """[h, w, 3] undistorted ray directions with z = 1 in the space of the lens."""
     v, u = np.mgrid[: lens.height, : lens.width].astype(np.float64)
     pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
     xy = cv2.undistortPoints(pixels, _matrix(lens), np.array(lens.distortion, np.float64)).reshape(*u.shape, 2)
@@ -148,9 +148,9 @@ def _matrix(lens: CameraModel | DepthCamera) -> Floats:
 
 
 def usable_pixels(depth_m: Floats) -> NDArray[np.bool_]:
-    """[h, w] pixels with depth that is trusted, and none of whose eight neighbours lies beyond an edge of depth."""
+    """[h, w] pixels with depth up to TRUSTED_DEPTH_M and no depth edge to one of the eight neighbours."""
     valid = (depth_m > 0) & (depth_m <= TRUSTED_DEPTH_M)
-    # A pixel without depth is no edge: it must neither be the highest nor the lowest of its neighbourhood.
+    # Pixels without depth are no edge: they must be neither maximum nor minimum of a neighbourhood.
     highest = cv2.dilate(np.where(valid, depth_m, 0.0), np.ones((3, 3)))
     lowest = cv2.erode(np.where(valid, depth_m, 2 * TRUSTED_DEPTH_M), np.ones((3, 3)))
     step = np.maximum(highest - depth_m, depth_m - lowest)
@@ -167,5 +167,5 @@ def linear_colors(color: Color, camera: CameraModel) -> Floats:
 
 
 def _sum_rows(rows: NDArray[np.intp], values: Floats, count: int) -> Floats:
-    """[count, k] sums of the values [n, k] that belong to each row, added in the order given."""
+    """[count, k] sums of values [n, k] per row, in the given order."""
     return np.stack([np.bincount(rows, column, count) for column in values.T], axis=1)

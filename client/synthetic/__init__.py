@@ -1,4 +1,4 @@
-"""Analytic scenes with exact truth: intersections in closed form, light in closed form, shadows by quadrature.
+"""Analytic scenes with exact ground truth: closed-form intersections and light, shadows by quadrature.
 
-No OpenCL and nothing of the server: these scenes are what the pipeline is measured against.
+Independent of OpenCL and of the server, because the pipeline is tested against these scenes.
 """

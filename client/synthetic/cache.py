@@ -1,4 +1,4 @@
-"""Baked tables on disk: made once per scene and version of this code, made again where the file is unusable."""
+"""Disk cache of precomputed tables, per scene and version of this code; unusable files are computed again."""
 
 from __future__ import annotations
 
@@ -25,16 +25,13 @@ _UNUSABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 
 
 def cached(name: str, compute: Callable[[], Tables]) -> Tables:
-    """What `compute` returns, from the cache where it is there and whole.
-
-    A cache that cannot be written is no error: the next start computes again.
-    """
+    """The result of `compute`, from the cache if it is there and intact. An unwritable cache is ignored."""
     path = folder() / f"{name}-{code_version()}.npz"
     try:
         return _load(path)
     except _UNUSABLE:
         if sys.stderr.isatty():
-            note(f"computing the shadows of the synthetic scene {name}, once")
+            note(f"computing shadows of the synthetic scene {name}, once")
     tables = compute()
     with contextlib.suppress(OSError):
         _store(path, tables)
@@ -42,13 +39,13 @@ def cached(name: str, compute: Callable[[], Tables]) -> Tables:
 
 
 def folder() -> Path:
-    """Where the tables are kept."""
+    """Folder of the cache."""
     return Path(user_cache_dir("probeless")) / "synthetic"
 
 
 @cache
 def code_version() -> str:
-    """Changes whenever a source file of this package does."""
+    """Hash of the source files of this package."""
     digest = hashlib.sha256()
     for file in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(file.name.encode() + b"\0" + file.read_bytes())

@@ -1,9 +1,9 @@
-"""A synthetic scene written as a folder of the ground-truth layout, for those who do not run this code.
+"""Export of a synthetic scene as a folder of the ground-truth layout.
 
     write_ground_truth(open_synthetic("synthetic:stage?texture=town&with=ball"), Path("out/stage"), range(0, 60, 10))
 
-The guests that stand on the stage set (`with=`) become the virtual objects: `color` and `depth` are without them,
-`with_objects` is the exact picture with them, `objects/*.ply` are their meshes in world coordinates.
+The guests on the stage set (`with=`) become virtual objects: `color` and `depth` are without them, `with_objects` is
+the exact picture with them, `objects/*.ply` are their meshes in world coordinates.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from client.synthetic.solids.tessellate import Triangles, can_tessellate, triang
 from client.synthetic.source import SyntheticSource, Truth
 
 _NORMAL, _ALBEDO = np.float16, np.float16
+_KEYS = {"appearance": "look"}
+"""Keys of scene.json that differ from the names of the options."""
 
 
 def write_ground_truth(source: SyntheticSource, folder: Path, frames: Sequence[int]) -> None:
-    """Write `frames` of the scene, numbered from 0. Depth keeps the source's noise, `truth` is exact.
+    """Write `frames` of the scene, numbered from 0. Depth has the source's noise, `truth` is exact.
 
-    Raises SourceError for a scene whose light is not one distant light that stays, OSError if it cannot be written.
+    Raises SourceError unless the light is one constant distant light, OSError if it cannot be written.
     """
     if source.lamps or source.options.name == "light" or source.options.exposure != "constant":
-        raise SourceError(
-            f"{source.name}: cannot be written, light.json says one distant light, the same in every frame"
-        )
+        raise SourceError(f"{source.name}: cannot be exported, because light.json holds one constant distant light")
     bare = SyntheticSource(replace(source.options, guest="none"))
     for name in ("color", "depth", "truth", *(("objects", "with_objects") if source.guests else ())):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -57,12 +57,12 @@ def write_ground_truth(source: SyntheticSource, folder: Path, frames: Sequence[i
 
 
 def guest_ply(guest: Guest) -> bytes:
-    """Its mesh as binary PLY: world metres, normals, sRGB vertex colours."""
+    """A guest's mesh as binary PLY: world metres, normals, sRGB vertex colours."""
     return _ply(triangles_of([guest.solid]), guest.srgb)
 
 
 def write_guests(folder: Path, source: SyntheticSource) -> list[Path]:
-    """Files with the meshes of a source's guests in world coordinates. Raises OSError."""
+    """Write the meshes of a source's guests in world coordinates; returns the files. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{guest.name}.ply" for guest in source.guests]
     for path, guest in zip(paths, source.guests, strict=True):
@@ -71,7 +71,7 @@ def write_guests(folder: Path, source: SyntheticSource) -> list[Path]:
 
 
 def linear16(radiance: NDArray[np.float64]) -> NDArray[np.uint16]:
-    """[h, w, 3] the picture of linear radiance, 1 at 65535."""
+    """[h, w, 3] 16-bit picture of linear radiance; 1 is 65535."""
     return (np.clip(radiance, 0, 1) * 65535).round().astype(np.uint16)
 
 
@@ -120,7 +120,8 @@ def _write_truth(folder: Path, source: SyntheticSource, bare: list[Truth], with_
         }
     np.savez_compressed(folder / "geometry.npz", allow_pickle=False, **arrays)
     guests = [{"name": guest.name, "srgb": guest.srgb, "albedo": guest.albedo.tolist()} for guest in source.guests]
-    _write_json(folder / "scene.json", {"synthetic": asdict(source.options), "guests": guests})
+    options = {_KEYS.get(name, name): value for name, value in asdict(source.options).items()}
+    _write_json(folder / "scene.json", {"synthetic": options, "guests": guests})
     if can_tessellate(source.scene.solids):
         (folder / "room.ply").write_bytes(_ply(triangles_of(source.scene.solids)))
 

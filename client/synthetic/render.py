@@ -1,4 +1,4 @@
-"""One frame of a scene: what each pixel's ray meets, and how it is lit."""
+"""Rendering of a scene: ray casting and shading of each pixel."""
 
 from __future__ import annotations
 
@@ -16,43 +16,43 @@ from client.synthetic.solids.polyhedra import Solid
 from protocol.frames import CameraModel
 
 BACKDROP = 0.3
-"""Where there is no surface the sky itself is seen, dimmed by this so that it cannot exceed the picture's range."""
+"""Factor of the sky in pixels without surface, so that it stays within the picture's range."""
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class LitSolid:
-    """A solid with what is needed to colour it."""
+    """A solid with its texture and shadows."""
 
     solid: Solid
     texture: Texture | None
-    """None: plain."""
+    """None: PLAIN_ALBEDO."""
     grids: list[Grid]
     occluded: tuple[tuple[list[Grid], NDArray[np.float32]], ...]
-    """Tables of light [total, 3] that shadows take away, each with this solid's grids into it."""
+    """(grids of this solid, table [total, 3] of the light that shadows remove)."""
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """Exact values per pixel; zeros where `owner` is -1."""
+    """Exact values per pixel; 0 where `owner` is -1."""
 
     depth_m: Floats
-    """[h, w] along the camera's z; 0 = no surface."""
+    """[h, w] along the camera's z; 0: no surface."""
     owner: NDArray[np.int16]
-    """[h, w] position in the list of solids, lamps' bulbs after them, -1 = no surface."""
+    """[h, w] index of the solid, then of the lamps' bulbs; -1: no surface."""
     normals: Floats
     """[h, w, 3] world."""
     albedo: Floats
     """[h, w, 3] linear."""
     radiance: Floats
-    """[h, w, 3] linear, in the units of the picture; the backdrop where there is no surface."""
+    """[h, w, 3] linear, in units of the picture; the dimmed sky where there is no surface."""
     lamplight: Floats
-    """[h, w, 3] the part of it that lamps send to surfaces."""
+    """[h, w, 3] part of the radiance that is reflected light of lamps."""
 
 
 def camera_rays(camera: CameraModel) -> Floats:
-    """[h * w, 3] camera-space directions with z = 1, so that distances along them are depths."""
+    """[h * w, 3] camera-space directions with z = 1, so that ray parameters are depths."""
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     return np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
@@ -70,7 +70,7 @@ def look_at(position: Floats, target: Floats, up: Floats) -> Floats:
 
 
 def cast(solids: list[Solid], camera: CameraModel, rays: Floats, pose: Floats) -> tuple[Floats, NDArray[np.int16]]:
-    """Depth in metres (inf where there is none) and the solid's number (-1) of each of the h * w rays."""
+    """Depth in metres (inf: none) and index of the solid (-1: none) of each of the h * w rays."""
     directions, origin = rays @ pose[:3, :3].T, pose[:3, 3]
     depth = np.full((camera.height, camera.width), np.inf)
     owner = np.full(depth.shape, -1, np.int16)
@@ -95,7 +95,7 @@ def render(
     light: DistantLight,
     lamps: tuple[Lamp, ...] = (),
 ) -> Rendering:
-    """Everything about one view."""
+    """Render one view. `rays`: of `camera_rays`; `pose`: world_from_camera [4, 4]."""
     solids: list[Solid] = [body.solid for body in bodies]
     depth, owner = cast([*solids, *(lamp.bulb for lamp in lamps)], camera, rays, pose)
     directions = rays @ pose[:3, :3].T
@@ -130,7 +130,7 @@ def render(
 
 
 def irradiance(body: LitSolid, points: Floats, normals: Floats, light: DistantLight) -> Floats:
-    """[n, 3] light arriving over pi: what white would show. Unshadowed part exact, shadows interpolated."""
+    """[n, 3] irradiance / pi. The unshadowed part is exact, shadows are interpolated."""
     part = body.solid.part(points)
     arriving = np.empty((len(points), 3))
     for number in np.unique(part):
@@ -144,7 +144,7 @@ def irradiance(body: LitSolid, points: Floats, normals: Floats, light: DistantLi
 
 
 def _window(solid: Solid, camera: CameraModel, pose: Floats) -> tuple[slice, slice]:
-    """Rows and columns that the solid can be seen in: those of its bounding sphere's box, all if it is too near."""
+    """Rows and columns that contain the projected bounding sphere; all of them if it is too near."""
     everything = (slice(0, camera.height), slice(0, camera.width))
     if solid.bounds is None:
         return everything
@@ -159,7 +159,7 @@ def _window(solid: Solid, camera: CameraModel, pose: Floats) -> tuple[slice, sli
 
 
 def _span(across: float, ahead: float, radius: float, focal: float, center: float, size: int) -> slice:
-    """Pixels between the two tangents from the camera to a circle."""
+    """Pixels between the tangents from the camera to a circle."""
     angle = np.arctan2(across, ahead)
     half = np.arcsin(min(radius / np.hypot(across, ahead), 1))
     low, high = np.tan(np.clip([angle - half, angle + half], -1.5, 1.5)) * focal + center

@@ -1,4 +1,4 @@
-"""Depth as a structured-light sensor measures it: lateral jitter, disparity steps, drop-outs at grazing angles."""
+"""Noise of a structured-light depth sensor: lateral jitter, disparity steps, drop-outs at grazing angles."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ DISPARITY_NOISE_PX = 0.06
 DISPARITY_STEP_PX = 1 / 8
 BASELINE_M = 0.075
 DROPOUT_FROM_COSINE, DROPOUT_ALWAYS_COSINE = 0.35, 0.1
-"""Seen flatter than the first cosine some pixels are lost, flatter than the second all."""
+"""Below the first cosine of incidence some pixels are lost, below the second all."""
 SEED = 20150923
 
 
 def kinect_like(depth_m: Floats, cosines: Floats, focal_px: float, index: int) -> Floats:
-    """[h, w] metres with 0 = none, from exact depth (0 = none) and the cosine between surface and ray.
+    """[h, w] noisy depth in metres (0: none) from exact depth and the cosine between normal and ray.
 
-    The same for the same frame `index`.
+    Deterministic for each frame `index`.
     """
     random = np.random.default_rng([SEED, index])
     height, width = depth_m.shape

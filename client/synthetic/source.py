@@ -1,4 +1,4 @@
-"""`synthetic:NAME[?key=value&...]`: scenes of this project's own, with exact poses, depth, colour and light."""
+"""`synthetic:NAME[?key=value&...]`: scenes with exact poses, depth, colour and light."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from protocol.frames import CameraModel, RgbdFrame
 
 FPS = 30.0
 LIGHT_TURN_FRAMES = 240
-"""Of one round of the moving light."""
+"""Frames of one turn of the moving light."""
 FOCAL_OF_WIDTH = 525 / 640
 
 _UP = np.array([0.0, 1.0, 0.0])
@@ -32,41 +32,41 @@ _UP = np.array([0.0, 1.0, 0.0])
 
 @dataclass(frozen=True)
 class Truth:
-    """What is exactly known of one frame."""
+    """Exact ground truth of one frame."""
 
     sh: NDArray[np.float64]
-    """[16, 3] radiance in the units of the linearised picture: picture = albedo * (transfer . sh)."""
+    """[16, 3] radiance in units of the linear picture: picture = albedo * (transfer . sh)."""
     depth_m: NDArray[np.float32]
-    """[h, w] along the camera's z, 0 = no surface."""
+    """[h, w] along the camera's z, 0: no surface."""
     normals: NDArray[np.float32]
-    """[h, w, 3] world, 0 where there is no surface."""
+    """[h, w, 3] world, 0: no surface."""
     albedo: NDArray[np.float32]
-    """[h, w, 3] linear, 0 where there is no surface."""
+    """[h, w, 3] linear, 0: no surface."""
     visible: NDArray[np.bool_]
-    """[h, w] there is a surface."""
+    """[h, w] pixels with surface."""
     dynamic: NDArray[np.bool_]
-    """[h, w] the surface moves."""
+    """[h, w] pixels of moving surfaces."""
     guest: NDArray[np.bool_]
-    """[h, w] the surface is one that `with=` has put there."""
+    """[h, w] pixels of objects inserted by `with=`."""
     radiance: NDArray[np.float64]
-    """[h, w, 3] the picture before it is encoded as sRGB in 8 bits."""
+    """[h, w, 3] linear picture before encoding as 8-bit sRGB."""
     light_direction: NDArray[np.float64]
-    """[3] unit, world: the dominant direction of the light."""
+    """[3] unit, world: dominant direction towards the light."""
     lamps: tuple[Lamp, ...]
-    """Lights inside the scene, besides `sh`, in the same units."""
+    """Lights inside the scene, in addition to `sh`, in the same units."""
     lamplight: NDArray[np.float64]
-    """[h, w, 3] the part of `radiance` that lamps send to surfaces."""
+    """[h, w, 3] part of `radiance` that is reflected light of lamps."""
 
 
 class SyntheticSource:
-    """A scene seen by a moving camera; see client.sources.frame_source.Source."""
+    """A scene with a moving camera, as a `Source`."""
 
     fps = FPS
     has_poses = True
     up: tuple[float, float, float] | None = (0.0, 1.0, 0.0)
 
     def __init__(self, options: Options) -> None:
-        """Cheap; the scene's shadows are baked, or read from the cache, when the first frame is asked for."""
+        """Shadows are computed, or read from the cache, at the first frame."""
         self.name = f"synthetic:{options.name}"
         self.options = options
         width, height = options.size
@@ -99,7 +99,7 @@ class SyntheticSource:
         return RgbdFrame(index, index / FPS, picture, depth, pose, reported if self.options.exposure_given else None)
 
     def exposure(self, index: int) -> float:
-        """Of one frame's picture, relative to the first one's."""
+        """Exposure of a frame relative to the first."""
         return EXPOSURE_CURVES[self.options.exposure](index)
 
     def pose(self, index: int) -> NDArray[np.float64]:
@@ -113,7 +113,7 @@ class SyntheticSource:
         return ring_light(self.options.light + moved, self.scene.brightness)
 
     def truth(self, index: int) -> Truth:
-        """What is exactly known of frame `index`."""
+        """Ground truth of frame `index`."""
         rendering, light, exposure = self._rendering(index), self.light(index), self.exposure(index)
         return Truth(
             sh=exposure * light.sh,
@@ -140,7 +140,7 @@ class SyntheticSource:
 
     @cached_property
     def _guest_transfer(self) -> dict[str, NDArray[np.float32]]:
-        """Occluded transfer that the guests cause, and on them, see bake_guests."""
+        """Occluded transfer on the set and on the guests, see bake_guests."""
         directions = sphere_directions(self.scene.directions).astype(np.float32)
         return cached(
             f"{self.scene.name}_{self.options.guest}",
@@ -154,7 +154,7 @@ class SyntheticSource:
         return hand.StaticVisibility(solids, bits)
 
     def _shadowed_light(self, index: int) -> NDArray[np.float32]:
-        """[total, 3] light that static shadows take away."""
+        """[total, 3] light that static shadows remove."""
         return self._transfer @ self.light(index).sh.astype(np.float32)
 
     def _render(self, index: int) -> Rendering:
@@ -171,7 +171,7 @@ class SyntheticSource:
         return render(bodies, self.camera, self._rays, self.pose(index), light, self.lamps)
 
     def _with_hand(self, bodies: list[LitSolid], index: int, light: DistantLight) -> list[LitSolid]:
-        """The static bodies under the hand's shadow, then the hand's parts."""
+        """The static solids with the shadow of the hand, and the parts of the hand."""
         parts = hand.capsules(index / max(len(self) - 1, 1))
         if not parts:
             return bodies
@@ -187,7 +187,7 @@ class SyntheticSource:
         return [*shadowed, *skin]
 
     def _with_guests(self, bodies: list[LitSolid], light: DistantLight) -> list[LitSolid]:
-        """The static bodies under the guests' shadows, then the guests."""
+        """The static solids with the shadows of the guests, and the guests."""
         sh = light.sh.astype(np.float32)
         occluded_on_set, occluded_light = self._guest_transfer["on_set"] @ sh, self._guest_transfer["on_guests"] @ sh
         shadowed = [

@@ -1,4 +1,4 @@
-"""What a `synthetic:NAME[?key=value&...]` says."""
+"""Parsing of `synthetic:NAME[?key=value&...]`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SCENES: dict[str, Callable[[], scenes.Scene]] = {
 
 @dataclass(frozen=True)
 class Options:
-    """What stands after the name."""
+    """Options of a synthetic scene."""
 
     name: str
     frames: int = 60
@@ -44,21 +44,21 @@ class Options:
     noise: bool = False
     lamps: int = 0
     place: int = 0
-    """Of the first lamp, see lamps.py."""
+    """Position of the first lamp, see lighting/lamps.py."""
     exposure: str = "constant"
-    """How it goes, see camera_exposure.py."""
+    """Curve over the frames, see camera_exposure.py."""
     exposure_given: bool = True
-    """Whether frames say it."""
-    look: str = "paper"
-    """Of the stage set, see looks.py."""
+    """Whether frames report their exposure."""
+    appearance: str = "paper"
+    """Appearance of the stage set, see scenes/appearance.py."""
     guest: str = "none"
-    """What stands on the stage set besides, see guests.py."""
+    """Objects inserted into the stage set, see scenes/guests.py."""
     is_still: bool = False
-    """The camera does not walk around the stage set."""
+    """Whether the camera of the stage set stands still."""
 
 
 def parse_spec(spec: str) -> Options:
-    """Raises SourceError naming what is wrong."""
+    """Raises SourceError for an unknown scene or key, or an invalid value."""
     name, _, query = spec.removeprefix("synthetic:").partition("?")
     if name not in SCENES:
         raise SourceError(f"{spec}: there is no such scene; use synthetic:{', synthetic:'.join(SCENES)}")
@@ -78,8 +78,8 @@ def parse_spec(spec: str) -> Options:
 
 
 def scene_of(options: Options) -> scenes.Scene:
-    """What stands there and how it is seen."""
-    return stage(options.look, options.is_still) if options.name == "stage" else SCENES[options.name]()
+    """The scene of these options."""
+    return stage(options.appearance, options.is_still) if options.name == "stage" else SCENES[options.name]()
 
 
 def _count(low: int, high: int) -> Callable[[str], int]:
@@ -132,4 +132,4 @@ _STAGE_KEYS: dict[str, Callable[[str], Any]] = {
     "with": _one_of(GUESTS),
     "still": _flag,
 }
-_STAGE_FIELDS = {"texture": "look", "with": "guest", "still": "is_still"}
+_STAGE_FIELDS = {"texture": "appearance", "with": "guest", "still": "is_still"}

@@ -1,7 +1,7 @@
-"""E1 (thesis 5.3.1, 6.1.3): reconstructed geometry under a known light replaces the camera's picture.
+"""E1 (thesis 5.3.1, 6.1.3): the camera's picture is replaced by reconstructed geometry under a known light.
 
-The picture shows the hybrid geometry buffer, all of one albedo, shaded through a transfer of its own with more rays
-than any estimator uses, so that sampling, the 8-bit picture and the estimator are tested, not the reconstruction.
+The picture shows the hybrid geometry buffer with one albedo, shaded with more rays than any estimator uses. This tests
+sampling, 8-bit quantisation and the estimator, but not the reconstruction.
 """
 
 from __future__ import annotations
@@ -26,39 +26,39 @@ from server.volume.bounds import Bounds
 Floats = NDArray[np.float64]
 
 ALBEDO = 0.5
-"""Of everything in the picture."""
+"""Albedo of all surfaces."""
 RAYS = 243
-"""Directions that the picture is shaded from: three times the estimator's, and from a lattice of its own."""
+"""Directions for shading the picture: three times those of the estimator, in another lattice."""
 BACKGROUND = 0.25
-"""Linear grey where there is no surface."""
+"""Linear grey of pixels without surface."""
 
 
 @dataclass(frozen=True)
 class LitFrame:
-    """A frame whose picture shows a known light."""
+    """A frame under a known light."""
 
     frame: RgbdFrame
     sh: Floats
-    """[16, 3] the light, in the units of the linearised picture."""
+    """[16, 3] the light, in units of the linear picture."""
 
 
 @dataclass(frozen=True)
 class ShadedView:
-    """What is needed to shade one frame under any light."""
+    """A frame with its transfer, to shade it under any light."""
 
     frame: RgbdFrame
     transfer: Floats
     """[h, w, 16] float32."""
     covered: NDArray[np.bool_]
-    """[h, w] there is surface."""
+    """[h, w] pixels with surface."""
 
     def under(self, sh: Floats, albedo: Floats | float = ALBEDO) -> Floats:
-        """[h, w, 3] linear radiance under a light [16, 3]; `albedo`: a number or [h, w, 3]."""
+        """[h, w, 3] linear radiance under a light [16, 3]; `albedo`: scalar or [h, w, 3]."""
         shading = np.maximum(self.transfer.astype(np.float64) @ sh, 0)
         return np.where(self.covered[..., None], albedo * shading, BACKGROUND)
 
     def lit(self, sh: Floats, albedo: Floats | float = ALBEDO) -> LitFrame:
-        """The frame as a camera would see it, 8-bit sRGB."""
+        """The frame under a light [16, 3], in 8-bit sRGB."""
         return LitFrame(replace(self.frame, color=srgb_codes(self.under(sh, albedo))), sh)
 
 
@@ -70,7 +70,7 @@ def shaded_views(
     voxel_m: float,
     rays: int = RAYS,
 ) -> Iterator[ShadedView]:
-    """Fuse `frames` one after the other; after each, the transfer of what the hybrid buffer then shows."""
+    """Fuse `frames` one by one; yields the transfer of the hybrid buffer after each."""
     engine = Engine(device)
     geometry = Geometry(engine, camera, Wishes(volume_m=volume_m, voxel_m=voxel_m))
     directions = direction_sets(rays, 4)
@@ -88,7 +88,7 @@ def _view(engine: Engine, frame: RgbdFrame, transfer: Transfer) -> ShadedView:
 
 
 def moving_light(views: Iterable[ShadedView], light: Callable[[int], Floats]) -> Iterator[LitFrame]:
-    """Each frame under the light [16, 3] of its number."""
+    """Each frame under the light [16, 3] for its number."""
     for view in views:
         yield view.lit(light(view.frame.index))
 
@@ -96,7 +96,7 @@ def moving_light(views: Iterable[ShadedView], light: Callable[[int], Floats]) ->
 def estimated_lights(
     device: Device, camera: CameraModel, frames: Iterable[LitFrame], wishes: Wishes
 ) -> Iterator[tuple[LitFrame, Floats]]:
-    """Run the pipeline over `frames`: each of them, and the light [16, 3] that is found in it.
+    """Run the pipeline; yields each frame with its estimated light [16, 3].
 
     Raises ValueError for wishes that the pipeline cannot fulfil.
     """

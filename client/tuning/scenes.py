@@ -1,9 +1,8 @@
-"""What `probeless tune` measures on: scenes made by code, whose light and composites are known exactly.
+"""Scenes of `probeless tune`: synthetic, with exactly known light and composites.
 
-What a point costs is measured as `probeless run` runs with nothing else said, with two virtual objects in view. What
-its light errs by is measured as the thesis does (5.3.1): the room's pictures are replaced by its reconstructed geometry
-under a known light, of one albedo, so that it is sampling that errs and not what is assumed of surfaces; each frame has
-another light and is on its own, without memory.
+The time of an operating point is measured with the default options of `probeless run` and two virtual objects in view.
+The light error is measured as in thesis 5.3.1: pictures are replaced by the reconstructed geometry with one albedo
+under a known light, so the error is due to sampling only. Each frame has another light and uses no earlier frames.
 """
 
 from __future__ import annotations
@@ -36,29 +35,29 @@ from server.quality.sampling_settings import SamplingSettings
 from server.shading.composite import srgb_codes
 
 Progress = Callable[[int], None]
-"""Told how many frames of a point are done."""
+"""Called with the number of processed frames of an operating point."""
 SIZE = "640x480"
 LIT_SIZE = "480x360"
 FRAMES, SETTLING = 9, 3
-"""Of the stage. In the first frames kernels are compiled and arrays made."""
+"""Frames of the stage, and how many are not measured, as they compile kernels and allocate arrays."""
 LIT_FRAMES, LIT_SETTLING = 12, 2
-_STEP = 2  # of the lit room's walk, about as far as somebody walks in a tenth of a second
+_STEP = 2  # frames of the camera path between pictures, about a tenth of a second of walking
 _WALK = 240
 _LEAST_HEIGHT = 0.3
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Of one point."""
+    """Cost of one operating point."""
 
     ms: dict[str, float]
-    """Median of a frame, by rows and `other`."""
+    """Median time of a frame, by row of the timings and `other`."""
     picture_error: float
-    """Mean difference from the true composite where the objects change it, in display units."""
+    """Mean difference from the true composite where objects change it, in display units."""
 
 
 class Stage:
-    """The stage set, two things on it that are virtual for the pipeline and real in the truth."""
+    """The stage set with two objects, virtual in the pipeline and real in the ground truth."""
 
     def __init__(self) -> None:
         spec = f"synthetic:stage?size={SIZE}&frames={FRAMES}&texture=market&light=7"
@@ -70,7 +69,7 @@ class Stage:
         self._changed = [(a != b).any(axis=-1) for a, b in zip(self._composites, bare, strict=True)]
 
     def cost(self, device: Device, point: SamplingSettings, progress: Progress) -> Cost:
-        """Run the frames at a point."""
+        """Run the frames at an operating point."""
         found = self._results(device, point, progress)
         rows = [rows_of(result.timings) for result in found[SETTLING:]]
         errors = [self._difference(i, found[i].color) for i in range(SETTLING, FRAMES)]
@@ -99,7 +98,7 @@ class Stage:
 
 
 class LitRoom:
-    """The room, each frame of it under another known light."""
+    """The room, every frame under another known light."""
 
     def __init__(self, device: Device, progress: Progress) -> None:
         self._source = open_synthetic(f"synthetic:room?size={LIT_SIZE}&frames={_WALK}&noise=1&texture=0")
@@ -114,7 +113,7 @@ class LitRoom:
             progress(len(self._frames))
 
     def error_deg(self, device: Device, point: SamplingSettings, progress: Progress) -> float:
-        """Of the dominant direction, median over frames."""
+        """Error of the dominant direction, median over frames."""
         lights = estimated_lights(device, self._source.camera, self._frames, point.wishes(self._wishes))
         errors: list[float] = []
         for frame, found in lights:
@@ -129,8 +128,8 @@ def _usual(source: SyntheticSource) -> Wishes:
 
 
 def _light_of(index: int) -> NDArray[np.float64]:
-    """[16, 3] from above, from another side each frame."""
+    """[16, 3] light from above, with another direction in each frame."""
     sides = spherical_fibonacci(2 * LIT_FRAMES)
     x, y, z = sides[index // _STEP]
-    toward = np.array([x, max(abs(z), _LEAST_HEIGHT), y])  # y is up there
+    toward = np.array([x, max(abs(z), _LEAST_HEIGHT), y])  # y is up in the room
     return disc_light(toward / np.linalg.norm(toward)).sh

@@ -1,4 +1,4 @@
-"""`probeless tune`: what accuracy costs in time on this device, measured once and kept (U1)."""
+"""`probeless tune`: accuracy against time of operating points on this device, measured once and saved (U1)."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ POINTS: tuple[SamplingSettings, ...] = (
     SamplingSettings(preset="art1"),
     SamplingSettings(preset="rm"),
 )
-"""From coarse and fast to fine and slow; which of them lie on the front, the device says."""
+"""From coarse and fast to fine and slow; which are Pareto-optimal depends on the device."""
 
 Progress = Callable[[int, int], None]
 
 
 def tune(device: Device, progress: Progress, points: Sequence[SamplingSettings] = POINTS) -> ParetoFront:
-    """Measure `points` on the device; `progress` is told frames done and in all."""
+    """Measure `points` on the device; `progress` receives frames done and total."""
     total, done = LIT_FRAMES + len(points) * (FRAMES + LIT_FRAMES), 0
 
-    def say(of_this: int) -> None:
-        progress(done + of_this, total)
+    def advance(frames: int) -> None:
+        progress(done + frames, total)
 
-    room, stage = LitRoom(device, say), Stage()
+    room, stage = LitRoom(device, advance), Stage()
     done += LIT_FRAMES
     measured: list[ParetoPoint] = []
     for point in points:
-        cost = stage.cost(device, point, say)
+        cost = stage.cost(device, point, advance)
         done += FRAMES
-        error_deg = room.error_deg(device, point, say)
+        error_deg = room.error_deg(device, point, advance)
         done += LIT_FRAMES
         measured.append(
             ParetoPoint(point=point, ms=cost.ms, light_error_deg=error_deg, picture_error=cost.picture_error)
@@ -50,18 +50,18 @@ def tune(device: Device, progress: Progress, points: Sequence[SamplingSettings] 
 
 
 def ensure_front(device: Device, note: Callable[[str], None]) -> None:
-    """Measure the device if that was not done yet. Raises OSError where the front cannot be kept."""
+    """Measure the device unless a saved front exists. Raises OSError if the front cannot be saved."""
     try:
         read_front(device.name)
     except NoFrontError:
-        note(f"measuring once what accuracy costs on {device.name}, some minutes ...")
+        note(f"measuring accuracy against time on {device.name} once, some minutes ...")
         with progress_bar("frames") as progress:
             path = write_front(tune(device, progress))
-        note(f"kept in {path}")
+        note(f"saved in {path}")
 
 
 def lines_of(front: ParetoFront) -> Iterator[str]:
-    """A front as a table, fastest first."""
+    """A front as a table, fastest point first."""
     best = {point.point for point in front.best()}
     yield f"{front.device}, {front.measured}: median of {FRAMES - SETTLING} frames, {SIZE}, two objects in view"
     yield f"{'':2}{'ms':>8}{'light off by':>14}{'picture off by':>16}  settings"

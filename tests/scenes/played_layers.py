@@ -23,7 +23,7 @@ def played(
     try:
         for number, item in enumerate(source.scene.objects):
             mesh = load_mesh(item.glb(), "glb")
-            pipeline.place_object(f"object-{number}", mesh, Placement(position_m=item.place(0)))
+            pipeline.place_object(f"object-{number}", mesh, Placement(position_m=item.position(0)))
         return [pipeline.process(source[index], watched=index in watched) for index in range(frames)]
     finally:
         pipeline.close()

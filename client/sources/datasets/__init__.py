@@ -1,4 +1,4 @@
-"""Readers of data-set folders; the layout is recognised by its files."""
+"""Readers of data-set folders; the files identify the layout."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LAYOUTS: tuple[Layout, ...] = (ground_truth, tum, seven_scenes, redwood)
 
 
 def open_folder(folder: Path) -> FolderSource:
-    """The data set in `folder`. Raises SourceError: what was looked for, or what is wrong with what was found."""
+    """The data set in `folder`. Raises SourceError for an unknown layout or a damaged data set."""
     for layout in LAYOUTS:
         if layout.recognises(folder):
             return layout.open_folder(folder)

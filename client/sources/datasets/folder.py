@@ -1,4 +1,4 @@
-"""What the readers of data-set folders share: a list of files, read frame by frame when asked for."""
+"""Shared by the readers of data-set folders: a list of files, read frame by frame on demand."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COLOR_DTYPE = {"srgb8": np.uint8, "linear16": np.uint16}
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """Where one frame lies."""
+    """Files of one frame."""
 
     color: Path
     depth: Path
@@ -33,7 +33,7 @@ class FrameFiles:
 
 @dataclass(frozen=True)
 class FolderSource:
-    """A recorded data set; nothing but the file names is held in memory."""
+    """A data set; only file names are kept in memory."""
 
     name: str
     camera: CameraModel
@@ -66,7 +66,7 @@ class FolderSource:
 
 
 def numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    """{number: file} of `folder`'s pictures named by a number. Raises SourceError if there are none."""
+    """{number: file} of the pictures whose name is a number. Raises SourceError if there are none."""
     found = {int(p.stem): p for p in sorted(folder.iterdir()) if p.suffix.lower() in suffixes and p.stem.isdecimal()}
     if not found:
         raise SourceError(f"{folder}: holds no numbered pictures ({', '.join(suffixes)})")
@@ -74,14 +74,14 @@ def numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
 
 
 def require_file(path: Path, why: str) -> Path:
-    """`path`, if it is a file. Raises SourceError naming it and `why` it is needed."""
+    """`path` if it is a file. Raises SourceError with the path and `why` it is needed."""
     if not path.is_file():
         raise SourceError(f"{path}: {why} is missing")
     return path
 
 
 def is_numbered_folder(folder: Path, suffixes: tuple[str, ...]) -> bool:
-    """True if `folder` exists and holds pictures named by a number."""
+    """Whether `folder` contains pictures whose name is a number."""
     return folder.is_dir() and any(p.suffix.lower() in suffixes and p.stem.isdecimal() for p in folder.iterdir())
 
 

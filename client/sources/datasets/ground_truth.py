@@ -1,10 +1,9 @@
 """The ground-truth layout: meta.json with relative paths to depth, colour and poses.
 
-Its camera may say `distortion` and, where the depth picture has a lens of its own, `depth`, as `CameraModel` does.
-`exposures` may list what each frame's exposure time times gain was, null where that is not known; a `linear16` set
-without it is taken as of one exposure.
+`camera` may contain `distortion` and, if depth has its own lens, `depth`, as in `CameraModel`. `exposures` may list
+exposure time times gain of each frame, null: unknown; a `linear16` set without it has constant exposure.
 
-Its virtual objects and its light are truth for evaluation, never input; `meta` keeps them for those who compare.
+Virtual objects and light of the set are ground truth for evaluation, not input; `meta` keeps them.
 """
 
 from __future__ import annotations
@@ -30,14 +29,14 @@ _REQUIRED = ("camera", "depth_scale_m", "color_encoding", "color", "depth")
 
 @dataclass(frozen=True)
 class GroundTruthSource(FolderSource):
-    """A folder of the ground-truth layout and what its meta.json says."""
+    """A folder of the ground-truth layout with the content of its meta.json."""
 
     folder: Path = field(default_factory=Path)
     meta: dict[str, Any] = field(default_factory=dict)
 
     @property
     def radiance_of_white(self) -> float:
-        """What the picture's 1 stands for, in the units of its light.json. Raises SourceError."""
+        """Radiance of a white pixel, in the units of light.json. Raises SourceError."""
         unit = self.meta.get("radiance_at_65535", 1.0)
         if type(unit) not in (int, float) or not 0 < unit < math.inf:
             raise SourceError(f"{self.folder / 'meta.json'}: radiance_at_65535 is {unit!r}, must be a positive number")
@@ -45,7 +44,7 @@ class GroundTruthSource(FolderSource):
 
 
 def recognises(folder: Path) -> bool:
-    """True if the folder has a meta.json."""
+    """Whether the folder has a meta.json."""
     return (folder / "meta.json").is_file()
 
 
@@ -83,15 +82,15 @@ def _frames(folder: Path, meta: dict[str, Any], path: Path) -> tuple[FrameFiles,
 
 
 def _exposures(path: Path, meta: dict[str, Any], count: int) -> list[float | None]:
-    """Of each frame. Values that cannot be one are for the pipeline to tell of. Raises SourceError."""
-    said = meta.get("exposures")
-    if said is None:
+    """Exposure of each frame; the pipeline checks the values. Raises SourceError."""
+    values = meta.get("exposures")
+    if values is None:
         return [1.0 if meta["color_encoding"] == "linear16" else None] * count
-    is_list = isinstance(said, list) and all(x is None or type(x) in (int, float) for x in said)
-    if not is_list or len(said) != count:
+    is_list = isinstance(values, list) and all(x is None or type(x) in (int, float) for x in values)
+    if not is_list or len(values) != count:
         raise SourceError(f"{path}: exposures must be {count} numbers, one a frame, null where it is not known")
     try:
-        return [None if x is None else float(x) for x in said]
+        return [None if x is None else float(x) for x in values]
     except OverflowError as error:
         raise SourceError(f"{path}: exposures has a number that no float holds") from error
 

@@ -1,4 +1,4 @@
-"""Camera models in the files of data sets."""
+"""Camera models in data-set files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from protocol.frames import CameraModel
 
 
 def from_matrix_file(path: Path, picture: Path) -> CameraModel:
-    """Of a text file with a 3x3 matrix, for pictures of `picture`'s size. Raises SourceError."""
+    """Camera of a text file with a 3x3 matrix; the size is that of `picture`. Raises SourceError."""
     numbers = [float_of(word, str(path)) for word in read_text(path).split()]
     if len(numbers) != 9:
         raise SourceError(f"{path}: intrinsics need 9 numbers, found {len(numbers)}")
@@ -24,7 +24,7 @@ def from_matrix_file(path: Path, picture: Path) -> CameraModel:
 
 
 def from_open3d_json(path: Path) -> CameraModel:
-    """Of Open3D's pinhole JSON (`width height intrinsic_matrix`, column-major). Raises SourceError."""
+    """Camera of Open3D's pinhole JSON (`width height intrinsic_matrix`, column-major). Raises SourceError."""
     values = read_json(path)
     matrix = values.get("intrinsic_matrix")
     if not isinstance(matrix, list) or len(matrix) != 9 or "width" not in values or "height" not in values:
@@ -33,7 +33,7 @@ def from_open3d_json(path: Path) -> CameraModel:
 
 
 def make(path: Path, width: Any, height: Any, fx: Any, fy: Any, cx: Any, cy: Any, **more: Any) -> CameraModel:
-    """CameraModel of what `path` says. Raises SourceError naming `path`."""
+    """CameraModel of values read from `path`. Raises SourceError with `path`."""
     try:
         return CameraModel(
             width=int(width), height=int(height), fx=float(fx), fy=float(fy), cx=float(cx), cy=float(cy), **more

@@ -21,7 +21,7 @@ _INTRINSICS = ("camera_primesense.json", "intrinsic.json", "camera_intrinsic.jso
 
 
 def recognises(folder: Path) -> bool:
-    """True if the folder has numbered colour and depth pictures in folders of their own."""
+    """Whether the folder has subfolders with numbered colour and depth pictures."""
     return _color_folder(folder) is not None and is_numbered_folder(folder / "depth", (".png",))
 
 
@@ -30,7 +30,7 @@ def open_folder(folder: Path) -> FolderSource:
     color_folder = _color_folder(folder)
     assert color_folder is not None
     colors, depths = numbered(color_folder, COLOR_SUFFIXES), numbered(folder / "depth", (".png",))
-    # Some sets number one folder from 0 and the other from 1: then the order is what pairs them.
+    # Some sets number one folder from 0 and the other from 1; pictures are paired by order.
     if len(colors) != len(depths):
         raise SourceError(f"{folder}: {len(colors)} colour pictures but {len(depths)} depth pictures")
     poses = _poses(folder, len(colors))
@@ -65,7 +65,7 @@ def _camera(folder: Path, picture: Path) -> CameraModel:
     for name in _INTRINSICS:
         if (folder / name).is_file():
             return intrinsics.from_open3d_json(folder / name)
-    # Redwood's own sets come without a file: PrimeSense defaults, as its documentation says.
+    # Redwood's sets have no intrinsics file; its documentation gives PrimeSense defaults.
     width, height = intrinsics.size_of(picture)
     focal = 525.0 * width / 640
     return intrinsics.make(picture, width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)

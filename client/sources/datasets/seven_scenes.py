@@ -1,4 +1,4 @@
-"""7-Scenes and tsdf-fusion: frame-NNNNNN.color, .depth.png, .pose.txt in one folder, perhaps named data/."""
+"""7-Scenes and tsdf-fusion: frame-NNNNNN.color, .depth.png, .pose.txt in the folder or in its data/."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from protocol.frames import CameraModel
 LOOKED_FOR = "frame-NNNNNN.color.jpg|png with .depth.png and .pose.txt (7-Scenes)"
 FPS = 30.0
 KINECT_FOCAL_PX = 585.0
-"""The depth camera of 7-Scenes, in its own documentation; used where the folder has no camera-intrinsics.txt."""
+"""Focal length of the 7-Scenes depth camera (its documentation), for folders without camera-intrinsics.txt."""
 
 _COLOR_NAME = re.compile(r"frame-(\d+)\.color\.(jpg|jpeg|png)")
 
 
 def recognises(folder: Path) -> bool:
-    """True if the folder, or its data/, holds frame-NNNNNN.color pictures."""
+    """Whether the folder or its data/ contains frame-NNNNNN.color pictures."""
     return _frames_folder(folder) is not None
 
 

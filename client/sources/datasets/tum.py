@@ -1,4 +1,4 @@
-"""TUM RGB-D: rgb.txt, depth.txt and groundtruth.txt, each stamped by its own clock ticks and joined by time."""
+"""TUM RGB-D: rgb.txt, depth.txt and groundtruth.txt, associated by timestamps."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from protocol.frames import CameraModel
 
 LOOKED_FOR = "rgb.txt with depth.txt and groundtruth.txt (TUM RGB-D)"
 MAX_TIME_APART_S = 0.02
-"""As in the set's own association tool."""
+"""As in the association tool of the data set."""
 DEPTH_SCALE_M = 1 / 5000
 DEFAULT_FPS = 30.0
 
-_CALIBRATIONS = {  # the set's own tables: fx fy cx cy, then k1 k2 p1 p2 k3
+_CALIBRATIONS = {  # tables of the data set: fx fy cx cy, then k1 k2 p1 p2 k3
     "freiburg1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
     "freiburg2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
     "freiburg3": (535.4, 539.2, 320.1, 247.6, 0.0, 0.0, 0.0, 0.0, 0.0),
@@ -30,7 +30,7 @@ _CALIBRATIONS = {  # the set's own tables: fx fy cx cy, then k1 k2 p1 p2 k3
 
 
 def recognises(folder: Path) -> bool:
-    """True if the folder has rgb.txt and depth.txt."""
+    """Whether the folder has rgb.txt and depth.txt."""
     return (folder / "rgb.txt").is_file() and (folder / "depth.txt").is_file()
 
 
@@ -60,7 +60,7 @@ def _associate(
     depths: list[tuple[float, Path]],
     poses: list[tuple[float, NDArray[np.float64]]] | None,
 ) -> tuple[FrameFiles, ...]:
-    """Each colour picture with the nearest depth and pose; one without either is left out, each depth serves once."""
+    """Colour pictures with the nearest depth and pose; each depth is used once, incomplete frames are skipped."""
     depth_times = [t for t, _ in depths]
     ordered = sorted(poses or [], key=lambda stamped: stamped[0])
     pose_times = [t for t, _ in ordered]

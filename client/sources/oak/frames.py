@@ -1,4 +1,4 @@
-"""Frames out of a depthai pipeline, of a camera or of host nodes that play one: the newest that has all its parts."""
+"""Newest complete frames of a depthai pipeline, of a camera or of host nodes that simulate one."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from protocol.frames import CameraModel, RgbdFrame
 
 MILLIMETRE_M = 0.001
 SILENCE_S = 10.0
-"""Without a picture, or with pictures but no pose: the camera is given up."""
+"""Time without a picture, or without a pose, after which reading fails."""
 POSE_PATIENCE_S = 0.1
 NO_DEPTH = 65535
-"""What a stereo disparity of 0 comes to; 0 is no depth too."""
+"""Depth of disparity 0; becomes 0, no depth."""
 
 
 class FrameReader:
-    """Reads a started pipeline; made before it starts. Keeps no frame but the newest."""
+    """Reads the newest frame of a pipeline; must be created before the pipeline starts."""
 
     def __init__(
         self, pipeline: dai.Pipeline, outputs: Outputs, fps: float, left_from_color: NDArray[np.float64]
@@ -39,12 +39,12 @@ class FrameReader:
         self._trail = self._follow(outputs, PoseTrail(2.5 / fps)) if outputs.pose is not None else None
         self._last: int | None = None
         self.missed = 0
-        """Pictures that the camera took and nobody asked for in time."""
+        """Number of pictures that were not read in time."""
 
     def read(self, index: int) -> tuple[RgbdFrame, CameraModel]:
-        """The newest frame that was not read yet, waited for if need be, numbered `index`; and its camera.
+        """The newest unread frame, numbered `index`, and its camera; waits for one if necessary.
 
-        Raises SourceError when the camera has gone, sends nothing, or knows no poses though it should.
+        Raises SourceError if the camera is disconnected, sends nothing, or finds no pose.
         """
         for _ in range(round(SILENCE_S / POSE_PATIENCE_S)):
             color, depth = self._parts()
@@ -53,7 +53,7 @@ class FrameReader:
             if self._trail is not None:
                 found = self._trail.at(time_s, POSE_PATIENCE_S)
                 if found is None:
-                    continue  # odometry that has not found its feet yet, or lost a picture
+                    continue  # odometry is still initialising, or missed a picture
                 pose = found @ self._left_from_color
             return self._frame(index, time_s, color, depth, pose), _camera(color)
         raise SourceError(
@@ -61,7 +61,7 @@ class FrameReader:
         )
 
     def close(self) -> None:
-        """End the pipeline. It is waited for: its destructor would wait for threads that wait for this one."""
+        """End the pipeline and wait for it; its destructor would deadlock with threads that wait for this one."""
         self._pipeline.stop()
         self._pipeline.wait()
 
@@ -91,9 +91,9 @@ class FrameReader:
 
     @staticmethod
     def _follow(outputs: Outputs, trail: PoseTrail) -> PoseTrail:
-        """Fill the trail as poses come. A pose has no time of its own: it is that of the picture sent after it.
+        """Fill the trail with incoming poses. A pose has no timestamp; it belongs to the picture that is sent next.
 
-        Callbacks run in the thread that sends, one after the other: queues read later could slip by one.
+        Callbacks run in order in the sending thread; separate queues could be off by one.
         """
         newest: list[dai.TransformData] = []
 
@@ -102,8 +102,8 @@ class FrameReader:
 
         def date(_name: str, message: Any) -> None:
             if newest:
-                at, turn = newest[0].getTranslation(), newest.pop().getQuaternion()
-                pose = world_from_lens((at.x, at.y, at.z), (turn.qx, turn.qy, turn.qz, turn.qw))
+                at, rotation = newest[0].getTranslation(), newest.pop().getQuaternion()
+                pose = world_from_lens((at.x, at.y, at.z), (rotation.qx, rotation.qy, rotation.qz, rotation.qw))
                 trail.add(message.getTimestamp().total_seconds(), pose)
 
         for output, callback in ((outputs.pose, keep), (outputs.pose_image, date)):
@@ -113,13 +113,13 @@ class FrameReader:
 
 
 def _exposure(color: dai.ImgFrame) -> float | None:
-    """Seconds times gain; None where the camera does not say."""
+    """Exposure time in seconds times gain; None if the camera does not report it."""
     product = color.getExposureTime().total_seconds() * color.getSensitivity() / 100
     return product if product > 0 else None
 
 
 def _camera(color: dai.ImgFrame) -> CameraModel:
-    """The picture's own lens, from the calibration, after resizing, cropping and undistortion."""
+    """Camera model of the picture after resizing, cropping and undistortion."""
     matrix = np.array(color.getTransformation().getIntrinsicMatrix(), np.float64)
     return CameraModel(
         width=color.getWidth(),

@@ -1,4 +1,4 @@
-"""The nodes that run on an OAK-D: colour, stereo depth laid on it, odometry. Needs depthai 3 and builds on a device."""
+"""Nodes of the pipeline on an OAK-D: colour, stereo depth aligned to it, odometry. Needs depthai 3 and a device."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from numpy.typing import NDArray
 COLOR, LEFT, RIGHT = dai.CameraBoardSocket.CAM_A, dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C
 STEREO_SIZE = (640, 400)
 SUBPIXEL_BITS = 5
-"""Disparity in 1/32 of a pixel: 2 mm at 1.5 m instead of 60."""
+"""Disparity in 1/32 pixel: depth steps of 2 mm at 1.5 m instead of 60 mm."""
 LEFT_RIGHT_THRESHOLD = 5
-"""Of the check that both lenses agree, in the device's unit; it takes what only one of them sees."""
+"""Threshold of the left-right check in the device's unit; removes depth of points visible to one lens only."""
 CONFIDENCE = 55
-"""0 to 255, less is stricter: a wrong depth costs a fused room more than a missing one."""
+"""0 to 255, smaller is stricter; for fusion a wrong depth is worse than a missing one."""
 IMU_HZ = 200
 DOT_PROJECTOR = 0.7
-"""Share of the infrared dots' greatest brightness, where the camera has them: walls without texture get depth."""
+"""Relative brightness of the infrared dots, if the camera has a projector; they give depth on textureless walls."""
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """Streams of a rig: what `FrameReader` reads."""
+    """Output streams of the nodes, read by `FrameReader`."""
 
     color: dai.Node.Output
     """BGR, without distortion."""
     depth: dai.Node.Output
-    """Millimetres, of the colour picture's pixels."""
+    """Millimetres, aligned to the colour picture."""
     pose: dai.Node.Output | None = None
     pose_image: dai.Node.Output | None = None
-    """The left picture that a pose is of, sent after it."""
+    """The left picture of a pose, sent after the pose."""
 
 
 def build_nodes(
     pipeline: dai.Pipeline, device: dai.Device, size: tuple[int, int], fps: float, with_pose: bool
 ) -> Outputs:
-    """Colour of `size`, depth on it, and poses where asked for."""
+    """Colour of `size`, depth aligned to it, and poses if `with_pose`."""
     cameras = {socket: pipeline.create(dai.node.Camera).build(socket, sensorFps=fps) for socket in (COLOR, LEFT, RIGHT)}
     color = cameras[COLOR].requestOutput(
         size, dai.ImgFrame.Type.BGR888i, dai.ImgResizeMode.CROP, fps, enableUndistortion=True
@@ -45,7 +45,7 @@ def build_nodes(
     left, right = (cameras[socket].requestOutput(STEREO_SIZE) for socket in (LEFT, RIGHT))
     depth = _build_depth(pipeline, device, left, right, color)
     if not with_pose:
-        if device.getIrDrivers():  # odometry would take the dots, which move with the camera, for the room
+        if device.getIrDrivers():  # not with odometry: the dots move with the camera
             device.setIrLaserDotProjectorIntensity(DOT_PROJECTOR)
         return Outputs(color, depth)
     odometry = _build_odometry(pipeline, left, right)
@@ -53,12 +53,12 @@ def build_nodes(
 
 
 def has_odometry(device: dai.Device) -> bool:
-    """Whether the camera has the sensor of inertia that visual-inertial odometry needs."""
+    """Whether the camera has the IMU that visual-inertial odometry needs."""
     return device.getConnectedIMU() not in ("", "NONE", "UNKNOWN")
 
 
 def left_from_color(calibration: dai.CalibrationHandler) -> NDArray[np.float64]:
-    """[4, 4] rigid, metres: from the colour lens's axes to the left lens's, as the camera was calibrated."""
+    """[4, 4] rigid, metres: from the axes of the colour lens to those of the left lens, from the calibration."""
     matrix = np.eye(4)
     matrix[:3] = np.array(calibration.getCameraExtrinsics(COLOR, LEFT, unit=dai.LengthUnit.METER), np.float64)[:3]
     return matrix
@@ -84,7 +84,7 @@ def _build_depth(
     if device.getPlatform() != dai.Platform.RVC4:
         color.link(stereo.inputAlignTo)
         return stereo.depth
-    align = pipeline.create(dai.node.ImageAlign)  # there stereo does not align by itself
+    align = pipeline.create(dai.node.ImageAlign)  # RVC4 does not align in the stereo node
     stereo.depth.link(align.input)
     color.link(align.inputAlignTo)
     return align.outputAligned

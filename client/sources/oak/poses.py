@@ -1,7 +1,7 @@
-"""Poses of a visual-inertial odometry: its axes turned into the camera's, and the pose at a picture's time.
+"""Poses of visual-inertial odometry: conversion to camera axes, and interpolation at the time of a picture.
 
-The odometry speaks of a gravity-aligned world and of a body at the left lens, both with x forward, y left and z up.
-Here a world is x right, y down, z forward at the start, like a camera: `UP` is its direction away from gravity.
+The odometry uses a gravity-aligned world and a body at the left lens, both with x forward, y left and z up. The world
+here is x right, y down, z forward at the start, like a camera; `UP` is opposite to gravity.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Pose = NDArray[np.float64]
 
 
 def world_from_lens(position_m: tuple[float, float, float], quaternion_xyzw: tuple[float, ...]) -> Pose:
-    """[4, 4] rigid, metres, camera axes on both sides, of a pose with x forward, y left, z up on both sides."""
+    """[4, 4] rigid, metres, in camera axes, of a pose whose world and body have x forward, y left, z up."""
     flu = np.eye(4)
     flu[:3, :3] = Rotation.from_quat(quaternion_xyzw).as_matrix()
     flu[:3, 3] = position_m
@@ -31,7 +31,7 @@ def world_from_lens(position_m: tuple[float, float, float], quaternion_xyzw: tup
 
 
 class PoseTrail:
-    """The last poses by time; added by one thread, asked for by another. `gap_s`: most between two neighbours."""
+    """The last poses by time; thread-safe. `gap_s`: longest interval between neighbours to interpolate."""
 
     def __init__(self, gap_s: float) -> None:
         self._gap_s = gap_s
@@ -39,16 +39,16 @@ class PoseTrail:
         self._changed = threading.Condition()
 
     def add(self, time_s: float, pose: Pose) -> None:
-        """Poses come in the order of their times; one that does not is left out."""
+        """Append a pose; one that is not newer than the last is ignored."""
         with self._changed:
             if not self._trail or time_s > self._trail[-1][0]:
                 self._trail.append((time_s, pose))
                 self._changed.notify_all()
 
     def at(self, time_s: float, patience_s: float) -> Pose | None:
-        """The pose at `time_s`, between its neighbours; None where none is near in time.
+        """The pose at `time_s`, interpolated; None without a pose near that time.
 
-        Odometry lags the picture: the pose is waited for, for `patience_s` at most.
+        Odometry lags behind the picture: waits up to `patience_s` for a newer pose.
         """
         with self._changed:
             self._changed.wait_for(lambda: bool(self._trail) and self._trail[-1][0] >= time_s, patience_s)
@@ -61,10 +61,10 @@ class PoseTrail:
 
 
 def _between(first_s: float, first: Pose, last_s: float, last: Pose, time_s: float) -> Pose:
-    """Position along the line, rotation along the great arc."""
+    """Linear interpolation of the position, spherical of the rotation."""
     share = (time_s - first_s) / (last_s - first_s)
     pose = np.eye(4)
-    turns = Rotation.from_matrix(np.stack([first[:3, :3], last[:3, :3]]))
-    pose[:3, :3] = Slerp([0.0, 1.0], turns)([share]).as_matrix()[0]
+    rotations = Rotation.from_matrix(np.stack([first[:3, :3], last[:3, :3]]))
+    pose[:3, :3] = Slerp([0.0, 1.0], rotations)([share]).as_matrix()[0]
     pose[:3, 3] = (1 - share) * first[:3, 3] + share * last[:3, 3]
     return pose

@@ -1,7 +1,7 @@
-"""An OAK-D camera as a source: live, without an end. depthai is an extra, loaded only here.
+"""An OAK-D camera as a live source. depthai is an optional package, imported only on use.
 
-`oak` takes poses from the camera's visual-inertial odometry where it has the sensor; `oak?vio=off` leaves tracking to
-the server and the projector of dots on, where there is one.
+`oak` takes poses from the camera's visual-inertial odometry, if the camera has an IMU. `oak?vio=off` leaves tracking to
+the server and switches the infrared dot projector on, if there is one.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ INSTEAD = "stream a data-set folder, a recording or synthetic:table instead"
 
 
 class Reader(Protocol):
-    """What `oak_frames.FrameReader` does."""
+    """Interface of `frames.FrameReader`."""
 
     missed: int
 
@@ -37,7 +37,7 @@ class OakSource:
     def __init__(
         self, reader: Reader, has_poses: bool, up: tuple[float, float, float] | None, close: Callable[[], None]
     ) -> None:
-        """`reader` is of a running pipeline, which `close` ends, at the program's end at the latest."""
+        """`reader` reads a running pipeline; `close` ends it, at exit at the latest."""
         self._reader = reader
         self.has_poses, self.up = has_poses, up
         self._close = weakref.finalize(self, close)
@@ -49,7 +49,7 @@ class OakSource:
 
     @property
     def missed(self) -> int:
-        """Frames that the camera took and nobody asked for in time."""
+        """Number of camera frames that were not read in time."""
         return self._reader.missed
 
     def __len__(self) -> int:
@@ -60,18 +60,18 @@ class OakSource:
         return frame
 
     def close(self) -> None:
-        """Give the camera back."""
+        """Release the camera."""
         self._close()
 
 
 def open_oak(options: str = "") -> OakSource:
-    """The first camera that is connected. `options`: `vio=off` or nothing.
+    """The first connected camera. `options`: empty, `vio=on` or `vio=off`.
 
-    Raises SourceError, one line, without depthai, without a camera, and for other options.
+    Raises SourceError without depthai, without a camera, and for other options.
     """
     if options not in ("", "vio=on", "vio=off"):
         raise SourceError(f"oak?{options}: there is only oak?vio=off, which leaves tracking to the server")
-    # Before it is loaded: it would send usage to its maker, calibrate anew in use, and warn where there is no USB.
+    # Set before the import: no telemetry, no recalibration while in use, no warnings without USB.
     for name, value in (("DEPTHAI_TELEMETRY", "0"), ("DEPTHAI_AUTOCALIBRATION", "OFF"), ("DEPTHAI_LEVEL", "error")):
         os.environ.setdefault(name, value)
     try:
@@ -80,7 +80,7 @@ def open_oak(options: str = "") -> OakSource:
         raise SourceError(
             f"oak: depthai, which reads OAK cameras, is not installed: make install-oak installs it; or {INSTEAD}"
         ) from error
-    found = dai.Device.getAllAvailableDevices()  # opening one that is not there looks for it for 10 s
+    found = dai.Device.getAllAvailableDevices()  # opening an absent one would block for 10 s
     if not found:
         raise SourceError(f"oak: no OAK camera is connected; plug one in, or {INSTEAD}")
     try:

@@ -1,7 +1,7 @@
-"""Shadows of solids on each other, integrated once over the sphere of directions and kept per grid sample.
+"""Precomputed shadows of solids on each other, integrated over the sphere at every grid sample.
 
-Kept is the *occluded* part of the Lambert transfer: the whole is the unshadowed part, which is known in closed form,
-minus this. So whatever sees its whole hemisphere is exact, and only shadows carry the quadrature's error.
+The tables contain the *occluded* part of the Lambert transfer; the transfer is the closed-form unshadowed part minus
+this. So surfaces with an open hemisphere are exact, and only shadows have an error of quadrature.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from client.synthetic.solids.polyhedra import Points, Solid
 from client.synthetic.solids.shell import Shell
 
 RAYS_AT_ONCE = 65536
-"""Points times directions of a piece that is worked on at once: it stays in the processor's cache."""
+"""Points times directions of a tile; small enough for the processor's cache."""
 BATCH = 64
-"""Pieces whose sums over the directions are one matrix product."""
+"""Tiles whose sums over directions are one matrix product."""
 LIFT_M = 1e-4
-"""A sample buried less than this is still on the surface that is seen."""
+"""A sample buried by less than this counts as visible."""
 FILL_PASSES = 2
 
 Floats = NDArray[np.float32]
 
 
 def bake(solids: list[Solid], atlas: list[list[Grid]], directions: Floats) -> Floats:
-    """[total, 16] occluded Lambert transfer (1/pi included) of every grid sample, world axes.
+    """[total, 16] occluded Lambert transfer, including 1/pi, of all grid samples, world axes.
 
-    `directions` [n, 3] float32, unit, evenly spread over the sphere.
+    `directions` [n, 3] float32, unit, of equal solid angle.
     """
     table = np.zeros((table_size(atlas), COEFFICIENTS), np.float32)
     for own, grids in enumerate(atlas):
@@ -42,7 +42,7 @@ def bake(solids: list[Solid], atlas: list[list[Grid]], directions: Floats) -> Fl
 
 
 def table_size(atlas: list[list[Grid]]) -> int:
-    """Samples in all grids."""
+    """Number of samples in all grids."""
     return atlas[-1][-1].offset + atlas[-1][-1].size
 
 
@@ -51,45 +51,45 @@ def blocked_directions(
     skip: Solid | None,
     points: Floats,
     directions: Floats,
-    wanted: NDArray[np.bool_] | None = None,
+    mask: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.bool_]:
-    """[points, directions] True where any solid but `skip` stands in the way of unit `directions`.
+    """[points, directions] True where any solid except `skip` blocks a unit direction.
 
-    Points should lie near each other: that bounds which directions a solid can block. Only `wanted` [directions] are
-    asked, the others stay False.
+    Points should be close together, which limits the directions that a solid can block. Only directions in `mask`
+    [directions] are tested, the others stay False.
     """
     blocked = np.zeros((len(points), len(directions)), bool)
     middle = points.mean(axis=0)
-    reach = float(np.linalg.norm(points - middle, axis=1).max())
-    still_open = np.ones(len(directions), bool) if wanted is None else wanted
+    radius_of_points = float(np.linalg.norm(points - middle, axis=1).max())
+    still_open = np.ones(len(directions), bool) if mask is None else mask
     for solid in solids:
         if solid is skip:
             continue
-        asked = np.flatnonzero(still_open & directions_near(solid, middle, directions, reach))
-        if asked.size:
-            blocked[:, asked] |= solid.blocks(points, directions[asked])
+        tested = np.flatnonzero(still_open & directions_near(solid, middle, directions, radius_of_points))
+        if tested.size:
+            blocked[:, tested] |= solid.blocks(points, directions[tested])
         if solid.bounds is None:
             still_open = still_open & ~blocked.all(axis=0)
     return blocked
 
 
-def directions_near(solid: Solid, middle: Floats, directions: Floats, reach: float) -> NDArray[np.bool_]:
-    """[directions] which of them may meet the solid from within `reach` of `middle`."""
+def directions_near(solid: Solid, middle: Floats, directions: Floats, radius_of_points: float) -> NDArray[np.bool_]:
+    """[directions] which may hit the solid from points within `radius_of_points` of `middle`."""
     everything = np.ones(len(directions), bool)
     if solid.bounds is None:
         return everything
     center, radius = solid.bounds
     offset = center - middle
     distance = float(np.linalg.norm(offset))
-    if distance <= radius + reach:
+    if distance <= radius + radius_of_points:
         return everything
-    cone = np.sqrt(1 - ((radius + reach) / distance) ** 2)
+    cone = np.sqrt(1 - ((radius + radius_of_points) / distance) ** 2)
     near: NDArray[np.bool_] = directions @ (offset / distance).astype(np.float32) > cone - 1e-4
     return near
 
 
 def seen_samples(solid: Solid, part: int, grid: Grid) -> tuple[Points, Points, Solid | None]:
-    """Where shadow rays from a chart's grid start, the surface's normals there, and which solid they cannot meet."""
+    """Origins of shadow rays of a chart's grid, surface normals there, and a solid that these rays cannot hit."""
     positions, normals = grid.samples()
     if isinstance(solid, Carved):
         normals = -normals if solid.inwards(part) else normals
@@ -109,8 +109,10 @@ def _bake_grid(solids: list[Solid], own: int, part: int, grid: Grid, directions:
         solids = [solid for solid in solids if _rises_above(solid, positions[0, 0], normals[0, 0])]
     pieces = [piece for piece in tiles(grid, len(directions)) if not buried[piece].all()]
     for batch in (pieces[i : i + BATCH] for i in range(0, len(pieces), BATCH)):
-        lost = _lost(solids, skip, grid, [positions[p] for p in batch], [normals[p] for p in batch], directions)
-        sums = np.split(lost @ weights, np.cumsum([buried[p].size for p in batch])[:-1])
+        occlusion = _occlusion(
+            solids, skip, grid, [positions[p] for p in batch], [normals[p] for p in batch], directions
+        )
+        sums = np.split(occlusion @ weights, np.cumsum([buried[p].size for p in batch])[:-1])
         for piece, of_piece in zip(batch, sums, strict=True):
             values[piece] = of_piece.reshape(*buried[piece].shape, COEFFICIENTS)
     fill_buried(values, buried, grid.chart.wraps)
@@ -118,11 +120,11 @@ def _bake_grid(solids: list[Solid], own: int, part: int, grid: Grid, directions:
 
 
 def _rises_above(solid: Solid, point: Points, normal: Points) -> bool:
-    """Some of it may be above the horizon of a flat face."""
+    """Whether part of the solid may be above the horizon of a flat face."""
     return solid.bounds is None or bool((solid.bounds[0] - point) @ normal > -solid.bounds[1])
 
 
-def _lost(
+def _occlusion(
     solids: list[Solid],
     skip: Solid | None,
     grid: Grid,
@@ -130,28 +132,28 @@ def _lost(
     normals: list[Points],
     directions: Floats,
 ) -> Floats:
-    """[samples, directions] 1 where a direction is blocked, times the cosine on surfaces that are not flat."""
-    lost = []
+    """[samples, directions] 1 where a direction is blocked, times the cosine on curved surfaces."""
+    parts = []
     for places, ups in zip(positions, normals, strict=True):
         points = places.reshape(-1, 3).astype(np.float32)
         if grid.is_flat:
-            lost.append(blocked_directions(solids, skip, points, directions).astype(np.float32))
+            parts.append(blocked_directions(solids, skip, points, directions).astype(np.float32))
         else:
             cosines = ups.reshape(-1, 3).astype(np.float32) @ directions.T
             facing: NDArray[np.bool_] = np.any(cosines > 0, axis=0)
-            lost.append(blocked_directions(solids, skip, points, directions, facing) * np.maximum(cosines, 0))
-    return np.concatenate(lost)
+            parts.append(blocked_directions(solids, skip, points, directions, facing) * np.maximum(cosines, 0))
+    return np.concatenate(parts)
 
 
 def tiles(grid: Grid, directions: int) -> list[tuple[slice, slice]]:
-    """Pieces of a grid that are worked on at once with so many directions."""
+    """Tiles of a grid for this number of directions."""
     side = max(2, math.isqrt(RAYS_AT_ONCE // directions))
     starts = ((r, c) for r in range(0, grid.rows, side) for c in range(0, grid.columns, side))
     return [(slice(r, r + side), slice(c, c + side)) for r, c in starts]
 
 
 def buried_samples(solids: list[Solid], own: int, part: int, grid: Grid) -> NDArray[np.bool_]:
-    """[rows, columns] samples inside another solid or in an opening, which nobody sees."""
+    """[rows, columns] invisible samples: inside another solid or in an opening."""
     _, normals, _ = seen_samples(solids[own], part, grid)
     positions, _ = grid.samples()
     lifted = (positions + LIFT_M * normals).reshape(-1, 3)
@@ -167,7 +169,7 @@ def buried_samples(solids: list[Solid], own: int, part: int, grid: Grid) -> NDAr
 
 
 def fill_buried(values: Floats, buried: NDArray[np.bool_], wraps: bool) -> None:
-    """Give buried samples, in place, the mean of their neighbours that are not: interpolation near them reads both."""
+    """Set buried samples, in place, to the mean of their visible neighbours, as interpolation reads both."""
     unknown = buried.copy()
     for _ in range(FILL_PASSES):
         known = (~unknown).astype(values.dtype)[..., None]
@@ -178,7 +180,7 @@ def fill_buried(values: Floats, buried: NDArray[np.bool_], wraps: bool) -> None:
 
 
 def _around(values: Floats, wraps: bool) -> Floats:
-    """The sum over the 3x3 neighbourhood."""
+    """Sum over the 3x3 neighbourhood."""
     padded = np.pad(values, ((0, 0), (1, 1), (0, 0)), mode="wrap" if wraps else "constant")
     padded = np.pad(padded, ((1, 1), (0, 0), (0, 0)))
     rows, columns = values.shape[:2]

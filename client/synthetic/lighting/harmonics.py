@@ -1,4 +1,4 @@
-"""Real orthonormal spherical harmonics of four bands, no Condon-Shortley phase, index l(l+1)+m."""
+"""Real orthonormal spherical harmonics of four bands, without Condon-Shortley phase, index l(l+1)+m."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 COEFFICIENTS = 16
 LAMBERT = np.repeat((1.0, 2 / 3, 1 / 4, 0.0), (1, 3, 5, 7))
-"""[16] factors of the clamped cosine over pi, band by band: a uniform sky of radiance 1 shades white to 1."""
+"""[16] clamped-cosine factors over pi: a uniform sky of radiance 1 gives white a radiance of 1."""
 
 
 def basis(directions: NDArray[np.floating]) -> NDArray[np.floating]:
-    """[n, 16] values at unit `directions` [n, 3], in their precision."""
+    """[n, 16] values at unit `directions` [n, 3], in the same precision."""
     x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z
     return np.stack(
@@ -38,12 +38,12 @@ def basis(directions: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def unshadowed_transfer(normals: NDArray[np.floating]) -> NDArray[np.floating]:
-    """[n, 16] Lambert transfer, 1/pi included, of surfaces that see their whole hemisphere. Exact."""
+    """[n, 16] exact Lambert transfer, including 1/pi, of surfaces with an open hemisphere."""
     return basis(normals) * LAMBERT.astype(normals.dtype)
 
 
 def sphere_directions(count: int) -> NDArray[np.float64]:
-    """[count, 3] unit directions that each stand for 4 pi / count of the sphere (Fibonacci lattice)."""
+    """[count, 3] unit directions of equal solid angle 4 pi / count (Fibonacci lattice)."""
     i = np.arange(count) + 0.5
     y = 1 - 2 * i / count
     azimuth = np.pi * (1 + 5**0.5) * i

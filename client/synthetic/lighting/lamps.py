@@ -1,6 +1,6 @@
-"""Lamps inside a scene: points that shine evenly all around, each in a small bulb that the camera can see.
+"""Lamps inside a scene: isotropic point lights, each in a small visible bulb.
 
-Their direct light is exact, shadows of all solids included. Not modelled: the bulbs' own shadows from the sky.
+Direct light with shadows of all solids is exact. Shadows of the bulbs in distant light are not modelled.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from client.synthetic.solids.round import Sphere
 BULB_RADIUS_M = 0.03
 WARM = np.array([1.0, 0.76, 0.5])
 INTENSITY = 2.4
-"""Radiance times m^2 of the strongest colour: what is 1 m away and faces the lamp shades to 0.76 of its albedo."""
+"""Radiance times m^2 of the strongest colour: a facing surface at 1 m has radiance 0.76 * albedo."""
 PLACES_M = (
     (0.55, 1.15, -0.85),
     (-0.6, 1.3, -0.3),
@@ -29,34 +29,33 @@ PLACES_M = (
     (1.1, 1.3, -0.2),
     (-1.72, 1.0, -0.4),
 )
-"""In the room: 0 above the desk, 1 above the low table, 2 and 3 behind the picture's edge, 7 a hand's breadth from a
-wall."""
+"""Positions in the room: 0 above the desk, 1 above the low table, 2 and 3 out of view, 7 near a wall."""
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Lamp:
-    """A point that shines evenly all around."""
+    """An isotropic point light."""
 
     position: Floats
     """[3] world, metres."""
     intensity: Floats
-    """[3] radiant intensity, linear RGB: radiance of the picture's units times m^2."""
+    """[3] radiant intensity, linear RGB: radiance in picture units times m^2."""
 
     @cached_property
     def bulb(self) -> Sphere:
-        """What the camera sees of it."""
+        """The visible bulb."""
         return Sphere(self.position, BULB_RADIUS_M)
 
     @property
     def radiance(self) -> Floats:
-        """[3] of the bulb, which sends the intensity from its visible disc."""
+        """[3] radiance of the bulb: intensity over the area of its disc."""
         return self.intensity / (np.pi * BULB_RADIUS_M**2)
 
 
 def room_lamps(count: int, place: int) -> tuple[Lamp, ...]:
-    """`count` lamps of the room, the first at `place`, each next one three places on, whiter and weaker."""
+    """`count` lamps of the room, the first at position `place`; each next one three positions on, whiter and weaker."""
     return tuple(
         Lamp(np.array(PLACES_M[(place + 3 * k) % len(PLACES_M)]), INTENSITY * 0.8**k * WARM ** (1 - 0.5 * k))
         for k in range(count)
@@ -64,7 +63,7 @@ def room_lamps(count: int, place: int) -> tuple[Lamp, ...]:
 
 
 def lamplight(lamps: Sequence[Lamp], solids: Sequence[Solid], points: Floats, normals: Floats) -> Floats:
-    """[n, 3] light of the lamps arriving at surface points over pi: what white would show."""
+    """[n, 3] irradiance / pi of the lamps at surface points."""
     arriving = np.zeros((len(points), 3))
     for lamp in lamps:
         obstacles = [*solids, *(other.bulb for other in lamps if other is not lamp)]
@@ -77,7 +76,7 @@ def lamplight(lamps: Sequence[Lamp], solids: Sequence[Solid], points: Floats, no
 
 
 def _is_visible(lamp: Lamp, solids: Sequence[Solid], away: Floats) -> NDArray[np.bool_]:
-    """[n] whether nothing stands between the lamp and the points that are `away` [n, 3] from it."""
+    """[n] whether the points at lamp position + `away` [n, 3] are visible from the lamp."""
     nearest = np.full(len(away), np.inf)
     for solid in solids:
         nearest = np.minimum(nearest, solid.intersect(lamp.position, away))

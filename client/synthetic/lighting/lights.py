@@ -1,7 +1,7 @@
-"""Distant lights of exactly 16 coefficients: a soft disc somewhere in the sky, and an even ambient light.
+"""Distant lights of exactly 16 coefficients: a soft disc in the sky and uniform ambient light.
 
-The disc is symmetric about its direction, so that the l = 1 coefficients of every colour point exactly there.
-Numbers are in the units of the linearised picture: a white surface facing the disc, unshadowed, shades to `EXPOSURE`.
+The disc is symmetric about its direction, so the l = 1 coefficients of every colour point exactly there. Units are
+those of the linear picture: an unshadowed white surface that faces the disc has radiance `EXPOSURE`.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from client.synthetic.lighting.harmonics import LAMBERT, basis
 RING_SIZE = 8
 ELEVATION_RAD = math.radians(40)
 EXPOSURE = 1.18
-"""Surfaces have albedo 0.8 at most, so that no pixel exceeds 0.95 of what the picture can hold."""
+"""Surfaces have at most albedo 0.8, so no pixel exceeds 0.95 of the picture's range."""
 
 DISC_CORE_RAD, DISC_EDGE_RAD = math.radians(15), math.radians(40)
-"""The disc is even up to the first angle and gone at the second."""
+"""The disc is uniform up to the first angle and 0 from the second."""
 AMBIENT_SHARE = 0.25
-"""Of the light that a surface facing the disc receives."""
+"""Share of ambient light in the irradiance of a surface that faces the disc."""
 DISC_COLOR = np.array([1.0, 0.94, 0.84])
 AMBIENT_COLOR = np.array([0.86, 0.93, 1.0])
 
@@ -33,20 +33,20 @@ _ZONAL_NORM = np.sqrt((2 * _BANDS + 1) / (4 * np.pi))
 
 @dataclass(frozen=True)
 class DistantLight:
-    """A light and what is exactly known of it."""
+    """A distant light."""
 
     direction: NDArray[np.float64]
-    """[3] unit, world, towards the light: the dominant direction."""
+    """[3] unit, world: dominant direction, towards the light."""
     sh: NDArray[np.float64]
     """[16, 3] radiance, linear RGB."""
 
     def radiance(self, directions: NDArray[np.floating]) -> NDArray[np.floating]:
-        """[n, 3] from unit `directions` [n, 3]; not negative anywhere."""
+        """[n, 3] radiance from unit `directions` [n, 3]; never negative."""
         return basis(directions) @ self.sh.astype(directions.dtype)
 
 
 def ring_light(position: float, brightness: float = 1.0) -> DistantLight:
-    """One of the ring: azimuth `position` * 45 degrees from +z towards +x, 40 degrees above the horizon."""
+    """A light of the ring: azimuth `position` * 45 degrees from +z towards +x, elevation 40 degrees."""
     azimuth = 2 * math.pi * position / RING_SIZE
     level = math.cos(ELEVATION_RAD)
     direction = np.array([level * math.sin(azimuth), math.sin(ELEVATION_RAD), level * math.cos(azimuth)])
@@ -54,11 +54,11 @@ def ring_light(position: float, brightness: float = 1.0) -> DistantLight:
 
 
 def disc_light(direction: NDArray[np.float64], brightness: float = 1.0) -> DistantLight:
-    """The disc around unit `direction` [3], and the ambient light; `brightness` times `EXPOSURE` at the most."""
+    """The disc around unit `direction` [3] with ambient light; at most `brightness` * `EXPOSURE`."""
     disc = _disc_zonal()
     per_band = np.repeat(disc / _ZONAL_NORM, 2 * _BANDS + 1) * basis(direction[None])[0]
     ambient = np.zeros(16)
-    ambient[0] = math.sqrt(4 * math.pi)  # radiance 1 from everywhere
+    ambient[0] = math.sqrt(4 * math.pi)  # radiance 1 from all directions
     facing_disc = per_band @ (LAMBERT * basis(direction[None])[0])
     sh = (1 - AMBIENT_SHARE) / facing_disc * np.outer(per_band, DISC_COLOR) + AMBIENT_SHARE * np.outer(
         ambient, AMBIENT_COLOR
@@ -69,7 +69,7 @@ def disc_light(direction: NDArray[np.float64], brightness: float = 1.0) -> Dista
 
 @cache
 def _disc_zonal() -> NDArray[np.float64]:
-    """[4] zonal coefficients of the disc, windowed just enough to be positive with half of the ambient light."""
+    """[4] zonal coefficients of the disc, windowed until it is positive with half of the ambient light."""
     nodes, weights = np.polynomial.legendre.leggauss(200)
     legendre = np.polynomial.legendre.legvander(nodes, 3) * _ZONAL_NORM
     disc = 2 * np.pi * (weights * _profile(np.arccos(nodes))) @ legendre

@@ -1,7 +1,7 @@
-"""What the stage set is covered with: textures that follow each surface, all linear albedo from 0.03 to 0.8.
+"""Appearances of the stage set: textures in surface coordinates, with linear albedo from 0.03 to 0.8.
 
-A pattern lies in two coordinates along the surface, so that it goes around columns and up roofs; its lines are some
-millimetres wide with soft edges, so that pictures of 320x240 do not alias.
+Patterns follow two coordinates along the surface, around columns and up roofs. Their lines are some millimetres wide
+with soft edges, so that pictures of 320x240 do not alias.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from client.synthetic.solids.polyhedra import Polyhedron
 from client.synthetic.solids.round import Cylinder, Sphere
 
 SOFT_M = 0.0012
-"""Half of an edge's width."""
+"""Half the width of an edge."""
 
 Values = NDArray[np.floating]
 Color = tuple[float, float, float]
@@ -27,25 +27,25 @@ Convex = Polyhedron | Cylinder | Sphere
 
 @dataclass(frozen=True)
 class StageSurface:
-    """Which surface is covered."""
+    """A surface of the stage set."""
 
     role: str
     """ground, wall, stone, roof or dome."""
     building: int
     """From 1; 0 is the ground."""
     solid: Convex | Carved
-    turn: NDArray[np.float64]
-    """[3, 3] of the building's frame."""
+    rotation: NDArray[np.float64]
+    """[3, 3] world_from_building."""
 
 
 Appearance = Callable[[StageSurface], Texture]
 
 
 def along_surface(surface: StageSurface, points: Values) -> tuple[Values, Values]:
-    """[n] metres across and up the surface at its points [n, 3]; on what lies flat, along the building's axes."""
-    local = points @ surface.turn
-    normals = surface.solid.normals(points) @ surface.turn
-    center = surface.solid.bounds[0] @ surface.turn
+    """[n] metres across and up the surface at points [n, 3]; on horizontal faces along the building's axes."""
+    local = points @ surface.rotation
+    normals = surface.solid.normals(points) @ surface.rotation
+    center = surface.solid.bounds[0] @ surface.rotation
     level = np.hypot(normals[:, 0], normals[:, 2])
     facing = np.arctan2(normals[:, 0], normals[:, 2])
     sideways = local - center
@@ -66,12 +66,12 @@ def _radius(solid: Convex | Carved) -> float:
 
 
 def paper(_surface: StageSurface) -> Texture:
-    """White throughout."""
+    """White everywhere."""
     return lambda points: np.full((len(points), 3), 0.78)
 
 
 def checker(surface: StageSurface) -> Texture:
-    """Squares of black and white on everything: nothing is without an edge, and no two neighbours are alike."""
+    """Black and white squares on all surfaces, so that there are edges everywhere."""
     side = 0.04 if surface.role == "ground" else 0.02
 
     def texture(points: Values) -> Values:
@@ -83,7 +83,7 @@ def checker(surface: StageSurface) -> Texture:
 
 
 def brick(surface: StageSurface) -> Texture:
-    """Bricks and ashlar, slates, lead; slabs on the ground."""
+    """Bricks, ashlar, slate and lead; slabs on the ground."""
     match surface.role:
         case "wall":
             return _courses(surface, (0.036, 0.014), (0.42, 0.13, 0.07), (0.55, 0.5, 0.42), 0.25)
@@ -98,7 +98,7 @@ def brick(surface: StageSurface) -> Texture:
 
 
 def market(surface: StageSurface) -> Texture:
-    """Saturated paint, awnings for roofs, a carpet of many colours."""
+    """Saturated paint, striped roofs, a colourful carpet on the ground."""
     hue = _HUES[surface.building % len(_HUES)]
     match surface.role:
         case "ground":
@@ -112,7 +112,7 @@ def market(surface: StageSurface) -> Texture:
 
 
 def town(surface: StageSurface) -> Texture:
-    """Plaster with windows, tiled roofs, sandstone, a copper dome; cobbles and grass."""
+    """Plaster with windows, tiled roofs, sandstone, a copper dome; cobbles and grass on the ground."""
     match surface.role:
         case "wall":
             return _windows(surface, _PLASTER[surface.building % len(_PLASTER)])
@@ -151,7 +151,7 @@ def _plain(color: Color) -> Texture:
 
 
 def _courses(surface: StageSurface, size_m: tuple[float, float], face: Color, joint: Color, spread: float) -> Texture:
-    """Rows of bricks `size_m` long and high, each row half a brick on, of shades that differ by up to `spread`."""
+    """Rows of bricks of `size_m` (length, height), offset by half a brick; shades vary by up to `spread`."""
 
     def texture(points: Values) -> Values:
         u, v = along_surface(surface, points)
@@ -174,7 +174,7 @@ def _stripes(surface: StageSurface, one: Color, other: Color, width_m: float) ->
 
 
 def _patches(surface: StageSurface) -> Texture:
-    """Squares of 5 cm, each of one hue."""
+    """Squares of 5 cm, each with one hue."""
 
     def texture(points: Values) -> Values:
         u, v = along_surface(surface, points)
@@ -198,7 +198,7 @@ def _windows(surface: StageSurface, plaster: Color) -> Texture:
 
 
 def _square_and_grass(surface: StageSurface) -> Texture:
-    """Cobbles, lighter on an oval square in the middle, grass outside of the roads around it."""
+    """Cobbles, lighter on an oval square in the middle, and grass outside."""
     cobbles = _courses(surface, (0.02, 0.016), (0.42, 0.4, 0.37), (0.3, 0.28, 0.26), 0.15)
 
     def texture(points: Values) -> Values:
@@ -218,26 +218,26 @@ def _mix(one: Color | Values, other: Color | Values, share: Values) -> Values:
 
 
 def _step(distance_m: Values) -> Values:
-    """0 to 1 where `distance_m` passes 0, softly."""
+    """Smooth step from 0 to 1 at `distance_m` 0."""
     share: Values = 0.5 + 0.5 * np.tanh(distance_m / SOFT_M)
     return share
 
 
 def _to_edge(position_m: Values, period_m: float) -> Values:
-    """How far inside its cell a position lies."""
+    """Distance of a position to the edge of its cell."""
     within = position_m % period_m
     distance: Values = np.minimum(within, period_m - within)
     return distance
 
 
 def _waves(position_m: Values, width_m: float) -> Values:
-    """-1 and 1 in turn, each `width_m` wide, with soft edges."""
+    """Alternating -1 and 1, each `width_m` wide, with soft edges."""
     wave: Values = np.tanh(np.sin(np.pi * position_m / width_m) * width_m / (np.pi * SOFT_M))
     return wave
 
 
 def _random(row: Values, column: Values, seed: int) -> Values:
-    """[n] in [0, 1), the same for the same cell: whole numbers hashed, so that every machine agrees."""
+    """[n] pseudo-random in [0, 1) per cell; an integer hash, equal on all machines."""
     mixed = row.astype(np.int64) * 73_856_093 ^ column.astype(np.int64) * 19_349_663 ^ seed * 83_492_791
     mixed &= 0xFFFF_FFFF
     mixed = (mixed ^ mixed >> 13) * 1_274_126_177 & 0xFFFF_FFFF

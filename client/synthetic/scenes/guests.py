@@ -1,7 +1,6 @@
-"""Things that stand on the stage set on request: real in one sequence, so that they can be virtual in another.
+"""Guests: objects inserted into the stage set, real in one sequence and virtual in another, for ground truth.
 
-What a guest takes of the light is kept apart from the set's own shadows: a pixel that no guest touches is the same
-with it and without, bit for bit.
+Shadows of guests are stored apart from those of the set, so that unaffected pixels are equal bit for bit.
 """
 
 from __future__ import annotations
@@ -28,17 +27,17 @@ from client.synthetic.solids.round import Sphere
 
 Floats = NDArray[np.float32]
 STEP_M = 0.002
-"""Between samples of the shadows on guests."""
+"""Distance between samples of shadows on guests."""
 
 
 @dataclass(frozen=True)
 class Guest:
-    """A solid_of_guest of one colour."""
+    """An inserted object of one colour."""
 
     name: str
     solid: Sphere | Polyhedron
     srgb: tuple[int, int, int]
-    """Eight bits, as a mesh file keeps its colour."""
+    """8-bit sRGB, as in a mesh file."""
 
     @property
     def albedo(self) -> NDArray[np.float64]:
@@ -47,7 +46,7 @@ class Guest:
         return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
     def texture(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
-        """[n, 3] linear albedo."""
+        """[n, 3] linear albedo at points [n, 3]."""
         return np.broadcast_to(self.albedo, points.shape)
 
 
@@ -58,31 +57,31 @@ GUESTS: dict[str, tuple[Guest, ...]] = {"none": (), "ball": (_BALL,), "crate": (
 
 
 def guest_grids(guests: tuple[Guest, ...]) -> list[list[Grid]]:
-    """Over the guests themselves."""
+    """Grids over the surfaces of the guests."""
     return atlas([guest.solid.charts for guest in guests], STEP_M)
 
 
 def bake_guests(
     guests: tuple[Guest, ...], solids: list[Solid], grids: list[list[Grid]], directions: Floats
 ) -> dict[str, Floats]:
-    """Occluded Lambert transfer: `around` [total, 16] what guests alone take from the set, `on` [total, 16] on guests.
+    """Occluded Lambert transfer: `on_set` [total, 16] due to guests only, `on_guests` [total, 16] on the guests.
 
-    `grids` lie over `solids`; `directions` [n, 3] float32, unit, evenly spread over the sphere.
+    `grids`: over `solids`; `directions` [n, 3] float32, unit, of equal solid angle.
     """
     guest_solids: list[Solid] = [guest.solid for guest in guests]
-    around = np.zeros((table_size(grids), COEFFICIENTS), np.float32)
+    on_set = np.zeros((table_size(grids), COEFFICIENTS), np.float32)
     for own, of_solid in enumerate(grids):
         for part, grid in enumerate(of_solid):
-            around[grid.offset : grid.offset + grid.size] = _occluded_by_guests(
+            on_set[grid.offset : grid.offset + grid.size] = _occluded_by_guests(
                 guest_solids, solids, own, part, grid, directions
             )
-    return {"around": around, "on": bake([*guest_solids, *solids], guest_grids(guests), directions)}
+    return {"on_set": on_set, "on_guests": bake([*guest_solids, *solids], guest_grids(guests), directions)}
 
 
 def _occluded_by_guests(
     guest_solids: list[Solid], solids: list[Solid], own: int, part: int, grid: Grid, directions: Floats
 ) -> Floats:
-    """[samples, 16] of one grid: zero where no guest stands between it and light that nothing else keeps away."""
+    """[samples, 16] of one grid; 0 where guests block no direction that is otherwise open."""
     positions, normals, skip = seen_samples(solids[own], part, grid)
     values = np.zeros((grid.rows, grid.columns, COEFFICIENTS), np.float32)
     for piece in tiles(grid, len(directions)):
@@ -91,19 +90,19 @@ def _occluded_by_guests(
         blocked = blocked_directions(guest_solids, None, points, near)
         blocked[:, blocked.any(axis=0)] &= ~blocked_directions(solids, skip, points, near[blocked.any(axis=0)])
         if blocked.any():
-            lost = blocked * np.maximum(up @ near.T, 0)
-            values[piece] = (lost @ basis(near)).reshape(values[piece].shape) * np.float32(4 / len(directions))
+            occlusion = blocked * np.maximum(up @ near.T, 0)
+            values[piece] = (occlusion @ basis(near)).reshape(values[piece].shape) * np.float32(4 / len(directions))
     if values.any():
         fill_buried(values, buried_samples([*solids, *guest_solids], own, part, grid), grid.chart.wraps)
     return values.reshape(-1, COEFFICIENTS)
 
 
 def _may_meet_guest(guest_solids: list[Solid], points: Floats, up: Floats, directions: Floats) -> NDArray[np.bool_]:
-    """[directions] which of them may meet a guest above the horizon of some of the points."""
+    """[directions] which may hit a guest above the horizon of any of the points."""
     middle = points.mean(axis=0)
-    reach = float(np.linalg.norm(points - middle, axis=1).max())
+    radius_of_points = float(np.linalg.norm(points - middle, axis=1).max())
     near = np.zeros(len(directions), bool)
-    for solid_of_guest in guest_solids:
-        near |= directions_near(solid_of_guest, middle, directions, reach)
+    for solid in guest_solids:
+        near |= directions_near(solid, middle, directions, radius_of_points)
     near[near] = (up @ directions[near].T > 0).any(axis=0)
     return near

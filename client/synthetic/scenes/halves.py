@@ -1,6 +1,6 @@
-"""A room of which one half is painted black and the other white, lit from above and from the front.
+"""A room with a black and a white half, lit from above and from the front.
 
-To one albedo for all, the white half looks as if the light came from the black one's side: the hard case of B2.
+With one constant albedo, the white half suggests light from the side of the black half: the hard case of B2.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ BLACK, WHITE = 0.06, 0.75
 
 
 def halves() -> Scene:
-    """4 x 2.6 x 3 m without ceiling and front; the same solids on both sides, those in the middle of both colours."""
+    """4 x 2.6 x 3 m without ceiling and front; the same solids on both sides, two-coloured ones in the middle."""
     ceiling, front = Opening(3, (-2.0, -1.5), (2.0, 1.5)), Opening(5, (-2.0, 0.0), (2.0, 2.6))
     shell = Shell(np.array([-2, 0, -1.5]), np.array([2, 2.6, 1.5]), (ceiling, front))
     bodies = [Body(shell, half_black)]
@@ -42,6 +42,6 @@ def half_black(points: textures.Values) -> textures.Values:
 
 
 def _walk_along_front(time_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """To and fro at the open side, looking in."""
+    """Back and forth along the open side, looking in."""
     sideways = -0.8 * np.cos(2 * np.pi * time_s / 8)
     return np.array([sideways, 1.5, 1.4]), np.array([0.2 * sideways, 0.5, -0.7])

@@ -1,8 +1,8 @@
-"""A hand that comes in over the table from the side, waves, and goes again; with its shadow, and the table's on it.
+"""A moving hand of capsules: it enters over the table, waves, and leaves; with mutual shadows.
 
-The hand is made of capsules. Its shadow on what stands still is integrated anew in every frame, on a coarser grid and
-with fewer directions than the table's own: it hovers, so that its shadow is soft. The static solids' own visibility is
-baked as bits, so that what they shadow already is not shadowed twice.
+Its shadow on static solids is integrated in every frame, on a coarser grid and with fewer directions than static
+shadows; the hand hovers, so its shadow is soft. The visibility of static solids is precomputed as bits, so that
+directions that they block are not counted twice.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from client.synthetic.solids.round import Capsule
 
 DIRECTIONS, SKIN_DIRECTIONS = 1024, 512
 SHADOW_STEP_M = 0.016
-"""Between samples of the hand's shadow on static surfaces."""
+"""Distance between samples of the hand's shadow on static surfaces."""
 SKIN_STEP_M = 0.008
-"""Between samples of the shadows on the hand."""
+"""Distance between samples of shadows on the hand."""
 SKIN = painted(0.68, 0.44, 0.34)
 
-COMES, STAYS, GOES, IS_GONE = 0.15, 0.35, 0.7, 0.9
-"""Parts of the sequence."""
+ENTER, STAY, LEAVE, GONE = 0.15, 0.35, 0.7, 0.9
+"""Start of each phase, as a fraction of the sequence."""
 WAVES = 2.5
-"""Times it waves while it stays."""
+"""Number of waves while it stays."""
 STAY_POSITION = np.array([0.12, 0.25, 0.2])
-"""Where the palm's middle stays, world metres."""
+"""World position of the palm while it stays."""
 OUT_OF_SIGHT_OFFSET = np.array([0.95, 0.06, 0.12])
-"""From there, out of sight."""
+"""Offset from there to a position out of sight."""
 
 _FINGERS = (  # of a right hand pointing to -x, palm down: root in the palm's frame, splay in degrees, length, radius
     ((-0.05, 0.0, -0.033), -9.0, 0.062, 0.0085),
@@ -47,48 +47,48 @@ _FINGERS = (  # of a right hand pointing to -x, palm down: root in the palm's fr
 
 
 def capsules(progress: float) -> list[Capsule]:
-    """The hand at `progress` (0 to 1) of the sequence; empty while it is out of sight."""
+    """Capsules of the hand at `progress` (0 to 1) of the sequence; empty while it is out of sight."""
     presence = _presence(progress)
     if presence <= 0:
         return []
-    staying = np.clip((progress - STAYS) / (GOES - STAYS), 0, 1)
+    staying = np.clip((progress - STAY) / (LEAVE - STAY), 0, 1)
     swing = np.sin(2 * np.pi * WAVES * staying) * np.sin(np.pi * staying)
-    turn = rotation_about("y", 22 * swing) @ rotation_about("z", -8) @ rotation_about("x", 15 * swing)
+    rotation = rotation_about("y", 22 * swing) @ rotation_about("z", -8) @ rotation_about("x", 15 * swing)
     palm = STAY_POSITION + (1 - presence) * OUT_OF_SIGHT_OFFSET + np.array([0.0, 0.015 * swing, 0.07 * swing])
 
     def part(start: tuple[float, float, float], end: tuple[float, float, float], radius: float) -> Capsule:
-        return Capsule(palm + turn @ np.array(start), palm + turn @ np.array(end), radius)
+        return Capsule(palm + rotation @ np.array(start), palm + rotation @ np.array(end), radius)
 
     hand = [part((0.035, 0, z), (-0.04, 0, z * 1.1), 0.017) for z in (-0.028, -0.009, 0.01, 0.029)]
     for root, splay, length, radius in _FINGERS:
         away = rotation_about("y", splay) @ np.array([-length, -0.1 * length, 0])
         hand.append(part(root, tuple(np.array(root) + away), radius))
-    wrist = palm + turn @ np.array([0.05, 0, 0])
+    wrist = palm + rotation @ np.array([0.05, 0, 0])
     elbow = wrist + np.array([0.55, 0.08, 0.06]) + 0.25 * (palm - STAY_POSITION) * np.array([0, 0, 1])
     return [*hand, Capsule(wrist, elbow, 0.032)]
 
 
 def _presence(progress: float) -> float:
-    """0 out of sight, 1 in place."""
-    x = np.clip(min((progress - COMES) / (STAYS - COMES), (IS_GONE - progress) / (IS_GONE - GOES)), 0, 1)
+    """0: out of sight, 1: in place."""
+    x = np.clip(min((progress - ENTER) / (STAY - ENTER), (GONE - progress) / (GONE - LEAVE)), 0, 1)
     return float(x * x * (3 - 2 * x))
 
 
 @dataclass(frozen=True)
 class _Piece:
-    """Neighbouring samples on one chart."""
+    """Neighbouring samples of one chart."""
 
     solid: Solid
     samples: NDArray[np.intp]
-    """[n] numbers in the table."""
+    """[n] indices in the table."""
     points: NDArray[np.float32]
     """[n, 3] world metres."""
     normals: NDArray[np.float32]
-    """[n, 3], or [1, 3] where it is flat."""
+    """[n, 3], or [1, 3] on a flat face."""
 
 
 class StaticVisibility:
-    """Which directions the static solids leave open, at samples all over them."""
+    """Directions not blocked by static solids, at samples on their surfaces."""
 
     def __init__(self, solids: list[Solid], open_bits: NDArray[np.uint8] | None = None) -> None:
         self.solids = solids
@@ -99,7 +99,7 @@ class StaticVisibility:
         self.open_bits = self._compute() if open_bits is None else open_bits
 
     def shadow(self, hand: list[Capsule], light: DistantLight) -> NDArray[np.float32]:
-        """[total, 3] light, over pi, that the hand alone takes from every sample."""
+        """[total, 3] irradiance / pi that only the hand blocks at every sample."""
         blocked_light = np.zeros((self.size, 3), np.float32)
         weights = light.radiance(self.directions) * np.float32(4 / DIRECTIONS)
         for piece in self._pieces:
@@ -131,12 +131,12 @@ class StaticVisibility:
 
 
 def _is_above(part: Capsule, piece: _Piece) -> bool:
-    """Some of it may be above the horizon of a flat piece; of a curved one it is not asked."""
+    """Whether part of the capsule may be above the horizon of a flat piece; True for curved ones."""
     center, radius = part.bounds
     return len(piece.normals) > 1 or bool((center - piece.points[0]) @ piece.normals[0] > -radius)
 
 
 def skin_shadows(hand: list[Capsule], static: list[Solid]) -> tuple[list[list[Grid]], NDArray[np.float32]]:
-    """Grids over the hand, and [total, 16] occluded transfer on them: by the static solids and by its other parts."""
+    """Grids over the hand, and [total, 16] occluded transfer there, by static solids and other parts of the hand."""
     grids = atlas([part.charts for part in hand], SKIN_STEP_M)
     return grids, bake([*hand, *static], grids, sphere_directions(SKIN_DIRECTIONS).astype(np.float32))

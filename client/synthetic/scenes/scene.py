@@ -1,4 +1,4 @@
-"""The scenes: which solids stand where, how they are coloured, and how the camera moves."""
+"""Description of a scene, and the scenes table and room."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from client.synthetic.solids.round import Cylinder, Sphere
 from client.synthetic.solids.shell import Opening, Shell
 
 DIM_SKY = 0.2
-"""Brightness of the sky where lamps are what lights the room."""
+"""Brightness of the sky if the room is lit by lamps."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """A solid and its colour."""
+    """A solid and its texture."""
 
     solid: Solid
     texture: textures.Texture
-    """Used where the scene is asked for with textures."""
+    """Used only with the option `texture`."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What does not move, and how it is seen."""
+    """Static solids and the camera path."""
 
     name: str
     bodies: tuple[Body, ...]
     step_m: float
-    """Between the samples of baked shadows."""
+    """Distance between samples of precomputed shadows."""
     directions: int
-    """Of the quadrature over the sphere."""
+    """Number of directions of the quadrature over the sphere."""
     camera_path: Callable[[float], tuple[NDArray[np.float64], NDArray[np.float64]]]
-    """Seconds to (position, point looked at), metres."""
+    """Seconds -> (position, target), metres."""
     brightness: float = 1.0
-    """Of the lights: rooms let less of it in."""
+    """Factor of the light; larger for rooms, which admit less of it."""
 
     @property
     def solids(self) -> list[Solid]:
@@ -47,7 +47,7 @@ class Scene:
 
 
 def table() -> Scene:
-    """A table top of 1.2 x 0.8 m at y = 0 with things of many slopes on it; nothing around it."""
+    """A table top of 1.2 x 0.8 m at y = 0 with objects of many slopes; nothing around it."""
     wood, paint = textures.wood, textures.painted
     standing = rotation_about("y", 35)
     leaning = rotation_about("y", -25) @ rotation_about("z", 28)
@@ -88,12 +88,12 @@ def room() -> Scene:
 
 
 def lamp_room() -> Scene:
-    """The room under a dim sky: what lights it are its lamps, see lamps.py."""
+    """The room under a dim sky, lit mainly by its lamps (lighting/lamps.py)."""
     return replace(room(), brightness=DIM_SKY)
 
 
 def _walk_around_table(time_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """An arc of 70 degrees at 1.25 m, to and fro in 6 s, with the small sway of a person walking."""
+    """An arc of 70 degrees at 1.25 m, back and forth in 6 s, with the sway of a walking person."""
     azimuth = np.radians(-35 * np.cos(2 * np.pi * time_s / 6))
     distance = 1.12 + 0.05 * np.sin(2 * np.pi * time_s / 4)
     height = 0.62 + 0.02 * np.sin(2 * np.pi * time_s / 1.1)

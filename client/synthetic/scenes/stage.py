@@ -1,6 +1,6 @@
-"""The stage set: a small paper-model city on a plate, in the spirit of the City of Sights (thesis 3.3).
+"""The stage set: a small paper-model city on a plate, similar to the City of Sights (thesis 3.3).
 
-Always the same buildings; what they are covered with is one of looks.py. Everything is known: shapes, colours, light.
+The buildings are fixed; appearance.py has their textures.
 """
 
 from __future__ import annotations
@@ -22,50 +22,50 @@ from client.synthetic.solids.round import Cylinder, Sphere
 PLATE_M = (0.8, 0.03, 0.6)
 """Its top is y = 0, its middle x = z = 0."""
 ROUND_S = 12.0
-"""The camera walks once around in so long."""
+"""Duration of one walk around the set."""
 
 Floats = NDArray[np.float64]
 Parts = Iterator[tuple[Convex | Carved, str]]
 """Each solid of a building and its role: wall, stone, roof, dome or ground."""
 
 
-def stage(look: str = "paper", is_still: bool = False) -> Scene:
+def stage(appearance: str = "paper", is_still: bool = False) -> Scene:
     """The set with an appearance of APPEARANCES; the camera walks around it, or stays at the start of that path."""
     plate = box((0, -PLATE_M[1] / 2, 0), PLATE_M)
-    bodies = [Body(plate, APPEARANCES[look](StageSurface("ground", 0, plate, np.eye(3))))]
+    bodies = [Body(plate, APPEARANCES[appearance](StageSurface("ground", 0, plate, np.eye(3))))]
     for number, (site, building) in enumerate(BUILDINGS, 1):
         for solid, role in building(site):
-            bodies.append(Body(solid, APPEARANCES[look](StageSurface(role, number, solid, site.turn))))
+            bodies.append(Body(solid, APPEARANCES[appearance](StageSurface(role, number, solid, site.rotation))))
     return Scene("stage", tuple(bodies), 0.0035, 3072, _stand if is_still else _walk_around)
 
 
 @dataclass(frozen=True)
 class Site:
-    """Where a building stands, metres, and how it is turned about y. Shapes are given in its own frame."""
+    """Position in metres and rotation about y of a building; shapes are given in its frame."""
 
     x: float
     z: float
     yaw_deg: float
 
     @cached_property
-    def turn(self) -> Floats:
+    def rotation(self) -> Floats:
         return rotation_about("y", self.yaw_deg)
 
     def at(self, x: float, y: float, z: float) -> Place:
         """A point of the building's frame in world metres."""
-        right, up, front = self.turn @ np.array([x, y, z])
+        right, up, front = self.rotation @ np.array([x, y, z])
         return self.x + float(right), float(up), self.z + float(front)
 
     def block(self, foot: Place, size: tuple[float, float, float]) -> Polyhedron:
-        """A box on the middle of its bottom face."""
+        """A box, positioned by the centre of its bottom face."""
         x, y, z = foot
-        return box(self.at(x, y + size[1] / 2, z), size, self.turn)
+        return box(self.at(x, y + size[1] / 2, z), size, self.rotation)
 
     def roof(self, foot: Place, size: tuple[float, float, float]) -> Polyhedron:
-        return gable(self.at(*foot), size, self.turn)
+        return gable(self.at(*foot), size, self.rotation)
 
     def shaft(self, foot: Place, sides: int, radii: tuple[float, float], height: float) -> Polyhedron:
-        return frustum(self.at(*foot), sides, radii, height, self.turn)
+        return frustum(self.at(*foot), sides, radii, height, self.rotation)
 
     def column(self, foot: Place, radius: float, height: float) -> Cylinder:
         return Cylinder(np.array(self.at(*foot)), np.array([0, 1.0, 0]), height, radius)
@@ -85,7 +85,7 @@ def _gate(site: Site) -> Parts:
     leg = width / 2 - radius
     for side in (-1, 1):
         yield site.block((side * (radius + leg / 2), 0, 0), (leg, spring, depth)), "stone"
-    hole = Cylinder(np.array(site.at(0, spring, -depth)), site.turn[:, 2], 2 * depth, radius)
+    hole = Cylinder(np.array(site.at(0, spring, -depth)), site.rotation[:, 2], 2 * depth, radius)
     yield Carved(site.block((0, spring, 0), (width, 0.06, depth)), hole), "stone"
     yield site.block((0, spring + 0.06, 0), (width + 0.012, 0.008, depth + 0.012)), "roof"
     yield site.block((0, spring + 0.068, 0), (width - 0.02, 0.024, depth - 0.01)), "wall"
@@ -153,7 +153,7 @@ BUILDINGS: tuple[tuple[Site, Callable[[Site], Parts]], ...] = (
 
 
 def _walk_around(time_s: float) -> tuple[Floats, Floats]:
-    """Once around, with the small sway of a person walking."""
+    """Once around the set, with the sway of a walking person."""
     azimuth = 2 * np.pi * time_s / ROUND_S
     height = 0.54 + 0.015 * np.sin(2 * np.pi * time_s / 1.1)
     away = 0.88 + 0.03 * np.sin(2 * np.pi * time_s / 4)

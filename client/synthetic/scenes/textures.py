@@ -1,4 +1,4 @@
-"""Procedural albedo: solid textures, smooth enough not to alias, linear values from 0.05 to 0.8."""
+"""Procedural solid textures of linear albedo from 0.05 to 0.8, smooth enough not to alias."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ Texture = Callable[[Values], Values]
 """[n, 3] world points to [n, 3] linear albedo."""
 
 PLAIN_ALBEDO = 0.5
-"""Of everything in a scene without texture."""
+"""Albedo of scenes without textures."""
 
 
 def painted(red: float, green: float, blue: float) -> Texture:
-    """An even paint, slightly mottled."""
+    """Paint of one colour, slightly mottled."""
     color = np.array([red, green, blue])
 
     def texture(points: Values) -> Values:
@@ -39,7 +39,7 @@ def wood(points: Values) -> Values:
 
 
 def cloth(points: Values) -> Values:
-    """A woven check."""
+    """A woven check pattern."""
     x, y, z = points.T
     weave = np.sin(55 * x) * np.sin(55 * y + 0.5) + np.sin(55 * z) * np.sin(55 * y + 0.5)
     stripe = np.tanh(3 * np.sin(21 * x))

@@ -1,4 +1,4 @@
-"""A solid with a hole through it: an arch, a bowl. The one kind here that is not convex, so that it shadows itself."""
+"""A solid with a hole, such as an arch or a bowl. The only non-convex kind; it shadows itself."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from client.synthetic.solids.polyhedra import NEAREST, Points, Polyhedron
 from client.synthetic.solids.round import Cylinder
 
 CLEARANCE_M = 1e-5
-"""Shadow rays start this far off the surface: more than float32 loses, less than anybody sees."""
+"""Offset of shadow rays from the surface: above float32 rounding, below visibility."""
 
 
 @dataclass(frozen=True, eq=False)
 class Carved:
-    """What of `outer` is not in `hole`; both are convex."""
+    """`outer` minus `hole`; both are convex."""
 
     outer: Polyhedron | Cylinder
     hole: Cylinder
@@ -29,11 +29,11 @@ class Carved:
 
     @cached_property
     def charts(self) -> list[Chart]:
-        """Those of the outer solid, then those of the hole, whose normals point into the solid: see `inwards`."""
+        """Charts of the outer solid, then of the hole, whose normals point into the solid (`inwards`)."""
         return [*self.outer.charts, *self.hole.charts]
 
     def inwards(self, part: int) -> bool:
-        """Whether a chart's normals are those of the hole, opposite to the surface's."""
+        """Whether a chart belongs to the hole; its normals are opposite to those of the surface."""
         return part >= len(self.outer.charts)
 
     def intersect(self, origin: Points, directions: Points) -> Points:
@@ -59,11 +59,11 @@ class Carved:
         return self.outer.contains(points) & (self.hole.outside_m(points) > 1e-9)
 
     def absent(self, points: Points, part: int) -> NDArray[np.bool_]:
-        """[n] True where a point of chart `part` is no part of the surface."""
+        """[n] True where a point of chart `part` is not on the surface."""
         return ~self.outer.contains(points) if self.inwards(part) else self.hole.outside_m(points) < 1e-9
 
     def _spans(self, points: Points, directions: Points) -> tuple[Points, Points, Points, Points]:
-        """[points, directions] where rays enter and leave the outer solid, and the hole (at infinity if they miss)."""
+        """[points, directions] entry and exit of the outer solid, then of the hole (inf, -inf: no hit)."""
         a, b = self.outer.span(points, directions)
         c, d = self.hole.span(points, directions)
         missed = c >= d

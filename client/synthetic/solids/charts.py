@@ -1,4 +1,4 @@
-"""Charts: a pair of numbers in [0, 1] for every point of a smooth surface, and an atlas of grids over many of them."""
+"""Charts: coordinates in [0, 1]^2 of smooth surfaces, and an atlas of sample grids over many charts."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ Points = NDArray[np.float64]
 
 
 class Chart(Protocol):
-    """Coordinates (s, t) on a surface. `wraps`: s = 1 is s = 0 again."""
+    """Coordinates (s, t) on a surface. `wraps`: s = 1 is the same as s = 0."""
 
     @property
     def wraps(self) -> bool: ...
 
     @property
     def lengths_m(self) -> tuple[float, float]:
-        """How long the surface is along s and t, at most."""
+        """Upper bound of the lengths along s and t."""
 
     def point(self, s: Points, t: Points) -> tuple[Points, Points]:
         """Positions and outward unit normals, each [..., 3]."""
 
     def coordinates(self, points: Points) -> tuple[Points, Points]:
-        """s and t [n] of points [n, 3] of the surface."""
+        """s and t [n] of surface points [n, 3]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class PlaneChart:
 
     @classmethod
     def around(cls, face: Points, normal: NDArray[np.float64], axis_u: NDArray[np.float64]) -> PlaneChart:
-        """The rectangle along unit `axis_u` that holds the corners `face` [n, 3] of a flat face."""
+        """The bounding rectangle along unit `axis_u` of the corners `face` [n, 3] of a flat face."""
         axis_v = np.cross(normal, axis_u)
         u, v = face @ axis_u, face @ axis_v
         corner = u.min() * axis_u + v.min() * axis_v + (face[0] @ normal) * normal
@@ -108,7 +108,7 @@ class CylinderChart:
 
 @dataclass(frozen=True, eq=False)
 class CapsuleChart:
-    """Azimuth about the axis, and the way along the outline from pole to pole."""
+    """Azimuth about the axis, and arc length from pole to pole."""
 
     start: NDArray[np.float64]
     axis: NDArray[np.float64]
@@ -123,9 +123,9 @@ class CapsuleChart:
     def point(self, s: Points, t: Points) -> tuple[Points, Points]:
         u, v = frame_around(self.axis)
         azimuth = 2 * np.pi * s[..., None]
-        way = t[..., None] * self.lengths_m[1] - math.pi / 2 * self.radius
-        height = np.clip(way, 0, self.length)
-        tilt = (way - height) / self.radius
+        arc = t[..., None] * self.lengths_m[1] - math.pi / 2 * self.radius
+        height = np.clip(arc, 0, self.length)
+        tilt = (arc - height) / self.radius
         normals = np.cos(tilt) * (np.sin(azimuth) * u + np.cos(azimuth) * v) + np.sin(tilt) * self.axis
         return self.start + height * self.axis + self.radius * normals, normals
 
@@ -135,12 +135,12 @@ class CapsuleChart:
         height = offset @ self.axis
         on_segment = np.clip(height, 0, self.length)
         tilt = np.arcsin(np.clip((height - on_segment) / self.radius, -1, 1))
-        way = on_segment + self.radius * (tilt + math.pi / 2)
-        return np.arctan2(offset @ u, offset @ v) / (2 * np.pi) % 1, way / self.lengths_m[1]
+        arc = on_segment + self.radius * (tilt + math.pi / 2)
+        return np.arctan2(offset @ u, offset @ v) / (2 * np.pi) % 1, arc / self.lengths_m[1]
 
 
 def frame_around(axis: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Two unit vectors that stand on unit `axis` [3] and on each other."""
+    """Two unit vectors orthogonal to unit `axis` [3] and to each other."""
     helper = np.array([1.0, 0, 0]) if abs(axis[0]) < 0.8 else np.array([0, 1.0, 0])
     u = np.cross(helper, axis)
     u /= np.linalg.norm(u)
@@ -149,7 +149,7 @@ def frame_around(axis: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Sample points over one chart, `rows` along t and `columns` along s; their values begin at `offset` in a table."""
+    """Samples of one chart, `rows` along t and `columns` along s; their values start at `offset` of a table."""
 
     chart: Chart
     columns: int
@@ -158,7 +158,7 @@ class Grid:
 
     @classmethod
     def over(cls, chart: Chart, step_m: float, offset: int) -> Grid:
-        """A grid with samples no further apart than `step_m`, but 8 around whatever closes on itself."""
+        """A grid with samples at most `step_m` apart, and at least 8 columns if the chart wraps."""
         across, along = (math.ceil(length / step_m) for length in chart.lengths_m)
         columns = max(across, 8) if chart.wraps else across + 1
         return cls(chart, columns, along + 1, offset)
@@ -178,7 +178,7 @@ class Grid:
         return self.chart.point(*np.meshgrid(s, t))
 
     def interpolate(self, table: NDArray[np.float32], points: Points) -> NDArray[np.float32]:
-        """[n, k] the table's values [total, k] at points [n, 3] of the surface, bilinear."""
+        """[n, k] bilinear interpolation of table values [total, k] at surface points [n, 3]."""
         s, t = self.chart.coordinates(points)
         x = s * (self.columns if self.chart.wraps else self.columns - 1)
         y = np.clip(t, 0, 1) * (self.rows - 1)
@@ -197,7 +197,7 @@ class Grid:
 
 
 def atlas(charts: list[list[Chart]], step_m: float) -> list[list[Grid]]:
-    """Grids over every chart of every solid, their tables laid end to end."""
+    """Grids over all charts of all solids, consecutive in one table."""
     grids, offset = [], 0
     for of_solid in charts:
         row = []

@@ -1,9 +1,8 @@
-"""Solids with closed-form ray intersections: what each must offer, and the polyhedra; round ones are in rounds.py.
+"""Interface of solids, and convex polyhedra.
 
-All but those of carved.py are convex, so that none shadows itself. `intersect` takes rays of one origin (a camera),
-in float64; directions need not be unit, distances are in multiples of them. `blocks` answers many rays of many points
-at once, and computes in the precision of what it is given. Charts lay a grid over each smooth part of a surface, for
-what is baked.
+All solids except those of carved.py are convex, so they do not shadow themselves. `intersect` takes float64 rays of one
+origin (a camera); directions need not be unit, distances are multiples of them. `blocks` tests many directions of many
+points at once, in the precision of its arguments. Charts parametrise each smooth part of a surface, for shadow grids.
 """
 
 from __future__ import annotations
@@ -19,31 +18,31 @@ from client.synthetic.solids.charts import Chart, PlaneChart
 
 Points = NDArray[np.floating]
 NEAREST = 1e-6
-"""Hits closer than this belong to the surface that a ray starts from."""
+"""Closer hits are the surface that the ray starts from."""
 
 
 class Solid(Protocol):
-    """What rendering and baking need of a solid."""
+    """Interface of solids for rendering and shadows."""
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], float] | None:
-        """Centre and radius of a sphere around it; None where it surrounds everything."""
+        """Centre and radius of a bounding sphere; None: it encloses the scene."""
 
     @property
     def charts(self) -> list[Chart]:
-        """One for each smooth part of the surface, numbered as `part` does."""
+        """One chart per smooth part of the surface, in the order of `part`."""
 
     def intersect(self, origin: Points, directions: Points) -> Points:
-        """[n] distances to the first hit in front of `origin`, inf for a miss."""
+        """[n] distances to the first hit in front of `origin` [3]; inf: no hit."""
 
     def part(self, points: Points) -> NDArray[np.intp]:
-        """[n] which chart each point of the surface lies on."""
+        """[n] index of the chart of each surface point."""
 
     def normals(self, points: Points) -> Points:
         """[n, 3] outward unit normals at points of the surface."""
 
     def blocks(self, points: Points, directions: Points) -> NDArray[np.bool_]:
-        """[points, directions] True where the ray from the point hits; directions are unit."""
+        """[points, directions] True where the ray hits; directions are unit."""
 
     def contains(self, points: Points) -> NDArray[np.bool_]:
         """[n] True strictly inside."""
@@ -91,14 +90,14 @@ class Polyhedron:
     def blocks(self, points: Points, directions: Points) -> NDArray[np.bool_]:
         normals, offsets = self.plane_normals.astype(points.dtype), self.plane_offsets.astype(points.dtype)
         gaps, slopes = offsets - points @ normals.T, directions @ normals.T
-        # Rays that leave a plane which all points are outside of never come in: most of them, so they go first.
+        # If all points are outside a plane, rays away from it cannot hit. This excludes most rays.
         may_hit = np.flatnonzero((slopes[:, (gaps < 0).all(axis=0)] < 0).all(axis=1))
         hit = np.zeros((len(points), len(directions)), bool)
         hit[:, may_hit] = _slab_hit(gaps, slopes[may_hit])
         return hit
 
     def span(self, points: Points, directions: Points) -> tuple[Points, Points]:
-        """[points, directions] where rays enter and leave, behind the point too; near >= far for a miss."""
+        """[points, directions] distances of entry and exit, also behind the point; near >= far: no hit."""
         normals, offsets = self.plane_normals.astype(points.dtype), self.plane_offsets.astype(points.dtype)
         near = np.full((len(points), len(directions)), -np.inf, points.dtype)
         far = np.full_like(near, np.inf)
@@ -115,7 +114,7 @@ class Polyhedron:
 
 
 def clip(near: Points, far: Points, gap: float | Points, slope: Points) -> None:
-    """Narrow the stretch [near, far] of each ray to where `slope * t <= gap`, in place."""
+    """Clip the interval [near, far] of each ray to `slope * t <= gap`, in place."""
     t = gap / no_zero(slope)
     entering = slope < 0
     np.maximum(near, t, out=near, where=entering)
@@ -123,9 +122,9 @@ def clip(near: Points, far: Points, gap: float | Points, slope: Points) -> None:
 
 
 def _slab_hit(gaps: Points, slopes: Points) -> NDArray[np.bool_]:
-    """[points, directions] True where the stretch of the ray inside all planes is not empty.
+    """[points, directions] True where the interval of the ray inside all planes is not empty.
 
-    `gaps` [points, planes] to each plane, positive inside; `slopes` [directions, planes] how fast they close.
+    `gaps` [points, planes]: distance to each plane, positive inside; `slopes` [directions, planes]: its decrease.
     """
     near = np.zeros((len(gaps), len(slopes)), gaps.dtype)
     far = np.full_like(near, np.inf)
@@ -146,47 +145,44 @@ def _slab_hit(gaps: Points, slopes: Points) -> NDArray[np.bool_]:
 
 
 def no_zero(slope: Points) -> Points:
-    """A ray parallel to a plane meets it very far away, on the side that keeps the comparison right."""
+    """`slope` without zeros: a ray parallel to a plane hits it very far away instead of never."""
     return np.where(np.abs(slope) < 1e-12, slope.dtype.type(1e-12), slope)
 
 
 def _shortest(edges: NDArray[np.float64]) -> int:
-    """Of a rectangle's three edges from one corner, the shortest is a side, never the diagonal."""
+    """Index of the shortest edge from one corner of a rectangle, which is never the diagonal."""
     return int(np.linalg.norm(edges, axis=1).argmin())
 
 
 def box(
     center: tuple[float, float, float], size: tuple[float, float, float], rotation: NDArray[np.float64] | None = None
 ) -> Polyhedron:
-    """A box of edge lengths `size`, turned by `rotation` [3, 3] about its centre; metres."""
-    turn = np.eye(3) if rotation is None else rotation
-    normals = np.concatenate([turn.T, -turn.T])
+    """A box with edge lengths `size`, rotated by `rotation` [3, 3] about its centre; metres."""
+    matrix = np.eye(3) if rotation is None else rotation
+    normals = np.concatenate([matrix.T, -matrix.T])
     half = np.array(size) / 2
     offsets = np.tile(half, 2) + normals @ np.array(center)
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    return Polyhedron(normals, offsets, np.array(center) + (signs * half) @ turn.T)
+    return Polyhedron(normals, offsets, np.array(center) + (signs * half) @ matrix.T)
 
 
 def wedge(
     corner: tuple[float, float, float], size: tuple[float, float, float], rotation: NDArray[np.float64] | None = None
 ) -> Polyhedron:
-    """A ramp: a box's lower half under the plane from its low edge at -x to its high edge at +x.
-
-    `corner` is the centre of its bottom face, about which `rotation` turns it.
-    """
-    turn = np.eye(3) if rotation is None else rotation
+    """A ramp that rises from -x to +x. `corner` is the centre of its bottom face and of the `rotation`; metres."""
+    matrix = np.eye(3) if rotation is None else rotation
     length, height, width = size
     slope = np.hypot(length, height)
     local = np.array([[-height / slope, length / slope, 0], [1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
     offsets = np.array([height * length / 2 / slope, length / 2, 0, width / 2, width / 2])
     ends = [(-length / 2, 0), (length / 2, 0), (length / 2, height)]
     corners = np.array([[x, y, z] for x, y in ends for z in (-width / 2, width / 2)])
-    normals = local @ turn.T
-    return Polyhedron(normals, offsets + normals @ np.array(corner), np.array(corner) + corners @ turn.T)
+    normals = local @ matrix.T
+    return Polyhedron(normals, offsets + normals @ np.array(corner), np.array(corner) + corners @ matrix.T)
 
 
 def rotation_about(axis: str, degrees: float) -> NDArray[np.float64]:
-    """[3, 3] right-handed about x, y or z."""
+    """[3, 3] right-handed rotation about x, y or z."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return {
         "x": np.array([[1, 0, 0], [0, c, -s], [0, s, c]]),

@@ -1,4 +1,4 @@
-"""More polyhedra: roofs, steps, shafts and spires. Each stands on the middle of its bottom face."""
+"""More polyhedra: roofs, shafts and spires, positioned by the centre of the bottom face."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Place = tuple[float, float, float]
 
 
 def gable(foot: Place, size: tuple[float, float, float], rotation: NDArray[np.float64] | None = None) -> Polyhedron:
-    """A roof: `size` is the length along x, which its ridge runs, the height, and the width; metres."""
+    """A gable roof: `size` is the length along the ridge (x), the height and the width; metres."""
     length, height, width = size
     eaves = [(x, 0, z) for x in (-length / 2, length / 2) for z in (-width / 2, width / 2)]
     ridge = [(x, height, 0) for x in (-length / 2, length / 2)]
@@ -22,7 +22,7 @@ def gable(foot: Place, size: tuple[float, float, float], rotation: NDArray[np.fl
 def frustum(
     foot: Place, sides: int, radii: tuple[float, float], height: float, rotation: NDArray[np.float64] | None = None
 ) -> Polyhedron:
-    """A tapered shaft of `sides` equal sides, `radii` to its corners at the bottom and top; a spire if the second is 0.
+    """A tapered shaft with `sides` equal sides and `radii` to the corners at bottom and top (0: a spire).
 
     One side faces +z.
     """
@@ -43,12 +43,12 @@ def _polyhedron(
     foot: Place,
     rotation: NDArray[np.float64] | None,
 ) -> Polyhedron:
-    """The convex solid of these corners, three of each face named; turned about the origin, then moved to `foot`."""
+    """The convex solid of these corners; `faces`: three corners of each. Rotated, then moved to `foot`."""
     a, b, c = (corners[[face[k] for face in faces]] for k in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     outward = np.sign(((a - corners.mean(axis=0)) * normals).sum(axis=1))
-    turn = np.eye(3) if rotation is None else rotation
-    normals = outward[:, None] * normals @ turn.T
-    corners = corners @ turn.T + np.array(foot)
+    matrix = np.eye(3) if rotation is None else rotation
+    normals = outward[:, None] * normals @ matrix.T
+    corners = corners @ matrix.T + np.array(foot)
     return Polyhedron(normals, (normals * corners[[face[0] for face in faces]]).sum(axis=1), corners)

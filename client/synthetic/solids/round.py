@@ -91,7 +91,7 @@ class Cylinder:
         return np.where(part == 0, radial, np.where(part == 1, -self.axis, self.axis))
 
     def span(self, points: Points, directions: Points) -> tuple[Points, Points]:
-        """[points, directions] where rays enter and leave, behind the point too; near >= far for a miss."""
+        """[points, directions] distances of entry and exit, also behind the point; near >= far: no hit."""
         axis = self.axis.astype(points.dtype)
         start = points - self.base.astype(points.dtype)
         near, far = _tube(start, directions, axis, self.radius)
@@ -107,7 +107,7 @@ class Cylinder:
         return self.outside_m(points) < -1e-9
 
     def outside_m(self, points: Points) -> NDArray[np.float64]:
-        """[n] how far points are out of the side or of an end, whichever is more; negative inside."""
+        """[n] distance outside of the side or of an end, whichever is larger; negative inside."""
         height = (points - self.base) @ self.axis
         distances = [self._off_axis(points) - self.radius, -height, height - self.length]
         outside: NDArray[np.float64] = np.max(distances, axis=0)
@@ -152,7 +152,7 @@ class Capsule:
         ends = np.minimum(
             _sphere_hit(offset, directions, self.radius), _sphere_hit(origin - self.end, directions, self.radius)
         )
-        # A ball's hit counts beyond the segment's ends only; elsewhere the side, which is around it, was hit first.
+        # A hit of an end sphere counts only beyond the segment; elsewhere the side encloses it and is hit first.
         return np.where(on_side, near, ends)
 
     def part(self, points: Points) -> NDArray[np.intp]:
@@ -178,13 +178,13 @@ class Capsule:
         return inside
 
     def _nearest(self, points: Points) -> Points:
-        """[n, 3] the segment's closest points."""
+        """[n, 3] closest points on the segment."""
         height = np.clip((points - self.start) @ self.axis, 0, self.length)
         return self.start + height[:, None] * self.axis
 
 
 def _tube(start: Points, directions: Points, axis: Points, radius: float) -> tuple[Points, Points]:
-    """[points, directions] where rays enter and leave the endless cylinder through the origin; near > far for none."""
+    """[points, directions] entry and exit of an infinite cylinder through the origin; near > far: no hit."""
     along = directions @ axis
     a = np.maximum((directions * directions).sum(axis=1) - along * along, 1e-12).astype(start.dtype)
     height = start @ axis

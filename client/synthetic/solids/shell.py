@@ -1,4 +1,4 @@
-"""A room: a box seen from inside, with rectangular openings through which light enters."""
+"""A room: a box seen from inside, with rectangular openings for light."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from client.synthetic.solids.charts import Chart, PlaneChart
 from client.synthetic.solids.polyhedra import NEAREST, Points
 
 WALLS = ((0, -1), (0, 1), (1, -1), (1, 1), (2, -1), (2, 1))
-"""(axis, side) of each wall; the number of a wall is its place here."""
+"""(axis, side) of each wall; its index is the number of the wall."""
 
 
 @dataclass(frozen=True)
 class Opening:
-    """A rectangle in a wall, in world coordinates of the two other axes, in their order."""
+    """A rectangle in a wall, in world coordinates of the two other axes in order."""
 
     wall: int
     low: tuple[float, float]
@@ -26,7 +26,7 @@ class Opening:
 
 @dataclass(frozen=True, eq=False)
 class Shell:
-    """The inside of the box from `low` [3] to `high` [3]; everything of the scene lies inside, the camera too."""
+    """The inside of the box from `low` [3] to `high` [3]; it contains the scene and the camera."""
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]
@@ -72,18 +72,18 @@ class Shell:
             towards = np.flatnonzero(directions[:, axis] * side > NEAREST)
             depth = (self.high[axis] if side > 0 else self.low[axis]).astype(points.dtype) - points[:, axis, None]
             slope = directions[towards]
-            # The room is convex: a ray that meets the wall's plane inside the opening has met no other wall.
+            # The room is convex: a ray through the opening meets no other wall before.
             u, v = (points[:, a, None] + depth * (slope[:, a] / slope[:, axis]) for a in range(3) if a != axis)
             blocked[:, towards] &= ~_within(opening, u, v)
         return blocked
 
     def contains(self, points: Points) -> NDArray[np.bool_]:
-        """True outside the room, where nothing can be seen."""
+        """True outside the room, which is invisible."""
         inside: NDArray[np.bool_] = np.all((points > self.low) & (points < self.high), axis=1)
         return ~inside
 
     def absent(self, points: Points) -> NDArray[np.bool_]:
-        """[n] True where a point of the walls lies in an opening."""
+        """[n] True where a wall point lies in an opening."""
         part = self.part(points)
         inside = np.zeros(len(points), bool)
         for opening in self.openings:
@@ -92,7 +92,7 @@ class Shell:
         return inside
 
     def _exit(self, points: Points, directions: Points) -> tuple[Points, NDArray[np.intp]]:
-        """[points, directions] how far to the wall that each ray meets, and that wall's number."""
+        """[points, directions] distance to the wall that each ray hits, and the number of the wall."""
         distances = np.stack([self._distance(points, directions, axis) for axis in range(3)])
         axis = distances.argmin(axis=0)
         side = np.where(directions > 0, 1, 0)

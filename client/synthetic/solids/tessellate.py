@@ -1,4 +1,4 @@
-"""Triangles of the solids, for those who trace meshes. Flat faces are exact, round ones within `TOLERANCE_M`."""
+"""Triangle meshes of the solids. Flat faces are exact, round surfaces within `TOLERANCE_M`."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from client.synthetic.solids.polyhedra import Polyhedron, Solid
 from client.synthetic.solids.round import Cylinder, Sphere
 
 TOLERANCE_M = 2e-5
-"""Between the middle of a triangle and the round surface."""
+"""Largest distance between a triangle and the round surface."""
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Triangles:
-    """A mesh, or pieces of one: corners are not shared between pieces, so that edges stay sharp."""
+    """A mesh or a piece of one; vertices are not shared between pieces, so edges stay sharp."""
 
     vertices: Floats
     """[v, 3] world metres."""
@@ -32,17 +32,17 @@ class Triangles:
 
 
 def triangles_of(solids: list[Solid]) -> Triangles:
-    """The surfaces of all solids, those inside another too. Raises TypeError for a solid that it does not know."""
+    """Surfaces of all solids, including parts inside other solids. Raises TypeError for an unsupported solid."""
     return joined([piece for solid in solids for piece in _pieces(solid)])
 
 
 def can_tessellate(solids: list[Solid]) -> bool:
-    """Whether `triangles_of` knows them all."""
+    """Whether `triangles_of` supports all of them."""
     return all(isinstance(solid, Polyhedron | Sphere | Cylinder | Carved) for solid in solids)
 
 
 def joined(pieces: list[Triangles]) -> Triangles:
-    """One after the other."""
+    """Concatenate meshes."""
     first = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
     return Triangles(
         np.concatenate([piece.vertices for piece in pieces]),
@@ -79,20 +79,20 @@ def _outline(solid: Polyhedron, plane: int) -> Floats:
 
 
 def _face(outline: Floats, normal: Floats) -> Triangles:
-    """A flat convex face of corners in order; either way around."""
+    """A flat convex face; corners in either order of rotation."""
     fan = np.array([(0, k, k + 1) for k in range(1, len(outline) - 1)])
     return _oriented(Triangles(outline, np.broadcast_to(normal, outline.shape), fan))
 
 
 def _angles(radius: float) -> Floats:
-    """A whole turn in steps whose chords stay within the tolerance of the circle."""
+    """Angles of a full circle whose chords stay within the tolerance."""
     step = 2 * math.acos(max(1 - TOLERANCE_M / radius, 0.0))
     angles: Floats = np.linspace(0, 2 * np.pi, max(math.ceil(2 * np.pi / step), 12) + 1)
     return angles
 
 
 def _rim(solid: Cylinder, height: float, angles: Floats) -> Floats:
-    """[n, 3] points of the circle at `height`; after a whole turn the very same point again."""
+    """[n, 3] points of the circle at `height`; 2 pi gives exactly the point of 0."""
     u, v = frame_around(solid.axis)
     angles = angles % (2 * np.pi)
     around = np.cos(angles)[:, None] * u + np.sin(angles)[:, None] * v
@@ -100,20 +100,20 @@ def _rim(solid: Cylinder, height: float, angles: Floats) -> Floats:
 
 
 def _side(solid: Cylinder, low: Floats, high: Floats, outward: float = 1.0) -> Triangles:
-    """The strip between two rims of the same angles."""
+    """The strip between two rims with the same angles."""
     center = solid.base + ((low - solid.base) @ solid.axis)[:, None] * solid.axis
     return _strip(low, high, outward * (low - center) / solid.radius)
 
 
 def _strip(low: Floats, high: Floats, normals: Floats) -> Triangles:
-    """Quadrilaterals between the points of two lines, with the normals [n, 3] of both."""
+    """Quadrilaterals between two lines of points that share normals [n, 3]."""
     k, n = np.arange(len(low) - 1), len(low)
     faces = np.concatenate([np.stack([k, k + 1, n + k], 1), np.stack([k + 1, n + k + 1, n + k], 1)])
     return _oriented(Triangles(np.concatenate([low, high]), np.concatenate([normals, normals]), faces))
 
 
 def _ball(solid: Sphere) -> Triangles:
-    """Rings between two poles; one vertex a place, so that the mesh is closed."""
+    """Rings between two poles, with shared vertices, so that the mesh is closed."""
     azimuth = _angles(solid.radius)[:-1]
     columns, rings = len(azimuth), len(azimuth) // 2
     polar = (np.pi * np.arange(1, rings) / rings)[:, None]
@@ -134,7 +134,7 @@ def _ball(solid: Sphere) -> Triangles:
 
 
 def _bowl(outer: Cylinder, hole: Cylinder) -> list[Triangles]:
-    """A hole from above, about the same axis, that does not reach the bottom."""
+    """A coaxial hole from above that ends before the bottom."""
     angles, top = _angles(outer.radius), outer.length
     depth = float((hole.base - outer.base) @ outer.axis)
     outside = [_rim(outer, height, angles) for height in (0.0, top)]
@@ -150,7 +150,7 @@ def _bowl(outer: Cylinder, hole: Cylinder) -> list[Triangles]:
 
 
 def _arch(outer: Polyhedron, hole: Cylinder) -> list[Triangles]:
-    """A box with a half-round hole from end to end, whose axis lies in one of its faces."""
+    """A box with a half-cylinder hole from end to end, whose axis lies in one face."""
     along = outer.plane_normals @ hole.axis
     gaps = outer.plane_offsets - outer.plane_normals @ hole.base
     (bottom,) = np.flatnonzero((np.abs(along) < 1e-9) & (np.abs(gaps) < 1e-9))
@@ -172,7 +172,7 @@ def _arch(outer: Polyhedron, hole: Cylinder) -> list[Triangles]:
 def _around_hole(
     outer: Polyhedron, hole: Cylinder, center: Floats, up: Floats, walls: NDArray[np.intp]
 ) -> tuple[Floats, Floats]:
-    """[n, 3] points of the half circle, and where the rays through them from `center` meet the `walls`."""
+    """[n, 3] points of the half circle, and hits of the rays from `center` through them with the `walls`."""
     right = np.cross(up, hole.axis)
     offset = outer.corners - center
     offset = offset[np.abs(offset @ hole.axis) < 1e-9]
@@ -182,12 +182,14 @@ def _around_hole(
     rays = np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * up
     normals = outer.plane_normals[walls]
     slopes = rays @ normals.T
-    reach = np.where(slopes > 1e-9, (outer.plane_offsets[walls] - normals @ center) / np.maximum(slopes, 1e-9), np.inf)
-    return center + hole.radius * rays, center + reach.min(axis=1)[:, None] * rays
+    distances = np.where(
+        slopes > 1e-9, (outer.plane_offsets[walls] - normals @ center) / np.maximum(slopes, 1e-9), np.inf
+    )
+    return center + hole.radius * rays, center + distances.min(axis=1)[:, None] * rays
 
 
 def _feet(first: Floats, second: Floats, outer: Polyhedron, bottom: int) -> list[Triangles]:
-    """What is left of the bottom face on both sides of the hole, between the ends of its two arcs."""
+    """The parts of the bottom face on both sides of the hole."""
     face, normal = _outline(outer, bottom), outer.plane_normals[bottom]
     sideways = first[-1] - first[0]
     middle = (first[-1] + first[0]) / 2
@@ -200,7 +202,7 @@ def _feet(first: Floats, second: Floats, outer: Polyhedron, bottom: int) -> list
 
 
 def _oriented(mesh: Triangles) -> Triangles:
-    """Without faces that have no area, and with the others' corners counter-clockwise seen along the normals."""
+    """Without degenerate faces, and with corners counter-clockwise seen from the side of the normals."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     crosses = np.cross(b - a, c - a)
     agrees = (crosses * mesh.normals[mesh.faces].sum(axis=1)).sum(axis=1) >= 0

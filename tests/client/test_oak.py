@@ -147,7 +147,7 @@ def test_the_second_ctrl_c_interrupts() -> None:
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before
-    with stop_on_interrupt(wanted=False):
+    with stop_on_interrupt(enabled=False):
         assert signal.getsignal(signal.SIGINT) is before
 
 

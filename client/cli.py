@@ -294,7 +294,7 @@ def model(
     done = model_of_source(opened, chosen, cell_m, track)
     write_model(done.mesh, out)
     counts = f"{len(chosen)} frames, {done.points} points, {len(done.mesh.triangles)} triangles"
-    say(f"{counts}, {done.flipped} normals turned to the camera, written to {out}")
+    say(f"{counts}, {done.flipped} normals flipped towards the camera, written to {out}")
 
 
 @app.command()

@@ -145,7 +145,7 @@ GALLERY: dict[str, GalleryScene] = {
         (GalleryObject(0.2, (0.0, -1.2, 2.5)),),
     ),
     "shadow-falls-in": GalleryScene(
-        "a ball beside the picture, whose shadow the sun throws into it",
+        "a ball beside the picture, whose sharp shadow falls into the picture",
         _FLOOR,
         _SUN,
         _always({"composite", "prepare_rays", "light_objects", "shadow_real", "mark_changes", "bounce_real"}, _MAPPED),
@@ -177,7 +177,7 @@ GALLERY: dict[str, GalleryScene] = {
         (GalleryObject(0.2, (0.0, 0.0, 0.0), is_box=True),),
     ),
     "dark-floor": GalleryScene(
-        "a matt ball on a floor that sends next to nothing, seen from above",
+        "a matt ball on a floor that reflects almost nothing, seen from above",
         _DARK_FLOOR,
         _SOFT,
         _always(_STANDS),
@@ -255,7 +255,7 @@ GALLERY: dict[str, GalleryScene] = {
         held_frames=range(SETTLED + HELD, STILL_FRAMES),
     ),
     "still-and-empty": GalleryScene(
-        "nothing virtual, before a camera that stands still",
+        "no virtual object, a still camera",
         _FLOOR,
         _SUN,
         _always({"composite"}),
@@ -274,7 +274,7 @@ GALLERY: dict[str, GalleryScene] = {
         held_frames=range(SETTLED_NOISY, STILL_FRAMES),
     ),
     "still-tracked": GalleryScene(
-        "nothing virtual, before a camera that stands still, with noise, and nobody tells where it is",
+        "no virtual object, a still camera with noise and without given poses",
         _FLOOR,
         _SOFT,
         _always({"composite"}),
@@ -293,7 +293,7 @@ GALLERY: dict[str, GalleryScene] = {
         held_frames=range(SETTLED_NOISY, CHANGE_FRAME + 1),
     ),
     "lamp-switches-while-still": GalleryScene(
-        "the same box in a light that is to be found, of which a part goes out",
+        "the same box in an estimated light, one part of which is switched off",
         _FLOOR,
         _SUN,
         _always(_STANDS, {"match_average", "bounce_real"}),
@@ -315,7 +315,7 @@ GALLERY: dict[str, GalleryScene] = {
         held_frames=range(SETTLED_NOISY, CHANGE_FRAME),
     ),
     "hand": GalleryScene(
-        "a real ball moves in above a virtual one, which shall be as bright beside the picture",
+        "a real ball moves in above a virtual one, with brightness matched to the picture",
         (*_FLOOR, _HAND),
         _SOFT,
         _always(_STANDS, {"match_average", "bounce_real"}),

@@ -46,7 +46,7 @@ def _series(random: np.random.Generator, number: int) -> dict[str, Any]:
         steps.append({"kind": "answered", **asdict(frame), **told})
         steps += [_asked(random, adaptive, frame) for _ in range(3)]
         now_s = frame.answered_s - float(random.uniform(0, 0.5)) * (frame.answered_s - frame.sent_s)
-    return {"source_interval_s": wanted_s, "delay_s": None if delay_s == math.inf else delay_s, "steps": steps}
+    return {"wanted_interval_s": wanted_s, "delay_s": None if delay_s == math.inf else delay_s, "steps": steps}
 
 
 def _measured(

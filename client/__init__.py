@@ -1,6 +1,6 @@
-"""Thin clients and the command line."""
+"""Command line, Python client and web page."""
 
 import os
 
-# Its threads wait in busy loops, and take the cores from PoCL's. NumPy reads this once, when it is first imported.
+# Its threads busy-wait and take cores from PoCL. NumPy reads the variable only when it is first imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -1,4 +1,4 @@
-"""The command line. A user's error ends in one line on standard error: status 2 for usage, 1 for anything else."""
+"""Command line. An error of the user ends with one line on standard error: status 2 for usage, 1 otherwise."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Annotated
 
 import typer
 
-from client import capture_options as o
-from client.capture_options import CaptureOptions, capturing
-from client.laptop.errors import OptionError
-from client.options import prepare, refuse_depth_noise, refuse_video
+from client.errors import OptionError
+from client.options import capture_options as o
+from client.options.capture import prepare, refuse_depth_noise, refuse_video
+from client.options.capture_options import CaptureOptions, capturing
 from client.progress import Stopwatch, note, progress_bar, say, track
 
 USAGE_STATUS, FAILURE_STATUS, INTERRUPTED_STATUS = 2, 1, 130
@@ -28,7 +28,7 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Entry point: runs the command and turns every error into one line."""
+    """Entry point: run the command; every error is one line."""
     arguments = [word for word in sys.argv[1:] if word != "--debug"]
     sys.exit(run_command(arguments, debug="--debug" in sys.argv[1:]))
 
@@ -40,7 +40,7 @@ def run_command(arguments: list[str], debug: bool = False) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED_STATUS
     except BrokenPipeError:
-        # The reader of our output is gone; nothing more can be told to it, at exit neither.
+        # The reader of stdout is gone; flushing at exit must not fail.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILURE_STATUS
     except Exception as error:
@@ -62,7 +62,9 @@ def _one_line(error: Exception) -> str:
 
 @app.callback()
 def common(
-    debug: Annotated[bool, typer.Option("--debug", help="show the traceback of an error; may stand anywhere")] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="show the traceback of an error; valid at any position")
+    ] = False,
 ) -> None:
     """Lights virtual objects with the room's own light, with no light probe."""
 
@@ -71,19 +73,19 @@ def common(
 @capturing
 def run(
     options: CaptureOptions,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="folder for what is written")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="output folder")],
     mesh: o.Mesh = False,
     device: o.DeviceOption = None,
 ) -> None:
-    """The pipeline in one process, no network."""
+    """Run the pipeline in one process, without a network."""
     capture = prepare(options)
-    from client.laptop.output import OutputWriter
-    from client.laptop.run import Run
+    from client.commands.run import Run
+    from client.display.output_folder import OutputWriter
 
     if mesh:
         from server.meshing.surface import find_library
 
-        find_library()  # before the frames, not after them
+        find_library()  # a missing library is an error before the frames, not after
     watch = Stopwatch()
     with OutputWriter(out) as writer, Run(capture, device, note) as pipeline:
         for output in track(pipeline.outputs(), capture.total):
@@ -99,12 +101,14 @@ def run(
 @capturing
 def explain(
     options: CaptureOptions,
-    frame: Annotated[int | None, typer.Option(metavar="N", help="position in the source; default: the fifth")] = None,
+    frame: Annotated[
+        int | None, typer.Option(metavar="N", help="position in the source; default: the fifth frame")
+    ] = None,
     device: o.DeviceOption = None,
 ) -> None:
-    """The plan of a frame in words: what runs and what for, what is left out and why."""
+    """Explain the plan of a frame: which effects run, which are left out, and why."""
     capture = prepare(options)
-    from client.explain import explain as explain_frame
+    from client.commands.explain import explain as explain_frame
 
     for line in explain_frame(capture, frame, device):
         say(line)
@@ -117,32 +121,39 @@ def stream(
     server: Annotated[
         str, typer.Option(metavar="URL", help="as the server prints it: http://localhost:8080/?token=...")
     ],
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for what is written")] = None,
-    record: Annotated[Path | None, typer.Option(metavar="FILE", help="keep what is sent as a recording")] = None,
-    lossless: Annotated[bool, typer.Option("--lossless", help="raw colour, and every frame is waited for")] = False,
-    adapt: Annotated[bool, typer.Option(help="picture quality, size and rate follow what the link carries")] = True,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="output folder")] = None,
+    record: Annotated[Path | None, typer.Option(metavar="FILE", help="write all messages into a recording")] = None,
+    lossless: Annotated[
+        bool, typer.Option("--lossless", help="raw colour and exact depth; wait for every answer")
+    ] = False,
+    adapt: Annotated[bool, typer.Option(help="adapt picture quality, size and rate to the link")] = True,
     depth_noise: Annotated[
-        float | None, typer.Option(metavar="M", help="of the sensor at 1 m: depth may be rounded by that times z^2")
+        float | None,
+        typer.Option(metavar="M", help="noise of the sensor at 1 m; depth may be rounded by this times z^2"),
     ] = None,
     video: Annotated[
-        str | None, typer.Option(metavar="h264", help="colour as video instead of JPEG, where both sides have PyAV")
+        str | None, typer.Option(metavar="h264", help="colour as video instead of JPEG; both sides need PyAV")
     ] = None,
     answer: Annotated[
         str | None,
-        typer.Option(metavar="picture|layer|light", help="layer: put over the picture here; default: picture"),
+        typer.Option(metavar="picture|layer|light", help="layer: composed here; default: picture"),
     ] = None,
-    view: Annotated[bool, typer.Option("--view", help="the picture in the terminal, in half blocks")] = False,
+    view: Annotated[bool, typer.Option("--view", help="show the picture in the terminal")] = False,
     mesh: o.Mesh = False,
     room: o.RoomName = None,
     room_key: o.RoomKey = None,
     room_from_world: o.RoomFromWorld = None,
     marker: o.MarkerOption = None,
     token: o.Token = None,
-    tls_fingerprint: Annotated[str | None, typer.Option(metavar="SHA256", help="of the server's certificate")] = None,
-    tls_ca: Annotated[Path | None, typer.Option(metavar="FILE", help="who vouches for its certificate, PEM")] = None,
+    tls_fingerprint: Annotated[
+        str | None, typer.Option(metavar="SHA256", help="fingerprint of the server's certificate")
+    ] = None,
+    tls_ca: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="authority that signed its certificate, PEM")
+    ] = None,
     device: o.DeviceOption = None,
 ) -> None:
-    """The laptop client: sends a source to a server and shows what comes back."""
+    """Send a source to a server, show and write the answers."""
     if device is not None:
         raise OptionError("--device: the server has the device; name it there with probeless serve --device")
     if mesh and out is None:
@@ -150,16 +161,25 @@ def stream(
     refuse_depth_noise(depth_noise, lossless)
     refuse_video(video, lossless)
     capture = prepare(options, lossless=lossless, answer=answer)
-    from client.client import Access
-    from client.laptop.stream import Sending
-    from client.laptop.stream import stream as send
-    from client.room_options import room_place
+    from client.commands.stream import Sending
+    from client.commands.stream import stream as send
+    from client.options.room_options import room_place
+    from client.streaming.client import Access
 
-    place = room_place(room, room_from_world, marker, room_key)
-    access = Access(token, tls_fingerprint, tls_ca)
-    others = {"frames": capture.frames, "mesh": mesh, "room": place, "access": access}
-    others["sending"] = Sending(adapt, depth_noise, view, video is not None)
-    done = send(capture.source, server, capture.objects, capture.wishes, out, lossless, record, **others)
+    done = send(
+        capture.source,
+        server,
+        capture.objects,
+        capture.wishes,
+        out,
+        lossless,
+        record,
+        frames=capture.frames,
+        mesh=mesh,
+        room=room_place(room, room_from_world, marker, room_key),
+        access=Access(token, tls_fingerprint, tls_ca),
+        sending=Sending(adapt, depth_noise, view, video is not None),
+    )
     written = f", written to {out}" if out is not None else ""
     speed = done.answered / done.seconds if done.seconds > 0 else 0.0
     say(
@@ -171,37 +191,43 @@ def stream(
 @app.command()
 def serve(
     host: Annotated[str, typer.Option(help="address to listen on; 0.0.0.0 for all")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0: a free one")] = 8080,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free port")] = 8080,
     device: o.DeviceOption = None,
     token: o.ServeToken = None,
-    insecure: Annotated[bool, typer.Option("--insecure", help="with --token none: really for everybody")] = False,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="with --token none: allow access from other machines")
+    ] = False,
     allow_origin: o.AllowOrigin = None,
-    tls: Annotated[bool, typer.Option("--tls", help="https and wss, with a certificate made once and kept")] = False,
-    tls_cert: Annotated[Path | None, typer.Option(metavar="FILE", help="a certificate of yours, PEM")] = None,
-    tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="its key, PEM")] = None,
-    volume_memory: Annotated[int | None, typer.Option(metavar="MIB", help="of one volume; default 512")] = None,
-    sessions: Annotated[int | None, typer.Option(min=1, help="that capture at once; default 16")] = None,
-    sessions_per_address: Annotated[int | None, typer.Option(min=1, help="of one client; default 8")] = None,
-    objects: Annotated[Path | None, typer.Option(metavar="DIR", help="models that clients may place, by name")] = None,
+    tls: Annotated[
+        bool, typer.Option("--tls", help="https and wss, with a self-signed certificate that is kept")
+    ] = False,
+    tls_cert: Annotated[Path | None, typer.Option(metavar="FILE", help="own certificate, PEM")] = None,
+    tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="key of the certificate, PEM")] = None,
+    volume_memory: Annotated[int | None, typer.Option(metavar="MIB", help="memory of one volume; default 512")] = None,
+    sessions: Annotated[int | None, typer.Option(min=1, help="concurrent capturing sessions; default 16")] = None,
+    sessions_per_address: Annotated[
+        int | None, typer.Option(min=1, help="concurrent sessions of one client; default 8")
+    ] = None,
+    objects: Annotated[Path | None, typer.Option(metavar="DIR", help="models that clients may place by name")] = None,
     data: Annotated[
-        str | None, typer.Option(metavar="DIR|none", help="where rooms are kept; default: the user's data folder")
+        str | None, typer.Option(metavar="DIR|none", help="folder of saved rooms; default: the user's data folder")
     ] = None,
     data_gib: Annotated[
         float | None,
-        typer.Option(min=0, help="that rooms may take there, oldest removed first; default 16, 0: no limit"),
+        typer.Option(min=0, help="limit of saved rooms, oldest removed first; default 16, 0: no limit"),
     ] = None,
     data_days: Annotated[
-        float | None, typer.Option(min=0, help="after which rooms nobody entered are removed; default 180, 0: never")
+        float | None, typer.Option(min=0, help="unused saved rooms are removed after this; default 180, 0: never")
     ] = None,
-    log: Annotated[str, typer.Option(metavar="text|json", help="how events are written to standard error")] = "text",
+    log: Annotated[str, typer.Option(metavar="text|json", help="format of events on standard error")] = "text",
 ) -> int:
-    """The server. It asks for a token, which the URL that it prints brings along."""
-    from client.serving import (
+    """Run the server. It requires a token, which is part of the URL that it prints."""
+    from client.options.serve_options import (
         ServeOptions,
         authenticator_of,
         certificate_of,
         data_folder,
-        leave_soon,
+        exit_soon,
         limits_of,
         log_format_of,
         objects_folder,
@@ -226,27 +252,29 @@ def serve(
     limits, authenticator, log_format = limits_of(options), authenticator_of(options), log_format_of(log)
     certificate = certificate_of(options)
     log_events(log_format)
-    kept_in = data_folder(data)
-    others = {
-        "limits": limits,
-        "authenticator": authenticator,
-        "certificate": certificate,
-        "objects": objects_folder(objects),
-    }
-    status = serve_forever(host, port, device, data=kept_in, **others)
-    leave_soon(status)
+    status = serve_forever(
+        host,
+        port,
+        device,
+        data=data_folder(data),
+        limits=limits,
+        authenticator=authenticator,
+        certificate=certificate,
+        objects=objects_folder(objects),
+    )
+    exit_soon(status)
     return status
 
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="folder for what is written")] = Path("out/demo"),
-    keep: Annotated[bool, typer.Option("--keep", help="leave the server running to look at the page")] = False,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="of the page; 0: a free one")] = 0,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="output folder")] = Path("out/demo"),
+    keep: Annotated[bool, typer.Option("--keep", help="keep the server running for the page")] = False,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port of the page; 0: any free port")] = 0,
     device: o.DeviceOption = None,
 ) -> None:
-    """Server and client together on a synthetic scene; pictures in out/demo."""
-    from client.laptop.demo import run_demo
+    """Run server and client on a synthetic scene; pictures in out/demo."""
+    from client.commands.demo import run_demo
 
     run_demo(out, device, keep, port)
 
@@ -254,34 +282,34 @@ def demo(
 @app.command()
 def model(
     source: o.SourceArgument,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="what is written: .ply (world axes) or .glb (+y up)")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="output file: .ply (world axes) or .glb (+y up)")],
     frames: o.Frames = None,
     voxel: o.Voxel = None,
 ) -> None:
-    """A static scene's posed frames as one triangle mesh, made offline from a point cloud."""
-    from client.laptop.static_model import check_output, model_of_source, open_posed, write_model
+    """Reconstruct a triangle mesh of a static scene from posed frames, offline."""
+    from client.static_model.model import check_output, model_of_source, open_posed, write_model
 
     check_output(out)
     opened, chosen, cell_m = open_posed(source, frames, voxel)
     done = model_of_source(opened, chosen, cell_m, track)
     write_model(done.mesh, out)
     counts = f"{len(chosen)} frames, {done.points} points, {len(done.mesh.triangles)} triangles"
-    say(f"{counts}, {done.turned} normals turned to the camera, written to {out}")
+    say(f"{counts}, {done.flipped} normals flipped towards the camera, written to {out}")
 
 
 @app.command()
 def devices() -> None:
-    """OpenCL devices, and which one would be used."""
-    from client.laptop.devices import show_devices
+    """List the OpenCL devices and the default one."""
+    from client.commands.devices import show_devices
 
     show_devices()
 
 
 @app.command()
 def tune(device: o.DeviceOption = None) -> None:
-    """This device's front of accuracy against time, measured once and kept for --budget-ms and --preset auto."""
-    from client.laptop.tune import lines_of
-    from client.laptop.tune import tune as measure
+    """Measure accuracy against time on this device, for --budget-ms, --max-light-error and --preset auto."""
+    from client.tuning.tune import lines_of
+    from client.tuning.tune import tune as measure
     from server.opencl.device import open_device
     from server.quality.pareto_front import write_front
 
@@ -294,15 +322,21 @@ def tune(device: o.DeviceOption = None) -> None:
 
 @app.command()
 def bench(
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="what to measure")],
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="name of the suite")],
     json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="fewer frames and trials")] = False,
-    scenes: Annotated[str | None, typer.Option(metavar="LIST", help="of accuracy; default: all that are here")] = None,
-    engine: Annotated[str | None, typer.Option(metavar="serial|ray", help="of accuracy: where points are run")] = None,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="of accuracy; default: out/bench/accuracy")] = None,
+    scenes: Annotated[
+        str | None, typer.Option(metavar="LIST", help="suite accuracy: scenes; default: all that are available")
+    ] = None,
+    engine: Annotated[
+        str | None, typer.Option(metavar="serial|ray", help="suite accuracy: where points are measured")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="suite accuracy: output folder; default: out/bench/accuracy")
+    ] = None,
     device: o.DeviceOption = None,
 ) -> None:
-    """Measure, and compare with the goals."""
-    from client.bench import run_bench
+    """Run a benchmark suite and compare with its goals."""
+    from client.commands.bench import run_bench
 
     run_bench(suite, json, quick, {"scenes": scenes, "engine": engine, "out": out, "device": device})

@@ -1,4 +1,4 @@
-"""What the user sees while frames are processed: a bar on standard error, a line at the end."""
+"""Progress bars and notes on standard error, results on standard output."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ T = TypeVar("T")
 
 
 class FramesPerSecond(ProgressColumn):
-    """Frames in a second, over the last few."""
+    """Column with recent frames per second."""
 
     def render(self, task: Task) -> Text:
         return Text(f"{task.speed:.1f} frames/s" if task.speed else "- frames/s")
 
 
 def track(items: Iterable[T], total: int | None) -> Iterator[T]:
-    """The items, with a bar on standard error where that is a terminal. `total`: None where they have no end."""
+    """The items, with a progress bar if standard error is a terminal. `total`: None: unknown."""
     columns = (BarColumn(), MofNCompleteColumn(), FramesPerSecond(), TextColumn("left"), TimeRemainingColumn())
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
@@ -35,7 +35,7 @@ def track(items: Iterable[T], total: int | None) -> Iterator[T]:
 
 @contextmanager
 def progress_bar(name: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar on standard error, where that is a terminal, moved by calls with what is done and what there is in all."""
+    """A progress bar if standard error is a terminal; yields a function of (done, total) that updates it."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
@@ -44,7 +44,7 @@ def progress_bar(name: str) -> Iterator[Callable[[int, int], None]]:
 
 
 class Stopwatch:
-    """Counts frames and the seconds they took."""
+    """Counts frames and measures their time."""
 
     def __init__(self) -> None:
         self._start_s = time.perf_counter()
@@ -57,12 +57,12 @@ class Stopwatch:
 
 
 def say(text: str) -> None:
-    """A line of result on standard output."""
+    """Print a line of result on standard output."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 
 
 def note(text: str) -> None:
-    """A line of comment on standard error."""
+    """Print a note on standard error."""
     sys.stderr.write(f"probeless: {text}\n")
     sys.stderr.flush()

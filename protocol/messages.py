@@ -42,6 +42,7 @@ Poses = Literal["given", "track", "refine"]
 Dictionary = Literal["4x4_50", "5x5_100", "6x6_250", "7x7_1000", "apriltag_36h11"]
 Tracking = Literal["given", "tracked", "lost"]
 MeshFormat = Literal["ply", "glb"]
+ObjectFormat = Literal["glb", "obj", "ply", "stl"]
 ColorCodec = Literal["jpeg", "png", "raw", "h264"]
 DepthCodec = Literal["raw", "zdelta", "zranks", "zstd-delta", "zstd-ranks"]
 
@@ -260,7 +261,7 @@ class PlaceObject(Message, frozen=True, kw_only=True, tag="place_object"):
 
     request: Index
     object: Name
-    format: Literal["glb", "obj", "ply", "stl"]
+    format: ObjectFormat
     data: Annotated[bytes, Meta(max_length=MAX_MESH_BYTES)]
     position_m: Vector3 | None = None
     """World position of the bottom centre of the model's box; None: the vertices are world coordinates already."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-import msgpack  # type: ignore[import-untyped]
+import msgpack
 import msgspec
 
 from protocol.codec import ProtocolError, encode

@@ -89,8 +89,8 @@ def cycle_of(graph: Graph) -> list[str] | None:
     return None
 
 
-def server_folder(module: str) -> str:
-    """The folder of server/ that a module lies in; a file at the top of server/ stands for itself."""
+def folder_of_package(module: str) -> str:
+    """The folder directly below the package, such as server.volume; a file at the top of the package is its own."""
     parts = module.split(".")
     return ".".join(parts[:2])
 
@@ -105,10 +105,11 @@ def test_no_file_imports_itself_through_others() -> None:
     assert cycle_of(project()) is None
 
 
-def test_the_folders_of_the_server_form_no_cycle() -> None:
-    modules = {module for module in project() if module.startswith("server.")}
+@pytest.mark.parametrize("package", ["server", "client"])
+def test_the_folders_of_a_package_form_no_cycle(package: str) -> None:
+    modules = {module for module in project() if module.startswith(f"{package}.")}
     inside = {module: project()[module] & modules for module in modules}
-    assert cycle_of(folded(inside, server_folder)) is None
+    assert cycle_of(folded(inside, folder_of_package)) is None
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,8 @@
-"""Builds the page into client/web/dist with the Node.js that comes from PyPI: `python -m client.web.build`.
+"""Build the page into client/web/dist with Node.js from PyPI: `python -m client.web.build`.
 
-`--package FOLDER` packs the client for programs instead, as an npm package.
+`--package FOLDER` packs the npm package of the client library instead.
 
-The built page is part of the repository, so that running probeless needs no Node.js; a test holds it to its sources.
+The built page is part of the repository, so running probeless needs no Node.js; a test compares it with its sources.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def npm(*arguments: str, folder: Path = FOLDER) -> None:
 
 
 def install(folder: Path = FOLDER) -> None:
-    """Put the packages of package-lock.json, and no others, into `folder`/node_modules; runs none of their scripts."""
+    """Install exactly the packages of package-lock.json into `folder`/node_modules, without running their scripts."""
     npm("ci", "--ignore-scripts", "--no-audit", "--no-fund", "--prefer-offline", folder=folder)
 
 
@@ -50,7 +50,7 @@ def pack(output: Path, folder: Path = FOLDER) -> None:
 
 
 def main() -> int:
-    """Install and build; on failure say what npm said."""
+    """Install and build; on failure, print the output of npm."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--out", type=Path, default=FOLDER / "dist", help="folder of the built page")
     options.add_argument("--package", type=Path, metavar="FOLDER", help="pack the npm package into it instead")

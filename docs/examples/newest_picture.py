@@ -6,8 +6,8 @@ import sys
 import numpy as np
 from stream_frames import CAMERA, my_frames
 
-from client.client import Answer, StreamClient
-from client.layers import DecodedLayer, decode_layer, put_over
+from client.display.layers import DecodedLayer, decode_layer, put_over
+from client.streaming.client import Answer, StreamClient
 from protocol.messages import Wishes
 
 SIGN = b"v -1 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\nf 3 2 1\n"

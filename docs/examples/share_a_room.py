@@ -5,7 +5,7 @@ import sys
 
 from stream_frames import CAMERA, my_frames
 
-from client.client import Answer, RoomPlace, StreamClient
+from client.streaming.client import Answer, RoomPlace, StreamClient
 from protocol.messages import Light, Wishes
 
 TRIANGLE = b"v 0 0 0\nv 0.2 0 0\nv 0 0.2 0\nf 1 2 3\n"

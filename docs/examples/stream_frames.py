@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from client.client import Answer, StreamClient
+from client.streaming.client import Answer, StreamClient
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import decode_color
 from protocol.messages import Light, Wishes

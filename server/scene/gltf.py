@@ -64,7 +64,7 @@ def _connect_materials(header: Json, materials: list[GltfMaterial]) -> tuple[str
 
 
 def _told(header: Json) -> tuple[str, ...]:
-    """Notes of the file's author (client/laptop/obj_to_glb.py writes them) and on unsupported extensions."""
+    """Notes of the file's author (client/objects/obj_to_glb.py writes them) and on unsupported extensions."""
     notes = header["asset"].get("extras", {}).get("notes", [])
     told = tuple(" ".join(str(note).split())[:_NOTE_CHARS] for note in notes[:_MOST_NOTES])
     missing = {str(name) for name in header.get("extensionsRequired", [])} - _KNOWN_EXTENSIONS

@@ -1,4 +1,4 @@
-"""What `client.adaptive` decides over simulated links of every kind, for the page's port of it to be held to."""
+"""What `client.streaming.adaptive` decides over simulated links; the port of the page must decide the same."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from client.adaptive import Adaptive, Measured
+from client.streaming.adaptive import Adaptive, AnsweredFrame
 
 SERIES, STEPS = 24, 400
 LOST_SHARE = 0.004
@@ -37,7 +37,7 @@ def _series(random: np.random.Generator, number: int) -> dict[str, Any]:
             bytes_per_s = 10 ** float(random.uniform(5, 7.3))
             computed_s = float(random.choice([0.01, 0.05, 0.2, 1.0]))
         if random.random() < LOST_SHARE:
-            adaptive.note_lost()
+            adaptive.note_reconnection()
             steps.append({"kind": "lost", "rung": adaptive.rung})
         frame = _measured(random, adaptive, now_s, bytes_per_s, computed_s)
         adaptive.note(frame)
@@ -51,16 +51,16 @@ def _series(random: np.random.Generator, number: int) -> dict[str, Any]:
 
 def _measured(
     random: np.random.Generator, adaptive: Adaptive, now_s: float, bytes_per_s: float, computed_s: float
-) -> Measured:
+) -> AnsweredFrame:
     up = int(random.uniform(0.8, 1.2) * (40_000 + 80_000 / (1 + adaptive.rung)))
     down = int(random.uniform(5_000, 60_000))
     took_s = computed_s * float(random.uniform(0.8, 1.3))
     waited_s = float(random.choice([0.0, 0.0, 0.1]))
     answered_s = now_s + 0.04 + waited_s + took_s + (up + down) / bytes_per_s + float(random.exponential(0.004))
-    return Measured(now_s, answered_s, took_s, up, down, waited_s if random.random() < 0.5 else None)
+    return AnsweredFrame(now_s, answered_s, took_s, up, down, waited_s if random.random() < 0.5 else None)
 
 
-def _asked(random: np.random.Generator, adaptive: Adaptive, frame: Measured) -> dict[str, Any]:
+def _asked(random: np.random.Generator, adaptive: Adaptive, frame: AnsweredFrame) -> dict[str, Any]:
     """At any moment, and beside the one at which the answer changes."""
     sent_s = frame.answered_s - float(random.uniform(0, 0.2))
     unanswered = int(random.choice([0, 1, 1, 1, 2]))

@@ -9,7 +9,7 @@ from statistics import median
 
 import pytest
 
-from client.adaptive import LADDER, Adaptive, Measured
+from client.streaming.adaptive import LADDER, Adaptive, AnsweredFrame
 
 FPS = 15
 DEPTH_BYTES = 80_000
@@ -35,7 +35,7 @@ class Link:
     ages_s: list[float] = field(default_factory=list)
     """Of each answered frame, from its capture."""
 
-    def send(self, sent_s: float, size: int) -> Measured:
+    def send(self, sent_s: float, size: int) -> AnsweredFrame:
         arrived_s = max(sent_s, self.up_free_s) + size / self.bytes_per_s
         self.up_free_s = arrived_s
         here_s = arrived_s + self.delay_s
@@ -44,13 +44,13 @@ class Link:
         self.server_free_s = done_s
         self.down_free_s = max(done_s, self.down_free_s) + ANSWER_BYTES / self.bytes_per_s
         waited_s = begun_s - here_s if self.says_wait else None
-        return Measured(sent_s, self.down_free_s + self.delay_s, self.computed_s, size, ANSWER_BYTES, waited_s)
+        return AnsweredFrame(sent_s, self.down_free_s + self.delay_s, self.computed_s, size, ANSWER_BYTES, waited_s)
 
 
 def stream(adaptive: Adaptive, link: Link, seconds: float, start_s: float = 0.0, color: tuple = COLOR_BYTES) -> list:
     """Send for a time; the frames' records. The camera's newest frame is never older than a frame's time."""
     now_s, last_s = start_s, -1e9
-    under_way: list[tuple[float, Measured]] = []
+    under_way: list[tuple[float, AnsweredFrame]] = []
     done = []
     while now_s < start_s + seconds:
         now_s += 0.001
@@ -114,7 +114,7 @@ class _Fixed(Adaptive):
     def may_send(self, _now_s: float, _last_sent_s: float, unanswered: int) -> bool:
         return unanswered < 2
 
-    def note(self, _frame: Measured) -> None: ...
+    def note(self, _frame: AnsweredFrame) -> None: ...
 
 
 def test_pacing_keeps_frames_younger_than_the_window_does() -> None:
@@ -195,10 +195,10 @@ def test_throughput_is_told() -> None:
 
 def test_after_a_lost_connection_it_begins_a_rung_lower() -> None:
     adaptive = Adaptive(1 / FPS)
-    adaptive.note_lost()
+    adaptive.note_reconnection()
     assert adaptive.rung == 1
     for _ in range(20):
-        adaptive.note_lost()
+        adaptive.note_reconnection()
     assert adaptive.rung == len(LADDER) - 1
 
 

@@ -6,10 +6,10 @@ import sys
 
 import pytest
 
-from client import bench
-from client.bench import SUITES, find_suite
 from client.cli import FAILURE_STATUS, run_command
-from client.laptop.errors import OptionError
+from client.commands import bench
+from client.commands.bench import SUITES, find_suite
+from client.errors import OptionError
 from server.opencl import device
 
 

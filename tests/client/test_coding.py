@@ -6,11 +6,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from client.coding import Coding, frame_message, picture_bytes
-from client.depth_rounding import round_depth
-from client.laptop.errors import OptionError
-from client.options import refuse_video
-from client.video import VideoEncoder
+from client.errors import OptionError
+from client.options.capture import refuse_video
+from client.streaming.coding import Coding, frame_message, picture_bytes
+from client.streaming.depth_rounding import round_depth
+from client.streaming.video import VideoEncoder
 from protocol.codec import ProtocolError, decode_client, encode
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import decode_color, decode_depth, encode_color
@@ -109,7 +109,7 @@ def test_video_that_cannot_be_is_refused(codec: str, lossless: bool, words: str)
 
 
 def test_without_its_library_video_is_refused_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("client.video.IS_POSSIBLE", False)
+    monkeypatch.setattr("client.streaming.video.IS_POSSIBLE", False)
     with pytest.raises(OptionError, match="needs PyAV, which is not installed: make install-video"):
         refuse_video("h264", False)
     refuse_video(None, False)
@@ -117,8 +117,8 @@ def test_without_its_library_video_is_refused_with_what_to_do(monkeypatch: pytes
 
 @pytest.mark.data
 def test_the_kitchen_takes_fewer_bytes_on_every_rung() -> None:
-    from client.adaptive import LADDER
-    from client.laptop.source import open_source
+    from client.options.source import open_source
+    from client.streaming.adaptive import LADDER
 
     source = open_source(str(data_folder("rgbd_7scenes_redkitchen")))
     sizes = [picture_bytes(frame_message(source[0], source.camera, coding=rung)) for rung in LADDER]

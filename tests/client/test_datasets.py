@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from client.laptop.errors import SourceError
-from client.laptop.source import open_source
+from client.errors import SourceError
+from client.options.source import open_source
 from tests.client import folders
 from tests.data import data_folder
 

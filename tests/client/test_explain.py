@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from client.cli import run_command
-from client.explain import PURPOSES, lines
-from client.laptop.errors import SourceError
-from client.laptop.gallery.scenes import GALLERY
-from client.laptop.source import open_source
+from client.commands.explain import PURPOSES, lines
+from client.errors import SourceError
+from client.gallery.scenes import GALLERY
+from client.options.source import open_source
 from protocol.messages import LeftOut, Plan
 from server.effects.table import effect_names
 
@@ -32,9 +32,9 @@ def test_a_plan_is_said_an_effect_a_line() -> None:
     assert "puts the picture together" in said["composite"]
     assert said["reflect"].endswith("nothing is glossy (changes nothing)")
     assert said["shadow_real"].endswith("(changes no pixel by more than 0.25/255)")
-    assert said["cover"].endswith("asked for (what that changes is not bounded)")
-    assert said["lamplight"].endswith("(what that changes is not known)")
-    assert "no pixel changes by more than 0.75/255" in text[-1]  # one reason counts once
+    assert said["cover"].endswith("asked for (change not bounded)")
+    assert said["lamplight"].endswith("(change unknown)")
+    assert "change no pixel by more than 0.75/255" in text[-1]  # one reason counts once
 
 
 def test_the_gallery_is_explained_with_its_own_things(capsys: pytest.CaptureFixture[str]) -> None:
@@ -53,7 +53,9 @@ def test_a_frame_that_there_is_not_is_refused(capsys: pytest.CaptureFixture[str]
 
 def test_the_gallery_is_as_large_as_promised() -> None:
     assert len(GALLERY) >= 12
-    assert len({scene.calls_for(0) for scene in GALLERY.values()}) >= 8  # scenes differ in what they call for
-    called_for = set().union(*(scene.calls_for(index) for scene in GALLERY.values() for index in range(scene.frames)))
+    assert len({scene.expected_effects(0) for scene in GALLERY.values()}) >= 8  # scenes differ in what they call for
+    called_for = set().union(
+        *(scene.expected_effects(index) for scene in GALLERY.values() for index in range(scene.frames))
+    )
     presets = {"draw_depth_views", "refine_virtual", "refine_real"}
     assert {*effect_names("picture")} - presets <= called_for

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from client.layers import NEUTRAL, DecodedLayer, decode_layer, put_over, shown_picture
+from client.display.layers import NEUTRAL, DecodedLayer, decode_layer, put_over, shown_picture
 from protocol.codec import ProtocolError
 from protocol.frames import CameraModel
 from protocol.images import encode_depth

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from client.laptop.errors import OptionError
-from client.laptop.light_file import read_light, read_panorama_light
-from client.options import CaptureOptions, prepare
+from client.errors import OptionError
+from client.options.capture import CaptureOptions, prepare
+from client.options.light_file import read_light, read_panorama_light
 from protocol.messages import Wishes
 from server.light.static_light import static_estimate
 from server.maths.sh import dominant_direction, webxr_from_world

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from client.capture_options import CaptureOptions
-from client.laptop.errors import SourceError
-from client.laptop.frame_source import ENDLESS, is_live
-from client.laptop.oak import OakSource
-from client.laptop.oak_pose import FLU_FROM_CAMERA, UP, PoseTrail, world_from_lens
-from client.laptop.run import Run
-from client.laptop.source import open_source
-from client.laptop.stopping import stop_on_interrupt
-from client.options import prepare
+from client.commands.run import Run
+from client.commands.stopping import stop_on_interrupt
+from client.errors import SourceError
+from client.options.capture import prepare
+from client.options.capture_options import CaptureOptions
+from client.options.source import open_source
+from client.sources.frame_source import ENDLESS, is_live
+from client.sources.oak.poses import FLU_FROM_CAMERA, UP, PoseTrail, world_from_lens
+from client.sources.oak.source import OakSource
 from protocol.frames import CameraModel, RgbdFrame
 
 CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
@@ -110,7 +110,7 @@ def test_a_camera_that_sends_nothing_is_given_back() -> None:
 
 
 def test_a_live_capture_is_prepared_from_its_first_frame(oak: OakSource, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("client.laptop.oak.open_oak", lambda options: oak if options == "vio=off" else None)
+    monkeypatch.setattr("client.sources.oak.source.open_oak", lambda options: oak if options == "vio=off" else None)
     capture = prepare(CaptureOptions("oak?vio=off"))
     assert (capture.total, capture.wishes.poses, capture.wishes.up) == (None, "given", UP)
     x0, _, z0, x1, _, z1 = capture.wishes.volume_m
@@ -122,7 +122,7 @@ def test_a_live_capture_is_prepared_from_its_first_frame(oak: OakSource, monkeyp
 
 
 def test_run_of_a_camera_ends_at_ctrl_c(oak: OakSource, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("client.laptop.oak.open_oak", lambda _options: oak)
+    monkeypatch.setattr("client.sources.oak.source.open_oak", lambda _options: oak)
     given: list[int] = []
 
     def outputs(_pipeline: object, frames: object) -> object:
@@ -132,7 +132,7 @@ def test_run_of_a_camera_ends_at_ctrl_c(oak: OakSource, monkeypatch: pytest.Monk
                 os.kill(os.getpid(), signal.SIGINT)
             yield frame
 
-    monkeypatch.setattr("client.laptop.run.process_frames", outputs)
+    monkeypatch.setattr("client.commands.run.process_frames", outputs)
     run = Run.__new__(Run)
     run._capture, run._pipeline = prepare(CaptureOptions("oak")), None
     assert len(list(run.outputs())) == 3
@@ -147,7 +147,7 @@ def test_the_second_ctrl_c_interrupts() -> None:
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before
-    with stop_on_interrupt(wanted=False):
+    with stop_on_interrupt(enabled=False):
         assert signal.getsignal(signal.SIGINT) is before
 
 
@@ -165,4 +165,6 @@ def test_an_unknown_option_of_the_camera_is_refused() -> None:
 
 
 def test_oak_modules_do_not_load_depthai() -> None:
-    assert importlib.util.find_spec("depthai") is None or "depthai" not in vars(sys.modules["client.laptop.oak"])
+    assert importlib.util.find_spec("depthai") is None or "depthai" not in vars(
+        sys.modules["client.sources.oak.source"]
+    )

@@ -15,11 +15,11 @@ for _name, _value in (("DEPTHAI_TELEMETRY", "0"), ("DEPTHAI_AUTOCALIBRATION", "O
     os.environ.setdefault(_name, _value)
 dai = pytest.importorskip("depthai", reason="depthai is an extra: make install-oak")
 
-from client.laptop.errors import SourceError  # noqa: E402
-from client.laptop.oak import OakSource, open_oak  # noqa: E402
-from client.laptop.oak_frames import FrameReader  # noqa: E402
-from client.laptop.oak_nodes import Outputs, build_nodes, has_odometry, left_from_color  # noqa: E402
-from client.laptop.oak_pose import FLU_FROM_CAMERA, UP  # noqa: E402
+from client.errors import SourceError  # noqa: E402
+from client.sources.oak.frames import FrameReader  # noqa: E402
+from client.sources.oak.nodes import Outputs, build_nodes, has_odometry, left_from_color  # noqa: E402
+from client.sources.oak.poses import FLU_FROM_CAMERA, UP  # noqa: E402
+from client.sources.oak.source import OakSource, open_oak  # noqa: E402
 from tests.absent import NO_HARDWARE  # noqa: E402
 
 FPS = 30.0

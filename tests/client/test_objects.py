@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from client.laptop.errors import ObjectError
-from client.laptop.objects import pack_mesh, parse_object
+from client.errors import ObjectError
+from client.objects.object_file import pack_mesh, parse_object
 from protocol.limits import MAX_MESH_BYTES
 from server.scene.mesh import load_mesh
 from server.scene.vase import HEIGHT_M, vase_glb

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from client.laptop.errors import OptionError, SourceError
-from client.laptop.volume import default_volume, default_voxel, with_room_to_move
-from client.options import CaptureOptions, parse_frames, parse_ray_length, prepare
+from client.errors import OptionError, SourceError
+from client.options.capture import CaptureOptions, parse_frames, parse_ray_length, prepare
+from client.sources.volume import default_volume, default_voxel, enlarged_volume
 from tests.client import folders
 
 
@@ -189,7 +189,7 @@ def test_source_without_poses_is_tracked(tmp_path: Path, source: str) -> None:
     (folder / "trajectory.log").unlink()
     capture = prepare(CaptureOptions(str(folder)))
     assert capture.wishes.poses == "track"
-    assert capture.wishes.volume_m == with_room_to_move(default_volume(capture.source, capture.frames))
+    assert capture.wishes.volume_m == enlarged_volume(default_volume(capture.source, capture.frames))
     assert prepare(CaptureOptions(str(folder), volume="0,0,0,1,2,3")).wishes.volume_m == (0, 0, 0, 1, 2, 3)
     for poses in ("given", "refine"):
         with pytest.raises(OptionError, match="--poses track"):

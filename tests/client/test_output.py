@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from client.laptop.errors import OutputError
-from client.laptop.output import FrameOutput, OutputWriter
+from client.display.output_folder import FrameOutput, OutputWriter
+from client.errors import OutputError
 from protocol.messages import LeftOut, Light, Plan, Timings
 from tests.client.lights import light_of
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from client.laptop.errors import SourceError
-from client.laptop.poses import quaternion, read_tum, rigid
+from client.errors import SourceError
+from client.sources.poses import quaternion, read_tum, rigid
 
 
 def test_quaternion_against_scipy() -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from client.laptop.errors import SourceError
-from client.laptop.source import open_source
+from client.errors import SourceError
+from client.options.source import open_source
 from protocol.frames import CameraModel
 from protocol.images import encode_color, encode_depth
 from protocol.messages import Bye, Frame, Hello, Welcome, Wishes

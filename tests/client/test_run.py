@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from client.laptop.errors import RunError
-from client.laptop.object_placing import object_id
-from client.laptop.run import process_frames
+from client.commands.run import process_frames
+from client.errors import RunError
+from client.objects.placing import object_id
 from protocol.frames import RgbdFrame
 from protocol.messages import Plan, Timings
 from tests.client.lights import light_of

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from client.laptop.errors import OptionError
-from client.serving import ServeOptions, authenticator_of, certificate_of, limits_of, objects_folder
+from client.errors import OptionError
+from client.options.serve_options import ServeOptions, authenticator_of, certificate_of, limits_of, objects_folder
 
 
 def test_a_token_is_made_unless_one_is_given() -> None:

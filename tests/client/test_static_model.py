@@ -16,20 +16,20 @@ import pytest
 import trimesh
 
 from client.cli import run_command
-from client.laptop.cloud_normals import (
+from client.errors import RunError, SourceError
+from client.options.source import open_source
+from client.static_model.cloud_normals import (
     GREATEST_RADIUS,
     LEAST_RADIUS,
     NORMAL_ERROR_RAD,
     chosen_radius_m,
     fit_planes,
+    oriented_outwards,
     smooth,
     spacing_m,
-    turned_outwards,
 )
-from client.laptop.errors import RunError, SourceError
-from client.laptop.point_cloud import CloudFusion, PointCloud, depth_noise_m, pixel_rays, usable_pixels
-from client.laptop.source import open_source
-from client.laptop.static_model import StaticModel, model_of_fusion
+from client.static_model.model import StaticModel, model_of_fusion
+from client.static_model.point_cloud import CloudFusion, PointCloud, depth_noise_m, pixel_rays, usable_pixels
 from protocol.frames import IDENTITY, CameraModel, DepthCamera, RgbdFrame
 from tests.data import data_folder
 from tests.scenes.analytic import Shape, look, look_at, plane, room, sphere
@@ -197,7 +197,7 @@ def test_order_of_frames_does_not_matter() -> None:
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_normals_are_the_surfaces(noise: float) -> None:
     """Degrees, away from edges by two radii of the smoothing."""
-    surface, _ = turned_outwards(smooth(scene_cloud(noise)))
+    surface, _ = oriented_outwards(smooth(scene_cloud(noise)))
     distance, normal = distance_and_normal(surface.cloud.points)
     off = angle_deg(surface.normals, normal)
     assert np.median(off) < (0.1, 1.5)[int(noise)]
@@ -213,13 +213,13 @@ def test_smoothing_takes_noise_away() -> None:
 
 def test_the_viewing_direction_mends_every_wrong_normal() -> None:
     smoothed = smooth(scene_cloud(1.0))
-    turned, away = turned_outwards(smoothed)
+    flipped, away = oriented_outwards(smoothed)
     _, truth = distance_and_normal(smoothed.cloud.points)
-    wrong_before, wrong_after = (angle_deg(s.normals, truth) > 90 for s in (smoothed, turned))
+    wrong_before, wrong_after = (angle_deg(s.normals, truth) > 90 for s in (smoothed, flipped))
     assert wrong_before.mean() > 0.2
     assert wrong_after.mean() < 0.002
-    np.testing.assert_array_equal(turned.normals[away], -smoothed.normals[away])
-    np.testing.assert_array_equal(turned.normals[~away], smoothed.normals[~away])
+    np.testing.assert_array_equal(flipped.normals[away], -smoothed.normals[away])
+    np.testing.assert_array_equal(flipped.normals[~away], smoothed.normals[~away])
 
 
 def flat_cloud(noise_m: float, count: int = 4000, at: tuple[float, float, float] = (0, 0, 0)) -> PointCloud:
@@ -239,7 +239,7 @@ def test_the_radius_is_the_one_that_gives_the_wanted_error() -> None:
     assert spacing == pytest.approx(1 / np.sqrt(4000), rel=0.1)
     radius = chosen_radius_m(spacing, 0.004)
     assert LEAST_RADIUS * spacing < radius < GREATEST_RADIUS * spacing
-    found, _ = turned_outwards(fit_planes(cloud, radius))
+    found, _ = oriented_outwards(fit_planes(cloud, radius))
     inner = np.abs(cloud.points).max(axis=1) < 0.35
     tilt = cloud.towards_camera[0]
     off = np.radians(angle_deg(found.normals[inner[: len(found.normals)]], tilt[None]))
@@ -344,7 +344,7 @@ def test_the_command_writes_what_viewers_open(tmp_path: Path, capsys) -> None:
     for name in ("model.ply", "model.glb"):
         command = ["model", "synthetic:table?size=160x120", "--frames", "0:3", "--voxel", "0.02", "--out"]
         assert run_command([*command, str(tmp_path / name)]) == 0
-        assert "normals turned" in capsys.readouterr().out
+        assert "normals flipped" in capsys.readouterr().out
         read = trimesh.load(tmp_path / name, force="mesh")
         assert len(read.faces) > 500
         assert np.all(read.extents > 0.2)
@@ -362,7 +362,7 @@ def test_rendered_rooms(open3d, name: str, median_deg: float) -> None:
     for i in range(0, 100, 9):
         fusion.add(source[i])
     smoothed = smooth(fusion.cloud())
-    surface, away = turned_outwards(smoothed)
+    surface, away = oriented_outwards(smoothed)
     found = scene.compute_closest_points(open3d.core.Tensor(surface.cloud.points.astype(np.float32)))
     normal = found["primitive_normals"].numpy().astype(np.float64)
     normal *= np.where((normal * surface.cloud.towards_camera).sum(axis=1) < 0, -1, 1)[:, None]

@@ -1,4 +1,4 @@
-"""What `stream` shows while it runs: figures, words, the picture in half blocks."""
+"""What `stream` shows while it runs: statistics, words, the picture in half blocks."""
 
 from __future__ import annotations
 
@@ -10,45 +10,45 @@ import pytest
 from rich.console import Console
 from rich.progress import Progress
 
-from client.coding import Coding
-from client.laptop.stream_figures import StreamFigures
-from client.laptop.stream_view import StreamView, coding_line, half_blocks, light_line
+from client.display.stream_statistics import StreamStatistics
+from client.display.stream_view import StreamView, coding_line, half_blocks, light_line
+from client.streaming.coding import Coding
 from tests.protocol.samples import SERVER
 
 LIGHT, COMPOSITE = SERVER["light"], SERVER["composite"]
 
 
 def test_a_frames_way_is_taken_apart() -> None:
-    figures = StreamFigures()
-    assert figures.percentiles("way") is None
-    figures.note_sent(7, captured_s=10.0, sent_s=10.005, size_bytes=1000)
-    figures.note_answer(7, returned_s=10.105, shown_s=10.115, computed_s=0.06, size_bytes=500, waited_s=0.01)
-    found = {stage: figures.percentiles(stage)[0] for stage in figures.milliseconds}
+    statistics = StreamStatistics()
+    assert statistics.percentiles("way") is None
+    statistics.note_sent(7, captured_s=10.0, sent_s=10.005, size_bytes=1000)
+    statistics.note_answer(7, returned_s=10.105, shown_s=10.115, computed_s=0.06, size_bytes=500, waited_s=0.01)
+    found = {stage: statistics.percentiles(stage)[0] for stage in statistics.milliseconds}
     assert found == pytest.approx({"encode": 5, "way": 30, "wait": 10, "compute": 60, "show": 10, "whole": 115})
 
 
 def test_percentiles_are_of_many_frames_and_dropped_ones_do_not_count() -> None:
-    figures = StreamFigures()
+    statistics = StreamStatistics()
     for number in range(100):
-        figures.note_sent(number, number, number, 1)
+        statistics.note_sent(number, number, number, 1)
         if number % 10:
-            figures.note_answer(number, number + 0.001 * number, number + 0.001 * number, 0.0, 1)
+            statistics.note_answer(number, number + 0.001 * number, number + 0.001 * number, 0.0, 1)
         else:
-            figures.forget(number)
-            figures.note_answer(number, number + 50.0, number + 50.0, 0.0, 1)
-    p50, p99 = figures.percentiles("whole")
+            statistics.forget(number)
+            statistics.note_answer(number, number + 50.0, number + 50.0, 0.0, 1)
+    p50, p99 = statistics.percentiles("whole")
     assert p50 == pytest.approx(50, abs=2)
     assert 95 < p99 <= 99
 
 
 def test_rates_are_of_the_last_seconds() -> None:
-    figures = StreamFigures()
+    statistics = StreamStatistics()
     for number in range(100):
-        figures.note_sent(number, number / 10, number / 10, 12_500)
-    sent, up, answered, down = figures.rates(10.0)
+        statistics.note_sent(number, number / 10, number / 10, 12_500)
+    sent, up, answered, down = statistics.rates(10.0)
     assert (sent, up) == pytest.approx((10, 1), rel=0.05)
     assert (answered, down) == (0, 0)
-    assert figures.rates(100.0) == (0, 0, 0, 0)
+    assert statistics.rates(100.0) == (0, 0, 0, 0)
 
 
 def test_half_blocks_have_the_pictures_colours() -> None:
@@ -67,10 +67,10 @@ def test_half_blocks_have_the_pictures_colours() -> None:
 def shown(is_terminal: bool, with_picture: bool = True) -> str:
     file = io.StringIO()
     console = Console(file=file, force_terminal=is_terminal, width=100, height=60, color_system="truecolor")
-    figures = StreamFigures()
-    figures.note_sent(COMPOSITE.frame, 1.0, 1.01, 90_000)
-    figures.note_answer(COMPOSITE.frame, 1.2, 1.21, 0.1, 40_000)
-    with StreamView(console, Progress(console=console), figures, with_picture) as view:
+    statistics = StreamStatistics()
+    statistics.note_sent(COMPOSITE.frame, 1.0, 1.01, 90_000)
+    statistics.note_answer(COMPOSITE.frame, 1.2, 1.21, 0.1, 40_000)
+    with StreamView(console, Progress(console=console), statistics, with_picture) as view:
         picture = np.full((40, 60, 3), 9, np.uint8)
         view.show(1.3, LIGHT, COMPOSITE, picture, Coding(65, 2, depth_noise_per_m=0.003), reconnected=2)
         assert view.wants_pictures is (is_terminal and with_picture)

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from client.laptop.synthetic import cache
-from client.laptop.synthetic.bake import bake, blocked_directions, fill_buried
-from client.laptop.synthetic.charts import Grid, PlaneChart, SphereChart, atlas
-from client.laptop.synthetic.hand import capsules
-from client.laptop.synthetic.harmonics import basis, sphere_directions, unshadowed_transfer
-from client.laptop.synthetic.lights import ring_light
-from client.laptop.synthetic.rounds import Sphere
-from client.laptop.synthetic.shapes import Solid, box
-from client.laptop.synthetic.source import SyntheticSource, open_synthetic
+from client.synthetic import cache
+from client.synthetic.lighting.bake import bake, blocked_directions, fill_buried
+from client.synthetic.lighting.harmonics import basis, sphere_directions, unshadowed_transfer
+from client.synthetic.lighting.lights import ring_light
+from client.synthetic.scenes.hand import capsules
+from client.synthetic.solids.charts import Grid, PlaneChart, SphereChart, atlas
+from client.synthetic.solids.polyhedra import Solid, box
+from client.synthetic.solids.round import Sphere
+from client.synthetic.source import SyntheticSource, open_synthetic
 
 BRUTE_DIRECTIONS = 40_000
 """The brute force's own error is then below 1e-3 of the light."""

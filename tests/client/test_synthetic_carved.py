@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from client.laptop.synthetic.bake import bake
-from client.laptop.synthetic.carved import Carved
-from client.laptop.synthetic.charts import atlas
-from client.laptop.synthetic.harmonics import sphere_directions
-from client.laptop.synthetic.prisms import frustum, gable
-from client.laptop.synthetic.rounds import Cylinder
-from client.laptop.synthetic.shapes import Solid, box, rotation_about
+from client.synthetic.lighting.bake import bake
+from client.synthetic.lighting.harmonics import sphere_directions
+from client.synthetic.solids.carved import Carved
+from client.synthetic.solids.charts import atlas
+from client.synthetic.solids.polyhedra import Solid, box, rotation_about
+from client.synthetic.solids.prisms import frustum, gable
+from client.synthetic.solids.round import Cylinder
 
 TURN = rotation_about("y", 30)
 FOOT = np.array([0.2, -0.1, 0.3])

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from client.laptop.errors import SourceError
-from client.laptop.light_file import read_light
-from client.laptop.source import open_source
-from client.laptop.synthetic.export import guest_ply, write_ground_truth
-from client.laptop.synthetic.guests import GUESTS
-from client.laptop.synthetic.source import SyntheticSource, open_synthetic
+from client.errors import SourceError
+from client.options.light_file import read_light
+from client.options.source import open_source
+from client.synthetic.export import guest_ply, write_ground_truth
+from client.synthetic.scenes.guests import GUESTS
+from client.synthetic.source import SyntheticSource, open_synthetic
 from server.scene.mesh import load_mesh
 
 FRAMES = (0, 30, 45)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from client.laptop.synthetic.halves import BLACK, WHITE
-from client.laptop.synthetic.source import SyntheticSource, open_synthetic
+from client.synthetic.scenes.halves import BLACK, WHITE
+from client.synthetic.source import SyntheticSource, open_synthetic
 
 
 @pytest.fixture(scope="module")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from client.laptop.errors import SourceError
-from client.laptop.synthetic.lamps import BULB_RADIUS_M, PLACES_M, Lamp, lamplight, room_lamps
-from client.laptop.synthetic.rounds import Sphere
-from client.laptop.synthetic.shapes import box
-from client.laptop.synthetic.source import SyntheticSource, open_synthetic
+from client.errors import SourceError
+from client.synthetic.lighting.lamps import BULB_RADIUS_M, PLACES_M, Lamp, lamplight, room_lamps
+from client.synthetic.solids.polyhedra import box
+from client.synthetic.solids.round import Sphere
+from client.synthetic.source import SyntheticSource, open_synthetic
 
 SMALL = "size=96x72"
 LAMP = Lamp(np.array([0.2, 1.5, -0.3]), np.array([2.0, 1.0, 0.5]))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.special import sph_harm_y
 
-from client.laptop.synthetic.harmonics import basis, sphere_directions, unshadowed_transfer
-from client.laptop.synthetic.lights import EXPOSURE, RING_SIZE, ring_light
+from client.synthetic.lighting.harmonics import basis, sphere_directions, unshadowed_transfer
+from client.synthetic.lighting.lights import EXPOSURE, RING_SIZE, ring_light
 
 REC709 = np.array([0.2126, 0.7152, 0.0722])
 

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from client.laptop.synthetic.rounds import Capsule, Cylinder, Sphere
-from client.laptop.synthetic.shapes import Solid, box, rotation_about, wedge
-from client.laptop.synthetic.shell import Opening, Shell
+from client.synthetic.solids.polyhedra import Solid, box, rotation_about, wedge
+from client.synthetic.solids.round import Capsule, Cylinder, Sphere
+from client.synthetic.solids.shell import Opening, Shell
 
 TILT = rotation_about("y", 30) @ rotation_about("z", 50)
 AXIS = np.array([2.0, 3, 6]) / 7

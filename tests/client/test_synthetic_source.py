@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from client.laptop.errors import SourceError
-from client.laptop.source import open_source
-from client.laptop.synthetic.hand import GOES, capsules
-from client.laptop.synthetic.noise import kinect_like
-from client.laptop.synthetic.source import SyntheticSource, open_synthetic, to_srgb8
+from client.errors import SourceError
+from client.options.source import open_source
+from client.synthetic.scenes.hand import LEAVE, capsules
+from client.synthetic.sensor_noise import kinect_like
+from client.synthetic.source import SyntheticSource, open_synthetic, to_srgb8
 
 SMALL = "size=96x72"
 SCENES = ("table", "room", "hand", "light")
@@ -154,7 +154,7 @@ def test_hand_hides_the_table_and_shadows_it() -> None:
 
 
 def test_hand_hovers_and_waves() -> None:
-    stays = [capsules(p) for p in np.linspace(0.36, GOES, 20)]
+    stays = [capsules(p) for p in np.linspace(0.36, LEAVE, 20)]
     lowest = min(min(c.start[1], c.end[1]) - c.radius for parts in stays for c in parts)
     assert lowest > 0.05  # its shadow is integrated coarsely because it is soft
     sideways = [parts[0].start[2] for parts in stays]

@@ -7,14 +7,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from client.laptop.errors import SourceError
-from client.laptop.synthetic.guests import GUESTS
-from client.laptop.synthetic.harmonics import basis, sphere_directions
-from client.laptop.synthetic.looks import LOOKS, Covering, along_surface
-from client.laptop.synthetic.rounds import Cylinder
-from client.laptop.synthetic.shapes import Polyhedron, Solid
-from client.laptop.synthetic.source import SyntheticSource, open_synthetic
-from client.laptop.synthetic.tessellate import TOLERANCE_M, triangles_of
+from client.errors import SourceError
+from client.synthetic.lighting.harmonics import basis, sphere_directions
+from client.synthetic.scenes.appearance import APPEARANCES, StageSurface, along_surface
+from client.synthetic.scenes.guests import GUESTS
+from client.synthetic.solids.polyhedra import Polyhedron, Solid
+from client.synthetic.solids.round import Cylinder
+from client.synthetic.solids.tessellate import TOLERANCE_M, triangles_of
+from client.synthetic.source import SyntheticSource, open_synthetic
 
 ROUND = 360
 """Frames of one walk around."""
@@ -175,7 +175,7 @@ def test_the_gate_lets_light_through_and_shadows() -> None:
     assert 0.05 < within / beside < 0.6
 
 
-@pytest.mark.parametrize("look", LOOKS)
+@pytest.mark.parametrize("look", APPEARANCES)
 def test_a_look_changes_colours_and_nothing_else(look: str) -> None:
     plain, covered = stage().truth(70), stage(f"&texture={look}").truth(70)
     np.testing.assert_array_equal(plain.depth_m, covered.depth_m)
@@ -197,7 +197,7 @@ def test_patterns_keep_their_size_along_every_surface() -> None:
     random = np.random.default_rng(0)
     source, compared = stage(), 0
     for solid in [body.solid for body in source.scene.bodies if isinstance(body.solid, Polyhedron | Cylinder)]:
-        covering = Covering("wall", 1, solid, np.eye(3))
+        covering = StageSurface("wall", 1, solid, np.eye(3))
         start = np.array([0.6, 1.0, 0.9])
         directions = solid.bounds[0] + random.normal(0, 0.3 * solid.bounds[1], (40, 3)) - start
         t = solid.intersect(start, directions)
@@ -212,7 +212,7 @@ def test_patterns_keep_their_size_along_every_surface() -> None:
 
 
 def test_looks_are_as_they_are_called() -> None:
-    albedo = {look: (truth := stage(f"&texture={look}").truth(70)).albedo[truth.visible] for look in LOOKS}
+    albedo = {look: (truth := stage(f"&texture={look}").truth(70)).albedo[truth.visible] for look in APPEARANCES}
     assert np.ptp(albedo["paper"]) == 0
     saturation = {look: np.median(np.ptp(a, axis=1) / a.max(axis=1)) for look, a in albedo.items()}
     assert saturation["market"] > 0.5 > saturation["brick"] > saturation["checker"] - 1e-9
@@ -220,7 +220,7 @@ def test_looks_are_as_they_are_called() -> None:
     assert bright / dark > 8
 
 
-@pytest.mark.parametrize("look", LOOKS)
+@pytest.mark.parametrize("look", APPEARANCES)
 def test_nothing_clips(look: str) -> None:
     for light in (0, 3, 6):
         for index in (0, 180):

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from client.cli import run_command
-from client.laptop import tune as tuning
-from client.laptop import tune_scenes
-from client.laptop.tune import lines_of, tune
+from client.tuning import scenes as tune_scenes
+from client.tuning import tune as tuning
+from client.tuning.tune import lines_of, tune
 from server.opencl.device import Device
 from server.quality.pareto_front import read_front, write_front
 from server.quality.sampling_settings import SamplingSettings
@@ -53,7 +53,7 @@ def test_a_first_budget_measures_the_device(tmp_path: Path, capsys: pytest.Captu
     """And a second one does not; every frame says its point."""
     for again in (False, True):
         assert run_command(["run", TABLE, "--out", str(tmp_path / "out"), "--budget-ms", "60000"]) == 0
-        assert ("measuring once" in capsys.readouterr().err) is not again
+        assert ("measuring accuracy against time" in capsys.readouterr().err) is not again
     rows = (tmp_path / "out" / "timings.jsonl").read_text().splitlines()
     assert len(rows) == 4
     assert all('"reason": "the first frames of a budget of 60000 ms' in row for row in rows)
@@ -62,7 +62,7 @@ def test_a_first_budget_measures_the_device(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_without_a_front_the_server_says_what_to_do(device: Device) -> None:
-    from client.laptop.synthetic.source import open_synthetic
+    from client.synthetic.source import open_synthetic
     from protocol.messages import Wishes
     from server.client_session import ClientSession
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from client.laptop.errors import SourceError
-from client.laptop.volume import MARGIN_M, default_volume, default_voxel
+from client.errors import SourceError
+from client.sources.volume import MARGIN_M, default_volume, default_voxel
 from protocol.frames import CameraModel, DepthCamera, RgbdFrame
 
 CAMERA = CameraModel(width=64, height=48, fx=50, fy=50, cx=31.5, cy=23.5)

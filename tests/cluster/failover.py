@@ -43,7 +43,7 @@ import ray  # noqa: E402
 from ray import serve  # noqa: E402
 from ray.cluster_utils import Cluster  # noqa: E402
 
-from client.client import Answer, RoomPlace, StreamClient  # noqa: E402
+from client.streaming.client import Answer, RoomPlace, StreamClient  # noqa: E402
 from server.cluster.application import build  # noqa: E402
 from server.cluster.ray_directory import NAMESPACE, PREFIX  # noqa: E402
 from server.cluster.routing import room_id_of  # noqa: E402

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from client.bench import run_bench
-from client.laptop.errors import OptionError
+from client.commands.bench import run_bench
+from client.errors import OptionError
 from protocol.messages import Wishes
 from server.opencl.device import Device
 from server.quality.settings import read_wishes

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from client.laptop.synthetic.source import open_synthetic
-from client.laptop.volume import default_volume, default_voxel
+from client.sources.volume import default_volume, default_voxel
+from client.synthetic.source import open_synthetic
 from protocol.messages import Wishes
 from server.light.light_estimation import TileSums, prior_precision
 from server.maths.sh import LUMINANCE, spherical_fibonacci

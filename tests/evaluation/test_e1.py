@@ -8,9 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from client.laptop.known_light import ALBEDO, BACKGROUND, ShadedView, moving_light, shaded_views
-from client.laptop.synthetic.source import open_synthetic
-from client.laptop.volume import default_volume, default_voxel
+from client.sources.volume import default_volume, default_voxel
+from client.synthetic.source import open_synthetic
+from client.tuning.known_light import ALBEDO, BACKGROUND, ShadedView, moving_light, shaded_views
 from protocol.messages import Wishes
 from server.opencl.device import Device
 from tests.bench.light.e1 import FRAMES, SEQUENCES, Thing, WithThings, light_of

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from client.laptop.synthetic.source import open_synthetic
+from client.synthetic.source import open_synthetic
 from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
 from server.maths.sh import lambert_transfer, sh_basis, spherical_fibonacci

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from client.laptop.source import open_source
+from client.options.source import open_source
 from protocol.messages import Wishes
 from server.maths.sh import dominant_direction, rotate_sh
 from tests.bench.light.room import in_picture

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from client.laptop.gallery.play import play, wishes_of
-from client.laptop.gallery.scenes import CHANGE_FRAME, GALLERY
-from client.laptop.gallery.source import GallerySource
-from client.laptop.gallery.things import Thing
+from client.gallery.objects import GalleryObject
+from client.gallery.play import play, wishes_of
+from client.gallery.scenes import CHANGE_FRAME, GALLERY
+from client.gallery.source import GallerySource
 from protocol.frames import RgbdFrame
 from protocol.messages import LeftOut, Plan
 from server.client_session import ClientSession
@@ -102,7 +102,7 @@ def test_what_noise_changes_is_bounded(device: Device) -> None:
 def test_what_is_placed_and_moved_before_a_resting_view_is_drawn(device: Device) -> None:
     """As it would be with everything simulated; a byte may differ by the rounding of sums."""
     source, pipelines = GallerySource("still-and-empty"), []
-    ball = load_mesh(Thing(0.2, (0.0, 0.0, 0.0)).glb(), "glb")
+    ball = load_mesh(GalleryObject(0.2, (0.0, 0.0, 0.0)).glb(), "glb")
     for plan in ("needed", "everything"):
         pipeline = ClientSession(device, source.camera, wishes_of(source, plan=plan))
         results = []
@@ -151,7 +151,7 @@ def test_the_plan_says_how_much_of_the_picture_changes() -> None:
     ]
     assert [changed_share(plan) for plan in plans] == [0.12, 0.0]
     far = GallerySource("far-away")
-    known = tuple(far.scene.calls_for(0))
+    known = tuple(far.scene.expected_effects(0))
     assert is_as_known(far, 0, Plan(run=known, left_out=plans[0].left_out))
     much = structs.replace(
         plans[0].left_out[0], reason="virtual things change 50 % of the picture, and hardly the rest"

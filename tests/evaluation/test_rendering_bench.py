@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from client.laptop.synthetic.lights import disc_light
-from client.laptop.synthetic.render import camera_rays, cast
-from client.laptop.synthetic.source import open_synthetic
+from client.synthetic.lighting.lights import disc_light
+from client.synthetic.render import camera_rays, cast
+from client.synthetic.source import open_synthetic
 from server.effects.plan import Effect
 from server.maths.sh import lambert_transfer
 from server.opencl.device import Device

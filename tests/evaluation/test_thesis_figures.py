@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from client.laptop.synthetic.source import open_synthetic
+from client.synthetic.source import open_synthetic
 from protocol.messages import Wishes
 from server.maths.light_direction import direction_error_deg
 from server.maths.sh import dominant_direction

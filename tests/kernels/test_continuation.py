@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
-from client.laptop.source import open_source
-from client.laptop.volume import default_volume, default_voxel
+from client.options.source import open_source
+from client.sources.volume import default_volume, default_voxel
 from protocol.frames import CameraModel
 from protocol.messages import Wishes
 from server.client_session import ClientSession

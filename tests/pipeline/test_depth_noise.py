@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from client.laptop.synthetic.noise import kinect_like
+from client.synthetic.sensor_noise import kinect_like
 from protocol.frames import CameraModel
 from server.opencl.device import Device
 from tests.bench.geometry.noise import NormalView, depth_normals, normal_improvement, plane_normals

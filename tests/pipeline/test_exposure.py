@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from client.laptop.source import open_source
-from client.laptop.synthetic.source import SyntheticSource
-from client.laptop.volume import default_volume, default_voxel
+from client.options.source import open_source
+from client.sources.volume import default_volume, default_voxel
+from client.synthetic.source import SyntheticSource
 from protocol.messages import Light, Wishes
 from server.client_session import ClientSession
 from server.input.measure import linear_values

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from client.laptop.gallery.play import play, wishes_of
-from client.laptop.gallery.source import GallerySource
+from client.gallery.play import play, wishes_of
+from client.gallery.source import GallerySource
 from protocol.messages import Plan
 from server.opencl.device import Device
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from client.laptop.source import open_source
-from client.laptop.synthetic.noise import kinect_like
+from client.options.source import open_source
+from client.synthetic.sensor_noise import kinect_like
 from protocol.frames import CameraModel, RgbdFrame
 from server.opencl.device import Device
 from server.volume.raycast import LABEL_DYNAMIC, LABEL_STATIC

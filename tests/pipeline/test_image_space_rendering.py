@@ -14,8 +14,8 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from client.laptop.source import open_source
-from client.laptop.synthetic.lights import disc_light
+from client.options.source import open_source
+from client.synthetic.lighting.lights import disc_light
 from protocol.frames import CameraModel
 from server.client_session import ClientSession
 from server.culling.reason import CullReason

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from client.laptop.source import open_source
-from client.laptop.synthetic.lights import ring_light
-from client.laptop.volume import default_volume, default_voxel
+from client.options.source import open_source
+from client.sources.volume import default_volume, default_voxel
+from client.synthetic.lighting.lights import ring_light
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from server.client_session import ClientSession

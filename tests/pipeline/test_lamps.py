@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from client.laptop.synthetic.source import open_synthetic
-from client.laptop.volume import default_volume, default_voxel
+from client.sources.volume import default_volume, default_voxel
+from client.synthetic.source import open_synthetic
 from protocol.frames import CameraModel
 from protocol.messages import Wishes
 from server.client_session import ClientSession

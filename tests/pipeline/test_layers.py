@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from client.laptop.gallery.play import wishes_of
-from client.laptop.gallery.source import GallerySource
+from client.gallery.play import wishes_of
+from client.gallery.source import GallerySource
 from protocol.codec import encode
 from server.client_session import ClientSession
 from server.effects.table import effect_names

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from client.laptop.gallery.play import wishes_of
-from client.laptop.gallery.source import GallerySource
-from client.layers import DecodedLayer, Part, decode_layer, put_over
+from client.display.layers import DecodedLayer, Part, decode_layer, put_over
+from client.gallery.play import wishes_of
+from client.gallery.source import GallerySource
 from protocol.codec import decode_server, encode
 from protocol.frames import RgbdFrame
 from protocol.images import encode_color, encode_depth

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from client.laptop.source import open_source
-from client.laptop.synthetic.source import SyntheticSource
-from client.laptop.volume import default_volume, default_voxel
+from client.options.source import open_source
+from client.sources.volume import default_volume, default_voxel
+from client.synthetic.source import SyntheticSource
 from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
 from server.client_session import ClientSession

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from client.laptop.synthetic.lights import RING_SIZE
-from client.laptop.synthetic.source import SyntheticSource, open_synthetic
-from client.laptop.volume import default_volume, default_voxel
+from client.sources.volume import default_volume, default_voxel
+from client.synthetic.lighting.lights import RING_SIZE
+from client.synthetic.source import SyntheticSource, open_synthetic
 from protocol.messages import Light, Wishes
 from server.client_session import ClientSession
 from server.opencl.device import Device

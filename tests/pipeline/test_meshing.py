@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from client.laptop.source import open_source
+from client.options.source import open_source
 from protocol.messages import Wishes
 from server.client_session import ClientSession
 from server.geometry.geometry import Geometry

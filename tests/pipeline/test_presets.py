@@ -10,8 +10,8 @@ import trimesh
 from msgspec import structs
 from numpy.typing import NDArray
 
-from client.laptop.source import open_source
-from client.laptop.volume import default_volume, default_voxel
+from client.options.source import open_source
+from client.sources.volume import default_volume, default_voxel
 from protocol.messages import Wishes
 from server.client_session import ClientSession
 from server.opencl.device import Device

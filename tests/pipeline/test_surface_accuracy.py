@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from client.laptop.source import open_source
+from client.options.source import open_source
 from protocol.frames import CameraModel, RgbdFrame
 from server.opencl.device import Device
 from tests.bench.geometry.surface import SurfaceView, fused_views, inside_bounds, surface_accuracy

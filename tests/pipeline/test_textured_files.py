@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from client.laptop.objects import pack_mesh
+from client.objects.object_file import pack_mesh
 from protocol.frames import CameraModel
 from server.objects.rasterize import rasterize
 from server.objects.virtual_object import VirtualObject

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from client.laptop.source import open_source
-from client.laptop.volume import default_volume, default_voxel
+from client.options.source import open_source
+from client.sources.volume import default_volume, default_voxel
 from server.client_session import ClientSession
 from server.geometry.geometry import Geometry
 from server.maths.registration import angle_between, distance_between, motion_of_twist

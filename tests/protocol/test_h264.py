@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from client.video import VideoEncoder
+from client.streaming.video import VideoEncoder
 from protocol.codec import ProtocolError
 from protocol.h264 import MISSING, Sequence, VideoOrder, is_key_picture, sequence_of, units_of
 

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("av")
 
-from client.video import VideoEncoder
+from client.streaming.video import VideoEncoder
 from protocol.codec import ProtocolError
 from protocol.colors import ColorReader, readable_codecs
 from protocol.frames import CameraModel

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-from client.laptop.gallery.source import GallerySource
+from client.gallery.source import GallerySource
 from protocol.messages import Wishes
 from server.client_session import ClientSession
 from server.opencl.device import Device
@@ -18,12 +18,12 @@ from server.scene.placement import Placement
 def played(
     device: Device, source: GallerySource, wishes: Wishes, frames: int, watched: Sequence[int] = ()
 ) -> list[FrameResult]:
-    """The first frames' results; the scene's things in their first places. watched: frames that somebody else sees."""
+    """Results of the first frames; the objects stay at their first positions. watched: frames with a watcher."""
     pipeline = ClientSession(device, source.camera, wishes)
     try:
-        for number, thing in enumerate(source.scene.things):
-            mesh = load_mesh(thing.glb(), "glb")
-            pipeline.place_object(f"object-{number}", mesh, Placement(position_m=thing.place(0)))
+        for number, item in enumerate(source.scene.objects):
+            mesh = load_mesh(item.glb(), "glb")
+            pipeline.place_object(f"object-{number}", mesh, Placement(position_m=item.position(0)))
         return [pipeline.process(source[index], watched=index in watched) for index in range(frames)]
     finally:
         pipeline.close()

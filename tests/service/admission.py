@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from client.client import Access, ClientError, StreamClient
+from client.streaming.client import Access, ClientError, StreamClient
 from tests.service.fakes import CAMERA, PATIENCE_S
 
 TOKEN = "a+b/c=d&e?f%20"  # what a URL must quote

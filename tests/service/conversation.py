@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 
-from client.client import Answer, StreamClient
+from client.streaming.client import Answer, StreamClient
 from protocol.messages import Dropped, Error
 from tests.service.fakes import PATIENCE_S
 

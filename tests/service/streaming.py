@@ -5,9 +5,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from client.laptop import stream as streaming
-from client.laptop.errors import SourceError
-from client.laptop.stream import stream
+from client.commands import stream as streaming
+from client.commands.stream import stream
+from client.errors import SourceError
 from protocol.frames import RgbdFrame
 from tests.service.fakes import CAMERA, rgbd_frame
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from client.client import Access
+from client.streaming.client import Access
 from protocol.local_keys import LocalKey, find_key, key_left, key_path
 from protocol.messages import Error
 from server.service.app import create_app

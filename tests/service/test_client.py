@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from websockets.sync.server import Server, serve
 
-from client.client import ClientError, StreamClient, stream_url
+from client.streaming.client import ClientError, StreamClient, stream_url
 from protocol.images import decode_color
 from protocol.messages import Bye, Composite, Frame, Hello, Light, Welcome, Wishes
 from tests.service.conversation import next_answer, with_client

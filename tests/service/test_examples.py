@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from client.client import StreamClient
+from client.streaming.client import StreamClient
 from server.maths.sh import lambert_transfer
 from server.opencl.device import Device
 from server.service.serve import BackgroundServer

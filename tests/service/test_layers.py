@@ -13,11 +13,11 @@ from msgspec import structs
 from rich.console import Console
 
 from client.cli import run_command
-from client.client import Answer, StreamClient
-from client.laptop.gallery.source import GallerySource
-from client.laptop.objects import ObjectFile
-from client.laptop.stream import StreamSummary, stream
-from client.layers import NEUTRAL, decode_layer, put_over
+from client.commands.stream import StreamSummary, stream
+from client.display.layers import NEUTRAL, decode_layer, put_over
+from client.gallery.source import GallerySource
+from client.objects.object_file import ObjectFile
+from client.streaming.client import Answer, StreamClient
 from protocol.images import encode_depth
 from protocol.messages import Bye, Composite, Dropped, Layer, Light, Wishes
 from server.opencl.device import Device

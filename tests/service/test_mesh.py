@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from websockets.sync.server import Server, serve
 
-from client.client import ClientError, StreamClient
+from client.streaming.client import ClientError, StreamClient
 from protocol.codec import decode_client, encode
 from protocol.limits import MAX_MESH_PART_BYTES, SUBPROTOCOL
 from protocol.messages import Acknowledged, Composite, Hello, Light, MeshPart, RequestMesh, Welcome, Wishes

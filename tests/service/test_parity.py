@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from client.laptop.objects import ObjectFile, pack_mesh
-from client.laptop.output import FrameOutput, OutputWriter
-from client.laptop.stream import stream
+from client.commands.stream import stream
+from client.display.output_folder import FrameOutput, OutputWriter
+from client.objects.object_file import ObjectFile, pack_mesh
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from server.client_session import ClientSession

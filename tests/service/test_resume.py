@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from client.client import Answer, ClientError, RoomPlace, StreamClient
+from client.streaming.client import Answer, ClientError, RoomPlace, StreamClient
 from protocol.messages import Acknowledged, Composite, Dropped, Hello, MoveObject, PlaceObject, Welcome, Wishes
 from tests.service.fakes import CAMERA, EXPLODE_MM, PATIENCE_S, Lab, frame_message, rgbd_frame
 from tests.service.proxy import Proxy, impaired

@@ -12,8 +12,8 @@ import trimesh
 from typer.testing import CliRunner
 
 from client.cli import app
-from client.laptop.errors import OptionError
-from client.room_options import room_place
+from client.errors import OptionError
+from client.options.room_options import room_place
 from protocol.frames import IDENTITY
 from protocol.messages import Acknowledged, Composite, Error, Hello, Light, Marker, PlaceObject, Watch, Welcome
 from server.opencl.device import Device

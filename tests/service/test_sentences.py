@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from client.client import Access, ClientError, RoomPlace, StreamClient
+from client.streaming.client import Access, ClientError, RoomPlace, StreamClient
 from protocol.messages import Hello
 from server.service.authenticator import Authenticator
 from server.service.graceful_shutdown import DRAINING, GOODBYE
@@ -54,7 +54,7 @@ def test_a_server_of_another_version(start_server, monkeypatch) -> None:
     ("access", "word"), [(None, "missing"), (Access(token="another"), "wrong")], ids=["missing", "wrong"]
 )
 def test_a_wrong_token(start_server, access: Access | None, word: str, monkeypatch) -> None:
-    monkeypatch.setattr("client.access.find_key", lambda _port: None)  # as on another machine
+    monkeypatch.setattr("client.streaming.access.find_key", lambda _port: None)  # as on another machine
     assert told(start_server(authenticator=Authenticator("a-token")).url, access=access) == (
         f"the token is {word}: use the URL that the server printed at its start, which ends in ?token=..."
     )

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from client.client import ClientError
-from client.laptop import stream as streaming
-from client.laptop.errors import ObjectError, OutputError, SourceError
-from client.laptop.objects import ObjectFile
-from client.laptop.output import FrameOutput, OutputWriter
-from client.laptop.stream import stream
+from client.commands import stream as streaming
+from client.commands.stream import stream
+from client.display.output_folder import FrameOutput, OutputWriter
+from client.errors import ObjectError, OutputError, SourceError
+from client.objects.object_file import ObjectFile
+from client.streaming.client import ClientError
 from protocol.messages import Bye, Composite, Frame, Hello, Light, PlaceObject, Welcome
 from protocol.recording import read_messages
 from tests.service.fakes import EXPLODE_MM, REFUSE_MM, fake_result, rgbd_frame

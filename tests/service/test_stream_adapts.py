@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from client.laptop.stream import Sending
+from client.commands.stream import Sending
 from protocol.messages import Frame
 from protocol.recording import read_messages
 from tests.service.proxy import impaired

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from client.laptop.frame_source import ENDLESS
-from client.laptop.recorded import open_recording
+from client.sources.frame_source import ENDLESS
+from client.sources.recording import open_recording
 from protocol.frames import RgbdFrame
 from tests.service.streaming import FakeSource, quietly
 

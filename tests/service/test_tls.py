@@ -14,8 +14,8 @@ import httpx
 import pytest
 from cryptography import x509
 
-from client.access import AccessError, entrance, fingerprint_bytes
-from client.client import Access
+from client.streaming.access import AccessError, connection_parameters, fingerprint_bytes
+from client.streaming.client import Access
 from server.service import tls
 from server.service.authenticator import Authenticator
 from server.service.serve import BackgroundServer
@@ -120,9 +120,9 @@ def test_trust_that_cannot_be_read_is_told(tmp_path: Path) -> None:
     (tmp_path / "no.pem").write_text("nothing")
     for path in (tmp_path / "no.pem", tmp_path / "absent.pem"):
         with pytest.raises(AccessError, match=path.name):
-            entrance("https://host", Access(tls_ca=path))
+            connection_parameters("https://host", Access(tls_ca=path))
     with pytest.raises(AccessError, match="leave one of the two out"):
-        entrance("https://host", Access(tls_ca=path, tls_fingerprint="ab" * 32))
+        connection_parameters("https://host", Access(tls_ca=path, tls_fingerprint="ab" * 32))
 
 
 def test_certificates_that_cannot_be_used_are_one_line(certificate: Certificate, tmp_path: Path) -> None:

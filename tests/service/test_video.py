@@ -15,12 +15,12 @@ import pytest
 
 pytest.importorskip("av")
 
-from client.client import ClientError
-from client.coding import Coding
-from client.coding import frame_message as coded_message
-from client.laptop.recorded import open_recording
-from client.laptop.stream import Sending
-from client.video import VideoEncoder
+from client.commands.stream import Sending
+from client.sources.recording import open_recording
+from client.streaming.client import ClientError
+from client.streaming.coding import Coding
+from client.streaming.coding import frame_message as coded_message
+from client.streaming.video import VideoEncoder
 from protocol.codec import ProtocolError
 from protocol.colors import ColorReader
 from protocol.h264 import is_key_picture

@@ -15,9 +15,9 @@ from statistics import fmean, median
 import numpy as np
 from msgspec import structs
 
-from client.laptop.frame_source import Source
-from client.laptop.tune import tune
-from client.laptop.volume import default_volume, default_voxel
+from client.sources.frame_source import Source
+from client.sources.volume import default_volume, default_voxel
+from client.tuning.tune import tune
 from protocol.messages import Wishes
 from server.client_session import ClientSession
 from server.pipeline import FrameResult

@@ -12,8 +12,8 @@ import numpy as np
 from msgspec import Struct, structs
 from numpy.typing import NDArray
 
-from client.laptop.object_placing import place_objects
-from client.laptop.objects import ObjectFile
+from client.objects.object_file import ObjectFile
+from client.objects.placing import place_objects
 from server.client_session import ClientSession
 from server.maths.light_direction import direction_error_deg
 from server.opencl.device import Device

@@ -17,13 +17,13 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
-from client.laptop.frame_source import Source
-from client.laptop.known_light import moving_light, shaded_views
-from client.laptop.source import open_source
-from client.laptop.synthetic.export import write_guests
-from client.laptop.synthetic.lights import disc_light
-from client.laptop.synthetic.source import open_synthetic
-from client.laptop.volume import default_volume, default_voxel
+from client.options.source import open_source
+from client.sources.frame_source import Source
+from client.sources.volume import default_volume, default_voxel
+from client.synthetic.export import write_guests
+from client.synthetic.lighting.lights import disc_light
+from client.synthetic.source import open_synthetic
+from client.tuning.known_light import moving_light, shaded_views
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from server.maths.sh import spherical_fibonacci

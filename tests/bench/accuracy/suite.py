@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from client.laptop.errors import OptionError
+from client.errors import OptionError
 from server.opencl.device import open_device
 from tests.bench.accuracy.budget import budget_part
 from tests.bench.accuracy.knobs import points

@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.synthetic.source import open_synthetic
-from client.laptop.volume import default_volume, default_voxel
+from client.sources.volume import default_volume, default_voxel
+from client.synthetic.source import open_synthetic
 from protocol.messages import Wishes
 from server.light.panorama import read_panorama
 from tests.bench.bases.bases import SIZES, Basis, bases_of, largest_haar

@@ -15,7 +15,7 @@ import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
-from client.laptop.known_light import ALBEDO, BACKGROUND
+from client.tuning.known_light import ALBEDO, BACKGROUND
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from server.geometry.geometry import Geometry

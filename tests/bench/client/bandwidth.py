@@ -11,10 +11,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from client.adaptive import LADDER
-from client.coding import Coding, frame_message, picture_bytes
-from client.laptop.frame_source import Source
-from client.laptop.source import open_source
+from client.options.source import open_source
+from client.sources.frame_source import Source
+from client.streaming.adaptive import LADDER
+from client.streaming.coding import Coding, frame_message, picture_bytes
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import decode_color, decode_depth
 from server.client_session import ClientSession

@@ -14,11 +14,11 @@ import msgspec
 import numpy as np
 from rich.console import Console
 
-from client.client import Access
-from client.laptop.frame_source import Source
-from client.laptop.stream import Sending, StreamSummary, stream
-from client.laptop.stream_figures import STAGES
-from client.video import IS_POSSIBLE
+from client.commands.stream import Sending, StreamSummary, stream
+from client.display.stream_statistics import STAGES
+from client.sources.frame_source import Source
+from client.streaming.client import Access
+from client.streaming.video import IS_POSSIBLE
 from protocol.colors import ColorReader
 from protocol.frames import RgbdFrame
 from protocol.messages import Frame

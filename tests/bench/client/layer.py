@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from client.laptop.frame_source import Source
+from client.sources.frame_source import Source
 from protocol.codec import encode
 from protocol.images import encode_color, encode_depth
 from protocol.messages import Frame

@@ -12,10 +12,10 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from client.coding import Coding, frame_message
-from client.laptop.frame_source import Source
-from client.laptop.source import open_source
-from client.video import IS_POSSIBLE, VideoEncoder
+from client.options.source import open_source
+from client.sources.frame_source import Source
+from client.streaming.coding import Coding, frame_message
+from client.streaming.video import IS_POSSIBLE, VideoEncoder
 from protocol.colors import ColorReader
 from protocol.frames import RgbdFrame
 from tests.bench.client.bandwidth import FPS, kitchen, psnr_db, run_pipeline, turns_deg

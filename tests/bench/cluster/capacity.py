@@ -16,9 +16,9 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from client.client import Answer, StreamClient
-from client.laptop.frame_source import Source
-from client.laptop.source import open_source
+from client.options.source import open_source
+from client.sources.frame_source import Source
+from client.streaming.client import Answer, StreamClient
 from protocol.codec import encode
 from protocol.messages import ClientMessage, ServerMessage, Wishes
 from tests.bench.service.process import resident_mb, serving

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.frame_source import Source
-from client.laptop.volume import default_volume, default_voxel
+from client.sources.frame_source import Source
+from client.sources.volume import default_volume, default_voxel
 from server.opencl.device import Device
 from server.volume.bounds import Bounds
 from tests.bench.geometry.hybrid import HandReport, measure_hand

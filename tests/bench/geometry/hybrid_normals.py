@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from client.laptop.frame_source import Source
-from client.laptop.synthetic.source import SyntheticSource, open_synthetic
-from client.laptop.volume import default_volume, default_voxel
+from client.sources.frame_source import Source
+from client.sources.volume import default_volume, default_voxel
+from client.synthetic.source import SyntheticSource, open_synthetic
 from server.opencl.device import Device
 from server.volume.bounds import Bounds
 from tests.bench.geometry.noise import plane_normals

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.frame_source import Source
 from client.progress import note
+from client.sources.frame_source import Source
 from server.opencl.device import open_device
 from tests.bench.geometry.filters import filters_part
 from tests.bench.geometry.hand import hand_part, hand_volume

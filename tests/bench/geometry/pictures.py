@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from client.laptop.frame_source import Source
+from client.sources.frame_source import Source
 from server.opencl.device import Device
 from server.volume.bounds import Bounds
 from tests.bench.geometry.hybrid import depth_of, run_geometry, vectors

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.frame_source import Source
-from client.laptop.synthetic.noise import kinect_like
-from client.laptop.volume import default_volume, default_voxel
+from client.sources.frame_source import Source
+from client.sources.volume import default_volume, default_voxel
+from client.synthetic.sensor_noise import kinect_like
 from server.opencl.device import Device
 from tests.bench.geometry.hybrid import depth_of, run_geometry, vectors
 from tests.bench.geometry.pictures import LABEL_COLORS, save

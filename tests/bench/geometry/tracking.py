@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.frame_source import Source
-from client.laptop.volume import default_volume, default_voxel
+from client.sources.frame_source import Source
+from client.sources.volume import default_volume, default_voxel
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.volume.bounds import Bounds

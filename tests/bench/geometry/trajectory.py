@@ -52,7 +52,7 @@ def aligned_ate_rmse_m(estimated: list[Floats], truth: list[Floats]) -> float:
 
 
 class Frames(Protocol):
-    """A source of posed frames, as `client.laptop.frame_source.Source` is one."""
+    """A source of posed frames, as `client.sources.frame_source.Source` is one."""
 
     @property
     def camera(self) -> CameraModel: ...

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.known_light import LitFrame, moving_light, shaded_views
-from client.laptop.synthetic.lights import disc_light
-from client.laptop.synthetic.render import camera_rays, cast
-from client.laptop.synthetic.rounds import Sphere
-from client.laptop.synthetic.shapes import Solid, box, rotation_about
-from client.laptop.synthetic.source import SyntheticSource, open_synthetic
-from client.laptop.volume import default_volume, default_voxel
+from client.sources.volume import default_volume, default_voxel
+from client.synthetic.lighting.lights import disc_light
+from client.synthetic.render import camera_rays, cast
+from client.synthetic.solids.polyhedra import Solid, box, rotation_about
+from client.synthetic.solids.round import Sphere
+from client.synthetic.source import SyntheticSource, open_synthetic
+from client.tuning.known_light import LitFrame, moving_light, shaded_views
 from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
 from tests.bench.light.light_score import Score, lag_of, score

@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.known_light import ALBEDO, ShadedView, shaded_views
-from client.laptop.synthetic.source import SyntheticSource, open_synthetic
+from client.synthetic.source import SyntheticSource, open_synthetic
+from client.tuning.known_light import ALBEDO, ShadedView, shaded_views
 from protocol.frames import CameraModel
 from protocol.messages import Wishes
 from server.client_session import ClientSession

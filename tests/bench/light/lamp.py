@@ -11,9 +11,9 @@ import numpy as np
 import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
-from client.laptop.synthetic.lamps import Lamp
-from client.laptop.synthetic.source import SyntheticSource, open_synthetic
-from client.laptop.volume import default_volume, default_voxel
+from client.sources.volume import default_volume, default_voxel
+from client.synthetic.lighting.lamps import Lamp
+from client.synthetic.source import SyntheticSource, open_synthetic
 from protocol.messages import Wishes
 from server.geometry.geometry import Geometry
 from server.light.lamp_finder import VIEW_SAMPLES

@@ -1,4 +1,4 @@
-"""How well one operating point finds a known light (E1, thesis 5.3.1, 6.1.3); pictures: client.laptop.known_light."""
+"""How well one operating point finds a known light (E1, thesis 5.3.1, 6.1.3); pictures: client.tuning.known_light."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.known_light import LitFrame, found_lights
+from client.tuning.known_light import LitFrame, estimated_lights
 from protocol.frames import CameraModel
 from protocol.messages import Wishes
 from server.maths.light_direction import direction_dot, direction_error_deg
@@ -33,7 +33,7 @@ class Score:
 def score(device: Device, camera: CameraModel, frames: Iterable[LitFrame], wishes: Wishes) -> Score:
     """Run the pipeline over `frames`. Raises ValueError for wishes that it cannot fulfil."""
     result = Score()
-    for item, found in found_lights(device, camera, frames, wishes):
+    for item, found in estimated_lights(device, camera, frames, wishes):
         result.dots.append(direction_dot(found, item.sh))
         result.differences.append(environment_difference(found, item.sh))
         result.lights.append(found)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from client.laptop.frame_source import Source
-from client.laptop.synthetic.source import open_synthetic
+from client.sources.frame_source import Source
+from client.synthetic.source import open_synthetic
 from protocol.messages import Wishes
 from server.maths.light_direction import direction_error_deg
 from server.pipeline import FrameResult

@@ -6,7 +6,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from client.laptop.synthetic.source import open_synthetic
+from client.synthetic.source import open_synthetic
 from protocol.messages import Wishes
 from server.maths.light_direction import direction_error_deg
 from tests.bench.light.runs import at_preset, light_in, results_of, wishes_for

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.source import open_source
+from client.options.source import open_source
 from protocol.messages import Wishes
 from server.input.measure import linear_values
 from server.maths.light_direction import direction_error_deg

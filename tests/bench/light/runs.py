@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.frame_source import Source
-from client.laptop.object_placing import place_objects
-from client.laptop.objects import ObjectFile
-from client.laptop.volume import default_volume, default_voxel
+from client.objects.object_file import ObjectFile
+from client.objects.placing import place_objects
+from client.sources.frame_source import Source
+from client.sources.volume import default_volume, default_voxel
 from protocol.frames import RgbdFrame
 from protocol.messages import Preset, Wishes
 from server.client_session import ClientSession
@@ -27,7 +27,7 @@ REFERENCE: Preset = "rm"
 
 @dataclass(frozen=True)
 class Exposed:
-    """A linear16 source whose pictures are taken with a shorter exposure; see client.laptop.frame_source.Source."""
+    """A linear16 source whose pictures are taken with a shorter exposure; see client.sources.frame_source.Source."""
 
     source: Source
     factor: float

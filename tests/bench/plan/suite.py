@@ -1,6 +1,6 @@
 """`probeless bench plan`: does each frame run what its scene calls for, and is what is left out not seen (U3).
 
-Every scene of the gallery (client/laptop/gallery) goes through the pipeline twice: as planned, and with everything
+Every scene of the gallery (client/gallery) goes through the pipeline twice: as planned, and with everything
 simulated that can be. Time is processor time over all cores, which other load distorts least.
 """
 
@@ -21,10 +21,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from client.explain import is_of_noise
-from client.laptop.gallery.play import play, wishes_of
-from client.laptop.gallery.scenes import GALLERY
-from client.laptop.gallery.source import GallerySource
+from client.commands.explain import is_of_noise
+from client.gallery.play import play, wishes_of
+from client.gallery.scenes import GALLERY
+from client.gallery.source import GallerySource
 from protocol.messages import Plan
 from server.opencl.device import Device, open_device
 from tests.bench.rendering.flip import flip_map
@@ -70,8 +70,8 @@ def run_suite(quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
         rendering_saved.append(_saved(pairs, frames, lambda frame: frame.rendering_ms))
         _beside(report, f"{name}: time saved, of the whole frame", saved[name])
         _beside(report, f"{name}: time saved, of rendering", rendering_saved[-1])
-        if source.scene.rests:
-            at_rest = _saved(pairs, source.scene.rests, lambda frame: frame.cpu_ms)
+        if source.scene.resting_frames:
+            at_rest = _saved(pairs, source.scene.resting_frames, lambda frame: frame.cpu_ms)
             _beside(report, f"{name}: time saved, of the frames known to rest", at_rest)
         cv2.imwrite(str(OUT / f"{name}.png"), pairs[0][0][-1].color[..., ::-1])
     report.rows.append(
@@ -120,13 +120,16 @@ def is_as_known(source: GallerySource, index: int, plan: Plan) -> bool:
     """Whether a frame ran what its scene calls for, and the spine rested where it could; where it hangs on noise when a
     view has settled, it may."""
     scene = source.scene
-    if changed_share(plan) > scene.changes:
+    if changed_share(plan) > scene.largest_changed_share:
         return False
     rests = any(left.effect == "estimate_light" for left in plan.left_out)
-    run, called = frozenset(plan.run) - scene.hangs, scene.calls_for(index) - scene.hangs
-    if index in scene.settles:
+    run, called = (
+        frozenset(plan.run) - scene.noise_dependent_effects,
+        scene.expected_effects(index) - scene.noise_dependent_effects,
+    )
+    if index in scene.settling_frames:
         return run in (HELD, called)
-    return run == (HELD if index in scene.holds else called) and rests == (index in scene.rests)
+    return run == (HELD if index in scene.held_frames else called) and rests == (index in scene.resting_frames)
 
 
 def changed_share(plan: Plan) -> float:
@@ -189,8 +192,8 @@ def _add_larger(report: Report, device: Device, say: Callable[[str], None]) -> N
 
 def _beside_medians(report: Report, what: str, saved: dict[str, float]) -> None:
     """Of all scenes, of those where something always moves, and of those that come to rest."""
-    rest = [value for name, value in saved.items() if GALLERY[name].rests]
-    moving = [value for name, value in saved.items() if not GALLERY[name].rests]
+    rest = [value for name, value in saved.items() if GALLERY[name].resting_frames]
+    moving = [value for name, value in saved.items() if not GALLERY[name].resting_frames]
     _beside(report, f"{what}: time saved, of the whole frame, median of all", median(saved.values()))
     _beside(report, f"{what}: time saved, of the whole frame, median where nothing rests", median(moving))
     _beside(report, f"{what}: time saved, of the whole frame, median where a view comes to rest", median(rest))

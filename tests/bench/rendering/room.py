@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.source import open_source
+from client.options.source import open_source
 from server.quality.settings import THESIS_REACH_M
 from tests.bench.light.runs import REFERENCE, at_preset, refusal, results_of, wishes_for
 from tests.bench.rendering.bleeding import to_objects, to_real

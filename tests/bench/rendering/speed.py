@@ -19,7 +19,7 @@ import msgspec
 import pyopencl as cl
 import trimesh
 
-from client.laptop.source import open_source
+from client.options.source import open_source
 from server.client_session import ClientSession
 from server.effects import plan, renderer
 from server.effects.plan import Effect

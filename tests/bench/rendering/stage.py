@@ -8,8 +8,8 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from client.laptop.synthetic.export import write_guests
-from client.laptop.synthetic.source import SyntheticSource, open_synthetic
+from client.synthetic.export import write_guests
+from client.synthetic.source import SyntheticSource, open_synthetic
 from server.shading.composite import srgb_codes
 from tests.bench.light.runs import at_preset, refusal, results_of, wishes_for
 from tests.bench.rendering.common import OUT, PRESETS, require

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.synthetic.source import open_synthetic, to_srgb8
+from client.synthetic.source import open_synthetic, to_srgb8
 
 TEXTURES = ("paper", "brick", "market", "checker", "town")
 WIDTH, HEIGHT = 320, 240

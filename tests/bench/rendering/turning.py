@@ -18,11 +18,11 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from client.laptop.synthetic.bake import blocked_directions
-from client.laptop.synthetic.lights import disc_light
-from client.laptop.synthetic.render import camera_rays, cast, look_at
-from client.laptop.synthetic.shapes import Solid, box
-from client.laptop.synthetic.source import FOCAL_OF_WIDTH
+from client.synthetic.lighting.bake import blocked_directions
+from client.synthetic.lighting.lights import disc_light
+from client.synthetic.render import camera_rays, cast, look_at
+from client.synthetic.solids.polyhedra import Solid, box
+from client.synthetic.source import FOCAL_OF_WIDTH
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from server.maths.sh import sh_basis, spherical_fibonacci

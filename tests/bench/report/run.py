@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from client.laptop.frame_source import Source
-from client.laptop.source import open_source
+from client.options.source import open_source
+from client.sources.frame_source import Source
 from server.opencl.device import Device
 from tests.bench.report.finished import ROOT, UnmeasurableError
 

@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 
 import trimesh
 
-from client.client import ClientError
+from client.streaming.client import ClientError
 from tests.bench.report.finished import ROOT, Part
 from tests.bench.report.run import Run
 from tests.bench.service.guests import Guest

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import trimesh
 
-from client.client import Answer, ClientError, RoomPlace, StreamClient
+from client.streaming.client import Answer, ClientError, RoomPlace, StreamClient
 from protocol.frames import IDENTITY, CameraModel, RgbdFrame
 from protocol.messages import Acknowledged, Wishes
 

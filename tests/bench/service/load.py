@@ -22,10 +22,10 @@ from typing import Any
 
 import trimesh
 
-from client.client import Answer, ClientError, StreamClient
-from client.laptop.frame_source import Source
-from client.laptop.source import open_source
-from client.laptop.volume import default_volume
+from client.options.source import open_source
+from client.sources.frame_source import Source
+from client.sources.volume import default_volume
+from client.streaming.client import Answer, ClientError, StreamClient
 from protocol.frames import RgbdFrame
 from protocol.messages import Acknowledged, Composite, Dropped, Preset, Wishes
 from tests.bench.report.finished import Part

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from client.client import Answer, RoomPlace, StreamClient
+from client.streaming.client import Answer, RoomPlace, StreamClient
 from protocol.frames import IDENTITY
 from protocol.messages import Light
 from tests.bench.report.finished import Part

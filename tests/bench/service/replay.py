@@ -15,10 +15,10 @@ from typing import Any
 
 from websockets.asyncio.client import ClientConnection
 
-from client.client import Access, StreamClient
-from client.laptop.source import open_source
-from client.laptop.volume import default_volume
-from client.opening import open_client_socket
+from client.options.source import open_source
+from client.sources.volume import default_volume
+from client.streaming.client import Access, StreamClient
+from client.streaming.opening import open_client_socket
 from protocol.codec import decode_server, encode
 from protocol.messages import (
     Acknowledged,

@@ -16,9 +16,9 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from client.client import Answer, StreamClient
-from client.laptop.frame_source import Source
-from client.laptop.source import open_source
+from client.options.source import open_source
+from client.sources.frame_source import Source
+from client.streaming.client import Answer, StreamClient
 from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
 from server.scene.vase import vase_glb

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from client.laptop.synthetic.source import SyntheticSource
+from client.synthetic.source import SyntheticSource
 from protocol.messages import Wishes
 from server.maths.light_direction import direction_error_deg
 from server.pipeline import FrameResult

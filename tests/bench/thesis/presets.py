@@ -1,6 +1,6 @@
 """The six presets of thesis 6.1.3 on E1 sequences with one virtual thing: table 6.1 and figures 6.5 to 6.8.
 
-Pictures show reconstructed geometry under the moving disc light (client.laptop.known_light), so the light is known.
+Pictures show reconstructed geometry under the moving disc light (client.tuning.known_light), so the light is known.
 What the presets make of a frame is held against RM's: light against the known one, composites against RM's composite.
 """
 
@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.known_light import LitFrame, moving_light, shaded_views
-from client.laptop.synthetic.source import SyntheticSource
+from client.synthetic.source import SyntheticSource
+from client.tuning.known_light import LitFrame, moving_light, shaded_views
 from protocol.messages import Wishes
 from server.maths.light_direction import direction_dot
 from server.scene.placement import Placement

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.synthetic.source import SyntheticSource
+from client.synthetic.source import SyntheticSource
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from server.input.measure import linear_values

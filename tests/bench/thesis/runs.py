@@ -15,9 +15,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from client.laptop.synthetic.export import guest_ply
-from client.laptop.synthetic.source import SyntheticSource, open_synthetic
-from client.laptop.volume import default_volume, default_voxel
+from client.sources.volume import default_volume, default_voxel
+from client.synthetic.export import guest_ply
+from client.synthetic.source import SyntheticSource, open_synthetic
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from server.client_session import ClientSession

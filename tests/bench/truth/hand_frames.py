@@ -35,7 +35,7 @@ Bools = NDArray[np.bool_]
 
 
 class Frames(Protocol):
-    """The part of a source that is needed here; see client.laptop.frame_source.Source."""
+    """The part of a source that is needed here; see client.sources.frame_source.Source."""
 
     @property
     def camera(self) -> CameraModel: ...

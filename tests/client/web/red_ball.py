@@ -7,8 +7,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from client.laptop.synthetic.source import SyntheticSource
-from client.laptop.synthetic.spec import parse_spec
+from client.synthetic.source import SyntheticSource
+from client.synthetic.spec import parse_spec
 from protocol.frames import CameraModel, RgbdFrame
 from tests.client.web.ball_scene import linear
 

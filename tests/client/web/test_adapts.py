@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page
 
-from client.coding import frame_message, picture_bytes
+from client.streaming.coding import frame_message, picture_bytes
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.h264 import is_key_picture
 from protocol.messages import ColorImage, Hello, Wishes

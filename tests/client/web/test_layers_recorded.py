@@ -13,7 +13,7 @@ from msgspec import structs
 from numpy.typing import NDArray
 from playwright.sync_api import Page
 
-from client.layers import shown_picture
+from client.display.layers import shown_picture
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import encode_color, encode_depth
 from protocol.messages import Frame, Hello

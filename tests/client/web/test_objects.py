@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from playwright.sync_api import Page
 
-from client.laptop.source import open_source
+from client.options.source import open_source
 from protocol.frames import CameraModel, RgbdFrame
 from server.service.serve import BackgroundServer
 from tests.client.web.conftest import OpenPage, wait_for_text

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page
 
-from client.laptop.recorded import open_recording
-from client.laptop.source import open_source
-from client.laptop.stream import stream
+from client.commands.stream import stream
+from client.options.source import open_source
+from client.sources.recording import open_recording
 from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
 from protocol.recording import read_messages

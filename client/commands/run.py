@@ -1,0 +1,95 @@
+"""`probeless run`: process a source in this process, without a network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from itertools import takewhile
+from types import TracebackType
+from typing import Protocol
+
+from client.commands.stopping import stop_on_interrupt
+from client.display.output_folder import FrameOutput
+from client.errors import RunError
+from client.objects.placing import place_objects
+from client.options.capture import Capture
+from client.sources.frame_source import is_live
+from protocol.frames import CameraModel, RgbdFrame
+from protocol.messages import MeshFormat, Wishes
+from server.client_session import ClientSession
+from server.meshing.files import mesh_files
+from server.opencl.device import open_device
+from server.pipeline import FrameResult
+
+
+class Processor(Protocol):
+    """The part of ClientSession that `process_frames` uses."""
+
+    def process(self, frame: RgbdFrame) -> FrameResult: ...
+
+
+class Run:
+    """An open pipeline for a capture; a context manager."""
+
+    def __init__(self, capture: Capture, device_name: str | None, note: Callable[[str], None]) -> None:
+        """`note` receives notes on objects. Raises UserError, DeviceError or MeshError, each with one line."""
+        self._capture = capture
+        self._pipeline = _open_pipeline(device_name, capture.source.camera, capture.wishes, note)
+        try:
+            place_objects(self._pipeline, capture.objects, note)
+        except BaseException:
+            self._pipeline.close()
+            raise
+
+    def outputs(self) -> Iterator[FrameOutput]:
+        """One output per frame, in order; a live source ends with Ctrl-C. Raises UserError."""
+        source = self._capture.source
+        with stop_on_interrupt(is_live(source)) as stopping:
+            positions = takewhile(lambda _: not stopping.is_set(), self._capture.frames)
+            yield from process_frames(self._pipeline, (source[i] for i in positions))
+
+    def mesh(self, progress: Callable[[int, int], None]) -> dict[MeshFormat, bytes]:
+        """Mesh files of the surface fused so far; `progress` receives parts done and total. Raises MeshingError."""
+        return mesh_files(self._pipeline.scene_mesh(progress))
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._pipeline.close()
+
+
+def process_frames(pipeline: Processor, frames: Iterable[RgbdFrame]) -> Iterator[FrameOutput]:
+    """The output of each frame. Raises RunError with the number of a frame that the pipeline refuses."""
+    for frame in frames:
+        try:
+            result = pipeline.process(frame)
+        except ValueError as error:
+            raise RunError(f"frame {frame.index}: {error}") from error
+        assert result.color is not None  # `Wishes.answer` is picture
+        yield FrameOutput(
+            frame=frame.index,
+            timestamp_s=frame.timestamp_s,
+            color=result.color,
+            light=result.light,
+            world_from_camera=result.world_from_camera,
+            tracking=result.tracking,
+            timings=result.timings,
+            plan=result.plan,
+            notes=result.notes,
+        )
+
+
+def _open_pipeline(
+    device_name: str | None, camera: CameraModel, wishes: Wishes, note: Callable[[str], None]
+) -> ClientSession:
+    device = open_device(device_name)
+    if wishes.preset == "auto":
+        from client.tuning.tune import ensure_front
+
+        ensure_front(device, note)
+    try:
+        return ClientSession(device, camera, wishes)
+    except ValueError as error:
+        raise RunError(str(error)) from error

@@ -1,0 +1,1 @@
+"""Files of virtual objects: parsing, packing into one message, placing."""

@@ -1,0 +1,1 @@
+"""Options of the command line: declaration, checks, and the capture that they describe."""

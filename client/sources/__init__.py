@@ -1,0 +1,1 @@
+"""Sources of RGB-D frames. `frame_source.Source` is their interface."""

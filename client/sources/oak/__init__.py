@@ -1,0 +1,1 @@
+"""Source: an OAK-D camera."""

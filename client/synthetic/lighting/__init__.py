@@ -1,0 +1,1 @@
+"""Distant lights, lamps, and precomputed shadows."""

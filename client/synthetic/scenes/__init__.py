@@ -1,0 +1,1 @@
+"""The scenes: solids, textures and camera paths."""

@@ -1,0 +1,1 @@
+"""Measurement of accuracy against time on a device (`probeless tune`)."""

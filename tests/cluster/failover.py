@@ -20,6 +20,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 TOKEN = "failover"
+PATIENCE_S = 600.0
+"""For what has no bound of its own; longer is taken to hang."""
 ROOMS = 4
 FRAMES_BEFORE = 5
 SAVED_WITHIN_S = 6.0
@@ -106,7 +108,7 @@ async def play(url: str, cluster: Cluster, doomed: Any) -> dict[str, Any]:
     guests = [await enter(url, f"room {number}") for number in range(ROOMS)]
     opened_s = time.perf_counter() - began
     try:
-        await until(lambda: all(len(guest.answered_s) >= FRAMES_BEFORE for guest in guests), 120)
+        await until(lambda: all(len(guest.answered_s) >= FRAMES_BEFORE for guest in guests), PATIENCE_S)
         await asyncio.sleep(SAVED_WITHIN_S)
         nodes = {guest.room: await node_of(guest.room) for guest in guests}
         moved = [guest for guest in guests if nodes[guest.room] == doomed.node_id]
@@ -114,7 +116,7 @@ async def play(url: str, cluster: Cluster, doomed: Any) -> dict[str, Any]:
         sys.stderr.write(f"killed at {time.strftime('%H:%M:%S')}\n")
         starts = [asyncio.create_task(process_back(guest.room, doomed.node_id)) for guest in moved]
         await asyncio.to_thread(kill, cluster, doomed)
-        await until(lambda: all(guest.back is not None for guest in moved), 200)
+        await until(lambda: all(guest.back is not None for guest in moved), PATIENCE_S)
         return {
             "processors": os.cpu_count(),
             "rooms_opened_s": round(opened_s, 1),

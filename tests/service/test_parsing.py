@@ -41,7 +41,7 @@ from tests.service.wire import Wire
 
 STUBBORN_MESHES = replace(MESH_JOB, job="tests.service.jobs:read_mesh")
 STUBBORN_PICTURES = replace(PICTURE_JOB, job="tests.service.jobs:read_picture")
-IMPATIENT = replace(STUBBORN_MESHES, timeout_s=0.2)
+IMPATIENT = replace(STUBBORN_MESHES, timeout_s=2.0)
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +191,7 @@ def test_a_mesh_that_hangs_its_reader_is_told_and_the_next_has_a_new_one(impatie
     impatient.on_death = deaths.append
     assert is_served(impatient)
     (before,) = impatient.meshes.pids
-    assert "was stopped: it took more than 0.2 s" in told(impatient, b"hang")
+    assert "was stopped: it took more than 2 s" in told(impatient, b"hang")
     assert impatient.meshes.pids == []
     assert is_served(impatient)
     assert impatient.meshes.pids != [before]
@@ -368,7 +368,7 @@ def test_a_mesh_that_kills_its_reader_over_the_socket(start_server: Callable) ->
         answer = wire.hear()
         assert isinstance(answer, Acknowledged)
         assert answer.request == request
-        expected = ("died on it (signal 11)", "took more than 0.2 s", None)[request]
+        expected = ("died on it (signal 11)", "took more than 2 s", None)[request]
         assert (answer.error is None) if expected is None else (expected in answer.error)
         assert wire.hear_until(Composite)[-1].frame == request
     assert rows(server)["probeless_parser_deaths_total", "mesh"] == 2

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page
 
-from client.streaming.coding import frame_message, picture_bytes
+from client.streaming.coding import frame_message
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.h264 import is_key_picture
 from protocol.messages import ColorImage, Hello, Wishes
@@ -34,7 +34,8 @@ DELAY_S = 0.02
 SETTLED, LOOKED_AT = 12, 10
 """Answers until the page has found its rung, and those whose age is then looked at."""
 LONGEST_S = 60.0
-AGE_BOUND_MS = 500.0
+YOUNGER = 0.75
+"""Age of frames with adaptation over the age without, at most. Seen: 0.15 and 0.59."""
 """Of a frame when it is answered, from its capture: about what one picture at the best takes over the link."""
 
 
@@ -122,6 +123,8 @@ def test_a_narrow_link_gets_smaller_pictures_younger_frames_and_the_best_again_w
     server: BackgroundServer, seen: Seen, open_page: OpenPage, keep_picture: Callable[[Page, str], None]
 ) -> None:
     device = of_device(CAMERA, textured(), loops=True)
+    age_without_ms = age_without_adapting_ms(server, seen, open_page)
+    seen.images.clear()
     with impaired(server.url, DELAY_S, BYTES_PER_S) as link, closing(open_page(link.url, device, (900, 900))) as page:
         note_ages(page)
         start_capture(page)
@@ -137,7 +140,7 @@ def test_a_narrow_link_gets_smaller_pictures_younger_frames_and_the_best_again_w
         assert page.evaluate("document.activeElement.id") == "sending"
         assert page.locator("#sending").get_attribute("aria-live") is None
         keep_picture(page, "sending_half")
-        assert age_ms < AGE_BOUND_MS
+        assert age_ms < YOUNGER * age_without_ms
 
         link.bytes_per_s = None
         wait_for_text(page, "#sending", "Sent now: full size, quality 90")
@@ -145,7 +148,8 @@ def test_a_narrow_link_gets_smaller_pictures_younger_frames_and_the_best_again_w
         page.goto("about:blank")
 
 
-def test_without_adapting_frames_are_older_than_that(server: BackgroundServer, seen: Seen, open_page: OpenPage) -> None:
+def age_without_adapting_ms(server: BackgroundServer, seen: Seen, open_page: OpenPage) -> float:
+    """Age of frames over the same link where the page sends all at the best quality."""
     device = of_device(CAMERA, textured(), loops=True)
     with impaired(server.url, DELAY_S, BYTES_PER_S) as link, closing(open_page(link.url, device, (900, 900))) as page:
         note_ages(page)
@@ -153,10 +157,10 @@ def test_without_adapting_frames_are_older_than_that(server: BackgroundServer, s
         page.locator("[name=adapt]").select_option("no")
         start_capture(page)
         age_ms = settled_age_ms(page)
-        assert age_ms > AGE_BOUND_MS
         assert {image.width for image in seen.images} == {CAMERA.width}
         wait_for_text(page, "#sending", "Sent now: full size, quality 90")
         page.goto("about:blank")
+    return age_ms
 
 
 @pytest.mark.skipif(importlib.util.find_spec("av") is None, reason="the server reads no video without PyAV")
@@ -180,25 +184,26 @@ def test_video_gets_fewer_bits_and_goes_on(server: BackgroundServer, seen: Seen,
     assert keys.count(True) < len(keys) / 3
 
 
-@pytest.mark.parametrize("adapts", ["yes", "no"])
 def test_a_recording_is_sent_as_it_is_when_the_link_is_free(
-    adapts: str, server: BackgroundServer, seen: Seen, open_page: OpenPage, tmp_path: Path
+    server: BackgroundServer, seen: Seen, open_page: OpenPage, tmp_path: Path
 ) -> None:
+    """Frames wait in the page for the link, not in the link, so they are not older than the link makes them."""
     messages = [frame_message(frame, CAMERA) for frame in recorded_frames()]
     with (tmp_path / "textured.rec").open("wb") as file:
         for message in (Hello(client="test", camera=CAMERA, wishes=Wishes(poses="given")), *messages):
             write_message(file, message)
-    with impaired(server.url, DELAY_S, BYTES_PER_S) as link, closing(open_page(link.url, size=(900, 900))) as page:
-        note_ages(page)
-        page.locator("input[name=source][value=recorded]").check()
-        page.locator("[name=adapt]").select_option(adapts)
-        start_recording(page, tmp_path / "textured.rec")
-        wait_for_text(page, "#sending", "Sent now: as recorded, ")
-        age_ms = settled_age_ms(page)
-        page.goto("about:blank")
+    ages_ms = {}
+    for adapts in ("yes", "no"):
+        with impaired(server.url, DELAY_S, BYTES_PER_S) as link, closing(open_page(link.url, size=(900, 900))) as page:
+            note_ages(page)
+            page.locator("input[name=source][value=recorded]").check()
+            page.locator("[name=adapt]").select_option(adapts)
+            start_recording(page, tmp_path / "textured.rec")
+            wait_for_text(page, "#sending", "Sent now: as recorded, ")
+            ages_ms[adapts] = settled_age_ms(page)
+            page.goto("about:blank")
     assert {image.data for image in seen.images} <= {message.color.data for message in messages}
-    one_ms = 1e3 * max(map(picture_bytes, messages)) / BYTES_PER_S
-    assert (age_ms < 1.4 * one_ms + 1e3 * 2 * DELAY_S) == (adapts == "yes")
+    assert ages_ms["yes"] < YOUNGER * ages_ms["no"]
 
 
 def recorded_frames() -> list[RgbdFrame]:

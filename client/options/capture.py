@@ -108,7 +108,6 @@ def prepare(options: CaptureOptions, lossless: bool = False, answer: str | None 
         exposure=choices.exposure or "auto",
         edges=choices.edges or "smooth",
         tone_mapping=choices.tone_mapping or "auto",
-        light_color=choices.light_color or "estimated",
         robustness=robustness,
         plan=choices.plan or "needed",
         answer=answer_kind or "picture",
@@ -231,7 +230,7 @@ def _robustness(text: str | None) -> tuple[Robustness, ...]:
     words = () if text == "none" else tuple(word.strip() for word in text.split(","))
     for word in words:
         choice("--robustness", word, (*ROBUSTNESS, "none"))
-    if "none" in words or {"normals", "normals_printed"} <= set(words):
+    if "none" in words:
         raise OptionError(f"--robustness {text}: these exclude one another; leave one out")
     return tuple(name for word in words for name in ROBUSTNESS if name == word)
 

@@ -15,7 +15,8 @@ from protocol.messages import Robustness as RobustnessName
 
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 DENOISE: tuple[Literal["none", "bilateral", "tv_l1"], ...] = ("none", "bilateral", "tv_l1")
-ROBUSTNESS: tuple[RobustnessName, ...] = get_args(RobustnessName)
+ROBUSTNESS: tuple[RobustnessName, ...] = ("openness", "normals", "memory", "outliers")
+"""The wire has one more, `normals_printed`, for a comparison in `probeless bench light`."""
 
 SourceArgument = Annotated[
     str, typer.Argument(metavar="SOURCE", help="data-set folder, synthetic:NAME, recording or oak[?vio=off]")
@@ -81,9 +82,6 @@ ToneMapping = Annotated[
         metavar="light|average",
         help="reference for the brightness of virtual objects; default: average, with --light: light",
     ),
-]
-LightColor = Annotated[
-    str | None, typer.Option(metavar="estimated|white", help="white: only the luminance of the light, as in the thesis")
 ]
 Plan = Annotated[
     str | None, typer.Option(metavar="needed|everything", help="everything: also effects whose change is invisible")
@@ -159,7 +157,6 @@ class CaptureOptions:
     robustness: Robustness = None
     edges: Edges = None
     tone_mapping: ToneMapping = None
-    light_color: LightColor = None
     plan: Plan = None
     budget_ms: BudgetMs = None
     max_light_error: MaxLightError = None

@@ -24,7 +24,6 @@ class Choices:
     lamps: Literal["on", "off"] | None
     edges: Literal["smooth", "hard"] | None
     tone_mapping: Literal["light", "average"] | None
-    light_color: Literal["estimated", "white"] | None
     plan: Literal["needed", "everything"] | None
     exposure: Literal["auto", "constant"] | None
     upsampling: Literal["bilateral", "bicubic"] | None
@@ -42,7 +41,6 @@ def choices_of(options: CaptureOptions) -> Choices:
         lamps=choice("--lamps", options.lamps, ("on", "off")),
         edges=choice("--edges", options.edges, ("smooth", "hard")),
         tone_mapping=choice("--tone-mapping", options.tone_mapping, ("light", "average")),
-        light_color=choice("--light-color", options.light_color, ("estimated", "white")),
         plan=choice("--plan", options.plan, ("needed", "everything")),
         exposure=choice("--exposure", options.exposure, ("auto", "constant")),
         upsampling=choice("--upsampling", options.upsampling, ("bilateral", "bicubic")),

@@ -29,12 +29,10 @@ install-video: .venv/installed-video
 demo: .venv/installed
 	$(BIN)/probeless demo
 
-# Tests marked alone (browsers, bounds on time) have the machine to themselves; the others run beside each other.
-WORKERS ?= 2
+# One more than there are processors, since tests of sockets and browsers wait.
+WORKERS ?= $(shell expr $$(nproc) + 1)
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest
 PARALLEL := -n $(WORKERS) --dist worksteal
-# Where tests marked alone may be: tests/conftest.py refuses them elsewhere.
-ALONE := tests/client/web tests/cluster tests/service
 test test-slow test-second-device slow-list: export PROBELESS_DATA := $(or $(PROBELESS_DATA),$(DATA))
 test test-slow slow-list: export PROBELESS_TEST_DEVICE := $(or $(PROBELESS_TEST_DEVICE),portable computing language)
 
@@ -42,8 +40,7 @@ test: .venv/installed-test
 ifdef TESTS
 	$(PYTEST) $(TESTS)
 else
-	$(PYTEST) $(PARALLEL) -m "not slow and not alone"
-	$(PYTEST) -m "not slow and alone" $(ALONE)
+	$(PYTEST) $(PARALLEL) -m "not slow"
 endif
 
 test-all:
@@ -53,20 +50,17 @@ test-all:
 test-rest: test-slow test-second-device
 
 test-slow: .venv/installed-all
-	$(PYTEST) $(PARALLEL) -m "slow and not alone"
-	$(PYTEST) -m "slow and alone" $(ALONE)
+	$(PYTEST) $(PARALLEL) -m slow
 
 # The loader of OpenCL finds PoCL in any case, and Intel's runtime by this folder.
 test-second-device: export OCL_ICD_VENDORS := $(CURDIR)/.venv/opencl
 test-second-device: export PROBELESS_TEST_DEVICE := intel
 test-second-device: .venv/installed-all
-	$(PYTEST) $(PARALLEL) -m "device and not alone"
-	$(PYTEST) -m "device and alone" $(ALONE)
+	$(PYTEST) $(PARALLEL) -m device
 
 slow-list: .venv/installed-all
 	mkdir -p out
-	$(PYTEST) $(PARALLEL) --durations=0 -vv -m "not alone" > out/durations.log
-	$(PYTEST) --durations=0 -vv -m alone $(ALONE) >> out/durations.log
+	$(PYTEST) -n $(shell nproc) --dist worksteal --durations=0 -vv > out/durations.log
 	$(BIN)/python -m tests.slow out/durations.log
 
 # Small faults in kernels and host code, one at a time: do the tests see them? Takes hours.

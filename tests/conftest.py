@@ -1,5 +1,6 @@
-"""Which tests are slow or run alone, what may be skipped, and the OpenCL devices that kernel tests run on."""
+"""Which tests are slow, what may be skipped, and the OpenCL devices that kernel tests run on."""
 
+import asyncio
 import os
 from collections.abc import Generator, Iterator
 from typing import Any
@@ -12,8 +13,6 @@ from tests import guards
 from tests.absent import fail_unexpected_skip
 from tests.slow import function_of, read_list, stale_lines, without_device
 
-ALONE_FOLDERS = ("tests/client/web/", "tests/cluster/", "tests/service/")
-"""Where `make` looks for tests that are marked alone."""
 COLLECTED = pytest.StashKey[list[str]]()
 """Names of all tests that were found, before any is deselected; without their device."""
 
@@ -35,23 +34,8 @@ def _name_of(item: pytest.Item) -> str:
     return without_device(item.nodeid, device) if device else item.nodeid
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> Generator[None, None, None]:
-    """Mark slow tests by tests/slow.txt, and others by the fixtures that they take; put those with a browser last.
-
-    The one browser of a session runs an event loop in the main thread from its first test on: no test after that can
-    run another.
-    """
-    _mark(config, items)
-    yield
-    items.sort(key=_takes_browser)
-
-
-def _takes_browser(item: pytest.Item) -> bool:
-    return "browser" in getattr(item, "fixturenames", ())
-
-
-def _mark(config: pytest.Config, items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark slow tests by tests/slow.txt, and tests that take a device."""
     slow = set(read_list())
     config.stash[COLLECTED] = []
     for item in items:
@@ -59,10 +43,6 @@ def _mark(config: pytest.Config, items: list[pytest.Item]) -> None:
         config.stash[COLLECTED].append(name)
         if name in slow or function_of(name) in slow:
             item.add_marker("slow")
-        if _takes_browser(item):
-            item.add_marker("alone")
-        if item.get_closest_marker("alone") and not item.nodeid.startswith(ALONE_FOLDERS):
-            raise pytest.UsageError(f"{item.nodeid} is marked alone; such tests belong in {', '.join(ALONE_FOLDERS)}")
         if "device" in getattr(item, "fixturenames", ()):
             item.add_marker("device")
 
@@ -95,6 +75,19 @@ def stale_slow_lines(pytestconfig: pytest.Config) -> list[str]:
 def device(request: pytest.FixtureRequest) -> Device:
     """An opened OpenCL device."""
     return open_device(request.param)
+
+
+@pytest.fixture(autouse=True)
+def suspended_browser(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Suspend the event loop of the session's browser, which runs in the main thread, while a test without a browser
+    may run a loop of its own."""
+    loop = asyncio._get_running_loop()
+    if loop is None or "browser" in request.fixturenames:
+        yield
+        return
+    asyncio._set_running_loop(None)
+    yield
+    asyncio._set_running_loop(loop)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -12,7 +12,6 @@ PATIENCE_S = 1500.0
 
 
 @pytest.mark.cluster
-@pytest.mark.alone
 @pytest.mark.skipif(
     importlib.util.find_spec("ray") is None or importlib.util.find_spec("grpc") is None,
     reason="needs the extra cluster: make install-cluster",

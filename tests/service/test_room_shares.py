@@ -64,7 +64,6 @@ def room(device: Device) -> Iterator[Room]:
     room.close()
 
 
-@pytest.mark.alone
 def test_clients_of_a_room_get_equal_shares_and_what_is_asked_between_waits_for_few_frames(room: Room) -> None:
     """As in the service: frames by the scheduler's turns; moves and saves by the lock alone."""
     scheduler, had, waited_s = Scheduler(), Counter[int](), list[float]()

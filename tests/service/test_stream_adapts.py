@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import pytest
-
 from client.commands.stream import Sending
 from protocol.messages import Frame
 from protocol.recording import read_messages
@@ -18,7 +16,6 @@ def sent_frames(record: Path) -> list[Frame]:
     return [message for message in read_messages(record, print) if isinstance(message, Frame)]
 
 
-@pytest.mark.alone
 def test_a_slow_link_gets_smaller_pictures_and_exact_depth(server, tmp_path: Path) -> None:
     source = FakeSource(180, fps=60.0)
     with impaired(server.url, delay_s=0.01, bytes_per_s=BYTES_PER_S) as link:

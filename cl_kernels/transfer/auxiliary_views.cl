@@ -2,6 +2,7 @@
 // Provides draw_views, look_into_views.
 #include "direction_sets.clh"
 #include "rays.clh"
+#include "samples.clh"
 
 #ifndef MASK_WORDS
 #error MASK_WORDS must be defined: 32-bit words that hold one bit a direction
@@ -50,14 +51,14 @@ kernel void draw_views(const int count, global const int *views, VOLUME_PARAMETE
 // to it, within reach_m of the point and above the point's tangent plane by lift_m.
 //
 // One item LANES samples, `blocks` items a set. positions [h][w], sample_normals [rows][cols] (w = 0 without surface); axes,
-// depths, center, distance_m, per_pixel: see draw_views; view_of [sets][count]: the view for a direction.
+// depths: see draw_views; view_of [sets][count]: the view for a direction.
 // -> lit [rows][cols][MASK_WORDS]: bit j = direction j lies above the surface and its light arrives.
-kernel void look_into_views(const int cols, const int rows, const int stride, const int width, const int block_cols,
-                            const int block_rows, global const float4 *positions, global const float4 *sample_normals,
-                            const int count, const int first_set, global const float4 *directions, global const int *view_of,
-                            global const float4 *axes, global const float *depths, const float4 center, const float distance_m,
-                            const float per_pixel, const float reach_m, const float lift_m, global uint *lit) {
+kernel void look_into_views(const LookUpParameters p, global const float4 *positions, global const float4 *sample_normals,
+                            global const float4 *directions, global const int *view_of, global const float4 *axes,
+                            global const float *depths, global uint *lit) {
     const int item = get_global_id(0);
+    const int cols = p.grid.cols, rows = p.grid.rows, count = p.count, block_cols = p.block_cols, block_rows = p.block_rows;
+    const float distance_m = p.distance_m, per_pixel = p.per_pixel;
     const int blocks = block_cols * block_rows;
     if (item >= SET_STEP * SET_STEP * blocks) return;
     const int place = item / blocks, block = item % blocks;
@@ -69,7 +70,7 @@ kernel void look_into_views(const int cols, const int rows, const int stride, co
         const int col = first_col + lane % LANE_COLS * SET_STEP, row = first_row + lane / LANE_COLS * SET_STEP;
         float4 position = (float4)(0.0f), normal = (float4)(0.0f);
         if (col < cols && row < rows) {
-            position = positions[(stride / 2 + row * stride) * width + stride / 2 + col * stride] - center;
+            position = positions[sample_pixel(p.grid, row, col)] - p.center;
             normal = sample_normals[row * cols + col];
         }
         covered |= normal.w > 0.0f;
@@ -79,27 +80,27 @@ kernel void look_into_views(const int cols, const int rows, const int stride, co
     uint bits[LANES * MASK_WORDS];
     for (int i = 0; i < LANES * MASK_WORDS; i++) bits[i] = 0;
     if (covered) {
-        const Vectors p = {LOAD_LANES(px), LOAD_LANES(py), LOAD_LANES(pz)}, n = {LOAD_LANES(nx), LOAD_LANES(ny), LOAD_LANES(nz)};
+        const Vectors o = {LOAD_LANES(px), LOAD_LANES(py), LOAD_LANES(pz)}, n = {LOAD_LANES(nx), LOAD_LANES(ny), LOAD_LANES(nz)};
         const float shift_x = 0.5f * SIDE + (first_col & 1) * 0.5f - 0.25f, shift_y = 0.5f * SIDE + (first_row & 1) * 0.5f - 0.25f;
-        const int set = (first_set + direction_set(first_row, first_col)) * count;
+        const int set = (p.first_set + direction_set(first_row, first_col)) * count;
         for (int j = 0; j < count; j++) {
             const float4 w = directions[set + j];
             const intn above = MASK(n.x * w.x + n.y * w.y + n.z * w.z > 0.0f);
             if (!ANY(above)) continue;
             const int view = view_of[set + j];
             const float4 right = axes[3 * view], down = axes[3 * view + 1], ahead = axes[3 * view + 2];
-            const floatn z = ahead.x * p.x + ahead.y * p.y + ahead.z * p.z + distance_m;
+            const floatn z = ahead.x * o.x + ahead.y * o.y + ahead.z * o.z + distance_m;
             const floatn pixels = 1.0f / (z * per_pixel);
-            const floatn x = (right.x * p.x + right.y * p.y + right.z * p.z) * pixels + shift_x;
-            const floatn y = (down.x * p.x + down.y * p.y + down.z * p.z) * pixels + shift_y;
+            const floatn x = (right.x * o.x + right.y * o.y + right.z * o.z) * pixels + shift_x;
+            const floatn y = (down.x * o.x + down.y * o.y + down.z * o.z) * pixels + shift_y;
             const intn col = clamp(CONVERT_INTN(x), 0, SIDE - 1), row = clamp(CONVERT_INTN(y), 0, SIDE - 1);
             const floatn depth = GATHER_FLOATN(depths, ((view * SIDE + row) * SIDE + col) & above);
             const floatn sx = (CONVERT_FLOATN(col) - 0.5f * (SIDE - 1)) * per_pixel, sy = (CONVERT_FLOATN(row) - 0.5f * (SIDE - 1)) * per_pixel;
-            const floatn tx = depth * (sx * right.x + sy * down.x + ahead.x) - (distance_m * ahead.x + p.x);
-            const floatn ty = depth * (sx * right.y + sy * down.y + ahead.y) - (distance_m * ahead.y + p.y);
-            const floatn tz = depth * (sx * right.z + sy * down.z + ahead.z) - (distance_m * ahead.z + p.z);
-            const intn hidden = MASK(depth > 0.0f) & MASK(depth < z) & MASK(tx * n.x + ty * n.y + tz * n.z > lift_m) &
-                                MASK(tx * tx + ty * ty + tz * tz < reach_m * reach_m);
+            const floatn tx = depth * (sx * right.x + sy * down.x + ahead.x) - (distance_m * ahead.x + o.x);
+            const floatn ty = depth * (sx * right.y + sy * down.y + ahead.y) - (distance_m * ahead.y + o.y);
+            const floatn tz = depth * (sx * right.z + sy * down.z + ahead.z) - (distance_m * ahead.z + o.z);
+            const intn hidden = MASK(depth > 0.0f) & MASK(depth < z) & MASK(tx * n.x + ty * n.y + tz * n.z > p.lift_m) &
+                                MASK(tx * tx + ty * ty + tz * tz < p.reach_m * p.reach_m);
             const int arrives = bits_of(above & ~hidden);
             for (int lane = 0; lane < LANES; lane++)
                 bits[lane * MASK_WORDS + (j >> 5)] |= (uint)((arrives >> lane) & 1) << (j & 31);

@@ -145,6 +145,32 @@ TRANSFER_PARAMETERS = Struct(
 )
 """Parameters of radiance_transfer.cl. cached_normals_at: byte of the cache's surface at which its normals begin."""
 
+LOOK_UP_PARAMETERS = Struct(
+    "LookUpParameters",
+    grid=GRID,
+    center="float4",
+    distance_m="float",
+    per_pixel="float",
+    block_cols="int",
+    block_rows="int",
+    count="int",
+    first_set="int",
+    reach_m="float",
+    lift_m="float",
+)
+"""Parameters of look_into_views in auxiliary_views.cl. center, distance_m, per_pixel: of the views, see draw_views."""
+
+GATHER_PARAMETERS = Struct(
+    "GatherParameters",
+    grid=GRID,
+    volume=VOLUME_SHAPE,
+    count="int",
+    every="int",
+    reach_m="float",
+    least_cosine="float",
+)
+"""Parameters of indirect.cl. count: directions of one set; every: a sample traces every n-th blocked direction."""
+
 VIEW_TRANSFER_PARAMETERS = Struct(
     "ViewTransferParameters",
     grid=GRID,
@@ -201,6 +227,8 @@ STRUCTS = (
     VIEW_PARAMETERS,
     DIRECT_PARAMETERS,
     TRANSFER_PARAMETERS,
+    LOOK_UP_PARAMETERS,
+    GATHER_PARAMETERS,
     VIEW_TRANSFER_PARAMETERS,
     MIXTURE_PARAMETERS,
     LAYER_PARAMETERS,

@@ -19,6 +19,7 @@ from protocol.frames import CameraModel
 from server.maths.sh import GOLDEN_TURN, spherical_fibonacci
 from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, float4
+from server.opencl.structs import GRID, LOOK_UP_PARAMETERS
 from server.transfer.radiance_transfer import Directions, first_set
 from server.volume.raycast import Surface
 from server.volume.volume import BRICK, Volume
@@ -206,25 +207,24 @@ def look_into_views(
     engine.launch(
         _kernel(engine, "look_into_views", views, words),
         (_SET_STEP**2 * block_cols * block_rows,),
-        cols,
-        rows,
-        stride,
-        camera.width,
-        block_cols,
-        block_rows,
+        LOOK_UP_PARAMETERS(
+            grid=GRID(cols=cols, rows=rows, stride=stride, width=camera.width),
+            center=float4(*views.center, 0.0),
+            distance_m=views.distance_m,
+            per_pixel=views.per_pixel,
+            block_cols=block_cols,
+            block_rows=block_rows,
+            count=rays.count,
+            first_set=first_set(turn),
+            reach_m=reach_m,
+            lift_m=lift_m,
+        ),
         surface.positions,
         normals,
-        rays.count,
-        first_set(turn),
         rays.on_device(engine),
         engine.buffers(_Buffers).view_of.upload(view_of),
         views.axes,
         views.depths,
-        float4(*views.center, 0.0),
-        views.distance_m,
-        views.per_pixel,
-        reach_m,
-        lift_m,
         lit,
     )
     return lit

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
-from server.transfer.radiance_transfer import Directions, Transfer, own_sets
+from server.opencl.structs import GATHER_PARAMETERS
+from server.transfer.radiance_transfer import Directions, Transfer, own_sets, sample_grid
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
 
@@ -74,21 +75,21 @@ def gather_hits(
     engine.launch(
         engine.kernel("indirect.cl", "gather_hits", **defines),
         (transfer.cols, transfer.rows),
-        transfer.cols,
-        transfer.rows,
-        transfer.stride,
-        camera.width,
+        GATHER_PARAMETERS(
+            grid=sample_grid(camera, transfer),
+            volume=volume.shape,
+            count=rays.count,
+            every=every,
+            reach_m=reach_m,
+            least_cosine=LEAST_COSINE,
+        ),
         surface.positions,
         surface.normals,
         transfer.free_mask,
         transfer.sets if transfer.sets is not None else own_sets(engine, transfer.rows, transfer.cols),
-        *volume.arguments(),
+        *volume.arguments()[1:],
         volume.colors,
-        rays.count,
         rays.on_device(engine),
-        reach_m,
-        every,
-        LEAST_COSINE,
         hits,
     )
     return hits

@@ -13,7 +13,7 @@ from server.service.authenticator import Authenticator
 from server.service.object_library import ObjectLibrary
 from server.service.serve import BackgroundServer
 from tests.client.web.conftest import OpenPage, wait_for_text
-from tests.client.web.page import start_capture
+from tests.client.web.page import start_capture, wait_until
 from tests.client.web.received import CAMERA, frames_seen
 from tests.client.web.sequence import of_device
 from tests.service.fakes import Lab
@@ -50,6 +50,16 @@ def place(page: Page, name: str) -> None:
     wait_for_text(page, "#object-said", f"{name} placed.")
 
 
+def placed_meshes(page: Page, lab: Lab, count: int) -> list[tuple[str, bytes]]:
+    """What the pipeline was given, once there are so many: the page says so before."""
+
+    def given() -> list[tuple[str, bytes]]:
+        return [entry[2] for entry in lab.log if entry[0] == "place"]
+
+    wait_until(lambda: len(given()) >= count, page)
+    return given()
+
+
 def test_the_servers_objects_are_listed_fetched_and_placed(
     page: Page, lab: Lab, keep_picture: Callable[[Page, str], None]
 ) -> None:
@@ -67,8 +77,7 @@ def test_the_servers_objects_are_listed_fetched_and_placed(
     assert len(fetched) == 1
     page.locator("#model").select_option("server:vase.glb")
     place(page, "vase")
-    placed = [entry[2] for entry in lab.log if entry[0] == "place"]
-    assert placed == [("obj", SOFA), ("obj", SOFA), ("glb", vase_glb())]
+    assert placed_meshes(page, lab, 3) == [("obj", SOFA), ("obj", SOFA), ("glb", vase_glb())]
 
 
 def test_an_object_that_was_taken_away_is_told_and_another_can_be_placed(page: Page, folder: Path) -> None:
@@ -93,8 +102,7 @@ def test_a_file_is_dropped_onto_the_picture_and_onto_the_tools(page: Page, lab: 
         page.dispatch_event(target, "drop", {"dataTransfer": page.evaluate_handle(make, name)})
         wait_for_text(page, "#object-said", f"{name} can be placed now.")
         place(page, name[:-4])
-    placed = [entry[2] for entry in lab.log if entry[0] == "place"]
-    assert placed == [("obj", b"a mesh"), ("ply", b"a mesh")]
+    assert placed_meshes(page, lab, 2) == [("obj", b"a mesh"), ("ply", b"a mesh")]
     make = "() => { const all = new DataTransfer(); all.items.add(new File(['text'], 'letter.txt')); return all; }"
     page.dispatch_event("#object-tools", "drop", {"dataTransfer": page.evaluate_handle(make)})
     wait_for_text(page, "#object-said", "letter.txt is no model that can be placed: choose a .glb, .obj, .ply or .stl")

@@ -104,6 +104,7 @@ def test_a_server_that_is_started_anew_gets_objects_again(start: StartServer, la
     start(port=int(first.url.rpartition(":")[2]))
     wait_for_text(page, "#notes", "the session has begun anew")
     wait_for_text(page, "#state", "Live, captured here")
+    wait_until(lambda: sum(entry[0] == "place" for entry in lab.log) >= 2, page)
     again = [entry for entry in lab.log if entry[0] == "place"]
     assert [entry[1] for entry in again] == 2 * [placed[0][1]]
 

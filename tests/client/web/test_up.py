@@ -44,6 +44,7 @@ def test_what_is_level_is_so_in_the_room(server: BackgroundServer, lab: Lab, ope
     def places() -> list[np.ndarray]:
         return [np.array(entry[-1].position_m) for entry in lab.log if entry[0] in ("place", "move")]
 
+    wait_until(lambda: len(places()) >= 1)
     for key in ("Shift+ArrowRight", "Shift+ArrowUp"):
         count = len(places())
         page.keyboard.press(key)

@@ -29,8 +29,8 @@ install-video: .venv/installed-video
 demo: .venv/installed
 	$(BIN)/probeless demo
 
-# One more than there are processors, since tests of sockets and browsers wait.
-WORKERS ?= $(shell expr $$(nproc) + 1)
+# Two more than there are processors, since tests of sockets, browsers and clusters wait.
+WORKERS ?= $(shell expr $$(nproc) + 2)
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest
 PARALLEL := -n $(WORKERS) --dist worksteal
 test test-slow test-second-device slow-list: export PROBELESS_DATA := $(or $(PROBELESS_DATA),$(DATA))

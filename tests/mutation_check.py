@@ -1,9 +1,10 @@
 """Do the tests see small faults? Changes one operator, constant or condition at a time and runs the tests of its stem.
 
 `python -m tests.mutation_check --seed 18 --count 30` draws changes from the kernels, server/ and protocol/, each place
-as likely as any other, and applies each to a copy of the tree. The tests of its stem are the test files with the
-stem in their name, or else those that import the module. A change that they do not see survives; `--whole` then runs
-`make test` on each survivor. Changes that do not compile are drawn again. Writes out/mutations.json.
+as likely as any other, and applies each to a copy of the tree. The tests of its stem are the test files with the stem
+in their name, and those that import the module, or, without any, that import a module that uses it. A change that they
+do not see survives; `--whole` then runs `make test` on each survivor. Changes that do not compile are drawn again.
+Writes out/mutations.json; `--again` judges the survivors in it once more.
 """
 
 from __future__ import annotations
@@ -134,17 +135,35 @@ def all_mutations() -> list[Mutation]:
 
 
 def tests_of(path: str) -> list[str]:
-    """Test files with the stem in their name, or else those that import the module, for a kernel its host."""
+    """Test files with the stem in their name, then those that import the module (for a kernel its host), or without any
+    those that import a module that does."""
     stems = {Path(path).stem} | (
         {kernel.stem for kernel in _users(Path(path).name)} if path.endswith(".clh") else set()
     )
     tests = sorted((ROOT / "tests").rglob("test_*.py"))
     named = [t for t in tests if any(t.stem == f"test_{s}" or t.stem.startswith(f"test_{s}_") for s in stems)]
-    module = path.removesuffix(".cl").removesuffix(".py").replace("/", ".").replace("cl_kernels.", "server.")
-    package, _, name = module.rpartition(".")
-    imports = re.compile(rf"from {re.escape(module)} import|from {re.escape(package)} import [^\n]*\b{name}\b")
-    found = named or [test for test in tests if imports.search(test.read_text())]
-    return [str(test.relative_to(ROOT)) for test in found]
+    users = _users(Path(path).name) if path.endswith(".clh") else set()
+    modules = {_module_of(str(user.relative_to(ROOT))) for user in users} or {_module_of(path)}
+    importing = _importing(modules, tests)
+    if not named and not importing:
+        sources = sorted(file for package in (*PACKAGES, "client") for file in (ROOT / package).rglob("*.py"))
+        hosts = {_module_of(str(file.relative_to(ROOT))) for file in _importing(modules, sources)}
+        importing = _importing(hosts, tests)
+    return [str(test.relative_to(ROOT)) for test in dict.fromkeys([*named, *importing])]
+
+
+def _module_of(path: str) -> str:
+    return path.removesuffix(".cl").removesuffix(".py").replace("/", ".").replace("cl_kernels.", "server.")
+
+
+def _importing(modules: set[str], files: list[Path]) -> list[Path]:
+    """Files that import one of the modules."""
+    patterns = []
+    for module in modules:
+        package, _, name = module.rpartition(".")
+        patterns.append(rf"from {re.escape(module)} import|from {re.escape(package)} import [^\n]*\b{name}\b")
+    imports = re.compile("|".join(patterns)) if patterns else None
+    return [file for file in files if imports and imports.search(file.read_text())]
 
 
 def _users(include: str) -> set[Path]:
@@ -183,8 +202,14 @@ def main() -> None:
     options.add_argument("--seed", type=int, default=18)
     options.add_argument("--count", type=int, default=30)
     options.add_argument("--whole", action="store_true", help="run `make test` on what survives the tests of its stem")
+    options.add_argument("--again", action="store_true", help="judge the survivors of the last run once more")
     asked = options.parse_args()
-    drawn = iter(random.Random(asked.seed).sample(found := all_mutations(), len(found)))
+    found = all_mutations()
+    drawn = iter(random.Random(asked.seed).sample(found, len(found)))
+    if asked.again:
+        last = json.loads((ROOT / "out" / "mutations.json").read_text())
+        again = [Mutation(**verdict["mutation"]) for verdict in last if verdict["outcome"] == "survived"]
+        drawn, asked.count = iter(again), len(again)
     verdicts: list[Verdict] = []
     with tempfile.TemporaryDirectory() as folder:
         tree = _copy_of_the_tree(Path(folder) / "tree")

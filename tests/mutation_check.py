@@ -143,12 +143,13 @@ def tests_of(path: str) -> list[str]:
     tests = sorted((ROOT / "tests").rglob("test_*.py"))
     named = [t for t in tests if any(t.stem == f"test_{s}" or t.stem.startswith(f"test_{s}_") for s in stems)]
     users = _users(Path(path).name) if path.endswith(".clh") else set()
+    named += [test for test in tests if path.endswith(".clh") and Path(path).name in test.read_text()]
     modules = {_module_of(str(user.relative_to(ROOT))) for user in users} or {_module_of(path)}
     importing = _importing(modules, tests)
-    if not named and not importing:
-        sources = sorted(file for package in (*PACKAGES, "client") for file in (ROOT / package).rglob("*.py"))
-        hosts = {_module_of(str(file.relative_to(ROOT))) for file in _importing(modules, sources)}
-        importing = _importing(hosts, tests)
+    sources = sorted(file for package in (*PACKAGES, "client") for file in (ROOT / package).rglob("*.py"))
+    while modules and not named and not importing:
+        modules = {_module_of(str(file.relative_to(ROOT))) for file in _importing(modules, sources)}
+        importing = _importing(modules, tests)
     return [str(test.relative_to(ROOT)) for test in dict.fromkeys([*named, *importing])]
 
 

@@ -101,6 +101,20 @@ def test_layer_is_the_twins(device: Device, is_smooth: bool, kind: type[Engine])
     engine.close()
 
 
+def test_depth_of_real_surface_goes_one_pixel_beyond_what_is_changed(engine: Engine) -> None:
+    """A client that interpolates at the rim needs it; farther out the layer is empty."""
+    _, (radiance, real, *virtual), fine = hard_scene()
+    ratio = virtual[-1].values
+    ratio[:, :, :3] = 1
+    ratio[2:4, 3:5, :3] = ratio[-4:-2, -5:-3, :3] = 2  # two places, with a gap between them
+    factors, depths = whole(layer_of(engine, radiance, real, *virtual, inverse_depths=fine).ratio, NEUTRAL, channels=3)
+    changed = (factors != NEUTRAL).any(-1)
+    beside = np.pad(changed, 1)
+    near = np.any([beside[1 + y : 1 + y + HEIGHT, 1 + x : 1 + x + WIDTH] for y in (-1, 0, 1) for x in (-1, 0, 1)], 0)
+    assert not depths[~near].any()
+    assert (depths[near & ~changed] > 0).any()
+
+
 def test_parts_are_no_larger_than_what_they_hold(engine: Engine) -> None:
     _, (radiance, real, *virtual), fine = hard_scene()
     found = layer_of(engine, radiance, real, *virtual, inverse_depths=fine)

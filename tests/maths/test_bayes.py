@@ -141,5 +141,7 @@ def test_perfect_data_is_exact() -> None:
 def test_condition_number() -> None:
     assert condition_number(np.diag([4.0, 2.0, 1.0])) == pytest.approx(4)
     assert condition_number(np.diag([1.0, 0.0])) == float("inf")
+    assert condition_number(np.diag([1.0, 1e-13, 1e-13])) == pytest.approx(1e13)
+    assert condition_number(np.diag([1.0, 1.0, 1e-15])) == float("inf")
     assert condition_number(np.diag([1.0, -1e-20])) == float("inf")
     assert condition_number(np.zeros((3, 3))) == float("inf")

@@ -13,7 +13,7 @@ from server.culling.influence_bound import NOWHERE, UNKNOWN, InfluenceBound
 from server.culling.reason import ALLOWANCE
 from server.culling.scene_facts import Brightness, SceneFacts, most_radiance, most_shading
 from server.input.measure import linear_values
-from server.maths.microfacets import most_reflected, reflected_share
+from server.maths.microfacets import HEAD_ON, most_reflected, reflected_share
 from server.maths.sh import lambert_transfer, sh_basis, spherical_fibonacci
 from server.shading.composite import srgb_codes
 
@@ -59,6 +59,7 @@ def test_gloss_is_bounded_by_its_materials() -> None:
     assert most_reflected(np.array([[1.0, 0.0, -1, 0]], np.float32), 0.5) == 1.0
     both = np.concatenate([rough, smooth, rough])
     assert most_reflected(both, 0.5) == most_reflected(smooth, 0.5)
+    assert pytest.approx(((1.5 - 1) / (1.5 + 1)) ** 2) == HEAD_ON  # glTF's dielectric, of index 1.5 (Fresnel)
     a, b = reflected_share(np.full(9, 0.3), np.linspace(0, 1, 9))
     assert ((a + b) <= 1.05).all()
     assert most_reflected(np.array([[0.3, 1.0, -1, -1]], np.float32), 1.0) == 1.0  # metal keeps all diffuse light

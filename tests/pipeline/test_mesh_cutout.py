@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from server.scene import cutout
+from server.scene.materials import Texture
 from server.scene.mesh import Mesh, MeshError, load_mesh
 from tests.scenes.gltf_files import QUAD, Gltf, Json, assert_well_formed, color_uv
 
@@ -37,6 +38,17 @@ def card(mode: str, uv: np.ndarray = UNIT_UV, factor: float = 1.0, picture: Any 
 def area(mesh: Mesh) -> float:
     a, b, c = (mesh.vertices[mesh.triangles[:, k]].astype(float) for k in range(3))
     return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+
+
+def test_the_outline_is_bilinear_between_texels() -> None:
+    """A bilinear function of the texels' centres is met exactly within them."""
+    y, x = np.mgrid[:5, :7]
+    alpha = (3 * x * y + 20 * y + 9 * x).astype(np.uint8)
+    outline = cutout.Outline.of(Texture(np.zeros((5, 7, 3), np.uint8), alpha=alpha), 1.0, 0.25)
+    u, v = np.random.default_rng(0).uniform([[0], [0]], [[6], [4]], (2, 50))
+    expected = (3 * u * v + 20 * v + 9 * u) / 255 - 0.25
+    found = outline.at((np.stack([u, v], axis=1) + 0.5) / [7, 5])
+    np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 def test_a_card_becomes_its_disc() -> None:

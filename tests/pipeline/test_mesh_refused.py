@@ -87,6 +87,15 @@ def test_accessor_bomb() -> None:
         load_mesh(file.glb(), "glb")
 
 
+def test_an_accessor_of_less_than_nothing() -> None:
+    """Counts that cancel out in the sum."""
+    file = Gltf()
+    file.quad()
+    file.header["accessors"].append({"count": -3, "componentType": 5126, "type": "VEC3"})
+    with pytest.raises(MeshError, match="accessors"):
+        load_mesh(file.glb(), "glb")
+
+
 def test_many_primitives_of_the_same_bytes() -> None:
     file = Gltf()
     primitive = file.quad()

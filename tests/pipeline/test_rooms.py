@@ -241,6 +241,17 @@ def test_a_marker_that_nobody_has_seen_is_said(device: Device, room: Room) -> No
     assert any("nobody in the room has seen marker 7" in note for note in result.notes)
 
 
+def test_a_frame_has_no_pose_before_its_marker_has_a_place(device: Device, room: Room) -> None:
+    view = view_at(0)
+    frame = replace(show_marker(frame_at(view, 0, given=view), view), world_from_camera=None)
+    client = join(device, room, marker=MARKER)
+    assert client._alignment.in_room(frame) is frame
+    room.markers.note(MARKER, marker_place())
+    found = client._alignment.in_room(frame).world_from_camera
+    assert found is not None
+    assert distance_between(found, view) < 0.4  # seen: 0.26 m, from a marker of a few pixels alone, 2.5 m away
+
+
 def test_somebody_who_only_looks_sees_the_room_from_where_he_stands(device: Device, room: Room) -> None:
     scan(join(device, room), range(0, 30, 2))
     looker = join(device, room, room_from_world=said(inverse_rigid(ELSEWHERE)))

@@ -1,4 +1,4 @@
-// Adaptive refinement (thesis 6.1.1, step 1): shading at every pixel where that of samples changes from one to the next.
+// Adaptive refinement (thesis 6.1.1, step 1): shading at every pixel where it changes from sample to sample.
 // Provides mark_edges, mark_varying, mark_shown, refine_virtual, refine_real.
 #include "direction_sets.clh"
 #include "shadows.clh"
@@ -33,8 +33,8 @@ kernel void mark_edges(const int width, const int height, global const float4 *p
     edges[at] = (uchar)edge;
 }
 
-// Mean of the valid ones of 4 x 4 samples from (row, col) on, whose directions are those of all sets of a lattice: single
-// samples differ by their directions alone. w = 0 without any.
+// Mean of the valid samples of a 4 x 4 block from (row, col) on, which together use all sets of a lattice: single samples
+// already differ by their directions. w = 0 without any.
 static float4 block_mean(const int cols, const int rows, global const float4 *ratio, const int row, const int col) {
     float4 sum = (float4)(0.0f);
     for (int r = max(row, 0); r <= min(row + 3, rows - 1); r++) {
@@ -51,8 +51,8 @@ static inline float greatest_change(const float4 a, const float4 b) {
     return fmax(fmax(change.x, change.y), change.z);
 }
 
-// ratio [rows][cols] (w = 1 valid) -> varying [rows + 1][cols + 1]: whether the mean of the 4 x 4 samples to one side of a
-// cell, which begins at sample (row - 1, col - 1), is another than to the opposite side by more than `least_change`.
+// ratio [rows][cols] (w = 1 valid) -> varying [rows + 1][cols + 1]: whether the means of the 4 x 4 samples on two opposite
+// sides of a cell, which begins at sample (row - 1, col - 1), differ by more than `least_change`.
 kernel void mark_varying(const int cols, const int rows, global const float4 *ratio, const float least_change,
                          global uchar *varying) {
     const int cell_col = (int)get_global_id(0) - 1;
@@ -77,8 +77,9 @@ kernel void mark_shown(const int width, const int height, global const float4 *r
     shown[y * width + x] = !(here.w > 0.0f && (there.w <= 0.0f || dot(to_virtual, to_virtual) < dot(to_real, to_real)));
 }
 
-// What occluders take from the virtual surface at `pixels` [listed]; positions, normals, shown [h][w]: the virtual geometry buffer.
-// scene.every: as in shadow_virtual; the picture is a mean over 4 x 4 pixels (upsample.clh). -> occluded [h][w] (rgb, w = 1); other pixels are left as they are.
+// Radiance that occluders take from the virtual surface at `pixels` [listed]; positions, normals, shown [h][w]: the virtual geometry
+// buffer. scene.every: as in shadow_virtual; the picture is a mean over 4 x 4 pixels (upsample.clh).
+// -> occluded [h][w] (rgb, w = 1); other pixels are not written.
 kernel void refine_virtual(SCENE_PARAMETERS, const int listed, global const int *pixels, global const float4 *positions,
                            global const float4 *normals, global const int *shown, global float4 *occluded) {
     const int item = get_global_id(0);
@@ -92,8 +93,8 @@ kernel void refine_virtual(SCENE_PARAMETERS, const int listed, global const int 
                                          direction_subset(y, x, scene.every), scene.every);
 }
 
-// The ratio R' / R of shading with virtual objects to shading without, at `pixels` [listed] of the real surface. What the
-// objects take is sampled at the pixel; R changes little from sample to sample and is taken from them: shaded [rows][cols].
+// The ratio R' / R of shading with virtual objects to shading without, at `pixels` [listed] of the real surface. The
+// objects' part is computed at the pixel; R changes little from sample to sample and is interpolated: shaded [rows][cols].
 // -> ratio [h][w] (rgb, w = 1), w = 0 where there is no surface; other pixels are left as they are.
 kernel void refine_real(REAL_SCENE_PARAMETERS, const int listed, global const int *pixels, global const float4 *positions,
                         global const float4 *normals, global const float4 *shaded, global float4 *ratio) {

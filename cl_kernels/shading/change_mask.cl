@@ -1,9 +1,9 @@
-// Which parts of the picture virtual objects change more than is to be left out (thesis 7.1): R' / R counts there, and 1 elsewhere.
+// Cells of the picture that virtual objects change visibly (thesis 7.1): R' / R is applied there, and 1 elsewhere.
 // Provides mark_reached.
 #include "upsample.clh"
 
-#define WINDOW 6    // samples along a side that a cell's pixels are means of
-#define CORNERS 3   // places along a side of a cell between which means of boxes change linearly: its ends and its middle
+#define WINDOW 6    // samples along each side that a cell's pixels are means of
+#define CORNERS 3   // places along a side of a cell between which means of boxes change linearly: its ends and its centre
 
 // Weights of the box of upsample.clh at these places; sample 2 is the one at the cell's beginning.
 constant float BOX[CORNERS][WINDOW] = {{0.5f, 1.0f, 1.0f, 1.0f, 0.5f, 0.0f},
@@ -16,7 +16,7 @@ static inline float change_of(const float4 ratio) {
     return ratio.w > 0.0f ? fmax(fmax(change.x, change.y), change.z) : 0.0f;
 }
 
-// What surface has in common: a plane through `point`.
+// A plane through `point` that approximates several surface points.
 typedef struct {
     float3 point;
     float3 normal;
@@ -32,7 +32,7 @@ static inline void take_in(Flat *flat, const float3 point, const float3 normal) 
     flat->apart_m = fmax(flat->apart_m, length(offset));
 }
 
-// Less than what any of that surface counts for any other at upsampling, but for the box: see weight_of. Two normals are no more
+// Lower bound of the weights between any two of these points in upsampling, without the box: see weight_of. Two normals are no more
 // than twice as far apart as each is from the plane's, and a point is off another's plane by no more than off its own and by how
 // much that is tilted.
 static inline float least_weight(const Flat flat, const float tolerance_m) {
@@ -42,7 +42,7 @@ static inline float least_weight(const Flat flat, const float tolerance_m) {
     return facing * facing * facing * facing / (1.0f + off * off * off * off);
 }
 
-// The greatest mean change over boxes around the cell's places, were all surface one plane; anything, where there is none.
+// Greatest mean change over boxes around the cell's places, if all surface were one plane; undefined without surface.
 static float greatest_mean(const Grid grid, global const float4 *ratio, const int first_row, const int first_col) {
     float changes[CORNERS][CORNERS], weights[CORNERS][CORNERS];
     for (int i = 0; i < CORNERS * CORNERS; i++) changes[i / CORNERS][i % CORNERS] = weights[i / CORNERS][i % CORNERS] = 0.0f;
@@ -72,7 +72,7 @@ static float greatest_mean(const Grid grid, global const float4 *ratio, const in
 }
 
 // ratio [rows][cols] (w = 1 valid): R' / R at samples of real surface; positions, normals [height][width] of it; refined [height][width]:
-// what stands for `ratio` where w = 1, or none where has_refined is 0. -> reached [rows + 1][cols + 1]: 0 where no pixel of a cell
+// replaces `ratio` where w = 1, or none where has_refined is 0. -> reached [rows + 1][cols + 1]: 0 where no pixel of a cell
 // (see upsample.clh) has a mean that is farther from 1 than `spare`, and none that is not exactly 1 is refined.
 //
 // A mean is no farther from 1 than the farthest sample. Where all surface of the cell and of its samples is about one plane, no

@@ -1,4 +1,4 @@
-// Compositing (thesis 7.2.1, R3): real hides virtual and virtual hides real; linear inside, sRGB at the end.
+// Compositing (thesis 7.2.1, R3) with mutual occlusion of real and virtual surface; linear radiance, encoded as sRGB at the end.
 // Provides composite.
 #include "composite_inputs.clh"
 
@@ -19,7 +19,7 @@ static inline void copy_codes(global const uchar *shown, global uchar *picture, 
 }
 
 // shown [h][w][3]: the camera picture as sRGB codes. codes [65536]: sRGB code of linear radiance i / 65535.
-// One item LANES pixels of a row -> picture [h][w][3] sRGB. A pixel that nothing virtual touches is the camera's, byte for byte.
+// One item LANES pixels of a row -> picture [h][w][3] sRGB. Pixels without virtual content keep the camera's bytes.
 kernel void composite(const MixtureParameters parameters, MIXTURE_BUFFERS, global const uchar *shown, global const uchar *codes, global uchar *picture) {
     const int first = get_global_id(0) * LANES;
     const int y = get_global_id(1);

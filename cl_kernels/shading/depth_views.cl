@@ -1,4 +1,4 @@
-// Pictures of virtual objects from all around, which shading in image space looks into (thesis 7.3.2). Provides draw_object.
+// Depth views of virtual objects from all around, for image-space shading (thesis 7.3.2). Provides draw_object.
 #include "views.clh"
 #include "virtual_objects.clh"
 

@@ -3,7 +3,7 @@
 //
 // Equation 7.1 adds the difference of two shadings R and R' to the picture scaled by the picture itself. For a Lambertian
 // surface the picture is albedo times R, so the factor that leaves the albedo alone is R' / R; it needs no tone mapper.
-// Where surfaces send light too (7.3.3), R and R' hold one bounce of it: seen surface sends what the camera saw of it.
+// With light from surfaces (7.3.3), R and R' include one bounce: visible surface sends the radiance that the camera saw.
 #include "direction_sets.clh"
 #include "open_shading.clh"
 #include "real_shading.clh"
@@ -12,8 +12,8 @@
 
 // Real surface: the ratio R' / R of shading with virtual objects to shading without, at the samples of the transfer.
 // transfer [rows][cols][COEFFICIENTS]; hits [rows][cols]: see indirect.cl.
-// -> ratio [rows][cols] (rgb, w = 1), shaded [rows][cols] (rgb of R, w = 1); w = 0 where there is no surface. R is whole where nothing
-// is taken too: other parts of the light (shadow_map.cl), bounces and refined pixels (adaptive.cl) are set against it.
+// -> ratio [rows][cols] (rgb, w = 1), shaded [rows][cols] (rgb of R, w = 1); w = 0 where there is no surface. R is computed even
+// where objects take nothing: other parts of the light (shadow_map.cl), bounces and refined pixels (adaptive.cl) relate to it.
 kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, global const float *transfer, global const float4 *hits,
                         global float4 *ratio, global float4 *shaded) {
     const int col = get_global_id(0);
@@ -42,10 +42,10 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, global const floa
     shaded[sample] = (float4)(without, 1.0f);
 }
 
-// What a sample of real surface gains from other real surface whose own shading virtual objects changed (eq. 7.6: R'_ID - R_ID),
-// added to the ratio. It follows every `scene.every`-th of its hidden directions, beginning with another one than its neighbours do.
-// ratio, shaded [rows][cols]: of shadow_real; changed: that ratio. returned: the most that what a hidden direction brings can change
-// by; a sample that this can change by no more than `spare` of `least` [rows][cols], which is no more than `shaded`, follows none.
+// Light that a sample of real surface gains from other real surface whose shading virtual objects changed (eq. 7.6: R'_ID - R_ID),
+// added to the ratio. It traces every `scene.every`-th of its blocked directions; neighbours begin with different ones.
+// ratio, shaded [rows][cols]: of shadow_real; changed: that ratio. returned: bound on the change of radiance from a blocked
+// direction; a sample that it can change by at most `spare` times `least` [rows][cols] (at most `shaded`) traces none.
 // -> bounced [rows][cols] (rgb, w = 1), w = 0 as in ratio.
 kernel void bounce_real(SURROUNDINGS_PARAMETERS, SAMPLE_BUFFERS, global const float4 *shaded, const float returned,
                         const float spare, global const float4 *least, global float4 *bounced) {
@@ -99,7 +99,7 @@ kernel void bounce_real(SURROUNDINGS_PARAMETERS, SAMPLE_BUFFERS, global const fl
 
 // Virtual surface: the radiance that real and virtual occluders take from it, at the samples that it covers.
 // positions, normals [h][w] (w = 1 where covered), shown [h][w] (which object, -1 none): the virtual geometry buffer.
-// scene.every: of how many directions of its set a sample traces one, its neighbours others. -> occluded [rows][cols] (rgb, w = 1 valid).
+// scene.every: a sample traces every n-th direction of its set; its neighbours trace others. -> occluded [rows][cols] (rgb, w = 1 valid).
 kernel void shadow_virtual(SCENE_PARAMETERS, global const float4 *positions, global const float4 *normals, global const int *shown,
                            global float4 *occluded) {
     const int col = get_global_id(0);
@@ -114,8 +114,8 @@ kernel void shadow_virtual(SCENE_PARAMETERS, global const float4 *positions, glo
                                                     direction_subset(row, col, scene.every), scene.every);
 }
 
-// Points on virtual objects: what they send. points, normals (volume space), albedos [points_count] -> radiances [points_count] (rgb).
-// offsets_m [points_count]: how far off the surface rays begin.
+// Radiance of points on virtual objects. points, normals (volume space), albedos [points_count] -> radiances [points_count] (rgb).
+// offsets_m [points_count]: distance from the surface at which rays begin.
 kernel void light_points(SCENE_PARAMETERS, const int points_count, global const float4 *points, global const float4 *normals,
                          global const float4 *albedos, global const float *offsets_m, global float4 *radiances) {
     const int index = get_global_id(0);

@@ -1,15 +1,15 @@
-// What composite would mix with the camera's picture, apart from it (thesis 7.2.1): for clients that put it over a later one.
+// The virtual layer without the camera's picture (thesis 7.2.1), for clients that compose it with a later picture.
 // Provides compose_layer.
 #include "composite_inputs.clh"
 
 #define NEUTRAL 128  // code of a factor of 1
 
-// Camera depth as a code: 0 says nothing, so what lies nearer than half a unit has 1; what lies too far has the last.
+// Code of a camera depth: 0 means empty, so depths below half a unit have code 1; too large ones the last code.
 static inline ushort depth_code(const float z, const float depth_scale_m) {
     return (ushort)clamp(z / depth_scale_m + 0.5f, 1.0f, 65535.0f);
 }
 
-// Of its root, so that dark shadows have codes enough.
+// Code of the square root, so that dark shadows have enough codes.
 static inline uchar ratio_code(const float factor) {
     return (uchar)clamp(NEUTRAL * sqrt(factor) + 0.5f, 0.0f, 255.0f);
 }

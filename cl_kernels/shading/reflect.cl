@@ -1,4 +1,4 @@
-// Glossy virtual surface (thesis fig. 8.4): what it reflects of the light, of real and of other virtual surface.
+// Glossy virtual surface (thesis fig. 8.4): its reflection of the light, of real and of other virtual surface.
 // Provides reflect_surroundings.
 #include "sh.clh"
 #include "shadows.clh"
@@ -18,14 +18,14 @@ static float3 blurred_light(global const float4 *light, const float3 direction, 
     return fmax(sum, (float3)(0.0f));
 }
 
-// Share of even light that microfacets reflect, as a + b F0: Karis' fit (2014) to the integral of GGX over directions.
+// Fraction of uniform light that microfacets reflect, as a + b F0: Karis' fit (2014) to the integral of GGX over directions.
 static inline float2 reflected_share(const float roughness, const float cosine) {
     const float4 r = roughness * (float4)(-1.0f, -0.0275f, -0.572f, 0.022f) + (float4)(1.0f, 0.0425f, 1.04f, -0.04f);
     const float a = fmin(r.x * r.x, exp2(-9.28f * cosine)) * r.x + r.y;
     return (float2)(1.04f * a + r.w, -1.04f * a + r.z);
 }
 
-// Mean of what arrives along RAYS directions around `mirrored`, `spread` radians wide.
+// Mean radiance from RAYS directions around `mirrored`, `spread` radians wide.
 static float3 mean_arriving(const Volume volume, const Objects things, const Arriving light, global const float4 *coefficients,
                             const float3 position, const float3 normal, const float3 mirrored, const float spread, const float turn) {
     const float3 side = normalize(cross(mirrored, fabs(mirrored.x) < 0.7f ? (float3)(1, 0, 0) : (float3)(0, 1, 0)));
@@ -64,7 +64,7 @@ static float3 mean_arriving(const Volume volume, const Objects things, const Arr
 
 // positions, normals, base_colors, materials [h][w] (w = 1 where covered): the virtual geometry buffer, materials: roughness, metalness.
 // The scene's samples are the pixels.
-// -> reflected [h][w]: radiance to add (rgb) and what remains of the diffuse one (w); (0, 0, 0, 1) for what is matt.
+// -> reflected [h][w]: radiance to add (rgb) and factor of the diffuse one (w); (0, 0, 0, 1) for matt surface.
 kernel void reflect_surroundings(const ReflectionParameters parameters, SCENE_BUFFERS, global const float4 *positions,
                                  global const float4 *normals, global const float4 *base_colors, global const float4 *materials,
                                  global const int *shown, global float4 *reflected) {
@@ -83,7 +83,7 @@ kernel void reflect_surroundings(const ReflectionParameters parameters, SCENE_BU
         const float cosine = clamp(dot(normal, back), 0.0f, 1.0f), metal = clamp(material.y, 0.0f, 1.0f);
         const float3 head_on = (1.0f - metal) * (float3)(0.04f) + metal * base_colors[pixel].xyz;
         const float2 share = reflected_share(material.x, cosine);
-        // Light that leaves microfacets only after several of them is lost to the fit; Turquin (2019) gives it back.
+        // The fit lacks multiple scattering between microfacets; compensated as in Turquin (2019).
         const float3 gloss = clamp((share.x + share.y * head_on) * (1.0f + head_on * (1.0f / (share.x + share.y) - 1.0f)), 0.0f, 1.0f);
         const float turn = GOLDEN * ((y & 3) * 4 + (x & 3));
         const float3 arriving = mean_arriving(volume, things, arrives, whole_light_of(scene.light, light_table), position.xyz, normal, 2.0f * dot(normal, back) * normal - back,

@@ -1,4 +1,4 @@
-// Shadow maps along the sharp lights of a room and what these lights bring past them (thesis 7.2.3, fig. 7.7).
+// Shadow maps along the sharp lights of a room, and shading with them (thesis 7.2.3, fig. 7.7).
 // Provides begin_maps, halve_maps, trace_discs, light_virtual, light_real, light_points_by_discs, light_samples, mix_direct,
 // unmix_direct.
 #include "arriving.clh"
@@ -14,8 +14,8 @@
 #define RAYS 8  // of a sample to a disc; neighbours have others
 #define RAY_SETS 16
 
-// nearest [count MAP_SIDE][MAP_SIDE]: for each light, bits of 1 / depth of objects drawn from distance_m before the ball's middle, 0
-// where there is none -> level 0 of its map.
+// nearest [count MAP_SIDE][MAP_SIDE]: for each light, bits of 1 / depth of objects drawn from distance_m before the ball's centre, 0
+// without any -> level 0 of its map.
 kernel void begin_maps(const int count, const float distance_m, global const uint *nearest, global float2 *maps) {
     const int x = get_global_id(0);
     const int y = get_global_id(1);
@@ -45,7 +45,7 @@ kernel void halve_maps(const int count, const int level, global float2 *maps) {
     VOLUME_PARAMETERS, const LightParameters lit, global const uchar *light_table, global const float2 *ray_places
 #define PLANES_OF_TRACE make_continued(lit, light_table)
 
-// The part of what a disc brings to the surface that real things leave, along RAYS rays to places [RAYS] in the unit disc. axes: of
+// Fraction of a disc's light at the surface that real surface does not block, along RAYS rays to places [RAYS] in the unit disc. axes: of
 // the disc, as DirectLights has them.
 static float real_part(const Volume volume, const Continued continued, const float reach_m, global const float4 *axes,
                        const float3 position, const float3 normal, const float3 origin, global const float2 *places) {
@@ -65,7 +65,7 @@ static float real_part(const Volume volume, const Continued continued, const flo
         const Rays rays = make_rays(origin / volume.voxel_m, direction);
         floatn begin, end;
         clip_rays(volume, rays, &begin, &end);
-        end = MASK(cosine > 0.0f) ? fmin(end, reach_m / volume.voxel_m) : 0.0f;  // below the horizon nothing is looked for
+        end = MASK(cosine > 0.0f) ? fmin(end, reach_m / volume.voxel_m) : 0.0f;  // directions below the horizon are not traced
         const intn open = MASK(find_solid_voxels(volume, rays, begin, end) >= end);
         float dx[LANES], dy[LANES], dz[LANES], cosines[LANES], left[LANES];
         STORE_LANES(direction.x, dx);
@@ -91,7 +91,7 @@ static float4 real_parts(const Volume volume, const Continued continued, const f
 }
 
 // Samples of a surface: positions, normals [h][w] (w = 0 without surface). ray_places [RAY_SETS][RAYS].
-// -> parts [rows][cols]: of what each disc brings, the part that real things leave (xyz: discs 0 to 2, w = 1 valid).
+// -> parts [rows][cols]: the fraction of each disc's light that real surface does not block (xyz: discs 0 to 2, w = 1 valid).
 kernel void trace_discs(const Grid grid, global const float4 *positions, global const float4 *normals, const int is_virtual, DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *parts) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
@@ -141,7 +141,7 @@ static inline void store_vectors(const Vectors v, const float w, const int i, co
 }
 
 // positions, normals [h][w] (w = 1 where covered): the virtual geometry buffer; parts [rows][cols]: of trace_discs. One item LANES
-// pixels of a row of `around` (x0 y0 x1 y1, half-open). -> direct [h][w]: what reaches white surface, 0 where there is none.
+// pixels of a row of `around` (x0 y0 x1 y1, half-open). -> direct [h][w]: light on white surface, 0 without surface.
 kernel void light_virtual(const Grid grid, const int4 around, global const float4 *positions, global const float4 *normals,
                           global const float4 *parts, const float tolerance_m, DIRECT_PARAMETERS, global float4 *direct) {
     const int x = around.x + get_global_id(0) * LANES;
@@ -169,7 +169,7 @@ kernel void light_virtual(const Grid grid, const int4 around, global const float
     store_vectors(with, 0.0f, pixel, last, direct);
 }
 
-// Of LANES pixels, those in whose cells something is touched (see change_mask.cl).
+// Mask of the LANES pixels in changed cells (see change_mask.cl).
 static inline intn touched_lanes(global const uchar *touched, const int cols, const int stride, const int x, const int y, const int width) {
     global const uchar *row = touched + (cell_of(y, stride) + 1) * (cols + 1) + 1;
     int bits[LANES];
@@ -179,7 +179,7 @@ static inline intn touched_lanes(global const uchar *touched, const int cols, co
 
 // positions, normals [h][w]: real surface; parts [rows][cols]: of trace_discs; ratio, rest [rows][cols], refined [h][w]: R' / R and R
 // of the rest of the light, see composite.cl; touched: of change_mask.cl for `ratio`. One item LANES pixels
-// -> mixed [h][w]: R' / R of all of the light (rgb), w = 1 where it may be other than 1, else all 0.
+// -> mixed [h][w]: R' / R of the whole light (rgb), w = 1 where it may be other than 1, else all 0.
 kernel void light_real(const Grid grid, const int height, global const float4 *positions, global const float4 *normals,
                        global const float4 *parts, const float tolerance_m, global const float4 *ratio, const int has_refined, global const float4 *refined, global const float4 *rest,
                        global const uchar *touched, DIRECT_PARAMETERS, global float4 *mixed) {
@@ -202,7 +202,7 @@ kernel void light_real(const Grid grid, const int height, global const float4 *p
     }
     const Row row = row_from(grid, positions, normals, x, y);
     floatn total = 0.0f;
-    Vectors sums[3] = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};  // of R of the rest, what real things leave, R' / R
+    Vectors sums[3] = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}};  // R of the rest, unblocked parts, R' / R
     for (int i = row.first.y; i <= row.last.y; i++) {
         for (int j = row.first.x; j <= row.last.x; j++) {
             const int sample = i * grid.cols + j;
@@ -244,8 +244,8 @@ kernel void light_real(const Grid grid, const int height, global const float4 *p
     }
 }
 
-// Points on virtual objects send more: points, normals (volume space), albedos [points_count]; radiances [points_count] are added to.
-// One item LANES points.
+// Adds the discs' light to radiances [points_count] of points on virtual objects: points, normals (volume space), albedos
+// [points_count]. One item LANES points.
 kernel void light_points_by_discs(const int points_count, global const float4 *points, global const float4 *normals, global const float4 *albedos,
                        DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *radiances) {
     const int first = get_global_id(0) * LANES;
@@ -273,7 +273,7 @@ kernel void light_points_by_discs(const int points_count, global const float4 *p
 }
 
 // Samples of real surface: positions, normals [h][w]; parts [rows][cols]: of trace_discs. One item LANES samples
-// -> without, with [rows][cols]: what the discs bring to white surface without and with objects (rgb).
+// -> without, with [rows][cols]: light from the discs on white surface without and with objects (rgb).
 kernel void light_samples(const Grid grid, global const float4 *positions, global const float4 *normals, global const float4 *parts, DIRECT_PARAMETERS,
                           global float4 *without, global float4 *with) {
     const int col = get_global_id(0) * LANES;
@@ -299,7 +299,7 @@ kernel void light_samples(const Grid grid, global const float4 *positions, globa
     store_vectors(sent.with, 1.0f, sample, last, with);
 }
 
-// ratio, shaded [count]: R' / R and R of the rest of the light (w = 1 valid); without, with: what its discs bring
+// ratio, shaded [count]: R' / R and R of the rest of the light (w = 1 valid); without, with: light from its discs
 // -> whole, whole_shaded: R' / R and R of both together. least: see direct_mix.clh.
 kernel void mix_direct(const int count, const float4 least, global const float4 *ratio, global const float4 *shaded,
                        global const float4 *without, global const float4 *with, global float4 *whole, global float4 *whole_shaded) {
@@ -309,7 +309,7 @@ kernel void mix_direct(const int count, const float4 least, global const float4 
     whole_shaded[i] = (float4)(fmax(shaded[i].xyz, least.xyz) + without[i].xyz, shaded[i].w);
 }
 
-// The other way: the ratio of the rest, from that of both.
+// The inverse: the ratio of the rest, from the ratio of both.
 kernel void unmix_direct(const int count, const float4 least, global const float4 *whole, global const float4 *shaded,
                          global const float4 *without, global const float4 *with, global float4 *ratio) {
     const int i = get_global_id(0);

@@ -1,8 +1,8 @@
-// What virtual objects can change of real surface at most, before anything of them is traced. Provides bound_samples, bound_pixels.
+// Bounds on the change of real surface by virtual objects, without tracing. Provides bound_samples, bound_pixels.
 //
 // An object lies inside a ball. A sample's directions that miss all balls, or lie under its horizon, are not blocked by objects;
-// each of the others takes no more than what may arrive along it, or brings no more than what objects send. Over the shading R
-// of the sample without objects, that bounds |R'/R - 1| (eq. 7.1); a pixel's ratio is a weighted mean of samples'.
+// every other direction loses at most the radiance that can arrive along it, or gains at most the radiance that objects send.
+// Relative to R, the shading without objects, this bounds |R'/R - 1| (eq. 7.1); a pixel's ratio is a weighted mean of samples.
 #ifndef BANDS
 #error BANDS must be defined: the number of spherical-harmonics bands
 #endif
@@ -12,17 +12,17 @@
 #include "sh.clh"
 
 #define CHUNK 16
-#define SPREAD 1.1f  // directions' shares add up to 1, but for what error few have
+#define SPREAD 1.1f  // the directions' weights add up to 1, apart from the error of few directions
 
 static inline float greatest(const float3 v) {
     return fmax(fmax(v.x, v.y), v.z);
 }
 
 // transfer [rows][cols][COEFFICIENTS]; hits [rows][cols]: see indirect.cl; at every `every`-th sample.
-// balls [balls_count]: center, radius; sent, real_sent: the most that objects and that real surface send (rgb).
-// -> bounds [bound_rows][bound_cols]: greatest change of R over R by what objects hide or send, by what they send alone;
-// of bounced light over that change (w = 1 valid, 0 where there is no surface). Without balls: 0, and what objects that hid all
-// would send.
+// balls [balls_count]: center, radius; sent, real_sent: bounds on the radiance from objects and from real surface (rgb).
+// -> bounds [bound_rows][bound_cols]: greatest relative change of R by light that objects block or send; by light that they send;
+// of bounced light relative to that change (w = 1 valid, 0 without surface). Without balls: 0, and the light from objects that
+// block everything.
 kernel void bound_samples(const Grid grid, SAMPLE_BUFFERS, global const float *transfer, global const float4 *hits,
                           const LightParameters lit, LIGHT_BUFFERS, const int balls_count, global const float4 *balls,
                           const float4 sent, const float4 real_sent, const int every, const int bound_cols, const int bound_rows,
@@ -70,7 +70,7 @@ kernel void bound_samples(const Grid grid, SAMPLE_BUFFERS, global const float *t
     bounds[bound_row * bound_cols + bound_col] = bound;
 }
 
-// Whether a ball may stand in some of a disc's light at a surface point. disc: direction, half angle in radians.
+// Whether a ball may block part of a disc's light at a surface point. disc: direction, half angle in radians.
 static inline int dims(const float4 disc, const float4 ball, const float3 position, const float3 normal) {
     if (dot(normal, disc.xyz) <= -sin(disc.w)) return 0;
     const float3 offset = ball.xyz - position;
@@ -81,8 +81,8 @@ static inline int dims(const float4 disc, const float4 ball, const float3 positi
 }
 
 // positions, normals [h][w] of real surface; bounds [rows][cols]: of bound_samples for every sample, or none where has_bounds is 0.
-// discs [discs_count]: see dims. -> most [h][ceil(w / CHUNK)]: the greatest of CHUNK pixels of what bounds are of, 0 where no sample
-// has a change; w: whether a disc is dimmed.
+// discs [discs_count]: see dims. -> most [h][ceil(w / CHUNK)]: the greatest bounds of CHUNK pixels, 0 where no sample changes;
+// w: whether a disc is dimmed.
 kernel void bound_pixels(const int height, global const float4 *positions, global const float4 *normals,
                          const Grid grid, const int has_bounds, global const float4 *bounds, const float tolerance_m, const int discs_count, global const float4 *discs, const int balls_count,
                          global const float4 *balls, global float4 *most) {

@@ -3,20 +3,20 @@
 // clear_picture -> project_vertices -> setup_triangles -> scan_tiles -> fill_tiles -> raster_tiles -> settle_fragments
 // -> shade_surface, each once for all objects. Screen positions are snapped to 1/256 pixel and edges evaluated in exact
 // integers, so that triangles sharing an edge cover each pixel centre once (top-left rule). Pixel centres lie at
-// integers. Triangles that can cover but a few pixels are drawn at once, as fragments, all others by way of lists of
-// tiles. Of both the nearest depth of a pixel is found first, then the lowest triangle that has it: the result does not
-// depend on the order in which they come.
+// integers. Triangles that cover only a few pixels are drawn directly, as fragments, all others through lists per tile.
+// First the nearest depth of each pixel is found, then the lowest triangle index with that depth: the result does not
+// depend on the order of processing.
 //
 // The meshes of all objects lie one after the other (server/objects/arena.py). `objects` [n] int8, one row an object of
-// the picture: its mesh's first vertex, first triangle and first material; how many vertices and triangles it has; the
-// numbers of its first triangle and of its first vertex in this picture. Rows out of view have no triangles.
+// the picture: its mesh's first vertex, first triangle and first material; its numbers of vertices and triangles; the
+// indices of its first triangle and of its first vertex in this picture. Rows out of view have no triangles.
 // `matrices` [3 n] float16, three an object: pixel_from_model, model_from_pixel (see shade_surface), volume_from_model.
-// `chunks` int2, one a work-group: an object, and the first of the CHUNK vertices or triangles of it that it does.
+// `chunks` int2, one a work-group: an object, and the first of its CHUNK vertices or triangles that the group processes.
 //
 // `projected` [vertices] int4: x and y in subpixels, 1 / depth as bits (0: outside, to be clipped), 1 if behind.
 // A piece is a triangle after clipping. `corners` [pieces] int8: x0 y0 x1 y1 x2 y2 in subpixels, turned to positive
 // area; the triangle's number in this picture. `inverse_depths` [pieces] float4: 1 / depth at the corners, 1/metre.
-// A fragment is what a small piece shows at one pixel: the pixel, the bits of 1 / depth, the triangle's number, 0.
+// A fragment is one pixel of a small piece: the pixel, the bits of 1 / depth, the triangle's index, 0.
 // `nearest` [h][w] bits of the greatest 1 / depth so far, which order as the numbers do; 0 where there is none.
 // `counts` [2 + tiles] pieces, fragments, and the pieces of each tile.
 #pragma OPENCL FP_CONTRACT OFF  // the same vertex must land on the same subpixel in every triangle that shares it
@@ -25,9 +25,9 @@
 #include "surface_point.clh"
 #include "textures.clh"
 
-#define CHUNK 128  // vertices or triangles of one object that a work-group does
+#define CHUNK 128  // vertices or triangles of one object per work-group
 #define SCAN_ITEMS 256
-#define FEW 16         // pieces that a tile's pixels look through themselves
+#define FEW 16         // pieces that a tile's pixels test themselves
 #define COLOR_PROBES 4  // most samples of a base colour along a pixel's footprint; more look the same
 #define NOBODY 0x7fffffff
 
@@ -46,7 +46,7 @@ static void write_piece(const int8 piece, const float4 depths, const int slot, c
     count_tiles(piece, size, tile_counts);
 }
 
-// Ready for a new picture: nothing counted, nothing near in the tiles of `region` (x0 y0 x1 y1, half-open).
+// Clears the counters and the depths of the tiles of `region` (x0 y0 x1 y1, half-open).
 // One item a row of pixels of a tile.
 kernel void clear_picture(const int2 size, const int4 region, const int count, global int *counts,
                           global uint *nearest) {
@@ -72,7 +72,7 @@ void project_vertices(const global int2 *chunks, const global int8 *objects, con
     projected[object.s6 + vertex] = on_screen(point, near_m);
 }
 
-// A triangle that passes through the near plane or leaves the guard band: cut, and what is left of it written.
+// Clips a triangle that crosses the near plane or the guard band, and writes its pieces.
 static void write_clipped(const float16 pixel_from_model, const global float *vertices, const int3 vertex,
                           const float near_m, const int triangle, const int room, const int2 size, global int *counts,
                           global int8 *corners, global float4 *inverse_depths) {
@@ -90,8 +90,8 @@ static void write_clipped(const float16 pixel_from_model, const global float *ve
     }
 }
 
-// Notes how near a small piece is where it covers pixels, bits SMALL y + x from `corner` on. Returns those with nothing
-// nearer so far.
+// Updates the nearest depth of the pixels that a small piece covers, bits SMALL y + x from `corner` on. Returns the pixels
+// where it is the nearest so far.
 static ulong note_nearest(const ulong covered, const int2 corner, const int2 size, const long8 edges,
                           const float4 depths, global uint *nearest) {
     ulong shown = covered;
@@ -117,8 +117,8 @@ static void write_fragments(ulong left, const int8 piece, const int2 size, const
     }
 }
 
-// The piece of a triangle of which no corner must be clipped; NO_PIECE for others. `behind`: all corners are; `whole`:
-// none must be clipped.
+// The piece of a triangle that needs no clipping; NO_PIECE for others. `behind`: all corners are behind the camera; `whole`:
+// no corner must be clipped.
 static int8 piece_of(const int8 object, const int triangle, const int2 size, const global int *triangles,
                      const global int4 *projected, float4 *depths, bool *whole, bool *behind) {
     const int3 vertex = vload3(object.s1 + triangle, triangles) + object.s6;
@@ -128,9 +128,9 @@ static int8 piece_of(const int8 object, const int triangle, const int2 size, con
     return *whole ? make_piece(a, b, c, object.s5 + triangle, size, depths) : NO_PIECE;
 }
 
-// Every triangle of the objects in view: its pieces written, in no order, and counted in the tiles they touch, or its
-// fragments, less those that something nearer hides already. What there is no room for is counted all the same.
-// room: pieces, fragments.
+// For every triangle of the objects in view, writes its pieces, in any order, and counts them in the tiles they touch, or
+// writes its fragments that nothing nearer hides yet. Pieces and fragments beyond the capacity are only counted.
+// room: capacity of pieces and of fragments.
 kernel __attribute__((reqd_work_group_size(CHUNK, 1, 1)))
 void setup_triangles(const int2 size, const int2 room, const global int2 *chunks, const global int8 *objects,
                      const global float16 *matrices, const float near_m, const global float *vertices,
@@ -175,7 +175,7 @@ void setup_triangles(const int2 size, const int2 room, const global int2 *chunks
     if (shown) write_fragments(shown, piece, size, depths, first[1] + place, room.y, fragments);
 }
 
-// Where the fragments were more than there is room for: settle_fragments, from the triangles themselves.
+// As settle_fragments, from the triangles themselves, if there were more fragments than capacity.
 kernel __attribute__((reqd_work_group_size(CHUNK, 1, 1)))
 void settle_triangles(const int2 size, const global int2 *chunks, const global int8 *objects,
                       const global int *triangles, const global int4 *projected, const global uint *nearest,
@@ -198,9 +198,9 @@ void settle_triangles(const int2 size, const global int2 *chunks, const global i
     }
 }
 
-// Exclusive running sum over the tiles' counts, by one work-group. starts[tiles] is the sum of all, and the last two
-// numbers are the pieces and the fragments, for the host to read all at once.
-// A tile lists no more than `most` pieces: what has more could not be looked through in time either.
+// Exclusive running sum over the tiles' counts, by one work-group. starts[tiles] is the total, followed by the
+// numbers of pieces and fragments, so that the host reads all at once.
+// A tile lists at most `most` pieces; testing more would take too long anyway.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1)))
 void scan_tiles(const int tiles, const int most, const global int *counts, global int *starts) {
     const global int *tile_counts = counts + 2;
@@ -242,11 +242,11 @@ kernel void fill_tiles(const int pieces, const int2 size, const global int8 *cor
 
 static inline int2 pixel_of(const int bit) { return (int2)(bit % TILE, bit / TILE); }
 
-// One work-group a tile of `region`. Of its entries, up to 64 at a time: where there are few, each pixel looks through
-// those that cover it; where there are many, they are mostly small, and each entry goes over the pixels it covers:
+// One work-group a tile of `region`. It processes up to 64 entries at a time: if there are few, each pixel tests
+// those that cover it; if there are many, they are mostly small, and each entry visits the pixels it covers:
 // first the nearest depth of each pixel is found, then the lowest triangle that has it.
-// -> visible: the triangle of each pixel, the lower number where two are equally near; NOBODY where a fragment is
-// nearer or nothing is there. nearest: of fragments and pieces.
+// -> visible: the triangle of each pixel, the lower index of two equally near ones; NOBODY where a fragment is
+// nearer or there is none. nearest: of fragments and pieces.
 kernel __attribute__((reqd_work_group_size(TILE * TILE, 1, 1)))
 void raster_tiles(const int2 size, const int4 region, const global int8 *corners,
                   const global float4 *inverse_depths, const global int *starts,
@@ -309,7 +309,7 @@ void raster_tiles(const int2 size, const int4 region, const global int8 *corners
     }
 }
 
-// The fragments that are nearest, the lowest triangle's of those at one pixel.
+// Writes the triangles of the nearest fragments; of several at one pixel, the lowest index.
 kernel void settle_fragments(const int count, const global int4 *fragments, const global uint *nearest,
                              global int *visible) {
     const int index = get_global_id(0);
@@ -325,7 +325,7 @@ static float3 textured(const Textures textures, const int texture, const float2 
     return sample_texture(textures, texture, footprint, most_probes);
 }
 
-// Index of the object that a triangle's number belongs to: the last row that begins at or before it.
+// Index of a triangle's object: the last row that begins at or before the triangle's index.
 static int object_of(const int triangle, const int count, const global int8 *objects) {
     int low = 0, high = count;
     while (high - low > 1) {
@@ -342,8 +342,8 @@ static int object_of(const int triangle, const int count, const global int8 *obj
 // metalness. `materials` [m] float4: roughness, metalness, numbers of the textures of base colour and of roughness (G)
 // and metalness (B), -1 for none. `material_of` [t] a triangle's, in its mesh.
 // The ray of pixel (u, v) is model_from_pixel's column 3 + t * its columns 0 to 2 times (u, v, 1), with t the depth;
-// its last row is not part of that: it takes a model point to its depth.
-// Goes over the pixels `around` (x0 y0 x1 y1, half-open); `visible` is known in the tiles of `region`.
+// its last row is not part of the ray: it maps a model point to its depth.
+// Writes the pixels `around` (x0 y0 x1 y1, half-open); `visible` is known in the tiles of `region`.
 kernel void shade_surface(const SurfaceParameters parameters, const global int *visible, const global int8 *objects,
                           const global float16 *matrices, const global float *vertices, const global int *triangles,
                           const global float4 *attributes, const global int *material_of,

@@ -1,8 +1,8 @@
-// Points of a virtual object's surface, dealt once on load (objects/surface_points.py). Provides count_open.
+// Points on a virtual object's surface, distributed once on load (objects/surface_points.py). Provides count_open.
 #include "virtual_objects.clh"
 
-// How many of `directions` [count] above the surface leave the object whose grid has `dims` unhindered, from one cell off
-// each of its points. points, normals [points_count] in cells and along the axes of the grid.
+// For each point, how many of `directions` [count] above the surface leave the object (grid of `dims` cells) unblocked, from
+// one cell off the point. points, normals [points_count] in cells and along the axes of the grid.
 kernel void count_open(const int points_count, global const float4 *points, global const float4 *normals, const int count,
                        global const float4 *directions, const int4 dims, global const float *distances, global int *open) {
     const int index = get_global_id(0);

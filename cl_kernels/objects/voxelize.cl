@@ -1,8 +1,8 @@
 // A mesh's occupancy grid and distance grid, once on load (the volumes of thesis 7.2, fig. 7.5).
 //
 // clear_cells -> mark_cells, measure_near; seed_distance (x) -> spread_distance (y) -> spread_distance (z); finish.
-// Near the mesh the distance is that to its triangles, so that what is thinner than a cell keeps its place within it;
-// farther out it is that to the nearest touched cell, an exact Euclidean distance transform.
+// Near the mesh the distance is measured to its triangles, so that parts thinner than a cell keep their position in it;
+// farther away it is the distance to the nearest touched cell, by an exact Euclidean distance transform.
 // Grids are [z, y, x] int32 or float32; cell (x, y, z) is the cube from (x, y, z) to (x + 1, y + 1, z + 1) grid units.
 #include "camera.clh"
 
@@ -13,10 +13,10 @@
 #define NONE (1 << 28)  // squared distance where no cell is occupied; sums of it with a squared grid side fit an int
 
 constant float HALF_CELL = 0.5001f;  // touching counts: more than rounding, less than matters
-constant float NEAR_CELLS = 1.65f;   // up to here distances are measured, from the cells' centres
+constant float NEAR_CELLS = 1.65f;   // up to this distance from cells' centres it is measured to triangles
 
-// False if the projections on `axis` of a triangle and of a cell around the origin are apart. Any axis may be asked:
-// only a true gap separates, so an axis that rounding has turned costs tightness, never a cell.
+// False if the projections on `axis` of a triangle and of a cell around the origin are apart. Any axis is valid:
+// only a true gap separates, so an axis rotated by rounding costs tightness, never a cell.
 static inline bool overlaps_along(const float3 axis, const float3 a, const float3 b, const float3 c) {
     const float reach = HALF_CELL * (fabs(axis.x) + fabs(axis.y) + fabs(axis.z));
     const float pa = dot(axis, a), pb = dot(axis, b), pc = dot(axis, c);
@@ -30,7 +30,7 @@ static inline bool overlaps_beside(const float3 edge, const float3 a, const floa
            && overlaps_along((float3)(-edge.y, edge.x, 0.0f), a, b, c);
 }
 
-// Separating-axis test of a triangle and a cell around the origin, less the cell's own axes: the bounds were compared.
+// Separating-axis test of a triangle and a cell around the origin, without the cell's own axes, which the bounds cover.
 static bool overlaps_cell(const float3 a, const float3 b, const float3 c) {
     return overlaps_along(cross(b - a, c - a), a, b, c) && overlaps_beside(b - a, a, b, c)
            && overlaps_beside(c - b, a, b, c) && overlaps_beside(a - c, a, b, c);
@@ -52,7 +52,7 @@ kernel void clear_cells(const int cells, global int *occupied, global int *near)
     near[cell] = as_int(2.0f * NEAR_CELLS);
 }
 
-// Marks the cells that a triangle touches, in one slab of the grid: a large triangle is shared out over all slabs.
+// Marks the cells that a triangle touches, in one slab of the grid: a large triangle is split over all slabs.
 // dims: cells in x, y, z.
 kernel void mark_cells(const int triangle_count, const int4 dims, const global float *vertices,
                        const global int *triangles, const float16 grid_from_model, global int *occupied) {
@@ -92,8 +92,8 @@ kernel void seed_distance(const int4 dims, const global int *occupied, global in
     }
 }
 
-// Extends squared distances by one axis: min over the line of what is there plus the squared way along it. Looks
-// outwards until nothing farther can be nearer. `length`: cells of the line; `stride`: from one of them to the next.
+// Extends squared distances by one axis: minimum over the line of each value plus its squared distance along the line.
+// Searches outwards until no farther cell can be nearer. `length`: cells of the line; `stride`: from one of them to the next.
 kernel void spread_distance(const int cells, const int length, const int stride, const global int *squared,
                             global int *result) {
     const int cell = get_global_id(0);
@@ -115,12 +115,12 @@ static inline float squared_to_edge(const float3 a, const float3 ab) {
     return squared_length(a + clamp(along, 0.0f, 1.0f) * ab);
 }
 
-// The normal of a sliver is all rounding; its edges are as near as its inside.
+// The normal of a sliver is only rounding error; its edges are as near as its inside.
 static inline bool is_sliver(const float3 normal, const float3 ab, const float3 ca) {
     return squared_length(normal) <= 1e-8f * squared_length(ab) * squared_length(ca);
 }
 
-// Squared distance from the origin to a triangle: to its inside where the origin is above that, else to its edges.
+// Squared distance from the origin to a triangle: to its inside if the origin projects into it, else to its edges.
 static float squared_to_triangle(const float3 a, const float3 b, const float3 c) {
     const float3 ab = b - a, bc = c - b, ca = a - c, normal = cross(ab, -ca);
     const float best = fmin(squared_to_edge(a, ab), fmin(squared_to_edge(b, bc), squared_to_edge(c, ca)));
@@ -155,7 +155,7 @@ kernel void measure_near(const int triangle_count, const int4 dims, const global
             }
 }
 
-// The measured distance where there is one, else that to the nearest touched cell.
+// The measured distance if there is one, else the distance to the nearest touched cell.
 kernel void finish_distance(const int cells, const global int *squared, const global int *near,
                             global float *distance) {
     const int cell = get_global_id(0);

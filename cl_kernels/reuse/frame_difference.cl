@@ -1,7 +1,7 @@
-// Whether a frame is what a still camera saw before, but for the sensor's noise.
+// Differences of a frame from the mean of earlier frames of a still camera.
 // Provides compare_codes, average_codes.
 //
-// Both are of codes as they came: [height][width][CHANNELS] of uint8 or uint16 (WIDE), where depth has values that mean nothing.
+// Both work on the received codes: [height][width][CHANNELS] of uint8 or uint16 (WIDE), where depth has two invalid values.
 #ifndef CHANNELS
 #error CHANNELS must be defined: the numbers of a pixel
 #endif
@@ -12,7 +12,7 @@ typedef uchar code_t;
 #endif
 
 #define TILE 8
-#define NONE_LEAST 0       // of depth: both mean that nothing was measured
+#define NONE_LEAST 0       // invalid depth values: nothing was measured
 #define NONE_MOST 65535
 
 static inline int is_known(const float value) {
@@ -20,8 +20,8 @@ static inline int is_known(const float value) {
 }
 
 // mean [height][width][CHANNELS]: of the frames before, 0 where depth is unknown. A work-item has a tile of TILE x TILE pixels.
-// -> sums [tile_rows][tile_cols]: of codes less their mean, of the squares of that, the number of both, and how many are known to
-// one of the two alone.
+// -> sums [tile_rows][tile_cols]: of codes minus their mean, of the squares of these differences, their number, and the number of
+// pixels that are valid in only one of the two.
 kernel void compare_codes(const int width, const int height, const int tile_cols, const int tile_rows, global const code_t *codes,
                           global const float *mean, global float4 *sums) {
     const int tile_col = get_global_id(0);
@@ -45,7 +45,7 @@ kernel void compare_codes(const int width, const int height, const int tile_cols
     sums[tile_row * tile_cols + tile_col] = (float4)(sum, squares, known, flipped);
 }
 
-// Fold codes [count] into their running mean as the `frames`-th; what is known for the first time is taken as it is.
+// Fold codes [count] into their running mean as the `frames`-th; a value that is valid for the first time is copied.
 kernel void average_codes(const int count, const int frames, global const code_t *codes, global float *mean) {
     const int i = get_global_id(0);
     if (i >= count) return;

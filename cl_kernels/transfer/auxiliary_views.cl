@@ -1,4 +1,4 @@
-// Depth pictures of the volume from all around it, and what they say of visibility (thesis 6.2.1, 7.3.2).
+// Depth views of the volume from all around it, and visibility look-ups in them (thesis 6.2.1, 7.3.2).
 // Provides draw_views, look_into_views.
 #include "direction_sets.clh"
 #include "rays.clh"
@@ -16,8 +16,8 @@ static inline float slope_of(const float pixel, const float per_pixel) {
     return (pixel - 0.5f * (SIDE - 1)) * per_pixel;
 }
 
-// Where the lines of sight of auxiliary views first meet a solid voxel: what is behind it, as seen from there, gets no light from
-// there. One item LANES pixels of a row of views[get_global_id(2)]. axes [views][3]: right, down and forward, unit, volume space; a
+// Where the lines of sight of auxiliary views first meet a solid voxel: surface behind it gets no light from the view's direction.
+// One item LANES pixels of a row of views[get_global_id(2)]. axes [views][3]: right, down and forward, unit, volume space; a
 // view's eye is distance_m before center. per_pixel: slope of a pixel. -> depths [view][SIDE][SIDE]: metres along the axis, 0 = none.
 kernel void draw_views(const int count, global const int *views, VOLUME_PARAMETERS, const float4 center, const float distance_m, const float per_pixel,
                        global const float4 *axes, global float *depths) {
@@ -41,14 +41,14 @@ kernel void draw_views(const int count, global const int *views, VOLUME_PARAMETE
     for (int lane = 0; lane < min(LANES, SIDE - x); lane++) depths[(view * SIDE + y) * SIDE + x + lane] = found[lane];
 }
 
-// LANES samples of the same direction set: every 8th sample along both axes has the same (direction_sets.clh), and what they look
-// into for one direction is one view.
+// LANES samples of the same direction set: every 8th sample along both axes has the same set (direction_sets.clh), so all of them
+// look into the same view for one direction.
 #define SET_STEP 8
 #define LANE_COLS (LANES == 8 ? 4 : 1)
 #define LANE_ROWS (LANES / LANE_COLS)
 
-// Whether auxiliary views from where the directions' light comes see the samples: nothing that one sees in a point's pixel is nearer
-// to it, within reach_m of the point and above the point's tangent plane by lift_m.
+// Whether the auxiliary view along each direction sees the sample: no surface in the sample's pixel of the view is nearer to the
+// view, within reach_m of the sample and above its tangent plane by lift_m.
 //
 // One item LANES samples, `blocks` items a set. positions [h][w], sample_normals [rows][cols] (w = 0 without surface); axes,
 // depths: see draw_views; view_of [sets][count]: the view for a direction.

@@ -1,4 +1,4 @@
-// Diffuse shadowed radiance transfer from depth pictures instead of the volume (thesis 6.2), projected to spherical harmonics.
+// Diffuse shadowed radiance transfer from depth views instead of the volume (thesis 6.2), projected to spherical harmonics.
 // Provides measure_depths, smooth_normals, transfer_from_views.
 #include "camera.clh"
 #include "direction_sets.clh"
@@ -13,9 +13,9 @@
 #define DIRECTIONS (32 * MASK_WORDS)
 #define LABEL_DYNAMIC 2
 #define LABEL_FILLED 3
-#define FREE_BIT 0.5f  // what is more than half free counts as free where only a bit can be kept
+#define FREE_BIT 0.5f  // V' above a half counts as free where only one bit is stored
 
-// A depth picture of the scene.
+// A depth view of the scene.
 typedef struct {
     float16 view_from_volume;
     float4 intrinsics;
@@ -24,7 +24,7 @@ typedef struct {
 } View;
 
 // Geometry buffer positions [h][w] (volume space, w = 1 surface), labels [h][w] -> depths [h][w]: metres along the view's axis,
-// 0 = none or only guessed from its neighbours, negative where the sensor alone knows the surface; any_unknown: 1 if there is such
+// 0 = none or only filled from its neighbours, negative where only the sensor knows the surface; any_unknown: 1 if there is such
 // a pixel.
 kernel void measure_depths(const int width, const int height, global const float4 *positions, global const uchar *labels,
                            const float16 view_from_volume, global float *depths, global int *any_unknown) {
@@ -47,9 +47,9 @@ static inline Vectors turned(const float16 m, const Vectors v) {
 
 // V' of eq. 6.3 along LANES directions w (view axes) from one point: the least over `steps` samples y at distances r, r ratio,
 // ..., none beyond near_m that surface known to the volume hides, and none beyond reach_m. `surface`, `normal`: the point's tangent plane, view axes. A sample is hidden where the surface s that
-// the view sees on its line of sight is nearer than it by more than bias_m; s must stand above the tangent plane by lift_m, or a
-// flat wall would hide itself. V' is 0 where s lies along w and 1 from the threshold on. slack: s may lie deeper by up to this
-// share of r, which is what passes unseen between two samples.
+// the view sees on its line of sight is nearer than it by more than bias_m; s must be above the tangent plane by lift_m, or a
+// flat wall would hide itself. V' is 0 where s lies along w and 1 from the threshold on. slack: s may be deeper by up to this
+// fraction of r, the gap between two samples.
 static floatn visibility(const View view, const float3 origin, const float3 surface, const float3 normal, const Vectors w,
                          floatn r, const float ratio, const int steps, const float near_m, const float reach_m,
                          const float bias_m, const float lift_m, const float slack, const float inverse_threshold) {
@@ -81,7 +81,7 @@ static floatn visibility(const View view, const float3 origin, const float3 surf
     return free;
 }
 
-// Lessens open[] of directions above the horizon by what the camera's own picture shows in their way.
+// Reduces open[] of directions above the horizon by the occluders in the camera's own picture.
 static void look_near(const View view, const float3 origin, const float3 surface, const float3 normal, const int count,
                       global const float4 *directions, global const float *starts, const float ratio, const int steps,
                       const float near_m, const float reach_m, const float bias_m, const float lift_m, const float slack, const float inverse_threshold,
@@ -107,7 +107,7 @@ static void look_near(const View view, const float3 origin, const float3 surface
     }
 }
 
-// Normals that samples stand for: see smooth_normal.clh -> [rows][cols], w: flatness, 0 where there is no surface.
+// Mean normals around samples: see smooth_normal.clh -> [rows][cols], w: flatness, 0 where there is no surface.
 kernel void smooth_normals(const int cols, const int rows, const int stride, const int width, const int height, const int radius,
                            global const float4 *positions, global const float4 *normals, const float voxel_m,
                            global float4 *sample_normals) {
@@ -119,10 +119,10 @@ kernel void smooth_normals(const int cols, const int rows, const int stride, con
     sample_normals[row * cols + col] = valid ? smooth_normal(width, height, positions, normals, x, y, radius, voxel_m) : (float4)(0.0f);
 }
 
-// T(x) = 1/pi * integral of V' max(n.w, 0) Y(w) dw, with V' from the camera's own depth picture and auxiliary ones (6.2.1, 7.3.2).
+// T(x) = 1/pi * integral of V' max(n.w, 0) Y(w) dw, with V' from the camera's own depth and auxiliary views (6.2.1, 7.3.2).
 // The unoccluded part is exact, as in radiance_transfer.cl, whose arguments and results the first and last ones are.
 //
-// sample_normals: see smooth_normals. lit [rows][cols][MASK_WORDS]: what the auxiliary views say. camera_depths [height][width],
+// sample_normals: see smooth_normals. lit [rows][cols][MASK_WORDS]: of look_into_views. camera_depths [height][width],
 // camera_from_volume, intrinsics: the camera's picture, looked into at `steps` distances, which lie within near_m, and at `further`
 // ones where there is something that the volume does not know. starts [4][count]: distance of a direction's first sample in metres,
 // for the 2 x 2 pattern of jitter. inverse_threshold: 1 / chi.

@@ -1,4 +1,4 @@
-// What surfaces send to a sample has been photographed: the colour that the volume holds where a hidden direction ends.
+// Indirect light from photographed surfaces: the colour in the volume where a blocked direction of a sample ends.
 // Provides gather_hits.
 #include "samples.clh"
 #include "surface_color.clh"
@@ -8,11 +8,11 @@
 #error MASK_WORDS must be defined: 32-bit words that hold one bit a direction
 #endif
 
-// One item a sample. It follows every `every`-th of its hidden directions, beginning with another one than its neighbours do.
+// One item a sample. It traces every `every`-th of its blocked directions; neighbours begin with different ones.
 // positions, normals [h][w]; free_mask [rows][cols][MASK_WORDS], sets [rows][cols][INTERLEAVE] (see Transfer); directions
 // [256][count] (unit, sr); colors: of the volume
-// -> hits [rows][cols]: sum over them of radiance times cosine, and of cosine (w), where the surface met has a colour; both
-// times `every`.
+// -> hits [rows][cols]: sums of radiance times cosine and of cosine (w) over directions whose surface has a colour; both times
+// `every`.
 kernel void gather_hits(const GatherParameters p, global const float4 *positions, global const float4 *normals,
                         global const uint *free_mask, global const uchar *sets, global const int *slots,
                         global const ulong *solid, global const uchar *octets, global const float2 *voxels,

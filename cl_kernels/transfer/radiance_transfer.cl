@@ -15,17 +15,17 @@
 
 #define LABEL_STATIC 1
 
-// T(x) = 1/pi * integral of V max(n.w, 0) Y(w) dw. The unoccluded part is exact (A_l Y(n) / pi); only what is blocked is
-// sampled and taken away, so an open surface shades without quadrature error.
+// T(x) = 1/pi * integral of V max(n.w, 0) Y(w) dw. The unoccluded part is exact (A_l Y(n) / pi); only the blocked part
+// is sampled and subtracted, so an open surface has no quadrature error.
 //
 // One item a sample. positions, normals, labels [h][w]: the geometry buffer. directions [sets][count]: unit directions and their solid angle (w, sr), basis [sets][count][COEFFICIENTS]: Y there;
-// first_set: see direction_sets.clh. radius: of the window that a sample's normal is the mean of, pixels.
+// first_set: see direction_sets.clh. radius: of the window of a sample's mean normal, pixels.
 // phase: the subset that this frame traces (visibility_cache.clh); intrinsics, layers, newest, cameras, points and behind them normals,
-// traced, blocked: what earlier frames know, this frame's layer (newest + 1) is written. state: see visibility_state.clh.
-// -> transfer [rows][cols][COEFFICIENTS], openness [rows][cols]: free share of the cosine-weighted sky (-1 where there is no
-// surface), flatness [rows][cols]: share of the window on the sample's own surface, free_mask [rows][cols][MASK_WORDS]: bit j =
+// traced, blocked: layers of earlier frames; this frame's layer (newest + 1) is written. state: see visibility_state.clh.
+// -> transfer [rows][cols][COEFFICIENTS], openness [rows][cols]: free fraction of the cosine-weighted sky (-1 where there is no
+// surface), flatness [rows][cols]: fraction of the window on the sample's own surface, free_mask [rows][cols][MASK_WORDS]: bit j =
 // direction j lies above the surface and is free, sets [rows][cols][INTERLEAVE]: direction j is that of set sets[j % INTERLEAVE].
-// With IS_CHOSEN only the samples `chosen` [chosen_count] are done, one item each; what is kept of the others stays as it was.
+// With IS_CHOSEN only the samples `chosen` [chosen_count] are computed, one item each; the others keep their values.
 kernel void transfer_radiance(const TransferParameters parameters, global const float4 *positions, global const float4 *normals,
                               global const uchar *labels, global const int *slots, global const ulong *solid, global const uchar *octets,
                               global const float4 *directions, global const float *basis, global const float16 *cameras,

@@ -1,4 +1,4 @@
-// Visibility of the sky from samples of a surface (thesis 5.1.2), without what is made of it. Provides trace_visibility.
+// Visibility of the sky from samples of a surface (thesis 5.1.2), without transfer. Provides trace_visibility.
 #include "direction_sets.clh"
 #include "hemisphere.clh"
 

@@ -1,4 +1,4 @@
-// The visibility state of voxels (thesis 6.1.2): filled from what was traced, emptied where the reconstruction changed.
+// The visibility state of voxels (thesis 6.1.2): set from traced samples, cleared where the reconstruction changed.
 // Provides mark_samples, compare_views, clear_bricks.
 #include "camera.clh"
 #include "visibility_state.clh"
@@ -6,7 +6,7 @@
 #define LABEL_STATIC 1
 
 // One item a sample of the transfer. value 1: sets the bits of the voxels that hold an open sample of static surface;
-// value 0, launched after it: takes them from voxels that hold a sample which is not, so that the order does not matter.
+// value 0, launched afterwards: clears the bits of voxels that hold a sample that is not open, so that the order does not matter.
 // openness [rows][cols], positions, labels [h][w] -> state [voxels / 32].
 kernel void mark_samples(const int cols, const int rows, const int stride, const int width, global const float4 *positions,
                          global const uchar *labels, global const float *openness, const float least_openness, const int4 bricks,
@@ -44,8 +44,8 @@ static inline void flag_brick(const int4 bricks, const float voxel_m, const floa
     changed[brick_index(bricks, brick)] = 1;
 }
 
-// One validation camera: what it saw of the volume before, and sees now [h][w] (volume metres, w = 1 where there is surface).
-// -> changed [bricks]: set where surface has gone or has come; the rest is left as it is.
+// Views of one validation camera, before and now [h][w] (volume metres, w = 1 where there is surface).
+// -> changed [bricks]: set where surface disappeared or appeared; others are not written.
 kernel void compare_views(const int width, const int height, global const float4 *before, global const float4 *after,
                           const float16 camera_from_volume, const float tolerance_m, const int4 bricks, const float voxel_m,
                           global uchar *changed) {

@@ -49,8 +49,10 @@ test-all:
 
 test-rest: test-slow test-second-device
 
+# Ray gives its own processes a few seconds to begin: tests of a cluster have the machine to themselves.
 test-slow: .venv/installed-all
-	$(PYTEST) $(PARALLEL) -m slow
+	$(PYTEST) $(PARALLEL) -m "slow and not cluster"
+	$(PYTEST) -m "slow and cluster" tests/cluster
 
 # The loader of OpenCL finds PoCL in any case, and Intel's runtime by this folder.
 test-second-device: export OCL_ICD_VENDORS := $(CURDIR)/.venv/opencl

@@ -1,0 +1,51 @@
+// Light that arrives at points: which surface each direction meets first, and the radiance it sends. Provides trace_arrivals.
+#include "clear_origin.clh"
+#include "surface_color.clh"
+#include "visibility.clh"
+
+// Whether a ray meets the surface at voxel coordinates `at` from its back, which no camera saw.
+static inline int is_back(const Volume volume, const float3 at, const float3 direction) {
+    float distance_m;
+    float3 outwards;
+    return surface_near(volume, at * volume.voxel_m, &distance_m, &outwards) && dot(outwards, direction) > 0.0f;
+}
+
+// One item LANES directions of a point. points [count]: volume metres, w unused; normals [count]: directions below the plane
+// are skipped, w = 0: none is. directions [sets][per_set] unit; point i takes set i % sets.
+// -> arrivals [count][per_set]: radiance (rgb) of the surface that is met, and its distance in metres (w): positive, surface
+// that was photographed; negative, a back or surface without a colour; 0, nothing is met, or the direction is skipped.
+kernel void trace_arrivals(const VolumeShape shape, global const int *slots, global const ulong *solid,
+                           global const uchar *octets, global const float2 *voxels, global const uint *colors,
+                           const int count, const int per_set, const int sets, global const float4 *points,
+                           global const float4 *normals, global const float4 *directions, global float4 *arrivals) {
+    const int first = get_global_id(0) * LANES;
+    const int point = get_global_id(1);
+    if (first >= per_set || point >= count) return;
+    const Volume volume = make_volume(shape, slots, solid, octets, voxels);
+    const float4 normal = normals[point];
+    const int set = (point % sets) * per_set;
+    int chosen[LANES], skipped = 0;
+    for (int lane = 0; lane < LANES; lane++) {
+        chosen[lane] = set + min(first + lane, per_set - 1);
+        skipped |= (normal.w > 0.0f && dot(normal.xyz, directions[chosen[lane]].xyz) <= 0.0f) << lane;
+    }
+    const Rays rays = volume_rays(volume, points[point].xyz, directions, chosen);
+    floatn begin, end;
+    clip_rays(volume, rays, &begin, &end);
+    end = mask_of(skipped) ? begin : end;
+    const floatn t = find_solid_voxels(volume, rays, begin, end);
+    float met[LANES];
+    STORE_LANES(t < end ? t : 0.0f, met);
+    for (int lane = 0; lane < min(LANES, per_set - first); lane++) {
+        float4 arrival = (float4)(0.0f);
+        if (met[lane] > 0.0f) {
+            const float3 direction = directions[chosen[lane]].xyz;
+            const float3 at = points[point].xyz / volume.voxel_m + met[lane] * direction;
+            const float4 color = color_at(volume, colors, at);
+            const int is_known = color.w > 0.0f && !is_back(volume, at, direction);
+            const float distance_m = met[lane] * volume.voxel_m;
+            arrival = is_known ? (float4)(color.xyz, distance_m) : (float4)(0.0f, 0.0f, 0.0f, -distance_m);
+        }
+        arrivals[point * per_set + first + lane] = arrival;
+    }
+}

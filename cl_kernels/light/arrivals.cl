@@ -41,7 +41,8 @@ kernel void trace_arrivals(const VolumeShape shape, global const int *slots, glo
         if (met[lane] > 0.0f) {
             const float3 direction = directions[chosen[lane]].xyz;
             const float3 at = points[point].xyz / volume.voxel_m + met[lane] * direction;
-            const float4 color = color_at(volume, colors, at);
+            float4 color = color_at(volume, colors, at);
+            if (color.w <= 0.0f) color = color_at(volume, colors, at - direction);  // colours reach 1.5 voxels deep (integrate.cl)
             const int is_known = color.w > 0.0f && !is_back(volume, at, direction);
             const float distance_m = met[lane] * volume.voxel_m;
             arrival = is_known ? (float4)(color.xyz, distance_m) : (float4)(0.0f, 0.0f, 0.0f, -distance_m);

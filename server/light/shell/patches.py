@@ -1,0 +1,231 @@
+"""Evidence about a room's light: what small patches of its surface show, and what reaches each of them.
+
+A patch is what one cell of a grid in the world holds of surface that faces one way. Frames add to it, so memory follows
+the surface that was seen, not the number of frames. Kernels: patches.cl, arrivals.cl.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.light.arrivals import trace_arrivals
+from server.maths.sh import GOLDEN_TURN
+from server.opencl.buffers import BufferDescription, StageBuffers
+from server.opencl.engine import Engine
+from server.volume.raycast import Surface
+from server.volume.volume import Volume
+
+PATCH_M = 0.15
+"""Side of the grid's cells: shading changes little over it but at contacts, and a room has about 1000 of them."""
+REGION_M = 0.4
+"""Side of the regions over which a material may differ from what its colour says (objective.py)."""
+MOST_PATCHES = 1536
+"""The patch that was not seen for longest makes way for another. 8 rooms' worth of what one picture shows."""
+RAYS = 128
+"""Rays of a patch, evenly spread over its cosine-weighted hemisphere: a lamp of 1 % of it is met by one of them."""
+TRACED_A_FRAME = 160
+"""Patches whose rays are traced in a frame once all are: the scan behind them goes on growing."""
+MOST_WEIGHT = 30.0
+"""Frames that a patch's mean remembers."""
+LEAST_SHARE = 0.6
+"""Of a block of pixels that must lie on one surface."""
+_BLOCKS_ACROSS = 40  # blocks of pixels along a picture's width
+_TOLERANCE_VOXELS = 1.5
+_FACINGS = 1.2  # normals are rounded to multiples of 1 / 1.2: 26 ways to face
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class _Buffers(StageBuffers):
+    places = BufferDescription(cl_types.float4)
+    facing = BufferDescription(cl_types.float4)
+    shown = BufferDescription(cl_types.float4)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What one picture shows of patches, on the host, world space."""
+
+    positions: Floats
+    """[n, 3] metres."""
+    normals: Floats
+    """[n, 3] unit."""
+    logarithms: Floats
+    """[n, 3] mean log radiance, RGB."""
+    variances: Floats
+    """[n] of the mean over the channels within the patch."""
+    clipped: Floats
+    """[n] share of the pixels that are clipped."""
+
+    @property
+    def count(self) -> int:
+        """Number of patches."""
+        return len(self.positions)
+
+
+def gather_patches(
+    engine: Engine, camera: CameraModel, surface: Surface, radiance: cl_array.Array, volume: Volume
+) -> Seen:
+    """The patches in one picture; radiance: [h, w] float4 as in Measurement, in the units of the first picture."""
+    step = max(2, camera.width // _BLOCKS_ACROSS)
+    cols, rows = camera.width // step, camera.height // step
+    buffers, size = engine.buffers(_Buffers), (rows, cols)
+    places, facing, shown = buffers.places.array(size), buffers.facing.array(size), buffers.shown.array(size)
+    engine.launch(
+        engine.kernel("patches.cl", "gather_patches"),
+        (cols, rows),
+        cols,
+        rows,
+        step,
+        camera.width,
+        _TOLERANCE_VOXELS * volume.voxel_m,
+        surface.positions,
+        surface.normals,
+        surface.labels,
+        radiance,
+        places,
+        facing,
+        shown,
+    )
+    at, towards, show = (engine.download(a).view(np.float32).reshape(-1, 4).astype(np.float64) for a in (places, facing, shown))
+    used = at[:, 3] >= LEAST_SHARE
+    return Seen(
+        at[used, :3] + volume.origin_world, towards[used, :3], show[used, :3], show[used, 3], towards[used, 3]
+    )
+
+
+class Patches:
+    """The patches of a room, in rows 0 to `count` of its arrays."""
+
+    def __init__(self) -> None:
+        n = MOST_PATCHES
+        self._rows: dict[tuple[int, ...], int] = {}
+        self.weights = np.zeros(n)
+        """Frames in the mean; 0: a row without a patch."""
+        self.positions, self.normals, self.logarithms = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
+        self.variances, self.clipped = np.zeros(n), np.zeros(n)
+        self.regions = np.zeros(n, np.int64)
+        """Which region each lies in: equal numbers, the same one."""
+        self.seen_in, self.traced_in = np.full(n, -1), np.full(n, -1)
+        """Number of the last frame that showed it, or in which its rays were traced; -1: none."""
+        self.directions = np.zeros((n, RAYS, 3), np.float32)
+        self.arrivals = np.zeros((n, RAYS, 4), np.float32)
+        """As of trace_arrivals."""
+        self._frame = 0
+
+    @property
+    def used(self) -> Ints:
+        """Rows of patches whose rays were traced."""
+        return np.flatnonzero((self.weights > 0) & (self.traced_in >= 0))
+
+    def add(self, seen: Seen) -> tuple[Ints, Floats]:
+        """Fold a picture in. Returns the rows it shows and their change [k]: log of mean radiance over that before."""
+        self._frame += 1
+        cells = np.floor(seen.positions / PATCH_M).astype(np.int64)
+        facing = np.rint(seen.normals * _FACINGS).astype(np.int64)
+        keys, first, inverse = np.unique(
+            np.concatenate([cells, facing], axis=1), axis=0, return_index=True, return_inverse=True
+        )
+        inverse = inverse.ravel()
+        counts = np.bincount(inverse, minlength=len(keys)).astype(np.float64)
+        mean = _Means(inverse, counts)
+        logarithms = mean.of(seen.logarithms)
+        rows = self._rows_of(keys)
+        before, weights = self.logarithms[rows].mean(1), self.weights[rows]
+        changes = np.where(weights > 0, logarithms.mean(1) - before, 0.0)
+        share = 1.0 / (np.minimum(weights, MOST_WEIGHT - 1) + 1.0)
+        columns = share[:, None]
+        self.logarithms[rows] += columns * (logarithms - self.logarithms[rows])
+        self.positions[rows] += columns * (mean.of(seen.positions) - self.positions[rows])
+        normals = self.normals[rows] + columns * (mean.of(seen.normals) - self.normals[rows])
+        self.normals[rows] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+        self.variances[rows] += share * (mean.of(seen.variances[:, None])[:, 0] - self.variances[rows])
+        self.clipped[rows] += share * (mean.of(seen.clipped[:, None])[:, 0] - self.clipped[rows])
+        self.weights[rows] = np.minimum(weights + 1.0, MOST_WEIGHT)
+        self.seen_in[rows] = self._frame
+        return rows, changes
+
+    def scale_weights(self, factor: float) -> None:
+        """Leave all means so much of their weight: the light has changed."""
+        self.weights *= factor
+        self.weights[self.weights < 1e-3] = 0.0
+
+    def trace(self, engine: Engine, volume: Volume) -> Ints:
+        """Trace the rays of patches that have none yet, and of those traced longest ago. Returns their rows."""
+        alive = np.flatnonzero(self.weights > 0)
+        order = alive[np.argsort(self.traced_in[alive], kind="stable")]
+        fresh = int((self.traced_in[order] < 0).sum())
+        rows = order[: max(fresh, TRACED_A_FRAME)]
+        if len(rows) == 0:
+            return rows
+        self.directions[rows] = hemisphere_rays(self.normals[rows], rows)
+        origins = self.positions[rows] + volume.voxel_m * self.normals[rows] - volume.origin_world
+        directions = self.directions[rows].astype(np.float64)
+        self.arrivals[rows] = trace_arrivals(engine, volume, origins, None, directions)
+        self.traced_in[rows] = self._frame
+        return rows
+
+    def _rows_of(self, keys: Ints) -> Ints:
+        """Rows of patches by key, new ones included."""
+        rows = np.array([self._rows.get(tuple(key), -1) for key in keys], np.int64)
+        new = np.flatnonzero(rows < 0)
+        self._make_room(len(self._rows) + len(new) - MOST_PATCHES, rows[rows >= 0])
+        free = sorted(set(range(MOST_PATCHES)) - set(self._rows.values())) if len(new) else []
+        for place, row in zip(new, free, strict=False):
+            self._rows[tuple(keys[place])] = rows[place] = row
+        self.weights[rows[new]], self.traced_in[rows[new]] = 0.0, -1
+        self.regions[rows[new]] = _region_numbers(keys[new])
+        return rows
+
+    def _make_room(self, excess: int, wanted: Ints) -> None:
+        """Forget `excess` patches, those seen longest ago first and `wanted` rows last."""
+        if excess <= 0:
+            return
+        seen_in = self.seen_in.copy()
+        seen_in[wanted] = self._frame
+        for key in sorted(self._rows, key=lambda other: int(seen_in[self._rows[other]]))[:excess]:
+            self.weights[self._rows.pop(key)] = 0.0
+
+
+def _region_numbers(keys: Ints) -> Ints:
+    """[n] a number for each region of patches, by their keys [n, 6]."""
+    cells = np.floor(keys[:, :3] * (PATCH_M / REGION_M)).astype(np.int64)
+    parts = np.concatenate([cells, keys[:, 3:]], axis=1) + (1 << 9)
+    return np.asarray(parts @ (1 << (10 * np.arange(6, dtype=np.int64))))
+
+
+class _Means:
+    """Means over groups of equal number."""
+
+    def __init__(self, groups: Ints, counts: Floats) -> None:
+        self._groups, self._counts = groups, counts
+
+    def of(self, values: Floats) -> Floats:
+        """[groups, k] of values [n, k]."""
+        columns = [np.bincount(self._groups, column, len(self._counts)) for column in values.T]
+        return np.asarray(np.stack(columns, axis=1) / self._counts[:, None])
+
+
+def hemisphere_rays(normals: Floats, numbers: Ints) -> NDArray[np.float32]:
+    """[n, RAYS, 3] unit directions, spread as the cosine to `normals` [n, 3]; `numbers` [n] choose their turn."""
+    index = np.arange(RAYS) + 0.5
+    radius, height = np.sqrt(index / RAYS), np.sqrt(1 - index / RAYS)
+    turns = 2 * np.pi * ((numbers * GOLDEN_TURN) % 1.0)[:, None]
+    angle = 2 * np.pi * GOLDEN_TURN * np.arange(RAYS)[None, :] + turns
+    across = np.eye(3)[np.abs(normals).argmin(axis=1)]
+    first = np.cross(normals, across)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(normals, first)
+    parts = (
+        (radius * np.cos(angle))[..., None] * first[:, None],
+        (radius * np.sin(angle))[..., None] * second[:, None],
+        np.broadcast_to(height[:, None], (*angle.shape, 1)) * normals[:, None],
+    )
+    return np.asarray(sum(parts), np.float32)

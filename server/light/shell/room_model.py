@@ -1,0 +1,163 @@
+"""The light of one room, from the pictures so far: evidence, solution, and the light that arrives at a place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pyopencl.array as cl_array
+from numpy.typing import NDArray
+
+from server.frame_context import FrameContext
+from server.light.arrivals import trace_arrivals
+from server.light.shell.objective import Unknowns, radiances, step
+from server.light.shell.patches import Patches, gather_patches
+from server.light.shell.shell import Shell, shell_around
+from server.light.shell.transport import Transport
+from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
+from server.opencl.engine import Engine
+from server.volume.volume import Volume
+
+BANDS = 4
+DIRECTIONS = 1024
+"""Directions in which the light at a place is looked up: 16 coefficients of a lamp of 10 degrees are good to 3 %."""
+FIRST_STEPS, STEPS = 8, 1
+"""Gauss-Newton steps of the first frame, and of every other."""
+LEAST_PATCHES = 12
+"""Patches below which nothing is said."""
+SPREAD_DOUBT = 1.0
+"""Of the angle over what the curvature tells of it (docs/light.md)."""
+VALID_DEG = 25.0
+"""A dominant direction is valid if 90 % lie within this angle."""
+_QUANTILE_90 = 2.146  # radius that holds 90 % of a two-dimensional normal distribution
+_LINEAR = [3, 1, 2]  # x, y, z
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Arriving:
+    """The light that arrives at a place, surfaces included."""
+
+    position: Floats
+    """[3] metres, world."""
+    sh: Floats
+    """[16, 3] radiance, world axes."""
+    std: Floats
+    """[16, 3] one standard deviation."""
+    spread_deg: float
+    """Angle that 90 % of dominant directions are within; 180 where nothing is known."""
+
+    @property
+    def valid(self) -> bool:
+        """Whether the dominant direction is known well enough to cast shadows by."""
+        return self.spread_deg <= VALID_DEG
+
+
+@cache
+def look_up_directions() -> Floats:
+    """[1, DIRECTIONS, 3] unit, evenly spread."""
+    return spherical_fibonacci(DIRECTIONS)[None]
+
+
+@cache
+def _basis() -> Floats:
+    """[16, DIRECTIONS] weights that project radiance on spherical harmonics."""
+    return np.asarray(4 * np.pi / DIRECTIONS * sh_basis(look_up_directions()[0], BANDS).T)
+
+
+class RoomModel:
+    """Radiance of all that is not scanned surface, with the evidence for it. World axes and metres."""
+
+    def __init__(self) -> None:
+        self._patches = Patches()
+        self._transport = Transport()
+        self._unknowns = Unknowns()
+        self._shell: Shell | None = None
+
+    @property
+    def is_known(self) -> bool:
+        """Whether anything has been solved."""
+        return self._unknowns.known > 0
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the last solve."""
+        return self._unknowns.condition
+
+    def update(self, context: FrameContext, up: Floats) -> None:
+        """Fold in one frame and take a step. up: [3] unit, world."""
+        engine, volume = context.engine, context.volume
+        seen = gather_patches(engine, context.camera, context.surface, context.scene_radiance, volume)
+        if seen.count:
+            self._patches.add(seen)
+        traced = self._patches.trace(engine, volume)
+        rows = self._patches.used
+        if len(rows) < LEAST_PATCHES:
+            return
+        camera = context.volume_from_camera[:3, 3] + volume.origin_world
+        with engine.profile.host():
+            self._shell = shell_around(
+                self._patches.positions[rows], self._patches.normals[rows], camera[None], up, self._shell
+            )
+            self._transport.update(self._patches, traced, self._shell)
+            for _ in range(STEPS if self.is_known else FIRST_STEPS):
+                step(self._unknowns, self._patches, self._transport, self._shell)
+
+    def radiance_at(self, engine: Engine, volume: Volume, position: Floats, directions: Floats) -> Floats:
+        """[m, 3] radiance that arrives at `position` [3] (world) against `directions` [m, 3]; needs `is_known`."""
+        return self._looked_up(engine, volume, position[None], directions[None])[0][0]
+
+    def arriving_at(self, engine: Engine, volume: Volume, positions: Floats) -> list[Arriving]:
+        """The light at each of `positions` [n, 3] (world); needs `is_known`."""
+        radiance, columns = self._looked_up(engine, volume, positions, look_up_directions())
+        return [
+            self._arriving(position, one, cells)
+            for position, one, cells in zip(positions, radiance, columns, strict=True)
+        ]
+
+    def beyond(self, position: Floats) -> Floats:
+        """[16, 3] the light from the shell as seen from `position` [3] (world), with no surface in between."""
+        assert self._shell is not None
+        directions = look_up_directions()
+        cells = self._shell.exits(np.broadcast_to(position, directions.shape), directions)[0]
+        return np.asarray(_basis() @ radiances(self._unknowns, self._transport, self._unknowns.known)[cells])
+
+    def _looked_up(
+        self, engine: Engine, volume: Volume, positions: Floats, directions: Floats
+    ) -> tuple[Floats, NDArray[np.int64]]:
+        """Radiance [n, m, 3] and the unknown cell [n, m] it comes from (below 0: known, or no cell)."""
+        assert self._shell is not None
+        arrivals = trace_arrivals(engine, volume, positions - volume.origin_world, None, directions)
+        turned = np.broadcast_to(directions[0], (len(positions), *directions[0].shape))
+        met = self._transport.meet(self._shell, positions, turned, arrivals.astype(np.float64))
+        sent = radiances(self._unknowns, self._transport, self._unknowns.known)
+        columns = np.where(met.columns < self._unknowns.known, met.columns, -2)
+        radiance = np.where((columns >= 0)[..., None], sent[np.maximum(columns, 0)], met.known)
+        mean = np.exp(self._unknowns.mean)
+        is_new = (columns == -2)[..., None]  # surface of which no patch has received light
+        unseen = np.where(met.at_least.max(axis=-1, keepdims=True) > 0, met.at_least, mean)
+        return np.where(is_new, unseen, np.maximum(radiance, met.at_least)), columns
+
+    def _arriving(self, position: Floats, radiance: Floats, columns: NDArray[np.int64]) -> Arriving:
+        sh = _basis() @ radiance
+        is_unknown = columns >= 0
+        gradient = np.zeros((BANDS * BANDS, self._unknowns.known))
+        luminance = radiance @ LUMINANCE
+        np.add.at(gradient.T, columns[is_unknown], (_basis() * luminance).T[is_unknown])
+        covariance = gradient @ self._unknowns.covariance @ gradient.T
+        std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        tint = radiance.mean(axis=0) / max(float(luminance.mean()), 1e-12)
+        return Arriving(position, sh, np.outer(std, tint), _spread_deg(sh @ LUMINANCE, covariance))
+
+
+def _spread_deg(sh: Floats, covariance: Floats) -> float:
+    """Angle that 90 % of dominant directions are within, for luminance [16] and its covariance."""
+    vector, spread = sh[_LINEAR], covariance[np.ix_(_LINEAR, _LINEAR)]
+    length = float(np.linalg.norm(vector))
+    if length < 1e-12:
+        return 180.0
+    across = np.linalg.svd(np.eye(3) - np.outer(vector, vector) / length**2)[0][:, :2]
+    deviation = np.sqrt(max(float(np.trace(across.T @ spread @ across)) / 2, 0.0))
+    return float(np.degrees(np.arctan2(SPREAD_DOUBT * _QUANTILE_90 * deviation, length)))

@@ -1,0 +1,150 @@
+"""The shell: a closed box around a room's scan and its cameras, whose cells send the light that is not scanned surface.
+
+A ray that leaves the scan ends in the cell where it meets the box, so light from 2 m away is not taken for distant light. The
+box is aligned with gravity and with the walls that were seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+SIDE = 6
+"""Cells along an edge of a face. From 4 to 10, rooms' medians change by a few degrees (docs/light.md)."""
+CELLS = 6 * SIDE * SIDE
+LEAST_HEIGHT_M = 2.4
+"""A ceiling is at least this high above the floor."""
+BEHIND_M = 1.0
+"""A wall is at least this far from a camera."""
+LAMPS_ABOVE_M = 1.0
+"""Height over the floor above which windows and lamps are expected."""
+_GROWTH_M = 0.1  # the box grows only where the scan leaves it by more, so that noise does not move it
+_UP_WEIGHT = 5.0  # patches that the given up direction counts as
+_OUTLIERS = 0.002  # share of positions along an axis that may lie outside, on either side: stray depth
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Shell:
+    """A box in world space."""
+
+    axes: Floats
+    """[3, 3] rows: two horizontal directions along walls, and up."""
+    low: Floats
+    """[3] metres along `axes`."""
+    high: Floats
+    floor_m: float
+    """Height of the lowest surface that was scanned, along `axes[2]`."""
+
+    def exits(self, points: Floats, directions: Floats) -> NDArray[np.int64]:
+        """[...] the cell in which rays from `points` [..., 3] inside of it along `directions` [..., 3] end."""
+        origin, direction = points @ self.axes.T, directions @ self.axes.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = np.where(direction > 0, self.high - origin, self.low - origin) / direction
+        distance = np.where(np.isfinite(distance), distance, np.inf)
+        axis = distance.argmin(axis=-1)
+        nearest = np.take_along_axis(distance, axis[..., None], -1)
+        share = np.clip((origin + nearest * direction - self.low) / (self.high - self.low), 0.0, 1.0 - 1e-9)
+        is_high = np.take_along_axis(direction, axis[..., None], -1)[..., 0] > 0
+        first = np.where(axis == 0, share[..., 1], share[..., 0])
+        second = np.where(axis == 2, share[..., 1], share[..., 2])
+        cells: NDArray[np.int64] = (
+            ((2 * axis + is_high) * SIDE + (first * SIDE).astype(np.int64)) * SIDE + (second * SIDE).astype(np.int64)
+        )
+        return cells
+
+    @cached_property
+    def centers(self) -> Floats:
+        """[CELLS, 3] middles of the cells along `axes`, metres."""
+        share = np.empty((6, SIDE, SIDE, 3))
+        steps = (np.arange(SIDE) + 0.5) / SIDE
+        for face in range(6):
+            first, second = _other_axes(face // 2)
+            share[face, :, :, face // 2] = face % 2
+            share[face, :, :, first] = steps[:, None]
+            share[face, :, :, second] = steps[None, :]
+        return np.asarray(self.low + share.reshape(-1, 3) * (self.high - self.low))
+
+    @cached_property
+    def is_low(self) -> NDArray[np.bool_]:
+        """[CELLS] cells below the height of windows and lamps."""
+        return np.asarray(self.centers[:, 2] < self.floor_m + LAMPS_ABOVE_M)
+
+
+def upright(normals: Floats, up: Floats) -> Floats:
+    """[3] the direction that floors and tables face: the mode of `normals` [n, 3] near `up` [3], which may be 30 degrees off.
+
+    A mean shift on the sphere, from a wide window to a narrow one; each window's mean is held by what `up` itself weighs.
+    """
+    found = up
+    for width_deg in (30.0, 15.0, 8.0):
+        sharpness = 1 / np.radians(width_deg) ** 2
+        for _ in range(4):
+            weights = np.exp(sharpness * (normals @ found - 1))
+            mean = weights @ normals + _UP_WEIGHT * up * (width_deg > 20)
+            found = mean / np.linalg.norm(mean)
+    return np.asarray(found)
+
+
+def wall_axes(normals: Floats, up: Floats) -> Floats:
+    """[3, 3] rows of Shell.axes: the horizontal direction that most walls face along or across, its normal, and up.
+
+    The mean of the fourth power of the horizontal normals, as complex numbers, has four times the walls' angle. normals:
+    [n, 3] of surface, unit; up: [3] unit.
+    """
+    across = np.eye(3)[np.argmin(np.abs(up))]
+    first = across - (across @ up) * up
+    first /= np.linalg.norm(first)
+    second = np.cross(up, first)
+    fourth: complex = complex(np.sum((normals @ first + 1j * (normals @ second)) ** 4))
+    angle = np.angle(fourth) / 4
+    along = np.cos(angle) * first + np.sin(angle) * second
+    return np.stack([along, np.cross(up, along), up])
+
+
+def shell_around(positions: Floats, normals: Floats, cameras: Floats, up: Floats, before: Shell | None) -> Shell:
+    """The shell around `positions` [n, 3] of surface and `cameras` [m, 3], world metres; `before` where that still holds.
+
+    It never shrinks.
+    """
+    axes = wall_axes(normals, upright(normals, up)) if before is None else before.axes
+    surface, seen_from = positions @ axes.T, cameras @ axes.T
+    low, high = np.quantile(surface, _OUTLIERS, axis=0), np.quantile(surface, 1 - _OUTLIERS, axis=0)
+    floor_m = float(low[2])
+    reach = np.array([BEHIND_M, BEHIND_M, 0.0])
+    low, high = np.minimum(low, (seen_from - reach).min(0)), np.maximum(high, (seen_from + reach).max(0))
+    high[2] = max(high[2], floor_m + LEAST_HEIGHT_M)
+    if before is not None:
+        floor_m = min(floor_m, before.floor_m)
+        if np.all(low > before.low - _GROWTH_M) and np.all(high < before.high + _GROWTH_M):
+            return before
+        low, high = np.minimum(low, before.low), np.maximum(high, before.high)
+    return Shell(axes, low, high, floor_m)
+
+
+def neighbours() -> NDArray[np.int64]:
+    """[k, 2] pairs of cells that share an edge, on all faces and across the edges of the box."""
+    cells = np.arange(CELLS).reshape(6, SIDE, SIDE)
+    pairs = [np.stack([cells[:, :-1].ravel(), cells[:, 1:].ravel()], 1)]
+    pairs.append(np.stack([cells[:, :, :-1].ravel(), cells[:, :, 1:].ravel()], 1))
+    for face in range(6):
+        for other in range(face + 1, 6):
+            if face // 2 != other // 2:
+                pairs.append(np.stack([_border(cells, face, other), _border(cells, other, face)], 1))
+    return np.concatenate(pairs)
+
+
+def _other_axes(axis: int) -> tuple[int, int]:
+    first, second = (other for other in range(3) if other != axis)
+    return first, second
+
+
+def _border(cells: NDArray[np.int64], face: int, other: int) -> NDArray[np.int64]:
+    """[SIDE] cells of `face` along its edge with `other`."""
+    end = -1 if other % 2 else 0
+    row: NDArray[np.int64] = cells[face, end] if _other_axes(face // 2)[0] == other // 2 else cells[face, :, end]
+    return row

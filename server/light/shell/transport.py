@@ -1,0 +1,118 @@
+"""How radiance travels in a room: which share of what a patch receives comes from each unknown cell, and what it is known to receive.
+
+Unknown cells are those of the shell, saturated surface (at least as bright as the picture could show), and surface that
+was met from its back or without a colour. Scanned surface sends what the camera saw it send.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.light.shell.patches import MOST_PATCHES, RAYS, Patches
+from server.light.shell.shell import CELLS, Shell
+
+HIDDEN_M = 0.3
+"""Side of the cells of saturated and of hidden surface: smaller than a lamp or a piece of furniture."""
+MOST_HIDDEN = 192
+"""Cells of either kind together; what does not fit shares the last one."""
+SATURATED = 0.97
+"""Radiance of a channel from which a picture's values are lower bounds: code 252 of 255."""
+COLUMNS = CELLS + MOST_HIDDEN
+_MOST_COUNTED = 1e4  # rays that the mean of a saturated cell remembers
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Met:
+    """What rays meet."""
+
+    columns: Ints
+    """[...] the unknown cell; -1: surface whose radiance is known."""
+    known: Floats
+    """[..., 3] radiance of known surface, 0 elsewhere."""
+    at_least: Floats
+    """[..., 3] what saturated surface sends at least, 0 elsewhere."""
+
+
+class Transport:
+    """Shares of the unknown cells, for all patches."""
+
+    def __init__(self) -> None:
+        self.shares: NDArray[np.float32] = np.zeros((MOST_PATCHES, COLUMNS), np.float32)
+        """[patches, COLUMNS] share of a patch's cosine-weighted rays that end in each cell."""
+        self.known: Floats = np.zeros((MOST_PATCHES, 3))
+        """[patches, 3] radiance that known surface brings."""
+        self.is_saturated = np.zeros(COLUMNS, bool)
+        self.at_least: Floats = np.zeros((COLUMNS, 3))
+        """[COLUMNS, 3] mean clipped radiance of saturated cells."""
+        self._counts = np.zeros(COLUMNS)
+        self._hidden: dict[tuple[int, ...], int] = {}
+        self._shell: Shell | None = None
+
+    @property
+    def columns(self) -> int:
+        """Cells that exist."""
+        return CELLS + len(self._hidden)
+
+    def update(self, patches: Patches, traced: Ints, shell: Shell) -> None:
+        """Fold in the patches whose rays were traced; all patches, where the shell has changed."""
+        rows = traced if shell is self._shell else patches.used
+        self._shell = shell
+        if len(rows) == 0:
+            return
+        directions = patches.directions[rows].astype(np.float64)
+        met = self.meet(shell, patches.positions[rows], directions, patches.arrivals[rows].astype(np.float64), learn=True)
+        self.shares[rows] = 0.0
+        is_unknown = met.columns >= 0
+        row = np.broadcast_to(rows[:, None], is_unknown.shape)[is_unknown]
+        np.add.at(self.shares, (row, met.columns[is_unknown]), np.float32(1 / RAYS))
+        self.known[rows] = met.known.mean(axis=1)
+
+    def meet(self, shell: Shell, origins: Floats, directions: Floats, arrivals: Floats, *, learn: bool = False) -> Met:
+        """What rays from `origins` [n, 3] (world) along `directions` [n, m, 3] meet; arrivals [n, m, 4] as traced.
+
+        learn: cells that did not exist are added, and saturated ones note their radiance.
+        """
+        distance, radiance = arrivals[..., 3], arrivals[..., :3]
+        is_bright = (distance > 0) & (radiance.max(axis=-1) >= SATURATED)
+        is_back = distance < 0
+        is_free = distance == 0
+        columns = np.full(distance.shape, -1, np.int64)
+        starts = np.broadcast_to(origins[:, None], directions.shape)
+        columns[is_free] = shell.exits(starts[is_free], directions[is_free])
+        ends = starts + np.abs(distance)[..., None] * directions
+        for kind, chosen in ((0, is_back), (1, is_bright)):
+            columns[chosen] = self._hidden_columns(ends[chosen], kind, learn=learn)
+        if learn and is_bright.any():
+            self._note_bright(columns[is_bright], radiance[is_bright])
+        known = np.where(((distance > 0) & ~is_bright)[..., None], radiance, 0.0)
+        return Met(columns, known, np.where(is_bright[..., None], radiance, 0.0))
+
+    def _hidden_columns(self, points: Floats, kind: int, *, learn: bool) -> Ints:
+        """[n] columns of the cells around `points` [n, 3]; -2 for cells that do not exist."""
+        if len(points) == 0:
+            return np.zeros(0, np.int64)
+        keys, inverse = np.unique(np.floor(points / HIDDEN_M).astype(np.int64), axis=0, return_inverse=True)
+        columns = np.array([self._hidden_column((kind, *(int(k) for k in key)), learn=learn) for key in keys])
+        return np.asarray(columns[inverse.ravel()], np.int64)
+
+    def _hidden_column(self, key: tuple[int, ...], *, learn: bool) -> int:
+        if key not in self._hidden and learn:
+            if len(self._hidden) >= MOST_HIDDEN:
+                return COLUMNS - 1
+            self._hidden[key] = self.columns
+            self.is_saturated[self._hidden[key]] = key[0] == 1
+        return self._hidden.get(key, -2)
+
+    def _note_bright(self, columns: Ints, radiance: Floats) -> None:
+        counts = np.bincount(columns, minlength=COLUMNS).astype(np.float64)
+        sums = np.stack([np.bincount(columns, channel, COLUMNS) for channel in radiance.T], axis=1)
+        total = self._counts + counts
+        share = np.where(total > 0, counts / np.maximum(total, 1.0), 0.0)[:, None]
+        self.at_least += share * (sums / np.maximum(counts, 1.0)[:, None] - self.at_least)
+        self._counts = np.minimum(total, _MOST_COUNTED)

@@ -479,7 +479,7 @@ class Light(Message, frozen=True, kw_only=True, tag="light"):
     condition: float | None
     """Condition number of the unregularised normal equations; null if infinite."""
     valid: bool
-    """Whether the dominant direction is known: `spread_deg` is at most 25, or as the estimator says where it is null."""
+    """Whether the dominant direction is known: `spread_deg` is at most 25; where it is null, as the estimator says."""
     spread_deg: float | None = None
     """Angle in degrees that 90 % of the possible dominant directions are within; null where unknown."""
     position: Vector3 | None = None

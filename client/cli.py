@@ -10,11 +10,14 @@ from typing import Annotated
 
 import typer
 
+from client.display.light_words import light_lines
 from client.errors import OptionError
 from client.options import capture_options as o
 from client.options.capture import prepare, refuse_depth_noise, refuse_video
 from client.options.capture_options import CaptureOptions, capturing
+from client.options.light_places import parse_panorama_out, write_panorama
 from client.progress import Stopwatch, note, progress_bar, say, track
+from protocol.messages import Light
 
 USAGE_STATUS, FAILURE_STATUS, INTERRUPTED_STATUS = 2, 1, 130
 OWN_PACKAGES = {"client", "server", "protocol"}
@@ -75,9 +78,11 @@ def run(
     options: CaptureOptions,
     out: Annotated[Path, typer.Option(metavar="DIR", help="output folder")],
     mesh: o.Mesh = False,
+    panorama_out: o.PanoramaFile = None,
     device: o.DeviceOption = None,
 ) -> None:
     """Run the pipeline in one process, without a network."""
+    panorama = parse_panorama_out(panorama_out)
     capture = prepare(options)
     from client.commands.run import Run
     from client.display.output_folder import OutputWriter
@@ -86,15 +91,19 @@ def run(
         from server.meshing.surface import find_library
 
         find_library()  # a missing library is an error before the frames, not after
-    watch = Stopwatch()
+    watch, light = Stopwatch(), None
     with OutputWriter(out) as writer, Run(capture, device, note) as pipeline:
         for output in track(pipeline.outputs(), capture.total):
             writer.write(output)
             watch.frames += 1
+            light = output.light
         if mesh:
             with progress_bar("mesh") as progress:
                 writer.write_mesh(pipeline.mesh(progress))
+        if panorama is not None:
+            write_panorama(panorama.path, pipeline.panorama(panorama.format, panorama.position_m))
     say(f"{watch.summary()}, written to {out}")
+    _say_light(light)
 
 
 @app.command()
@@ -140,6 +149,7 @@ def stream(
     ] = None,
     view: Annotated[bool, typer.Option("--view", help="show the picture in the terminal")] = False,
     mesh: o.Mesh = False,
+    panorama_out: o.PanoramaFile = None,
     room: o.RoomName = None,
     room_key: o.RoomKey = None,
     room_from_world: o.RoomFromWorld = None,
@@ -160,6 +170,7 @@ def stream(
         raise OptionError("--mesh writes files: say where with --out")
     refuse_depth_noise(depth_noise, lossless)
     refuse_video(video, lossless)
+    panorama = parse_panorama_out(panorama_out)
     capture = prepare(options, lossless=lossless, answer=answer)
     from client.commands.stream import Sending
     from client.commands.stream import stream as send
@@ -176,6 +187,7 @@ def stream(
         record,
         frames=capture.frames,
         mesh=mesh,
+        panorama=panorama,
         room=room_place(room, room_from_world, marker, room_key),
         access=Access(token, tls_fingerprint, tls_ca),
         sending=Sending(adapt, depth_noise, view, video is not None),
@@ -186,6 +198,14 @@ def stream(
         f"{done.answered} frames answered in {done.seconds:.1f} s ({speed:.1f} frames/s), {done.skipped} skipped, "
         f"{done.dropped} dropped{written}"
     )
+    _say_light(done.light)
+
+
+def _say_light(light: Light | None) -> None:
+    """The last frame's light, and what is not known of it."""
+    if light is not None:
+        for line in light_lines(light):
+            say(line)
 
 
 @app.command()

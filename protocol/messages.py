@@ -16,10 +16,12 @@ from protocol.frames import CameraModel, ColorEncoding, check_rigid
 from protocol.limits import (
     MAX_IMAGE_PIXELS,
     MAX_IMAGE_SIDE_PX,
+    MAX_LIGHT_PLACES,
     MAX_MESH_BYTES,
     MAX_MESH_PART_BYTES,
     MAX_MESSAGE_BYTES,
     MAX_NAME_CHARS,
+    MAX_PANORAMA_BYTES,
     MAX_REASON_CHARS,
     MAX_SCENE_MESH_BYTES,
     MAX_SH_BANDS,
@@ -42,6 +44,8 @@ Poses = Literal["given", "track", "refine"]
 Dictionary = Literal["4x4_50", "5x5_100", "6x6_250", "7x7_1000", "apriltag_36h11"]
 Tracking = Literal["given", "tracked", "lost"]
 MeshFormat = Literal["ply", "glb"]
+PanoramaFormat = Literal["hdr", "exr"]
+LightPlace = Literal["view", "place", "object"]
 ObjectFormat = Literal["glb", "obj", "ply", "stl"]
 ColorCodec = Literal["jpeg", "png", "raw", "h264"]
 DepthCodec = Literal["raw", "zdelta", "zranks", "zstd-delta", "zstd-ranks"]
@@ -141,6 +145,8 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Radiance SH to render with instead of an estimate: 1, 4, 9 ... coefficients; None: estimate one."""
     light_axes: Literal["world", "webxr"] = "world"
     """Axes of `light`; `webxr`: up as +y and the first camera's view near -z."""
+    light_at: tuple[Vector3, ...] = ()
+    """World positions, metres: places at which the arriving light is told in `light.at`, at most MAX_LIGHT_PLACES."""
     lamps: Literal["auto", "on", "off"] = "auto"
     """Whether to search for lights inside the room; `auto`: only if distant light does not explain the image."""
     exposure: Literal["auto", "constant"] = "auto"
@@ -169,6 +175,9 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             "wishes", ray_length_m=self.ray_length_m, volume_m=self.volume_m, voxel_m=self.voxel_m, up=self.up
         )
         _require_auto("wishes", self.preset, self.budget_ms, self.max_light_error_deg)
+        _require_finite("wishes", light_at=tuple(value for place in self.light_at for value in place))
+        if len(self.light_at) > MAX_LIGHT_PLACES:
+            raise ValueError(f"wishes.light_at names {len(self.light_at)} places, at most {MAX_LIGHT_PLACES} are told")
         if self.volume_m is not None and not all(self.volume_m[a] < self.volume_m[a + 3] for a in range(3)):
             raise ValueError("wishes.volume_m must be x0,y0,z0,x1,y1,z1 with each x0 < x1")
         if self.up is not None and math.hypot(*self.up) < 1e-6:
@@ -310,6 +319,18 @@ class RequestMesh(Message, frozen=True, kw_only=True, tag="request_mesh"):
     request: Index
 
 
+class RequestPanorama(Message, frozen=True, kw_only=True, omit_defaults=True, tag="request_panorama"):
+    """Request the light that arrives at a place as a lat-long picture; answered by a panorama and then acknowledged."""
+
+    request: Index
+    format: PanoramaFormat
+    position_m: Vector3 | None = None
+    """World. None: the middle of the first virtual object, or of what the last frame sees if there is none."""
+
+    def __post_init__(self) -> None:
+        _require_finite("request_panorama", position_m=self.position_m)
+
+
 class Bye(Message, frozen=True, kw_only=True, tag="bye"):
     """Either side is leaving, with the reason."""
 
@@ -407,6 +428,29 @@ class Lamp(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Share of the luminance that visible surfaces receive."""
 
 
+class ArrivingLight(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The light that arrives at a place: from scanned surface where a direction meets it, from beyond it elsewhere."""
+
+    of: LightPlace
+    """`view`: the middle of what the frame sees; `place`: of `wishes.light_at`; `object`: the middle of its box."""
+    index: Index
+    """Among the `light_at` or the objects, in their order; 0 for the view."""
+    position: Vector3
+    """World, metres."""
+    sh: tuple[Rgb, ...]
+    """This and the fields below as in `light`; 16 x [r, g, b]."""
+    sh_std: tuple[RgbOrNull, ...]
+    sh_webxr: tuple[float, ...]
+    dominant_direction: Vector3
+    dominant_intensity: float
+    spread_deg: float | None
+    valid: bool
+    seen: float | None = None
+    """Share of the directions from here in which photographed surface is met, 0 to 1; null where unknown."""
+    object: Name | None = None
+    """With `of: object`: the object's name."""
+
+
 class Light(Message, frozen=True, kw_only=True, tag="light"):
     """The estimate of the room's light after one frame; the fields of a line of `light.jsonl`."""
 
@@ -435,6 +479,13 @@ class Light(Message, frozen=True, kw_only=True, tag="light"):
     condition: float | None
     """Condition number of the unregularised normal equations; null if infinite."""
     valid: bool
+    """Whether the dominant direction is known: `spread_deg` is at most 25; where it is null, as the estimator says."""
+    spread_deg: float | None = None
+    """Angle in degrees that 90 % of the possible dominant directions are within; null where unknown."""
+    position: Vector3 | None = None
+    """World, metres: the middle of what the frame sees, from where `sh` is meant. Null until a frame was placed."""
+    at: tuple[ArrivingLight, ...] = ()
+    """Light arriving at places: the view, then `wishes.light_at` in their order, then objects in theirs."""
 
 
 class Drawn(Message, frozen=True, kw_only=True):
@@ -510,6 +561,20 @@ class MeshPart(Message, frozen=True, kw_only=True, tag="mesh_part"):
     data: Annotated[bytes, Meta(min_length=1, max_length=MAX_MESH_PART_BYTES)]
 
 
+class Panorama(Message, frozen=True, kw_only=True, tag="panorama"):
+    """The light that arrives at a place as a lat-long picture of linear radiance, in units of the last frame's image.
+
+    The top row looks up; the middle column looks along the first camera's view, columns go on to the right.
+    """
+
+    request: Index
+    format: PanoramaFormat
+    position_m: Vector3
+    """World: where it was made for."""
+    data: Annotated[bytes, Meta(min_length=1, max_length=MAX_PANORAMA_BYTES)]
+    """The file: Radiance `hdr` or OpenEXR `exr`."""
+
+
 class Acknowledged(Message, frozen=True, kw_only=True, tag="acknowledged"):
     """A control message was applied, or refused with `error`."""
 
@@ -525,5 +590,7 @@ class Error(Message, frozen=True, kw_only=True, tag="error"):
     fatal: bool
 
 
-ClientMessage = Hello | Watch | Frame | PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh | Bye
-ServerMessage = Welcome | Composite | Layer | Light | Dropped | MeshPart | Acknowledged | Error | Bye
+ClientMessage = (
+    Hello | Watch | Frame | PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh | RequestPanorama | Bye
+)
+ServerMessage = Welcome | Composite | Layer | Light | Dropped | MeshPart | Panorama | Acknowledged | Error | Bye

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 from msgspec import structs
 
 from protocol.frames import CameraModel, RgbdFrame, Viewpoint
-from protocol.messages import Hello, Preset, Wishes
+from protocol.messages import Hello, PanoramaFormat, Preset, Vector3, Wishes
 from server.effects.renderer import RenderRequest
+from server.light.panorama_file import encode_panorama
 from server.meshing.scene_mesh import SceneMesh
 from server.opencl.device import Device
 from server.opencl.engine import Engine
@@ -104,6 +106,17 @@ class ClientSession:
     def scene_mesh(self, progress: Callable[[int, int], None] = lambda _done, _total: None) -> SceneMesh:
         """The surface fused so far as triangles. Raises MeshingError, one line, where there is none."""
         return self._room.scene_mesh(self._alignment.webxr_from_room, progress)
+
+    def panorama(self, format_: PanoramaFormat, position_m: Vector3 | None = None) -> tuple[bytes, Vector3]:
+        """The light that arrives at a place as a lat-long file, and that place, both in the client's world.
+
+        position_m: None for the first virtual object, else the middle of what the last frame saw. Radiance is in units
+        of the last frame's image. Raises ValueError, one line, before the first frame.
+        """
+        with self._room.lock:
+            asked = None if position_m is None else np.array(position_m, np.float64)
+            radiance, (x, y, z) = self._pipeline.panorama(asked)
+        return encode_panorama(radiance, format_), (float(x), float(y), float(z))
 
     @property
     def kernel_ms(self) -> dict[str, float]:

@@ -24,6 +24,8 @@ from server.input.measure import measure
 from server.light.light_estimation import LightEstimate
 from server.light.light_message import light_message, seen_from
 from server.light.near_light import remove_lamps
+from server.light.panorama_file import lat_long_radiance
+from server.light.told_places import MOST_OBJECTS, ToldPlaces
 from server.objects.rasterize import Placed
 from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
@@ -90,6 +92,9 @@ class Pipeline:
         self._cache = FrameCache(engine)
         self._renderer = Renderer(engine, self._cache, settings)
         self._reuse = None if settings.plan == "everything" else TemporalReuse(engine, camera, poses=wishes.poses)
+        self._light_at = np.array(wishes.light_at, np.float64).reshape(-1, 3)
+        self._told = ToldPlaces()
+        self._exposure = 1.0
         self._frames = self._losses = self._samplings = 0
         self.kernel_ms: dict[str, float] = {}
         """Device time of each kernel in the last frame."""
@@ -134,6 +139,7 @@ class Pipeline:
         left_out = self._left_out(frame, reuse, is_kept, is_shaded)
         with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
             light = self._estimate_light(context, samples, left_out)
+            self._look_up_places(context, is_still=reuse.keeps_geometry)
         with stage("rendering"):  # 7.1-7.2, the effects that this frame calls for
             spine = self._spine_outputs(frame, objects, samples, light, left_out)
             rendered = self._renderer.render(context, spine, self._settings, reuse, request)
@@ -217,6 +223,32 @@ class Pipeline:
         distant = remove_lamps(engine, radiance, context.surface, context.volume, self._room.lamps.lamps)  # B4
         return light.update(context, distant, samples)
 
+    def _look_up_places(self, context: FrameContext, *, is_still: bool) -> None:
+        """The light that arrives at the places of which this client is told."""
+        place, room = self._alignment.room_from_client, self._room
+        asked = self._light_at @ place[:3, :3].T + place[:3, 3]
+        self._told.update(context, room.light, asked, room.objects.middles(), is_still=is_still)
+
+    def panorama(self, position: NDArray[np.float64] | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """[h, w, 3] radiance that arrives at a place, in units of the last frame's image, and the place [3].
+
+        Both are of the client's world; position None: the first object's, else the middle of the last view. Rows and
+        columns are those of `panorama_directions` in WebXR's axes. Raises ValueError, one line, before a frame.
+        """
+        room, alignment, volume = self._room, self._alignment, self._room.reconstruction.volume
+        to_webxr, view = alignment.webxr_from_room, self._told.newest.view
+        if volume is None or to_webxr is None or view is None:
+            raise ValueError("there is no light yet: no frame has been placed in the room")
+        if position is None:
+            where = next(iter(room.objects.middles().values()), view)
+        else:
+            where = alignment.room_from_client[:3, :3] @ position + alignment.room_from_client[:3, 3]
+        radiance = lat_long_radiance(
+            lambda directions: room.light.radiance_at(self._engine, volume, where, directions), to_webxr
+        )
+        to_client = alignment.client_from_room
+        return self._exposure * radiance, to_client[:3, :3] @ where + to_client[:3, 3]
+
     def _denoised(self, context: FrameContext) -> Array:
         """[h, w] float4: what the light is estimated from, in the first picture's units."""
         settings = self._settings
@@ -294,7 +326,7 @@ class Pipeline:
             tracking=geometry.tracking,
             timings=timings,
             plan=structs.replace(rendered.plan, left_out=(*rendered.plan.left_out, *lamps_left_out)),
-            notes=(*geometry.notes, *notes, *_light_notes(light)),
+            notes=(*geometry.notes, *notes, *_light_notes(light), *self._place_notes()),
             is_reused=geometry.is_held,
         )
 
@@ -302,9 +334,18 @@ class Pipeline:
         """The light in the client's world."""
         lamps, axes = self._room.lamps.lamps_at(volume.origin_world), self._alignment.webxr_from_client
         assert axes is not None
+        self._exposure, places = geometry.exposure, self._told.newest
         if not self._alignment.is_identity:
             light, lamps = seen_from(self._alignment.client_from_room, light, lamps)
-        return light_message(frame.index, frame.timestamp_s, light, axes, lamps, geometry.exposure)
+            places = places.seen_from(self._alignment.client_from_room)
+        return light_message(frame.index, frame.timestamp_s, light, axes, lamps, geometry.exposure, places)
+
+    def _place_notes(self) -> tuple[str, ...]:
+        """What is not known of the places that were asked for."""
+        count = len(self._room.objects.middles())
+        if count <= MOST_OBJECTS:
+            return ()
+        return (f"{count} objects: only the first {MOST_OBJECTS} are told a light of their own",)
 
 
 def _light_notes(light: LightEstimate) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from client.objects.placing import place_objects
 from client.options.capture import Capture
 from client.sources.frame_source import is_live
 from protocol.frames import CameraModel, RgbdFrame
-from protocol.messages import MeshFormat, Wishes
+from protocol.messages import MeshFormat, PanoramaFormat, Vector3, Wishes
 from server.client_session import ClientSession
 from server.meshing.files import mesh_files
 from server.opencl.device import open_device
@@ -50,6 +50,13 @@ class Run:
     def mesh(self, progress: Callable[[int, int], None]) -> dict[MeshFormat, bytes]:
         """Mesh files of the surface fused so far; `progress` receives parts done and total. Raises MeshingError."""
         return mesh_files(self._pipeline.scene_mesh(progress))
+
+    def panorama(self, format_: PanoramaFormat, position_m: Vector3 | None) -> bytes:
+        """The light that arrives at a place as a lat-long file; None: see `--panorama-out`. Raises RunError."""
+        try:
+            return self._pipeline.panorama(format_, position_m)[0]
+        except ValueError as error:
+            raise RunError(f"--panorama-out: {error}") from error
 
     def __enter__(self) -> Run:
         return self

@@ -24,6 +24,7 @@ from client.display.stream_statistics import STAGES, StreamStatistics
 from client.display.stream_view import StreamView
 from client.errors import OutputError, SourceError
 from client.objects.object_file import ObjectFile, pack_mesh
+from client.options.light_places import PanoramaOut, write_panorama
 from client.sources.frame_source import ENDLESS, Source, is_live
 from client.streaming.adaptive import Adaptive, AnsweredFrame
 from client.streaming.client import Access, Answer, ClientError, RoomPlace, StreamClient
@@ -36,6 +37,7 @@ from protocol.messages import (
     Dropped,
     Error,
     Layer,
+    Light,
     MeshFormat,
     ObjectFormat,
     ServerMessage,
@@ -66,6 +68,8 @@ class StreamSummary:
     first_picture_s: float = math.nan
     """From connecting to showing the first answer."""
     reconnected: int = 0
+    light: Light | None = None
+    """Of the last answer."""
     latency_ms: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """p50 and p99 over the last frames, by stage of `stream_statistics.STAGES`."""
 
@@ -96,6 +100,7 @@ def stream(
     *,
     frames: range | None = None,
     mesh: bool = False,
+    panorama: PanoramaOut | None = None,
     room: RoomPlace | None = None,
     access: Access | None = None,
     sending: Sending | None = None,
@@ -105,12 +110,13 @@ def stream(
 
     `realtime` keeps the source's frame rate and skips frames while the server is busy; otherwise every frame is sent as
     soon as the window has room. `lossless` sends raw colour, waits for each answer, and receives exact pictures.
-    `mesh` requests the scene's mesh after the last answer and writes it into `out`. `record`: file for all messages.
+    `mesh` requests the scene's mesh after the last answer and writes it into `out`; `panorama` the light at a place.
+    `record`: file for all messages.
     `room`: the room to share. `access`: access options that the URL does not contain. `console`: default stderr.
     Raises ClientError, UserError, each with one line.
     """
     wishes = msgspec.structs.replace(wishes or Wishes(), lossless=lossless)
-    others = (realtime and not lossless, mesh, room, access, sending or Sending())
+    others = (realtime and not lossless, mesh, panorama, room, access, sending or Sending())
     job = _Job(source, frames or range(len(source)), server_url, objects, wishes, *others)
     console = console or Console(stderr=True)
     with _recorder(record) as tap, contextlib.ExitStack() as stack:
@@ -132,6 +138,7 @@ class _Job:
     wishes: Wishes
     realtime: bool
     mesh: bool
+    panorama: PanoramaOut | None
     room: RoomPlace | None
     access: Access | None
     sending: Sending
@@ -227,6 +234,10 @@ class _Stream:
         await client.wait_until_answered()
         if self._job.mesh:
             await self._fetch_mesh(client)
+        if self._job.panorama is not None:
+            asked = self._job.panorama
+            found = await client.request_panorama(asked.format, asked.position_m)
+            await asyncio.to_thread(write_panorama, asked.path, found.data)
 
     async def _send_frames(self, client: StreamClient) -> None:
         start_s = time.perf_counter()
@@ -311,6 +322,7 @@ class _Stream:
         for note in () if drawn is None else drawn.notes:
             self._print_once(note)
         self._summary.answered += 1
+        self._summary.light = answer.light
         self._advance()
 
     def _write_answer(self, answer: Answer) -> NDArray[np.uint8] | None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from client.errors import OutputError
 from client.sources.poses import quaternion
-from protocol.messages import Light, MeshFormat, Plan, Timings
+from protocol.messages import ArrivingLight, Light, MeshFormat, Plan, Timings
 
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 3, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT)
 _LINE_FILES = ("light.jsonl", "trajectory.txt", "timings.jsonl")
@@ -128,9 +128,19 @@ def light_row(light: Light) -> dict[str, Any]:
         "exposure": light.exposure,
         "condition": light.condition,
         "valid": light.valid,
+        "spread_deg": light.spread_deg,
+        "position": light.position,
+        "at": [arriving_row(arriving) for arriving in light.at],
     }
     if light.sh_all is None:
         del row["sh_all"]
+    return row
+
+
+def arriving_row(arriving: ArrivingLight) -> dict[str, Any]:
+    """An entry of `at`. Names of objects are of the session, not of the source, and are left out."""
+    row: dict[str, Any] = msgspec.structs.asdict(arriving)
+    del row["object"]
     return row
 
 

@@ -17,6 +17,7 @@ from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
+from client.display.light_words import light_line, unknown_lines
 from client.display.stream_statistics import STAGES, StreamStatistics
 from client.streaming.coding import Coding
 from protocol.messages import Composite, Layer, Light
@@ -109,20 +110,14 @@ class StreamView:
             if found is not None and is_reported:
                 table.add_row(LABELS[stage], f"p50 {found[0]:.0f} ms, p99 {found[1]:.0f} ms")
         table.add_row("light", light_line(light))
+        for line in unknown_lines(light):
+            table.add_row("", line)
         if drawn is not None:
             table.add_row("plan", plan_line(drawn))
         if self._coding is not None:
             table.add_row("sent as", coding_line(self._coding, self.codec))
         table.add_row("connection", f"restored {self._reconnected} times" if self._reconnected else "held")
         return table
-
-
-def light_line(light: Light) -> str:
-    """Direction and intensity of the light."""
-    x, y, z = light.dominant_direction
-    sure = "" if light.valid else ", not fixed by the pictures so far"
-    lamps = f", lamps in the room: {len(light.lamps)}" if light.lamps else ""
-    return f"from ({x:+.2f}, {y:+.2f}, {z:+.2f}), intensity {light.dominant_intensity:.2g}{lamps}{sure}"
 
 
 def plan_line(drawn: Composite | Layer) -> str:

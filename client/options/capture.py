@@ -12,6 +12,7 @@ from client.objects.object_file import ObjectFile, parse_object
 from client.options.capture_options import ROBUSTNESS, CaptureOptions
 from client.options.choices import Choices, choice, choices_of
 from client.options.light_file import Coefficients, read_light, read_panorama_light
+from client.options.light_places import parse_light_at
 from client.options.source import open_source
 from client.sources.datasets.ground_truth import GroundTruthSource
 from client.sources.frame_source import ENDLESS, Source, is_live
@@ -66,6 +67,7 @@ def prepare(options: CaptureOptions, lossless: bool = False, answer: str | None 
     answer_kind: Literal["picture", "layer", "light"] | None = choice("--answer", answer, ("picture", "layer", "light"))
     objects = tuple(parse_object(text) for text in options.object or ())
     up, volume = parse_up(options.up), parse_volume(options.volume)
+    light_at = parse_light_at(options.light_at)
     _refuse_conflicts(options)
     as_thesis = options.as_thesis
     ray_length_m = THESIS_RAY_LENGTH_M if as_thesis else parse_ray_length(options.ray_length)
@@ -104,6 +106,7 @@ def prepare(options: CaptureOptions, lossless: bool = False, answer: str | None 
         up=up or source.up,
         light=light.sh,
         light_axes=light.axes,
+        light_at=light_at,
         lamps=choices.lamps or "auto",
         exposure=choices.exposure or "auto",
         edges=choices.edges or "smooth",

@@ -65,6 +65,18 @@ Up = Annotated[
 ]
 LightFile = Annotated[str | None, typer.Option("--light", metavar="FILE", help="use this light instead of an estimate")]
 Panorama = Annotated[str | None, typer.Option(metavar="FILE", help="use the light of this panorama")]
+LightAt = Annotated[
+    list[str] | None,
+    typer.Option("--light-at", metavar="x,y,z", help="tell the light that arrives at this place; may be repeated"),
+]
+PanoramaFile = Annotated[
+    str | None,
+    typer.Option(
+        "--panorama-out",
+        metavar="FILE.hdr|.exr[@x,y,z]",
+        help="write the light that arrives at a place, after the last frame; default: the first object's",
+    ),
+]
 Lamps = Annotated[
     str | None, typer.Option(metavar="on|off", help="search for lights inside the room; default: if needed")
 ]
@@ -152,6 +164,7 @@ class CaptureOptions:
     up: Up = None
     light: LightFile = None
     panorama: Panorama = None
+    light_at: LightAt = None
     lamps: Lamps = None
     exposure: Exposure = None
     robustness: Robustness = None

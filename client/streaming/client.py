@@ -35,11 +35,14 @@ from protocol.messages import (
     MeshPart,
     MoveObject,
     ObjectFormat,
+    Panorama,
+    PanoramaFormat,
     PlaceObject,
     Preset,
     Quality,
     RemoveObject,
     RequestMesh,
+    RequestPanorama,
     ServerMessage,
     Vector3,
     Watch,
@@ -100,7 +103,7 @@ class _MeshInbox:
 
 
 Tap = Callable[[ClientMessage | ServerMessage], None]
-Request = PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh
+Request = PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh | RequestPanorama
 
 
 @dataclass(frozen=True)
@@ -143,6 +146,7 @@ class StreamClient:
         self._unread: deque[Answer | Dropped | Error] = deque()
         self._acknowledged: dict[int, Acknowledged] = {}
         self._mesh: _MeshInbox | None = None
+        self._panoramas: dict[int, Panorama] = {}
         self._welcome: Welcome | None = None
         self._light: Light | None = None
         self._reason_given: str | None = None
@@ -304,6 +308,19 @@ class StreamClient:
         if not inbox.files or any(len(data) != inbox.sizes[format_] for format_, data in inbox.files.items()):
             raise ClientError(f"the server at {self._url} sent an incomplete mesh")
         return {format_: bytes(data) for format_, data in inbox.files.items()}
+
+    async def request_panorama(self, format_: PanoramaFormat, position_m: Vector3 | None = None) -> Panorama:
+        """The light that arrives at a place as a lat-long file, after the frames sent so far.
+
+        `position_m`: world; None: the first virtual object, else the middle of what the last frame sees. Raises
+        ClientError if there is no light yet.
+        """
+        request = next(self._requests)
+        done = await self._ask(RequestPanorama(request=request, format=format_, position_m=position_m))
+        panorama = self._panoramas.pop(request, None)
+        if done.error is not None or panorama is None:
+            raise ClientError(done.error or f"the server at {self._url} acknowledged a panorama and sent none")
+        return panorama
 
     async def answers(self) -> AsyncIterator[Answer | Dropped | Error]:
         """Answers in the order of arrival, until `close` or the end of the session. Raises ClientError.
@@ -505,15 +522,23 @@ class StreamClient:
                 await self._finish(message.frame, Answer(self._light, layer=message))
             case Dropped():
                 await self._finish(message.frame, message)
-            case MeshPart() if self._mesh is not None:
-                self._mesh.add(message)
-            case Acknowledged() if message.request in self._unacknowledged:
-                del self._unacknowledged[message.request]
-                self._acknowledged[message.request] = message
             case Error(fatal=False):
                 await self._deliver(message)
             case Error() | Bye():
                 self._reason_given = message.reason
+            case MeshPart() | Panorama() | Acknowledged():
+                self._note_request(message)
+
+    def _note_request(self, message: MeshPart | Panorama | Acknowledged) -> None:
+        """Keep what answers a request until its sender takes it."""
+        match message:
+            case MeshPart() if self._mesh is not None:
+                self._mesh.add(message)
+            case Panorama() if message.request in self._unacknowledged:
+                self._panoramas[message.request] = message
+            case Acknowledged() if message.request in self._unacknowledged:
+                del self._unacknowledged[message.request]
+                self._acknowledged[message.request] = message
 
     async def _finish(self, frame: int, answer: Answer | Dropped) -> None:
         """Deliver the last message about a frame."""

@@ -67,6 +67,8 @@ class LightEstimate:
     """Condition number of the unregularised normal equations; infinite if singular."""
     valid: bool
     """Whether the pictures fix the dominant direction to 15 degrees (95 %)."""
+    spread_deg: float | None = None
+    """Angle that 90 % of the possible dominant directions are within; None where unknown."""
 
     def whitened(self) -> LightEstimate:
         """The same luminance without colours, as the thesis assumes light to be (7.1)."""

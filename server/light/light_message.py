@@ -3,18 +3,38 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.messages import DirectedLight, Lamp, Light
+from protocol.messages import ArrivingLight, DirectedLight, Lamp, Light, RgbOrNull
 from server.light.light_estimation import LightEstimate
+from server.light.place_light import LitPlace
 from server.maths.dominant import dominant_lights
 from server.maths.emitters import Emitter
 from server.maths.sh import dominant_direction, dominant_intensity, rotate_sh, webxr_floats
 
 _WIRE_COEFFICIENTS = 16
+VALID_SPREAD_DEG = 25.0
+"""A dominant direction counts as known if 90 % of the possible ones are within this angle: a shadow then falls on the
+right side of its object."""
+
+
+@dataclass(frozen=True)
+class LightPlaces:
+    """Where a light is told."""
+
+    view: NDArray[np.float64] | None = None
+    """[3] world metres: the middle of what the frame sees; None before a frame was placed."""
+    lit: Sequence[LitPlace] = ()
+
+    def seen_from(self, client_from_room: NDArray[np.float64]) -> LightPlaces:
+        """The same in the world of one client; client_from_room: [4, 4] rigid."""
+        view = None if self.view is None else client_from_room[:3, :3] @ self.view + client_from_room[:3, 3]
+        return LightPlaces(view, [lit.seen_from(client_from_room) for lit in self.lit])
 
 
 def light_message(
@@ -24,24 +44,19 @@ def light_message(
     webxr_from_world: NDArray[np.float64],
     lamps: tuple[Emitter, ...] = (),
     exposure: float = 1.0,
+    places: LightPlaces | None = None,
 ) -> Light:
-    """Message of `estimate` and lamps in the world; bands not estimated are zeros with unknown deviation.
+    """Message of `estimate`, lamps and places in the world; bands not estimated are zeros with unknown deviation.
 
     exposure: of the frame, by which the light, told in units of the first picture, becomes one of the frame's own.
     """
-    sh, std = exposure * estimate.sh, None if estimate.std is None else exposure * estimate.std
-    direction = dominant_direction(sh)
+    places = places or LightPlaces()
+    sh = exposure * estimate.sh
     return Light(
         frame=frame,
         timestamp_s=timestamp_s,
-        sh=tuple(_rgb(sh[i]) if i < len(sh) else (0.0, 0.0, 0.0) for i in range(_WIRE_COEFFICIENTS)),
+        **_coefficients(estimate.sh, estimate.std, exposure, webxr_from_world),
         sh_all=tuple(_rgb(row) for row in sh) if len(sh) > _WIRE_COEFFICIENTS else None,
-        sh_std=tuple(
-            _rgb(std[i]) if std is not None and i < len(std) else (None, None, None) for i in range(_WIRE_COEFFICIENTS)
-        ),
-        sh_webxr=webxr_floats(sh, webxr_from_world),
-        dominant_direction=_rgb(direction),
-        dominant_intensity=dominant_intensity(sh),
         dominant_lights=tuple(
             DirectedLight(
                 direction=_rgb(light.direction),
@@ -54,8 +69,46 @@ def light_message(
         exposure=exposure,
         up=_rgb(webxr_from_world[1]),
         condition=estimate.condition if math.isfinite(estimate.condition) else None,
-        valid=estimate.valid,
+        valid=_is_valid(estimate.spread_deg, estimate.valid),
+        spread_deg=estimate.spread_deg,
+        position=None if places.view is None else _rgb(places.view),
+        at=tuple(_arriving(lit, exposure, webxr_from_world) for lit in places.lit),
     )
+
+
+def _arriving(lit: LitPlace, exposure: float, webxr_from_world: NDArray[np.float64]) -> ArrivingLight:
+    place, light = lit.place, lit.light
+    return ArrivingLight(
+        of=place.of,
+        index=place.index,
+        position=_rgb(light.position),
+        **_coefficients(light.sh, light.std, exposure, webxr_from_world),
+        spread_deg=light.spread_deg,
+        valid=_is_valid(light.spread_deg, light.valid),
+        seen=light.seen,
+        object=place.name,
+    )
+
+
+def _coefficients(
+    sh: NDArray[np.float64], std: NDArray[np.float64] | None, exposure: float, webxr_from_world: NDArray[np.float64]
+) -> dict[str, Any]:
+    """Fields of `Light` and `ArrivingLight`: coefficients and what follows from them, in units of the frame's image."""
+    sh = exposure * sh
+    known = () if std is None else tuple(_rgb(exposure * row) for row in std[:_WIRE_COEFFICIENTS])
+    unknown: RgbOrNull = (None, None, None)
+    return {
+        "sh": tuple(_rgb(sh[i]) if i < len(sh) else (0.0, 0.0, 0.0) for i in range(_WIRE_COEFFICIENTS)),
+        "sh_std": (*known, *(unknown,) * (_WIRE_COEFFICIENTS - len(known))),
+        "sh_webxr": webxr_floats(sh, webxr_from_world),
+        "dominant_direction": _rgb(dominant_direction(sh)),
+        "dominant_intensity": dominant_intensity(sh),
+    }
+
+
+def _is_valid(spread_deg: float | None, otherwise: bool) -> bool:
+    """`otherwise`: what an estimator says that gives no spread."""
+    return otherwise if spread_deg is None else spread_deg <= VALID_SPREAD_DEG
 
 
 def seen_from(

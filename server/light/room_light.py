@@ -10,8 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyopencl.array as cl_array
+from numpy.typing import NDArray
 
 from server.frame_context import FrameContext
+from server.light.arriving import arriving_radiance, arriving_sh, distant_light
 from server.light.continuation import LEAST_GAIN_KNOWN, NO_PLANES, Continuation, PlaneArrays
 from server.light.light_estimation import (
     LEAST_OPENNESS,
@@ -23,6 +25,7 @@ from server.light.light_estimation import (
 )
 from server.light.light_model import LightModel
 from server.light.lobe_estimator import KnownLight, LobeEstimator
+from server.light.place_light import PlaceLight
 from server.maths.light_change import Shot
 from server.maths.lobes import cell_directions
 from server.maths.sh import LUMINANCE, sh_basis
@@ -30,6 +33,7 @@ from server.opencl.engine import Engine
 from server.quality.settings import Settings
 from server.transfer.indirect import Indirect, no_hits
 from server.transfer.samples import TransferSamples
+from server.volume.volume import Volume
 
 AS_SURE = 1.1
 """New frames tell the light as well as those before a restart did, if they leave at most so many times the doubt."""
@@ -87,6 +91,21 @@ class RoomLight:
         if self._harmonics:
             return self._colored(self._harmonics.estimate())
         return self._colored(self._remembered or self._lobes.estimate())
+
+    def arriving_at(self, engine: Engine, volume: Volume, positions: NDArray[np.float64]) -> tuple[PlaceLight, ...]:
+        """The light that arrives at each of `positions` [n, 3] (world metres), in units of the first picture."""
+        light = self.estimate()
+        sh, seen = arriving_sh(engine, volume, positions, distant_light(light.sh))
+        places = zip(positions, sh, seen, strict=True)
+        return tuple(PlaceLight(where, found, None, None, light.valid, float(share)) for where, found, share in places)
+
+    def radiance_at(
+        self, engine: Engine, volume: Volume, position: NDArray[np.float64], directions: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """[m, 3] radiance that arrives at `position` [3] (world metres) from unit `directions` [m, 3] (world axes)."""
+        beyond = distant_light(self.estimate().sh)
+        radiance, _ = arriving_radiance(engine, volume, position[None], directions, beyond)
+        return np.asarray(radiance[0])
 
     def known(self) -> KnownRoomLight:
         """All but the frames that it is estimated from."""

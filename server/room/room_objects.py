@@ -179,6 +179,14 @@ class RoomObjects:
         assert self._objects is not None
         return self._objects.placed(volume_from_world)
 
+    def middles(self) -> dict[str, NDArray[np.float64]]:
+        """[3] world metres: the middle of each placed object's box, by name in order of placement."""
+        entries = self._objects.entries() if self._objects else {}
+        return {
+            name: entry.world_from_model[:3, :3] @ np.mean(entry.mesh.bounds, axis=0) + entry.world_from_model[:3, 3]
+            for name, entry in entries.items()
+        }
+
     def clear(self) -> None:
         """Remove all objects."""
         if self._objects is not None:

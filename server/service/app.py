@@ -1,4 +1,4 @@
-"""HTTP and WebSocket routes of one service: stream, web page, objects, health and metrics."""
+"""HTTP and WebSocket routes of one service: stream, web page, objects, panoramas, health and metrics."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from server.service.authenticator import WHERE_IT_IS, Authenticator
 from server.service.connection import POLICY, Connection, Refusal
 from server.service.object_library import ObjectLibrary
 from server.service.object_routes import add_objects
+from server.service.panorama_routes import add_panorama
 from server.service.service import Service
 
 STREAM_PATH = "/v1/stream"
@@ -44,6 +45,7 @@ def create_app(
     _add_health(app, service)
     _add_metrics(app, service, authenticator)
     add_objects(app, library or ObjectLibrary(), authenticator)
+    add_panorama(app, service, authenticator)
     _add_page(app, page_folder)
     return app
 

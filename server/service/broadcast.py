@@ -88,6 +88,13 @@ class Broadcast:
                 self._move_on(watcher)
         self._note_watched()
 
+    def find(self, session: str | None, room: str | None = None, lock: bytes = b"") -> str | None:
+        """The named session, or the newest one (in `room`), if it may be seen with this key; None if there is none."""
+        watcher = Watcher(session, room, lock)
+        if session is None:
+            return self._newest(watcher)
+        return session if session in self._welcomes and self._shows(session, watcher) else None
+
     @contextlib.contextmanager
     def watcher(
         self, session: str | None, waiting: bytes, room: str | None = None, lock: bytes = b""

@@ -23,7 +23,7 @@ MAX_CLOSE_REASON_BYTES = 123
 SEND_PATIENCE_S = 30.0
 CLOSE_PATIENCE_S = 5.0
 
-CONTROL_TYPES = ("place_object", "move_object", "remove_object", "quality", "request_mesh")
+CONTROL_TYPES = ("place_object", "move_object", "remove_object", "quality", "request_mesh", "request_panorama")
 
 
 class Refusal(Exception):

@@ -11,12 +11,34 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
-from protocol.messages import Frame, MoveObject, PlaceObject, Quality, RemoveObject, RequestMesh
+from protocol.messages import (
+    Frame,
+    MoveObject,
+    PanoramaFormat,
+    PlaceObject,
+    Quality,
+    RemoveObject,
+    RequestMesh,
+    RequestPanorama,
+    Vector3,
+)
 
-Control = PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh
+
+@dataclass(frozen=True)
+class PanoramaOrder:
+    """A request for a panorama that did not come over the session's socket (panorama_routes.py)."""
+
+    format: PanoramaFormat
+    position_m: Vector3 | None
+    answer: Future[bytes] = field(default_factory=Future)
+    """The file, or ValueError with one line; cancelled if the session ends first."""
+
+
+Control = PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh | RequestPanorama | PanoramaOrder
 T = TypeVar("T", bound=Control)
 
 MAX_QUEUED_MESSAGES = 64
@@ -80,10 +102,11 @@ class Mailbox:
     def post(self, message: Frame | Control) -> Receipt:
         """Add a message; a frame beyond the window replaces the oldest unread one.
 
-        Messages posted to a closed mailbox are discarded.
+        Messages posted to a closed mailbox are discarded; orders are cancelled.
         """
         with self._changed:
             if self._closed:
+                _cancel(message)
                 return Receipt(None, 0)
             replaced = self._replace_unread() if isinstance(message, Frame) else None
             self._messages.append(QueuedMessage(message))
@@ -124,6 +147,8 @@ class Mailbox:
         """Discard unread messages and wake the reader."""
         with self._changed:
             self._closed = True
+            for queued in self._messages:
+                _cancel(queued.message)
             self._messages.clear()
             self._changed.notify_all()
 
@@ -145,3 +170,8 @@ class Mailbox:
         del self._messages[index]
         self._queued_bytes -= queued.size_bytes
         return queued
+
+
+def _cancel(message: Frame | Control) -> None:
+    if isinstance(message, PanoramaOrder):
+        message.answer.cancel()

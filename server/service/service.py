@@ -27,6 +27,7 @@ from server.service.connection_limits import ConnectionLimits
 from server.service.event_log import about
 from server.service.graceful_shutdown import GracefulShutdown
 from server.service.limits import DEFAULT_LIMITS, Limits
+from server.service.mailbox import PanoramaOrder
 from server.service.metrics import Metrics
 from server.service.room_persistence import RoomPersistence
 from server.service.room_registry import RoomFactory, RoomRegistry, key_digest_of
@@ -44,11 +45,18 @@ SERVER_NAME = f"probeless {version('probeless')}"
 NO_SESSION = "waiting"
 """Session name in a watcher's welcome while there is no capturing session."""
 
+ORDER_PATIENCE_S = 60.0
+"""Time limit of a panorama: it waits for the frames before it and for the device, which other sessions share."""
+
 log = logging.getLogger(__name__)
 
 PipelineFactory = Callable[["Device", CameraModel, Wishes, "Room | None", Hello], "ClientSession"]
 MeshLoader = Callable[[bytes, str], Mesh]
 WarmUp = Callable[["Device"], object]
+
+
+class NoSession(LookupError):
+    """No session of this name exists, or it may not be seen with this key; one line."""
 
 
 class Service:
@@ -98,6 +106,8 @@ class Service:
         self._parsers.on_death = self._note_parser_death
         self.metrics.ready.set_function(lambda: float(self.ready))
         self.metrics.device_memory.set_function(lambda: float(device.memory.bytes_held))
+        self._captures: dict[str, CaptureSession] = {}
+        """Capturing sessions by name."""
         self._resumable_sessions: dict[str, CaptureSession] = {}
         """Sessions that survive a lost connection, by their keys."""
         self.shutdown.begin_hooks.append(self._stop_waiting_for_clients)
@@ -191,6 +201,27 @@ class Service:
         self.metrics.refused.labels(str(refusal.code)).inc()
         log.info("client refused", extra={"code": refusal.code, "reason": refusal.reason})
 
+    async def panorama(
+        self, asked: PanoramaOrder, session: str | None = None, room: str | None = None, room_key: str | None = None
+    ) -> bytes:
+        """The file that `asked` describes, of a session; default: the newest one (in `room`).
+
+        Raises NoSession, TimeoutError, or ValueError with one line if there is no light yet.
+        """
+        name = self._broadcast.find(session, room, key_digest_of(room_key))
+        capture = self._captures.get(name or "")
+        if capture is None:
+            raise NoSession(f"there is no session {session!r} here" if session else "no session is streaming")
+        if not capture.take_order(asked):
+            raise TimeoutError
+        try:
+            async with asyncio.timeout(ORDER_PATIENCE_S):
+                return await asyncio.wrap_future(asked.answer)
+        except asyncio.CancelledError:
+            if asked.answer.cancelled():
+                raise NoSession("the session has just ended") from None
+            raise
+
     async def serve(self, connection: Connection) -> None:
         """Serve one client from its first message to its end."""
         try:
@@ -247,8 +278,12 @@ class Service:
             with about(session=name, address=connection.address):
                 log.info("session opened", extra={"client": hello.client, "picture": size})
                 session = CaptureSession(connection, hello, self._worker_context, outbox)
-                with self._resumable(key, session):
-                    await session.run(self._threads)
+                self._captures[name] = session
+                try:
+                    with self._resumable(key, session):
+                        await session.run(self._threads)
+                finally:
+                    del self._captures[name]
                 log.info("session closed")
 
     @contextlib.contextmanager

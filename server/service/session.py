@@ -13,7 +13,7 @@ from protocol.codec import encode
 from protocol.messages import Bye, ClientMessage, Dropped, Error, Frame, Hello, Watch, Welcome
 from server.service.broadcast import Broadcast
 from server.service.connection import GONE, INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
-from server.service.mailbox import Mailbox
+from server.service.mailbox import Mailbox, PanoramaOrder
 from server.service.worker import Worker, WorkerContext
 
 MAX_INFLIGHT = 2
@@ -174,6 +174,13 @@ class CaptureSession:
             raise Refusal(GONE, "the session has just ended")
         self._returned.set_result(connection)
         await self._done_with[connection].wait()
+
+    def take_order(self, order: PanoramaOrder) -> bool:
+        """Event loop: queue an order behind what the client has sent. Returns whether there was room."""
+        if not self._mailbox.has_room():
+            return False
+        self._mailbox.post(order)
+        return True
 
     def stop_waiting(self) -> None:
         """Stop waiting for the client to reconnect, now and later."""

@@ -25,18 +25,20 @@ from protocol.messages import (
     Hello,
     Layer,
     MoveObject,
+    Panorama,
     PlaceObject,
     Plan,
     Quality,
     RemoveObject,
     RequestMesh,
+    RequestPanorama,
 )
 from server.meshing.files import mesh_files
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.service.connection import POLICY, UNAUTHORIZED, Refusal
 from server.service.load_shedding import LoadShedding, SamplingRequest
-from server.service.mailbox import Mailbox, QueuedMessage
+from server.service.mailbox import Mailbox, PanoramaOrder, QueuedMessage
 from server.service.mesh_message import mesh_parts
 from server.service.metrics import Metrics
 from server.service.result_encoding import composite_message, layer_message
@@ -137,6 +139,10 @@ class Worker:
             self._answer_frame(pipeline, queued.message)
         elif isinstance(queued.message, RequestMesh):
             self._send_mesh(pipeline, queued.message.request)
+        elif isinstance(queued.message, RequestPanorama):
+            self._send_panorama(pipeline, queued.message)
+        elif isinstance(queued.message, PanoramaOrder):
+            self._fill_order(pipeline, queued.message)
         elif isinstance(queued.message, MoveObject):
             self._handle_moves(pipeline, [queued.message, *self._mailbox.take_while(MoveObject)])
         else:
@@ -204,6 +210,30 @@ class Worker:
         for part in parts:
             self._outbox.send(encode(part))
         return self._outbox.send(encode(Acknowledged(request=request)))
+
+    def _send_panorama(self, pipeline: ClientSession, asked: RequestPanorama) -> None:
+        try:
+            with self._context.scheduler.acquire(self._share):
+                data, position_m = pipeline.panorama(asked.format, asked.position_m)
+        except ValueError as error:
+            return self._outbox.send(encode(Acknowledged(request=asked.request, error=one_line(str(error)))))
+        panorama = Panorama(request=asked.request, format=asked.format, position_m=position_m, data=data)
+        self._outbox.send(encode(panorama))
+        return self._outbox.send(encode(Acknowledged(request=asked.request)))
+
+    def _fill_order(self, pipeline: ClientSession, order: PanoramaOrder) -> None:
+        if not order.answer.set_running_or_notify_cancel():
+            return  # nobody waits any more
+        try:
+            with self._context.scheduler.acquire(self._share):
+                data, _ = pipeline.panorama(order.format, order.position_m)
+        except ValueError as error:
+            order.answer.set_exception(error)
+        except BaseException as error:
+            order.answer.set_exception(error)
+            raise
+        else:
+            order.answer.set_result(data)
 
     def _decode(self, frame: Frame) -> RgbdFrame | Viewpoint:
         start_s = time.perf_counter()

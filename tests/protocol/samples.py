@@ -7,6 +7,7 @@ import numpy as np
 from protocol.frames import CameraModel, DepthCamera
 from protocol.messages import (
     Acknowledged,
+    ArrivingLight,
     Bye,
     ClientMessage,
     ColorImage,
@@ -22,15 +23,18 @@ from protocol.messages import (
     LayerPatch,
     LeftOut,
     Light,
+    LightPlace,
     Marker,
     MeshPart,
     MoveObject,
     OperatingPoint,
+    Panorama,
     PlaceObject,
     Plan,
     Quality,
     RemoveObject,
     RequestMesh,
+    RequestPanorama,
     ServerMessage,
     Timings,
     Watch,
@@ -76,6 +80,9 @@ CLIENT: dict[str, ClientMessage] = {
             lamps="on",
         ),
     ),
+    "hello_light_at": Hello(
+        client="laptop", camera=CAMERA, wishes=Wishes(light_at=((0.5, 0.25, -1.5), (1.0, 0.0, 2.0)))
+    ),
     "hello_two_lenses": Hello(client="rig", camera=TWO_LENSES),
     "hello_room": Hello(
         client="tablet",
@@ -99,6 +106,8 @@ CLIENT: dict[str, ClientMessage] = {
     "remove_object": RemoveObject(request=3, object="sofa"),
     "quality": Quality(request=4, preset="auto", budget_ms=40.0),
     "request_mesh": RequestMesh(request=5),
+    "request_panorama": RequestPanorama(request=6, format="exr"),
+    "request_panorama_at": RequestPanorama(request=7, format="hdr", position_m=(0.5, 0.25, -1.5)),
     "client_bye": Bye(reason="the sequence is over"),
 }
 
@@ -188,6 +197,48 @@ SERVER: dict[str, ServerMessage] = {
         condition=12.5,
         valid=False,
     ),
+    "light_at_places": Light(
+        frame=10,
+        timestamp_s=1.0,
+        sh=tuple((k / 4, -k / 8, 0.125) for k in range(16)),
+        sh_std=((None, None, None),) * 16,
+        sh_webxr=tuple(k / 16 for k in range(27)),
+        dominant_direction=(0.0, 0.6, -0.8),
+        dominant_intensity=1.25,
+        condition=12.5,
+        valid=True,
+        spread_deg=12.5,
+        position=(0.25, 0.5, 1.75),
+        at=(
+            ArrivingLight(
+                of="view",
+                index=0,
+                position=(0.25, 0.5, 1.75),
+                sh=tuple((k / 2, k / 8, 0.25) for k in range(16)),
+                sh_std=tuple((0.5, 0.25, 0.125) for _ in range(16)),
+                sh_webxr=tuple(k / 32 for k in range(27)),
+                dominant_direction=(0.6, 0.0, -0.8),
+                dominant_intensity=0.75,
+                spread_deg=8.25,
+                valid=True,
+                seen=0.375,
+            ),
+            ArrivingLight(
+                of="object",
+                index=0,
+                position=(-0.25, 0.5, 1.5),
+                sh=tuple((k / 4, k / 16, 0.5) for k in range(16)),
+                sh_std=((None, None, None),) * 16,
+                sh_webxr=tuple(k / 64 for k in range(27)),
+                dominant_direction=(0.0, 0.0, 0.0),
+                dominant_intensity=0.0,
+                spread_deg=None,
+                valid=False,
+                object="sofa",
+            ),
+        ),
+    ),
+    "panorama": Panorama(request=6, format="exr", position_m=(-0.25, 0.5, 1.5), data=b"\x76\x2f\x31\x01"),
     "dropped": Dropped(frame=6, reason="replaced by a newer frame"),
     "mesh_part": MeshPart(request=5, format="ply", size_bytes=9, offset=4, data=b"\nend\n"),
     "acknowledged": Acknowledged(request=1, notes=("no normals: computed",)),
@@ -239,4 +290,25 @@ def random_light(random: np.random.Generator) -> Light:
         exposure=float(random.exponential()),
         condition=None if random.random() < 0.5 else float(random.exponential(1e6)),
         valid=bool(random.random() < 0.5),
+        spread_deg=None if random.random() < 0.5 else float(random.uniform(0, 180)),
+        position=None if random.random() < 0.5 else rgb(),
+        at=tuple(_random_arriving(random) for _ in range(random.integers(0, 4))),
+    )
+
+
+def _random_arriving(random: np.random.Generator) -> ArrivingLight:
+    of: tuple[LightPlace, ...] = ("view", "place", "object")
+    return ArrivingLight(
+        of=of[random.integers(3)],
+        index=int(random.integers(0, 100)),
+        position=tuple(random.normal(0, 3, 3).tolist()),
+        sh=tuple(tuple(row) for row in random.normal(0, 3, (16, 3)).tolist()),
+        sh_std=tuple((None, row[0], row[1]) for row in random.normal(0, 3, (16, 2)).tolist()),
+        sh_webxr=tuple(random.normal(0, 3, 27).tolist()),
+        dominant_direction=tuple(random.normal(0, 1, 3).tolist()),
+        dominant_intensity=float(random.exponential()),
+        spread_deg=None if random.random() < 0.5 else float(random.uniform(0, 180)),
+        valid=bool(random.random() < 0.5),
+        seen=None if random.random() < 0.5 else float(random.random()),
+        object=None if random.random() < 0.5 else "sofa",
     )

@@ -33,13 +33,19 @@ def test_the_expected_fields_for_other_languages_are_current() -> None:
 
 @pytest.mark.parametrize("name", [path.stem for path in sorted(EARLIER.glob("*.msgpack"))])
 def test_bytes_of_earlier_clients_and_servers_are_read(name: str) -> None:
-    """From before exposure was said: fields that are missing have their defaults."""
+    """From before exposure, then places, were said: fields that are missing have their defaults."""
     data = (EARLIER / f"{name}.msgpack").read_bytes()
     assert (decode_server if name in SERVER else decode_client)(data) == messages()[name]
 
 
 def test_there_are_earlier_bytes() -> None:
-    assert {path.stem for path in EARLIER.glob("*.msgpack")} == {"hello", "hello_two_lenses", "light", "frame"}
+    assert {path.stem for path in EARLIER.glob("*.msgpack")} == {
+        "hello",
+        "hello_two_lenses",
+        "light",
+        "light_of_an_exposure",
+        "frame",
+    }
 
 
 def test_a_frame_of_unknown_exposure_is_written_as_it_always_was() -> None:

@@ -12,6 +12,8 @@ export const MAX_SCENE_MESH_BYTES = 268435456;
 export const MAX_NAME_CHARS = 64;
 export const MAX_REASON_CHARS = 400;
 export const MAX_SH_BANDS = 6;
+export const MAX_LIGHT_PLACES = 16;
+export const MAX_PANORAMA_BYTES = 8388608;
 
 /** Lens of the depth image, if it differs from the colour lens; conventions as in `CameraModel`. */
 export interface DepthCamera {
@@ -91,6 +93,8 @@ export interface Wishes {
   light?: Array<[number, number, number]> | null;
   /** Axes of `light`; `webxr`: up as +y and the first camera's view near -z. */
   light_axes?: "webxr" | "world";
+  /** World positions, metres: places at which the arriving light is told in `light.at`, at most MAX_LIGHT_PLACES. */
+  light_at?: Array<[number, number, number]>;
   /** Whether to search for lights inside the room; `auto`: only if distant light does not explain the image. */
   lamps?: "auto" | "off" | "on";
   /** `auto`: the frame's exposure if given, else estimated; `constant`: the same for all frames. */
@@ -255,6 +259,15 @@ export interface RequestMesh {
   request: number;
 }
 
+/** Request the light that arrives at a place as a lat-long picture; answered by a panorama and then acknowledged. */
+export interface RequestPanorama {
+  type: "request_panorama";
+  request: number;
+  format: "exr" | "hdr";
+  /** World. null: the middle of the first virtual object, or of what the last frame sees if there is none. */
+  position_m?: [number, number, number] | null;
+}
+
 /** Either side is leaving, with the reason. */
 export interface Bye {
   type: "bye";
@@ -407,6 +420,28 @@ export interface Lamp {
   share: number;
 }
 
+/** The light that arrives at a place: from scanned surface where a direction meets it, from beyond it elsewhere. */
+export interface ArrivingLight {
+  /** `view`: the middle of what the frame sees; `place`: of `wishes.light_at`; `object`: the middle of its box. */
+  of: "object" | "place" | "view";
+  /** Among the `light_at` or the objects, in their order; 0 for the view. */
+  index: number;
+  /** World, metres. */
+  position: [number, number, number];
+  /** This and the fields below as in `light`; 16 x [r, g, b]. */
+  sh: Array<[number, number, number]>;
+  sh_std: Array<[number | null, number | null, number | null]>;
+  sh_webxr: Array<number>;
+  dominant_direction: [number, number, number];
+  dominant_intensity: number;
+  spread_deg: number | null;
+  valid: boolean;
+  /** Share of the directions from here in which photographed surface is met, 0 to 1; null where unknown. */
+  seen: number | null;
+  /** With `of: object`: the object's name. */
+  object: string | null;
+}
+
 /** The estimate of the room's light after one frame; the fields of a line of `light.jsonl`. */
 export interface Light {
   type: "light";
@@ -436,7 +471,14 @@ export interface Light {
   up: [number, number, number] | null;
   /** Condition number of the unregularised normal equations; null if infinite. */
   condition: number | null;
+  /** Whether the dominant direction is known: `spread_deg` is at most 25; where it is null, as the estimator says. */
   valid: boolean;
+  /** Angle in degrees that 90 % of the possible dominant directions are within; null where unknown. */
+  spread_deg: number | null;
+  /** World, metres: the middle of what the frame sees, from where `sh` is meant. Null until a frame was placed. */
+  position: [number, number, number] | null;
+  /** Light arriving at places: the view, then `wishes.light_at` in their order, then objects in theirs. */
+  at: Array<ArrivingLight>;
 }
 
 /** The frame was replaced by a newer one before it was read, or was refused. It gets no other answer. */
@@ -459,6 +501,21 @@ export interface MeshPart {
   size_bytes: number;
   /** Offset of this part in the file. */
   offset: number;
+  data: Uint8Array;
+}
+
+/**
+ * The light that arrives at a place as a lat-long picture of linear radiance, in units of the last frame's image.
+ *
+ * The top row looks up; the middle column looks along the first camera's view, columns go on to the right.
+ */
+export interface Panorama {
+  type: "panorama";
+  request: number;
+  format: "exr" | "hdr";
+  /** World: where it was made for. */
+  position_m: [number, number, number];
+  /** The file: Radiance `hdr` or OpenEXR `exr`. */
   data: Uint8Array;
 }
 
@@ -486,6 +543,7 @@ export type ClientMessage =
   | RemoveObject
   | Quality
   | RequestMesh
+  | RequestPanorama
   | Bye;
 
 export type ServerMessage =
@@ -495,6 +553,7 @@ export type ServerMessage =
   | Light
   | Dropped
   | MeshPart
+  | Panorama
   | Acknowledged
   | Error
   | Bye;

@@ -1,0 +1,60 @@
+"""The light that arrives at a place: of scanned surface where a direction meets it, from beyond the scan elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.light.arrivals import trace_arrivals
+from server.maths.sh import sh_basis, spherical_fibonacci
+from server.opencl.engine import Engine
+from server.volume.volume import Volume
+
+DIRECTIONS = 1024
+"""Directions from a place. Each stands for 0.012 sr, a cone of 3.6 degrees radius; the finest of 16 coefficients turns
+once in 120 degrees. Twice as many cost twice the time (`docs/architecture.md`: at most 2 ms a place)."""
+BANDS = 4
+"""Of the light at a place: 16 coefficients, as the wire has."""
+
+Floats = NDArray[np.float64]
+BeyondScan = Callable[[Floats, Floats], Floats]
+"""Points [n, 3] (world metres) and unit directions [m, 3] (world axes) -> radiance [n, m, 3] from beyond the scan."""
+
+
+def distant_light(sh: Floats) -> BeyondScan:
+    """Light from infinitely far, the same at every point. sh: [bands^2, 3]; where its radiance is negative it is 0."""
+    bands = round(len(sh) ** 0.5)
+
+    def radiance(points: Floats, directions: Floats) -> Floats:
+        return np.broadcast_to(np.maximum(sh_basis(directions, bands) @ sh, 0.0), (len(points), len(directions), 3))
+
+    return radiance
+
+
+def arriving_radiance(
+    engine: Engine, volume: Volume, points: Floats, directions: Floats, beyond: BeyondScan
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Radiance [n, m, 3] that arrives at `points` [n, 3] from unit `directions` [m, 3], and where surface was met.
+
+    Points are world metres, directions world axes. Where the first thing met is photographed surface, its radiance;
+    elsewhere, also where a surface's back is met, what `beyond` says. The mask [n, m] is true in the first case.
+    """
+    in_volume = points + volume.volume_from_world()[:3, 3]  # the volume's axes are the world's
+    met = trace_arrivals(engine, volume, in_volume, None, directions[None]).astype(np.float64)
+    is_seen = met[..., 3] > 0
+    return np.where(is_seen[..., None], met[..., :3], beyond(points, directions)), is_seen
+
+
+def arriving_sh(engine: Engine, volume: Volume, points: Floats, beyond: BeyondScan) -> tuple[Floats, Floats]:
+    """SH [n, 16, 3] of the radiance that arrives at `points` [n, 3] (world metres), and the share [n] seen there."""
+    directions = _directions()
+    radiance, is_seen = arriving_radiance(engine, volume, points, directions, beyond)
+    projection = sh_basis(directions, BANDS).T * (4 * pi / DIRECTIONS)
+    return np.einsum("kd,ndc->nkc", projection, radiance), is_seen.mean(axis=1)
+
+
+def _directions() -> Floats:
+    return spherical_fibonacci(DIRECTIONS)

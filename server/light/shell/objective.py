@@ -52,10 +52,10 @@ SMOOTHNESS, EDGE = 1.0, 0.5
 the rims of lamps and windows."""
 CHROMA_NOISE = 0.06
 """Standard deviation of a patch's log chroma."""
-REGION_CHROMA = 1.0
+REGION_CHROMA = 2.0
 """Standard deviation of a region's chroma of albedo: rooms have orange wood and red walls."""
-CELL_CHROMA, TINT = 0.3, 0.5
-"""Standard deviations of a cell's chroma about the light's, and of the light's about grey."""
+CELL_CHROMA, TINT = 0.3, 0.2
+"""Standard deviations of a cell's chroma about the light's, and of the light's about grey: cameras balance white."""
 CHROMA_SMOOTHNESS = 5.0
 """Weight of the squared difference of neighbouring cells' chroma."""
 LOGIT = float(np.log(MEAN_ALBEDO / (1 - MEAN_ALBEDO)))
@@ -151,7 +151,7 @@ def step(unknowns: Unknowns, patches: Patches, transport: Transport, shell: Shel
     design = np.concatenate([parts, (1 - albedo)[:, None] * np.concatenate([materials, surfaces], axis=1)], axis=1)
     scale = np.concatenate([slope / level, np.ones(len(nodes) + len(offsets))])
     gram = _gram(design, weights)
-    matrix, vector = _without_regions(gram, design, weights, residual[:, None], data.regions, REGION_SPREAD)
+    matrix, vector = _without_regions(gram, design, weights, residual[:, None], data.regions, np.full(data.regions.max() + 1, REGION_SPREAD))
     matrix, right = matrix * np.outer(scale, scale), vector[:, 0] * scale
     pairs, differences = _pairs(z)
     strength = SMOOTHNESS / np.sqrt(1 + (differences / EDGE) ** 2)
@@ -250,17 +250,17 @@ def _gram(design: Floats, weights: Floats) -> Floats:
 
 
 def _without_regions(
-    gram: Floats, design: Floats, weights: Floats, residuals: Floats, regions: NDArray[np.int64], spread: float
+    gram: Floats, design: Floats, weights: Floats, residuals: Floats, regions: NDArray[np.int64], spreads: Floats
 ) -> tuple[Floats, Floats]:
-    """Normal matrix and vector [n, c] once each region's own offset, of deviation `spread`, is eliminated."""
-    count = int(regions.max()) + 1
+    """Normal matrix and vector [n, c] once each region's own offset, of deviation `spreads` [regions], is eliminated."""
+    count = len(spreads)
     order = np.argsort(regions, kind="stable")
     starts = np.searchsorted(regions[order], np.arange(count))
     weighted = design * weights[:, None]
     sums = np.add.reduceat(weighted[order], starts, axis=0)
     totals = np.add.reduceat(weights[order], starts)
     differences = np.add.reduceat((weights[:, None] * residuals)[order], starts, axis=0)
-    factor = spread**2 / (1 + spread**2 * totals)
+    factor = spreads**2 / (1 + spreads**2 * totals)
     root = (sums * np.sqrt(factor)[:, None]).astype(np.float32)
     matrix = gram - (root.T @ root).astype(np.float64)
     return matrix, weighted.T @ residuals - sums.T @ (factor[:, None] * differences)
@@ -293,7 +293,8 @@ def _solve_chroma(
     count, ratio = parts.shape[1], (PATCH_NOISE / CHROMA_NOISE) ** 2
     predicted = parts @ unknowns.chroma[:count]
     residual = np.where(data.is_clipped[:, None], predicted, seen)
-    matrix, vector = _without_regions(ratio * gram, parts, ratio * weights, residual, data.regions, REGION_CHROMA)
+    spreads = np.full(data.regions.max() + 1, REGION_CHROMA)
+    matrix, vector = _without_regions(ratio * gram, parts, ratio * weights, residual, data.regions, spreads)
     _add_smoothness(matrix, _PAIRS, CHROMA_SMOOTHNESS)
     matrix[np.diag_indices_from(matrix)] += 1 / CELL_CHROMA**2
     # The light's own chroma t is eliminated: u about t, t about 0.

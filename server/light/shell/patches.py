@@ -37,6 +37,7 @@ LEAST_SHARE = 0.6
 """Of a block of pixels that must lie on one surface."""
 _BLOCKS_ACROSS = 40  # blocks of pixels along a picture's width
 _TOLERANCE_VOXELS = 1.5
+_FORGOTTEN = 1e-3  # frames: a patch of less weight is none
 _FACINGS = 1.2  # normals are rounded to multiples of 1 / 1.2: 26 ways to face
 
 Floats = NDArray[np.float64]
@@ -125,24 +126,28 @@ class Patches:
         """Rows of patches whose rays were traced."""
         return np.flatnonzero((self.weights > 0) & (self.traced_in >= 0))
 
-    def add(self, seen: Seen) -> tuple[Ints, Floats]:
-        """Fold a picture in. Returns the rows it shows and their change [k]: log of mean radiance over that before."""
+    def changes(self, seen: Seen) -> Floats:
+        """[k] how the patches of a picture differ from what they showed before: logarithms of ratios of mean radiance."""
+        keys, mean = _grouped(seen)
+        rows = np.array([self._rows.get(tuple(key), -1) for key in keys], np.int64)
+        is_known = (rows >= 0) & (self.weights[rows] > 0)
+        now = mean.of(seen.logarithms)[is_known].mean(axis=1)
+        return np.asarray(now - self.logarithms[rows[is_known]].mean(axis=1))
+
+    def forget(self, share: float) -> None:
+        """Take `share` of their weight from all patches: the light has changed."""
+        self.weights *= 1.0 - share
+        self.weights[self.weights < _FORGOTTEN] = 0.0
+
+    def add(self, seen: Seen) -> None:
+        """Fold a picture in."""
         self._frame += 1
-        cells = np.floor(seen.positions / PATCH_M).astype(np.int64)
-        facing = np.rint(seen.normals * _FACINGS).astype(np.int64)
-        keys, first, inverse = np.unique(
-            np.concatenate([cells, facing], axis=1), axis=0, return_index=True, return_inverse=True
-        )
-        inverse = inverse.ravel()
-        counts = np.bincount(inverse, minlength=len(keys)).astype(np.float64)
-        mean = _Means(inverse, counts)
-        logarithms = mean.of(seen.logarithms)
+        keys, mean = _grouped(seen)
         rows = self._rows_of(keys)
-        before, weights = self.logarithms[rows].mean(1), self.weights[rows]
-        changes = np.where(weights > 0, logarithms.mean(1) - before, 0.0)
+        weights = self.weights[rows]
         share = 1.0 / (np.minimum(weights, MOST_WEIGHT - 1) + 1.0)
         columns = share[:, None]
-        self.logarithms[rows] += columns * (logarithms - self.logarithms[rows])
+        self.logarithms[rows] += columns * (mean.of(seen.logarithms) - self.logarithms[rows])
         self.positions[rows] += columns * (mean.of(seen.positions) - self.positions[rows])
         normals = self.normals[rows] + columns * (mean.of(seen.normals) - self.normals[rows])
         self.normals[rows] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
@@ -150,12 +155,6 @@ class Patches:
         self.clipped[rows] += share * (mean.of(seen.clipped[:, None])[:, 0] - self.clipped[rows])
         self.weights[rows] = np.minimum(weights + 1.0, MOST_WEIGHT)
         self.seen_in[rows] = self._frame
-        return rows, changes
-
-    def scale_weights(self, factor: float) -> None:
-        """Leave all means so much of their weight: the light has changed."""
-        self.weights *= factor
-        self.weights[self.weights < 1e-3] = 0.0
 
     def trace(self, engine: Engine, volume: Volume) -> Ints:
         """Trace the rays of patches that have none yet, and of those traced longest ago. Returns their rows."""
@@ -199,6 +198,15 @@ def _region_numbers(keys: Ints) -> Ints:
     cells = np.floor(keys[:, :3] * (PATCH_M / REGION_M)).astype(np.int64)
     parts = np.concatenate([cells, keys[:, 3:]], axis=1) + (1 << 9)
     return np.asarray(parts @ (1 << (10 * np.arange(6, dtype=np.int64))))
+
+
+def _grouped(seen: Seen) -> tuple[Ints, _Means]:
+    """Keys of the patches in a picture, [k, 6] distinct, and means over what it shows of each."""
+    cells = np.floor(seen.positions / PATCH_M).astype(np.int64)
+    facing = np.rint(seen.normals * _FACINGS).astype(np.int64)
+    keys, inverse = np.unique(np.concatenate([cells, facing], axis=1), axis=0, return_inverse=True)
+    inverse = inverse.ravel()
+    return keys, _Means(inverse, np.bincount(inverse, minlength=len(keys)).astype(np.float64))
 
 
 class _Means:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from math import pi
 
 import numpy as np
@@ -18,6 +19,9 @@ DIRECTIONS = 1024
 once in 120 degrees. The cost grows with their number; a place may take at most 2 ms."""
 BANDS = 4
 """Of the light at a place: 16 coefficients, as the wire has."""
+
+_FAR_M = 1e5
+"""A place farther off is looked up here: from so far the volume, some metres wide, is met by none of the directions."""
 
 Floats = NDArray[np.float64]
 BeyondScan = Callable[[Floats, Floats], Floats]
@@ -42,7 +46,8 @@ def arriving_radiance(
     Points are world metres, directions world axes. Where the first thing met is photographed surface, its radiance;
     elsewhere, also where a surface's back is met, what `beyond` says. The mask [n, m] is true in the first case.
     """
-    in_volume = points + volume.volume_from_world()[:3, 3]  # the volume's axes are the world's
+    # The volume's axes are the world's. Float32 rays need finite places.
+    in_volume = np.clip(points + volume.volume_from_world()[:3, 3], -_FAR_M, _FAR_M)
     met = trace_arrivals(engine, volume, in_volume, None, directions[None]).astype(np.float64)
     is_seen = met[..., 3] > 0
     return np.where(is_seen[..., None], met[..., :3], beyond(points, directions)), is_seen
@@ -50,11 +55,13 @@ def arriving_radiance(
 
 def arriving_sh(engine: Engine, volume: Volume, points: Floats, beyond: BeyondScan) -> tuple[Floats, Floats]:
     """SH [n, 16, 3] of the radiance that arrives at `points` [n, 3] (world metres), and the share [n] seen there."""
-    directions = _directions()
+    directions, projection = _quadrature()
     radiance, is_seen = arriving_radiance(engine, volume, points, directions, beyond)
-    projection = sh_basis(directions, BANDS).T * (4 * pi / DIRECTIONS)
-    return np.einsum("kd,ndc->nkc", projection, radiance), is_seen.mean(axis=1)
+    return projection @ radiance, is_seen.mean(axis=1)
 
 
-def _directions() -> Floats:
-    return spherical_fibonacci(DIRECTIONS)
+@cache
+def _quadrature() -> tuple[Floats, Floats]:
+    """Directions [DIRECTIONS, 3], and the weights [16, DIRECTIONS] that project radiance along them."""
+    directions = spherical_fibonacci(DIRECTIONS)
+    return directions, sh_basis(directions, BANDS).T * (4 * pi / DIRECTIONS)

@@ -19,6 +19,7 @@ import pytest
 import trimesh
 
 from client.cli import main, run_command
+from server.light.panorama import read_panorama
 from tests.client import folders
 from tests.data import ROOT
 
@@ -74,6 +75,8 @@ def assert_one_line(done: Done, status: int, words: str) -> None:
         (["run", TABLE, "--out", "{tmp}", "--wrong"], "--wrong"),
         (["run", TABLE, "--out", "{tmp}", "--frames", "0:9"], "0:4"),
         (["run", TABLE, "--out", "{tmp}", "--preset", "auto", "--rays", "9"], "leave one out"),
+        (["run", TABLE, "--out", "{tmp}", "--light-at", "1,2"], "expected x,y,z"),
+        (["run", TABLE, "--out", "{tmp}", "--panorama-out", "sky.png"], "expected FILE.hdr or FILE.exr"),
         (["stream", TABLE], "--server"),
         (["stream", TABLE, "--server", "localhost:1", "--device", "x"], "probeless serve --device"),
         (["stream", TABLE, "--server", "http://127.0.0.1:9", "--mesh"], "say where with --out"),
@@ -173,14 +176,19 @@ def test_devices_lists_the_one_that_would_be_used(probeless: Probeless) -> None:
 
 
 def test_run_writes_what_is_promised(tmp_path: Path) -> None:
-    done = probeless_process("run", TABLE, "--frames", "1:4", "--out", tmp_path)
+    asked = ("--light-at", "-0.1,0,0.8", "--light-at", "0,-0.2,1", "--panorama-out", f"{tmp_path}/sky.hdr@0,0,0.8")
+    done = probeless_process("run", TABLE, "--frames", "1:4", "--out", tmp_path, *asked)
     assert done.returncode == 0, done.stderr
     assert "3 frames" in done.stdout
+    assert "light from (" in done.stdout
+    assert "place 1 (-0.10, 0.00, 0.80)" in done.stdout
+    assert read_panorama(tmp_path / "sky.hdr").shape == (512, 1024, 3)
     assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == ["000001.png", "000002.png", "000003.png"]
     assert cv2.imread(str(tmp_path / "frames" / "000001.png")).shape == (120, 160, 3)
     lights = [json.loads(line) for line in (tmp_path / "light.jsonl").read_text().splitlines()]
     assert [light["frame"] for light in lights] == [1, 2, 3]
     assert all(np.isfinite(light["sh"]).all() for light in lights)
+    assert [at["position"] for at in lights[-1]["at"][1:]] == [[-0.1, 0.0, 0.8], [0.0, -0.2, 1.0]]
     assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == 3
     assert len((tmp_path / "timings.jsonl").read_text().splitlines()) == 3
 

@@ -155,6 +155,30 @@ def test_a_still_view_keeps_the_light_and_a_moved_object_gets_another(device: De
     pipeline.close()
 
 
+def test_a_lost_camera_keeps_the_light_of_the_last_frame(device: Device) -> None:
+    pipeline = ClientSession(device, rooms.CAMERA, rooms.wishes("track", light_at=((0.0, 0.0, 1.0),)))
+    for step in range(3):
+        before = pipeline.process(frame_at(view_at(step), step))
+    nothing = replace(frame_at(view_at(3), 3), depth=np.zeros((rooms.CAMERA.height, rooms.CAMERA.width), np.uint16))
+    lost = pipeline.process(nothing)
+    assert lost.tracking == "lost"
+    assert lost.light.at == before.light.at
+    assert lost.light.position == before.light.position
+    pipeline.close()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("far_m", [1e3, 1e6, 1e30, 1e300])
+def test_places_at_the_ends_of_the_world(device: Device, far_m: float) -> None:
+    """They receive the light from beyond the scan, whole."""
+    asked = structs.replace(wishes(), light_at=((far_m, 0.0, 0.0), (-far_m, far_m, -far_m)))
+    pipeline = ClientSession(device, CAMERA, asked)
+    for at in pipeline.process(frame()).light.at[1:]:
+        assert at.seen == 0
+        np.testing.assert_allclose(coefficients(at), LIGHT, atol=2e-3 * LIGHT.max())
+    pipeline.close()
+
+
 def test_objects_beyond_the_limit_are_named(device: Device, monkeypatch) -> None:
     monkeypatch.setattr(told_places, "MOST_OBJECTS", 2)
     monkeypatch.setattr("server.pipeline.MOST_OBJECTS", 2)

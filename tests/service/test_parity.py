@@ -1,6 +1,7 @@
 """The real pipeline behind the socket gives, losslessly, the bits it gives in this process."""
 
 import io
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from rich.console import Console
 from client.commands.stream import stream
 from client.display.output_folder import FrameOutput, OutputWriter
 from client.objects.object_file import ObjectFile, pack_mesh
+from client.options.light_places import PanoramaOut
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from server.client_session import ClientSession
@@ -23,7 +25,10 @@ from server.service.service import Service
 
 FRAMES = 3
 CAMERA = CameraModel(width=96, height=72, fx=80.0, fy=80.0, cx=47.5, cy=35.5)
-WISHES = Wishes(volume_m=(-1.0, -1.0, 0.5, 1.0, 1.0, 2.5), voxel_m=0.04, rays=32, up=(0.0, -1.0, 0.0))
+PLACE = (0.2, 0.1, 1.0)
+WISHES = Wishes(
+    volume_m=(-1.0, -1.0, 0.5, 1.0, 1.0, 2.5), voxel_m=0.04, rays=32, up=(0.0, -1.0, 0.0), light_at=(PLACE,)
+)
 BOX = "v -1 0 -1\nv 1 0 -1\nv 0 0 1\nv 0 2 0\nf 1 2 4\nf 2 3 4\nf 3 1 4\nf 1 3 2\n"
 
 
@@ -65,6 +70,7 @@ def run_in_process(device: Device, scene: Scene, folder: Path) -> None:
             result.pop("is_reused")  # of the server alone
             writer.write(FrameOutput(frame=frame.index, timestamp_s=frame.timestamp_s, **result))
         writer.write_mesh(mesh_files(pipeline.scene_mesh()))
+        (folder / "sky.exr").write_bytes(pipeline.panorama("exr", PLACE)[0])
     pipeline.close()
 
 
@@ -84,9 +90,12 @@ def test_lossless_stream_gives_the_bits_of_an_in_process_run(device: Device, sce
     run_in_process(device, scene, tmp_path / "run")
     with BackgroundServer(Service(device)) as server:
         quiet = Console(file=io.StringIO())
-        options = {"lossless": True, "mesh": True, "console": quiet}
+        panorama = PanoramaOut(tmp_path / "stream" / "sky.exr", "exr", PLACE)
+        options = {"lossless": True, "mesh": True, "panorama": panorama, "console": quiet}
         stream(scene.source, server.url, [scene.item], WISHES, tmp_path / "stream", **options)
     run, streamed = comparable(tmp_path / "run"), comparable(tmp_path / "stream")
     assert len([name for name in run if name.endswith(".png")]) == FRAMES
-    assert run.keys() == streamed.keys() >= {"mesh.ply", "mesh.glb"}
+    assert run.keys() == streamed.keys() >= {"mesh.ply", "mesh.glb", "sky.exr"}
     assert [name for name in run if run[name] != streamed[name]] == []
+    last = json.loads(streamed["light.jsonl"].splitlines()[-1])
+    assert [(at["of"], at["index"]) for at in last["at"]] == [("view", 0), ("place", 0), ("object", 0)]

@@ -166,7 +166,7 @@ def step(unknowns: Unknowns, patches: Patches, transport: Transport, shell: Shel
     )
     matrix[np.diag_indices_from(matrix)] += diagonal
     target = np.concatenate([prior - z, LOGIT - unknowns.materials[nodes], -offsets])
-    covariance: Floats = np.linalg.inv(matrix)
+    covariance = np.asarray(np.linalg.inv(matrix), np.float64)
     change = covariance @ (right + diagonal * target)
     unknowns.step = float(np.abs(change).max())
     change *= min(1.0, MOST_STEP / max(unknowns.step, 1e-12))

@@ -15,7 +15,7 @@ from server.volume.volume import Volume
 
 DIRECTIONS = 1024
 """Directions from a place. Each stands for 0.012 sr, a cone of 3.6 degrees radius; the finest of 16 coefficients turns
-once in 120 degrees. Twice as many cost twice the time (`docs/architecture.md`: at most 2 ms a place)."""
+once in 120 degrees. The cost grows with their number; a place may take at most 2 ms."""
 BANDS = 4
 """Of the light at a place: 16 coefficients, as the wire has."""
 

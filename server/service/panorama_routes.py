@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import FastAPI, Request
+from fastapi import FastAPI, Query, Request
 from fastapi.responses import PlainTextResponse, Response
 
 from protocol.codec import one_line
@@ -18,6 +18,12 @@ from server.service.service import NoSession, Service
 
 PANORAMA_PATH = "/v1/panorama"
 MEDIA_TYPES: dict[PanoramaFormat, str] = {"hdr": "image/vnd.radiance", "exr": "image/x-exr"}
+_NUMBER = r"-?[0-9]{1,4}(\.[0-9]{1,6})?"
+At = Annotated[
+    str | None,
+    # Described and not enforced: the answer to another text is one line, as all refusals are.
+    Query(description="x,y,z in metres", json_schema_extra={"pattern": f"^{_NUMBER},{_NUMBER},{_NUMBER}$"}),
+]
 _TEXT: dict[str, Any] = {"content": {"text/plain": {}}}
 
 
@@ -39,7 +45,7 @@ def _add_route(app: FastAPI, service: Service, authenticator: Authenticator, for
     @app.get(f"{PANORAMA_PATH}.{format_}", response_class=Response, responses=REFUSED | responses)
     async def panorama(
         request: Request,
-        at: str | None = None,
+        at: At = None,
         session: str | None = None,
         room: str | None = None,
         room_key: str | None = None,

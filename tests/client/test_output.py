@@ -14,10 +14,15 @@ from client.display.output_folder import FrameOutput, OutputWriter
 from client.errors import OutputError
 from protocol.messages import LeftOut, Light, Plan, Timings
 from tests.client.lights import light_of
+from tests.protocol.samples import SERVER
 
 LIGHT_FIELDS = [
     *"frame timestamp_s sh sh_std sh_webxr dominant_direction dominant_intensity dominant_lights".split(),  # noqa: SIM905
-    *"lamps exposure condition valid".split(),  # noqa: SIM905
+    *"lamps exposure condition valid spread_deg position at".split(),  # noqa: SIM905
+]
+AT_FIELDS = [
+    *"of index position sh sh_std sh_webxr dominant_direction dominant_intensity spread_deg".split(),  # noqa: SIM905
+    *"valid seen".split(),  # noqa: SIM905
 ]
 ROWS = (
     "input reconstruct surface dynamic_geometry radiance_transfer light_estimation rendering total".split()  # noqa: SIM905
@@ -72,6 +77,22 @@ def test_light_lines(tmp_path: Path) -> None:
     assert (first["condition"], first["valid"]) == (None, False)
     assert (second["condition"], second["valid"]) == (7.5, True)
     assert second["sh_all"] == [[0.5, 0.25, 0.125]] * 25
+
+
+def test_light_at_places(tmp_path: Path) -> None:
+    """The fields that the command line promises, in their order; objects by number, not by name."""
+    told = SERVER["light_at_places"]
+    assert isinstance(told, Light)
+    write(tmp_path, output_of(10, light=told))
+    (row,) = lines(tmp_path / "light.jsonl")
+    assert (row["position"], row["spread_deg"]) == ([0.25, 0.5, 1.75], 12.5)
+    view, thing = row["at"]
+    assert list(view) == list(thing) == AT_FIELDS
+    assert (view["of"], view["index"], view["spread_deg"], view["valid"]) == ("view", 0, 8.25, True)
+    assert (thing["of"], thing["index"], thing["spread_deg"], thing["valid"]) == ("object", 0, None, False)
+    assert view["sh"] == [list(one) for one in told.at[0].sh]
+    assert thing["sh_std"] == [[None] * 3] * 16
+    assert [len(view["sh_webxr"]), len(view["position"]), len(view["dominant_direction"])] == [27, 3, 3]
 
 
 def test_trajectory_lines(tmp_path: Path) -> None:

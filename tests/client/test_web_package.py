@@ -30,6 +30,11 @@ PATIENCE_S = 60
 
 STRICT = """
 import { type Answer, type Dropped, encodeDepth, type Light, StreamClient, streamUrl } from "probeless";
+import { type ArrivingLight, lightOf } from "probeless";
+
+export function litBy(light: Light): ArrivingLight | Light {
+  return lightOf(light, "chair");
+}
 
 export async function first(url: string): Promise<Light | string> {
   const camera = { width: 2, height: 1, fx: 1, fy: 1, cx: 0, cy: 0 };
@@ -112,6 +117,41 @@ def listened_to(folder: Path, script: str, url: str, hear: Callable[[list[str]],
         errors = process.stderr.read()
     assert process.returncode == 0, errors
     return said
+
+
+def test_a_panorama_is_fetched_and_each_object_has_its_own_light(server: BackgroundServer, program: Path) -> None:
+    """A cube on a wall 1 m ahead, in a light from everywhere: half of what it receives is the wall."""
+    script = """
+        import { lightOf, StreamClient } from "probeless";
+        const camera = { width: 64, height: 48, fx: 50, fy: 50, cx: 31.5, cy: 23.5, depth_scale_m: 0.001 };
+        const up = [0, -1, 0];
+        const light = [[3.5449077018, 3.5449077018, 3.5449077018]];
+        const wishes = { light, up, light_at: [[0, 0, 0.5]] };
+        const client = await StreamClient.connect(process.argv[1], { client: "test", camera, wishes });
+        await client.panorama("hdr").catch((error) => console.log(error.message));
+        const face = ["v 0 0 0", "v 0.1 0 0", "v 0 0.1 0", "f 1 2 3"].join(String.fromCharCode(10));
+        const data = new TextEncoder().encode(face);
+        const placed = { type: "place_object", object: "chair", format: "obj", data, position_m: [0, 0, 0.9] };
+        console.log((await client.request(placed)).error);
+        const color = { width: 64, height: 48, codec: "raw", data: new Uint8Array(3 * 64 * 48).fill(120) };
+        const depth = new Uint16Array(64 * 48).fill(1000);
+        const world_from_camera = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
+        const { light: told } = await client.send({ timestamp_s: 0, world_from_camera, color, depth });
+        console.log(told.at.map((each) => `${each.of} ${each.object}`).join(", "));
+        const mine = lightOf(told, "chair");
+        console.log(mine === told.at[2], lightOf(told, "sofa") === told);
+        const { data: file, position_m } = await client.panorama("exr", [0, 0, 0.5]);
+        console.log([...file.subarray(0, 4)].join(" "), position_m.join(" "));
+        client.close();
+    """
+    done = run(program, "--input-type=module", "--eval", script, "--", server.way_in)
+    assert done.stdout.splitlines() == [
+        "there is no light yet: no frame has been placed in the room",
+        "null",
+        "view null, place null, object chair",
+        "true true",
+        "118 47 49 1 0 0 0.5",
+    ], done.stderr
 
 
 def test_objects_are_placed_and_a_server_that_stops_ends_what_waits(program: Path) -> None:

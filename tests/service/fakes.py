@@ -51,6 +51,8 @@ class Lab:
     """Everything asked of the pipelines, in order."""
     mesh: SceneMesh | None = None
     """What the pipelines say they have fused; None: nothing."""
+    panorama: bytes | None = None
+    """The file that the pipelines make of their light; None: they know none."""
     closed: threading.Event = field(default_factory=threading.Event)
     threads: set = field(default_factory=set)
 
@@ -102,6 +104,14 @@ class FakePipeline:
         if self.lab.mesh is None:
             raise MeshingError("there is no surface to mesh: no frame has been fused yet")
         return self.lab.mesh
+
+    def panorama(
+        self, format_: str, position_m: tuple[float, float, float] | None = None
+    ) -> tuple[bytes, tuple[float, float, float]]:
+        self.lab.log.append(("panorama", format_, position_m))
+        if self.lab.panorama is None:
+            raise ValueError("there is no light yet: no frame has been placed in the room")
+        return self.lab.panorama, position_m or (1.0, 2.0, 3.0)
 
     def process(self, frame: RgbdFrame, *, watched: bool = False) -> FakeResult:
         self.lab.log.append(("frame", frame.index))

@@ -3,6 +3,7 @@
 export type { Address, ConnectionState, Hooks, Pauses } from "./connection";
 export { CAPTURING, Connection, REFUSED_CAPTURE, streamUrl, WATCHING } from "./connection";
 export { decodeDepth, encodeDepth } from "./depth";
+export { describeCertainty, lightOf, unknownPlaces } from "./lighting";
 export { decodeServer, encode } from "./messages";
 export * from "./protocol";
 export type { Asked, Request, Setup } from "./session";

@@ -1,7 +1,8 @@
 // The estimated light: as it arrives, as a matt white ball would look in it, and in numbers.
 
 import { BALL_PX, drawDirection, drawHatch, drawOutline, exposureOf, paintBall } from "./ball";
-import { byId, context2d, setText } from "./dom";
+import { byId, context2d, make, setText } from "./dom";
+import { describeCertainty, unknownPlaces } from "./lighting";
 import type { Light } from "./protocol";
 import { evaluate, flatten, toCamera, toMatt } from "./sh";
 import { describeDirection, number } from "./words";
@@ -12,6 +13,7 @@ const swatch = byId("light-swatch");
 const direction = byId("light-direction");
 const intensity = byId("light-intensity");
 const condition = byId("light-condition");
+const unknown = byId("light-unknown");
 
 for (const ball of balls) {
   ball.width = ball.height = BALL_PX;
@@ -35,7 +37,8 @@ export function showLight(light: Light, worldFromCamera: readonly number[]): voi
 }
 
 function showNumbers(light: Light, where: string): void {
-  setText(summary, light.valid ? "Direction is known to 15° or better" : "Not known yet: the pictures so far do not fix the direction");
+  setText(summary, describeCertainty(light));
+  showUnknown(unknownPlaces(light));
   summary.dataset["valid"] = String(light.valid);
   setText(direction, where);
   setText(intensity, number(light.dominant_intensity));
@@ -43,6 +46,16 @@ function showNumbers(light: Light, where: string): void {
   const shown = `Dominant light ${where}, intensity ${number(light.dominant_intensity)}${light.valid ? "" : ", not reliable"}`;
   balls[0].setAttribute("aria-label", `Light arriving from every direction. ${shown}`);
   balls[1].setAttribute("aria-label", `A matt white ball in this light. ${shown}`);
+}
+
+let shownUnknown = "";
+
+/** What is not known of the light at places; replaced only where it changes, for screen readers. */
+function showUnknown(lines: readonly string[]): void {
+  const key = lines.join("\n");
+  if (key === shownUnknown) return;
+  shownUnknown = key;
+  unknown.replaceChildren(...lines.map((line) => make("li", "", line)));
 }
 
 const rgb = new Float64Array(3);

@@ -2,6 +2,7 @@
 
 import { reasonOf } from "./capture/source";
 import type { Draw } from "./capture/xr_source";
+import { lightOf } from "./lighting";
 import type { LocalView } from "./local/view";
 import type { Placed } from "./objects/scene";
 import type { Light } from "./protocol";
@@ -31,8 +32,9 @@ export class LightMode {
 
   readonly draw: Draw = (view, layer, gl) => {
     this.view ??= new this.module.LocalView(gl, this.say);
-    if (this.light !== null) this.view.setLight(this.light.sh);
-    this.view.setObjects(this.light === null ? [] : this.objects());
+    const { light } = this;
+    this.view.setObjects(light === null ? [] : this.objects());
+    if (light !== null) this.view.setLight((id) => lightOf(light, id).sh);
     this.view.draw(view, layer);
   };
 }

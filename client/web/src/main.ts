@@ -34,7 +34,7 @@ const panels = new Panels();
 const remote = new Remote(receive, (reason) => fail(`This page cannot work in this browser: ${reason}`));
 let lightMode: LightMode | null = null;
 let layerMode: LayerMode | null = null;
-const tools = new ObjectTools((asked) => (lightMode === null ? remote.request(asked) : null));
+const tools = new ObjectTools((asked) => remote.request(asked));
 const qualityChanges = new QualityChanges(form, (asked) => remote.request(asked), (text) => {
   setText(byId("capture-said"), text);
   noteChoice();

@@ -20,6 +20,7 @@ const CLIENT_TAGS: ReadonlySet<unknown> = new Set<ClientMessage["type"]>([
   "remove_object",
   "quality",
   "request_mesh",
+  "request_panorama",
   "bye",
 ]);
 
@@ -30,6 +31,7 @@ const SERVER_TAGS: ReadonlySet<unknown> = new Set<ServerMessage["type"]>([
   "light",
   "dropped",
   "mesh_part",
+  "panorama",
   "acknowledged",
   "error",
   "bye",

@@ -47,6 +47,7 @@ export class Panels {
         for (const note of message.notes) addNote(note, null);
         break;
       case "mesh_part":
+      case "panorama":
         return;
       default:
         message satisfies never;

@@ -3,7 +3,7 @@
 import { CaptureStream, type Numbered } from "./capture/stream";
 import { type ConnectionState, streamUrl } from "./connection";
 import { encodeDepth } from "./depth";
-import type { Acknowledged, CameraModel, ColorImage, Composite, DepthImage, Dropped, Frame, Layer, Light, ServerMessage, Welcome } from "./protocol";
+import type { Acknowledged, CameraModel, ColorImage, Composite, DepthImage, Dropped, Frame, Layer, Light, Panorama, ServerMessage, Welcome } from "./protocol";
 import type { Asked, Request, Setup } from "./session";
 
 /** Options of a session; see protocol/README.md. */
@@ -46,6 +46,7 @@ export class StreamClient {
   private readonly answers = new Map<number, Waiting<Answer | Dropped>>();
   private readonly requests = new Map<number, Waiting<Acknowledged>>();
   private readonly lights = new Map<number, Light>();
+  private readonly panoramas = new Map<number, Panorama>();
   private readonly sending: Waiting<void>[] = [];
   private welcomed: Waiting<StreamClient> | null = null;
   private isWanted = false;
@@ -108,6 +109,18 @@ export class StreamClient {
     return answer;
   }
 
+  /**
+   * The light that arrives at a place as a lat-long file, after the frames sent so far. `position_m`: world; null: the
+   * first object's place, else the middle of what the last frame sees. Rejects with the reason if there is no light yet.
+   */
+  async panorama(format: Panorama["format"], position_m: Panorama["position_m"] | null = null): Promise<Panorama> {
+    const { request, error } = await this.request({ type: "request_panorama", format, position_m });
+    const found = this.panoramas.get(request);
+    this.panoramas.delete(request);
+    if (error !== null || found === undefined) throw new Error(error ?? "the server acknowledged a panorama and sent none");
+    return found;
+  }
+
   /** Close the session; pending promises are rejected. */
   close(reason = ""): void {
     this.fail(new Error("the session was closed"));
@@ -168,6 +181,9 @@ export class StreamClient {
       case "error":
       case "bye":
         this.options.onNote?.(message.reason ?? "");
+        return;
+      case "panorama":
+        if (this.requests.has(message.request)) this.panoramas.set(message.request, message);
         return;
       case "mesh_part":
         return;

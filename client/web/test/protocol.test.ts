@@ -24,7 +24,7 @@ const expected = JSON.parse(readFileSync(join(folder, "messages.json"), "utf8"),
 >;
 const golden = (name: string): Uint8Array => new Uint8Array(readFileSync(join(folder, `${name}.msgpack`)));
 const names = readdirSync(folder).filter((file) => file.endsWith(".msgpack")).map((file) => file.slice(0, -8));
-const fromServer = new Set(["welcome", "composite", "layer", "light", "dropped", "mesh_part", "acknowledged", "error", "bye"]);
+const fromServer = new Set(["welcome", "composite", "layer", "light", "dropped", "mesh_part", "panorama", "acknowledged", "error", "bye"]);
 
 test("there are golden vectors", () => assert.deepEqual(new Set(names), new Set(Object.keys(expected))));
 

@@ -71,6 +71,8 @@ declare module "three" {
   export class WebGLRenderer {
     constructor(options: { canvas: HTMLCanvasElement | OffscreenCanvas; context: WebGL2RenderingContext });
     outputColorSpace: string;
+    autoClear: boolean;
+    clear(): void;
     setClearColor(color: number, alpha: number): void;
     setRenderTarget(target: WebGLRenderTarget | null): void;
     setRenderTargetFramebuffer(target: WebGLRenderTarget, framebuffer: WebGLFramebuffer | null): void;

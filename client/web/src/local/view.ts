@@ -10,12 +10,17 @@ import type { Rgb } from "../sh";
 /** Coefficients of a LightProbe: ours, in the same order and basis, up to l = 2. */
 const COEFFICIENTS = 9;
 
+/** An object in a scene of its own, as a light probe lights all of its scene. */
+interface Shown {
+  scene: Scene;
+  probe: LightProbe;
+  group: Group;
+}
+
 export class LocalView {
   private readonly renderer: WebGLRenderer;
-  private readonly scene = new Scene();
   private readonly camera = new Camera();
-  private readonly probe = new LightProbe();
-  private readonly shown = new Map<string, Group>();
+  private readonly shown = new Map<string, Shown>();
   private target: WebGLRenderTarget | null = null;
 
   /** `gl`: the context of the session's layer. `say`: told what cannot be drawn. */
@@ -25,25 +30,26 @@ export class LocalView {
   ) {
     this.renderer = new WebGLRenderer({ canvas: gl.canvas, context: gl });
     this.renderer.setClearColor(0, 0);
+    this.renderer.autoClear = false; // the scenes share one depth buffer
     this.camera.matrixAutoUpdate = this.camera.matrixWorldAutoUpdate = false;
-    this.scene.add(this.probe);
     this.renderer.resetState();
   }
 
-  /** Radiance coefficients in the axes of the session's space. */
-  setLight(sh: readonly Rgb[]): void {
-    for (let i = 0; i < COEFFICIENTS; i++) this.probe.sh.coefficients[i]!.set(...(sh[i] ?? [0, 0, 0]));
+  /** `shOf`: radiance coefficients at an object's place, in the axes of the session's space. */
+  setLight(shOf: (id: string) => readonly Rgb[]): void {
+    for (const [id, { probe }] of this.shown) {
+      const sh = shOf(id);
+      for (let i = 0; i < COEFFICIENTS; i++) probe.sh.coefficients[i]!.set(...(sh[i] ?? [0, 0, 0]));
+    }
   }
 
   /** These objects and no others, where they stand. */
   setObjects(placed: readonly Placed[]): void {
-    for (const [id, group] of this.shown) {
-      if (placed.some((each) => each.id === id)) continue;
-      this.scene.remove(group);
-      this.shown.delete(id);
+    for (const id of [...this.shown.keys()]) {
+      if (!placed.some((each) => each.id === id)) this.shown.delete(id);
     }
     for (const each of placed) {
-      const group = this.shown.get(each.id) ?? this.show(each);
+      const { group } = this.shown.get(each.id) ?? this.show(each);
       group.position.set(...each.position);
       group.rotation.y = (each.yaw_deg * Math.PI) / 180;
       group.scale.setScalar(each.scale);
@@ -60,7 +66,8 @@ export class LocalView {
     camera.matrixWorldInverse.copy(camera.matrixWorld).invert();
     renderer.setRenderTargetFramebuffer(target, layer.framebuffer);
     renderer.setRenderTarget(target);
-    renderer.render(this.scene, camera);
+    renderer.clear();
+    for (const { scene } of this.shown.values()) renderer.render(scene, camera);
     renderer.setRenderTarget(null);
     renderer.resetState(); // others use this context too
   }
@@ -73,15 +80,16 @@ export class LocalView {
     return this.target;
   }
 
-  private show({ id, model }: Placed): Group {
-    const group = new Group();
-    this.shown.set(id, group);
-    this.scene.add(group);
+  private show({ id, model }: Placed): Shown {
+    const shown = { scene: new Scene(), probe: new LightProbe(), group: new Group() };
+    const { scene, probe, group } = shown;
+    this.shown.set(id, shown);
+    scene.add(probe, group);
     this.load(model).then(
       (loaded) => group.add(loaded),
       (error: unknown) => this.say(`${model.name} cannot be drawn here: ${reasonOf(error)}`),
     );
-    return group;
+    return shown;
   }
 
   /** The model with the middle of its box's bottom at the origin; each call gives another one. */

@@ -35,9 +35,9 @@ export class Scene {
   private count = 0;
   selected: Placed | null = null;
 
-  /** `ask`: sends a request, and gives its number; null: nobody needs to be asked. `onChange`: what is placed or selected is another. */
+  /** `ask`: sends a request, and gives its number. `onChange`: what is placed or selected is another. */
   constructor(
-    private readonly ask: (asked: Asked) => number | null,
+    private readonly ask: (asked: Asked) => number,
     private readonly onChange: () => void,
     private readonly prefix = Math.random().toString(36).slice(2, 6),
   ) {}

@@ -30,7 +30,7 @@ export class ObjectTools {
   private drags = 0;
   private lastDrag = 0;
 
-  constructor(ask: (asked: Asked) => number | null) {
+  constructor(ask: (asked: Asked) => number) {
     this.scene = new Scene(ask, () => this.refresh());
     this.listen();
     this.refresh();

@@ -1,0 +1,40 @@
+// By which light an object is drawn, for clients that draw by themselves, and what is not known of a light, in words.
+
+import type { ArrivingLight, Light } from "./protocol";
+
+/** Above it, in degrees, a dominant direction does not count as known (`light.valid`). */
+export const VALID_SPREAD_DEG = 25;
+
+/** The light that arrives where the object of this name stands; where that is not told, the room's light itself. */
+export function lightOf(light: Light, object: string): ArrivingLight | Light {
+  return places(light).find((each) => each.of === "object" && each.object === object) ?? light;
+}
+
+/** How well the dominant direction is known. */
+export function describeCertainty({ spread_deg, valid }: Pick<Light, "spread_deg" | "valid">): string {
+  if (spread_deg == null) return valid ? "Direction is known to 15° or better" : "Not known yet: the pictures so far do not fix the direction";
+  const within = `${Math.round(spread_deg)}°`;
+  return spread_deg <= VALID_SPREAD_DEG ? `Direction is known to ${within}` : `Not known well: the direction may be off by ${within}`;
+}
+
+/** What is not known of the light at places, a line each. */
+export function unknownPlaces(light: Light): string[] {
+  return places(light).flatMap((place) => doubts(place).map((doubt) => `${nameOf(place)}: ${doubt}`));
+}
+
+function doubts({ seen, spread_deg, valid }: ArrivingLight): string[] {
+  const found = seen === 0 ? ["no scanned surface is seen from there, its light is a guess"] : [];
+  if (spread_deg === null) return [...found, valid ? "how far its direction may be off is not known" : "its direction is not known yet"];
+  return spread_deg <= VALID_SPREAD_DEG ? found : [...found, `its direction may be off by ${Math.round(spread_deg)}°`];
+}
+
+function nameOf({ of, index, position, object }: ArrivingLight): string {
+  if (of === "view") return "Middle of the view";
+  if (of === "object") return object ?? `Object ${index + 1}`;
+  return `Place (${position.map((value) => value.toFixed(2)).join(", ")})`;
+}
+
+/** Earlier servers tell none. */
+function places(light: Light): readonly ArrivingLight[] {
+  return (light.at as ArrivingLight[] | undefined) ?? [];
+}

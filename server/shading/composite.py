@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.input.measure import linear_values
 from server.maths.rigid import inverse_rigid
-from server.objects.rasterize import SUBPIXELS, VirtualSurface
+from server.objects.rasterize import VirtualSurface
 from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, KernelArgument, float16
 from server.opencl.structs import MIXTURE_PARAMETERS
@@ -131,7 +131,7 @@ def launch_mixture(
         HAS_OBJECTS=virtual is not None,
         HAS_SHADOWS=ratio is not None,
         BICUBIC=mixture.upsampling == "bicubic",
-        SUBPIXELS=0 if mixture.coverage is None else SUBPIXELS,
+        SUBPIXELS=0 if mixture.coverage is None else mixture.coverage.shape[0] // camera.height,
         HAS_GLOSS=mixture.reflected is not None,
         HAS_DIRECT=bool(light.discs),
         LANES=engine.lanes,

@@ -175,6 +175,7 @@ class Pipeline:
             rays=self._transfer.rays,
             ray_length_m=settings.reach_m,
             smooth_edges=settings.edges == "smooth",
+            restores_clipped=not settings.as_thesis,
         )
 
     def _sample_transfer(

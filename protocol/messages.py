@@ -155,7 +155,7 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Edges of virtual objects: by pixel coverage, or by the pixel centre, for images that are point samples."""
     tone_mapping: Literal["auto", "light", "average"] = "auto"
     """Brightness of virtual objects follows the light's scale, or the averages of the image and its shading; `auto`:
-    the scale for a given light, the averages for an estimated one."""
+    the scale; with `as_thesis`, the averages for an estimated light."""
     light_color: Literal["estimated", "white"] = "estimated"
     """`white`: only the light's luminance, as the thesis assumes."""
     robustness: tuple[Robustness, ...] = ("openness", "memory", "outliers")

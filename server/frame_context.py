@@ -41,6 +41,8 @@ class FrameContext:
     ray_length_m: float
     smooth_edges: bool = True
     """Whether virtual objects may cover parts of pixels."""
+    restores_clipped: bool = True
+    """Whether shadows fall on the likely radiance of clipped surface; not in the thesis."""
 
     @property
     def camera_from_volume(self) -> NDArray[np.float64]:

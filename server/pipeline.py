@@ -141,14 +141,14 @@ class Pipeline:
             light = self._estimate_light(context, samples, left_out)
             self._look_up_places(context, is_still=reuse.keeps_geometry)
         with stage("rendering"):  # 7.1-7.2, the effects that this frame calls for
-            spine = self._spine_outputs(frame, objects, samples, light, left_out)
+            spine = self._spine_outputs(frame, objects, samples, left_out)
             rendered = self._renderer.render(context, spine, self._settings, reuse, request)
         if not room.light.is_given and frame.has_depth:  # B4, for the frames to come
             with stage("light_estimation"):
                 room.lamps.work(self._camera, context.scene_radiance, context.surface, volume)
 
         if self._reuse is not None:
-            self._reuse.observe(reuse, light.sh, room.light.planes, rendered.reference)
+            self._reuse.observe(reuse, spine.sh, spine.planes, rendered.reference)
         return self._result(frame, geometry, volume, light, rendered, notes, started)
 
     def _decide_reuse(self, frame: RgbdFrame, volume: Volume) -> ReuseDecision:
@@ -175,6 +175,7 @@ class Pipeline:
             rays=self._transfer.rays,
             ray_length_m=settings.reach_m,
             smooth_edges=settings.edges == "smooth",
+            restores_clipped=not settings.as_thesis,
         )
 
     def _sample_transfer(
@@ -221,7 +222,7 @@ class Pipeline:
             return light.estimate()
         radiance = self._denoised(context)
         distant = remove_lamps(engine, radiance, context.surface, context.volume, self._room.lamps.lamps)  # B4
-        return light.update(context, distant, samples)
+        return light.update(context, distant, samples, self._room.objects.up)
 
     def _look_up_places(self, context: FrameContext, *, is_still: bool) -> None:
         """The light that arrives at the places of which this client is told."""
@@ -263,20 +264,26 @@ class Pipeline:
         frame: RgbdFrame,
         objects: list[Placed],
         samples: TransferSamples,
-        light: LightEstimate,
         left_out: dict[str, CullReason],
     ) -> SpineOutputs:
+        sh, planes = self._room.light.seen_by_objects(self._place_of_objects())
         return SpineOutputs(
             frame=frame,
             objects=objects,
             samples=samples,
             depth_views=self._transfer.depth_views,
             period=self._transfer.period,
-            sh=light.sh,
-            planes=self._room.light.planes,
+            sh=sh,
+            planes=planes,
             is_light_given=self._room.light.is_given,
             left_out=left_out,
         )
+
+    def _place_of_objects(self) -> NDArray[np.float64]:
+        """[3] world metres: the middle of all virtual objects, else of what the frame sees."""
+        middles = [*self._room.objects.middles().values()]
+        view = self._told.newest.view
+        return np.mean(middles, axis=0) if middles else np.zeros(3) if view is None else view
 
     def _lost_frame(
         self,

@@ -1,6 +1,7 @@
 // Surface measurement (thesis 5.1.1): removes lens distortion from colour and depth, removes the gamma, marks usable radiance.
 // Provides measure_color, measure_depth.
 #include "camera.clh"
+#include "radiance_marks.clh"
 
 #ifdef LINEAR16
 typedef ushort color_t;
@@ -8,9 +9,8 @@ typedef ushort color_t;
 typedef uchar color_t;
 #endif
 
-// Usable radiance is above the sensor's black level and below clipping, where pixels are linear in light.
+// Usable radiance is above the sensor's black level and below CLIPPED, where pixels are linear in light.
 #define BLACK 0.0015f
-#define CLIPPED 0.985f
 
 static inline float3 linear_color(global const color_t *color, global const float *to_linear, const int pixel) {
     global const color_t *c = color + 3 * pixel;

@@ -296,7 +296,7 @@ GALLERY: dict[str, GalleryScene] = {
         "the same box in an estimated light, one part of which is switched off",
         _FLOOR,
         _SUN,
-        _always(_STANDS, {"match_average", "bounce_real"}),
+        _always(_STANDS, {"bounce_real"}),
         (_BOX,),
         **_NOISE,
         is_light_given=False,

@@ -92,7 +92,7 @@ ToneMapping = Annotated[
     str | None,
     typer.Option(
         metavar="light|average",
-        help="reference for the brightness of virtual objects; default: average, with --light: light",
+        help="what virtual objects are as bright as; default: light; with --as-thesis and no --light: average",
     ),
 ]
 Plan = Annotated[

@@ -255,6 +255,7 @@ def composite_inputs(context: FrameContext, parts: PictureParts) -> CompositeInp
         direct_virtual=_direct_virtual(context, parts),
         direct_ratio=parts.direct_ratio,
         reached=parts.changed,
+        restores_clipped=context.restores_clipped,
     )
 
 

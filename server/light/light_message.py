@@ -12,15 +12,12 @@ from numpy.typing import NDArray
 
 from protocol.messages import ArrivingLight, DirectedLight, Lamp, Light, RgbOrNull
 from server.light.light_estimation import LightEstimate
-from server.light.place_light import LitPlace
+from server.light.place_light import VALID_SPREAD_DEG, LitPlace
 from server.maths.dominant import dominant_lights
 from server.maths.emitters import Emitter
 from server.maths.sh import dominant_direction, dominant_intensity, rotate_sh, webxr_floats
 
 _WIRE_COEFFICIENTS = 16
-VALID_SPREAD_DEG = 25.0
-"""A dominant direction counts as known if 90 % of the possible ones are within this angle: a shadow then falls on the
-right side of its object."""
 
 
 @dataclass(frozen=True)

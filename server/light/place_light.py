@@ -10,6 +10,10 @@ from numpy.typing import NDArray
 
 from server.maths.sh import rotate_sh
 
+VALID_SPREAD_DEG = 25.0
+"""A dominant direction counts as known if 90 % of the possible ones are within this angle: a shadow then falls on the
+right side of its object."""
+
 
 @dataclass(frozen=True)
 class PlaceLight:

@@ -26,6 +26,7 @@ from server.light.light_estimation import (
 from server.light.light_model import LightModel
 from server.light.lobe_estimator import KnownLight, LobeEstimator
 from server.light.place_light import PlaceLight
+from server.light.shell.room_model import RoomModel
 from server.maths.light_change import Shot
 from server.maths.lobes import cell_directions
 from server.maths.sh import LUMINANCE, sh_basis
@@ -62,6 +63,7 @@ class RoomLight:
         self._harmonics = plain if is_plain or settings.as_thesis else None
         self._least_openness = LEAST_OPENNESS if "openness" in settings.robustness else 0.0
         self._lobes = LobeEstimator(engine, settings.bands, self._model, Continuation())
+        self._model_of_room = RoomModel()
         self._given: LightEstimate | None = None
         self._remembered: LightEstimate | None = None
         """Of earlier frames that are not there any more: it holds until new ones say better."""
@@ -92,8 +94,22 @@ class RoomLight:
             return self._colored(self._harmonics.estimate())
         return self._colored(self._remembered or self._lobes.estimate())
 
+    @property
+    def has_model(self) -> bool:
+        """Whether the light of the room is known by place: not where one light is given or estimated for all of it."""
+        return self._model_of_room.is_known and self._given is None and self._harmonics is None
+
+    def seen_by_objects(self, position: NDArray[np.float64]) -> tuple[NDArray[np.float64], PlaneArrays]:
+        """Light [bands^2, 3] from beyond the scan for objects at `position` [3] (world), and planes that hide it."""
+        if not self.has_model:
+            return self.estimate().sh, self.planes
+        sh = self._model_of_room.beyond(position, self._settings.bands)
+        return _whitened(sh) if self._settings.light_color == "white" else sh, NO_PLANES
+
     def arriving_at(self, engine: Engine, volume: Volume, positions: NDArray[np.float64]) -> tuple[PlaceLight, ...]:
         """The light that arrives at each of `positions` [n, 3] (world metres), in units of the first picture."""
+        if self.has_model:
+            return tuple(self._model_of_room.arriving_at(engine, volume, positions))
         light = self.estimate()
         sh, seen = arriving_sh(engine, volume, positions, distant_light(light.sh))
         places = zip(positions, sh, seen, strict=True)
@@ -103,6 +119,8 @@ class RoomLight:
         self, engine: Engine, volume: Volume, position: NDArray[np.float64], directions: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """[m, 3] radiance that arrives at `position` [3] (world metres) from unit `directions` [m, 3] (world axes)."""
+        if self.has_model:
+            return self._model_of_room.radiance_at(engine, volume, position, directions)
         beyond = distant_light(self.estimate().sh)
         radiance, _ = arriving_radiance(engine, volume, position[None], directions, beyond)
         return np.asarray(radiance[0])
@@ -132,8 +150,13 @@ class RoomLight:
         continuation = self._lobes.continuation
         return continuation.arrays() if continuation and not self._harmonics else NO_PLANES
 
-    def update(self, context: FrameContext, radiance: cl_array.Array, samples: TransferSamples) -> LightEstimate:
-        """The light with one more frame, whose samples have transfer. radiance: [h, w] float4 as in Measurement."""
+    def update(
+        self, context: FrameContext, radiance: cl_array.Array, samples: TransferSamples, up: NDArray[np.float64]
+    ) -> LightEstimate:
+        """The light with one more frame, whose samples have transfer.
+
+        radiance: [h, w] float4 as in Measurement, without what lamps add. up: [3] unit, world.
+        """
         engine, camera, surface, transfer = context.engine, context.camera, context.surface, samples.transfer
         assert transfer is not None
         voxel_m = context.volume.voxel_m
@@ -143,6 +166,8 @@ class RoomLight:
             tiles = sum_tiles(engine, camera, radiance, surface, transfer, voxel_m, self._least_openness)
             with engine.profile.host():
                 return self._colored(self._harmonics.update(tiles))
+        if self._given is None:
+            self._model_of_room.update(context, up)
         steady, before = self._lobes.steady, self._lobes.estimate()
         observed = gather_samples(engine, camera, radiance, surface, transfer, self._least_openness)
         estimate = self._lobes.update(
@@ -161,6 +186,10 @@ class RoomLight:
             if has_changed or _doubt(estimate) <= AS_SURE * _doubt(self._remembered):
                 self._remembered = None
         return self._given or self._colored(self._remembered or estimate)
+
+
+def _whitened(sh: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.outer(sh @ LUMINANCE, np.ones(3)))
 
 
 def _doubt(estimate: LightEstimate) -> float:

@@ -28,17 +28,20 @@ from server.opencl.structs import SURFACE_PARAMETERS
 
 __all__ = [
     "NEAR_M",
-    "SUBPIXELS",
     "PixelBox",
     "Placed",
     "VirtualSurface",
     "boxes_in_view",
     "nearest_depths",
     "rasterize",
+    "subpixels",
 ]
 
-SUBPIXELS = 2
-"""Subpixels along each side of a pixel, for coverage."""
+FINE_SUBPIXELS, COARSE_SUBPIXELS = 4, 2
+"""Subpixels along each side of a pixel, for coverage. A nearly level or upright edge passes a row of them at once: it
+has one shade more than that, and with three shades furniture has visible steps."""
+FINE_PIXELS = 640 * 480
+"""Pictures up to this size have fine subpixels. In larger ones steps are smaller, and the cost grows by the area."""
 _SCAN_ITEMS = 256
 _LEAST_ENTRIES = 1 << 16
 _LEAST_ROOM = 1 << 10
@@ -159,11 +162,16 @@ def rasterize(
 def nearest_depths(
     engine: Engine, camera: CameraModel, camera_from_volume: Matrix, objects: Sequence[Placed]
 ) -> cl_array.Array:
-    """[SUBPIXELS h, SUBPIXELS w] uint32: bits of 1 / depth (1/metre) of the nearest object at the centres of subpixels;
-    0 where there is none."""
+    """[s h, s w] uint32: bits of 1 / depth (1/metre) of the nearest object at the centres of s x s subpixels a pixel;
+    0 where there is none. s: of `subpixels`."""
     return drawn_depths(
-        engine, finer(camera, SUBPIXELS), camera_from_volume, objects, engine.buffers(_Buffers).fine_lists
+        engine, finer(camera, subpixels(camera)), camera_from_volume, objects, engine.buffers(_Buffers).fine_lists
     )
+
+
+def subpixels(camera: CameraModel) -> int:
+    """Subpixels along each side of a pixel of this camera."""
+    return FINE_SUBPIXELS if camera.width * camera.height <= FINE_PIXELS else COARSE_SUBPIXELS
 
 
 def drawn_depths(

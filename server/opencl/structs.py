@@ -196,6 +196,7 @@ MIXTURE_PARAMETERS = Struct(
     height="int",
     tolerance_m="float",
     virtual_gain="float",
+    log_white="float4",
     virtual_samples=GRID,
     real_samples=GRID,
     has_refined_occluded="int",

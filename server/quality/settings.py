@@ -31,7 +31,8 @@ class Settings:
     """P3: enabled measures, of `openness`, `normals`, `normals_printed`, `memory`, `outliers`."""
     edges: Literal["smooth", "hard"]
     tone_mapping: Literal["auto", "light", "average"]
-    """Brightness of virtual objects: by the scale of the light, or by the averages of picture and shading."""
+    """Brightness of virtual objects: by the scale of the light, or by the averages of picture and shading; `auto`, only
+    as in the thesis: by the averages where the light is estimated."""
     light_color: Literal["estimated", "white"]
     albedo: Literal["constant", "estimated"]
     indirect: Literal["none", "observed"]
@@ -55,7 +56,7 @@ def read_wishes(wishes: Wishes) -> Settings:
         as_thesis=wishes.as_thesis,
         robustness=frozenset(wishes.robustness),
         edges=wishes.edges,
-        tone_mapping=wishes.tone_mapping,
+        tone_mapping=wishes.tone_mapping if wishes.as_thesis or wishes.tone_mapping != "auto" else "light",
         light_color=wishes.light_color,
         albedo="constant" if wishes.as_thesis else wishes.albedo,
         indirect="none" if wishes.as_thesis else wishes.indirect,

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 CREASE_DEG = 40.0
 """Triangles that share an edge are smoothed if their normals differ by less."""
+MOST_AT_EDGE = 8
+"""Triangles at one edge of which each is compared with each; of more, those that come soon after one another."""
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -66,11 +68,17 @@ def _smooth_links(places: Ints, faces: Floats) -> Ints:
     low, high = np.where(swap, end, start), np.where(swap, start, end)
     key = at[low] * (at.max(initial=0) + 1) + at[high]
     order = np.argsort(key, kind="stable")
-    this, other = order[:-1], order[1:]
-    gentle = (faces[this // 3] * faces[other // 3]).sum(axis=1) > np.cos(np.radians(CREASE_DEG))
-    linked = (key[this] == key[other]) & gentle
-    this, other = this[linked], other[linked]
-    return np.concatenate([np.stack([low[this], low[other]], 1), np.stack([high[this], high[other]], 1)])
+    links = [np.zeros((0, 2), np.int64)]
+    for apart in range(1, MOST_AT_EDGE):  # a board of two sides has four triangles at an edge
+        this, other = order[:-apart], order[apart:]
+        meets = key[this] == key[other]
+        if not meets.any():
+            break
+        this, other = this[meets], other[meets]
+        gentle = (faces[this // 3] * faces[other // 3]).sum(axis=1) > np.cos(np.radians(CREASE_DEG))
+        this, other = this[gentle], other[gentle]
+        links += [np.stack([low[this], low[other]], 1), np.stack([high[this], high[other]], 1)]
+    return np.concatenate(links)
 
 
 def _joined(count: int, links: Ints) -> Ints:

@@ -12,15 +12,19 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.input.measure import linear_values
 from server.maths.rigid import inverse_rigid
-from server.objects.rasterize import SUBPIXELS, VirtualSurface
+from server.maths.sh import LUMINANCE
+from server.objects.rasterize import VirtualSurface
 from server.opencl.buffers import BufferDescription, StageBuffers
-from server.opencl.engine import Engine, KernelArgument, float16
+from server.opencl.engine import Engine, KernelArgument, float4, float16
 from server.opencl.structs import MIXTURE_PARAMETERS
 from server.shading.change_mask import mark_changes
 from server.shading.traced_scene import DeviceLight
 from server.transfer.sample_grid import SampleGrid, grid_of, no_samples
 from server.transfer.sampling import Upsampling
 from server.volume.raycast import Surface
+
+COLORED = 4.0
+"""Largest factor between a light's channel and its luminance: that of a candle or of shade is 2."""
 
 
 def srgb_codes(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
@@ -89,11 +93,23 @@ class CompositeInputs:
     """Stands for `ratio` and `refined_ratio` where the light has discs (shadow_map.py)."""
     reached: cl_array.Array | None = None
     """Of mark_changes: the cells in which `ratio` counts; None: wherever it is not 1."""
+    restores_clipped: bool = False
+    """Whether a shadow falls on the radiance that clipped channels are likely to have (restored.clh): what the picture
+    shows of it is a lower bound."""
 
     @property
     def is_nothing(self) -> bool:
         """Whether nothing is virtual."""
         return self.virtual is None and self.ratio is None
+
+
+def log_white(mean: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[3] log of the colour of a light of RGB radiance `mean` over its luminance, at most COLORED away from white."""
+    luminance = float(mean @ LUMINANCE)
+    if luminance <= 0:
+        return np.zeros(3)
+    colors: NDArray[np.float64] = np.log(np.clip(mean / luminance, 1 / COLORED, COLORED))
+    return colors
 
 
 def mixture_parameters(mixture: CompositeInputs) -> np.void:
@@ -104,6 +120,7 @@ def mixture_parameters(mixture: CompositeInputs) -> np.void:
         height=camera.height,
         tolerance_m=mixture.tolerance_m,
         virtual_gain=mixture.gain,
+        log_white=float4(*log_white(mixture.light.mean), float(mixture.restores_clipped)),
         virtual_samples=grid_of(occluded, camera) if occluded else no_samples(camera),
         real_samples=grid_of(ratio, camera) if ratio else no_samples(camera),
         has_refined_occluded=mixture.refined_occluded is not None,
@@ -131,7 +148,7 @@ def launch_mixture(
         HAS_OBJECTS=virtual is not None,
         HAS_SHADOWS=ratio is not None,
         BICUBIC=mixture.upsampling == "bicubic",
-        SUBPIXELS=0 if mixture.coverage is None else SUBPIXELS,
+        SUBPIXELS=0 if mixture.coverage is None else mixture.coverage.shape[0] // camera.height,
         HAS_GLOSS=mixture.reflected is not None,
         HAS_DIRECT=bool(light.discs),
         LANES=engine.lanes,

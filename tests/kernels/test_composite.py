@@ -9,7 +9,7 @@ import trimesh
 
 from protocol.frames import CameraModel
 from server.input.measure import linear_values
-from server.objects.rasterize import nearest_depths, rasterize
+from server.objects.rasterize import COARSE_SUBPIXELS, FINE_SUBPIXELS, nearest_depths, rasterize
 from server.objects.virtual_object import VirtualObject
 from server.opencl.engine import Engine
 from server.shading.composite import shown_picture, srgb_codes
@@ -94,16 +94,17 @@ def test_refined_and_bicubic_values_are_the_twins(engine: Engine, stride: int, u
     assert (expected != twin.composite(*arguments, bicubic=upsampling == "bicubic")).any()
 
 
-def test_partly_covered_pixels_are_the_twins(engine: Engine) -> None:
-    """Four parts a pixel; edges of a leaning disc against a wall that cuts through it, beyond the picture too."""
+@pytest.mark.parametrize("parts", [COARSE_SUBPIXELS, FINE_SUBPIXELS])
+def test_partly_covered_pixels_are_the_twins(engine: Engine, parts: int) -> None:
+    """`parts` squared a pixel; edges of a leaning disc against a wall that cuts through it, beyond the picture too."""
     random = np.random.default_rng(8)
     shown, radiance = camera_picture()
     radiance[..., 3] = random.choice([1, 0, -1], (HEIGHT, WIDTH), p=[0.8, 0.1, 0.1])
-    v, u = np.mgrid[: 2 * HEIGHT, : 2 * WIDTH] / 2 - 0.25
+    v, u = np.mgrid[: parts * HEIGHT, : parts * WIDTH] / parts - 0.5 + 0.5 / parts
     fine = (u - 30) ** 2 + (v - 20) ** 2 < 300
     depth = 1.0 + 0.01 * (u - 30)
     inverse_depths = np.where(fine, 1 / depth, 0).astype(np.float32).astype(float)
-    virtual = buffer(*plane(0.8, 0.7), fine.reshape(HEIGHT, 2, WIDTH, 2).sum((1, 3)) >= 3)
+    virtual = buffer(*plane(0.8, 0.7), fine.reshape(HEIGHT, parts, WIDTH, parts).mean((1, 3)) >= 0.75)
     real = buffer(*plane(1.0), random.random((HEIGHT, WIDTH)) < 0.9)
     ratio = samples(4, random.uniform(0.3, 1, (HEIGHT // 4, WIDTH // 4, 3)))
     occluded = samples(2, random.uniform(0, 0.2, (HEIGHT // 2, WIDTH // 2, 3)))
@@ -125,12 +126,12 @@ def test_a_slanted_edge_covers_what_it_covers(engine: Engine) -> None:
     objects = [(VirtualObject.upload(engine, mesh), VOLUME_FROM_CAMERA)]
     pose = np.linalg.inv(VOLUME_FROM_CAMERA)
     fine = engine.download(nearest_depths(engine, CAMERA, pose, objects)).view(np.float32)
-    assert fine.shape == (2 * HEIGHT, 2 * WIDTH)
+    assert fine.shape == (FINE_SUBPIXELS * HEIGHT, FINE_SUBPIXELS * WIDTH)
     np.testing.assert_allclose(1 / fine[fine > 0], 0.8, rtol=1e-5)
     pixels = corners[:, :2] / corners[:, 2:] * [CAMERA.fx, CAMERA.fy]
     x, y = pixels.T
     area = 0.5 * abs(x @ np.roll(y, 1) - y @ np.roll(x, 1))
-    assert (fine > 0).sum() / 4 == pytest.approx(area, rel=0.01)
+    assert (fine > 0).sum() / FINE_SUBPIXELS**2 == pytest.approx(area, rel=0.005)
     black = np.zeros((HEIGHT, WIDTH, 4))
     black[..., 3] = 1
     middle = rasterize(engine, CAMERA, pose, objects)
@@ -141,6 +142,22 @@ def test_a_slanted_edge_covers_what_it_covers(engine: Engine) -> None:
     linear = linear_values("srgb8")[picture].mean(-1)
     assert linear.sum() / 0.5 == pytest.approx(area, rel=0.01)
     assert ((linear > 0.05) & (linear < 0.45)).sum() > 40  # the edge is smooth
+
+
+def test_a_nearly_upright_edge_has_a_shade_for_each_column_of_parts(engine: Engine) -> None:
+    """It moves by a good pixel over the picture's height: coverage is at most half a part off; with
+    three shades it would be a quarter."""
+    left = np.array([-11.0, -8.0]) / CAMERA.fx
+    corners = np.array([[left[0], -1, 1], [1, -1, 1], [1, 1, 1], [left[1], 1, 1]])
+    objects = [(VirtualObject.upload(engine, shape_of(trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]]))), np.eye(4))]
+    fine = engine.download(nearest_depths(engine, CAMERA, np.eye(4), objects)).reshape(
+        HEIGHT, FINE_SUBPIXELS, WIDTH, FINE_SUBPIXELS
+    )
+    covered = (fine > 0).mean(axis=(1, 3)).sum(axis=1)
+    height = (np.arange(HEIGHT) - CAMERA.cy) / CAMERA.fy
+    edge = CAMERA.cx - 9.5 + 1.5 * height
+    assert np.abs(covered - (WIDTH - 0.5 - edge)).max() <= 0.5 / FINE_SUBPIXELS + 1 / 256
+    assert len(np.unique(np.round(covered * FINE_SUBPIXELS**2))) > 3
 
 
 def test_the_largest_camera_has_smooth_edges_too(engine: Engine) -> None:

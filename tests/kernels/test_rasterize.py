@@ -16,7 +16,7 @@ from server.objects.rasterize import NEAR_M, VirtualSurfaceBuffers, nearest_dept
 from server.objects.virtual_object import VirtualObject
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.scene.mesh import Mesh
+from server.scene.mesh import Mesh, load_mesh
 from tests.data import data_folder
 from tests.reference import rasterize as twin
 from tests.scenes.meshes import mesh_file, mesh_of, pose, public_mesh, shape_of, soup_of
@@ -433,3 +433,32 @@ def test_scan_tiles(engine: Engine, tiles: int) -> None:
     engine.launch(scan, (256,), tiles, 6, engine.workspace.upload("counts", counts), starts, local=(256,))
     expected = [0, *np.cumsum(np.minimum(counts[2:], 6)), *counts[:2]]
     np.testing.assert_array_equal(engine.download(starts), expected)
+
+
+@pytest.mark.parametrize("shape", [trimesh.creation.icosphere(2, 0.2), trimesh.creation.box((0.3, 0.2, 0.25))])
+def test_a_mesh_whose_triangles_share_no_vertices_looks_the_same(engine: Engine, shape: trimesh.Trimesh) -> None:
+    """A PLY file, read, drawn, covered and made into distances: with shared vertices, with own ones for each triangle,
+    and with each triangle there a second time, turned over, as furniture of thin boards is often made."""
+    own = trimesh.Trimesh(shape.vertices[shape.faces].reshape(-1, 3), np.arange(3 * len(shape.faces)).reshape(-1, 3))
+    own = trimesh.Trimesh(own.vertices, own.faces, process=False)
+    doubled = trimesh.Trimesh(
+        shape.vertices, np.hstack([shape.faces, shape.faces[:, ::-1]]).reshape(-1, 3), process=False
+    )
+    view = pose((0.02, 0.01, 0.9), (1, 2, 3), 0.4)
+    pictures, covers, distances = [], [], []
+    for file in (shape, own, doubled):
+        file.visual.vertex_colors = np.tile(np.uint8([200, 150, 90, 255]), (len(file.vertices), 1))
+        mesh = load_mesh(file.export(file_type="ply"), "ply")
+        thing = VirtualObject.upload(engine, mesh)
+        pictures.append(download(engine, rasterize(engine, CAMERA, EYE, [(thing, view)])))
+        covers.append(engine.download(nearest_depths(engine, CAMERA, EYE, [(thing, view)])).copy())
+        distances.append(engine.download(thing.grid.distance).copy())
+    shared = pictures[0]
+    assert (shared.index >= 0).sum() > 300
+    for picture, cover, distance in zip(pictures[1:], covers[1:], distances[1:], strict=True):
+        np.testing.assert_array_equal(picture.index, shared.index)
+        np.testing.assert_array_equal(cover > 0, covers[0] > 0)
+        np.testing.assert_allclose(cover.view(np.float32), covers[0].view(np.float32), rtol=4 * 2.0**-23)
+        np.testing.assert_allclose(distance, distances[0], atol=1e-4)  # cells; the order of corners rounds differently
+        for name in ("position", "normal", "color"):
+            np.testing.assert_allclose(getattr(picture, name), getattr(shared, name), atol=1e-5)

@@ -68,15 +68,20 @@ def test_nothing_to_match_is_said_and_keeps_the_lights_scale(device: Device, cod
     assert "the light's own scale holds" in reasons["match_average"]
 
 
-def test_the_averages_are_matched_where_the_light_is_estimated(device: Device) -> None:
-    for wished, light, is_matched in (
-        ("auto", LIGHT, False),
-        ("auto", None, True),
-        ("light", None, False),
-        ("average", LIGHT, True),
+def test_the_averages_are_matched_where_asked_for_and_in_the_thesis_where_the_light_is_estimated(
+    device: Device,
+) -> None:
+    for wished, light, as_thesis, is_matched in (
+        ("auto", LIGHT, False, False),
+        ("auto", None, False, False),
+        ("light", None, False, False),
+        ("average", LIGHT, False, True),
+        ("auto", None, True, True),
+        ("auto", LIGHT, True, False),
+        ("light", None, True, False),
     ):
-        run = shown(device, 120, light, tone_mapping=wished).plan.run
-        assert ("match_average" in run) == is_matched, (wished, light is None)
+        run = shown(device, 120, light, tone_mapping=wished, as_thesis=as_thesis).plan.run
+        assert ("match_average" in run) == is_matched, (wished, light is None, as_thesis)
 
 
 def test_white_light_keeps_its_luminance(device: Device) -> None:

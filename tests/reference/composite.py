@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
+from scipy.stats import truncnorm
 
 from tests.reference.sh import open_transfer
 
 Floats = NDArray[np.float64]
 UNTOUCHED = 1e-5
+CLIPPED, DEVIATION = 0.985, 0.4
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,19 @@ def upsample_bicubic(samples: Samples, x: int, y: int) -> Floats:
     )
 
 
+def restored(radiance: Floats, x: int, y: int, log_white: Floats) -> Floats:
+    """[3] radiance of pixel (x, y) of [h, w, 4]: of clipped channels the mean logarithm, see restored.clh."""
+    seen = radiance[y, x, :3]
+    clipped = seen >= CLIPPED
+    relative = np.log(np.maximum(seen, 1e-4)) - log_white
+    brightness = relative[~clipped].mean() if (~clipped).any() else 0.0
+    around = radiance[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3].reshape(-1, 4)
+    share = (around[around[:, 3] >= 0, :3] >= CLIPPED).mean(axis=0)
+    middle = np.maximum(brightness + log_white, -8 * DEVIATION)
+    above = truncnorm.mean(-middle / DEVIATION, np.inf, loc=middle, scale=DEVIATION)
+    return np.where(clipped, np.maximum(seen, np.exp(share * above)), seen)
+
+
 @dataclass(frozen=True)
 class Mixed:
     """What each pixel shows: real surface times `factor`, which is 1 where it is left as it is, and virtual over it."""
@@ -114,11 +129,13 @@ def mix(
     refined_ratio: Samples | None = None,
     bicubic: bool = False,
     inverse_depths: Floats | None = None,
+    log_white: Floats | None = None,
 ) -> Mixed:
     """What is mixed at each pixel: the nearer of virtual and real surface, real ones times `ratio`.
 
     radiance [h, w, 4]; light [n, 3]. A virtual surface at most `tolerance_m` behind a real one is in front.
     inverse_depths [f h, f w] of the nearest object at the parts of each pixel, 0 for none; else the middle counts.
+    log_white [3]: see `restored`; None: clipped channels are taken as they are.
     """
     height, width = radiance.shape[:2]
 
@@ -152,6 +169,10 @@ def mix(
             factor = value_at(ratio, refined_ratio, real, x, y)
             if factor[3] > 0 and np.abs(factor[:3] - 1).max() > UNTOUCHED:
                 mixed.factor[y, x], mixed.is_touched[y, x] = factor[:3], True
+                seen = radiance[y, x, :3]
+                if log_white is not None:
+                    dimmed = np.minimum(factor[:3] * restored(radiance, x, y, log_white) / np.maximum(seen, CLIPPED), 1)
+                    mixed.factor[y, x] = np.where(seen >= CLIPPED, dimmed, factor[:3])
         if virtual is not None and occluded is not None:
             share, source = share_and_source(x, y)
             if share > 0 and source is not None:

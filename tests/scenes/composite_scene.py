@@ -89,6 +89,7 @@ def mixture_of(
     refined_ratio: Samples | None = None,
     upsampling: Upsampling = "bilateral",
     inverse_depths: Floats | None = None,
+    restores_clipped: bool = False,
 ) -> CompositeInputs:
     surface: Surface = upload_surface(
         engine, real.positions[..., :3], real.normals[..., :3], real.positions[..., 3] > 0
@@ -107,6 +108,7 @@ def mixture_of(
         upload_every(engine, "refined_ratio", refined_ratio),
         upsampling,
         None if inverse_depths is None else engine.workspace.upload("fine", inverse_depths.astype(np.float32)),
+        restores_clipped=restores_clipped,
     )
 
 

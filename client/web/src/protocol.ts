@@ -103,7 +103,7 @@ export interface Wishes {
   edges?: "hard" | "smooth";
   /**
    * Brightness of virtual objects follows the light's scale, or the averages of the image and its shading; `auto`:
-   * the scale for a given light, the averages for an estimated one.
+   * the scale; with `as_thesis`, the averages for an estimated light.
    */
   tone_mapping?: "auto" | "average" | "light";
   /** `white`: only the light's luminance, as the thesis assumes. */

@@ -2,18 +2,20 @@
 
 Patch p of surface shows, for the mean logarithm of the channels y and two chroma coordinates q (`LOG_CHROMA`),
 
-    y_p = log(sum_k A_pk x_k + h_p) + B_p a + d_r(p) + e_p                                             (1)
-    q_p = sum_k T_pk u_k + (h_p / E_p) q(h_p) + c_r(p) + e'_p,    T_pk = A_pk x_k / E_p                (2)
+    y_p = log(sum_k A_pk x_k + h_p) + log s(B_p m + o_f(p)) + d_r(p) + e_p                     (1)
+    q_p = sum_k T_pk u_k + (h_p / E_p) q(h_p) + c_r(p) + e'_p,    T_pk = A_pk x_k / E_p        (2)
 
-with A_pk the share of p's cosine-weighted hemisphere that is unknown cell k, x_k = exp(z_k) its radiance (saturated cells:
-x_k = b_k (1 + exp(z_k)), b_k what the clipped picture shows), h_p what known surface brings, E_p the sum in (1), u_k the
-chroma of cell k. B_p a is the log albedo of materials, bilinear on a grid over the chroma of albedo; d_r and c_r are what
-the albedo of region r of surface has besides, with a prior that lets them be eliminated exactly. Minimised is
+with A_pk the share of p's cosine-weighted hemisphere that is unknown cell k, x_k = exp(z_k) its radiance (saturated
+cells: x_k = b_k (1 + exp(z_k)), b_k what the clipped picture shows), h_p what known surface brings, E_p the sum in
+(1), u_k the chroma of cell k. s is the logistic function, so no albedo exceeds 1; B_p m is the logit of the albedo of
+materials, bilinear on a grid over the chroma of albedo, and o_f that of surface f (a floor, a wall) besides; d_r and
+c_r are what region r of surface has besides, eliminated exactly. Minimised is
 
-    sum_p w_p huber(e_p) / S_p^2 + sum_k ((z_k - m_k) / s_k)^2 + sum_(k,l) rho(z_k - z_l) + sum_g ((a_g - m) / s_a)^2
-    + sum_p |e'_p|^2 / S'_p^2 + sum_k |u_k - t|^2 / s_u^2 + sum_(k,l) n |u_k - u_l|^2 + |t|^2 / s_t^2 + regions
+    sum_p huber(e_p / S_p) + sum_k ((z_k - n_k) / s_k)^2 + sum_(k,l) rho(z_k - z_l)
+    + sum_g ((m_g - m) / s_m)^2 + sum_f (o_f / s_o)^2 + sum_r (d_r / s_d)^2
+    + sum_p |e'_p / S'_p|^2 + sum_k |(u_k - t) / s_u|^2 + sum_(k,l) c |u_k - u_l|^2 + |t / s_t|^2 + sum_r |c_r / s_c|^2
 
-where a patch that is clipped only counts where (1) is below what it shows.
+over neighbouring cells (k,l) of the shell. A patch that is clipped only counts where (1) is below what it shows.
 """
 
 from __future__ import annotations
@@ -28,18 +30,18 @@ from server.light.shell.shell import CELLS, Shell, neighbours
 from server.light.shell.transport import COLUMNS, Transport
 
 MEAN_ALBEDO = 0.6
-"""Reflectance about which materials lie: a common mean of rooms. It sets the light's level."""
+"""Reflectance about which materials lie: walls and ceilings are mostly bright. It sets the light's level."""
 ALBEDO_SPREAD = 0.8
-"""Standard deviation of the logit of a material's albedo, about 0 (one half): most lie from .27 to .73, none above 1."""
+"""Standard deviation of the logit of a material's albedo: two thirds lie from .4 to .77, none above 1."""
 MATERIAL_CHROMA = 0.4
 """Spacing of the grid of materials over log chroma: orange wood and white paint are two nodes apart."""
 PATCH_NOISE = 0.1
 """Standard deviation of a patch's log radiance: transfer by 128 rays, normals, what is not diffuse."""
 REGION_SPREAD = 0.15
 """Standard deviation of a region's log albedo about its material's: gradients within a region are told from it."""
-SURFACE_M = 0.3
-SURFACE_SPREAD = 0.5
-"""The same of a whole surface (a floor, a wall): carpets are dark and walls are bright though both are grey."""
+SURFACE_M, SURFACE_SPREAD = 0.3, 0.5
+"""Spacing of the planes that count as one surface (a floor, a wall), and the standard deviation of its logit about its
+material's: carpets are dark and walls are bright though both are grey."""
 HUBER = 1.5
 """Deviations of the noise from which a patch counts as an outlier."""
 CELL_LOW, CELL_HIGH, CELL_HIDDEN = 0.7, 2.0, 0.7
@@ -48,8 +50,8 @@ above it (a lamp is 50 times the mean), and of surface that was not seen."""
 LAMP_EXCESS, LAMP_SPREAD = 0.2, 1.0
 """Of saturated cells: excess over the clipped radiance, relative to it, and the standard deviation of its log."""
 SMOOTHNESS, EDGE = 1.0, 0.5
-"""Weight of the squared difference of neighbouring cells' log radiance, and the difference from which it grows linearly:
-the rims of lamps and windows."""
+"""Weight of the squared difference of neighbouring cells' log radiance, and the difference from which it grows
+linearly: the rims of lamps and windows."""
 CHROMA_NOISE = 0.06
 """Standard deviation of a patch's log chroma."""
 REGION_CHROMA = 2.0
@@ -151,22 +153,26 @@ def step(unknowns: Unknowns, patches: Patches, transport: Transport, shell: Shel
     design = np.concatenate([parts, (1 - albedo)[:, None] * np.concatenate([materials, surfaces], axis=1)], axis=1)
     scale = np.concatenate([slope / level, np.ones(len(nodes) + len(offsets))])
     gram = _gram(design, weights)
-    matrix, vector = _without_regions(gram, design, weights, residual[:, None], data.regions, np.full(data.regions.max() + 1, REGION_SPREAD))
+    matrix, vector = _without_regions(
+        gram, design, weights, residual[:, None], data.regions, np.full(data.regions.max() + 1, REGION_SPREAD)
+    )
     matrix, right = matrix * np.outer(scale, scale), vector[:, 0] * scale
     pairs, differences = _pairs(z)
     strength = SMOOTHNESS / np.sqrt(1 + (differences / EDGE) ** 2)
     _add_smoothness(matrix, pairs, strength)
     right[:CELLS] -= _smoothness_gradient(pairs, strength * differences)
-    diagonal = np.concatenate([1 / deviation**2, np.full(len(nodes), 1 / ALBEDO_SPREAD**2), np.full(len(offsets), 1 / SURFACE_SPREAD**2)])
+    diagonal = np.concatenate(
+        [1 / deviation**2, np.full(len(nodes), 1 / ALBEDO_SPREAD**2), np.full(len(offsets), 1 / SURFACE_SPREAD**2)]
+    )
     matrix[np.diag_indices_from(matrix)] += diagonal
     target = np.concatenate([prior - z, LOGIT - unknowns.materials[nodes], -offsets])
-    covariance = np.linalg.inv(matrix)
+    covariance = np.asarray(np.linalg.inv(matrix), np.float64)
     change = covariance @ (right + diagonal * target)
     unknowns.step = float(np.abs(change).max())
     change *= min(1.0, MOST_STEP / max(unknowns.step, 1e-12))
     unknowns.z[:count] += change[:count]
     unknowns.materials[nodes] += change[count : count + len(nodes)]
-    offsets += change[count + len(nodes) :]
+    offsets = offsets + change[count + len(nodes) :]
     unknowns.surfaces = {int(key): float(offset) for key, offset in zip(data.surface_keys, offsets, strict=True)}
     unknowns.covariance = covariance[:count, :count]
     unknowns.condition = float(np.abs(matrix).sum(0).max() * np.abs(covariance).sum(0).max())
@@ -252,7 +258,7 @@ def _gram(design: Floats, weights: Floats) -> Floats:
 def _without_regions(
     gram: Floats, design: Floats, weights: Floats, residuals: Floats, regions: NDArray[np.int64], spreads: Floats
 ) -> tuple[Floats, Floats]:
-    """Normal matrix and vector [n, c] once each region's own offset, of deviation `spreads` [regions], is eliminated."""
+    """Normal matrix and vector [n, c] without each region's own offset, of deviation `spreads` [regions]."""
     count = len(spreads)
     order = np.argsort(regions, kind="stable")
     starts = np.searchsorted(regions[order], np.arange(count))
@@ -286,9 +292,7 @@ def _smoothness_gradient(pairs: NDArray[np.int64], pull: Floats) -> Floats:
     return np.asarray(up - down)
 
 
-def _solve_chroma(
-    unknowns: Unknowns, data: _Data, parts: Floats, gram: Floats, weights: Floats, seen: Floats
-) -> None:
+def _solve_chroma(unknowns: Unknowns, data: _Data, parts: Floats, gram: Floats, weights: Floats, seen: Floats) -> None:
     """Equation (2), linear in the chroma of the cells and the light's; a clipped patch has no chroma."""
     count, ratio = parts.shape[1], (PATCH_NOISE / CHROMA_NOISE) ** 2
     predicted = parts @ unknowns.chroma[:count]

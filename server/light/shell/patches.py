@@ -95,11 +95,11 @@ def gather_patches(
         facing,
         shown,
     )
-    at, towards, show = (engine.download(a).view(np.float32).reshape(-1, 4).astype(np.float64) for a in (places, facing, shown))
-    used = at[:, 3] >= LEAST_SHARE
-    return Seen(
-        at[used, :3] + volume.origin_world, towards[used, :3], show[used, :3], show[used, 3], towards[used, 3]
+    at, towards, show = (
+        engine.download(a).view(np.float32).reshape(-1, 4).astype(np.float64) for a in (places, facing, shown)
     )
+    used = at[:, 3] >= LEAST_SHARE
+    return Seen(at[used, :3] + volume.origin_world, towards[used, :3], show[used, :3], show[used, 3], towards[used, 3])
 
 
 class Patches:
@@ -127,7 +127,7 @@ class Patches:
         return np.flatnonzero((self.weights > 0) & (self.traced_in >= 0))
 
     def changes(self, seen: Seen) -> Floats:
-        """[k] how the patches of a picture differ from what they showed before: logarithms of ratios of mean radiance."""
+        """[k] log of the mean radiance of the patches of a picture over what they showed before."""
         keys, mean = _grouped(seen)
         rows = np.array([self._rows.get(tuple(key), -1) for key in keys], np.int64)
         is_known = (rows >= 0) & (self.weights[rows] > 0)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import pyopencl.array as cl_array
 from numpy.typing import NDArray
 
 from server.frame_context import FrameContext
 from server.light.arrivals import trace_arrivals
+from server.light.place_light import VALID_SPREAD_DEG, PlaceLight
 from server.light.shell.objective import Unknowns, radiances, step
 from server.light.shell.patches import Patches, Seen, gather_patches
 from server.light.shell.shell import Shell, shell_around
-from server.light.shell.transport import Transport
+from server.light.shell.transport import KNOWN, NO_CELL, Transport
 from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
@@ -32,31 +31,10 @@ within the spread in the rooms r1 and r3, checked in r2 and r4 (docs/light.md)."
 STEADY, CHANGED = 0.25, 0.5
 """Changes of log radiance at the upper quartile of the patches of a picture: up to the first (more than the texture
 within patches makes, .19 in the real kitchen) nothing is forgotten, from the second everything is."""
-VALID_DEG = 25.0
-"""A dominant direction is valid if 90 % lie within this angle."""
 _QUANTILE_90 = 2.146  # radius that holds 90 % of a two-dimensional normal distribution
 _LINEAR = [3, 1, 2]  # x, y, z
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Arriving:
-    """The light that arrives at a place, surfaces included."""
-
-    position: Floats
-    """[3] metres, world."""
-    sh: Floats
-    """[16, 3] radiance, world axes."""
-    std: Floats
-    """[16, 3] one standard deviation."""
-    spread_deg: float
-    """Angle that 90 % of dominant directions are within; 180 where nothing is known."""
-
-    @property
-    def valid(self) -> bool:
-        """Whether the dominant direction is known well enough to cast shadows by."""
-        return self.spread_deg <= VALID_DEG
 
 
 @cache
@@ -66,9 +44,9 @@ def look_up_directions() -> Floats:
 
 
 @cache
-def _basis() -> Floats:
-    """[16, DIRECTIONS] weights that project radiance on spherical harmonics."""
-    return np.asarray(4 * np.pi / DIRECTIONS * sh_basis(look_up_directions()[0], BANDS).T)
+def _basis(bands: int = BANDS) -> Floats:
+    """[bands^2, DIRECTIONS] weights that project radiance on spherical harmonics."""
+    return np.asarray(4 * np.pi / DIRECTIONS * sh_basis(look_up_directions()[0], bands).T)
 
 
 class RoomModel:
@@ -110,6 +88,11 @@ class RoomModel:
             for _ in range(STEPS if self.is_known else FIRST_STEPS):
                 step(self._unknowns, self._patches, self._transport, self._shell)
 
+    @property
+    def patches(self) -> int:
+        """Patches whose rays were traced."""
+        return len(self._patches.used)
+
     def _change(self, seen: Seen) -> float:
         """Share of the evidence that a picture contradicts, from 0 to 1."""
         changes = np.abs(self._patches.changes(seen))
@@ -119,9 +102,9 @@ class RoomModel:
 
     def radiance_at(self, engine: Engine, volume: Volume, position: Floats, directions: Floats) -> Floats:
         """[m, 3] radiance that arrives at `position` [3] (world) against `directions` [m, 3]; needs `is_known`."""
-        return self._looked_up(engine, volume, position[None], directions[None])[0][0]
+        return np.asarray(self._looked_up(engine, volume, position[None], directions[None])[0][0])
 
-    def arriving_at(self, engine: Engine, volume: Volume, positions: Floats) -> list[Arriving]:
+    def arriving_at(self, engine: Engine, volume: Volume, positions: Floats) -> list[PlaceLight]:
         """The light at each of `positions` [n, 3] (world); needs `is_known`."""
         radiance, columns = self._looked_up(engine, volume, positions, look_up_directions())
         return [
@@ -129,30 +112,30 @@ class RoomModel:
             for position, one, cells in zip(positions, radiance, columns, strict=True)
         ]
 
-    def beyond(self, position: Floats) -> Floats:
-        """[16, 3] the light from the shell as seen from `position` [3] (world), with no surface in between."""
+    def beyond(self, position: Floats, bands: int) -> Floats:
+        """[bands^2, 3] the light from the shell as seen from `position` [3] (world), with no surface in between."""
         assert self._shell is not None
         directions = look_up_directions()
         cells = self._shell.exits(np.broadcast_to(position, directions.shape), directions)[0]
-        return np.asarray(_basis() @ radiances(self._unknowns, self._transport, self._unknowns.known)[cells])
+        return np.asarray(_basis(bands) @ radiances(self._unknowns, self._transport, self._unknowns.known)[cells])
 
     def _looked_up(
         self, engine: Engine, volume: Volume, positions: Floats, directions: Floats
     ) -> tuple[Floats, NDArray[np.int64]]:
-        """Radiance [n, m, 3] and the unknown cell [n, m] it comes from (below 0: known, or no cell)."""
+        """Radiance [n, m, 3] and the cell [n, m] it comes from, or KNOWN or NO_CELL."""
         assert self._shell is not None
         arrivals = trace_arrivals(engine, volume, positions - volume.origin_world, None, directions)
         turned = np.broadcast_to(directions[0], (len(positions), *directions[0].shape))
         met = self._transport.meet(self._shell, positions, turned, arrivals.astype(np.float64))
         sent = radiances(self._unknowns, self._transport, self._unknowns.known)
-        columns = np.where(met.columns < self._unknowns.known, met.columns, -2)
+        columns = np.where(met.columns < self._unknowns.known, met.columns, NO_CELL)
         radiance = np.where((columns >= 0)[..., None], sent[np.maximum(columns, 0)], met.known)
         mean = np.exp(self._unknowns.mean)
-        is_new = (columns == -2)[..., None]  # surface of which no patch has received light
+        is_new = (columns == NO_CELL)[..., None]  # surface of which no patch has received light
         unseen = np.where(met.at_least.max(axis=-1, keepdims=True) > 0, met.at_least, mean)
         return np.where(is_new, unseen, np.maximum(radiance, met.at_least)), columns
 
-    def _arriving(self, position: Floats, radiance: Floats, columns: NDArray[np.int64]) -> Arriving:
+    def _arriving(self, position: Floats, radiance: Floats, columns: NDArray[np.int64]) -> PlaceLight:
         sh = _basis() @ radiance
         is_unknown = columns >= 0
         gradient = np.zeros((BANDS * BANDS, self._unknowns.known))
@@ -161,7 +144,15 @@ class RoomModel:
         covariance = gradient @ self._unknowns.covariance @ gradient.T
         std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         tint = radiance.mean(axis=0) / max(float(luminance.mean()), 1e-12)
-        return Arriving(position, sh, np.outer(std, tint), _spread_deg(sh @ LUMINANCE, covariance))
+        spread_deg = _spread_deg(sh @ LUMINANCE, covariance)
+        return PlaceLight(
+            position=position,
+            sh=sh,
+            std=np.outer(std, tint),
+            spread_deg=spread_deg,
+            valid=spread_deg <= VALID_SPREAD_DEG,
+            seen=float((columns == KNOWN).mean()),
+        )
 
 
 def _spread_deg(sh: Floats, covariance: Floats) -> float:

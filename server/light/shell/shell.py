@@ -1,7 +1,7 @@
 """The shell: a closed box around a room's scan and its cameras, whose cells send the light that is not scanned surface.
 
-A ray that leaves the scan ends in the cell where it meets the box, so light from 2 m away is not taken for distant light. The
-box is aligned with gravity and with the walls that were seen.
+A ray that leaves the scan ends in the cell where it meets the box, so light from 2 m away is not taken for distant
+light. The box is aligned with gravity and with the walls that were seen.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ class Shell:
         is_high = np.take_along_axis(direction, axis[..., None], -1)[..., 0] > 0
         first = np.where(axis == 0, share[..., 1], share[..., 0])
         second = np.where(axis == 2, share[..., 1], share[..., 2])
-        cells: NDArray[np.int64] = (
-            ((2 * axis + is_high) * SIDE + (first * SIDE).astype(np.int64)) * SIDE + (second * SIDE).astype(np.int64)
-        )
+        cells: NDArray[np.int64] = ((2 * axis + is_high) * SIDE + (first * SIDE).astype(np.int64)) * SIDE + (
+            second * SIDE
+        ).astype(np.int64)
         return cells
 
     @cached_property
@@ -76,9 +76,9 @@ class Shell:
 
 
 def upright(normals: Floats, up: Floats) -> Floats:
-    """[3] the direction that floors and tables face: the mode of `normals` [n, 3] near `up` [3], which may be 30 degrees off.
+    """[3] the direction that floors and tables face: the mode of `normals` [n, 3] near `up` [3], up to 30 degrees off.
 
-    A mean shift on the sphere, from a wide window to a narrow one; each window's mean is held by what `up` itself weighs.
+    A mean shift on the sphere, from a wide window to a narrow one; `up` itself counts in the widest.
     """
     found = up
     for width_deg in (30.0, 15.0, 8.0):
@@ -93,8 +93,8 @@ def upright(normals: Floats, up: Floats) -> Floats:
 def wall_axes(normals: Floats, up: Floats) -> Floats:
     """[3, 3] rows of Shell.axes: the horizontal direction that most walls face along or across, its normal, and up.
 
-    The mean of the fourth power of the horizontal normals, as complex numbers, has four times the walls' angle. normals:
-    [n, 3] of surface, unit; up: [3] unit.
+    The mean of the fourth power of the horizontal normals, as complex numbers, has four times the walls' angle.
+    normals: [n, 3] of surface, unit; up: [3] unit.
     """
     across = np.eye(3)[np.argmin(np.abs(up))]
     first = across - (across @ up) * up
@@ -107,9 +107,9 @@ def wall_axes(normals: Floats, up: Floats) -> Floats:
 
 
 def shell_around(positions: Floats, normals: Floats, cameras: Floats, up: Floats, before: Shell | None) -> Shell:
-    """The shell around `positions` [n, 3] of surface and `cameras` [m, 3], world metres; `before` where that still holds.
+    """The shell around `positions` [n, 3] of surface and `cameras` [m, 3], world metres. It never shrinks.
 
-    It never shrinks.
+    before: the last one, returned unless the scan has left it.
     """
     axes = wall_axes(normals, upright(normals, up)) if before is None else before.axes
     surface, seen_from = positions @ axes.T, cameras @ axes.T

@@ -1,4 +1,4 @@
-"""How radiance travels in a room: which share of what a patch receives comes from each unknown cell, and what it is known to receive.
+"""How radiance travels in a room: from which unknown cells a patch receives light, and what it is known to receive.
 
 Unknown cells are those of the shell, saturated surface (at least as bright as the picture could show), and surface that
 was met from its back or without a colour. Scanned surface sends what the camera saw it send.
@@ -21,6 +21,8 @@ MOST_HIDDEN = 192
 SATURATED = 0.97
 """Radiance of a channel from which a picture's values are lower bounds: code 252 of 255."""
 COLUMNS = CELLS + MOST_HIDDEN
+KNOWN, NO_CELL = -1, -2
+"""In place of a cell: photographed surface; hidden or saturated surface that no patch has received light from."""
 _MOST_COUNTED = 1e4  # rays that the mean of a saturated cell remembers
 
 Floats = NDArray[np.float64]
@@ -32,7 +34,7 @@ class Met:
     """What rays meet."""
 
     columns: Ints
-    """[...] the unknown cell; -1: surface whose radiance is known."""
+    """[...] the unknown cell, KNOWN or NO_CELL."""
     known: Floats
     """[..., 3] radiance of known surface, 0 elsewhere."""
     at_least: Floats
@@ -66,7 +68,9 @@ class Transport:
         if len(rows) == 0:
             return
         directions = patches.directions[rows].astype(np.float64)
-        met = self.meet(shell, patches.positions[rows], directions, patches.arrivals[rows].astype(np.float64), learn=True)
+        met = self.meet(
+            shell, patches.positions[rows], directions, patches.arrivals[rows].astype(np.float64), learn=True
+        )
         self.shares[rows] = 0.0
         is_unknown = met.columns >= 0
         row = np.broadcast_to(rows[:, None], is_unknown.shape)[is_unknown]
@@ -82,7 +86,7 @@ class Transport:
         is_bright = (distance > 0) & (radiance.max(axis=-1) >= SATURATED)
         is_back = distance < 0
         is_free = distance == 0
-        columns = np.full(distance.shape, -1, np.int64)
+        columns = np.full(distance.shape, KNOWN, np.int64)
         starts = np.broadcast_to(origins[:, None], directions.shape)
         columns[is_free] = shell.exits(starts[is_free], directions[is_free])
         ends = starts + np.abs(distance)[..., None] * directions
@@ -94,7 +98,7 @@ class Transport:
         return Met(columns, known, np.where(is_bright[..., None], radiance, 0.0))
 
     def _hidden_columns(self, points: Floats, kind: int, *, learn: bool) -> Ints:
-        """[n] columns of the cells around `points` [n, 3]; -2 for cells that do not exist."""
+        """[n] columns of the cells around `points` [n, 3], NO_CELL where there is none yet."""
         if len(points) == 0:
             return np.zeros(0, np.int64)
         keys, inverse = np.unique(np.floor(points / HIDDEN_M).astype(np.int64), axis=0, return_inverse=True)
@@ -107,7 +111,7 @@ class Transport:
                 return COLUMNS - 1
             self._hidden[key] = self.columns
             self.is_saturated[self._hidden[key]] = key[0] == 1
-        return self._hidden.get(key, -2)
+        return self._hidden.get(key, NO_CELL)
 
     def _note_bright(self, columns: Ints, radiance: Floats) -> None:
         counts = np.bincount(columns, minlength=COLUMNS).astype(np.float64)

@@ -1,0 +1,119 @@
+"""What pictures show of patches of surface, against the float64 twin; and the memory of patches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from protocol.frames import CameraModel
+from server.light.shell import patches as stage
+from server.light.shell.patches import MOST_PATCHES, MOST_WEIGHT, PATCH_M, RAYS, Patches, Seen, hemisphere_rays
+from server.opencl.engine import Engine
+from server.volume.volume import Volume
+from tests.reference.patches import gather_patches as twin
+from tests.scenes.analytic import Floats
+from tests.scenes.solids import float4, upload_surface
+
+VOXEL_M = 0.02
+
+
+def made_up(width: int, height: int) -> tuple[Floats, Floats, np.ndarray, Floats]:
+    """Two tilted planes with holes, moving pixels, clipped, black and missing colours."""
+    random = np.random.default_rng(8)
+    y, x = np.mgrid[:height, :width]
+    left = x < 0.6 * width
+    normals = np.where(left[..., None], [0.0, -1.0, 0.0], [-0.6, 0.0, -0.8])
+    heights = np.where(left, 0.0, 0.3) + random.normal(0, 0.015, (height, width))
+    positions = np.stack([x * 0.01, y * 0.01, 1 + 0 * x], -1) + heights[..., None] * normals
+    valid = random.random((height, width)) > 0.1
+    labels = np.where(valid, np.where(random.random((height, width)) > 0.1, 1, 2), 0).astype(np.uint8)
+    color = random.uniform(0, 1, (height, width, 3)) ** 2
+    mark = random.choice([1.0, 1.0, 1.0, 0.0, -0.5, -1.0], (height, width))
+    color[: height // 2, : width // 4] = 1.0
+    mark[: height // 2, : width // 4] = 0.0
+    radiance = np.concatenate([color, mark[..., None]], -1)
+    pad = valid[..., None].astype(float)
+    return np.concatenate([positions * pad, pad], -1), np.concatenate([normals * pad, pad], -1), labels, radiance
+
+
+@pytest.mark.parametrize("size", [(331, 93), (203, 61)])
+def test_matches_twin(engine: Engine, size: tuple[int, int]) -> None:
+    width, height = size
+    positions, normals, labels, radiance = made_up(width, height)
+    camera = CameraModel(width=width, height=height, fx=200.0, fy=200.0, cx=width / 2, cy=height / 2)
+    volume = Volume(engine, (1.0, 2.0, 3.0, 2.0, 3.0, 4.0), VOXEL_M)
+    surface = upload_surface(engine, positions[..., :3], normals[..., :3], labels > 0)
+    surface.labels.set(labels, engine.queue)
+    seen_radiance = engine.workspace.upload("test_radiance", float4(radiance[..., :3], radiance[..., 3]))
+    found = stage.gather_patches(engine, camera, surface, seen_radiance, volume)
+    step = max(2, width // 40)
+    places, facing, shown = (a.reshape(-1, 4) for a in twin(positions, normals, labels, radiance, step, 1.5 * VOXEL_M))
+    # Pixels at the very tolerance may fall on either side of it in float32.
+    used = places[:, 3] >= stage.LEAST_SHARE
+    assert 10 < used.sum() < 0.9 * len(used)
+    assert abs(found.count - used.sum()) <= 1
+    if found.count == used.sum():
+        np.testing.assert_allclose(found.positions - volume.origin_world, places[used, :3], atol=1e-5)
+        apart = np.abs(found.logarithms - shown[used, :3]).max(1) > 1e-4
+        assert apart.mean() < 0.03
+        np.testing.assert_allclose(found.normals[~apart], facing[used, :3][~apart], atol=1e-4)
+        np.testing.assert_allclose(found.clipped[~apart], facing[used, 3][~apart], atol=1e-5)
+        np.testing.assert_allclose(found.variances[~apart], shown[used, 3][~apart], atol=2e-4)
+        assert (found.clipped > 0.5).any()
+
+
+def one(position: Floats, radiance: float, normal: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Seen:
+    position = np.atleast_2d(position)
+    n = len(position)
+    return Seen(position, np.tile(normal, (n, 1)), np.full((n, 3), np.log(radiance)), np.zeros(n), np.zeros(n))
+
+
+def test_a_patch_is_the_mean_of_its_frames() -> None:
+    patches = Patches()
+    for radiance in (0.1, 0.2, 0.4):
+        patches.add(one(np.array([0.05, 0.05, 0.05]), radiance))
+    row = int(np.flatnonzero(patches.weights)[0])
+    np.testing.assert_allclose(patches.logarithms[row], np.log(0.2), atol=1e-12)
+    assert patches.weights[row] == 3
+    np.testing.assert_allclose(patches.changes(one(np.array([0.06, 0.04, 0.05]), 0.3)), [np.log(1.5)], atol=1e-12)
+
+
+def test_a_patch_never_weighs_more_than_its_memory() -> None:
+    patches = Patches()
+    for _ in range(int(3 * MOST_WEIGHT)):
+        patches.add(one(np.zeros(3), 0.5))
+    assert patches.weights.max() == MOST_WEIGHT
+    patches.add(one(np.zeros(3), 0.5 * np.e))
+    np.testing.assert_allclose(patches.logarithms[0], np.log(0.5) + 1 / MOST_WEIGHT, atol=1e-9)
+
+
+def test_memory_is_bounded_and_keeps_what_was_seen_last() -> None:
+    patches = Patches()
+    places = PATCH_M * (np.stack(np.meshgrid(np.arange(60), [0], np.arange(60)), -1).reshape(-1, 3) + 0.5)
+    for start in range(0, len(places), 300):
+        patches.add(one(places[start : start + 300], 0.5))
+    kept = patches.positions[patches.weights > 0]
+    assert len(kept) == MOST_PATCHES
+    last = places[-MOST_PATCHES:]
+    assert {tuple(p) for p in np.round(last, 6)} >= {tuple(p) for p in np.round(kept, 6)}
+
+
+def test_a_change_of_light_leaves_nothing_of_the_old() -> None:
+    patches = Patches()
+    patches.add(one(np.zeros(3), 0.1))
+    patches.forget(1.0)
+    assert len(patches.changes(one(np.zeros(3), 0.8))) == 0
+    patches.add(one(np.zeros(3), 0.8))
+    np.testing.assert_allclose(patches.logarithms[0], np.log(0.8))
+
+
+def test_rays_are_spread_as_the_cosine() -> None:
+    normals = np.array([[0.0, 0.0, 1.0], [0.6, -0.8, 0.0], [-1.0, 0.0, 0.0]])
+    rays = hemisphere_rays(normals, np.arange(3)).astype(np.float64)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=-1), 1.0, atol=1e-6)
+    cosine = np.einsum("nmk,nk->nm", rays, normals)
+    assert rays.shape == (3, RAYS, 3)
+    assert (cosine > 0).all()
+    np.testing.assert_allclose(cosine.mean(1), 2 / 3, atol=1e-3)  # of a cosine-weighted hemisphere
+    across = rays.mean(1) - cosine.mean(1)[:, None] * normals
+    assert np.linalg.norm(across, axis=1).max() < 0.01

@@ -1,0 +1,47 @@
+"""Float64 twin of the first half of server/light/shell/objective.py: equation (1) and its sum, written term by term."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.light.shell import objective as constants
+from server.light.shell.shell import neighbours
+
+Floats = NDArray[np.float64]
+
+
+def level_objective(
+    z: Floats,
+    materials: Floats,
+    offsets: Floats,
+    shares: Floats,
+    known: Floats,
+    level: Floats,
+    material_weights: Floats,
+    surfaces: NDArray[np.int64],
+    regions: NDArray[np.int64],
+    prior: Floats,
+    deviation: Floats,
+) -> float:
+    """Half the sum that is minimised, for a room without saturated cells, clipped patches and outliers.
+
+    z [k] log radiance of cells; materials [g] and offsets [f] logits of albedo; shares [n, k], known [n], level [n],
+    material_weights [n, g], surfaces [n], regions [n]; prior, deviation [k] of z.
+    """
+    total = 0.0
+    logit = material_weights @ materials + offsets[surfaces]
+    residual = level - np.log(shares @ np.exp(z) + known) - np.log(1 / (1 + np.exp(-logit)))
+    precision = 1 / constants.PATCH_NOISE**2
+    for region in np.unique(regions):
+        own = residual[regions == region]
+        weight = 1 / constants.REGION_SPREAD**2
+        offset = precision * own.sum() / (precision * len(own) + weight)  # the best d_r
+        total += precision * ((own - offset) ** 2).sum() / 2 + weight * offset**2 / 2
+    total += (((z - prior) / deviation) ** 2).sum() / 2
+    for first, second in neighbours():
+        ratio = (z[first] - z[second]) / constants.EDGE
+        total += constants.SMOOTHNESS * constants.EDGE**2 * (np.sqrt(1 + ratio**2) - 1)
+    total += (((materials - constants.LOGIT) / constants.ALBEDO_SPREAD) ** 2).sum() / 2
+    total += ((offsets / constants.SURFACE_SPREAD) ** 2).sum() / 2
+    return float(total)

@@ -14,4 +14,6 @@ MAX_NAME_CHARS = 64
 MAX_REASON_CHARS = 400
 MAX_SH_BANDS = 6
 MAX_LIGHT_PLACES = 16
+VALID_SPREAD_DEG = 25
+"""Not a limit of sizes: `light.valid` is true up to this `spread_deg` (server/light/place_light.py has the reason)."""
 MAX_PANORAMA_BYTES = 8 << 20

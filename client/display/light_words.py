@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
+from protocol.limits import VALID_SPREAD_DEG
 from protocol.messages import ArrivingLight, Light
 
-VALID_SPREAD_DEG = 25
-"""Above it a direction does not count as known (`light.valid`)."""
+GUESS = "no scanned surface is seen from there, its light is a guess"
 
 
 def light_line(light: Light) -> str:
@@ -23,7 +21,8 @@ def unknown_lines(light: Light) -> list[str]:
     """What is not known of the light at places; places of which the same is not known share a line."""
     places: dict[str, list[str]] = {}
     for arriving in light.at:
-        for doubt in _doubts(arriving):
+        doubt = GUESS if arriving.seen == 0 else _doubt(arriving.spread_deg, arriving.valid)
+        if doubt is not None:
             places.setdefault(doubt, []).append(_name(arriving))
     return [f"at {', '.join(names)}: {doubt}" for doubt, names in places.items()]
 
@@ -31,14 +30,6 @@ def unknown_lines(light: Light) -> list[str]:
 def light_lines(light: Light) -> list[str]:
     """All that is said after the last frame."""
     return [f"light {light_line(light)}", *(f"light {line}" for line in unknown_lines(light))]
-
-
-def _doubts(arriving: ArrivingLight) -> Iterator[str]:
-    if arriving.seen == 0:
-        yield "no scanned surface is seen from there; its light is a guess"
-    doubt = _doubt(arriving.spread_deg, arriving.valid)
-    if doubt is not None:
-        yield doubt
 
 
 def _doubt(spread_deg: float | None, is_valid: bool) -> str | None:

@@ -8,9 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol import limits
 from server.maths.sh import rotate_sh
 
-VALID_SPREAD_DEG = 25.0
+VALID_SPREAD_DEG = limits.VALID_SPREAD_DEG
 """A dominant direction counts as known if 90 % of the possible ones are within this angle: a shadow then falls on the
 right side of its object."""
 

@@ -38,7 +38,7 @@ class ToldPlaces:
     ) -> None:
         """Look up the light at all places. asked: [n, 3] world; objects: the middle of each by name.
 
-        `is_still`: geometry and surface are those of the frame before.
+        `is_still`: geometry and light are those of the frame before.
         """
         origin = context.volume.origin_world
         middle = view_middle(context.engine, context.surface, context.volume_from_camera)

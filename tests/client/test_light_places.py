@@ -104,7 +104,7 @@ def test_what_is_not_known_is_said_in_words() -> None:
     assert unknown_lines(light) == [
         "at the middle of the view: its direction may be off by 40 degrees",
         "at place 2 (0.25, 0.50, 1.75), object 1 (0.50, 1.00, -2.00): how far its direction may be off is not known",
-        "at place 3 (9.00, 0.00, 0.00): no scanned surface is seen from there; its light is a guess",
+        "at place 3 (9.00, 0.00, 0.00): no scanned surface is seen from there, its light is a guess",
     ]
     assert [line.startswith("light ") for line in light_lines(light)] == [True] * 4
 

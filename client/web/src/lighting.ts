@@ -1,9 +1,6 @@
 // By which light an object is drawn, for clients that draw by themselves, and what is not known of a light, in words.
 
-import type { ArrivingLight, Light } from "./protocol";
-
-/** Above it, in degrees, a dominant direction does not count as known (`light.valid`). */
-export const VALID_SPREAD_DEG = 25;
+import { type ArrivingLight, type Light, VALID_SPREAD_DEG } from "./protocol";
 
 /** The light that arrives where the object of this name stands; where that is not told, the room's light itself. */
 export function lightOf(light: Light, object: string): ArrivingLight | Light {
@@ -19,13 +16,16 @@ export function describeCertainty({ spread_deg, valid }: Pick<Light, "spread_deg
 
 /** What is not known of the light at places, a line each. */
 export function unknownPlaces(light: Light): string[] {
-  return places(light).flatMap((place) => doubts(place).map((doubt) => `${nameOf(place)}: ${doubt}`));
+  return places(light).flatMap((place) => {
+    const doubt = doubtOf(place);
+    return doubt === null ? [] : [`${nameOf(place)}: ${doubt}`];
+  });
 }
 
-function doubts({ seen, spread_deg, valid }: ArrivingLight): string[] {
-  const found = seen === 0 ? ["no scanned surface is seen from there, its light is a guess"] : [];
-  if (spread_deg === null) return [...found, valid ? "how far its direction may be off is not known" : "its direction is not known yet"];
-  return spread_deg <= VALID_SPREAD_DEG ? found : [...found, `its direction may be off by ${Math.round(spread_deg)}°`];
+function doubtOf({ seen, spread_deg, valid }: ArrivingLight): string | null {
+  if (seen === 0) return "no scanned surface is seen from there, its light is a guess";
+  if (spread_deg === null) return valid ? "how far its direction may be off is not known" : "its direction is not known yet";
+  return spread_deg <= VALID_SPREAD_DEG ? null : `its direction may be off by ${Math.round(spread_deg)}°`;
 }
 
 function nameOf({ of, index, position, object }: ArrivingLight): string {

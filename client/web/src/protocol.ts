@@ -13,6 +13,7 @@ export const MAX_NAME_CHARS = 64;
 export const MAX_REASON_CHARS = 400;
 export const MAX_SH_BANDS = 6;
 export const MAX_LIGHT_PLACES = 16;
+export const VALID_SPREAD_DEG = 25;
 export const MAX_PANORAMA_BYTES = 8388608;
 
 /** Lens of the depth image, if it differs from the colour lens; conventions as in `CameraModel`. */

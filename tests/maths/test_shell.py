@@ -66,7 +66,7 @@ def test_a_lamp_out_of_view_is_found(lit: ShellRoom, place: tuple[float, float, 
 
 def test_light_without_direction_has_none() -> None:
     """A white furnace: the ambient light alone."""
-    room = make_room(None, AMBIENT, {axis: (0.6, 0.6, 0.6) for axis in range(3)})
+    room = make_room(None, AMBIENT, dict.fromkeys(range(3), (0.6, 0.6, 0.6)))
     room.solve(15)
     cells = objective.radiances(room.unknowns, room.transport, CELLS)
     seen = room.transport.shares[:, :CELLS].sum(0) > 0.5
@@ -102,7 +102,7 @@ def test_albedos_stay_below_one(lit: ShellRoom) -> None:
 def test_the_solution_is_a_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the twin of the objective, which has no outliers: no unknown can be moved to a smaller sum."""
     monkeypatch.setattr(objective, "HUBER", np.inf)
-    room = make_room(LAMP, AMBIENT, {axis: (0.5, 0.5, 0.5) for axis in range(3)})
+    room = make_room(LAMP, AMBIENT, dict.fromkeys(range(3), (0.5, 0.5, 0.5)))
     room.solve(60)
     data, unknowns = objective._data(room.patches, room.transport), room.unknowns
     count = unknowns.known

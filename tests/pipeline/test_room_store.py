@@ -226,12 +226,13 @@ class Told:
 def test_a_light_is_forgotten_once_new_frames_say_as_much(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("server.light.room_light.gather_samples", lambda *_given: None)
     monkeypatch.setattr("server.light.room_light.no_hits", lambda *_given: None)
+    monkeypatch.setattr("server.light.room_light.RoomModel.update", lambda *_given: None)
     light = RoomLight(engine, read_wishes(corners.WISHES))
     told = LightEstimate(np.full((16, 3), 2.0), np.full((16, 3), 0.2), 1.0, valid=True)
     light._lobes = Told([0.0, 0.5, 0.0, 0.13, 0.1, 0.5])  # 0: a frame that says nothing
     light.resume(replace(light_known(), remembered=told))
     given: Any = MagicMock()
-    estimates = [light.update(given, given, given) for _ in range(6)]
+    estimates = [light.update(given, given, given, given) for _ in range(6)]
     assert [estimate is told for estimate in estimates] == [True, True, True, True, False, False]
     assert [light.estimate() is told] == [False]
 

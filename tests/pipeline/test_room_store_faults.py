@@ -8,9 +8,12 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
+import zstandard
 
 from protocol.messages import Marker
 from server.opencl.device import Device
@@ -19,6 +22,7 @@ from server.scene.placement import Placement
 from server.service.room_store import RoomStore, RoomStoreError, folder_name
 from server.service.saving import room_state as states
 from server.service.saving import save_slot as slots
+from server.service.saving.checksummed_files import read_parts, write_parts
 from tests.scenes.faulty_disk import FaultyDisk, PowerCut, full
 from tests.scenes.kept_rooms import CUBE, PLACE, client_of, found, layout_of, print_of, scan
 from tests.scenes.rooms import wishes
@@ -255,9 +259,37 @@ def test_a_save_of_another_version_is_set_aside(
 ) -> None:
     RoomStore(tmp_path).save(room)
     monkeypatch.setattr(slots, "VERSION", states.VERSION + 1)
+    monkeypatch.setattr(slots, "READABLE", (states.VERSION + 1,))
     with caplog.at_level(logging.WARNING):
         assert RoomStore(tmp_path).load("study", device) is None
-    assert "is of version 1, this program reads 2" in caplog.text
+    assert f"is of version {states.VERSION}, this program reads {states.VERSION + 1}" in caplog.text
+
+
+def test_a_save_of_the_first_version_is_read(device: Device, room: Room, tmp_path: Path) -> None:
+    """It has no places to be told of, and its lights no spread."""
+    RoomStore(tmp_path).save(room)
+    path = next(tmp_path.rglob(slots.SAVE))
+    header, packed = read_parts(path)
+    state = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(packed))
+    del state["wishes"]["light_at"]
+    for light in lights_in(state):
+        del light["spread_deg"]
+    old = msgspec.msgpack.encode(msgspec.msgpack.decode(header) | {"version": 1})
+    write_parts(path, [old, zstandard.ZstdCompressor().compress(msgspec.msgpack.encode(state))])
+    loaded = RoomStore(tmp_path).load("study", device)
+    assert loaded is not None
+    assert loaded.wishes.light_at == ()
+    assert loaded.light.estimate().spread_deg is None
+
+
+def lights_in(value: Any) -> Iterator[dict[str, Any]]:
+    if isinstance(value, dict):
+        if "spread_deg" in value:
+            yield value
+        value = list(value.values())
+    if isinstance(value, list):
+        for part in value:
+            yield from lights_in(part)
 
 
 def test_two_saves_are_kept(device: Device, room: Room, tmp_path: Path) -> None:
@@ -267,10 +299,10 @@ def test_two_saves_are_kept(device: Device, room: Room, tmp_path: Path) -> None:
     assert found(tmp_path, device) == prints[1]
 
 
-LAYOUT = "aebee7bf174ec815"
+LAYOUT = "ce6190e12443338a"
 
 
 def test_the_version_is_that_of_the_layout() -> None:
     """Where this fails, another layout is written: give it another `VERSION`."""
     layout = hashlib.blake2b(repr(layout_of(states.RoomState)).encode(), digest_size=8).hexdigest()
-    assert (states.VERSION, layout) == (1, LAYOUT)
+    assert (states.VERSION, layout) == (2, LAYOUT)

@@ -16,8 +16,10 @@ from server.maths.near_light import Found
 from server.scene.placement import Placement
 from server.tracking.relocalize import Keyframe
 
-VERSION = 1
+VERSION = 2
 """Format version. Increase it when any of these types, or a type that they contain, changes."""
+READABLE = (1, VERSION)
+"""Versions that can be read: what came since the first has a default."""
 _MOST_BYTES = 1 << 30
 
 FileName = Annotated[str, Meta(pattern="^[a-z0-9-]+$")]

@@ -20,6 +20,7 @@ from server.service.saving.brick_files import Batch, merged, write_bricks
 from server.service.saving.checksummed_files import DamagedFile, check_file, read_parts, sync_folder, write_parts
 from server.service.saving.retention import QUARANTINE_PREFIX
 from server.service.saving.room_state import (
+    READABLE,
     VERSION,
     FileName,
     Header,
@@ -118,7 +119,7 @@ class SaveSlot:
 
     def _state(self) -> RoomState:
         path, header = self.folder / SAVE, self.header()
-        if header is None or header.version != VERSION:
+        if header is None or header.version not in READABLE:
             raise DamagedFile(f"{path} is of version {header and header.version}, this program reads {VERSION}")
         try:
             _, packed = read_parts(path)

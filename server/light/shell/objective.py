@@ -166,8 +166,10 @@ def step(unknowns: Unknowns, patches: Patches, transport: Transport, shell: Shel
     )
     matrix[np.diag_indices_from(matrix)] += diagonal
     target = np.concatenate([prior - z, LOGIT - unknowns.materials[nodes], -offsets])
-    covariance = np.asarray(np.linalg.inv(matrix), np.float64)
-    change = covariance @ (right + diagonal * target)
+    covariance = np.linalg.inv(matrix.astype(np.float32)).astype(np.float64)
+    force = right + diagonal * target
+    change = covariance @ force
+    change += covariance @ (force - matrix @ change)
     unknowns.step = float(np.abs(change).max())
     change *= min(1.0, MOST_STEP / max(unknowns.step, 1e-12))
     unknowns.z[:count] += change[:count]
@@ -262,12 +264,12 @@ def _without_regions(
     count = len(spreads)
     order = np.argsort(regions, kind="stable")
     starts = np.searchsorted(regions[order], np.arange(count))
-    weighted = design * weights[:, None]
+    weighted = (design * weights[:, None]).astype(np.float32)
     sums = np.add.reduceat(weighted[order], starts, axis=0)
     totals = np.add.reduceat(weights[order], starts)
     differences = np.add.reduceat((weights[:, None] * residuals)[order], starts, axis=0)
     factor = spreads**2 / (1 + spreads**2 * totals)
-    root = (sums * np.sqrt(factor)[:, None]).astype(np.float32)
+    root = sums * np.sqrt(factor).astype(np.float32)[:, None]
     matrix = gram - (root.T @ root).astype(np.float64)
     return matrix, weighted.T @ residuals - sums.T @ (factor[:, None] * differences)
 

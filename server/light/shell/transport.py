@@ -23,6 +23,7 @@ SATURATED = 0.97
 COLUMNS = CELLS + MOST_HIDDEN
 KNOWN, NO_CELL = -1, -2
 """In place of a cell: photographed surface; hidden or saturated surface that no patch has received light from."""
+_MIDDLE = 1 << 19  # half the cells along an axis: 150 km
 _MOST_COUNTED = 1e4  # rays that the mean of a saturated cell remembers
 
 Floats = NDArray[np.float64]
@@ -53,7 +54,7 @@ class Transport:
         self.at_least: Floats = np.zeros((COLUMNS, 3))
         """[COLUMNS, 3] mean clipped radiance of saturated cells."""
         self._counts = np.zeros(COLUMNS)
-        self._hidden: dict[tuple[int, ...], int] = {}
+        self._hidden: dict[int, int] = {}
         self._shell: Shell | None = None
 
     @property
@@ -101,16 +102,18 @@ class Transport:
         """[n] columns of the cells around `points` [n, 3], NO_CELL where there is none yet."""
         if len(points) == 0:
             return np.zeros(0, np.int64)
-        keys, inverse = np.unique(np.floor(points / HIDDEN_M).astype(np.int64), axis=0, return_inverse=True)
-        columns = np.array([self._hidden_column((kind, *(int(k) for k in key)), learn=learn) for key in keys])
+        parts = np.floor(points / HIDDEN_M).astype(np.int64) + _MIDDLE
+        numbers = (parts[:, 0] * 2 * _MIDDLE + parts[:, 1]) * 2 * _MIDDLE + parts[:, 2]
+        keys, inverse = np.unique(2 * numbers + kind, return_inverse=True)
+        columns = np.array([self._hidden_column(int(key), learn=learn) for key in keys])
         return np.asarray(columns[inverse.ravel()], np.int64)
 
-    def _hidden_column(self, key: tuple[int, ...], *, learn: bool) -> int:
+    def _hidden_column(self, key: int, *, learn: bool) -> int:
         if key not in self._hidden and learn:
             if len(self._hidden) >= MOST_HIDDEN:
                 return COLUMNS - 1
             self._hidden[key] = self.columns
-            self.is_saturated[self._hidden[key]] = key[0] == 1
+            self.is_saturated[self._hidden[key]] = key % 2 == 1
         return self._hidden.get(key, NO_CELL)
 
     def _note_bright(self, columns: Ints, radiance: Floats) -> None:

@@ -69,6 +69,18 @@ class DirectLight:
         )
 
 
+def lamp_at(center_m: Floats, radius_m: float, radiance: Floats) -> DirectLight:
+    """A disc of `radius_m` and RGB `radiance` [3] at `center_m` [3], volume metres."""
+    # Irradiance over pi of a far disc is its radiance times its solid angle over pi, here at a metre.
+    return DirectLight(
+        direction=np.array([0.0, -1.0, 0.0]),
+        irradiance=radius_m**2 * np.asarray(radiance, np.float64),
+        half_angle_rad=float(np.arctan(radius_m)),
+        center_m=np.asarray(center_m, np.float64),
+        distance_m=1.0,
+    )
+
+
 @dataclass(frozen=True)
 class SplitLight:
     """A light as discs and a rest."""

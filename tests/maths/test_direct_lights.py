@@ -135,8 +135,8 @@ def shading_of_disc(direction: Floats, half_angle_rad: float, normals: Floats) -
 
 
 def test_a_lamp_gives_the_form_factor_of_its_disc() -> None:
-    """Of a disc of radius r at distance d that faces a surface it is r^2 / (r^2 + d^2). Shading, which takes all parts of
-    the disc to be as far as its centre, is that to the second order of r / d, from all sides."""
+    """Of a disc of radius r at distance d that faces a surface it is r^2 / (r^2 + d^2). Shading takes all parts of the
+    disc to be as far as its centre: it is that to the second order of r / d, from all sides."""
     center, radiance = np.array([1.0, 2.0, -1.0]), np.array([3.0, 2.0, 1.0])
     lamp = lamp_at(center, 0.2, radiance)
     for offset in ([0.0, 1.0, 0.0], [2.0, -1.0, 0.5], [0.0, 0.0, -4.0]):

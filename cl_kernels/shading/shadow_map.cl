@@ -14,14 +14,16 @@
 #define RAYS 8  // of a sample to a disc; neighbours have others
 #define RAY_SETS 16
 
-// nearest [count MAP_SIDE][MAP_SIDE]: for each light, bits of 1 / depth of objects drawn from distance_m before the ball's centre, 0
-// without any -> level 0 of its map.
-kernel void begin_maps(const int count, const float distance_m, global const uint *nearest, global float2 *maps) {
+// nearest [count MAP_SIDE][MAP_SIDE]: for each light, bits of 1 / depth of objects drawn from its distance, or if it is distant from
+// distance_m, before the ball's centre, 0 without any; rows: of DirectLights -> level 0 of its map, depths mapped.
+kernel void begin_maps(const int count, const float distance_m, global const float4 *rows, global const uint *nearest, global float2 *maps) {
     const int x = get_global_id(0);
     const int y = get_global_id(1);
     if (x >= MAP_SIDE || y >= count * MAP_SIDE) return;
     const float inverse = as_float(nearest[y * MAP_SIDE + x]);
-    maps[y / MAP_SIDE * MAP_TEXELS + y % MAP_SIDE * MAP_SIDE + x] = inverse > 0.0f ? (float2)(1.0f, 1.0f / inverse - distance_m) : (float2)(0.0f);
+    const float inverse_m = rows[4 * (y / MAP_SIDE)].w;
+    const float depth = inverse_m > 0.0f ? (1.0f - inverse / inverse_m) / inverse_m : 1.0f / inverse - distance_m;
+    maps[y / MAP_SIDE * MAP_TEXELS + y % MAP_SIDE * MAP_SIDE + x] = inverse > 0.0f ? (float2)(1.0f, depth) : (float2)(0.0f);
 }
 
 // `level` of all maps from the one before.
@@ -45,27 +47,33 @@ kernel void halve_maps(const int count, const int level, global float2 *maps) {
     VOLUME_PARAMETERS, const LightParameters lit, global const uchar *light_table, global const float2 *ray_places
 #define PLANES_OF_TRACE make_continued(lit, light_table)
 
-// Fraction of a disc's light at the surface that real surface does not block, along RAYS rays to places [RAYS] in the unit disc. axes: of
-// the disc, as DirectLights has them.
-static float real_part(const Volume volume, const Continued continued, const float reach_m, global const float4 *axes,
+// Real surface nearer to a near disc than this is the lamp itself.
+#define LAMP_M 0.1f
+
+// Fraction of disc k's light at the surface that real surface does not block, along RAYS rays to places [RAYS] in the unit disc.
+static float real_part(const Volume volume, const Continued continued, const float reach_m, const DirectLights lights, const int k,
                        const float3 position, const float3 normal, const float3 origin, global const float2 *places) {
+    global const float4 *axes = lights.rows + 4 * k;
     const float3 right = axes[0].xyz, down = axes[1].xyz, toward = axes[2].xyz;
-    const float tangent = axes[2].w;
-    const Vectors facing = {dot(normal, right), dot(normal, down), -dot(normal, toward)};
+    const Vectors point = {position.x, position.y, position.z}, facing = {normal.x, normal.y, normal.z};
+    const Seen seen = seen_by_disc(lights, k, point, facing, 0);
     float all = 0.0f, free = 0.0f;
     for (int first = 0; first < RAYS; first += LANES) {
         floatn x, y;
         load_pairs(places + first, &x, &y);
-        const floatn cosine = cosine_of_part(facing, tangent, x, y);
+        x = right_of(seen, x);
+        y = down_of(seen, y);
+        const floatn cosine = cosine_of_part(seen.normal, x, y);
         if (!ANY(MASK(cosine > 0.0f))) continue;
-        const floatn shorten = 1.0f / sqrt(1.0f + tangent * tangent * (x * x + y * y));
-        const Vectors direction = {(toward.x + tangent * (x * right.x + y * down.x)) * shorten,
-                                   (toward.y + tangent * (x * right.y + y * down.y)) * shorten,
-                                   (toward.z + tangent * (x * right.z + y * down.z)) * shorten};
+        const floatn shorten = 1.0f / sqrt(1.0f + x * x + y * y);
+        const Vectors direction = {(toward.x + (x * right.x + y * down.x)) * shorten, (toward.y + (x * right.y + y * down.y)) * shorten,
+                                   (toward.z + (x * right.z + y * down.z)) * shorten};
         const Rays rays = make_rays(origin / volume.voxel_m, direction);
         floatn begin, end;
         clip_rays(volume, rays, &begin, &end);
         end = MASK(cosine > 0.0f) ? fmin(end, reach_m / volume.voxel_m) : 0.0f;  // directions below the horizon are not traced
+        const floatn lamp_m = 1.0f / (seen.inverse_m * seen.scale * shorten);  // infinite if it is distant
+        end = fmin(end, (lamp_m - LAMP_M) / volume.voxel_m);
         const intn open = MASK(find_solid_voxels(volume, rays, begin, end) >= end);
         float dx[LANES], dy[LANES], dz[LANES], cosines[LANES], left[LANES];
         STORE_LANES(direction.x, dx);
@@ -86,7 +94,7 @@ static float4 real_parts(const Volume volume, const Continued continued, const f
     const float3 origin = is_virtual ? clear_origin(volume, position, normal) : position + volume.voxel_m * normal;
     float parts[4] = {1.0f, 1.0f, 1.0f, 1.0f};
     for (int k = 0; k < lights.count; k++)
-        parts[k] = real_part(volume, continued, reach_m, lights.rows + 4 * k, position, normal, origin, places);
+        parts[k] = real_part(volume, continued, reach_m, lights, k, position, normal, origin, places);
     return vload4(0, parts);
 }
 

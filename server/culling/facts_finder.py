@@ -17,6 +17,7 @@ from server.maths.microfacets import most_reflected
 from server.objects.rasterize import Placed, boxes_in_view
 from server.scene.colors import linear_from_srgb
 from server.shading.reflect import is_glossy
+from server.shading.shadow_map import most_irradiance
 from server.shading.traced_scene import DeviceLight
 from server.transfer.samples import TransferSamples
 
@@ -55,7 +56,7 @@ class FactsFinder:
         real = np.full(3, ROUNDING * exposure * self._brightest) if has_indirect else np.zeros(3)
         around = np.maximum(real, light.unseen)
         arriving = np.maximum(most_radiance(whole), around)
-        shading = most_shading(rest) + sum((disc.irradiance for disc in light.discs), np.zeros(3)) + SPREAD * around
+        shading = most_shading(rest) + most_irradiance(light, objects) + SPREAD * around
         sent = shading * most_albedo(objects) if has_indirect else np.zeros(3)
 
         boxes = boxes_in_view(context.camera, context.camera_from_volume, objects)

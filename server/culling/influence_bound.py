@@ -34,6 +34,9 @@ EVERY = 4
 WINDOW = 16.0
 """Most samples in a pixel's mean: the pixel of a sample gets at least this part of its bound."""
 _CHUNK = 16  # pixels of a work-item, as in influence_bound.cl
+_ANYWHERE_RAD = 2.5 * np.pi
+"""Half angle of a near disc, whose direction differs from point to point: no surface faces away from it (the sine is 1)
+and nothing stands beside it (it is more than pi)."""
 
 Floats = NDArray[np.float64]
 
@@ -178,7 +181,11 @@ def _bound_pixels(
 ) -> NDArray[np.float32]:
     """[4] the greatest of all pixels, see influence_bound.cl."""
     buffers, chunks = engine.buffers(_Buffers), -(-camera.width // _CHUNK)
-    table = np.array([(*disc.direction, disc.half_angle_rad) for disc in light.discs] or [(0, 0, 1, 0)], np.float32)
+    table = np.array(
+        [(*disc.direction, disc.half_angle_rad if disc.center_m is None else _ANYWHERE_RAD) for disc in light.discs]
+        or [(0, 0, 1, 0)],
+        np.float32,
+    )
     most = buffers.greatest.array((camera.height, chunks))
     defines = _defines(engine, light, transfer) | ({"BICUBIC": 1} if upsampling == "bicubic" else {})
     engine.launch(

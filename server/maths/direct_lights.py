@@ -8,9 +8,9 @@ band gives the size of a lobe: exp(-l (l + 1) spread^2 / 2) times the value of a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from math import log, sqrt
+from math import inf, log, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,13 +40,45 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DirectLight:
-    """A distant disc of uniform radiance."""
+    """A disc of uniform radiance, which faces every point: distant, or at a place in the room."""
 
     direction: Floats
     """[3] unit, towards its centre, in the coefficients' axes."""
     irradiance: Floats
     """[3] RGB radiance of a white surface that faces it and receives no other light, as for a point light."""
     half_angle_rad: float
+    center_m: Floats | None = None
+    """[3] where its centre is, volume metres; None: it is distant."""
+    distance_m: float = inf
+    """Of a disc with a place: how far from `center_m` the other fields are as they say."""
+
+    def seen_from(self, point_m: Floats) -> DirectLight:
+        """The same light as it is at another point [3], volume metres, which must not be the disc's centre."""
+        if self.center_m is None:
+            return self
+        offset = self.center_m - point_m
+        distance_m = float(np.linalg.norm(offset))
+        nearer = self.distance_m / distance_m
+        angle = float(np.arctan(nearer * np.tan(self.half_angle_rad)))
+        return replace(
+            self,
+            direction=offset / distance_m,
+            irradiance=nearer**2 * self.irradiance,
+            half_angle_rad=angle,
+            distance_m=distance_m,
+        )
+
+
+def lamp_at(center_m: Floats, radius_m: float, radiance: Floats) -> DirectLight:
+    """A disc of `radius_m` and RGB `radiance` [3] at `center_m` [3], volume metres."""
+    # Irradiance over pi of a far disc is its radiance times its solid angle over pi, here at a metre.
+    return DirectLight(
+        direction=np.array([0.0, -1.0, 0.0]),
+        irradiance=radius_m**2 * np.asarray(radiance, np.float64),
+        half_angle_rad=float(np.arctan(radius_m)),
+        center_m=np.asarray(center_m, np.float64),
+        distance_m=1.0,
+    )
 
 
 @dataclass(frozen=True)

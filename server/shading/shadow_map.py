@@ -24,7 +24,7 @@ from server.maths.disc_places import disc_places, ray_places, search_places
 from server.maths.dominant import MOST_LIGHTS
 from server.objects.dirty_region import DirtyRegion, box_around
 from server.objects.pinhole import Pinhole
-from server.objects.rasterize import Placed, RasterBuffers, VirtualSurface, drawn_depths
+from server.objects.rasterize import NEAR_M, Placed, RasterBuffers, VirtualSurface, drawn_depths
 from server.opencl.buffers import BufferDescription, BufferGroup, StageBuffers, Workspace
 from server.opencl.engine import Engine, KernelArgument, float4, int4
 from server.opencl.program import Define
@@ -42,7 +42,9 @@ from server.volume.volume import Volume
 MAP_SIDE = 256
 """Texels along a side of the objects' map."""
 DISTANCE = 1024.0
-"""Distance of the map's camera, in radii of the ball around the objects: practically parallel projection."""
+"""Distance of the camera of a distant light's map, in radii of the ball around the objects: practically parallel."""
+NEAREST = 1.25
+"""Least distance of a near light, in radii of that ball: its map is as fine as 0.6 of a distant light's."""
 LEAST_SHADING = 0.02
 """The least shading that counts, as in include/shadows.clh."""
 _COARSEST_SIDE = 8
@@ -93,7 +95,8 @@ class ShadowMaps:
     reach_m: float
     """Length of rays to real things."""
     rows: cl_array.Array
-    """[MOST_LIGHTS, 4] float4: right, down, towards the light (w: tangent of half its angle), irradiance (w: _rows)."""
+    """[MOST_LIGHTS, 4] float4: right (w: 1 / distance), down (w: half a side of the map), towards the light (w: tangent
+    of half its angle), irradiance (w: _rows); as the light is at the ball's centre."""
     ball: Floats
     """Centre and radius of the ball around all objects, volume metres."""
     objects: cl_array.Array
@@ -136,9 +139,34 @@ def draw_shadow_maps(
 ) -> ShadowMaps:
     """Depth maps of `objects`, each with its `volume_from_model`, from every disc of `light`."""
     ball = np.array(ball_around(objects).tolist(), np.float64)
-    axes = view_axes(np.stack([disc.direction for disc in light.discs]))
-    rows = engine.buffers(_Buffers).rows.upload(_rows(light.discs, axes))
-    return ShadowMaps(volume, light, reach_m, rows, ball, _draw_objects(engine, axes, ball, objects))
+    discs = [_seen_from(disc, ball) for disc in light.discs]
+    axes = view_axes(np.stack([disc.direction for disc in discs]))
+    rows = _rows(discs, axes, float(ball[3]))
+    uploaded = engine.buffers(_Buffers).rows.upload(rows.view(cl_types.float4)[..., 0])
+    return ShadowMaps(
+        volume, light, reach_m, uploaded, ball, _draw_objects(engine, axes, rows, uploaded, ball, objects)
+    )
+
+
+def most_irradiance(light: DeviceLight, objects: Sequence[Placed]) -> Floats:
+    """[3] bound on the radiance of white surface of `objects` from the discs of `light`: of a near disc, on the side of
+    the ball around them that is next to it."""
+    ball, most = np.array(ball_around(objects).tolist(), np.float64), np.zeros(3)
+    for disc in light.discs:
+        seen = _seen_from(disc, ball)
+        nearest = 1.0 if seen.center_m is None else 1 - ball[3] / seen.distance_m
+        most = most + seen.irradiance / nearest**2
+    return most
+
+
+def _seen_from(disc: DirectLight, ball: Floats) -> DirectLight:
+    """The disc as it is at the ball's centre; distant if it is nearly inside the ball, where no map can be drawn."""
+    offset = None if disc.center_m is None else disc.center_m - ball[:3]
+    if offset is None or not offset.any():
+        return replace(disc, center_m=None)
+    seen = disc.seen_from(ball[:3])
+    is_clear = seen.distance_m > max(NEAREST * ball[3], ball[3] + 2 * NEAR_M)
+    return seen if is_clear else replace(seen, center_m=None)
 
 
 def light_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, maps: ShadowMaps) -> cl_array.Array:
@@ -274,22 +302,32 @@ def without_direct(
     return replace(shadow, values=rest, whole=whole)
 
 
-def _draw_objects(engine: Engine, axes: Floats, ball: Floats, objects: Sequence[Placed]) -> cl_array.Array:
-    """The pyramids of all maps. axes: [lights, 3, 3]."""
-    texels, distance_m = (4 * MAP_SIDE**2 - _COARSEST_SIDE**2) // 3, DISTANCE * float(ball[3])
+def _draw_objects(
+    engine: Engine,
+    axes: Floats,
+    rows: NDArray[np.float32],
+    uploaded: cl_array.Array,
+    ball: Floats,
+    objects: Sequence[Placed],
+) -> cl_array.Array:
+    """The pyramids of all maps. axes: [lights, 3, 3]; rows: of _rows, also on the device."""
+    texels, far_m = (4 * MAP_SIDE**2 - _COARSEST_SIDE**2) // 3, DISTANCE * float(ball[3])
     maps = engine.buffers(_Buffers).maps.array((MOST_LIGHTS, texels))
     middle, focal_px = (MAP_SIDE - 1) / 2, DISTANCE * MAP_SIDE / 2
     camera = Pinhole(MAP_SIDE, MOST_LIGHTS * MAP_SIDE, focal_px, focal_px, middle, middle)
     drawn: list[Placed] = []
     for light, rotation in enumerate(axes):  # one picture, the maps below each other: one draw call
+        inverse_m, half_m = float(rows[light, 0, 3]), float(rows[light, 1, 3])
+        distance_m = 1 / inverse_m if inverse_m > 0 else far_m
         camera_from_volume = np.eye(4)
         camera_from_volume[:3, :3] = rotation
         camera_from_volume[:3, 3] = -rotation @ ball[:3] + [0.0, 0.0, distance_m]
+        camera_from_volume[:2] *= distance_m / (half_m * DISTANCE)  # one focal length for all: 1 for a distant light
         camera_from_volume[1] += light * MAP_SIDE / focal_px * camera_from_volume[2]
         drawn += [(thing, camera_from_volume @ volume_from_model) for thing, volume_from_model in objects]
     nearest = drawn_depths(engine, camera, np.eye(4), drawn, engine.buffers(_Buffers).objects)
     size = (MAP_SIDE, len(axes) * MAP_SIDE)
-    engine.launch(_kernel(engine, "begin_maps"), size, len(axes), distance_m, nearest, maps)
+    engine.launch(_kernel(engine, "begin_maps"), size, len(axes), far_m, uploaded, nearest, maps)
     for level in range(1, (MAP_SIDE // _COARSEST_SIDE).bit_length()):
         side = MAP_SIDE >> level
         engine.launch(_kernel(engine, "halve_maps"), (side, side, len(axes)), len(axes), level, maps)
@@ -318,18 +356,21 @@ def _trace_discs(
     )
 
 
-def _rows(discs: Sequence[DirectLight], axes: Floats) -> NDArray[np.float32]:
-    """[MOST_LIGHTS, 4] float4. Right, down, towards the light with the tangent of the disc's half angle, and the
-    irradiance with what surface that faces the disc gets of it: the mean cosine of its parts."""
+def _rows(discs: Sequence[DirectLight], axes: Floats, radius_m: float) -> NDArray[np.float32]:
+    """[MOST_LIGHTS, 4, 4] as ShadowMaps.rows says; the irradiance with what surface that faces the disc gets of it: the
+    mean cosine of its parts. radius_m: of the ball."""
     rows = np.zeros((MOST_LIGHTS, 4, 4), np.float32)  # always as many: lights come and go, arrays do not
     count = len(discs)
     rows[:count, :3, :3] = axes * np.array([1.0, 1.0, -1.0])[:, None]
+    inverse_m = np.array([0.0 if disc.center_m is None else 1 / disc.distance_m for disc in discs])
+    rows[:count, 0, 3] = inverse_m
+    rows[:count, 1, 3] = radius_m / np.sqrt(1 - (inverse_m * radius_m) ** 2)  # of the ball, mapped
     tangent = np.tan([disc.half_angle_rad for disc in discs])
     rows[:count, 2, 3] = tangent
     rows[:count, 3, :3] = [disc.irradiance for disc in discs]
     distance = np.linalg.norm(disc_places(), axis=1)
     rows[:count, 3, 3] = (1 / np.sqrt(1 + np.outer(tangent, distance) ** 2)).mean(axis=1)
-    return rows.view(cl_types.float4)[..., 0]
+    return rows
 
 
 def _float2(places: Floats) -> NDArray[np.float32]:

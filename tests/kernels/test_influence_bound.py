@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
@@ -228,6 +230,9 @@ def test_discs_reach_where_balls_stand_in_their_light(
     light = case.device_light()
     light = DeviceLight(**{**light.__dict__, "discs": (disc,)})
     found = _pixels(case, light, case.bounds(), has_bounds=False)[3] > 0
+    near = replace(disc, center_m=case.balls[0, :3] + 2 * towards, distance_m=2.0)
+    light = DeviceLight(**{**light.__dict__, "discs": (near,)})
+    assert _pixels(case, light, case.bounds(), has_bounds=False)[3] > 0  # its direction is not the same everywhere
     points = case.points[case.there]
     some = [twin.dims(towards, 0.1, case.balls[0], point, UP) for point in points[::3]]
     assert any(some) == reaches

@@ -28,6 +28,7 @@ from server.shading.shadow_map import (
     light_real,
     light_samples,
     light_virtual,
+    most_irradiance,
     trace_real,
     with_direct,
     without_direct,
@@ -78,6 +79,16 @@ def disc(half_angle_deg: float, toward: ArrayLike = TOWARD, color: ArrayLike = (
     return DirectLight(lights.unit(toward), np.asarray(color, float), float(np.radians(half_angle_deg)))
 
 
+def lamp(center_m: ArrayLike, radius_m: float, color: ArrayLike = (1.0, 1.0, 1.0)) -> DirectLight:
+    """A disc at a place, its irradiance as it is one metre off."""
+    angle = float(np.arctan(radius_m))
+    return DirectLight(UP, np.asarray(color, float), angle, np.asarray(center_m, float), 1.0)
+
+
+LAMP_M = np.array([0.7, 0.75, 0.3])
+"""Half a metre from the crate: the direction to it differs by 30 degrees from one side of the crate to the other."""
+
+
 @dataclass(frozen=True)
 class Lit:
     """Maps of a scene, ready to light surfaces."""
@@ -98,6 +109,8 @@ class Lit:
             self.maps.ball,
             search_places(),
             disc_places(),
+            rows[0, 3],
+            rows[1, 3],
         )
 
     def floor(self, points: Floats, normal: ArrayLike = UP) -> tuple[Floats, Floats]:
@@ -198,6 +211,106 @@ def test_virtual_surface_is_the_twins(engine: Engine) -> None:
     assert (error > 1e-4).mean() < FLIPS
     assert error.max() < 0.15
     assert 0.2 < (expected > 0).mean() < 0.8
+
+
+@KINDS
+def test_a_near_disc_is_the_twins(device: Device, kind: type[Engine]) -> None:
+    """On the floor and on a ball beside the crate, with a distant disc beside it."""
+    engine = kind(device)
+    light = lamp(LAMP_M, 0.06), disc(12.0)
+    points = floor_points(200)
+    scene = lit(engine, *light, solids=(CRATE, ball((0.62, 0.22, 0.5), 0.08)))
+    references = [scene.reference(k) for k in range(2)]
+    assert [r.inverse_m > 0 for r in references] == [True, False]
+    without, found = scene.floor(points)
+    opens = np.array([[float(r.open_part(UP[None], p)[0]) for r in references] for p in points])
+    free = np.array([[r.free_part(p, UP, False) for r in references] for p in points])
+    colors = np.array([d.seen_from(scene.maps.ball[:3]).irradiance for d in light])
+    np.testing.assert_allclose(without, opens @ colors, rtol=2 * relative_tolerance(device))
+    error = np.abs(found - (free * opens) @ colors).max(axis=1)
+    assert 0.1 < (free[:, 0] < 1).mean() < 0.9
+    assert (error > 1e-4 * colors.max()).mean() < FLIPS
+    normals = lights.random_directions(220, 3).reshape(10, 22, 3)
+    on_ball = [0.62, 0.22, 0.5] + 0.08 * normals
+    shaded = scene.virtual(on_ball, normals)[..., 0]
+    expected = [
+        sum(
+            c[0] * float(r.open_part(n[None], p)[0]) * r.free_part(p, n, True)
+            for r, c in zip(references, colors, strict=True)
+        )
+        for p, n in zip(on_ball.reshape(-1, 3), normals.reshape(-1, 3), strict=True)
+    ]
+    wrong = np.abs(shaded - np.reshape(expected, shaded.shape))
+    wrong[0, 0] = 0  # not covered
+    assert (wrong > 1e-4 * colors.max()).mean() < FLIPS
+
+
+@pytest.mark.parametrize(("radius_m", "bound"), [(0.01, 0.008), (0.05, 0.01), (0.12, 0.04)])
+def test_floor_darkens_as_a_near_lamp_is_hidden(engine: Engine, radius_m: float, bound: float) -> None:
+    """The shadow diverges from the lamp, and the light falls off, as the integral over its disc says; the same light
+    from afar, as it is at the crate's middle, is far off. Seen, root mean square: 0.004, 0.005, 0.021."""
+    light, points = lamp(LAMP_M, radius_m), floor_points(400)
+    points = points[CRATE.distance(points) > 0.004]
+    scene = lit(engine, light)
+    middle = scene.maps.ball[:3]
+    here = light.seen_from(middle)
+    without, found = (a[:, 0] / here.irradiance[0] for a in scene.floor(points))
+
+    def met_m(solids: Scene) -> Any:
+        return lambda o, d: hit(solids, o, d) if solids else np.full(len(o), np.inf)
+
+    true_without, true = (twin.near_irradiance(points + 1e-6 * UP, UP, light, middle, met_m(s)) for s in ((), (CRATE,)))
+    np.testing.assert_allclose(without, true_without, rtol=1e-4)  # seen: 4e-5
+    darker, right = 1 - found / without, 1 - true / true_without
+    assert (right > 0.9).any()
+    assert np.sqrt(np.mean((darker - right) ** 2)) < bound
+    assert darker[right == 0].mean() < 0.005
+    far, past = (a[:, 0] for a in lit(engine, replace(here, center_m=None)).floor(points))
+    assert np.sqrt(np.mean((1 - past / far - right) ** 2)) > 0.1
+
+
+def test_a_lamp_far_away_is_a_distant_disc(engine: Engine) -> None:
+    points, toward = floor_points(300), lights.unit(TOWARD)
+    near = lit(engine, DirectLight(toward, np.ones(3), 0.1, 1000.0 * toward, 1000.0)).floor(points)
+    for found, expected in zip(near, lit(engine, disc(np.degrees(0.1))).floor(points), strict=True):
+        error = np.abs(found - expected).max(axis=1)
+        assert (error > 5e-3).mean() < 2 * FLIPS  # of 1000 m, 0.3 m are 3e-4; look-ups of two maps
+
+
+@pytest.mark.parametrize("center_m", [(0.46, 0.18, 0.46), (0.46, 0.3, 0.46)], ids=["inside", "touching"])
+def test_a_lamp_among_the_objects_still_lights(engine: Engine, center_m: tuple[float, float, float]) -> None:
+    """Its map cannot be drawn: it is taken as distant, as it is at their middle."""
+    without, found = lit(engine, lamp(center_m, 0.03)).floor(floor_points(60))
+    assert np.isfinite(without).all()
+    assert np.isfinite(found).all()
+    assert (found <= without * (1 + 1e-6)).all()
+
+
+def test_the_lamp_itself_and_what_is_behind_it_hide_nothing(engine: Engine) -> None:
+    """Its own surface in the scan, above it a ceiling; a board half-way does hide it."""
+    center = np.array([0.46, 0.7, 0.46])
+    body = box((0.4, 0.68, 0.4), (0.52, 0.72, 0.52))
+    board = box((0.3, 0.5, 0.3), (0.6, 0.54, 0.6))
+    points = np.array([[0.3, FLOOR_Y, 0.46], [0.46, FLOOR_Y, 0.3], [0.42, FLOOR_Y, 0.42]])
+    alone, there, hidden = (
+        lit(engine, lamp(center, 0.03), scene=scene).floor(points)[0]
+        for scene in (FLOOR, (*FLOOR, body), (*FLOOR, board))
+    )
+    assert (alone > 0).all()
+    np.testing.assert_allclose(there, alone, rtol=1e-5)
+    assert (hidden[2] < 0.02 * alone[2]).all()
+
+
+def test_a_disc_is_the_same_from_wherever_it_is_described() -> None:
+    light = lamp((1.0, 2.0, 3.0), 0.3, (4.0, 2.0, 1.0))
+    there, back = light.seen_from(np.array([1.0, 0.0, 3.0])), light.seen_from(np.array([1.0, 0.0, 3.0]))
+    np.testing.assert_allclose(there.irradiance, [1.0, 0.5, 0.25])
+    np.testing.assert_allclose(there.direction, UP)
+    assert np.tan(there.half_angle_rad) == pytest.approx(0.15)
+    back = there.seen_from(np.array([2.0, 2.0, 3.0]))
+    np.testing.assert_allclose(back.irradiance, light.irradiance)
+    assert back.half_angle_rad == pytest.approx(light.half_angle_rad)
+    assert disc(5.0).seen_from(np.ones(3)).direction.tolist() == lights.unit(TOWARD).tolist()
 
 
 # ---- against the exact light of a disc ---------------------------------------------------------------------------
@@ -540,3 +653,15 @@ def test_places_cover_their_disc_evenly() -> None:
         assert radius2.mean() == pytest.approx(0.5, abs=0.1)
         assert np.linalg.norm(places.mean(axis=0)) < 0.25
     np.testing.assert_allclose(disc_places().sum(axis=0), 0, atol=1e-9)
+
+
+def test_no_point_of_an_object_gets_more_of_a_near_lamp_than_the_bound(engine: Engine) -> None:
+    for center in (LAMP_M, (0.46, 0.6, 0.46), (0.1, 0.3, 0.2)):
+        scene = lit(engine, lamp(center, 0.05, (1.0, 2.0, 0.5)), disc(10.0, BEHIND))
+        most = most_irradiance(scene.maps.light, [placed(engine, CRATE)])
+        random = np.random.default_rng(3)
+        points = random.uniform((0.38, 0.1, 0.4), (0.54, 0.26, 0.52), (20, 20, 3))
+        normals = lights.random_directions(400, 1).reshape(20, 20, 3)
+        found = scene.virtual(points, normals)[..., :3].max(axis=(0, 1))
+        assert (found <= most).all()
+        assert (found > 0.05 * most).all()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from server.maths.direct_lights import LEAST_GAIN, LEAST_REST, split_light
+from server.maths.direct_lights import LEAST_GAIN, LEAST_REST, lamp_at, split_light
 from server.maths.directional_fit import directional_sh
 from server.maths.dominant import dominant_lights
 from server.maths.sh import lambert_transfer, sh_basis
@@ -132,3 +132,18 @@ def shading_of_disc(direction: Floats, half_angle_rad: float, normals: Floats) -
     points = direction + radius[:, None] * (np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * across)
     shading: Floats = np.maximum(normals @ lights.unit(points).T, 0).mean(axis=1)
     return shading
+
+
+def test_a_lamp_gives_the_form_factor_of_its_disc() -> None:
+    """Of a disc of radius r at distance d that faces a surface it is r^2 / (r^2 + d^2). Shading takes all parts of the
+    disc to be as far as its centre: it is that to the second order of r / d, from all sides."""
+    center, radiance = np.array([1.0, 2.0, -1.0]), np.array([3.0, 2.0, 1.0])
+    lamp = lamp_at(center, 0.2, radiance)
+    for offset in ([0.0, 1.0, 0.0], [2.0, -1.0, 0.5], [0.0, 0.0, -4.0]):
+        seen = lamp.seen_from(center - offset)
+        distance = float(np.linalg.norm(offset))
+        share = (0.2 / distance) ** 2
+        np.testing.assert_allclose(seen.direction, np.array(offset) / distance)
+        np.testing.assert_allclose(seen.irradiance, share * radiance)
+        facing = shading_of_disc(seen.direction, seen.half_angle_rad, seen.direction[None])[0]
+        assert share * facing == pytest.approx(share / (1 + share), rel=2 * share)

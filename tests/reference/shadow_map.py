@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from server.maths.direct_lights import DirectLight
+
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
@@ -31,7 +33,7 @@ def pyramid(covered: Bools, depths: Floats) -> list[tuple[Floats, Floats]]:
 
 @dataclass(frozen=True)
 class Disc:
-    """A disc's map: what `ShadowMaps` holds for one light."""
+    """A disc's map: what `ShadowMaps` holds for one light. A near disc's map is in the space of direct_lights.clh."""
 
     levels: list[tuple[Floats, Floats]]
     axes: Floats
@@ -41,34 +43,40 @@ class Disc:
     """Middle and radius."""
     search: Floats
     places: Floats
+    inverse_m: float = 0.0
+    """1 / distance from the ball's middle; 0: it is distant."""
+    half_m: float = 0.0
+    """Half a side of the map; 0: the ball's radius."""
 
-    def open_part(self, normals: Floats) -> Floats:
-        """[n] what reaches white surface that nothing hides, over the disc's irradiance."""
-        return np.maximum(normals @ self._directions().T, 0).mean(axis=1)
+    def open_part(self, normals: Floats, point: Floats | None = None) -> Floats:
+        """[n] what reaches open white surface at `point` (None: the ball's middle), over the irradiance there."""
+        point = self.ball[:3] if point is None else point
+        across = self._directions(point)
+        right, down, away = self.axes @ (point - self.ball[:3]) * [1, 1, -1] * self.inverse_m
+        return np.maximum(normals @ across.T, 0).mean(axis=1) / ((1 + away) ** 2 + right**2 + down**2)
 
     def free_part(self, point: Floats, normal: Floats, is_virtual: bool) -> float:
         """What objects leave of that at one point, 1 where it gets nothing."""
-        at, own = self._seen(point), self.axes @ normal * [1, 1, -1]
-        plane = own if is_virtual else np.array([0.0, 0.0, -1.0])
+        raw, own = self.axes @ (point - self.ball[:3]) * [1, 1, -1], self.axes @ normal * [1, 1, -1]
+        at = raw / (1 + self.inverse_m * raw[2])
+        plane = own + self.inverse_m * (raw @ own) * np.eye(3)[2] if is_virtual else -np.eye(3)[2]
         lift_m = self._texel_m(0) if is_virtual else 0.0
         ahead = self._ahead(at, plane, lift_m)
         if ahead <= 0:
             return 1.0
         reach = max(ahead * self.tangent, self._texel_m(0) / 2)
         level = self._level(0.36 * reach)
-        cosines = np.maximum(self._directions() @ normal, 0)
+        cosines = np.maximum(self._directions(point) @ normal, 0)
         covered = [self._covered(at, plane, lift_m, level, reach * place)[0] for place in self.places]
         return float(1 - cosines @ covered / cosines.sum()) if cosines.sum() > 0 else 1.0
 
-    def _directions(self) -> Floats:
-        across = self.axes[2] + self.tangent * (self.places @ self.axes[:2])
-        return across / np.linalg.norm(across, axis=1, keepdims=True)
-
-    def _seen(self, point: Floats) -> Floats:
-        return np.asarray(self.axes @ (point - self.ball[:3]) * [1, 1, -1])
+    def _directions(self, point: Floats) -> Floats:
+        parts = self.axes[2] + self.tangent * (self.places @ self.axes[:2])  # from the ball's middle, over the distance
+        across = parts - self.inverse_m * (point - self.ball[:3])
+        return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))
 
     def _texel_m(self, level: int) -> float:
-        return 2 * self.ball[3] / len(self.levels[level][0])
+        return 2 * (self.half_m or self.ball[3]) / len(self.levels[level][0])
 
     def _level(self, size_m: float) -> int:
         texels = np.clip(size_m / self._texel_m(0), 1, len(self.levels[0][0]) // COARSEST_SIDE)
@@ -86,8 +94,8 @@ class Disc:
         return (float(part[row, col]) if offset[2] < 0 and above else 0.0), offset
 
     def _ahead(self, at: Floats, plane: Floats, lift_m: float) -> float:
-        reach = (at[2] + self.ball[3]) * self.tangent
-        if reach <= 0 or np.hypot(*at[:2]) > self.ball[3] + reach:
+        reach = (at[2] + self.ball[3] / (1 - self.inverse_m * self.ball[3])) * self.tangent
+        if reach <= 0 or np.hypot(*at[:2]) > (self.half_m or self.ball[3]) + reach:
             return 0.0
         weights, sums = 0.0, 0.0
         for ring in range(SEARCH_RINGS):
@@ -125,3 +133,27 @@ def irradiance(
     cosines = np.maximum(directions @ normal, 0)
     free = np.stack([is_free(np.broadcast_to(p, directions.shape), directions) for p in points])
     return np.asarray((free * cosines).mean(axis=1))
+
+
+def near_irradiance(
+    points: Floats, normal: Floats, light: DirectLight, middle: Floats, met_m: Callable[[Floats, Floats], Floats]
+) -> Floats:
+    """[n] over pi and over the irradiance at `middle`, of a near disc, whose plane faces `middle`, that things hide:
+    `met_m` of origins and directions [m, 3] is how far off they are met."""
+    assert light.center_m is not None
+    seen = light.seen_from(middle)
+    side = np.cross(seen.direction, np.eye(3)[np.abs(seen.direction).argmin()])
+    side /= np.linalg.norm(side)
+    index, parts = np.arange(1500), 1500
+    radius = seen.distance_m * np.tan(seen.half_angle_rad) * np.sqrt((index + 0.5) / parts)
+    turn = np.pi * (3 - 5**0.5) * index
+    across = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(seen.direction, side)
+    lamp, found = light.center_m + radius[:, None] * across, []
+    for point in points:
+        offset = lamp - point
+        distance = np.linalg.norm(offset, axis=1)
+        directions = offset / distance[:, None]
+        is_free = met_m(np.broadcast_to(point, directions.shape), directions) > distance
+        nearer = seen.distance_m / np.linalg.norm(light.center_m - point)
+        found.append(nearer**2 * (is_free * np.maximum(directions @ normal, 0)).mean())
+    return np.array(found)

@@ -8,6 +8,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
+from tests.bench.light.closed_rooms import closed_rooms_part
 from tests.bench.light.e1 import SEQUENCES, sequence_part
 from tests.bench.light.honesty import honesty_part
 from tests.bench.light.places import halves_part, kitchen_part
@@ -43,6 +44,7 @@ def elsewhere(part: str, run: Run) -> Part:
 PARTS: dict[str, Callable[[Run], Part]] = {
     ROOM: room_part,
     **{sequence.name: partial(sequence_part, sequence=sequence) for sequence in SEQUENCES},
+    "closed rooms": closed_rooms_part,
     "half black room": halves_part,
     "robustness": robustness_part,
     "honesty": honesty_part,

@@ -1,0 +1,89 @@
+"""The figures of closed rooms, for lights whose errors are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from protocol.messages import ArrivingLight
+from server.maths.sh import rotate_sh
+from server.opencl.device import Device
+from tests.bench.light.closed_rooms import Arrived, arrived_in, compare, level_and_chroma
+from tests.bench.report.run import Run
+from tests.data import data_folder
+from tests.scenes.analytic import Floats
+
+
+def light(strength: float = 1.0, tint: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Floats:
+    """Sky and a light along x."""
+    sh = np.zeros((16, 3))
+    sh[0], sh[3] = 3.0, 1.0
+    return np.asarray(strength * sh * tint)
+
+
+def told(sh: Floats, spread_deg: float | None = 10.0, valid: bool = True) -> ArrivingLight:
+    return ArrivingLight(
+        of="place",
+        index=0,
+        position=(0.0, 0.0, 0.0),
+        sh=tuple(tuple(map(float, row)) for row in sh),  # type: ignore[misc]
+        sh_std=((None, None, None),) * 16,
+        sh_webxr=(0.0,) * 27,
+        dominant_direction=(1.0, 0.0, 0.0),
+        dominant_intensity=1.0,
+        spread_deg=spread_deg,
+        valid=valid,
+    )
+
+
+def about_z(degrees: float) -> Floats:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+
+
+def one(found: Floats, true: Floats, **more: object) -> Arrived:
+    return compare([(told(found, **more),)], true[None])  # type: ignore[arg-type]
+
+
+def test_a_turned_light_is_off_by_its_turn() -> None:
+    arrived = one(rotate_sh(light(), about_z(25.0)), light())
+    assert arrived.angles_deg[0, 0] == pytest.approx(25.0, abs=1e-6)
+    assert arrived.irradiance[0, 0] > 0.05
+    assert arrived.level[0, 0] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_brighter_light_is_off_in_its_level_alone() -> None:
+    arrived = one(light(1.5), light())
+    assert arrived.irradiance[0, 0] == pytest.approx(0.0, abs=1e-9)
+    assert arrived.angles_deg[0, 0] == pytest.approx(0.0, abs=1e-3)
+    assert arrived.level[0, 0] == pytest.approx(1.5)
+    assert arrived.chroma[0, 0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_tint_is_off_in_its_chroma() -> None:
+    level, chroma = level_and_chroma(light(tint=(1.2, 1.0, 0.8)), light())
+    assert level == pytest.approx(1.0)
+    assert chroma == pytest.approx(0.2)
+
+
+def test_a_light_without_spread_may_point_anywhere() -> None:
+    arrived = one(light(), light(), spread_deg=None, valid=False)
+    assert arrived.spreads_deg[0, 0] == 180.0
+    assert not arrived.is_valid.any()
+
+
+def test_the_last_frames_are_judged() -> None:
+    frames = [(told(rotate_sh(light(), about_z(90.0))),)] * 4 + [(told(light()),)] * 15
+    assert compare(frames, light()[None]).last().angles_deg.max() < 1e-3
+
+
+def test_light_in_a_closed_room(device: Device) -> None:
+    """A ceiling lamp that no picture shows. Figures of whole runs are in docs/benchmarks/light.md."""
+    folder = data_folder("rooms") / "r1_ceiling"
+    arrived = arrived_in(Run(device, quick=True, say=print), folder, folder, frames=10, objects=())[0]
+    last = arrived.angles_deg[-5:]
+    assert np.median(last) <= 10  # seen: 3
+    assert last.max() <= 25  # seen: 9
+    assert np.median(arrived.irradiance[-5:]) <= 0.25  # seen: .14
+    assert abs(np.median(arrived.level[-5:]) - 1) <= 0.35  # seen: .2
+    assert (last <= arrived.spreads_deg[-5:]).mean() >= 0.9  # seen: 1

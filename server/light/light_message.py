@@ -15,7 +15,7 @@ from server.light.light_estimation import LightEstimate
 from server.light.place_light import VALID_SPREAD_DEG, LitPlace
 from server.maths.dominant import dominant_lights
 from server.maths.emitters import Emitter
-from server.maths.sh import dominant_direction, dominant_intensity, rotate_sh, webxr_floats
+from server.maths.sh import dominant_direction, dominant_intensity, sh_rotation, webxr_floats
 
 _WIRE_COEFFICIENTS = 16
 
@@ -116,7 +116,7 @@ def seen_from(
     Deviations turn as those of coefficients that err apart from one another.
     """
     turn = client_from_room[:3, :3]
-    bands = rotate_sh(np.eye(len(estimate.sh)), turn)
+    bands = sh_rotation(turn, round(len(estimate.sh) ** 0.5))
     std = None if estimate.std is None else np.sqrt(bands**2 @ estimate.std**2)
     moved = tuple(
         replace(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import limits
-from server.maths.sh import rotate_sh
+from server.maths.sh import sh_rotation
 
 VALID_SPREAD_DEG = limits.VALID_SPREAD_DEG
 """A dominant direction counts as known if 90 % of the possible ones are within this angle: a shadow then falls on the
@@ -39,7 +39,7 @@ class PlaceLight:
         Deviations turn as those of coefficients that err independently.
         """
         turn = client_from_room[:3, :3]
-        bands = rotate_sh(np.eye(len(self.sh)), turn)
+        bands = sh_rotation(turn, round(len(self.sh) ** 0.5))
         std = None if self.std is None else np.sqrt(bands**2 @ self.std**2)
         return replace(self, position=turn @ self.position + client_from_room[:3, 3], sh=bands @ self.sh, std=std)
 

@@ -6,6 +6,7 @@ uniform sky of radiance 1 shades to 1.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from math import factorial, pi, sqrt
 
 import numpy as np
@@ -79,6 +80,18 @@ def rotate_sh(coefficients: NDArray[np.float64], rotation: NDArray[np.float64]) 
     return result
 
 
+def sh_rotation(rotation: NDArray[np.float64], bands: int) -> NDArray[np.float64]:
+    """Matrix [bands^2, bands^2] by which `rotate_sh` turns coefficients. Remembered: worlds turn rarely."""
+    return _sh_rotation(np.ascontiguousarray(rotation, np.float64).tobytes(), bands)
+
+
+@lru_cache(maxsize=32)
+def _sh_rotation(rotation: bytes, bands: int) -> NDArray[np.float64]:
+    matrix = rotate_sh(np.eye(bands * bands), np.frombuffer(rotation).reshape(3, 3))
+    matrix.flags.writeable = False
+    return matrix
+
+
 def luminance_sh(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
     """Luminance [n] of RGB coefficients [n, 3]."""
     return np.asarray(coefficients @ LUMINANCE)
@@ -122,7 +135,7 @@ def webxr_floats(coefficients: NDArray[np.float64], rotation: NDArray[np.float64
     nine = np.zeros((9, 3))
     kept = coefficients[:9]
     nine[: len(kept)] = kept
-    return tuple(float(value) for value in rotate_sh(nine, rotation).ravel())
+    return tuple((sh_rotation(rotation, 3) @ nine).ravel().tolist())
 
 
 def project_panorama(panorama: NDArray[np.float64], bands: int, directions: NDArray[np.float64]) -> NDArray[np.float64]:

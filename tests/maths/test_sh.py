@@ -214,3 +214,16 @@ def test_panorama_reproduces_the_published_uffizi() -> None:
     # Relative to the whole row: single coefficients near zero have no relative error.
     assert np.linalg.norm(projected - published) < 0.01 * np.linalg.norm(published)
     assert np.abs(projected - published).max() < 0.01 * np.abs(published).max()
+
+
+@pytest.mark.parametrize("bands", [1, 3, 4, 6])
+def test_the_remembered_matrix_turns_as_coefficients_are_turned(bands: int) -> None:
+    """Also when it is asked for again, for another rotation in between, and from a view of a larger matrix."""
+    random = np.random.default_rng(bands)
+    for _ in range(2):
+        for axis in ((0.3, -1.1, 0.4), (0.0, 2.0, 0.1)):
+            pose = np.eye(4)
+            pose[:3, :3] = cv2.Rodrigues(np.array(axis))[0]
+            coefficients = random.normal(size=(bands * bands, 3))
+            found = sh.sh_rotation(pose[:3, :3], bands) @ coefficients
+            np.testing.assert_allclose(found, sh.rotate_sh(coefficients, pose[:3, :3]), atol=1e-10)

@@ -108,7 +108,9 @@ def test_what_follows_from_the_coefficients(light: Light) -> None:
 def test_the_light_at_a_place_is_its_panorama(device: Device, tmp_path: Path) -> None:
     """1024 directions against half a million pixels, through a file that another reader opens, in turned axes."""
     pipeline = session(device)
-    told = pipeline.process(frame()).light
+    pipeline.process(replace(frame(), exposure=1.0))
+    told = pipeline.process(replace(frame(), index=1, exposure=0.5)).light
+    assert told.exposure == 0.5
     for position, at in ((PLACES[0], told.at[1]), (None, told.at[0])):
         data, where = pipeline.panorama("hdr", position)
         np.testing.assert_allclose(where, at.position, atol=1e-6)

@@ -16,7 +16,8 @@ from server.maths.sh import rotate_sh, sh_basis, webxr_from_world
 from tests.scenes import lights
 
 Floats = NDArray[np.float64]
-UP, VIEW = np.array([0.0, -1.0, 0.0]), np.array([0.6, 0.0, 0.8])
+UP, VIEW = np.array([0.0, 0.0, 1.0]), np.array([0.6, 0.8, 0.0])
+"""With y down, the rotation would be its own inverse and hide a turn the wrong way."""
 
 
 def random_radiance(height: int = 12, width: int = 24) -> Floats:

@@ -141,7 +141,7 @@ class Pipeline:
             light = self._estimate_light(context, samples, left_out)
             self._look_up_places(context, is_still=reuse.keeps_geometry and "estimate_light" in left_out)
         with stage("rendering"):  # 7.1-7.2, the effects that this frame calls for
-            spine = self._spine_outputs(frame, objects, samples, left_out)
+            spine = self._spine_outputs(context, frame, objects, samples, left_out)
             rendered = self._renderer.render(context, spine, self._settings, reuse, request)
         if not room.light.is_given and frame.has_depth:  # B4, for the frames to come
             with stage("light_estimation"):
@@ -261,12 +261,13 @@ class Pipeline:
 
     def _spine_outputs(
         self,
+        context: FrameContext,
         frame: RgbdFrame,
         objects: list[Placed],
         samples: TransferSamples,
         left_out: dict[str, CullReason],
     ) -> SpineOutputs:
-        sh, planes = self._room.light.seen_by_objects(self._place_of_objects())
+        sh, split, planes = self._room.light.seen_by_objects(self._place_of_objects(), context.volume.origin_world)
         return SpineOutputs(
             frame=frame,
             objects=objects,
@@ -274,6 +275,7 @@ class Pipeline:
             depth_views=self._transfer.depth_views,
             period=self._transfer.period,
             sh=sh,
+            split=split,
             planes=planes,
             is_light_given=self._room.light.is_given,
             left_out=left_out,

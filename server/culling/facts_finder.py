@@ -12,7 +12,7 @@ from server.culling.reason import ALLOWANCE
 from server.culling.rules import share_of_codes
 from server.culling.scene_facts import SPREAD, Brightness, SceneFacts, most_albedo, most_radiance, most_shading
 from server.frame_context import FrameContext
-from server.maths.direct_lights import split_light
+from server.maths.direct_lights import SplitLight
 from server.maths.microfacets import most_reflected
 from server.objects.rasterize import Placed, boxes_in_view
 from server.scene.colors import linear_from_srgb
@@ -42,16 +42,17 @@ class FactsFinder:
         samples: TransferSamples,
         light: DeviceLight,
         sh: Floats,
+        split: SplitLight,
         shown: NDArray[np.uint8],
         gain: float,
     ) -> SceneFacts:
-        """Facts about a frame. sh: [bands^2, 3] of the whole `light`, in the first picture's units; shown: [h, w, 3]
-        sRGB."""
+        """Facts about a frame. sh: [bands^2, 3] of the whole `light`, in the first picture's units; `split`: in discs;
+        shown: [h, w, 3] sRGB."""
         exposure, has_indirect = context.exposure, samples.indirect is not None
         picture_most = _most_shown(shown)
         self._brightest = max(self._brightest, picture_most / exposure)
         whole = exposure * sh
-        rest = exposure * split_light(sh).rest if light.discs else whole
+        rest = exposure * split.rest if light.discs else whole
 
         real = np.full(3, ROUNDING * exposure * self._brightest) if has_indirect else np.zeros(3)
         around = np.maximum(real, light.unseen)

@@ -29,7 +29,7 @@ from server.effects.table import COMPOSE_LAYER, COMPOSITE, EFFECTS, FAINT_SHADOW
 from server.frame_context import FrameContext
 from server.input.measure import Measurement
 from server.light.continuation import PlaneArrays
-from server.maths.direct_lights import split_light
+from server.maths.direct_lights import SplitLight
 from server.objects.rasterize import Placed
 from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
@@ -91,6 +91,8 @@ class SpineOutputs:
     """Frames after which a still view is sampled the same again."""
     sh: NDArray[np.float64]
     """[bands^2, 3] the light, in the first picture's units."""
+    split: SplitLight
+    """The same as discs and a rest."""
     planes: PlaneArrays
     """Surfaces taken to hide the light where the volume is empty."""
     is_light_given: bool
@@ -168,9 +170,9 @@ class Renderer:
         light = upload_light(self._engine, spine.sh, rays, spine.planes, samples.indirect, context.exposure)
         averages = self._averages(context, spine, settings, light)  # 7.1, H
         if spine.objects:
-            light = take_discs(self._engine, light, split_light(spine.sh), rays, context.exposure)  # 7.2.3
+            light = take_discs(self._engine, light, spine.split, rays, context.exposure)  # 7.2.3
         gain = averages.gain if averages is not None else 1.0
-        facts = self._facts.find(context, spine.objects, samples, light, spine.sh, shown, gain)
+        facts = self._facts.find(context, spine.objects, samples, light, spine.sh, spine.split, shown, gain)
         given = _given(context, spine, light, averages, facts)
         effects = make_plan(EFFECTS, PictureParts, given, facts, everything=self._everything, stages=spine.left_out)
         parts, plan = effects.execute(given), effects.described()

@@ -6,7 +6,7 @@ light, albedos and the unobserved parts of the room are estimated together.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -27,6 +27,7 @@ from server.light.light_model import LightModel
 from server.light.lobe_estimator import KnownLight, LobeEstimator
 from server.light.place_light import PlaceLight
 from server.light.shell.room_model import RoomModel
+from server.maths.direct_lights import SplitLight, split_light
 from server.maths.light_change import Shot
 from server.maths.lobes import cell_directions
 from server.maths.sh import LUMINANCE, sh_basis
@@ -99,12 +100,22 @@ class RoomLight:
         """Whether the light of the room is known by place: not where one light is given or estimated for all of it."""
         return self._model_of_room.is_known and self._given is None and self._harmonics is None
 
-    def seen_by_objects(self, position: NDArray[np.float64]) -> tuple[NDArray[np.float64], PlaneArrays]:
-        """Light [bands^2, 3] from beyond the scan for objects at `position` [3] (world), and planes that hide it."""
+    def seen_by_objects(
+        self, position: NDArray[np.float64], origin_world: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], SplitLight, PlaneArrays]:
+        """Light [bands^2, 3] from beyond the scan for objects at `position` [3] (world), its discs, what hides it.
+
+        origin_world: [3] of the volume, in whose space discs have their places.
+        """
         if not self.has_model:
-            return self.estimate().sh, self.planes
-        sh = self._model_of_room.beyond(position, self._settings.bands)
-        return _whitened(sh) if self._settings.light_color == "white" else sh, NO_PLANES
+            sh = self.estimate().sh
+            return sh, split_light(sh), self.planes
+        whole, rest, lamps = self._model_of_room.beyond(position, self._settings.bands)
+        if self._settings.light_color == "white":
+            whole, rest = _whitened(whole), _whitened(rest)
+            lamps = [replace(lamp, radiance=_whitened(lamp.radiance)) for lamp in lamps]
+        discs = tuple(lamp.as_direct_light(origin_world) for lamp in lamps)
+        return whole, SplitLight(rest, discs), NO_PLANES
 
     def arriving_at(self, engine: Engine, volume: Volume, positions: NDArray[np.float64]) -> tuple[PlaceLight, ...]:
         """The light that arrives at each of `positions` [n, 3] (world metres), in units of the first picture."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from server.frame_context import FrameContext
 from server.light.arrivals import trace_arrivals
 from server.light.place_light import VALID_SPREAD_DEG, PlaceLight
+from server.light.shell.lamps import ShellLamp, find_lamps
 from server.light.shell.objective import Unknowns, radiances, step
 from server.light.shell.patches import Patches, Seen, gather_patches
 from server.light.shell.shell import Shell, shell_around
@@ -112,12 +113,19 @@ class RoomModel:
             for position, one, cells in zip(positions, radiance, columns, strict=True)
         ]
 
-    def beyond(self, position: Floats, bands: int) -> Floats:
-        """[bands^2, 3] the light from the shell as seen from `position` [3] (world), with no surface in between."""
+    def beyond(self, position: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
+        """The light from the shell as seen from `position` [3] (world), with no surface in between.
+
+        [bands^2, 3] the whole, [bands^2, 3] what its lamps leave, and the lamps; needs `is_known`.
+        """
         assert self._shell is not None
-        directions = look_up_directions()
-        cells = self._shell.exits(np.broadcast_to(position, directions.shape), directions)[0]
-        return np.asarray(_basis(bands) @ radiances(self._unknowns, self._transport, self._unknowns.known)[cells])
+        directions = look_up_directions()[0]
+        start = np.broadcast_to(position, directions.shape)
+        cells = self._shell.exits(start, directions)
+        ends = position + self._shell.distances(start, directions).min(axis=-1)[:, None] * directions
+        radiance = radiances(self._unknowns, self._transport, self._unknowns.known)[cells]
+        lamps, rest = find_lamps(position, ends, radiance)
+        return _basis(bands) @ radiance, _basis(bands) @ rest, lamps
 
     def _looked_up(
         self, engine: Engine, volume: Volume, positions: Floats, directions: Floats

@@ -40,12 +40,17 @@ class Shell:
     floor_m: float
     """Height of the lowest surface that was scanned, along `axes[2]`."""
 
-    def exits(self, points: Floats, directions: Floats) -> NDArray[np.int64]:
-        """[...] the cell in which rays from `points` [..., 3] inside of it along `directions` [..., 3] end."""
+    def distances(self, points: Floats, directions: Floats) -> Floats:
+        """[..., 3] metres along rays from `points` [..., 3] inside of it to the faces across each axis."""
         origin, direction = points @ self.axes.T, directions @ self.axes.T
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.where(direction > 0, self.high - origin, self.low - origin) / direction
-        distance = np.where(np.isfinite(distance), distance, np.inf)
+        return np.asarray(np.where(np.isfinite(distance), distance, np.inf))
+
+    def exits(self, points: Floats, directions: Floats) -> NDArray[np.int64]:
+        """[...] the cell in which rays from `points` [..., 3] inside of it along `directions` [..., 3] end."""
+        origin, direction = points @ self.axes.T, directions @ self.axes.T
+        distance = self.distances(points, directions)
         axis = distance.argmin(axis=-1)
         nearest = np.take_along_axis(distance, axis[..., None], -1)
         share = np.clip((origin + nearest * direction - self.low) / (self.high - self.low), 0.0, 1.0 - 1e-9)

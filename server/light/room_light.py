@@ -120,7 +120,10 @@ class RoomLight:
     def arriving_at(self, engine: Engine, volume: Volume, positions: NDArray[np.float64]) -> tuple[PlaceLight, ...]:
         """The light that arrives at each of `positions` [n, 3] (world metres), in units of the first picture."""
         if self.has_model:
-            return tuple(self._model_of_room.arriving_at(engine, volume, positions))
+            found = self._model_of_room.arriving_at(engine, volume, positions)
+            if self._settings.light_color == "white":
+                found = [replace(light, sh=_whitened(light.sh)) for light in found]
+            return tuple(found)
         light = self.estimate()
         sh, seen = arriving_sh(engine, volume, positions, distant_light(light.sh))
         places = zip(positions, sh, seen, strict=True)
@@ -131,7 +134,8 @@ class RoomLight:
     ) -> NDArray[np.float64]:
         """[m, 3] radiance that arrives at `position` [3] (world metres) from unit `directions` [m, 3] (world axes)."""
         if self.has_model:
-            return self._model_of_room.radiance_at(engine, volume, position, directions)
+            radiance = self._model_of_room.radiance_at(engine, volume, position, directions)
+            return _whitened(radiance) if self._settings.light_color == "white" else radiance
         beyond = distant_light(self.estimate().sh)
         radiance, _ = arriving_radiance(engine, volume, position[None], directions, beyond)
         return np.asarray(radiance[0])

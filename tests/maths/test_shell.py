@@ -21,7 +21,7 @@ from server.light.shell.transport import SATURATED, Transport
 from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
 from tests.reference.room_objective import level_objective
 from tests.scenes.analytic import Floats
-from tests.scenes.shell_room import CAMERA, SIZE_M, UP, Lamp, ShellRoom, make_room, sent
+from tests.scenes.shell_room import CAMERA, KNOWN, SIZE_M, UP, Lamp, ShellRoom, make_room, sent
 
 LAMP = Lamp((3.0, 0.9), 0.7, (16.0, 15.0, 14.0))
 AMBIENT = (0.3, 0.3, 0.3)
@@ -133,6 +133,63 @@ def test_the_solution_is_a_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
         ends = [value(z + sign * 0.05 * np.eye(count)[cell], materials, offsets) for sign in (-1, 1)]
         slope, bend = (ends[1] - ends[0]) / 0.1, (ends[1] + ends[0] - 2 * best) / 0.05**2
         assert abs(slope / bend) < 0.02  # the minimum along this cell is nearer than 2 %
+
+
+def spoilt(case: str) -> ShellRoom:
+    """A room whose pictures hardly tell anything, or lie."""
+    albedos = {2: (0.5, 0.5, 0.5)} if case == "one plane" else dict.fromkeys(range(3), (0.5, 0.5, 0.5))
+    room = make_room(LAMP, AMBIENT, albedos)
+    patches, used = room.patches, room.patches.used
+    if case == "black":
+        patches.logarithms[used] = np.log(0.002)
+        patches.arrivals[used, :, :3] = 0.0
+    elif case == "all clipped":
+        patches.clipped[used], patches.logarithms[used] = 1.0, 0.0
+        patches.arrivals[used, :, :3] = 1.0
+    elif case == "noise":
+        patches.logarithms[used] = np.random.default_rng(4).normal(-2, 3, (len(used), 3))
+    elif case == "seen from behind":
+        patches.arrivals[used, :, 3] *= -1
+    elif case == "a speck":
+        patches.weights[used[12:]] = 0.0
+    elif case == "nothing but surface":
+        patches.arrivals[used, :, :3], patches.arrivals[used, :, 3] = KNOWN, 1.0
+    room.transport = Transport()
+    room.transport.update(patches, patches.used, room.shell)
+    return room
+
+
+SPOILT = ("black", "all clipped", "noise", "seen from behind", "a speck", "nothing but surface", "one plane")
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_the_solve_is_stable(case: str) -> None:
+    """Finite light within what an 8-bit camera could have seen, a bounded condition."""
+    room = spoilt(case)
+    room.solve(25)
+    unknowns = room.unknowns
+    light = objective.radiances(unknowns, room.transport, unknowns.known)
+    assert np.isfinite(light).all()
+    assert light.max() < 1e5
+    assert np.isfinite(unknowns.covariance).all()
+    assert (np.diag(unknowns.covariance) > 0).all()
+    # A cell is known at least as well as beforehand.
+    _, deviation = objective._prior(unknowns.mean, room.transport, room.shell, unknowns.known)
+    assert (np.sqrt(np.diag(unknowns.covariance)) <= 1.01 * deviation).all()
+    assert unknowns.condition < 1e7
+    assert np.isfinite(unknowns.step)
+
+
+def test_last_bits_of_the_pictures_do_not_matter() -> None:
+    """A relative change of 1e-6 in every patch turns the light by far less than a degree."""
+    lights = []
+    for noise in (0.0, 1e-6):
+        room = make_room(LAMP, AMBIENT)
+        used = room.patches.used
+        room.patches.logarithms[used] += noise * np.random.default_rng(6).normal(size=(len(used), 3))
+        room.solve(10)
+        lights.append(light_at(room, np.array([1.0, 1.0, 0.7])))
+    assert angle_deg(*lights) < 0.05
 
 
 def test_rays_end_where_they_meet_the_box() -> None:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Preset, Wishes
 from server.client_session import ClientSession
-from server.effects import renderer
 from server.input.measure import linear_values
+from server.light import room_light
 from server.maths.direct_lights import SplitLight, split_light
 from server.maths.directional_fit import directional_sh
 from server.opencl.device import Device
@@ -124,7 +124,7 @@ def test_small_light_throws_its_shadow(device: Device, preset: Preset) -> None:
 
 def test_shadow_is_sharper_than_the_harmonics_can_show(device: Device) -> None:
     light = light_of(9.0)
-    with patch.object(renderer, "split_light", lambda sh: SplitLight(sh, ())):
+    with patch.object(room_light, "split_light", lambda sh: SplitLight(sh, ())):
         blurred = shown(device, light)
     assert "shadow_map" not in blurred.plan.run
     expected, is_floor = exact_ratio(9.0)
@@ -140,7 +140,7 @@ def test_soft_light_is_drawn_as_before(device: Device, indirect: bool) -> None:
     left_out = {item.effect: item for item in result.plan.left_out}
     assert left_out["shadow_map"].reason == "the light is soft"
     assert left_out["shadow_map"].error_bound == 0.0
-    with patch.object(renderer, "split_light", lambda sh: SplitLight(sh, ())):
+    with patch.object(room_light, "split_light", lambda sh: SplitLight(sh, ())):
         np.testing.assert_array_equal(result.color, shown(device, light, indirect=indirect).color)
     assert (result.color != GREY).any()
 

@@ -29,7 +29,7 @@ MOST_PATCHES = 1536
 """The patch that was not seen for longest makes way for another. 8 rooms' worth of what one picture shows."""
 RAYS = 128
 """Rays of a patch, evenly spread over its cosine-weighted hemisphere: a lamp of 1 % of it is met by one of them."""
-TRACED_A_FRAME = 160
+TRACED_A_FRAME = 96
 """Patches whose rays are traced in a frame once all are: the scan behind them goes on growing."""
 MOST_WEIGHT = 30.0
 """Frames that a patch's mean remembers."""

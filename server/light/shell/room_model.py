@@ -26,7 +26,7 @@ FIRST_STEPS, STEPS = 8, 1
 """Gauss-Newton steps of the first frame, and of every other."""
 LEAST_PATCHES = 12
 """Patches below which nothing is said."""
-SPREAD_DOUBT, LEAST_SPREAD_DEG = 3.5, 4.0
+SPREAD_DOUBT, LEAST_SPREAD_DEG = 2.5, 4.0
 """The angle over what the curvature tells of it, and what a cell's size leaves unknown: so that 90 % of directions are
 within the spread in the rooms r1 and r3, checked in r2 and r4 (docs/light.md)."""
 STEADY, CHANGED = 0.25, 0.5

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from server.light.shell.patches import MOST_PATCHES, RAYS, Patches
 from server.light.shell.shell import CELLS, Shell
 
-HIDDEN_M = 0.3
-"""Side of the cells of saturated and of hidden surface: smaller than a lamp or a piece of furniture."""
-MOST_HIDDEN = 192
+HIDDEN_M = 0.6
+"""Side of the cells of saturated and of hidden surface: a lamp, a window pane, a piece of furniture."""
+MOST_HIDDEN = 128
 """Cells of either kind together; what does not fit shares the last one."""
 SATURATED = 0.97
 """Radiance of a channel from which a picture's values are lower bounds: code 252 of 255."""

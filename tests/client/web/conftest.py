@@ -152,6 +152,6 @@ def keep_picture() -> Callable[[Page, str], None]:
     return keep
 
 
-def wait_for_text(page: Page, selector: str, text: str) -> None:
-    """Until the element says it."""
-    page.locator(selector).filter(has_text=text).first.wait_for(state="attached")
+def wait_for_text(page: Page, selector: str, text: str, times: int = 1) -> None:
+    """Until the element says it; `times`: as much patience as usual, where a busy machine needs more."""
+    page.locator(selector).filter(has_text=text).first.wait_for(state="attached", timeout=times * PATIENCE_MS)

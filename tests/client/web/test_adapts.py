@@ -143,7 +143,7 @@ def test_a_narrow_link_gets_smaller_pictures_younger_frames_and_the_best_again_w
         assert age_ms < YOUNGER * age_without_ms
 
         link.bytes_per_s = None
-        wait_for_text(page, "#sending", "Sent now: full size, quality 90")
+        wait_for_text(page, "#sending", "Sent now: full size, quality 90", times=4)  # rung by rung
         seen.wait(lambda images: images[-1].width == CAMERA.width and len(images[-1].data) > 0.9 * len(first.data))
         page.goto("about:blank")
 

@@ -148,7 +148,7 @@ class Pipeline:
                 room.lamps.work(self._camera, context.scene_radiance, context.surface, volume)
 
         if self._reuse is not None:
-            self._reuse.observe(reuse, spine.sh, spine.planes, rendered.reference)
+            self._reuse.observe(reuse, spine.sh, rendered.reference)
         return self._result(frame, geometry, volume, light, rendered, notes, started)
 
     def _decide_reuse(self, frame: RgbdFrame, volume: Volume) -> ReuseDecision:
@@ -202,7 +202,7 @@ class Pipeline:
     def _left_out(
         self, frame: RgbdFrame, reuse: ReuseDecision, is_kept: bool, is_shaded: bool
     ) -> dict[str, CullReason]:
-        is_learning = self._settings.plan == "everything" or self._room.light.reads_pictures
+        is_learning = self._settings.plan == "everything" or not self._room.light.is_given
         return spine_left_out(
             reuse.reason,
             reuse.echo if is_shaded else None,
@@ -267,7 +267,7 @@ class Pipeline:
         samples: TransferSamples,
         left_out: dict[str, CullReason],
     ) -> SpineOutputs:
-        sh, split, planes = self._room.light.seen_by_objects(self._place_of_objects(), context.volume.origin_world)
+        sh, split = self._room.light.seen_by_objects(self._place_of_objects(), context.volume.origin_world)
         return SpineOutputs(
             frame=frame,
             objects=objects,
@@ -276,7 +276,6 @@ class Pipeline:
             period=self._transfer.period,
             sh=sh,
             split=split,
-            planes=planes,
             is_light_given=self._room.light.is_given,
             left_out=left_out,
         )

@@ -55,14 +55,14 @@ kernel void bound_samples(const Grid grid, SAMPLE_BUFFERS, global const float *t
             if (!meets || dot(normal.xyz, direction) <= 0.0f) continue;
             const int is_free = (free[j >> 5] >> (j & 31)) & 1;
             const float share = share_of(arrives, index, normal.xyz);
-            const float3 taken = is_free ? fmax(arrives.arriving[index].xyz, lit.unseen.xyz) : most_hidden;
+            const float3 taken = is_free ? arrives.arriving[index].xyz : most_hidden;
             all += share * fmax(taken, sent.xyz);
             part += share;
         }
         if (balls_count == 0) part = SPREAD;
         float3 without = (float3)(0.0f);
         for (int i = 0; i < COEFFICIENTS; i++) without += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
-        without = shading_without(arrives, position.xyz, normal.xyz, without, openness[sample], hits[sample], own, free);
+        without = shading_without(arrives, without, openness[sample], hits[sample]);
         without = fmax(without, LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f);
         const float hidden = clamp(1.0f - openness[sample], 0.0f, 1.0f);
         bound = (float4)(greatest(all / without), part * greatest(sent.xyz / without), hidden * greatest(real_sent.xyz / without), 1.0f);

@@ -35,7 +35,7 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, global const floa
     global const uchar *own = sets + sample * INTERLEAVE;
     float3 without = (float3)(0.0f);
     for (int i = 0; i < COEFFICIENTS; i++) without += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
-    without = shading_without(arrives, position.xyz, normal.xyz, without, openness[sample], hits[sample], own, free);
+    without = shading_without(arrives, without, openness[sample], hits[sample]);
     const float3 taken = taken_from_real(volume, things, arrives, scene.objects.ball, position.xyz, normal.xyz, 0, 0, 1, own, INTERLEAVE, free);
     const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
     ratio[sample] = (float4)(fmax(without - taken, floor) / fmax(without, floor), 1.0f);

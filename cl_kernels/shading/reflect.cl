@@ -54,8 +54,6 @@ static float3 mean_arriving(const Volume volume, const Objects things, const Arr
         STORE_LANES(end, last);
         if (first[0] < last[0])
             sum += sent_from(volume, light, origin, direction, first[0], 1);
-        else if (is_hidden(light.continued, position, direction))
-            sum += light.unseen.xyz;
         else
             sum += blurred_light(coefficients, direction, 0.5f * spread);
     }

@@ -43,15 +43,13 @@ kernel void halve_maps(const int count, const int level, global float2 *maps) {
     map[level_offset(level) + y * side + x] = (float2)(0.25f * covered, covered > 0.0f ? sum / covered : 0.0f);
 }
 
-#define TRACE_PARAMETERS \
-    VOLUME_PARAMETERS, const LightParameters lit, global const uchar *light_table, global const float2 *ray_places
-#define PLANES_OF_TRACE make_continued(lit, light_table)
+#define TRACE_PARAMETERS VOLUME_PARAMETERS, const float reach_m, global const float2 *ray_places
 
 // Real surface nearer to a near disc than this is the lamp itself.
 #define LAMP_M 0.1f
 
 // Fraction of disc k's light at the surface that real surface does not block, along RAYS rays to places [RAYS] in the unit disc.
-static float real_part(const Volume volume, const Continued continued, const float reach_m, const DirectLights lights, const int k,
+static float real_part(const Volume volume, const float reach_m, const DirectLights lights, const int k,
                        const float3 position, const float3 normal, const float3 origin, global const float2 *places) {
     global const float4 *axes = lights.rows + 4 * k;
     const float3 right = axes[0].xyz, down = axes[1].xyz, toward = axes[2].xyz;
@@ -75,26 +73,23 @@ static float real_part(const Volume volume, const Continued continued, const flo
         const floatn lamp_m = 1.0f / (seen.inverse_m * seen.scale * shorten);  // infinite if it is distant
         end = fmin(end, (lamp_m - LAMP_M) / volume.voxel_m);
         const intn open = MASK(find_solid_voxels(volume, rays, begin, end) >= end);
-        float dx[LANES], dy[LANES], dz[LANES], cosines[LANES], left[LANES];
-        STORE_LANES(direction.x, dx);
-        STORE_LANES(direction.y, dy);
-        STORE_LANES(direction.z, dz);
+        float cosines[LANES], left[LANES];
         STORE_LANES(cosine, cosines);
         STORE_LANES(open ? cosine : 0.0f, left);
         for (int lane = 0; lane < LANES; lane++) {
             all += cosines[lane];
-            if (left[lane] > 0.0f && !is_hidden(continued, position, (float3)(dx[lane], dy[lane], dz[lane]))) free += left[lane];
+            free += left[lane];
         }
     }
     return all > 0.0f ? free / all : 1.0f;
 }
 
-static float4 real_parts(const Volume volume, const Continued continued, const float reach_m, const DirectLights lights,
+static float4 real_parts(const Volume volume, const float reach_m, const DirectLights lights,
                          const float3 position, const float3 normal, const int is_virtual, global const float2 *places) {
     const float3 origin = is_virtual ? clear_origin(volume, position, normal) : position + volume.voxel_m * normal;
     float parts[4] = {1.0f, 1.0f, 1.0f, 1.0f};
     for (int k = 0; k < lights.count; k++)
-        parts[k] = real_part(volume, continued, reach_m, lights, k, position, normal, origin, places);
+        parts[k] = real_part(volume, reach_m, lights, k, position, normal, origin, places);
     return vload4(0, parts);
 }
 
@@ -107,11 +102,10 @@ kernel void trace_discs(const Grid grid, global const float4 *positions, global 
     const int pixel = sample_pixel(grid, row, col);
     const float4 position = positions[pixel], normal = normals[pixel];
     const Volume volume = VOLUME_OF_PARAMETERS;
-    const Continued continued = PLANES_OF_TRACE;
     const DirectLights lights = DIRECT_OF_PARAMETERS;
     float4 result = (float4)(0.0f);
     if (position.w > 0.0f && normal.w > 0.0f)
-        result = real_parts(volume, continued, lit.reach_m, lights, position.xyz, normal.xyz, is_virtual,
+        result = real_parts(volume, reach_m, lights, position.xyz, normal.xyz, is_virtual,
                             ray_places + RAYS * ((row & 3) * 4 + (col & 3)));
     parts[row * grid.cols + col] = result;
 }
@@ -259,12 +253,11 @@ kernel void light_points_by_discs(const int points_count, global const float4 *p
     const int first = get_global_id(0) * LANES;
     if (first >= points_count) return;
     const Volume volume = VOLUME_OF_PARAMETERS;
-    const Continued continued = PLANES_OF_TRACE;
     const DirectLights lights = DIRECT_OF_PARAMETERS;
     float left[3][LANES];
     for (int lane = 0; lane < LANES; lane++) {
         const int index = min(first + lane, points_count - 1);
-        const float4 parts = real_parts(volume, continued, lit.reach_m, lights, points[index].xyz, normals[index].xyz, 1,
+        const float4 parts = real_parts(volume, reach_m, lights, points[index].xyz, normals[index].xyz, 1,
                                         ray_places + RAYS * (index & 15));
         left[0][lane] = parts.x, left[1][lane] = parts.y, left[2][lane] = parts.z;
     }

@@ -28,8 +28,7 @@ kernel void shade_pairs(const Grid grid, SAMPLE_BUFFERS, global const float4 *ra
         global const float4 *light = coefficients_of(lit, light_table);
         float3 shaded = (float3)(0.0f);
         for (int i = 0; i < COEFFICIENTS; i++) shaded += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
-        shaded = shading_without(arrives, positions[pixel].xyz, normals[pixel].xyz, shaded, openness[sample], hits[sample],
-                                 sets + sample * INTERLEAVE, free_mask + sample * MASK_WORDS);
+        shaded = shading_without(arrives, shaded, openness[sample], hits[sample]);
         pair = (float4)(dot(LUMINANCE, seen.xyz), dot(LUMINANCE, fmax(shaded, 0.0f)), 1.0f, 0.0f);
     }
     pairs[pair_row * pair_cols + pair_col] = pair;

@@ -28,7 +28,6 @@ from server.effects.resources import (
 from server.effects.table import COMPOSE_LAYER, COMPOSITE, EFFECTS, FAINT_SHADOWS, Answer, effect_names
 from server.frame_context import FrameContext
 from server.input.measure import Measurement
-from server.light.continuation import PlaneArrays
 from server.maths.direct_lights import SplitLight
 from server.objects.rasterize import Placed
 from server.opencl.buffers import BufferDescription, StageBuffers
@@ -93,8 +92,6 @@ class SpineOutputs:
     """[bands^2, 3] the light, in the first picture's units."""
     split: SplitLight
     """The same as discs and a rest."""
-    planes: PlaneArrays
-    """Surfaces taken to hide the light where the volume is empty."""
     is_light_given: bool
     left_out: Mapping[str, CullReason]
     """What of the spine was left out."""
@@ -167,7 +164,7 @@ class Renderer:
     ) -> tuple[PictureParts, Plan]:
         """What the picture is composed of, and the plan that made it."""
         samples, rays = spine.samples, context.rays
-        light = upload_light(self._engine, spine.sh, rays, spine.planes, samples.indirect, context.exposure)
+        light = upload_light(self._engine, spine.sh, rays, samples.indirect, context.exposure)
         averages = self._averages(context, spine, settings, light)  # 7.1, H
         if spine.objects:
             light = take_discs(self._engine, light, spine.split, rays, context.exposure)  # 7.2.3

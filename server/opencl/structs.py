@@ -73,13 +73,7 @@ LIGHT_PARAMETERS = Struct(
     unseen="float4",
     count="int",
     reach_m="float",
-    plane_count="int",
-    cell_m="float",
-    least_m="float",
     arriving_at="int",
-    planes_at="int",
-    shapes_at="int",
-    maps_at="int",
     coefficients_at="int",
     whole_at="int",
 )

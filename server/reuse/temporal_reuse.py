@@ -27,7 +27,6 @@ from protocol.messages import Poses
 from server.culling.reason import ALLOWANCE, CullReason
 from server.culling.rules import codes_of_share
 from server.culling.scene_facts import most_shading
-from server.light.continuation import PlaneArrays
 from server.light.light_estimation import FORGETTING
 from server.maths.emitters import Emitter
 from server.maths.sh import sh_basis, spherical_fibonacci
@@ -132,7 +131,6 @@ class TemporalReuse:
         self._is_tracked = poses != "given"
         self._changes = ChangeDetection(engine, camera, poses_are_given=poses != "track")
         self._scene = SceneVersion()
-        self._hiding = b""
         self._places: tuple[tuple[int, bytes], ...] = ()
         self._view = self._objects = 0
         self._states: dict[int, _State] = {}
@@ -162,20 +160,17 @@ class TemporalReuse:
             echo=CullReason(ECHO, ALLOWANCE) if self._echo_frames else None,
         )
 
-    def observe(self, decision: ReuseDecision, sh: Floats, planes: PlaneArrays, picture: Picture | None) -> None:
+    def observe(self, decision: ReuseDecision, sh: Floats, picture: Picture | None) -> None:
         """Learn from a fully computed frame whether the view has settled.
 
-        sh: the light [bands^2, 3]. planes: the planes that block it. picture: at a checkpoint, the virtual objects over
-        the camera picture with which the view began; None without objects.
+        sh: the light [bands^2, 3]. picture: at a checkpoint, the virtual objects over the camera picture with which the
+        view began; None without objects.
         """
         if decision.reason is not None:
             return
         self._lights.append(sh.copy())
         self._echo_frames = max(self._echo_frames - 1, 0)
-        count, hiding = self._changes.count, b"".join(array.tobytes() for array in planes)
-        if hiding != self._hiding:
-            self._states.clear()
-        self._hiding = hiding
+        count = self._changes.count
         if not decision.is_checkpoint:
             return
         now = self._states[count] = _State(sh.copy(), picture)

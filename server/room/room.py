@@ -53,7 +53,7 @@ class Room:
         self.lock = threading.Lock()
         self.engine = Engine(device)
         self.reconstruction = Reconstruction(self.engine, is_shared=name is not None)
-        self.light = RoomLight(self.engine, settings)
+        self.light = RoomLight(settings)
         self.lamps = LampFinder(self.engine, settings.lamps)
         self.objects = RoomObjects(self.engine)
         self.markers = Markers()

@@ -31,7 +31,7 @@ from server.opencl.program import Define
 from server.opencl.structs import DIRECT_PARAMETERS
 from server.shading.change_mask import mark_changes
 from server.shading.differential_rendering import MOST_POINTS, VIRTUAL_STRIDE, RealShadow
-from server.shading.traced_scene import DeviceLight, ball_around, light_parameters
+from server.shading.traced_scene import DeviceLight, ball_around
 from server.shading.virtual_point_lights import PlacedPoints, VirtualPointLights
 from server.transfer.auxiliary_views import view_axes
 from server.transfer.sample_grid import SampleGrid, grid_of
@@ -122,8 +122,7 @@ class ShadowMaps:
     def trace_arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
         """TRACE_PARAMETERS of shadow_map.cl."""
         places = engine.buffers(_Buffers).ray_places.constant(_float2(ray_places()))
-        lit = light_parameters(self.light, 0, self.reach_m)  # no directions: discs have their own
-        return (*self.volume.arguments(), lit, self.light.table.memory, places)
+        return (*self.volume.arguments(), np.float32(self.reach_m), places)
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.input.measure import intrinsics
-from server.light.continuation import LEAST_M, NO_PLANES, PlaneArrays
 from server.maths.direct_lights import DirectLight, SplitLight
-from server.maths.planes import CELL_M
 from server.objects.object_table import ObjectTable, object_table
 from server.objects.rasterize import Placed
 from server.opencl.buffers import BufferDescription, DeviceBuffer, StageBuffers
@@ -55,8 +53,6 @@ class DeviceLight:
     table: Parts
     """`arriving` [SETS, count] float4: RGB radiance from each direction of the visibility tests, clamped to 0
     (harmonics can ring below 0, and blocking negative light would brighten). The rest: include/arriving.clh."""
-    planes: PlaneArrays
-    """Planes that block the light where the volume is empty."""
     sh: NDArray[np.float64]
     """[bands^2, 3]: coefficients of the whole light."""
     unseen: NDArray[np.float64]
@@ -185,10 +181,7 @@ def light_parameters(light: DeviceLight, count: int, reach_m: float) -> np.void:
         unseen=float4(*light.unseen, light.surface_gain),
         count=count,
         reach_m=reach_m,
-        plane_count=len(light.planes[1]),
-        cell_m=CELL_M,
-        least_m=LEAST_M,
-        **{f"{part}_at": starts[part] for part in ("arriving", "planes", "shapes", "maps", "coefficients", "whole")},
+        **{f"{part}_at": starts[part] for part in ("arriving", "coefficients", "whole")},
     )
 
 
@@ -235,11 +228,10 @@ def upload_light(
     engine: Engine,
     sh: NDArray[np.float64],
     rays: Directions,
-    planes: PlaneArrays = NO_PLANES,
     indirect: Indirect | None = None,
     exposure: float = 1.0,
 ) -> DeviceLight:
-    """Upload the light: radiance coefficients [bands^2, 3], the radiance along `rays`, the planes that block it.
+    """Upload the light: radiance coefficients [bands^2, 3], the radiance along `rays`.
 
     indirect: radiance from surfaces, None for none. exposure: radiance in the picture over that in `sh` and volume.
     """
@@ -247,8 +239,7 @@ def upload_light(
     return DeviceLight(
         buffers.coefficients.upload(_float4(sh)),
         np.maximum(0.5 / np.sqrt(np.pi) * sh[0], 0.0),
-        _upload_table(buffers.table, rays, sh, sh, planes),
-        planes,
+        _upload_table(buffers.table, rays, sh, sh),
         sh,
         exposure * indirect.mean if indirect else np.zeros(3),
         exposure if indirect else 0.0,
@@ -265,7 +256,7 @@ def take_discs(
     return replace(
         light,
         coefficients=buffers.rest_coefficients.upload(_float4(rest)),
-        table=_upload_table(buffers.rest_table, rays, rest, light.sh, light.planes),
+        table=_upload_table(buffers.rest_table, rays, rest, light.sh),
         discs=tuple(replace(disc, irradiance=exposure * disc.irradiance) for disc in split.discs),
         with_discs=light.coefficients,
     )
@@ -276,12 +267,9 @@ def _upload_table(
     rays: Directions,
     sh: NDArray[np.float64],
     whole: NDArray[np.float64],
-    planes: PlaneArrays,
 ) -> Parts:
     """The light's table, laid out as in include/arriving.clh."""
-    rows, shapes, maps = planes
-    arrays = {"coefficients": _float4(sh), "whole": _float4(whole), "arriving": _arriving(rays, sh)}
-    return buffer.upload_parts(arrays | {"planes": rows, "shapes": shapes, "maps": maps})
+    return buffer.upload_parts({"coefficients": _float4(sh), "whole": _float4(whole), "arriving": _arriving(rays, sh)})
 
 
 def _arriving(rays: Directions, sh: NDArray[np.float64]) -> NDArray[np.float32]:

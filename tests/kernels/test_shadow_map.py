@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from server.effects import functions as effects
-from server.light.continuation import NO_PLANES, PlaneArrays
 from server.maths.direct_lights import DirectLight, SplitLight, split_light
 from server.maths.directional_fit import directional_sh
 from server.maths.disc_places import disc_places, ray_places, search_places
@@ -44,7 +43,6 @@ from tests.scenes.contexts import context_of
 from tests.scenes.lanes import KINDS, Narrow, Wide
 from tests.scenes.painted_walls import WALL as WALL_COLOR
 from tests.scenes.painted_walls import floor_beside_a_wall, wall_seen_from
-from tests.scenes.plane_patches import continued_wall
 from tests.scenes.shaded_floor import camera_of, placed
 from tests.scenes.solids import (
     SIDE_M,
@@ -142,11 +140,10 @@ def lit(
     *discs: DirectLight,
     solids: tuple[Box | Ball, ...] = (CRATE,),
     scene: Scene = FLOOR,
-    planes: PlaneArrays = NO_PLANES,
     reach_m: float = FAR_M,
 ) -> Lit:
     rays, volume = direction_sets(81, 4), fill_volume(engine, scene, VOXEL_M)
-    light = upload_light(engine, lights.uniform(), rays, planes)
+    light = upload_light(engine, lights.uniform(), rays)
     light = take_discs(engine, light, SplitLight(lights.uniform(), discs), rays)
     objects = [placed(engine, solid) for solid in solids]
     return Lit(engine, draw_shadow_maps(engine, volume, light, objects, reach_m))
@@ -445,19 +442,6 @@ def test_real_surface_that_a_virtual_one_touches_does_not_hide_the_disc(engine: 
     points[..., 2] = np.linspace(0.4, 0.52, 128).reshape(8, 16)
     found = lit(engine, light, scene=(*FLOOR, WALL)).virtual(points, np.broadcast_to(UP, points.shape))[..., 0]
     np.testing.assert_allclose(found.ravel()[1:], exact(points[0, :1], light, ())[0], rtol=2e-4)  # seen: 4e-5
-
-
-def test_a_plane_that_goes_on_hides_the_disc(engine: Engine) -> None:
-    """As the wall would that it is taken to be, of which the volume knows nothing."""
-    continuation = continued_wall(0.9)
-    light = disc(6.0, (1.0, 0.5, 0.0))
-    points = floor_points(200) - [0.1, 0, 0]
-    hidden, past = lit(engine, light, planes=continuation.arrays()).floor(points)
-    free, _ = lit(engine, light).floor(points)
-    deep = (points[:, 2] > 0.3) & (points[:, 2] < 0.6)
-    assert free[:, 0].min() > 0.3
-    assert not hidden[deep].any()
-    assert not past[deep].any()
 
 
 def test_rays_are_as_long_as_they_are_said_to_be(engine: Engine) -> None:

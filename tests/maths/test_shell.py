@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
-from server.light.shell import objective
+from server.light.shell import weights
+from server.light.shell.distant import distant_light
+from server.light.shell.evidence import DARKEST, log_chroma, materials_of
+from server.light.shell.objective import LOGIT, Unknowns, step
+from server.light.shell.patches import PATCH_M
 from server.light.shell.shell import (
     BEHIND_M,
+    CAMERA_M,
     CELLS,
     LEAST_HEIGHT_M,
     SIDE,
+    SIDES,
     Shell,
+    closed_sides,
     neighbours,
     shell_around,
     upright,
     wall_axes,
 )
+from server.light.shell.sources import distant_sources
+from server.light.shell.switches import Switches
 from server.light.shell.transport import SATURATED, Transport
 from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
 from tests.reference.room_objective import level_objective
@@ -34,7 +45,7 @@ def light_at(room: ShellRoom, place: Floats) -> Floats:
     directions = np.broadcast_to(DIRECTIONS, (1, *DIRECTIONS.shape))
     _, arrivals = sent(place[None], directions, None, np.zeros(3))
     met = room.transport.meet(room.shell, place[None], directions, arrivals)
-    cells = objective.radiances(room.unknowns, room.transport, room.unknowns.known)
+    cells = room.unknowns.radiance
     radiance = np.where((met.columns >= 0)[..., None], cells[np.maximum(met.columns, 0)], met.known)[0]
     return np.asarray(BASIS @ radiance @ LUMINANCE)
 
@@ -68,7 +79,7 @@ def test_light_without_direction_has_none() -> None:
     """A white furnace: the ambient light alone."""
     room = make_room(None, AMBIENT, dict.fromkeys(range(3), (0.6, 0.6, 0.6)))
     room.solve(15)
-    cells = objective.radiances(room.unknowns, room.transport, CELLS)
+    cells = room.unknowns.radiance[:CELLS]
     seen = room.transport.shares[:, :CELLS].sum(0) > 0.5
     assert np.ptp(np.log(cells[seen])) < 0.25
     assert np.exp(np.log(cells[seen]).mean()) == pytest.approx(0.3, rel=0.1)
@@ -85,15 +96,16 @@ def test_a_brighter_picture_is_a_brighter_light() -> None:
         room.transport = Transport()
         room.transport.update(room.patches, used, room.shell)
         room.solve(5)
-        rooms.append(objective.radiances(room.unknowns, room.transport, CELLS))
+        rooms.append(room.unknowns.radiance[:CELLS])
     np.testing.assert_allclose(rooms[1], 2 * rooms[0], rtol=2e-3)  # the Gram matrix is summed in float32
 
 
 def test_albedos_stay_below_one(lit: ShellRoom) -> None:
     """The brightest patch may not be explained by surface that sends more than it receives."""
-    data = objective._data(lit.patches, lit.transport)
-    level, _ = objective._levels(lit.unknowns.z[: lit.unknowns.known], lit.transport, lit.unknowns.known)
-    albedo = np.exp(data.level) / (data.shares @ level + data.known)
+    evidence, near = lit.evidence, lit.near
+    known = np.exp(np.log(np.maximum(near.known, DARKEST)).mean(1))
+    level = np.exp(np.log(lit.unknowns.radiance).mean(1))
+    albedo = np.exp(evidence.level) / (near.shares @ level + known)
     truth = np.exp(np.log([(0.6, 0.3, 0.2), (0.55, 0.55, 0.5), (0.3, 0.4, 0.6)]).mean(1))
     assert np.median(albedo) == pytest.approx(np.median(truth), rel=0.3)
     assert np.quantile(albedo, 0.99) < 1.0
@@ -101,22 +113,24 @@ def test_albedos_stay_below_one(lit: ShellRoom) -> None:
 
 def test_the_solution_is_a_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the twin of the objective, which has no outliers: no unknown can be moved to a smaller sum."""
-    monkeypatch.setattr(objective, "HUBER", np.inf)
+    monkeypatch.setattr(weights, "HUBER", np.inf)
     room = make_room(LAMP, AMBIENT, dict.fromkeys(range(3), (0.5, 0.5, 0.5)))
     room.solve(60)
-    data, unknowns = objective._data(room.patches, room.transport), room.unknowns
+    data, near, unknowns = room.evidence, room.near, room.unknowns
     count = unknowns.known
-    prior, deviation = objective._prior(unknowns.mean, room.transport, room.shell, count)
-    known_part = (data.known / (data.shares @ np.exp(unknowns.z[:count]) + data.known))[:, None] * data.known_chroma
-    parts = data.shares * np.exp(unknowns.z[:count]) / (data.shares @ np.exp(unknowns.z[:count]) + data.known)[:, None]
-    nodes, weights = objective._materials(data.chroma - parts @ unknowns.chroma[:count] - known_part)
+    known_logs = log_chroma(np.log(np.maximum(near.known, DARKEST)))
+    known = np.where(near.known.max(axis=1) > 0, np.exp(known_logs[:, 0]), 0.0)
+    arriving = near.shares @ np.exp(unknowns.z) + known
+    parts = near.shares * np.exp(unknowns.z) / arriving[:, None]
+    chroma = data.chroma - parts @ unknowns.chroma - (known / arriving)[:, None] * known_logs[:, 1:]
+    nodes, shares_of_materials = materials_of(chroma)
     offsets = np.array([unknowns.surfaces[int(key)] for key in data.surface_keys])
-    z, materials = unknowns.z[:count].copy(), unknowns.materials[nodes]
+    z, materials = unknowns.z.copy(), unknowns.materials[nodes]
 
     def value(z: Floats, materials: Floats, offsets: Floats) -> float:
         return level_objective(
-            z, materials, offsets, data.shares, data.known, data.level, weights, data.surfaces, data.regions,
-            prior, deviation,
+            z, materials, offsets, near.shares, known, data.level, shares_of_materials, data.surfaces, data.regions,
+            unknowns.mean + near.offset, near.deviation,
         )  # fmt: skip
 
     best = value(z, materials, offsets)
@@ -129,7 +143,7 @@ def test_the_solution_is_a_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
                 offsets + size * random.normal(size=len(offsets)),
             )
             assert moved > best
-    for cell in np.argsort(-data.shares.sum(0))[:12]:
+    for cell in np.argsort(-near.shares.sum(0))[:12]:
         ends = [value(z + sign * 0.05 * np.eye(count)[cell], materials, offsets) for sign in (-1, 1)]
         slope, bend = (ends[1] - ends[0]) / 0.1, (ends[1] + ends[0] - 2 * best) / 0.05**2
         assert abs(slope / bend) < 0.02  # the minimum along this cell is nearer than 2 %
@@ -168,15 +182,17 @@ def test_the_solve_is_stable(case: str) -> None:
     room = spoilt(case)
     room.solve(25)
     unknowns = room.unknowns
-    light = objective.radiances(unknowns, room.transport, unknowns.known)
-    assert np.isfinite(light).all()
-    assert light.max() < 1e5
-    assert np.isfinite(unknowns.covariance).all()
-    assert (np.diag(unknowns.covariance) > 0).all()
+    assert np.isfinite(unknowns.radiance).all()
+    assert unknowns.radiance.max() < 1e5
+    covariance, condition = unknowns.covariance_of(np.eye(unknowns.known))
+    assert np.isfinite(covariance).all()
+    assert (np.diag(covariance) > 0).all()
     # A cell is known at least as well as beforehand.
-    _, deviation = objective._prior(unknowns.mean, room.transport, room.shell, unknowns.known)
-    assert (np.sqrt(np.diag(unknowns.covariance)) <= 1.01 * deviation).all()
-    assert unknowns.condition < 1e7
+    near = room.near
+    deviation = np.where(near.is_saturated, weights.LAMP_SPREAD, near.deviation)
+    assert (np.sqrt(np.diag(covariance)) <= 1.01 * deviation).all()
+    assert condition < 1e7
+    assert condition > 0.1 * np.linalg.cond(unknowns.curvature.astype(np.float64), 1)
     assert np.isfinite(unknowns.step)
 
 
@@ -193,7 +209,7 @@ def test_last_bits_of_the_pictures_do_not_matter() -> None:
 
 
 def test_rays_end_where_they_meet_the_box() -> None:
-    shell = Shell(np.eye(3), np.zeros(3), np.array([2.0, 3.0, 4.0]), 0.0)
+    shell = Shell(np.eye(3), np.zeros(3), np.array([2.0, 3.0, 4.0]), 0.0, np.zeros((2, 3)))
     random = np.random.default_rng(5)
     points = random.uniform(0.1, 1.9, (50, 3))
     directions = DIRECTIONS[random.integers(0, len(DIRECTIONS), (50, 7))]
@@ -210,7 +226,7 @@ def test_rays_end_where_they_meet_the_box() -> None:
 def test_cells_of_a_closed_box_have_four_neighbours() -> None:
     counts = np.bincount(neighbours().ravel(), minlength=CELLS)
     np.testing.assert_array_equal(counts, 4)
-    shell = Shell(np.eye(3), np.zeros(3), np.ones(3), 0.0)
+    shell = Shell(np.eye(3), np.zeros(3), np.ones(3), 0.0, np.zeros((2, 3)))
     first, second = (shell.centers[side] for side in neighbours().T)
     assert np.linalg.norm(first - second, axis=1).max() < 1.01 / SIDE
 
@@ -228,22 +244,43 @@ def test_the_box_is_aligned_with_floor_and_walls() -> None:
     assert np.abs(axes @ turn.T).max(1).min() > np.cos(np.radians(4))
 
 
+def test_up_is_as_given_where_nothing_faces_up() -> None:
+    walls = np.repeat([[1.0, 0, 0], [0, 1.0, 0]], 50, axis=0)
+    np.testing.assert_allclose(upright(walls, UP), UP, atol=1e-6)
+
+
 def test_the_box_holds_scan_cameras_and_a_ceiling() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0.5], [0, 1, 0.2]])
-    shell = shell_around(points, np.tile(UP, (4, 1)), CAMERA[None], UP, None)
+    shell = shell_around(points, np.tile(UP, (4, 1)), CAMERA[None], UP, PATCH_M, None)
     camera = shell.axes @ CAMERA
     assert (shell.low[:2] <= camera[:2] - BEHIND_M + 1e-9).all() or (camera[:2] - BEHIND_M > shell.low[:2]).all()
     assert (shell.high[:2] >= camera[:2] + BEHIND_M - 1e-9).all()
     assert shell.high[2] - shell.floor_m >= LEAST_HEIGHT_M - 1e-9
-    again = shell_around(points + 0.01, np.tile(UP, (4, 1)), CAMERA[None], UP, shell)
+    again = shell_around(points + 0.01, np.tile(UP, (4, 1)), CAMERA[None], UP, PATCH_M, shell)
     assert again is shell  # noise moves nothing
-    grown = shell_around(points, np.tile(UP, (4, 1)), CAMERA[None] + SIZE_M, UP, shell)
-    assert (grown.high >= shell.high).all()
+    grown = shell_around(points, np.tile(UP, (4, 1)), CAMERA[None] + SIZE_M, UP, PATCH_M, shell)
     assert (grown.high[:2] > shell.high[:2]).all()
+    assert (grown.low[:2] <= camera[:2] - BEHIND_M + 0.1).all()  # the first camera's place is remembered
+
+
+def test_scanned_walls_close_their_sides() -> None:
+    """And bring the box from behind the camera to the wall; what faces out of the room closes nothing."""
+    place = np.stack(np.meshgrid(np.arange(0.05, 2, 0.15), np.arange(0.05, 2, 0.15)), -1).reshape(-1, 2)
+    wall = np.column_stack([np.zeros(len(place)), place])
+    floor = np.column_stack([place, np.zeros(len(place))])
+    points, normals = np.concatenate([wall, floor]), np.repeat([[1.0, 0, 0], [0, 0, 1.0]], len(place), axis=0)
+    np.testing.assert_array_equal(closed_sides(points, normals, np.eye(3), PATCH_M), [1, 0, 0, 0, 1, 0])
+    np.testing.assert_array_equal(closed_sides(points, -normals, np.eye(3), PATCH_M), np.zeros(6))
+    some = np.arange(len(wall) - 1, len(points))  # all of the floor, and one patch of wall
+    assert 0 < closed_sides(points[some], normals[some], np.eye(3), PATCH_M)[0] < 0.3
+    camera, to_wall = np.array([[0.3, 1.0, 1.5]]), np.array([[-1.0, 0.0, 0.0]])
+    for facing, distance_m in ((normals, 0.3), (-normals, BEHIND_M + CAMERA_M)):
+        shell = shell_around(points, facing, camera, UP, PATCH_M, None)
+        assert shell.distances(camera, to_wall).min() == pytest.approx(distance_m, abs=0.01)
 
 
 def test_what_rays_meet() -> None:
-    transport, shell = Transport(), Shell(np.eye(3), np.zeros(3), np.full(3, 4.0), 0.0)
+    transport, shell = Transport(), Shell(np.eye(3), np.zeros(3), np.full(3, 4.0), 0.0, np.zeros((2, 3)))
     directions = np.array([[[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0, 0, -1.0]]])
     arrivals = np.array([[[0.2, 0.3, 0.4, 1.0], [0, 0, 0, -1.0], [1, SATURATED, 0.5, 1.5], [0, 0, 0, 0]]])
     met = transport.meet(shell, np.array([[2.0, 2.0, 2.0]]), directions, arrivals, learn=True)
@@ -256,3 +293,70 @@ def test_what_rays_meet() -> None:
     np.testing.assert_allclose(transport.at_least[bright], [1, SATURATED, 0.5])
     assert free == shell.exits(np.array([2.0, 2.0, 2.0]), np.array([0.0, 0, -1.0]))
     assert transport.columns == CELLS + 2
+
+
+# ---- light from far away ---------------------------------------------------------------------------------------
+
+OPEN = [(0.6, 0.5, 0.6), (0.9, 0.1, 0.4), (0.3, 0.3, 0.9)]
+"""Directions of light that comes in at the sides that are not scanned."""
+
+
+def sky(towards: Floats) -> Callable[[Floats], Floats]:
+    """A dim even sky and a soft sun, 25 degrees wide."""
+    to = towards / np.linalg.norm(towards)
+
+    def radiance(directions: Floats) -> Floats:
+        apart = np.arccos(np.clip(directions @ to, -1, 1))
+        level = 0.3 + 3 * np.exp(-0.5 * (apart / np.radians(25)) ** 2)
+        return np.asarray(level[..., None] * np.ones(3))
+
+    return radiance
+
+
+@pytest.mark.parametrize("towards", OPEN)
+@pytest.mark.parametrize("with_indirect", [True, False])
+def test_light_from_far_away_is_found(towards: tuple[float, float, float], with_indirect: bool) -> None:
+    """Through the open sides of a corner, whose scanned sides are told to be wall."""
+    known = KNOWN if with_indirect else np.zeros(3)
+    room, truth = make_room(None, sky(np.array(towards)), known=known), sky(np.array(towards))(DIRECTIONS)
+    unknowns, evidence, distant = Unknowns(), room.evidence, room.distant(with_indirect=with_indirect)
+    for _ in range(25):
+        step(unknowns, evidence, distant)
+    light = distant_light(unknowns, 4)
+    assert angle_deg(light.sh @ LUMINANCE, BASIS @ truth @ LUMINANCE) < 16  # seen: 4 to 14
+    assert light.sh[0].mean() == pytest.approx((BASIS @ truth)[0].mean(), rel=0.4)
+    assert light.spread_deg is not None
+    assert light.valid == (light.spread_deg <= 25)
+    assert light.std is not None
+    assert np.isfinite(light.condition)
+
+
+def test_before_a_solve_there_is_no_distant_light() -> None:
+    light = distant_light(Unknowns(), 3)
+    assert not light.sh.any()
+    assert light.std is None
+    assert not light.valid
+
+
+def test_a_closed_box_says_nothing_of_what_is_beyond() -> None:
+    room = make_room(LAMP, AMBIENT)
+    unknowns, evidence = Unknowns(), room.evidence
+    closed = distant_sources(room.transport, np.ones(SIDES), room.patches.used, with_indirect=True)
+    for _ in range(25):
+        step(unknowns, evidence, closed)
+    light = distant_light(unknowns, 4)
+    assert not light.valid
+    assert light.spread_deg is not None
+    assert light.spread_deg > 60
+
+
+def test_one_albedo_is_one_albedo() -> None:
+    """Where it is known, the light of a white corner is known to its level."""
+    room = make_room(None, sky(np.array(OPEN[0])), dict.fromkeys(range(3), (weights.MEAN_ALBEDO,) * 3))
+    truth = sky(np.array(OPEN[0]))(DIRECTIONS)
+    unknowns, evidence, distant = Unknowns(), room.evidence, room.distant()
+    for _ in range(25):
+        step(unknowns, evidence, distant, Switches(albedos=False))
+    assert np.abs(unknowns.materials - LOGIT).max() < 0.1
+    light = distant_light(unknowns, 4)
+    assert angle_deg(light.sh @ LUMINANCE, BASIS @ truth @ LUMINANCE) < 6

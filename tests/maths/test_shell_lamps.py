@@ -11,7 +11,7 @@ from server.maths.dominant import MOST_LIGHTS
 from server.maths.sh import spherical_fibonacci
 from tests.scenes.analytic import Floats
 
-ROOM = Shell(np.eye(3), np.zeros(3), np.array([4.0, 3.6, 2.4]), 0.0)
+ROOM = Shell(np.eye(3), np.zeros(3), np.array([4.0, 3.6, 2.4]), 0.0, np.zeros((2, 3)))
 PLACE = np.array([1.7, 1.9, 0.6])
 DIRECTIONS = spherical_fibonacci(4096)
 AMBIENT = np.array([0.3, 0.3, 0.25])

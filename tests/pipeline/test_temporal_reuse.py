@@ -10,7 +10,6 @@ import pytest
 
 from protocol.frames import CameraModel, RgbdFrame
 from server.culling.reason import ALLOWANCE, CullReason
-from server.light.continuation import NO_PLANES
 from server.opencl.engine import Engine
 from server.reuse.temporal_reuse import (
     ECHO_FRAMES,
@@ -47,8 +46,8 @@ def fed(reuse: TemporalReuse, frames: int, step: float = 0.0, **learnt: Any) -> 
     """What is found after so many frames that are alike, whose light grows by the share `step` each."""
     for index in range(frames):
         decision = reuse.decide(replace(FRAME, index=index), SCENE)
-        sh, planes = LIGHT * (1 + index * step), learnt.get("planes", NO_PLANES)
-        reuse.observe(decision, sh, planes, learnt.get("picture") if decision.is_checkpoint else None)
+        sh = LIGHT * (1 + index * step)
+        reuse.observe(decision, sh, learnt.get("picture") if decision.is_checkpoint else None)
     return reuse._reason
 
 
@@ -56,7 +55,7 @@ def fed_noise(reuse: TemporalReuse, frames: int, pictures: Any = lambda _index: 
     """The same of frames that differ by noise."""
     for index in range(frames):
         decision = reuse.decide(noisy(index), SCENE)
-        reuse.observe(decision, LIGHT, NO_PLANES, pictures(index) if decision.is_checkpoint else None)
+        reuse.observe(decision, LIGHT, pictures(index) if decision.is_checkpoint else None)
     return reuse._reason
 
 
@@ -118,13 +117,6 @@ def test_a_light_that_still_moves_is_followed(engine: Engine) -> None:
     assert found.error_bound - ROUNDING == pytest.approx(2e-5 * 255 * 1.055 / 2.4, rel=0.02)
 
 
-def test_planes_that_come_are_news(engine: Engine) -> None:
-    reuse = TemporalReuse(engine, CAMERA)
-    fed(reuse, ROUND - 1)
-    reuse.observe(reuse.decide(FRAME, SCENE), LIGHT, PLANES, None)
-    assert reuse.decide(FRAME, SCENE).reason is None
-
-
 def test_it_rests_under_noise(engine: Engine) -> None:
     assert fed_noise(TemporalReuse(engine, CAMERA), NOISY - 1) is None
     assert fed_noise(TemporalReuse(engine, CAMERA), NOISY) == CullReason(NOISE, ALLOWANCE)
@@ -161,5 +153,5 @@ def test_what_a_light_has_missed_is_said_afterwards(engine: Engine) -> None:
     assert moving.decide(bright, SCENE).echo is not None
     for index in range(ECHO_FRAMES):
         moved = replace(bright, index=index, exposure=3.0 + index)
-        moving.observe(moving.decide(moved, SCENE), LIGHT, NO_PLANES, None)
+        moving.observe(moving.decide(moved, SCENE), LIGHT, None)
     assert moving.decide(bright, SCENE).echo is None

@@ -56,29 +56,17 @@ def shadow_real(
 
 
 def shading_without(
-    normal: Floats,
-    directions: Floats,
-    arriving: Floats,
-    free: NDArray[np.bool_],
-    beyond: NDArray[np.bool_],
-    transfer: Floats,
-    light: Floats,
-    openness: float,
-    hit: Floats,
-    unseen: Floats,
-    surface_gain: float,
+    count: int, transfer: Floats, light: Floats, openness: float, hit: Floats, unseen: Floats, surface_gain: float
 ) -> Floats:
     """[3] R of one sample: what reaches it, over pi, without virtual objects.
 
-    normal [3]; directions [count, 4], arriving [count, 3] the light's radiance along them; free [count]: which the
-    volume leaves free; beyond [count]: which meet a plane that goes on there; transfer [n], light [n, 3]; hit [4]: of
-    indirect.cl; unseen [3]: what surface that no picture shows sends.
+    count: of its directions; transfer [n], light [n, 3]; hit [4]: of indirect.cl; unseen [3]: what surface that no
+    picture shows sends.
     """
-    swapped = (_shares(normal, directions) * (free & beyond)) @ (unseen - arriving)
     hidden = min(max(1 - openness, 0.0), 1.0)
-    known = min(hit[3] / max(len(directions) / 4 * hidden, 1e-6), 1.0)
+    known = min(hit[3] / max(count / 4 * hidden, 1e-6), 1.0)
     sent = known * surface_gain * hit[:3] / max(hit[3], 1e-6) + (1 - known) * unseen
-    return np.asarray(transfer @ light + swapped + hidden * sent)
+    return np.asarray(transfer @ light + hidden * sent)
 
 
 def shadow_virtual(

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from server.light.shell import objective as constants
+from server.light.shell import weights as constants
+from server.light.shell.objective import LOGIT
 from server.light.shell.shell import neighbours
 
 Floats = NDArray[np.float64]
@@ -42,6 +43,6 @@ def level_objective(
     for first, second in neighbours():
         ratio = (z[first] - z[second]) / constants.EDGE
         total += constants.SMOOTHNESS * constants.EDGE**2 * (np.sqrt(1 + ratio**2) - 1)
-    total += (((materials - constants.LOGIT) / constants.ALBEDO_SPREAD) ** 2).sum() / 2
+    total += (((materials - LOGIT) / constants.ALBEDO_SPREAD) ** 2).sum() / 2
     total += ((offsets / constants.SURFACE_SPREAD) ** 2).sum() / 2
     return float(total)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from server.light.shell.evidence import Evidence, evidence_of
 from server.light.shell.objective import Unknowns, step
-from server.light.shell.patches import Patches, Seen, hemisphere_rays
-from server.light.shell.shell import Shell, shell_around
+from server.light.shell.patches import PATCH_M, Patches, Seen, hemisphere_rays
+from server.light.shell.shell import Shell, closed_sides, shell_around
+from server.light.shell.sources import Sources, distant_sources, near_sources
+from server.light.shell.switches import Switches
 from server.light.shell.transport import Transport
 from tests.scenes.analytic import Floats
 
@@ -41,14 +45,36 @@ class ShellRoom:
     shell: Shell
     unknowns: Unknowns
 
+    @property
+    def evidence(self) -> Evidence:
+        """What its patches show."""
+        return evidence_of(self.patches, self.patches.used, Switches())
+
+    @property
+    def near(self) -> Sources:
+        """The shell's cells."""
+        return near_sources(self.transport, self.shell, self.patches.used)
+
+    def distant(self, *, with_indirect: bool = True) -> Sources:
+        """Lobes, and the cells of sides that were scanned."""
+        rows = self.patches.used
+        closed = closed_sides(self.patches.positions[rows], self.patches.normals[rows], self.shell.axes, PATCH_M)
+        return distant_sources(self.transport, closed, rows, with_indirect=with_indirect)
+
     def solve(self, steps: int) -> None:
-        """Take Gauss-Newton steps."""
+        """Take steps towards the light of the shell."""
+        evidence, near = self.evidence, self.near
         for _ in range(steps):
-            step(self.unknowns, self.patches, self.transport, self.shell)
+            step(self.unknowns, evidence, near)
 
 
-def sent(points: Floats, directions: Floats, lamp: Lamp | None, ambient: Floats) -> tuple[Floats, Floats]:
-    """Radiance [n, m, 3] that arrives at `points` [n, 3] along `directions` [n, m, 3], and the arrivals [n, m, 4]."""
+def sent(
+    points: Floats, directions: Floats, lamp: Lamp | None, ambient: Floats, known: Floats = KNOWN
+) -> tuple[Floats, Floats]:
+    """Radiance [n, m, 3] that arrives at `points` [n, 3] along `directions` [n, m, 3], and the arrivals [n, m, 4].
+
+    ambient: [3], or [n, m, 3] from beyond the open sides. known: [3] that the scanned ones send.
+    """
     with np.errstate(divide="ignore"):
         far = np.where(directions > 0, SIZE_M - points[:, None], -points[:, None]) / directions
     far = np.where(np.isfinite(far) & (far > 1e-9), far, np.inf)
@@ -56,20 +82,26 @@ def sent(points: Floats, directions: Floats, lamp: Lamp | None, ambient: Floats)
     along = np.take_along_axis(directions, axis[..., None], -1)[..., 0]
     is_scanned = along < 0  # the faces x = 0, y = 0 and z = 0
     ends = points[:, None] + distance[..., None] * directions
-    radiance = np.where(is_scanned[..., None], KNOWN, ambient)
+    radiance = np.where(is_scanned[..., None], known, ambient)
     if lamp is not None:
         on_ceiling = (axis == 2) & (along > 0)
         inside = np.all(np.abs(ends[..., :2] - lamp.center) < lamp.side_m / 2, axis=-1)
         radiance = np.where((on_ceiling & inside)[..., None], lamp.radiance, radiance)
     arrivals = np.zeros((*distance.shape, 4))
-    arrivals[is_scanned, :3], arrivals[is_scanned, 3] = KNOWN, distance[is_scanned]
+    arrivals[is_scanned, :3], arrivals[is_scanned, 3] = known, distance[is_scanned]
     return radiance, arrivals
 
 
 def make_room(
-    lamp: Lamp | None, ambient: tuple[float, float, float], albedos: dict[int, tuple[float, float, float]] = ALBEDOS
+    lamp: Lamp | None,
+    ambient: tuple[float, float, float] | Callable[[Floats], Floats],
+    albedos: dict[int, tuple[float, float, float]] = ALBEDOS,
+    known: Floats = KNOWN,
 ) -> ShellRoom:
-    """The room as exact pictures show it."""
+    """The room as exact pictures show it.
+
+    ambient: radiance from all that is not scanned, or a function of directions [..., 3]. known: of what is.
+    """
     points, normals, colors = [], [], []
     for axis, color in albedos.items():
         first, second = (a for a in range(3) if a != axis)
@@ -83,14 +115,15 @@ def make_room(
     patches = Patches()
     rows: NDArray[np.int64] = np.arange(len(at))
     directions = hemisphere_rays(facing, rows).astype(np.float64)
-    radiance, arrivals = sent(at, directions, lamp, np.array(ambient))
+    from_beyond = ambient(directions) if callable(ambient) else np.array(ambient)
+    radiance, arrivals = sent(at, directions, lamp, from_beyond, known)
     shown = np.log(albedo * radiance.mean(axis=1))
     patches.add(Seen(at + 1e-4, facing, shown, np.zeros(len(at)), np.zeros(len(at))))
     # `add` sorts the patches: bring the rays into its order.
     order = np.array([np.abs(at + 1e-4 - position).sum(1).argmin() for position in patches.positions[rows]])
     patches.directions[rows], patches.arrivals[rows] = directions[order], arrivals[order]
     patches.traced_in[rows] = 1
-    shell = shell_around(at, facing, np.stack([CAMERA, SIZE_M - 1.0]), UP, None)
+    shell = shell_around(at, facing, np.stack([CAMERA, SIZE_M - 1.0]), UP, PATCH_M, None)
     transport = Transport()
     transport.update(patches, rows, shell)
     return ShellRoom(patches, transport, shell, Unknowns())

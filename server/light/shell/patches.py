@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.light.arrivals import trace_arrivals
+from server.light.shell.known_room import KnownPatches
 from server.maths.sh import GOLDEN_TURN
 from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
@@ -29,7 +30,7 @@ MOST_PATCHES = 1536
 """The patch that was not seen for longest makes way for another. 8 rooms' worth of what one picture shows."""
 RAYS = 128
 """Rays of a patch, evenly spread over its cosine-weighted hemisphere: a lamp of 1 % of it is met by one of them."""
-TRACED_A_FRAME = 96
+TRACED_A_FRAME = 64
 """Patches whose rays are traced in a frame once all are: the scan behind them goes on growing."""
 MOST_WEIGHT = 30.0
 """Frames that a patch's mean remembers."""
@@ -170,6 +171,23 @@ class Patches:
         self.arrivals[rows] = trace_arrivals(engine, volume, origins, None, directions)
         self.traced_in[rows] = self._frame
         return rows
+
+    def known(self) -> KnownPatches:
+        """All but their rays."""
+        keys = np.array(list(self._rows), np.int64).reshape(-1, 6)
+        rows = np.array(list(self._rows.values()), np.int64)
+        arrays = (self.positions, self.normals, self.logarithms, self.variances, self.clipped, self.weights)
+        return KnownPatches(keys, *(array[rows] for array in arrays))
+
+    def resume(self, known: KnownPatches) -> None:
+        """Begin with these; their rays are traced with the next."""
+        rows = self._rows_of(known.keys)
+        self.positions[rows], self.normals[rows], self.logarithms[rows] = (
+            known.positions,
+            known.normals,
+            known.logarithms,
+        )
+        self.variances[rows], self.clipped[rows], self.weights[rows] = known.variances, known.clipped, known.weights
 
     def _rows_of(self, keys: Ints) -> Ints:
         """Rows of patches by key, new ones included."""

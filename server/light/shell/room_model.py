@@ -9,11 +9,18 @@ from numpy.typing import NDArray
 
 from server.frame_context import FrameContext
 from server.light.arrivals import trace_arrivals
+from server.light.light_estimation import LightEstimate
 from server.light.place_light import VALID_SPREAD_DEG, PlaceLight
+from server.light.shell.distant import distant_light
+from server.light.shell.evidence import evidence_of
+from server.light.shell.known_room import KnownRoom
 from server.light.shell.lamps import ShellLamp, find_lamps
-from server.light.shell.objective import Unknowns, radiances, step
-from server.light.shell.patches import Patches, Seen, gather_patches
-from server.light.shell.shell import Shell, shell_around
+from server.light.shell.objective import Unknowns, step
+from server.light.shell.patches import PATCH_M, Patches, Seen, gather_patches
+from server.light.shell.shell import Shell, closed_sides, shell_around
+from server.light.shell.sources import distant_sources, near_sources
+from server.light.shell.spread import spread_deg
+from server.light.shell.switches import Switches
 from server.light.shell.transport import KNOWN, NO_CELL, Transport
 from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
 from server.opencl.engine import Engine
@@ -22,18 +29,15 @@ from server.volume.volume import Volume
 BANDS = 4
 DIRECTIONS = 1024
 """Directions in which the light at a place is looked up: 16 coefficients of a lamp of 10 degrees are good to 3 %."""
-FIRST_STEPS, STEPS = 8, 1
-"""Gauss-Newton steps of the first frame, and of every other."""
+MOST_STEPS = 16
+"""Gauss-Newton steps of a frame: one, and others while the last one changed what patches receive by more than MOVED."""
+MOVED, FIRST_MOVED = 0.05, 0.01
+"""Of a logarithm; the second in a first frame, whose solution the others follow."""
 LEAST_PATCHES = 12
 """Patches below which nothing is said."""
-SPREAD_DOUBT, LEAST_SPREAD_DEG = 2.5, 4.0
-"""The angle over what the curvature tells of it, and what a cell's size leaves unknown: so that 90 % of directions are
-within the spread in the rooms r1 and r3, checked in r2 and r4 (docs/light.md)."""
 STEADY, CHANGED = 0.25, 0.5
 """Changes of log radiance at the upper quartile of the patches of a picture: up to the first (more than the texture
 within patches makes, .19 in the real kitchen) nothing is forgotten, from the second everything is."""
-_QUANTILE_90 = 2.146  # radius that holds 90 % of a two-dimensional normal distribution
-_LINEAR = [3, 1, 2]  # x, y, z
 
 Floats = NDArray[np.float64]
 
@@ -53,10 +57,11 @@ def _basis(bands: int = BANDS) -> Floats:
 class RoomModel:
     """Radiance of all that is not scanned surface, with the evidence for it. World axes and metres."""
 
-    def __init__(self) -> None:
+    def __init__(self, switches: Switches | None = None) -> None:
+        self._switches = switches or Switches()
         self._patches = Patches()
         self._transport = Transport()
-        self._unknowns = Unknowns()
+        self._unknowns, self._distant = Unknowns(), Unknowns()
         self._shell: Shell | None = None
 
     @property
@@ -64,30 +69,48 @@ class RoomModel:
         """Whether anything has been solved."""
         return self._unknowns.known > 0
 
-    @property
-    def condition(self) -> float:
-        """Condition number of the last solve."""
-        return self._unknowns.condition
-
     def update(self, context: FrameContext, up: Floats) -> None:
         """Fold in one frame and take a step. up: [3] unit, world."""
-        engine, volume = context.engine, context.volume
+        engine, volume, switches = context.engine, context.volume, self._switches
         seen = gather_patches(engine, context.camera, context.surface, context.scene_radiance, volume)
         if seen.count:
-            self._patches.forget(self._change(seen))
+            self._patches.forget(self._change(seen) if switches.memory else 1.0)
             self._patches.add(seen)
         traced = self._patches.trace(engine, volume)
-        rows = self._patches.used
-        if len(rows) < LEAST_PATCHES:
-            return
         camera = context.volume_from_camera[:3, 3] + volume.origin_world
         with engine.profile.host():
-            self._shell = shell_around(
-                self._patches.positions[rows], self._patches.normals[rows], camera[None], up, self._shell
-            )
-            self._transport.update(self._patches, traced, self._shell)
-            for _ in range(STEPS if self.is_known else FIRST_STEPS):
-                step(self._unknowns, self._patches, self._transport, self._shell)
+            self._solve(traced, camera, up)
+
+    def _solve(self, traced: NDArray[np.int64], camera: Floats, up: Floats) -> None:
+        patches, transport, switches, rows = self._patches, self._transport, self._switches, self._patches.used
+        if len(rows) < LEAST_PATCHES:
+            return
+        positions, normals = patches.positions[rows], patches.normals[rows]
+        self._shell = shell_around(positions, normals, camera[None], up, PATCH_M, self._shell)
+        transport.update(patches, traced, self._shell)
+        closed = closed_sides(positions, normals, self._shell.axes, PATCH_M)
+        evidence = evidence_of(patches, rows, switches)
+        near = near_sources(transport, self._shell, rows)
+        distant = distant_sources(transport, closed, rows, with_indirect=switches.indirect)
+        is_followed = self.is_known and switches.memory
+        for unknowns, sources in ((self._unknowns, near), (self._distant, distant)):
+            for _ in range(MOST_STEPS):
+                step(unknowns, evidence, sources, switches)
+                if unknowns.step < (MOVED if is_followed else FIRST_MOVED):
+                    break
+
+    def estimate(self, bands: int) -> LightEstimate:
+        """The light from beyond the scan."""
+        return distant_light(self._distant, bands)
+
+    def known(self) -> KnownRoom:
+        """What it is solved from."""
+        return KnownRoom(self._patches.known(), self._shell)
+
+    def resume(self, known: KnownRoom) -> None:
+        """Go on from there, with the next frame."""
+        self._patches.resume(known.patches)
+        self._shell = known.shell
 
     @property
     def patches(self) -> int:
@@ -123,7 +146,7 @@ class RoomModel:
         start = np.broadcast_to(position, directions.shape)
         cells = self._shell.exits(start, directions)
         ends = position + self._shell.distances(start, directions).min(axis=-1)[:, None] * directions
-        radiance = radiances(self._unknowns, self._transport, self._unknowns.known)[cells]
+        radiance = self._unknowns.radiance[cells]
         lamps, rest = find_lamps(position, ends, radiance)
         return _basis(bands) @ radiance, _basis(bands) @ rest, lamps
 
@@ -135,7 +158,7 @@ class RoomModel:
         arrivals = trace_arrivals(engine, volume, positions - volume.origin_world, None, directions)
         turned = np.broadcast_to(directions[0], (len(positions), *directions[0].shape))
         met = self._transport.meet(self._shell, positions, turned, arrivals.astype(np.float64))
-        sent = radiances(self._unknowns, self._transport, self._unknowns.known)
+        sent = self._unknowns.radiance
         columns = np.where(met.columns < self._unknowns.known, met.columns, NO_CELL)
         radiance = np.where((columns >= 0)[..., None], sent[np.maximum(columns, 0)], met.known)
         mean = np.exp(self._unknowns.mean)
@@ -149,27 +172,15 @@ class RoomModel:
         gradient = np.zeros((BANDS * BANDS, self._unknowns.known))
         luminance = radiance @ LUMINANCE
         np.add.at(gradient.T, columns[is_unknown], (_basis() * luminance).T[is_unknown])
-        covariance = gradient @ self._unknowns.covariance @ gradient.T
+        covariance, _ = self._unknowns.covariance_of(gradient)
         std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         tint = radiance.mean(axis=0) / max(float(luminance.mean()), 1e-12)
-        spread_deg = _spread_deg(sh @ LUMINANCE, covariance)
+        angle = spread_deg(sh @ LUMINANCE, covariance)
         return PlaceLight(
             position=position,
             sh=sh,
             std=np.outer(std, tint),
-            spread_deg=spread_deg,
-            valid=spread_deg <= VALID_SPREAD_DEG,
+            spread_deg=angle,
+            valid=angle <= VALID_SPREAD_DEG,
             seen=float((columns == KNOWN).mean()),
         )
-
-
-def _spread_deg(sh: Floats, covariance: Floats) -> float:
-    """Angle that 90 % of dominant directions are within, for luminance [16] and its covariance."""
-    vector, spread = sh[_LINEAR], covariance[np.ix_(_LINEAR, _LINEAR)]
-    length = float(np.linalg.norm(vector))
-    if length < 1e-12:
-        return 180.0
-    across = np.linalg.svd(np.eye(3) - np.outer(vector, vector) / length**2)[0][:, :2]
-    deviation = np.sqrt(max(float(np.trace(across.T @ spread @ across)) / 2, 0.0))
-    angle = np.degrees(np.arctan2(SPREAD_DOUBT * _QUANTILE_90 * deviation, length))
-    return float(np.hypot(angle, LEAST_SPREAD_DEG))

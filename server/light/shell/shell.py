@@ -14,14 +14,24 @@ from numpy.typing import NDArray
 
 SIDE = 6
 """Cells along an edge of a face. From 4 to 10, rooms' medians change by a few degrees (docs/light.md)."""
-CELLS = 6 * SIDE * SIDE
+SIDES = 6
+"""In the order -x, +x, -y, +y, -z, +z of the shell's axes."""
+CELLS = SIDES * SIDE * SIDE
 LEAST_HEIGHT_M = 2.4
 """A ceiling is at least this high above the floor."""
 BEHIND_M = 1.0
-"""A wall is at least this far from a camera."""
+"""A wall that is not scanned is at least this far from a camera."""
+CAMERA_M = 0.05
+"""A wall that is scanned is at least this far from a camera."""
+WALL_M = 0.3
+"""Depth in which the surface of one wall lies: what hangs on it and bends in the scan included."""
+CLOSED_M2 = 0.15
+"""Area of scanned wall from which a side is closed: more than furniture or stray depth shows of one side's normal."""
 LAMPS_ABOVE_M = 1.0
 """Height over the floor above which windows and lamps are expected."""
-_GROWTH_M = 0.1  # the box grows only where the scan leaves it by more, so that noise does not move it
+_NOISE_M = 0.1  # the box moves only where a side does by more
+_INWARD = 0.9  # least cosine to a side's normal
+_MOST_TILT_DEG = 60.0  # of floors and tables to the given up direction: beyond are walls
 _UP_WEIGHT = 5.0  # patches that the given up direction counts as
 _OUTLIERS = 0.002  # share of positions along an axis that may lie outside, on either side: stray depth
 
@@ -39,6 +49,8 @@ class Shell:
     high: Floats
     floor_m: float
     """Height of the lowest surface that was scanned, along `axes[2]`."""
+    cameras: Floats
+    """[2, 3] the lowest and highest place of a camera along `axes`."""
 
     def distances(self, points: Floats, directions: Floats) -> Floats:
         """[..., 3] metres along rays from `points` [..., 3] inside of it to the faces across each axis."""
@@ -85,12 +97,12 @@ def upright(normals: Floats, up: Floats) -> Floats:
 
     A mean shift on the sphere, from a wide window to a narrow one; `up` itself counts in the widest.
     """
-    found = up
+    found, normals = up, normals[normals @ up > np.cos(np.radians(_MOST_TILT_DEG))]
     for width_deg in (30.0, 15.0, 8.0):
         sharpness = 1 / np.radians(width_deg) ** 2
         for _ in range(4):
             weights = np.exp(sharpness * (normals @ found - 1))
-            mean = weights @ normals + _UP_WEIGHT * up * (width_deg > 20)
+            mean = weights @ normals + _UP_WEIGHT * up * (width_deg > 20 or weights.sum() < 1)
             found = mean / np.linalg.norm(mean)
     return np.asarray(found)
 
@@ -111,24 +123,49 @@ def wall_axes(normals: Floats, up: Floats) -> Floats:
     return np.stack([along, np.cross(up, along), up])
 
 
-def shell_around(positions: Floats, normals: Floats, cameras: Floats, up: Floats, before: Shell | None) -> Shell:
-    """The shell around `positions` [n, 3] of surface and `cameras` [m, 3], world metres. It never shrinks.
+def closed_sides(positions: Floats, normals: Floats, axes: Floats, patch_m: float) -> Floats:
+    """[SIDES] how far each side of a room is scanned wall, from 0, open, to 1.
 
-    before: the last one, returned unless the scan has left it.
+    positions, normals: [n, 3] of patches of side `patch_m`, world; a side is closed by those at the end of the scan
+    that face into the room.
+    """
+    surface, facing = positions @ axes.T, normals @ axes.T
+    ends = _ends(surface)
+    closed = np.zeros(SIDES)
+    for side in range(SIDES):
+        axis, is_high = divmod(side, 2)
+        inward = facing[:, axis] * (-1 if is_high else 1) > _INWARD
+        is_wall = inward & (np.abs(surface[:, axis] - ends[is_high, axis]) < WALL_M)
+        closed[side] = min(float(is_wall.sum()) * patch_m**2 / CLOSED_M2, 1.0)
+    return closed
+
+
+def shell_around(
+    positions: Floats, normals: Floats, cameras: Floats, up: Floats, patch_m: float, before: Shell | None
+) -> Shell:
+    """The shell around `positions` [n, 3] of surface and `cameras` [m, 3], world metres.
+
+    before: the last one, returned unless the shell has changed by more than noise makes. patch_m: see closed_sides.
     """
     axes = wall_axes(normals, upright(normals, up)) if before is None else before.axes
-    surface, seen_from = positions @ axes.T, cameras @ axes.T
-    low, high = np.quantile(surface, _OUTLIERS, axis=0), np.quantile(surface, 1 - _OUTLIERS, axis=0)
+    low, high = _ends(positions @ axes.T)
     floor_m = float(low[2])
-    reach = np.array([BEHIND_M, BEHIND_M, 0.0])
-    low, high = np.minimum(low, (seen_from - reach).min(0)), np.maximum(high, (seen_from + reach).max(0))
-    high[2] = max(high[2], floor_m + LEAST_HEIGHT_M)
+    seen_from = cameras @ axes.T
     if before is not None:
-        floor_m = min(floor_m, before.floor_m)
-        if np.all(low > before.low - _GROWTH_M) and np.all(high < before.high + _GROWTH_M):
-            return before
-        low, high = np.minimum(low, before.low), np.maximum(high, before.high)
-    return Shell(axes, low, high, floor_m)
+        seen_from = np.concatenate([seen_from, before.cameras])
+    open_share = 1.0 - closed_sides(positions, normals, axes, patch_m).reshape(3, 2).T
+    reach = CAMERA_M + np.array([BEHIND_M, BEHIND_M, 0.0]) * open_share
+    seen = np.stack([seen_from.min(0), seen_from.max(0)])
+    low, high = np.minimum(low, seen[0] - reach[0]), np.maximum(high, seen[1] + reach[1])
+    high[2] = max(high[2], floor_m + LEAST_HEIGHT_M)
+    if before is not None and max(np.abs(low - before.low).max(), np.abs(high - before.high).max()) < _NOISE_M:
+        return before
+    return Shell(axes, low, high, floor_m, seen)
+
+
+def _ends(surface: Floats) -> Floats:
+    """[2, 3] where surface [n, 3] begins and ends along the axes, without stray depth."""
+    return np.quantile(surface, (_OUTLIERS, 1 - _OUTLIERS), axis=0)
 
 
 def neighbours() -> NDArray[np.int64]:

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.light.shell.patches import MOST_PATCHES, RAYS, Patches
-from server.light.shell.shell import CELLS, Shell
+from server.light.shell.shell import CELLS, SIDE, SIDES, Shell
+from server.maths.lobes import LOBES, lobes_along
 
 HIDDEN_M = 0.6
 """Side of the cells of saturated and of hidden surface: a lamp, a window pane, a piece of furniture."""
@@ -48,6 +49,9 @@ class Transport:
     def __init__(self) -> None:
         self.shares: NDArray[np.float32] = np.zeros((MOST_PATCHES, COLUMNS), np.float32)
         """[patches, COLUMNS] share of a patch's cosine-weighted rays that end in each cell."""
+        self.beyond: NDArray[np.float32] = np.zeros((MOST_PATCHES, SIDES, LOBES), np.float32)
+        """[patches, SIDES, LOBES] what white surface would show of distant lobes, by the side of the shell they come
+        in at."""
         self.known: Floats = np.zeros((MOST_PATCHES, 3))
         """[patches, 3] radiance that known surface brings."""
         self.is_saturated = np.zeros(COLUMNS, bool)
@@ -76,6 +80,7 @@ class Transport:
         is_unknown = met.columns >= 0
         row = np.broadcast_to(rows[:, None], is_unknown.shape)[is_unknown]
         np.add.at(self.shares, (row, met.columns[is_unknown]), np.float32(1 / RAYS))
+        self.beyond[rows] = _beyond(directions, np.where(patches.arrivals[rows, :, 3] == 0, met.columns, KNOWN))
         self.known[rows] = met.known.mean(axis=1)
 
     def meet(self, shell: Shell, origins: Floats, directions: Floats, arrivals: Floats, *, learn: bool = False) -> Met:
@@ -123,3 +128,15 @@ class Transport:
         share = np.where(total > 0, counts / np.maximum(total, 1.0), 0.0)[:, None]
         self.at_least += share * (sums / np.maximum(counts, 1.0)[:, None] - self.at_least)
         self._counts = np.minimum(total, _MOST_COUNTED)
+
+
+def _beyond(directions: Floats, columns: Ints) -> NDArray[np.float32]:
+    """[n, SIDES, LOBES] of rays `directions` [n, m, 3] that end in the shell's cells `columns` [n, m], or KNOWN."""
+    row, ray = np.nonzero(columns >= 0)
+    group = row * SIDES + columns[row, ray] // (SIDE * SIDE)
+    order = np.argsort(group, kind="stable")
+    result = np.zeros((len(columns) * SIDES, LOBES), np.float32)
+    if len(order):
+        groups, starts = np.unique(group[order], return_index=True)
+        result[groups] = np.add.reduceat(lobes_along(directions[row, ray][order]), starts, axis=0) / columns.shape[1]
+    return result.reshape(len(columns), SIDES, LOBES)

@@ -16,10 +16,10 @@ from server.maths.near_light import Found
 from server.scene.placement import Placement
 from server.tracking.relocalize import Keyframe
 
-VERSION = 2
+VERSION = 3
 """Format version. Increase it when any of these types, or a type that they contain, changes."""
-READABLE = (1, VERSION)
-"""Versions that can be read: what came since the first has a default."""
+READABLE = (1, 2, VERSION)
+"""Versions that can be read: what came since has a default, and what went is skipped."""
 _MOST_BYTES = 1 << 30
 
 FileName = Annotated[str, Meta(pattern="^[a-z0-9-]+$")]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from tests.hard_cases.cases.camera import INPUT, TRACKING
 from tests.hard_cases.cases.groups import GROUPS
 from tests.hard_cases.cases.harmonics import HARMONICS
-from tests.hard_cases.cases.light_lobes import LOBES
 from tests.hard_cases.cases.light_sums import LIGHT_SUMS
 from tests.hard_cases.cases.rendering import RASTER, SHADOWS
 from tests.hard_cases.cases.sessions import SESSIONS
@@ -15,7 +14,6 @@ from tests.hard_cases.catalogue import Case, Family
 
 FAMILIES: tuple[Family, ...] = (
     LIGHT_SUMS,
-    LOBES,
     SUMS,
     HARMONICS,
     TRANSFER,

@@ -1,0 +1,97 @@
+"""The rows of the objective: what patches show, and of which region, surface and material they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.light.shell.patches import MOST_WEIGHT, Patches
+from server.light.shell.switches import Switches
+from server.light.shell.weights import MATERIAL_CHROMA, PATCH_NOISE, SURFACE_M
+from server.maths.normals import normal_weights
+
+DARKEST = 0.002
+"""Radiance below which a logarithm says nothing: a code or two of 8-bit sRGB."""
+LOG_CHROMA = np.array([[1 / 3, 1 / 3, 1 / 3], [1.0, -1.0, 0.0], [-0.5, -0.5, 1.0]])
+"""[3, 3] from log RGB: mean, red against green, blue against both."""
+NODES = 64
+"""Of the grid of materials along an axis."""
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What n patches show; the letters are those of objective.py."""
+
+    level: Floats
+    """[n] y."""
+    chroma: Floats
+    """[n, 2] q."""
+    precision: Floats
+    """[n] 1 / S_p^2 of y."""
+    is_clipped: NDArray[np.bool_]
+    regions: Ints
+    """[n] from 0."""
+    surfaces: Ints
+    """[n] number of the surface that a patch is part of."""
+    surface_keys: Ints
+    """[surfaces]."""
+
+    @property
+    def mean(self) -> float:
+        """Mean radiance that is shown; 1 where all is clipped."""
+        usable = self.level[~self.is_clipped]
+        return float(np.exp(usable).mean()) if len(usable) else 1.0
+
+
+def evidence_of(patches: Patches, rows: Ints, switches: Switches) -> Evidence:
+    """What the patches in `rows` [n] show."""
+    surface_keys, surfaces = _surfaces(patches.positions[rows], patches.normals[rows])
+    logs = log_chroma(patches.logarithms[rows])
+    age = patches.weights[rows]
+    noise = PATCH_NOISE**2 + patches.variances[rows] / np.maximum(np.minimum(age, MOST_WEIGHT), 1.0)
+    precision = np.minimum(age, 1.0) / noise
+    return Evidence(
+        level=logs[:, 0],
+        chroma=logs[:, 1:],
+        precision=precision * normal_weights(patches.normals[rows], precision, switches.normals),
+        is_clipped=patches.clipped[rows] > 0.5,
+        regions=np.unique(patches.regions[rows], return_inverse=True)[1].ravel(),
+        surfaces=surfaces,
+        surface_keys=surface_keys,
+    )
+
+
+def log_chroma(logarithms: Floats) -> Floats:
+    """[n, 3] mean logarithm and two coordinates of chroma of log RGB [n, 3]."""
+    return np.asarray(logarithms @ LOG_CHROMA.T)
+
+
+def _surfaces(positions: Floats, normals: Floats) -> tuple[Ints, Ints]:
+    """Keys [k] of planes through the room, and which of them each patch lies on [n]."""
+    facing = np.rint(normals * 1.2).astype(np.int64)
+    unit = facing / np.linalg.norm(facing, axis=1, keepdims=True)
+    place = np.floor((positions * unit).sum(axis=1) / SURFACE_M).astype(np.int64)
+    parts = np.concatenate([facing, place[:, None]], axis=1) + (1 << 9)
+    keys, numbers = np.unique(parts @ (1 << (10 * np.arange(4, dtype=np.int64))), return_inverse=True)
+    return keys, numbers.ravel()
+
+
+def materials_of(chroma: Floats) -> tuple[Ints, Floats]:
+    """Nodes [g] of the grid of materials that are near `chroma` [n, 2] of albedo, and their bilinear weights [n, g]."""
+    place = np.clip(chroma / MATERIAL_CHROMA + NODES / 2, 0.0, NODES - 1.001)
+    low = place.astype(np.int64)
+    share = place - low
+    columns, weights = [], []
+    for right in (0, 1):
+        for above in (0, 1):
+            columns.append((low[:, 0] + right) * NODES + low[:, 1] + above)
+            weights.append(np.abs(1 - right - share[:, 0]) * np.abs(1 - above - share[:, 1]))
+    nodes, inverse = np.unique(np.stack(columns, axis=1), return_inverse=True)
+    result = np.zeros((len(chroma), len(nodes)))
+    np.add.at(result, (np.arange(len(chroma))[:, None], inverse.reshape(-1, 4)), np.stack(weights, axis=1))
+    return nodes, result

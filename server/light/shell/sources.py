@@ -1,0 +1,87 @@
+"""Where light may come from, as columns of the objective: cells of the shell, lobes at infinity, hidden surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.light.light_estimation import LEAST_OPENNESS
+from server.light.shell import weights
+from server.light.shell.shell import CELLS, SIDE, Shell, neighbours
+from server.light.shell.transport import Transport
+from server.maths.lobes import LOBES
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_PAIRS = neighbours()
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Sources of one radiance each, and what is known of them beforehand. [n] patches, [k] sources."""
+
+    shares: Floats
+    """[n, k] of a patch's cosine-weighted hemisphere."""
+    known: Floats
+    """[n, 3] radiance that photographed surface brings."""
+    at_least: Floats
+    """[k, 3] what saturated sources send at least, 0 for others."""
+    is_saturated: NDArray[np.bool_]
+    offset: Floats
+    """[k] prior mean of the log radiance, over that of the mean light."""
+    deviation: Floats
+    """[k] standard deviation of it."""
+    pairs: Ints
+    """[m, 2] neighbours."""
+    least_share: float = 0.0
+    """Patches that receive less than this share of their light from sources and known surface say nothing."""
+
+    @property
+    def count(self) -> int:
+        """Number of sources."""
+        return len(self.offset)
+
+
+def near_sources(transport: Transport, shell: Shell, rows: Ints) -> Sources:
+    """All that is not scanned lies on the shell, for the patches in `rows` [n]."""
+    count = transport.columns
+    deviation = np.full(count, weights.CELL_HIDDEN)
+    deviation[:CELLS] = np.where(shell.is_low, weights.CELL_LOW, weights.CELL_HIGH)
+    return Sources(
+        shares=transport.shares[rows, :count].astype(np.float64),
+        known=transport.known[rows],
+        at_least=transport.at_least[:count],
+        is_saturated=transport.is_saturated[:count],
+        offset=np.zeros(count),
+        deviation=deviation,
+        pairs=_PAIRS,
+    )
+
+
+def distant_sources(transport: Transport, closed: Floats, rows: Ints, *, with_indirect: bool) -> Sources:
+    """What leaves through open sides of the shell goes to infinity; closed sides are wall.
+
+    closed: [6] from 0, open, to 1. The first LOBES sources are the lobes. with_indirect: surfaces send light.
+    """
+    count = transport.columns
+    beyond = np.einsum("nfl,f->nl", transport.beyond[rows], 1.0 - closed)
+    near = transport.shares[rows, :count].astype(np.float64)
+    near[:, :CELLS] *= np.repeat(closed, SIDE * SIDE)
+    known = transport.known[rows]
+    if not with_indirect:
+        near[:, CELLS:], known = 0.0, np.zeros_like(known)
+    deviation = np.full(count, weights.CELL_HIDDEN)
+    deviation[:CELLS] = weights.CELL_LOW
+    return Sources(
+        shares=np.concatenate([beyond, near], axis=1),
+        known=known,
+        at_least=np.concatenate([np.zeros((LOBES, 3)), transport.at_least[:count]]),
+        is_saturated=np.concatenate([np.zeros(LOBES, bool), transport.is_saturated[:count]]),
+        offset=np.concatenate([np.full(LOBES, weights.LOBE), np.zeros(count)]),
+        deviation=np.concatenate([np.full(LOBES, weights.LOBE_SPREAD), deviation]),
+        pairs=_PAIRS + LOBES,
+        least_share=0.0 if with_indirect else LEAST_OPENNESS,
+    )

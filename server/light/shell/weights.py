@@ -1,0 +1,41 @@
+"""The weights of the objective (objective.py), each with its unit and its reason. Logarithms are natural ones."""
+
+from __future__ import annotations
+
+MEAN_ALBEDO = 0.6
+"""Reflectance about which materials lie: walls and ceilings are mostly bright. It sets the light's level."""
+ALBEDO_SPREAD = 0.5
+"""Standard deviation of the logit of a material's albedo: two thirds lie from .4 to .77, none above 1."""
+MATERIAL_CHROMA = 0.8
+"""Spacing of the grid of materials over log chroma: orange wood and white paint are two nodes apart."""
+PATCH_NOISE = 0.1
+"""Standard deviation of a patch's log radiance: transfer by 128 rays, normals, what is not diffuse."""
+REGION_SPREAD = 0.05
+"""Standard deviation of a region's log albedo about its material's: stains and texture. More would take the gradients
+that tell where light comes from for texture."""
+SURFACE_M, SURFACE_SPREAD = 0.3, 0.2
+"""Spacing of the planes that count as one surface (a floor, a wall), and the standard deviation of its logit about its
+material's. More would take a wall that is in shade for a dark one."""
+ONE_ALBEDO = 0.01
+"""In place of the three spreads where albedo is constant."""
+HUBER = 1.5
+"""Deviations of the noise from which a patch counts as an outlier."""
+CELL_LOW, CELL_HIGH, CELL_HIDDEN = 0.7, 2.0, 0.7
+"""Standard deviations of a cell's log radiance about the mean's: of the shell below the height of windows and lamps and
+above it (a lamp is 50 times the mean), and of surface that was not seen."""
+LOBE, LOBE_SPREAD = -1.0, 2.0
+"""Mean and standard deviation of the log radiance of distant lobes, about the mean's: most of a sky is darker than its
+mean, and a sun is 50 times it."""
+LAMP_EXCESS, LAMP_SPREAD = 0.2, 1.0
+"""Of saturated cells: excess over the clipped radiance, relative to it, and the standard deviation of its log."""
+SMOOTHNESS, EDGE = 1.0, 0.5
+"""Weight of the squared difference of neighbouring cells' log radiance, and the difference from which it grows
+linearly: the rims of lamps and windows."""
+CHROMA_NOISE = 0.06
+"""Standard deviation of a patch's log chroma."""
+REGION_CHROMA = 2.0
+"""Standard deviation of a region's chroma of albedo: rooms have orange wood and red walls."""
+CELL_CHROMA, TINT = 0.3, 0.2
+"""Standard deviations of a cell's chroma about the light's, and of the light's about grey: cameras balance white."""
+CHROMA_SMOOTHNESS = 5.0
+"""Weight of the squared difference of neighbouring cells' chroma."""

@@ -124,7 +124,7 @@ def test_the_solution_is_a_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
     parts = near.shares * np.exp(unknowns.z) / arriving[:, None]
     chroma = data.chroma - parts @ unknowns.chroma - (known / arriving)[:, None] * known_logs[:, 1:]
     nodes, shares_of_materials = materials_of(chroma)
-    offsets = np.array([unknowns.surfaces[int(key)] for key in data.surface_keys])
+    offsets = np.array([unknowns.offsets[data.rows][data.surfaces == f][0] for f in range(data.surfaces.max() + 1)])
     z, materials = unknowns.z.copy(), unknowns.materials[nodes]
 
     def value(z: Floats, materials: Floats, offsets: Floats) -> float:

@@ -27,12 +27,12 @@ def level_objective(
 ) -> float:
     """Half the sum that is minimised, for a room without saturated cells, clipped patches and outliers.
 
-    z [k] log radiance of cells; materials [g] and offsets [f] logits of albedo; shares [n, k], known [n], level [n],
-    material_weights [n, g], surfaces [n], regions [n]; prior, deviation [k] of z.
+    z [k] log radiance of cells; materials [g] logits of albedo; offsets [f] of log albedo; shares [n, k], known [n],
+    level [n], material_weights [n, g], surfaces [n], regions [n]; prior, deviation [k] of z.
     """
     total = 0.0
-    logit = material_weights @ materials + offsets[surfaces]
-    residual = level - np.log(shares @ np.exp(z) + known) - np.log(1 / (1 + np.exp(-logit)))
+    logit = material_weights @ materials
+    residual = level - np.log(shares @ np.exp(z) + known) - np.log(1 / (1 + np.exp(-logit))) - offsets[surfaces]
     precision = 1 / constants.PATCH_NOISE**2
     for region in np.unique(regions):
         own = residual[regions == region]
@@ -44,5 +44,6 @@ def level_objective(
         ratio = (z[first] - z[second]) / constants.EDGE
         total += constants.SMOOTHNESS * constants.EDGE**2 * (np.sqrt(1 + ratio**2) - 1)
     total += (((materials - LOGIT) / constants.ALBEDO_SPREAD) ** 2).sum() / 2
-    total += ((offsets / constants.SURFACE_SPREAD) ** 2).sum() / 2
+    ratio = offsets / constants.SURFACE_SPREAD
+    total += np.where(ratio > 0, ratio**2, np.log1p(ratio**2)).sum() / 2
     return float(total)

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.light.shell.patches import MOST_WEIGHT, Patches
+from server.light.shell.segments import segments
 from server.light.shell.switches import Switches
-from server.light.shell.weights import MATERIAL_CHROMA, PATCH_NOISE, SURFACE_M
+from server.light.shell.weights import MATERIAL_CHROMA, PATCH_NOISE
 from server.maths.normals import normal_weights
 
 DARKEST = 0.002
@@ -34,12 +35,12 @@ class Evidence:
     precision: Floats
     """[n] 1 / S_p^2 of y."""
     is_clipped: NDArray[np.bool_]
+    rows: Ints
+    """[n] of the patches."""
     regions: Ints
-    """[n] from 0."""
+    """[n] from 0; region by region of surface 0, then 1 and so on."""
     surfaces: Ints
-    """[n] number of the surface that a patch is part of."""
-    surface_keys: Ints
-    """[surfaces]."""
+    """[n] from 0."""
 
     @property
     def mean(self) -> float:
@@ -50,8 +51,8 @@ class Evidence:
 
 def evidence_of(patches: Patches, rows: Ints, switches: Switches) -> Evidence:
     """What the patches in `rows` [n] show."""
-    surface_keys, surfaces = _surfaces(patches.positions[rows], patches.normals[rows])
     logs = log_chroma(patches.logarithms[rows])
+    surfaces = segments(patches.keys[rows], logs)
     age = patches.weights[rows]
     noise = PATCH_NOISE**2 + patches.variances[rows] / np.maximum(np.minimum(age, MOST_WEIGHT), 1.0)
     precision = np.minimum(age, 1.0) / noise
@@ -60,9 +61,9 @@ def evidence_of(patches: Patches, rows: Ints, switches: Switches) -> Evidence:
         chroma=logs[:, 1:],
         precision=precision * normal_weights(patches.normals[rows], precision, switches.normals),
         is_clipped=patches.clipped[rows] > 0.5,
-        regions=np.unique(patches.regions[rows], return_inverse=True)[1].ravel(),
+        rows=rows,
+        regions=_nested(patches.regions[rows], surfaces),
         surfaces=surfaces,
-        surface_keys=surface_keys,
     )
 
 
@@ -71,14 +72,10 @@ def log_chroma(logarithms: Floats) -> Floats:
     return np.asarray(logarithms @ LOG_CHROMA.T)
 
 
-def _surfaces(positions: Floats, normals: Floats) -> tuple[Ints, Ints]:
-    """Keys [k] of planes through the room, and which of them each patch lies on [n]."""
-    facing = np.rint(normals * 1.2).astype(np.int64)
-    unit = facing / np.linalg.norm(facing, axis=1, keepdims=True)
-    place = np.floor((positions * unit).sum(axis=1) / SURFACE_M).astype(np.int64)
-    parts = np.concatenate([facing, place[:, None]], axis=1) + (1 << 9)
-    keys, numbers = np.unique(parts @ (1 << (10 * np.arange(4, dtype=np.int64))), return_inverse=True)
-    return keys, numbers.ravel()
+def _nested(regions: Ints, surfaces: Ints) -> Ints:
+    """[n] from 0: parts of `regions` on one surface each, in the order of `surfaces`."""
+    numbers = np.unique(regions, return_inverse=True)[1].ravel()
+    return np.asarray(np.unique(surfaces * (numbers.max() + 1) + numbers, return_inverse=True)[1].ravel())
 
 
 def materials_of(chroma: Floats) -> tuple[Ints, Floats]:

@@ -2,32 +2,34 @@
 
 Patch p of surface shows, for the mean logarithm of the channels y and two chroma coordinates q (`LOG_CHROMA`),
 
-    y_p = log(sum_k A_pk x_k + h_p) + log s(B_p m + o_f(p)) + d_r(p) + e_p                     (1)
+    y_p = log(sum_k A_pk x_k + h_p) + log s(B_p m) + o_f(p) + d_r(p) + e_p                     (1)
     q_p = sum_k T_pk u_k + (h_p / E_p) q(h_p) + c_r(p) + e'_p,    T_pk = A_pk x_k / E_p        (2)
 
 with A_pk the share of p's cosine-weighted hemisphere that is source k (sources.py), x_k = exp(z_k) its radiance
 (saturated ones: x_k = b_k (1 + exp(z_k)), b_k what the clipped picture shows), h_p what known surface brings, E_p the
-sum in (1), u_k the chroma of source k. s is the logistic function, so no albedo exceeds 1; B_p m is the logit of the
-albedo of materials, bilinear on a grid over the chroma of albedo, and o_f that of surface f (a floor, a wall) besides;
-d_r and c_r are what region r of surface has besides, eliminated exactly. Minimised is
+sum in (1), u_k the chroma of source k. s is the logistic function, B_p m the logit of the albedo of materials, bilinear
+on a grid over the chroma of albedo. o_f is what surface f (segments.py: a floor, a painted stripe) has besides, d_r and
+c_r what region r of it has; they are eliminated exactly. Minimised is
 
     sum_p huber(e_p / S_p) + sum_k ((z_k - n_k) / s_k)^2 + sum_(k,l) rho(z_k - z_l)
-    + sum_g ((m_g - m) / s_m)^2 + sum_f (o_f / s_o)^2 + sum_r (d_r / s_d)^2
+    + sum_g ((m_g - m) / s_m)^2 + sum_f tau(o_f) + sum_r (d_r / s_d)^2
     + sum_p |e'_p / S'_p|^2 + sum_k |(u_k - t) / s_u|^2 + sum_(k,l) c |u_k - u_l|^2 + |t / s_t|^2 + sum_r |c_r / s_c|^2
 
-over neighbouring sources (k,l). The weights stand in weights.py. A patch that is clipped only counts where (1) is below
-what it shows.
+over neighbouring sources (k,l). tau is quadratic, but log(1 + (o / s_o)^2) below 0, and steep where the albedo exceeds
+1. The weights stand in weights.py. A patch that is clipped only counts where (1) is below what it shows.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from server.light.shell import weights
 from server.light.shell.evidence import DARKEST, LOG_CHROMA, NODES, Evidence, log_chroma, materials_of
+from server.light.shell.patches import MOST_PATCHES
 from server.light.shell.sources import Sources
 from server.light.shell.switches import Switches
 
@@ -58,8 +60,8 @@ class Unknowns:
     """[k, 2]."""
     materials: Floats = field(default_factory=lambda: np.full(NODES * NODES, LOGIT))
     """[nodes] logit of albedo."""
-    surfaces: dict[int, float] = field(default_factory=dict)
-    """Offset of the logit by surface."""
+    offsets: Floats = field(default_factory=lambda: np.zeros(MOST_PATCHES))
+    """[MOST_PATCHES] o of the surface that each patch is part of."""
     mean: float = 0.0
     """Log of the mean radiance of light, about which sources lie."""
     radiance: Floats = field(default_factory=lambda: np.zeros((0, 3)))
@@ -105,42 +107,39 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     parts = sources.shares * (level / arriving[:, None])  # T
     known_part = (known / arriving)[:, None] * known_logs[:, 1:]
     nodes, materials = materials_of(evidence.chroma - parts @ cell_chroma - known_part)
-    offsets = np.array([unknowns.surfaces.get(int(key), 0.0) for key in evidence.surface_keys])
-    albedo = 1 / (1 + np.exp(-(materials @ unknowns.materials[nodes] + offsets[evidence.surfaces])))
+    albedo = 1 / (1 + np.exp(-(materials @ unknowns.materials[nodes])))
     residual = evidence.level - np.log(arriving) - np.log(albedo)
-    counts = evidence.precision * (_huber(residual * np.sqrt(evidence.precision)) if switches.outliers else 1.0)
-    counts[evidence.is_clipped & (residual < 0)] = 0.0
+    offsets = _means(unknowns.offsets[evidence.rows], evidence.surfaces)
+    error = residual - offsets[evidence.surfaces]
+    counts = evidence.precision * (_huber(error * np.sqrt(evidence.precision)) if switches.outliers else 1.0)
+    counts[evidence.is_clipped & (error < 0)] = 0.0
     counts[(known == 0) & (sources.shares.sum(axis=1) <= sources.least_share)] = 0.0
 
-    surfaces = np.eye(len(offsets))[evidence.surfaces]
-    design = np.concatenate([parts, (1 - albedo)[:, None] * np.concatenate([materials, surfaces], axis=1)], axis=1)
-    scale = np.concatenate([slope / level, np.ones(len(nodes) + len(offsets))])
+    design = np.concatenate([parts, (1 - albedo)[:, None] * materials], axis=1)
+    scale = np.concatenate([slope / level, np.ones(len(nodes))])
     gram = _gram(design, counts)
     spreads = _albedo_spreads(switches)
-    regions = _regions(design, counts, evidence.regions)
-    matrix, vector = _without_regions(gram, design, counts, residual[:, None], regions, spreads.region)
+    regions = _regions(design, counts, evidence)
+    whitest = -_means(np.log(albedo), evidence.surfaces)
+    surfaces = _Surfaces.of(offsets, whitest, regions, spreads)
+    residual = residual - surfaces.center[evidence.surfaces]
+    matrix, vector = _without_regions(gram, design, counts, residual[:, None], regions, spreads.region, surfaces)
     matrix, right = matrix * np.outer(scale, scale), vector[:, 0] * scale
     differences = z[sources.pairs[:, 0]] - z[sources.pairs[:, 1]]
     strength = weights.SMOOTHNESS / np.sqrt(1 + (differences / weights.EDGE) ** 2)
     _add_smoothness(matrix, sources.pairs, strength)
     right[:count] -= _smoothness_gradient(sources.pairs, strength * differences, count)
-    diagonal = np.concatenate(
-        [
-            1 / deviation**2,
-            np.full(len(nodes), 1 / spreads.material**2),
-            np.full(len(offsets), 1 / spreads.surface**2),
-        ]
-    )
+    diagonal = np.concatenate([1 / deviation**2, np.full(len(nodes), 1 / spreads.material**2)])
     matrix[np.diag_indices_from(matrix)] += diagonal
-    target = np.concatenate([prior - z, LOGIT - unknowns.materials[nodes], -offsets])
+    target = np.concatenate([prior - z, LOGIT - unknowns.materials[nodes]])
     unknowns.curvature = matrix.astype(np.float32)
     change = np.linalg.solve(unknowns.curvature, (right + diagonal * target).astype(np.float32)).astype(np.float64)
     change *= RELAXATION * min(1.0, MOST_STEP / max(float(np.abs(change).max()), 1e-12))
     unknowns.step = float(np.sqrt(np.mean((parts @ (scale[:count] * change[:count])) ** 2)))
     unknowns.z = z + change[:count]
-    unknowns.materials[nodes] += change[count : count + len(nodes)]
-    offsets = offsets + change[count + len(nodes) :]
-    unknowns.surfaces = {int(key): float(offset) for key, offset in zip(evidence.surface_keys, offsets, strict=True)}
+    unknowns.materials[nodes] += change[count:]
+    offsets = surfaces.offsets(residual - design @ (scale * change), counts)
+    unknowns.offsets[evidence.rows] = offsets[evidence.surfaces]
     seen = np.where(evidence.is_clipped[:, None], parts @ cell_chroma, evidence.chroma - known_part)
     unknowns.chroma = _solve_chroma(parts, gram[:count, :count], counts, seen, regions, spreads.chroma, sources.pairs)
     logs = np.concatenate([np.log(_levels(unknowns.z, sources)[0])[:, None], unknowns.chroma], axis=1)
@@ -177,6 +176,11 @@ def _gram(design: Floats, counts: Floats) -> Floats:
     return (root.T @ root).astype(np.float64)
 
 
+def _means(values: Floats, groups: Ints) -> Floats:
+    """[groups] of values [n]."""
+    return np.asarray(np.bincount(groups, values) / np.bincount(groups))
+
+
 @dataclass(frozen=True)
 class _Regions:
     """Weighted sums over the patches of each region."""
@@ -188,25 +192,81 @@ class _Regions:
     """[regions] of weights."""
     sums: NDArray[np.float32]
     """[regions, c] of the design's columns."""
+    surfaces: Ints
+    """[regions] which surface each is part of."""
+
+    def sums_of(self, values: Floats) -> Floats:
+        """[regions, ...] of values [n, ...]."""
+        return np.add.reduceat(values[self.order], self.starts)
 
 
-def _regions(design: Floats, counts: Floats, regions: Ints) -> _Regions:
-    order = np.argsort(regions, kind="stable")
-    starts = np.searchsorted(regions[order], np.arange(regions.max() + 1))
+def _regions(design: Floats, counts: Floats, evidence: Evidence) -> _Regions:
+    order = np.argsort(evidence.regions, kind="stable")
+    starts = np.searchsorted(evidence.regions[order], np.arange(evidence.regions.max() + 1))
     weighted = (design[order] * counts[order, None]).astype(np.float32)
-    return _Regions(order, starts, np.add.reduceat(counts[order], starts), np.add.reduceat(weighted, starts, axis=0))
+    totals, sums = np.add.reduceat(counts[order], starts), np.add.reduceat(weighted, starts, axis=0)
+    return _Regions(order, starts, totals, sums, evidence.surfaces[order[starts]])
+
+
+@dataclass(frozen=True)
+class _Surfaces:
+    """What is left of regions' sums once the regions' own offsets are eliminated, surface by surface."""
+
+    regions: _Regions
+    keeps: Floats
+    """[regions] share of a sum over a region that its own offset leaves."""
+    center: Floats
+    """[surfaces] prior mean of its offset."""
+    factor: Floats
+    """[surfaces] variance of its offset given all else."""
+
+    @staticmethod
+    def of(offsets: Floats, whitest: Floats, regions: _Regions, spreads: _AlbedoSpreads) -> _Surfaces:
+        """By the last `offsets` [surfaces] and the greatest, `whitest`, with which an albedo is 1.
+
+        The prior grows ever more slowly for dark ones, since paint may be black, and sharply from `whitest` on.
+        """
+        is_white = offsets >= whitest
+        variance = spreads.surface**2 * (1 + np.minimum(offsets / spreads.surface, 0.0) ** 2)
+        variance = np.where(is_white, weights.WHITE**2, variance)
+        keeps = 1 / (1 + spreads.region**2 * regions.totals)
+        totals = np.bincount(regions.surfaces, keeps * regions.totals)
+        return _Surfaces(regions, keeps, np.where(is_white, whitest, 0.0), variance / (1 + variance * totals))
+
+    def sums(self, by_region: NDArray[Any]) -> NDArray[Any]:
+        """[surfaces, ...] of sums over regions [regions, ...]."""
+        kept = by_region * self.keeps.reshape(-1, *[1] * (by_region.ndim - 1)).astype(by_region.dtype)
+        return np.add.reduceat(kept, np.searchsorted(self.regions.surfaces, np.arange(len(self.factor))))
+
+    def offsets(self, residual: Floats, counts: Floats) -> Floats:
+        """[surfaces] the best, for residuals [n] from which `center` was taken."""
+        return np.asarray(self.center + self.factor * self.sums(self.regions.sums_of(counts * residual)))
 
 
 def _without_regions(
-    gram: Floats, design: Floats, counts: Floats, residuals: Floats, regions: _Regions, spread: float
+    gram: Floats,
+    design: Floats,
+    counts: Floats,
+    residuals: Floats,
+    regions: _Regions,
+    spread: float,
+    surfaces: _Surfaces | None = None,
 ) -> tuple[Floats, Floats]:
-    """Normal matrix and vector [c, m] of the columns of `gram` without the regions' offsets, of deviation `spread`."""
+    """Normal matrix and vector [c, m] of the columns of `gram` without the offsets of regions and of surfaces.
+
+    spread: deviation of a region's offset.
+    """
     sums, weighted = regions.sums[:, : len(gram)], counts[:, None] * residuals
-    factor = spread**2 / (1 + spread**2 * regions.totals)
+    factor, differences = spread**2 / (1 + spread**2 * regions.totals), regions.sums_of(weighted)
     root = sums * np.sqrt(factor).astype(np.float32)[:, None]
-    differences = np.add.reduceat(weighted[regions.order], regions.starts)
     matrix = gram - (root.T @ root).astype(np.float64)
-    return matrix, design.T @ weighted - sums.T @ (factor[:, None] * differences)
+    vector = design.T @ weighted - sums.T @ (factor[:, None] * differences)
+    if surfaces is not None:
+        of_surfaces = surfaces.sums(sums)
+        root = of_surfaces * np.sqrt(surfaces.factor).astype(np.float32)[:, None]
+        matrix -= (root.T @ root).astype(np.float64)
+        vector -= of_surfaces.T @ (surfaces.factor[:, None] * surfaces.sums(differences))
+    return matrix, vector
 
 
 def _add_smoothness(matrix: Floats, pairs: Ints, strength: Floats | float) -> None:

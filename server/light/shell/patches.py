@@ -113,6 +113,8 @@ class Patches:
         """Frames in the mean; 0: a row without a patch."""
         self.positions, self.normals, self.logarithms = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
         self.variances, self.clipped = np.zeros(n), np.zeros(n)
+        self.keys = np.zeros((n, 6), np.int64)
+        """Cell of the grid and rounded normal."""
         self.regions = np.zeros(n, np.int64)
         """Which region each lies in: equal numbers, the same one."""
         self.seen_in, self.traced_in = np.full(n, -1), np.full(n, -1)
@@ -198,7 +200,7 @@ class Patches:
         for place, row in zip(new, free, strict=False):
             self._rows[tuple(keys[place])] = rows[place] = row
         self.weights[rows[new]], self.traced_in[rows[new]] = 0.0, -1
-        self.regions[rows[new]] = _region_numbers(keys[new])
+        self.keys[rows[new]], self.regions[rows[new]] = keys[new], _region_numbers(keys[new])
         return rows
 
     def _make_room(self, excess: int, wanted: Ints) -> None:

@@ -73,9 +73,10 @@ class RoomModel:
         """Fold in one frame and take a step. up: [3] unit, world."""
         engine, volume, switches = context.engine, context.volume, self._switches
         seen = gather_patches(engine, context.camera, context.surface, context.scene_radiance, volume)
-        if seen.count:
-            self._patches.forget(self._change(seen) if switches.memory else 1.0)
-            self._patches.add(seen)
+        if not seen.count:
+            return
+        self._patches.forget(self._change(seen) if switches.memory else 1.0)
+        self._patches.add(seen)
         traced = self._patches.trace(engine, volume)
         camera = context.volume_from_camera[:3, 3] + volume.origin_world
         with engine.profile.host():

@@ -5,17 +5,20 @@ from __future__ import annotations
 MEAN_ALBEDO = 0.6
 """Reflectance about which materials lie: walls and ceilings are mostly bright. It sets the light's level."""
 ALBEDO_SPREAD = 0.5
-"""Standard deviation of the logit of a material's albedo: two thirds lie from .4 to .77, none above 1."""
+"""Standard deviation of the logit of a material's albedo: two thirds lie from .48 to .71, none above 1."""
 MATERIAL_CHROMA = 0.8
-"""Spacing of the grid of materials over log chroma: orange wood and white paint are two nodes apart."""
+"""Spacing of the grid of materials over log chroma: orange wood and white paint are a node apart. On a finer one, the
+light's colour and the materials' go on exchanging."""
 PATCH_NOISE = 0.1
 """Standard deviation of a patch's log radiance: transfer by 128 rays, normals, what is not diffuse."""
 REGION_SPREAD = 0.05
-"""Standard deviation of a region's log albedo about its material's: stains and texture. More would take the gradients
-that tell where light comes from for texture."""
-SURFACE_M, SURFACE_SPREAD = 0.3, 0.2
-"""Spacing of the planes that count as one surface (a floor, a wall), and the standard deviation of its logit about its
-material's. More would take a wall that is in shade for a dark one."""
+"""Standard deviation of a region's log albedo about its surface's: stains, texture. More would take the gradients that
+tell where light comes from for texture."""
+SURFACE_SPREAD = 0.1
+"""Standard deviation of a surface's log albedo about its material's (segments.py): more would take a wall in shade for
+a dark one. On the dark side it has the tail of a Cauchy distribution, since paint may be black."""
+WHITE = 0.005
+"""Deviation of a surface's log albedo above 0: nothing sends back more than it receives."""
 ONE_ALBEDO = 0.01
 """In place of the three spreads where albedo is constant."""
 HUBER = 1.5

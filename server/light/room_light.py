@@ -1,7 +1,7 @@
 """The light of a room over time, by the estimator that the wishes select.
 
-With one constant albedo and no indirect light, spherical harmonics are solved directly in a few milliseconds. Otherwise
-light, albedos and the unobserved parts of the room are estimated together.
+The thesis's estimator, and one constant albedo without indirect light, solve spherical harmonics directly. All else is
+one model of the room (shell/).
 """
 
 from __future__ import annotations

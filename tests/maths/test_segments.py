@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from server.light.shell.segments import EDGE, segments
+from server.light.shell.segments import LEVEL_EDGE, segments
 from tests.scenes.analytic import Floats
 
 SIDE = 12
@@ -60,7 +60,7 @@ def test_alone_each_is_its_own() -> None:
 
 def test_order_does_not_matter() -> None:
     keys, random = wall(), np.random.default_rng(2)
-    level = np.where(random.random(len(keys)) < 0.3, 1.2 * EDGE, 0.0)
+    level = np.where(random.random(len(keys)) < 0.3, 1.2 * LEVEL_EDGE, 0.0)
     turn = random.permutation(len(keys))
     one, other = segments(keys, looks(level)), segments(keys[turn], looks(level[turn]))
     same = one[turn][:, None] == one[turn][None]

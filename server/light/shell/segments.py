@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-EDGE = 0.7
+LEVEL_EDGE = 0.7
 """Difference of the mean logarithms of neighbouring patches from which paint, and not shading, has an edge there: over
-the 15 cm between them, light falls off by a third only beside a lamp or in a shadow's rim."""
+the 15 cm between them, light falls to half only beside a lamp or in the rim of a shadow."""
 CHROMA_EDGE = 0.2
 """The same of either coordinate of log chroma."""
 _OFFSETS = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), -1).reshape(-1, 3)[14:]
@@ -33,7 +33,7 @@ def segments(keys: Ints, looks: Floats) -> Ints:
         second.append(order[place[found]])
     one, other = np.concatenate(first), np.concatenate(second)
     apart = np.abs(looks[one] - looks[other])
-    is_alike = (apart[:, 0] < EDGE) & (apart[:, 1:].max(axis=1) < CHROMA_EDGE)
+    is_alike = (apart[:, 0] < LEVEL_EDGE) & (apart[:, 1:].max(axis=1) < CHROMA_EDGE)
     return _components(len(keys), one[is_alike], other[is_alike])
 
 

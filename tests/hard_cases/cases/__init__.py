@@ -7,6 +7,7 @@ from tests.hard_cases.cases.groups import GROUPS
 from tests.hard_cases.cases.harmonics import HARMONICS
 from tests.hard_cases.cases.light_sums import LIGHT_SUMS
 from tests.hard_cases.cases.rendering import RASTER, SHADOWS
+from tests.hard_cases.cases.room_light import ROOM_LIGHT
 from tests.hard_cases.cases.sessions import SESSIONS
 from tests.hard_cases.cases.sums import SUMS
 from tests.hard_cases.cases.surfaces import TRANSFER, VOLUME
@@ -14,6 +15,7 @@ from tests.hard_cases.catalogue import Case, Family
 
 FAMILIES: tuple[Family, ...] = (
     LIGHT_SUMS,
+    ROOM_LIGHT,
     SUMS,
     HARMONICS,
     TRANSFER,

@@ -92,7 +92,7 @@ def test_the_catalogue_covers_what_it_should() -> None:
     families = {case.family for case in CASES}
     assert families == {
         "light by normal equations",
-        "light by lobes",
+        "light of a room",
         "sums",
         "spherical harmonics",
         "transfer",

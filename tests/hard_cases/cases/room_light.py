@@ -151,6 +151,36 @@ def twice(_trial: Trial) -> Found:
     return Found(other / one[0].mean(), 2 * one / one[0].mean())
 
 
+def _black(room: ShellRoom) -> None:
+    used = room.patches.used
+    room.patches.logarithms[used], room.patches.arrivals[used, :, :3] = np.log(0.002), 0.0
+
+
+@ROOM_LIGHT.case(
+    "black pictures",
+    0.02,
+    "radiance",
+    "all that is shown is a code of 255 or less, so the light is that over the albedo, and a few times it where lobes "
+    "that nothing sees lie at their prior.",
+)
+def black(_trial: Trial) -> Found:
+    return Found(distant_light(solved(corner(_black)), 4).sh, 0)
+
+
+def _from_behind(room: ShellRoom) -> None:
+    room.patches.arrivals[room.patches.used, :, 3] *= -1
+
+
+@ROOM_LIGHT.case(
+    "every surface seen from behind",
+    np.deg2rad(20),
+    "rad",
+    f"{_MODEL}; what would be known of the walls' light is unknown too.",
+)
+def from_behind(_trial: Trial) -> Found:
+    return direction_of(solved(corner(_from_behind)))
+
+
 @ROOM_LIGHT.case(
     "closed on all sides",
     0,

@@ -36,8 +36,9 @@ SMOOTHNESS, EDGE = 1.0, 0.5
 linearly: the rims of lamps and windows."""
 CHROMA_NOISE = 0.06
 """Standard deviation of a patch's log chroma."""
-REGION_CHROMA = 2.0
-"""Standard deviation of a region's chroma of albedo: rooms have orange wood and red walls."""
+REGION_CHROMA = 4.0
+"""Standard deviation of a region's chroma of albedo: one orange floor is many regions, and says no more of the light than
+one surface does."""
 CELL_CHROMA, TINT = 0.3, 0.2
 """Standard deviations of a cell's chroma about the light's, and of the light's about grey: cameras balance white."""
 CHROMA_SMOOTHNESS = 5.0

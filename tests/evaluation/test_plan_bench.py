@@ -26,7 +26,7 @@ from server.opencl.device import Device
 from server.reuse.temporal_reuse import NOISY
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
-from tests.bench.plan.suite import changed_share, greatest, holds, is_as_known, stated_bound
+from tests.bench.plan.suite import changed_share, greatest, holds, is_as_known, is_at_rest, stated_bound
 
 QUICK = (
     "elsewhere",
@@ -87,7 +87,7 @@ def test_a_noisy_view_rests_until_something_happens(device: Device) -> None:
     source = Cut("hand-enters-while-still", before, hand)
     rests = []
     for _, result in play(device, source, wishes_of(source)):
-        rests.append(any(left.effect == "estimate_light" for left in result.plan.left_out))
+        rests.append(is_at_rest(result.plan))
     assert not any(rests[:NOISY])
     assert rests[NOISY:] == [True] * 4 + [False] * 2
 
@@ -122,8 +122,8 @@ def test_what_is_placed_and_moved_before_a_resting_view_is_drawn(device: Device)
     assert all(count > 1 for count in run[23:26])
     for needed, everything in zip(*pipelines, strict=True):
         assert np.abs(needed.color.astype(int) - everything.color).max() <= 1
-    estimated = [not any(left.effect == "estimate_light" for left in r.plan.left_out) for r in pipelines[0]]
-    assert [i for i, was in enumerate(estimated) if was] == [*range(8), *range(10, 18), 26, 27]
+    moves = [not is_at_rest(result.plan) for result in pipelines[0]]
+    assert [i for i, was in enumerate(moves) if was] == [*range(8), *range(10, 18), 26, 27]
 
 
 def test_a_bound_that_is_wrong_is_seen(device: Device) -> None:

@@ -75,7 +75,7 @@ def test_a_patch_is_the_mean_of_its_frames() -> None:
     row = int(np.flatnonzero(patches.weights)[0])
     np.testing.assert_allclose(patches.logarithms[row], np.log(0.2), atol=1e-12)
     assert patches.weights[row] == 3
-    np.testing.assert_allclose(patches.changes(one(np.array([0.06, 0.04, 0.05]), 0.3)), [np.log(1.5)], atol=1e-12)
+    np.testing.assert_allclose(patches.changes(one(np.array([0.06, 0.04, 0.05]), 0.3))[0], [np.log(1.5)], atol=1e-12)
 
 
 def test_a_patch_never_weighs_more_than_its_memory() -> None:
@@ -102,7 +102,7 @@ def test_a_change_of_light_leaves_nothing_of_the_old() -> None:
     patches = Patches()
     patches.add(one(np.zeros(3), 0.1))
     patches.forget(1.0)
-    assert len(patches.changes(one(np.zeros(3), 0.8))) == 0
+    assert len(patches.changes(one(np.zeros(3), 0.8))[0]) == 0
     patches.add(one(np.zeros(3), 0.8))
     np.testing.assert_allclose(patches.logarithms[0], np.log(0.8))
 

@@ -129,13 +129,17 @@ class Patches:
         """Rows of patches whose rays were traced."""
         return np.flatnonzero((self.weights > 0) & (self.traced_in >= 0))
 
-    def changes(self, seen: Seen) -> Floats:
-        """[k] log of the mean radiance of the patches of a picture over what they showed before."""
+    def changes(self, seen: Seen) -> tuple[Floats, Ints]:
+        """[k] log of the mean radiance of the patches of a picture over what they showed before, and which face alike.
+
+        Equal numbers [k], from 0: patches that face one way.
+        """
         keys, mean = _grouped(seen)
         rows = np.array([self._rows.get(tuple(key), -1) for key in keys], np.int64)
         is_known = (rows >= 0) & (self.weights[rows] > 0)
         now = mean.of(seen.logarithms)[is_known].mean(axis=1)
-        return np.asarray(now - self.logarithms[rows[is_known]].mean(axis=1))
+        facing = np.unique(keys[is_known, 3:], axis=0, return_inverse=True)[1].ravel()
+        return np.asarray(now - self.logarithms[rows[is_known]].mean(axis=1)), facing
 
     def forget(self, share: float) -> None:
         """Take `share` of their weight from all patches: the light has changed."""

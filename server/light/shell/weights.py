@@ -37,8 +37,8 @@ linearly: the rims of lamps and windows."""
 CHROMA_NOISE = 0.06
 """Standard deviation of a patch's log chroma."""
 REGION_CHROMA = 4.0
-"""Standard deviation of a region's chroma of albedo: one orange floor is many regions, and says no more of the light than
-one surface does."""
+"""Standard deviation of a region's chroma of albedo: one orange floor is many regions, and says no more of the light
+than one surface does."""
 CELL_CHROMA, TINT = 0.3, 0.2
 """Standard deviations of a cell's chroma about the light's, and of the light's about grey: cameras balance white."""
 CHROMA_SMOOTHNESS = 5.0

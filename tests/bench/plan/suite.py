@@ -26,6 +26,7 @@ from client.gallery.play import play, wishes_of
 from client.gallery.scenes import GALLERY
 from client.gallery.source import GallerySource
 from protocol.messages import Plan
+from server.culling.spine import GIVEN_LIGHT
 from server.opencl.device import Device, open_device
 from tests.bench.rendering.flip import flip_map
 from tests.bench.rendering.speed import EVERYTHING as WHOLE_STAGE
@@ -122,14 +123,20 @@ def is_as_known(source: GallerySource, index: int, plan: Plan) -> bool:
     scene = source.scene
     if changed_share(plan) > scene.largest_changed_share:
         return False
-    rests = any(left.effect == "estimate_light" for left in plan.left_out)
     run, called = (
         frozenset(plan.run) - scene.noise_dependent_effects,
         scene.expected_effects(index) - scene.noise_dependent_effects,
     )
     if index in scene.settling_frames:
         return run in (HELD, called)
-    return run == (HELD if index in scene.held_frames else called) and rests == (index in scene.resting_frames)
+    return run == (HELD if index in scene.held_frames else called) and is_at_rest(plan) == (
+        index in scene.resting_frames
+    )
+
+
+def is_at_rest(plan: Plan) -> bool:
+    """Whether the spine learns nothing from a frame because the view is still, and not because its light is given."""
+    return any(left.effect == "estimate_light" and left.reason != GIVEN_LIGHT.reason for left in plan.left_out)
 
 
 def changed_share(plan: Plan) -> float:

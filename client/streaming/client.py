@@ -505,8 +505,8 @@ class StreamClient:
     async def _handle(self, message: ServerMessage) -> None:
         if self._tap is not None:
             self._tap(message)
-        if self._ends_answer(message) and message.frame in self._lost:
-            self._lost.discard(message.frame)  # already reported as lost
+        if self._ends_answer(message) and self._hello is not None and message.frame not in self._unanswered:
+            self._lost.discard(message.frame)  # reported as lost, or sent again while its answer was on the way
             return
         match message:
             case Welcome():

@@ -184,6 +184,39 @@ def test_the_client_comes_back_by_itself(proxy: Proxy, lab: Lab, lossless: bool,
         }
 
 
+@pytest.mark.parametrize("answer", ["picture", "layer", "light"])
+def test_a_frame_that_is_sent_again_while_it_is_worked_on_is_answered_once(proxy: Proxy, lab: Lab, answer: str) -> None:
+    lab.hold = True
+
+    async def cut_while_it_works() -> list:
+        client = await StreamClient.connect(proxy.url)
+        await client.hello(CAMERA, Wishes(lossless=True, answer=answer))
+        await client.send_frame(rgbd_frame(0))
+        await asyncio.to_thread(lab.next_entered)
+        proxy.cut()
+        async with asyncio.timeout(PATIENCE_S):
+            while client.reconnected == 0:
+                await asyncio.sleep(0.01)
+        lab.release(3)
+        taken: list = []
+
+        async def read() -> None:
+            async for found in client.answers():
+                taken.append(found)
+
+        reading = asyncio.create_task(read())
+        for index in (1, 2):
+            await client.send_frame(rgbd_frame(index))
+        await client.wait_until_answered()
+        await client.close()
+        await reading
+        return taken
+
+    taken = asyncio.run(cut_while_it_works())
+    assert [found.light.frame for found in taken] == [0, 1, 2]
+    assert [entry[1] for entry in lab.log if entry[0] == "frame"] == [0, 1, 2]
+
+
 def test_a_client_that_cannot_come_back_says_so(proxy: Proxy) -> None:
     async def stream() -> None:
         client = await StreamClient.connect(proxy.url)

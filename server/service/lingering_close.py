@@ -10,6 +10,7 @@ from __future__ import annotations
 from asyncio import TimerHandle
 
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.protocol import State
 
 SILENCE_S = 0.5
 
@@ -25,6 +26,14 @@ class LingeringCloseWebSocket(WebSocketsSansIOProtocol):
             super().data_received(data)
         else:
             self._await_silence()
+
+    def shutdown(self) -> None:
+        """Close with code 1012; uvicorn would fail, and the server with it, where the client is closing already."""
+        if self.handshake_complete and not self.close_sent and self.conn.state is not State.OPEN:
+            self.stop_keepalive()
+            self.transport.close()
+        else:
+            super().shutdown()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Report code 1006 (connection lost); uvicorn would report 1005. The first event in the queue counts."""

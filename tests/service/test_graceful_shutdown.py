@@ -7,11 +7,16 @@ import signal
 import subprocess
 import sys
 import threading
+from unittest.mock import MagicMock, patch
 
 import httpx
+import pytest
+from websockets.protocol import State
+from websockets.server import ServerProtocol
 
 from protocol.messages import Bye, Composite, Error
 from server.service.graceful_shutdown import DRAINING, GOODBYE, GracefulShutdown
+from server.service.lingering_close import LingeringCloseWebSocket
 from server.service.serve import BackgroundServer
 from tests.data import ROOT
 from tests.service.fakes import PATIENCE_S, frame_message
@@ -39,6 +44,19 @@ def test_everybody_is_told_goodbye_with_1012(start_server) -> None:
         assert messages[-1] == Bye(reason=GOODBYE)
     stopped.join(PATIENCE_S)
     assert not stopped.is_alive()
+
+
+@pytest.mark.parametrize("state", list(State))
+def test_a_connection_that_is_closing_does_not_keep_the_server_from_leaving(state: State) -> None:
+    """uvicorn sends a close frame, which websockets refuses where the client's is being answered."""
+    connection = LingeringCloseWebSocket.__new__(LingeringCloseWebSocket)
+    connection.handshake_complete, connection.close_sent, connection.queue = True, False, MagicMock()
+    connection.transport, connection.conn = MagicMock(), ServerProtocol()
+    connection.conn._state = state
+    with patch.object(LingeringCloseWebSocket, "stop_keepalive"):
+        connection.shutdown()
+    connection.transport.close.assert_called_once()
+    assert connection.transport.write.called == (state is State.OPEN)
 
 
 def test_while_a_session_ends_nobody_new_is_taken_and_health_says_so(start_server, lab, monkeypatch) -> None:

@@ -18,7 +18,8 @@ from server.service.service import Service
 from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh
 from tests.service.wire import Wire
 
-PATIENCE_S = 0.6
+IMPATIENT_S = 0.6
+"""Of an ingress that is to give up. Otherwise it has the product's patience: on a busy machine a host takes seconds."""
 TOKEN = "secret"
 
 
@@ -71,9 +72,15 @@ def town(lab: Lab) -> Iterator[TownPlaces]:
 
 
 @pytest.fixture
-def ingress_url(town: TownPlaces) -> Iterator[str]:
-    """Of an ingress before the town."""
-    app = create_ingress_app(Ingress(town, Authenticator(TOKEN), patience_s=PATIENCE_S))
+def ingress(town: TownPlaces) -> Ingress:
+    """Before the town."""
+    return Ingress(town, Authenticator(TOKEN))
+
+
+@pytest.fixture
+def ingress_url(ingress: Ingress) -> Iterator[str]:
+    """Of the ingress."""
+    app = create_ingress_app(ingress)
     config = uvicorn.Config(app, log_config=None, ws_per_message_deflate=False, ws_max_size=32 << 20)
     server = uvicorn.Server(config)
     with listen("127.0.0.1", 0) as listener:

@@ -6,6 +6,7 @@ from protocol.messages import Acknowledged, Composite, Hello, Quality, Watch, We
 from server.cluster.relay import MOVED
 from server.cluster.routing import room_id_of
 from server.service.connection import GONE, RESTART, TRY_LATER, UNAUTHORIZED
+from tests.cluster.conftest import IMPATIENT_S
 from tests.service.fakes import CAMERA, PATIENCE_S, frame_message
 
 
@@ -90,23 +91,27 @@ def test_host_that_dies_sends_its_clients_to_come_again(town, dial) -> None:
     host._server.stop()
 
 
-def test_room_that_moves_is_waited_for_and_then_the_client_is_told(town, dial) -> None:
+def test_room_that_moves_is_waited_for_and_then_the_client_is_told(town, dial, ingress, monkeypatch) -> None:
     wire = dial()
     welcome = greeted(wire, keep_s=30.0)
     town.moving.update(town.hosts)
+    patient = ingress._patience_s
+    monkeypatch.setattr(ingress, "_patience_s", IMPATIENT_S)
     wire.socket.socket.close()
     late = dial()
     late.say(Hello(client="test", camera=CAMERA, resume=welcome.key))
     assert late.ending()[0] == TRY_LATER
+    monkeypatch.setattr(ingress, "_patience_s", patient)
     soon = dial()
     soon.say(Hello(client="test", camera=CAMERA, resume=welcome.key))
     town.moving.clear()
     assert soon.hear().resumed
 
 
-def test_one_room_too_many_is_told_to_come_later(town, dial) -> None:
+def test_one_room_too_many_is_told_to_come_later(town, dial, ingress, monkeypatch) -> None:
     town.free = 1
     greeted(dial())
+    monkeypatch.setattr(ingress, "_patience_s", IMPATIENT_S)
     wire = dial()
     wire.say(Hello(client="test", camera=CAMERA))
     code, reason, _ = wire.ending()

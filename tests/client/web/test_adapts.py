@@ -119,6 +119,10 @@ def settled_age_ms(page: Page) -> float:
     return median(page.evaluate("() => window.ages")[SETTLED:])
 
 
+def is_best(image: ColorImage, first: ColorImage) -> bool:
+    return image.width == CAMERA.width and len(image.data) > 0.9 * len(first.data)
+
+
 def test_a_narrow_link_gets_smaller_pictures_younger_frames_and_the_best_again_when_it_eases(
     server: BackgroundServer, seen: Seen, open_page: OpenPage, keep_picture: Callable[[Page, str], None]
 ) -> None:
@@ -142,9 +146,11 @@ def test_a_narrow_link_gets_smaller_pictures_younger_frames_and_the_best_again_w
         keep_picture(page, "sending_half")
         assert age_ms < YOUNGER * age_without_ms
 
+        eased = len(seen.images)
         link.bytes_per_s = None
         wait_for_text(page, "#sending", "Sent now: full size, quality 90", times=4)  # rung by rung
-        seen.wait(lambda images: images[-1].width == CAMERA.width and len(images[-1].data) > 0.9 * len(first.data))
+        # On a busy machine it may have left the best again.
+        seen.wait(lambda images: any(is_best(image, first) for image in images[eased:]))
         page.goto("about:blank")
 
 

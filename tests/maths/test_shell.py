@@ -46,7 +46,7 @@ def light_at(room: ShellRoom, place: Floats) -> Floats:
     _, arrivals = sent(place[None], directions, None, np.zeros(3))
     met = room.transport.meet(room.shell, place[None], directions, arrivals)
     cells = room.unknowns.radiance
-    radiance = np.where((met.columns >= 0)[..., None], cells[np.maximum(met.columns, 0)], met.known)[0]
+    radiance = (met.known + np.einsum("nmc,nmcr->nmr", met.shares, cells[np.maximum(met.columns, 0)]))[0]
     return np.asarray(BASIS @ radiance @ LUMINANCE)
 
 
@@ -213,14 +213,18 @@ def test_rays_end_where_they_meet_the_box() -> None:
     random = np.random.default_rng(5)
     points = random.uniform(0.1, 1.9, (50, 3))
     directions = DIRECTIONS[random.integers(0, len(DIRECTIONS), (50, 7))]
-    cells = shell.exits(np.broadcast_to(points[:, None], directions.shape), directions)
-    # The middle of the cell lies within half a cell's diagonal of the point where the ray leaves.
+    cells, shares = shell.exits(np.broadcast_to(points[:, None], directions.shape), directions)
     with np.errstate(divide="ignore"):
         far = np.where(directions > 0, shell.high - points[:, None], -points[:, None]) / directions
     ends = points[:, None] + np.min(np.where(far > 0, far, np.inf), -1)[..., None] * directions
-    assert np.abs(ends - shell.centers[cells]).max() <= (4.0 / SIDE) / 2 + 1e-9
-    assert cells.min() >= 0
-    assert cells.max() < CELLS
+    # Bilinear shares give back a linear function, up to the outermost middles of a face.
+    half = (shell.high - shell.low) / SIDE / 2
+    is_across = (ends <= 1e-9) | (ends >= shell.high - 1e-9)
+    expected = np.where(is_across, ends, np.clip(ends, half, shell.high - half))
+    np.testing.assert_allclose((shares[..., None] * shell.centers[cells]).sum(axis=-2), expected, atol=1e-6)
+    np.testing.assert_allclose(shares.sum(axis=-1), 1.0)
+    assert shares.min() >= 0
+    assert (cells // SIDE**2 == cells[..., :1] // SIDE**2).all()
 
 
 def test_cells_of_a_closed_box_have_four_neighbours() -> None:
@@ -284,14 +288,17 @@ def test_what_rays_meet() -> None:
     directions = np.array([[[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0, 0, -1.0]]])
     arrivals = np.array([[[0.2, 0.3, 0.4, 1.0], [0, 0, 0, -1.0], [1, SATURATED, 0.5, 1.5], [0, 0, 0, 0]]])
     met = transport.meet(shell, np.array([[2.0, 2.0, 2.0]]), directions, arrivals, learn=True)
-    known, back, bright, free = met.columns[0]
-    assert known == -1
+    (known, back, bright, free), shares = met.columns[0], met.shares[0]
+    assert (known == -1).all()
+    np.testing.assert_allclose(shares.sum(axis=-1), [0, 1, 1, 1])
+    back, bright = back[0], bright[0]
     np.testing.assert_array_equal(met.known[0, 0], [0.2, 0.3, 0.4])
     assert not transport.is_saturated[back]
     assert back >= CELLS
     assert transport.is_saturated[bright]
     np.testing.assert_allclose(transport.at_least[bright], [1, SATURATED, 0.5])
-    assert free == shell.exits(np.array([2.0, 2.0, 2.0]), np.array([0.0, 0, -1.0]))
+    cells, _ = shell.exits(np.array([2.0, 2.0, 2.0]), np.array([0.0, 0, -1.0]))
+    np.testing.assert_array_equal(free, cells)
     assert transport.columns == CELLS + 2
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -21,7 +22,7 @@ from server.light.shell.shell import Shell, closed_sides, shell_around
 from server.light.shell.sources import distant_sources, near_sources
 from server.light.shell.spread import spread_deg
 from server.light.shell.switches import Switches
-from server.light.shell.transport import KNOWN, NO_CELL, Transport
+from server.light.shell.transport import KNOWN, NO_CELL, Met, Transport
 from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
@@ -134,15 +135,14 @@ class RoomModel:
 
     def radiance_at(self, engine: Engine, volume: Volume, position: Floats, directions: Floats) -> Floats:
         """[m, 3] radiance that arrives at `position` [3] (world) against `directions` [m, 3]; needs `is_known`."""
-        return np.asarray(self._looked_up(engine, volume, position[None], directions[None])[0][0])
+        return np.asarray(self._radiance_of(self._looked_up(engine, volume, position[None], directions[None]))[0])
 
     def arriving_at(self, engine: Engine, volume: Volume, positions: Floats) -> list[PlaceLight]:
         """The light at each of `positions` [n, 3] (world); needs `is_known`."""
-        radiance, columns = self._looked_up(engine, volume, positions, look_up_directions())
-        return [
-            self._arriving(position, one, cells)
-            for position, one, cells in zip(positions, radiance, columns, strict=True)
-        ]
+        met = self._looked_up(engine, volume, positions, look_up_directions())
+        radiance = self._radiance_of(met)
+        places = zip(positions, radiance, met.columns, met.shares, strict=True)
+        return [self._arriving(position, one, columns, shares) for position, one, columns, shares in places]
 
     def beyond(self, position: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
         """The light from the shell as seen from `position` [3] (world), with no surface in between.
@@ -152,35 +152,38 @@ class RoomModel:
         assert self._shell is not None
         directions = look_up_directions()[0]
         start = np.broadcast_to(position, directions.shape)
-        cells = self._shell.exits(start, directions)
+        cells, shares = self._shell.exits(start, directions)
         ends = position + self._shell.distances(start, directions).min(axis=-1)[:, None] * directions
-        radiance = self._unknowns.radiance[cells]
+        radiance = np.einsum("mc,mcr->mr", shares, self._unknowns.radiance[cells])
         lamps, rest = find_lamps(position, ends, radiance)
         return _basis(bands) @ radiance, _basis(bands) @ rest, lamps
 
-    def _looked_up(
-        self, engine: Engine, volume: Volume, positions: Floats, directions: Floats
-    ) -> tuple[Floats, NDArray[np.int64]]:
-        """Radiance [n, m, 3] and the cell [n, m] it comes from, or KNOWN or NO_CELL."""
+    def _looked_up(self, engine: Engine, volume: Volume, positions: Floats, directions: Floats) -> Met:
+        """What rays [n, m] meet; cells that the solution does not have are NO_CELL."""
         assert self._shell is not None
         arrivals = trace_arrivals(engine, volume, positions - volume.origin_world, None, directions)
         turned = np.broadcast_to(directions[0], (len(positions), *directions[0].shape))
         met = self._transport.meet(self._shell, positions, turned, arrivals.astype(np.float64))
-        sent = self._unknowns.radiance
-        columns = np.where(met.columns < self._unknowns.known, met.columns, NO_CELL)
-        radiance = np.where((columns >= 0)[..., None], sent[np.maximum(columns, 0)], met.known)
-        mean = np.exp(self._unknowns.mean)
-        is_new = (columns == NO_CELL)[..., None]  # surface of which no patch has received light
-        unseen = np.where(met.at_least.max(axis=-1, keepdims=True) > 0, met.at_least, mean)
-        return np.where(is_new, unseen, np.maximum(radiance, met.at_least)), columns
+        return replace(met, columns=np.where(met.columns < self._unknowns.known, met.columns, NO_CELL))
 
-    def _arriving(self, position: Floats, radiance: Floats, columns: NDArray[np.int64]) -> PlaceLight:
+    def _radiance_of(self, met: Met) -> Floats:
+        """[n, m, 3]."""
+        cells = self._unknowns.radiance[np.maximum(met.columns, 0)]
+        radiance = met.known + np.einsum("nmc,nmcr->nmr", met.shares, cells)
+        mean = np.exp(self._unknowns.mean)
+        is_new = (met.columns[..., 0] == NO_CELL)[..., None]  # surface of which no patch has received light
+        unseen = np.where(met.at_least.max(axis=-1, keepdims=True) > 0, met.at_least, mean)
+        return np.where(is_new, unseen, np.maximum(radiance, met.at_least))
+
+    def _arriving(self, position: Floats, radiance: Floats, columns: NDArray[np.int64], shares: Floats) -> PlaceLight:
         sh = _basis() @ radiance
         is_unknown = columns >= 0
-        gradient = np.zeros((BANDS * BANDS, self._unknowns.known))
         luminance = radiance @ LUMINANCE
-        np.add.at(gradient.T, columns[is_unknown], (_basis() * luminance).T[is_unknown])
-        covariance, _ = self._unknowns.covariance_of(gradient)
+        ray = np.nonzero(is_unknown)[0]
+        by_cell = np.zeros((len(radiance), self._unknowns.known))
+        cells = self._unknowns.radiance[columns[is_unknown]] @ LUMINANCE
+        np.add.at(by_cell, (ray, columns[is_unknown]), shares[is_unknown] * cells)  # derivative by z
+        covariance, _ = self._unknowns.covariance_of(_basis() @ by_cell)
         std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         tint = radiance.mean(axis=0) / max(float(luminance.mean()), 1e-12)
         angle = spread_deg(sh @ LUMINANCE, covariance)
@@ -190,5 +193,5 @@ class RoomModel:
             std=np.outer(std, tint),
             spread_deg=angle,
             valid=angle <= VALID_SPREAD_DEG,
-            seen=float((columns == KNOWN).mean()),
+            seen=float((columns[:, 0] == KNOWN).mean()),
         )

@@ -1,7 +1,7 @@
 """The shell: a closed box around a room's scan and its cameras, whose cells send the light that is not scanned surface.
 
-A ray that leaves the scan ends in the cell where it meets the box, so light from 2 m away is not taken for distant
-light. The box is aligned with gravity and with the walls that were seen.
+A ray that leaves the scan ends where it meets the box, so light from 2 m away is not taken for distant light. The box
+is aligned with gravity and with the walls that were seen.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ SIDE = 6
 SIDES = 6
 """In the order -x, +x, -y, +y, -z, +z of the shell's axes."""
 CELLS = SIDES * SIDE * SIDE
+CORNERS = 4
+"""Cells that a point of the shell lies between."""
 LEAST_HEIGHT_M = 2.4
 """A ceiling is at least this high above the floor."""
 BEHIND_M = 1.0
@@ -54,25 +56,28 @@ class Shell:
 
     def distances(self, points: Floats, directions: Floats) -> Floats:
         """[..., 3] metres along rays from `points` [..., 3] inside of it to the faces across each axis."""
-        origin, direction = points @ self.axes.T, directions @ self.axes.T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            distance = np.where(direction > 0, self.high - origin, self.low - origin) / direction
-        return np.asarray(np.where(np.isfinite(distance), distance, np.inf))
+        return _distances(self, points @ self.axes.T, directions @ self.axes.T)
 
-    def exits(self, points: Floats, directions: Floats) -> NDArray[np.int64]:
-        """[...] the cell in which rays from `points` [..., 3] inside of it along `directions` [..., 3] end."""
+    def exits(self, points: Floats, directions: Floats) -> tuple[NDArray[np.int64], Floats]:
+        """[..., CORNERS] cells, and their shares, by which rays from `points` [..., 3] inside of it end on it.
+
+        Radiance is bilinear between the middles of a face's cells, and even beyond the outermost ones. directions:
+        [..., 3].
+        """
         origin, direction = points @ self.axes.T, directions @ self.axes.T
-        distance = self.distances(points, directions)
-        axis = distance.argmin(axis=-1)
-        nearest = np.take_along_axis(distance, axis[..., None], -1)
-        share = np.clip((origin + nearest * direction - self.low) / (self.high - self.low), 0.0, 1.0 - 1e-9)
-        is_high = np.take_along_axis(direction, axis[..., None], -1)[..., 0] > 0
-        first = np.where(axis == 0, share[..., 1], share[..., 0])
-        second = np.where(axis == 2, share[..., 1], share[..., 2])
-        cells: NDArray[np.int64] = ((2 * axis + is_high) * SIDE + (first * SIDE).astype(np.int64)) * SIDE + (
-            second * SIDE
-        ).astype(np.int64)
-        return cells
+        distance = _distances(self, origin, direction)
+        axis = distance.argmin(axis=-1)[..., None]
+        end = origin + np.take_along_axis(distance, axis, -1) * direction
+        place = np.clip((end - self.low) / (self.high - self.low) * SIDE - 0.5, 0.0, SIDE - 1 - 1e-9)
+        is_high = np.take_along_axis(direction, axis, -1) > 0
+        across = np.take_along_axis(place, np.array([[1, 2], [0, 2], [0, 1]])[axis[..., 0]], -1)
+        low = across.astype(np.int64)
+        share = across - low
+        cell = ((2 * axis + is_high) * SIDE + low[..., :1]) * SIDE + low[..., 1:]
+        first, second = share[..., :1], share[..., 1:]
+        firsts, seconds = np.concatenate([1 - first, first], -1), np.concatenate([1 - second, second], -1)
+        shares = (firsts[..., :, None] * seconds[..., None, :]).reshape(*axis.shape[:-1], CORNERS)
+        return cell + np.array([0, 1, SIDE, SIDE + 1]), shares
 
     @cached_property
     def centers(self) -> Floats:
@@ -90,6 +95,12 @@ class Shell:
     def is_low(self) -> NDArray[np.bool_]:
         """[CELLS] cells below the height of windows and lamps."""
         return np.asarray(self.centers[:, 2] < self.floor_m + LAMPS_ABOVE_M)
+
+
+def _distances(shell: Shell, origin: Floats, direction: Floats) -> Floats:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.where(direction > 0, shell.high - origin, shell.low - origin) / direction
+    return np.asarray(np.where(np.isfinite(distance), distance, np.inf))
 
 
 def upright(normals: Floats, up: Floats) -> Floats:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.light.shell.patches import MOST_PATCHES, RAYS, Patches
-from server.light.shell.shell import CELLS, SIDE, SIDES, Shell
+from server.light.shell.shell import CELLS, CORNERS, SIDE, SIDES, Shell
 from server.maths.lobes import LOBES, lobes_along
 
 HIDDEN_M = 0.6
@@ -36,7 +36,9 @@ class Met:
     """What rays meet."""
 
     columns: Ints
-    """[...] the unknown cell, KNOWN or NO_CELL."""
+    """[..., CORNERS] the unknown cells; all of them KNOWN or NO_CELL."""
+    shares: Floats
+    """[..., CORNERS] of them, with sum 1 or, where KNOWN, 0."""
     known: Floats
     """[..., 3] radiance of known surface, 0 elsewhere."""
     at_least: Floats
@@ -76,11 +78,11 @@ class Transport:
         met = self.meet(
             shell, patches.positions[rows], directions, patches.arrivals[rows].astype(np.float64), learn=True
         )
-        self.shares[rows] = 0.0
-        is_unknown = met.columns >= 0
-        row = np.broadcast_to(rows[:, None], is_unknown.shape)[is_unknown]
-        np.add.at(self.shares, (row, met.columns[is_unknown]), np.float32(1 / RAYS))
-        self.beyond[rows] = _beyond(directions, np.where(patches.arrivals[rows, :, 3] == 0, met.columns, KNOWN))
+        place = COLUMNS * np.arange(len(rows))[:, None, None] + np.maximum(met.columns, 0)
+        sums = np.bincount(place.ravel(), met.shares.ravel() / RAYS, len(rows) * COLUMNS)
+        self.shares[rows] = sums.reshape(len(rows), COLUMNS)
+        is_free = patches.arrivals[rows, :, 3] == 0
+        self.beyond[rows] = _beyond(directions, np.where(is_free, met.columns[..., 0], KNOWN))
         self.known[rows] = met.known.mean(axis=1)
 
     def meet(self, shell: Shell, origins: Floats, directions: Floats, arrivals: Floats, *, learn: bool = False) -> Met:
@@ -92,16 +94,18 @@ class Transport:
         is_bright = (distance > 0) & (radiance.max(axis=-1) >= SATURATED)
         is_back = distance < 0
         is_free = distance == 0
-        columns = np.full(distance.shape, KNOWN, np.int64)
+        columns = np.full((*distance.shape, CORNERS), KNOWN, np.int64)
+        shares = np.zeros((*distance.shape, CORNERS))
         starts = np.broadcast_to(origins[:, None], directions.shape)
-        columns[is_free] = shell.exits(starts[is_free], directions[is_free])
+        columns[is_free], shares[is_free] = shell.exits(starts[is_free], directions[is_free])
         ends = starts + np.abs(distance)[..., None] * directions
         for kind, chosen in ((0, is_back), (1, is_bright)):
-            columns[chosen] = self._hidden_columns(ends[chosen], kind, learn=learn)
+            columns[chosen] = self._hidden_columns(ends[chosen], kind, learn=learn)[:, None]
+            shares[chosen, 0] = 1.0
         if learn and is_bright.any():
-            self._note_bright(columns[is_bright], radiance[is_bright])
+            self._note_bright(columns[is_bright, 0], radiance[is_bright])
         known = np.where(((distance > 0) & ~is_bright)[..., None], radiance, 0.0)
-        return Met(columns, known, np.where(is_bright[..., None], radiance, 0.0))
+        return Met(columns, shares, known, np.where(is_bright[..., None], radiance, 0.0))
 
     def _hidden_columns(self, points: Floats, kind: int, *, learn: bool) -> Ints:
         """[n] columns of the cells around `points` [n, 3], NO_CELL where there is none yet."""
@@ -131,7 +135,7 @@ class Transport:
 
 
 def _beyond(directions: Floats, columns: Ints) -> NDArray[np.float32]:
-    """[n, SIDES, LOBES] of rays `directions` [n, m, 3] that end in the shell's cells `columns` [n, m], or KNOWN."""
+    """[n, SIDES, LOBES] of rays `directions` [n, m, 3] that end at the shell's cells `columns` [n, m], or KNOWN."""
     row, ray = np.nonzero(columns >= 0)
     group = row * SIDES + columns[row, ray] // (SIDE * SIDE)
     order = np.argsort(group, kind="stable")

@@ -44,7 +44,7 @@ class Seen:
 
 @contextmanager
 def watched_server(device: Device, seen: Seen) -> Iterator[BackgroundServer]:
-    """The real service, which notes what comes. Its kernels are compiled already, as those of a service that is ready."""
+    """The real service, which notes what comes. Its kernels are compiled, as those of any service that is ready."""
 
     class Watched(ClientSession):
         def process(self, frame: RgbdFrame | Viewpoint, *, watched: bool = False) -> FrameResult:

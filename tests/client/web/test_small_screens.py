@@ -61,10 +61,11 @@ WHERE = """texts => texts.map((text) => {
 STATES = ("Connecting…", "Connected, waiting for a session", "Connected, no new pictures", "Live")
 
 
-@pytest.mark.parametrize("width", [360, 600, 760, 900, 1200])
 def test_what_a_finger_is_about_to_press_does_not_move_when_the_page_connects(
-    server: BackgroundServer, open_page: OpenPage, width: int
+    server: BackgroundServer, open_page: OpenPage
 ) -> None:
-    page = open_page(server.url, size=(width, 800))
+    page = open_page(server.url)
     wait_for_text(page, "#state", STATES[1])
-    assert len(set(page.evaluate(WHERE, STATES))) == 1
+    for width in (360, 600, 760, 900, 1200):
+        page.set_viewport_size({"width": width, "height": 800})
+        assert len(set(page.evaluate(WHERE, STATES))) == 1, width

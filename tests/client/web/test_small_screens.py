@@ -1,4 +1,4 @@
-"""On a phone the tools leave the picture its room, and what ends the session stays in sight."""
+"""Small screens: the tools leave the picture its room, what ends the session stays in sight, the form stands still."""
 
 from __future__ import annotations
 
@@ -49,3 +49,23 @@ def test_the_tools_of_a_selected_object_leave_most_of_the_screen(
     assert found["#selected-tools"]["top"] < height
     middle = page.evaluate("() => document.elementFromPoint(innerWidth / 3, innerHeight / 2).id")
     assert middle in ("picture-frame", "picture", "guide")
+
+
+WHERE = """texts => texts.map((text) => {
+    const state = document.getElementById("state"), said = state.textContent;
+    state.textContent = text;
+    const { top } = document.querySelector("input[value=xr]").getBoundingClientRect();
+    state.textContent = said;
+    return top;
+})"""
+STATES = ("Connecting…", "Connected, waiting for a session", "Connected, no new pictures", "Live")
+
+
+def test_what_a_finger_is_about_to_press_does_not_move_when_the_page_connects(
+    server: BackgroundServer, open_page: OpenPage
+) -> None:
+    page = open_page(server.url)
+    wait_for_text(page, "#state", STATES[1])
+    for width in (360, 600, 760, 900, 1200):
+        page.set_viewport_size({"width": width, "height": 800})
+        assert len(set(page.evaluate(WHERE, STATES))) == 1, width

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lu_factor, lu_solve
 
 from server.light.shell import weights
 from server.light.shell.evidence import DARKEST, LOG_CHROMA, NODES, Evidence, log_chroma, materials_of
@@ -68,6 +69,10 @@ class Unknowns:
     """[k, 3] RGB of the sources."""
     curvature: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     """[k + albedos] squared: half the second derivative of the objective at the last step, sources first."""
+    factors: tuple[NDArray[np.float32], NDArray[np.int32]] = field(
+        default_factory=lambda: (np.zeros((0, 0), np.float32), np.zeros(0, np.int32))
+    )
+    """Of the curvature (LU), and their order."""
     step: float = float("inf")
     """By how much the last step changed the logarithm of what patches receive, root mean square."""
 
@@ -75,6 +80,12 @@ class Unknowns:
     def known(self) -> int:
         """Sources that have been solved for."""
         return len(self.z)
+
+    def solve(self, curvature: Floats, right: Floats) -> Floats:
+        """[k + albedos] the whole Gauss-Newton step; keeps the curvature."""
+        self.curvature = curvature.astype(np.float32)
+        self.factors = lu_factor(self.curvature, check_finite=False)
+        return lu_solve(self.factors, right.astype(np.float32), check_finite=False).astype(np.float64)  # type: ignore[no-any-return]
 
     def covariance_of(self, gradient: Floats) -> tuple[Floats, float]:
         """[m, m] covariance of what changes by `gradient` [m, sources] with z, and the curvature's condition.
@@ -86,7 +97,7 @@ class Unknowns:
         right = np.zeros((len(self.curvature), rows + len(weakest)), np.float32)
         right[:count, :rows] = gradient.T
         right[weakest, rows + np.arange(len(weakest))] = 1.0
-        solved = np.linalg.solve(self.curvature, right).astype(np.float64)
+        solved = lu_solve(self.factors, right, check_finite=False).astype(np.float64)
         inverse = np.abs(solved[:, rows:]).sum(axis=0).max()
         return gradient @ solved[:count, :rows], float(np.abs(self.curvature).sum(axis=0).max() * inverse)
 
@@ -132,8 +143,7 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     diagonal = np.concatenate([1 / deviation**2, np.full(len(nodes), 1 / spreads.material**2)])
     matrix[np.diag_indices_from(matrix)] += diagonal
     target = np.concatenate([prior - z, LOGIT - unknowns.materials[nodes]])
-    unknowns.curvature = matrix.astype(np.float32)
-    change = np.linalg.solve(unknowns.curvature, (right + diagonal * target).astype(np.float32)).astype(np.float64)
+    change = unknowns.solve(matrix, right + diagonal * target)
     change *= RELAXATION * min(1.0, MOST_STEP / max(float(np.abs(change).max()), 1e-12))
     unknowns.step = float(np.sqrt(np.mean((parts @ (scale[:count] * change[:count])) ** 2)))
     unknowns.z = z + change[:count]

@@ -177,13 +177,8 @@ class RoomModel:
 
     def _arriving(self, position: Floats, radiance: Floats, columns: NDArray[np.int64], shares: Floats) -> PlaceLight:
         sh = _basis() @ radiance
-        is_unknown = columns >= 0
         luminance = radiance @ LUMINANCE
-        ray = np.nonzero(is_unknown)[0]
-        by_cell = np.zeros((len(radiance), self._unknowns.known))
-        cells = self._unknowns.radiance[columns[is_unknown]] @ LUMINANCE
-        np.add.at(by_cell, (ray, columns[is_unknown]), shares[is_unknown] * cells)  # derivative by z
-        covariance, _ = self._unknowns.covariance_of(_basis() @ by_cell)
+        covariance, _ = self._unknowns.covariance_of(self._gradient(columns, shares))
         std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         tint = radiance.mean(axis=0) / max(float(luminance.mean()), 1e-12)
         angle = spread_deg(sh @ LUMINANCE, covariance)
@@ -195,3 +190,13 @@ class RoomModel:
             valid=angle <= VALID_SPREAD_DEG,
             seen=float((columns[:, 0] == KNOWN).mean()),
         )
+
+    def _gradient(self, columns: NDArray[np.int64], shares: Floats) -> Floats:
+        """[bands^2, known] of coefficients of luminance by z, for rays that end in `shares` [m, 4] of cells."""
+        ray, corner = np.nonzero(columns >= 0)
+        cells = columns[ray, corner]
+        sent = shares[ray, corner] * (self._unknowns.radiance @ LUMINANCE)[cells]
+        bands = BANDS * BANDS
+        place = cells * bands + np.arange(bands)[:, None]
+        sums = np.bincount(place.ravel(), (_basis()[:, ray] * sent).ravel(), self._unknowns.known * bands)
+        return np.asarray(sums.reshape(-1, bands).T)

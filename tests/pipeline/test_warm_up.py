@@ -34,9 +34,9 @@ def warm() -> tuple[Device, set[object]]:
         {"preset": "art4"},
         {"light": SHARP_LIGHT},
         {"answer": "layer"},
+        {"preset": "gr15fast", "light": SHARP_LIGHT, "answer": "layer"},
         {"as_thesis": True},
         PLAIN_LIGHT,
-        {"preset": "gr15fast", "light": SHARP_LIGHT, "answer": "layer"},
     ],
 )
 def test_later_sessions_compile_nothing(warm: tuple[Device, set[object]], asked: dict[str, Any]) -> None:

@@ -128,9 +128,10 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     ray_length_m: Annotated[float, Meta(ge=0, le=1000)] | None = None
     """None: the whole room."""
     bands: Annotated[int, Meta(ge=2, le=MAX_SH_BANDS)] = 4
-    albedo: Literal["constant", "estimated"] = "constant"
-    indirect: Literal["none", "observed"] = "none"
+    albedo: Literal["constant", "estimated"] = "estimated"
+    indirect: Literal["none", "observed"] = "observed"
     as_thesis: bool = False
+    """Plain least squares with rays of 10 cm; one albedo and no indirect light, whatever the fields above say."""
     denoise: Literal["none", "bilateral", "tv_l1"] = "none"
     """Denoising of the lightness used for light estimation; the composite keeps the camera's image."""
     denoise_iterations: Annotated[int, Meta(ge=1, le=1000)] = 20

@@ -25,8 +25,6 @@ def wishes_of(source: GallerySource, **changes: Any) -> Wishes:
         volume_m=default_volume(source, range(len(source))),
         voxel_m=VOXEL_M,
         up=source.up,
-        albedo="estimated",
-        indirect="observed",
         light=source.light,
         lamps="off",
         poses=source.scene.poses,

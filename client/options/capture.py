@@ -9,7 +9,7 @@ from typing import Literal
 
 from client.errors import OptionError
 from client.objects.object_file import ObjectFile, parse_object
-from client.options.capture_options import ROBUSTNESS, CaptureOptions
+from client.options.capture_options import DEFAULTS, ROBUSTNESS, CaptureOptions
 from client.options.choices import Choices, choice, choices_of
 from client.options.light_file import Coefficients, read_light, read_panorama_light
 from client.options.light_places import parse_light_at
@@ -20,7 +20,6 @@ from client.sources.volume import Volume, default_volume, default_voxel, enlarge
 from protocol.messages import Poses, Preset, Robustness, Wishes
 
 THESIS_RAY_LENGTH_M = 0.1
-_DEFAULTS = Wishes()
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class _Sampling:
     preset: Preset
     budget_ms: float | None = None
     max_light_error_deg: float | None = None
-    rays: int = _DEFAULTS.rays
+    rays: int = DEFAULTS.rays
     stride: int | None = None
     interleave: Literal[1, 2, 4, 8] | None = None
     upsampling: Literal["bilateral", "bicubic"] | None = None
@@ -95,10 +94,10 @@ def prepare(options: CaptureOptions, lossless: bool = False, answer: str | None 
         smooth_depth=options.smooth_depth,
         ray_length_m=ray_length_m,
         bands=options.bands,
-        albedo=choices.albedo or ("constant" if as_thesis else "estimated"),
-        indirect=choices.indirect or ("none" if as_thesis else "observed"),
+        albedo="constant" if as_thesis else choices.albedo or DEFAULTS.albedo,
+        indirect="none" if as_thesis else choices.indirect or DEFAULTS.indirect,
         as_thesis=as_thesis,
-        denoise=choices.denoise or "none",
+        denoise=choices.denoise or DEFAULTS.denoise,
         denoise_iterations=options.denoise_iterations,
         poses=poses,
         volume_m=volume,
@@ -107,13 +106,13 @@ def prepare(options: CaptureOptions, lossless: bool = False, answer: str | None 
         light=light.sh,
         light_axes=light.axes,
         light_at=light_at,
-        lamps=choices.lamps or "auto",
-        exposure=choices.exposure or "auto",
-        edges=choices.edges or "smooth",
-        tone_mapping=choices.tone_mapping or "auto",
+        lamps=choices.lamps or DEFAULTS.lamps,
+        exposure=choices.exposure or DEFAULTS.exposure,
+        edges=choices.edges or DEFAULTS.edges,
+        tone_mapping=choices.tone_mapping or DEFAULTS.tone_mapping,
         robustness=robustness,
-        plan=choices.plan or "needed",
-        answer=answer_kind or "picture",
+        plan=choices.plan or DEFAULTS.plan,
+        answer=answer_kind or DEFAULTS.answer,
         lossless=lossless,
     )
     return Capture(source, frames, wishes, objects)
@@ -216,8 +215,8 @@ def _sampling(options: CaptureOptions, choices: Choices) -> _Sampling:
     if is_auto:
         return _Sampling("auto", options.budget_ms, options.max_light_error)
     return _Sampling(
-        choices.preset or "reg4",
-        rays=_DEFAULTS.rays if options.rays is None else options.rays,
+        choices.preset or DEFAULTS.preset,
+        rays=DEFAULTS.rays if options.rays is None else options.rays,
         stride=options.stride,
         interleave=choices.interleave,
         upsampling=choices.upsampling,
@@ -229,7 +228,7 @@ def _sampling(options: CaptureOptions, choices: Choices) -> _Sampling:
 def _robustness(text: str | None) -> tuple[Robustness, ...]:
     """Raises OptionError for an unknown measure, and for measures that exclude each other."""
     if text is None:
-        return _DEFAULTS.robustness
+        return DEFAULTS.robustness
     words = () if text == "none" else tuple(word.strip() for word in text.split(","))
     for word in words:
         choice("--robustness", word, (*ROBUSTNESS, "none"))

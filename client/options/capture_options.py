@@ -12,7 +12,10 @@ import typer
 from protocol.limits import MAX_SH_BANDS
 from protocol.messages import Preset as PresetName
 from protocol.messages import Robustness as RobustnessName
+from protocol.messages import Wishes
 
+DEFAULTS = Wishes()
+"""Of the wire; the command line has no others, except where the source knows better."""
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 DENOISE: tuple[Literal["none", "bilateral", "tv_l1"], ...] = ("none", "bilateral", "tv_l1")
 ROBUSTNESS: tuple[RobustnessName, ...] = ("openness", "normals", "memory", "outliers")
@@ -28,9 +31,12 @@ PosesOption = Annotated[
 VolumeOption = Annotated[str | None, typer.Option(metavar="x0,y0,z0,x1,y1,z1", help="metres; default: fits the source")]
 Voxel = Annotated[float | None, typer.Option(metavar="M", help="voxel size in metres; default: fits the volume")]
 Preset = Annotated[
-    str | None, typer.Option(metavar="|".join(PRESETS), help="where and how transfer is sampled; default: reg4")
+    str | None,
+    typer.Option(metavar="|".join(PRESETS), help=f"where and how transfer is sampled; default: {DEFAULTS.preset}"),
 ]
-Rays = Annotated[int | None, typer.Option(min=4, max=1024, help="visibility rays per sample; default: 81")]
+Rays = Annotated[
+    int | None, typer.Option(min=4, max=1024, help=f"visibility rays per sample; default: {DEFAULTS.rays}")
+]
 Stride = Annotated[
     int | None,
     typer.Option(
@@ -50,8 +56,8 @@ AuxiliaryViews = Annotated[
 SmoothDepth = Annotated[bool, typer.Option("--smooth-depth/--no-smooth-depth", help="final median of the merged depth")]
 RayLength = Annotated[str | None, typer.Option(metavar="M|room", help="search distance for occluders; default: room")]
 Bands = Annotated[int, typer.Option(min=2, max=MAX_SH_BANDS, help="spherical-harmonics bands")]
-Albedo = Annotated[str | None, typer.Option(metavar="constant|estimated", help="default: estimated")]
-Indirect = Annotated[str | None, typer.Option(metavar="none|observed", help="default: observed")]
+Albedo = Annotated[str | None, typer.Option(metavar="constant|estimated", help=f"default: {DEFAULTS.albedo}")]
+Indirect = Annotated[str | None, typer.Option(metavar="none|observed", help=f"default: {DEFAULTS.indirect}")]
 AsThesis = Annotated[bool, typer.Option("--as-thesis", help="--ray-length 0.1 --albedo constant --indirect none")]
 Denoise = Annotated[
     str, typer.Option(metavar="|".join(DENOISE), help="denoising of the lightness used for light estimation")
@@ -85,7 +91,9 @@ Exposure = Annotated[
 ]
 Robustness = Annotated[
     str | None,
-    typer.Option(metavar="LIST|none", help=f"list of {', '.join(ROBUSTNESS)}; default: openness,memory,outliers"),
+    typer.Option(
+        metavar="LIST|none", help=f"list of {', '.join(ROBUSTNESS)}; default: {','.join(DEFAULTS.robustness)}"
+    ),
 ]
 Edges = Annotated[str | None, typer.Option(metavar="smooth|hard", help="edges of virtual objects; hard: point-sampled")]
 ToneMapping = Annotated[
@@ -152,14 +160,14 @@ class CaptureOptions:
     upsampling: Upsampling = None
     visibility_state: VisibilityState = None
     auxiliary_views: AuxiliaryViews = None
-    smooth_depth: SmoothDepth = True
+    smooth_depth: SmoothDepth = DEFAULTS.smooth_depth
     ray_length: RayLength = None
-    bands: Bands = 4
+    bands: Bands = DEFAULTS.bands
     albedo: Albedo = None
     indirect: Indirect = None
-    as_thesis: AsThesis = False
-    denoise: Denoise = "none"
-    denoise_iterations: DenoiseIterations = 20
+    as_thesis: AsThesis = DEFAULTS.as_thesis
+    denoise: Denoise = DEFAULTS.denoise
+    denoise_iterations: DenoiseIterations = DEFAULTS.denoise_iterations
     object: Object = None
     up: Up = None
     light: LightFile = None

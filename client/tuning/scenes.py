@@ -76,9 +76,7 @@ class Stage:
         return Cost({name: median(row[name] for row in rows) for name in rows[0]}, median(errors))
 
     def _results(self, device: Device, point: SamplingSettings, progress: Progress) -> list[FrameResult]:
-        usual = _usual(self.source)
-        wishes = structs.replace(point.wishes(usual), albedo="estimated", indirect="observed")
-        pipeline = ClientSession(device, self.source.camera, wishes)
+        pipeline = ClientSession(device, self.source.camera, point.wishes(_usual(self.source)))
         found: list[FrameResult] = []
         try:
             with TemporaryDirectory() as folder:
@@ -98,11 +96,13 @@ class Stage:
 
 
 class LitRoom:
-    """The room, every frame under another known light."""
+    """The room, every frame under another known light; of one albedo, so that what errs is sampling."""
 
     def __init__(self, device: Device, progress: Progress) -> None:
         self._source = open_synthetic(f"synthetic:room?size={LIT_SIZE}&frames={_WALK}&noise=1&texture=0")
-        self._wishes = structs.replace(_usual(self._source), robustness=("openness", "outliers"))
+        self._wishes = structs.replace(
+            _usual(self._source), albedo="constant", indirect="none", robustness=("openness", "outliers")
+        )
         frames = (self._source[_STEP * i] for i in range(LIT_FRAMES))
         assert self._wishes.volume_m is not None
         assert self._wishes.voxel_m is not None

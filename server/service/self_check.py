@@ -43,7 +43,7 @@ def check_answers(device: Device) -> None:
     result = _processed(device, plain, lambda _pipeline: None)
     check_picture(result)
     check_light(result)
-    furnace = Wishes(volume_m=VOLUME_M, voxel_m=VOXEL_M, light=EVEN_SKY)
+    furnace = Wishes(volume_m=VOLUME_M, voxel_m=VOXEL_M, light=EVEN_SKY, albedo="constant", indirect="none")
     check_object(_processed(device, furnace, _place_triangle))
 
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 
+from client.commands import demo
 from client.errors import OptionError, SourceError
 from client.options.capture import CaptureOptions, parse_frames, parse_ray_length, prepare
 from client.sources.volume import default_volume, default_voxel, enlarged_volume
+from protocol.messages import Wishes
 from tests.client import folders
 
 
@@ -33,6 +36,14 @@ def test_defaults_fit_the_source(source: str) -> None:
     assert wishes.tone_mapping == "auto"
     assert not wishes.as_thesis
     assert not wishes.lossless
+
+
+def test_the_command_line_and_the_demo_have_the_defaults_of_the_wire(source: str) -> None:
+    """Except where the source knows better."""
+    with demo._prepared(2) as shown:
+        for wishes in (prepare(CaptureOptions(source)).wishes, shown.wishes):
+            of_source = {name: getattr(wishes, name) for name in ("poses", "volume_m", "voxel_m", "up")}
+            assert wishes == structs.replace(Wishes(), **of_source)
 
 
 def test_everything_said(source: str) -> None:

@@ -15,10 +15,12 @@ import numpy as np
 import pytest
 
 from client.web.build import pack
+from protocol.messages import Wishes
 from server.opencl.device import Device
 from server.service.authenticator import Authenticator
 from server.service.serve import BackgroundServer
 from server.service.service import Service
+from tests.client.web.received import Received
 from tests.data import ROOT
 from tests.node import copy_sources, node, run_npm
 from tests.service.conftest import keys_are_left_here  # noqa: F401
@@ -101,6 +103,19 @@ def test_what_is_refused_is_told_in_one_sentence(server: BackgroundServer, progr
     ), done.stderr
     done = run(program, "--input-type=module", "--eval", script, "--", "http://127.0.0.1:9")
     assert done.stdout.startswith("the server does not answer; see that it runs (probeless serve)"), done.stderr
+
+
+def test_a_program_that_wishes_nothing_has_the_defaults(program: Path) -> None:
+    script = """
+        import { StreamClient } from "probeless";
+        const camera = { width: 160, height: 120, fx: 150, fy: 150, cx: 79.5, cy: 59.5 };
+        (await StreamClient.connect(process.argv[1], { client: "test", camera })).close();
+    """
+    received = Received()
+    with BackgroundServer(Service(FAKE_DEVICE, pipeline_factory=received.build)) as server:
+        done = run(program, "--input-type=module", "--eval", script, "--", server.url)
+    assert done.returncode == 0, done.stderr
+    assert received.wishes == [Wishes()]
 
 
 def listened_to(folder: Path, script: str, url: str, hear: Callable[[list[str]], None]) -> list[str]:

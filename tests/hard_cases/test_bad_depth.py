@@ -6,6 +6,7 @@ What is wrong is said: in the frame's notes, or as a ValueError of one line that
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import product
 from typing import Any
 
 import msgspec
@@ -26,6 +27,7 @@ from tests.scenes.bad_depth import (
     CAMERA,
     PYRAMID,
     SIZE,
+    USUAL,
     WISHES,
     Matrix,
     assert_sound,
@@ -36,6 +38,7 @@ from tests.scenes.bad_depth import (
 from tests.scenes.meshes import soup_of
 
 Open = Callable[..., ClientSession]
+Place = tuple[float, float, float]
 
 
 @pytest.fixture
@@ -68,7 +71,7 @@ def lit(pipeline: ClientSession, offset: Any = (0.0, 0.0, 0.0)) -> FrameResult:
 @pytest.mark.parametrize("name", BAD_DEPTH)
 def test_bad_depth_from_the_start(open_pipeline: Open, name: str) -> None:
     """A session may begin with it, and gets well as soon as the depth does."""
-    pipeline = open_pipeline()
+    pipeline = open_pipeline(USUAL)
     for index in range(3):
         result = pipeline.process(frame_of(BAD_DEPTH[name], index=index))
         assert_sound(result)
@@ -132,12 +135,24 @@ def test_a_camera_inside_a_wall(open_pipeline: Open, eye: tuple[float, float, fl
     assert_sound(lit(pipeline))
 
 
-@pytest.mark.parametrize("offset", [(1e4, 0.0, 0.0), (-7e3, 7e3, -5e3)])
-def test_a_scene_10_km_from_the_origin(open_pipeline: Open, offset: tuple[float, float, float]) -> None:
-    """Poses are relative to the volume in float64 before they become float32: the same light and picture."""
-    near = lit(open_pipeline())
-    bounds = tuple(float(value) for value in np.array(BOUNDS) + np.tile(offset, 2))
-    far = lit(open_pipeline(replace(WISHES, volume_m=bounds), offset), offset)
+@pytest.mark.parametrize(
+    ("wishes", "near_m", "far_m"),
+    [
+        pytest.param(WISHES, (0.0, 0.0, 0.0), (1e4, 0.0, 0.0), id="offset0"),
+        pytest.param(WISHES, (0.0, 0.0, 0.0), (-7e3, 7e3, -5e3), id="offset1"),
+        pytest.param(USUAL, (6.0, 0.0, 0.0), (9999.6, 0.0, 0.0), id="usual"),
+    ],
+)
+def test_a_scene_10_km_from_the_origin(open_pipeline: Open, wishes: Wishes, near_m: Place, far_m: Place) -> None:
+    """Poses are relative to the volume in float64 before they become float32: the same light and picture.
+
+    The usual model of light has cells in the world, of 0.15, 0.4 and 0.6 m: it is moved by whole ones, from where no
+    wall lies between two of them.
+    """
+    near, far = (
+        lit(open_pipeline(replace(wishes, volume_m=tuple(np.array(BOUNDS) + np.tile(offset, 2))), offset), offset)
+        for offset in (near_m, far_m)
+    )
     assert_sound(far)
     np.testing.assert_allclose(far.light.sh, near.light.sh, atol=1e-3 * np.abs(near.light.sh).max())
     assert (np.abs(far.color.astype(int) - near.color) > 1).mean() < 2e-3
@@ -225,14 +240,15 @@ def test_a_live_session_waits_for_depth_to_place_its_volume(open_pipeline: Open,
 
 
 def test_a_black_and_a_white_picture(open_pipeline: Open) -> None:
-    """Good depth, no usable radiance: no light, and no light of what is clipped."""
+    """Good depth, no usable radiance: no light, and none of what is clipped, which tells the usual model how much it
+    is at least."""
     depth = good_depth(np.eye(4))
-    for code in (0, 255):
-        pipeline = open_pipeline()
+    for wishes, code in product((WISHES, USUAL), (0, 255)):
+        pipeline = open_pipeline(wishes)
         color = np.full((*SIZE, 3), code, np.uint8)
         for index in range(3):
             result = pipeline.process(RgbdFrame(index, index / 30, color, depth, np.eye(4)))
         assert_sound(result)
         assert not result.light.valid
-        assert any("the light is unknown" in note for note in result.notes)
+        assert wishes == USUAL or any("the light is unknown" in note for note in result.notes)
         assert (result.color == code).mean() > 0.99  # all but the object, which nothing lights

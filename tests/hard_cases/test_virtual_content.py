@@ -16,9 +16,10 @@ from server.client_session import ClientSession
 from server.opencl.device import Device
 from server.scene.placement import Placement
 from tests.scenes.meshes import shape_of, soup_of
+from tests.scenes.plain_light import PLAIN_LIGHT
 
 CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
-WISHES = Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.02, poses="given", up=(0.0, -1.0, 0.0))
+WISHES = Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.02, poses="given", up=(0.0, -1.0, 0.0), **PLAIN_LIGHT)
 COLOR = np.random.default_rng(0).integers(90, 160, (48, 64, 3), np.uint8)
 
 

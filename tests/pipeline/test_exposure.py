@@ -22,6 +22,7 @@ from server.scene.placement import Placement
 from tests.scenes.analytic import Floats
 from tests.scenes.lights import degrees_between
 from tests.scenes.meshes import shape_of
+from tests.scenes.plain_light import PLAIN_LIGHT
 
 FRAMES = range(0, 60, 3)
 SETTLED = slice(6, None)
@@ -36,7 +37,7 @@ def table(more: str = "") -> SyntheticSource:
 
 def wishes_for(source: SyntheticSource, **more: object) -> Wishes:
     bounds = default_volume(source, range(60))
-    return Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), up=source.up, **more)  # type: ignore[arg-type]
+    return Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), up=source.up, **PLAIN_LIGHT, **more)
 
 
 @dataclass

@@ -28,6 +28,7 @@ from server.shading.composite import srgb_codes
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
 from server.volume.raycast import raycast
 from server.volume.volume import Volume
+from tests.scenes.plain_light import PLAIN_LIGHT
 from tests.scenes.volumes import fuse_frame
 
 FRAMES = range(1, 30, 3)
@@ -60,7 +61,7 @@ class Path:
         source = open_source("synthetic:table?frames=30&size=320x240")
         self.camera: CameraModel = source.camera
         bounds = default_volume(source, range(30))
-        self.wishes = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), preset="reg4")
+        self.wishes = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), preset="reg4", **PLAIN_LIGHT)
         engine = Engine(device)
         volume = Volume(engine, bounds, default_voxel(bounds))
         self.shots = [self._shot(engine, volume, source[index]) for index in FRAMES]

@@ -21,6 +21,7 @@ from server.maths.sh import LUMINANCE
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import FrameResult
+from tests.scenes.plain_light import PLAIN_LIGHT
 
 FRAMES = range(0, 128, 2)
 """Three views, a search of 29 frames, and ten more for the sky to follow."""
@@ -30,7 +31,7 @@ CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
 def results_of(device: Device, spec: str, frames: range = FRAMES, **wishes: str) -> list[FrameResult]:
     source = open_synthetic(f"synthetic:{spec}&size=160x120&frames=150")
     bounds = default_volume(source, range(len(source)))
-    asked = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), up=source.up, **wishes)
+    asked = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), up=source.up, **PLAIN_LIGHT, **wishes)
     pipeline = ClientSession(device, source.camera, asked)
     try:
         return [pipeline.process(replace(source[index], index=index)) for index in frames]

@@ -17,6 +17,7 @@ from protocol.messages import Light, Wishes
 from server.client_session import ClientSession
 from server.opencl.device import Device
 from tests.scenes.lights import degrees_between
+from tests.scenes.plain_light import PLAIN_LIGHT
 
 FRAMES = range(0, 90, 18)
 """Half of the path: 70 degrees around the table."""
@@ -30,9 +31,9 @@ def source_of(light: int) -> SyntheticSource:
 
 
 def estimates(device: Device, source: SyntheticSource) -> list[Light]:
-    """The light after each of FRAMES, with the volume that `run` would choose."""
+    """The light after each of FRAMES, with the volume that `run` would choose, of one albedo as the table is."""
     volume_m = default_volume(source, range(len(source)))
-    wishes = Wishes(preset="reg4", volume_m=volume_m, voxel_m=default_voxel(volume_m), up=source.up)
+    wishes = Wishes(preset="reg4", volume_m=volume_m, voxel_m=default_voxel(volume_m), up=source.up, **PLAIN_LIGHT)
     pipeline = ClientSession(device, source.camera, wishes)
     found = [pipeline.process(source[index]).light for index in FRAMES]
     pipeline.close()

@@ -20,6 +20,7 @@ from server.scene.placement import Placement
 from tests.scenes import lights
 from tests.scenes.lit_pole import BOUNDS, CAMERA, POLE_M, frame
 from tests.scenes.meshes import shape_of
+from tests.scenes.plain_light import PLAIN_LIGHT
 
 LIGHT = 0.3 * lights.lobe_and_sky((0.5, -0.8, -0.3))
 LINEAR = linear_values("srgb8").astype(np.float64)
@@ -96,10 +97,10 @@ def test_white_light_keeps_its_luminance(device: Device) -> None:
 
 
 def test_an_estimated_light_is_whitened_too(device: Device) -> None:
-    """Of a floor of one colour, with deviations that are one for all channels."""
+    """Of a floor of one colour, which is the light's where one albedo is assumed."""
     color = np.full((CAMERA.height, CAMERA.width, 3), (180, 120, 90), np.uint8)
     pipelines = [
-        ClientSession(device, CAMERA, Wishes(volume_m=BOUNDS, voxel_m=0.01, light_color=c))
+        ClientSession(device, CAMERA, Wishes(volume_m=BOUNDS, voxel_m=0.01, light_color=c, **PLAIN_LIGHT))
         for c in ("estimated", "white")
     ]
     tinted, white = (np.array(p.process(replace(frame(), color=color)).light.sh) for p in pipelines)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+from protocol.messages import Wishes
 from server.client_session import ClientSession
 from server.maths.direct_lights import split_light
 from server.opencl.device import Device, open_device
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.service.warm_up import SHARP_LIGHT, warm_up
-from tests.scenes.rooms import CAMERA, frame_at, view_at, wishes
+from tests.scenes.plain_light import PLAIN_LIGHT
+from tests.scenes.rooms import BOUNDS, CAMERA, VOXEL_M, frame_at, view_at
 
 
 @pytest.fixture(scope="module")
@@ -31,11 +35,13 @@ def warm() -> tuple[Device, set[object]]:
         {"light": SHARP_LIGHT},
         {"answer": "layer"},
         {"preset": "gr15fast", "light": SHARP_LIGHT, "answer": "layer"},
+        {"as_thesis": True},
+        PLAIN_LIGHT,
     ],
 )
-def test_later_sessions_compile_nothing(warm: tuple[Device, set[object]], asked: dict[str, object]) -> None:
+def test_later_sessions_compile_nothing(warm: tuple[Device, set[object]], asked: dict[str, Any]) -> None:
     device, built = warm
-    pipeline = ClientSession(device, CAMERA, wishes("given", **asked))
+    pipeline = ClientSession(device, CAMERA, Wishes(volume_m=BOUNDS, voxel_m=VOXEL_M, **asked))
     square = Mesh(
         vertices=np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0.3, 0.3, 0]], np.float32),
         triangles=np.array([[0, 1, 2], [1, 3, 2]], np.int32),

@@ -34,6 +34,7 @@ from tests.scenes.analytic import Shape, plane, sphere
 from tests.scenes.furnace import BOUNDS, CAMERA, VOXEL_M, frames, reconstruct
 from tests.scenes.lights import random_directions, uniform
 from tests.scenes.meshes import shape_of
+from tests.scenes.plain_light import PLAIN_LIGHT
 from tests.scenes.solids import HalfSpace, ball, fill_volume, points_on, upload_surface
 
 STRIDES = {name: PRESETS[name].stride for name in ("rm", "reg4", "reg8")}
@@ -114,9 +115,10 @@ def test_far_object_changes_no_pixel(device: Device, preset: str) -> None:
 
 
 def test_white_scene_tells_the_even_sky(device: Device) -> None:
-    """The furnace backwards: a picture that is the same everywhere is explained by an even sky."""
+    """The furnace backwards: a picture that is the same everywhere is explained by an even sky, where one albedo is
+    assumed."""
     code = 188  # linear 0.5029: white times the assumed albedo
-    pipeline = ClientSession(device, CAMERA, Wishes(volume_m=BOUNDS, voxel_m=VOXEL_M))
+    pipeline = ClientSession(device, CAMERA, Wishes(volume_m=BOUNDS, voxel_m=VOXEL_M, **PLAIN_LIGHT))
     result: FrameResult | Any = None
     for frame in frames(BODIES["ball"], np.full((CAMERA.height, CAMERA.width, 3), code, np.uint8)):
         result = pipeline.process(replace(frame))

@@ -12,10 +12,12 @@ from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Light, Wishes
 from server.pipeline import FrameResult
 from tests.scenes.analytic import look, room, sphere
+from tests.scenes.plain_light import PLAIN_LIGHT
 
 CAMERA = CameraModel(width=96, height=72, fx=80.0, fy=80.0, cx=48.0, cy=36.0)
 BOUNDS = (-1.2, -1.0, -0.5, 1.2, 1.0, 2.1)
-WISHES = Wishes(volume_m=BOUNDS, voxel_m=0.04)
+USUAL = Wishes(volume_m=BOUNDS, voxel_m=0.04)
+WISHES = msgspec.structs.replace(USUAL, **PLAIN_LIGHT)
 SCENE = [room((-1.1, -0.9, -0.4), (1.1, 0.8, 2.0)), sphere((0.2, 0.4, 1.2), 0.35)]
 SIZE = (CAMERA.height, CAMERA.width)
 PYRAMID = 0.25 * np.array(

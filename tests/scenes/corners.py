@@ -16,9 +16,7 @@ CAMERA = CameraModel(
 SIDE_M, HALF_M, ALBEDO = 1.2, 0.8, 0.5
 FLOOR, WALL = 0, 1
 """The plane y = 0 with 0 < x < SIDE_M, and x = 0 with 0 < y < SIDE_M; both with |z| < HALF_M."""
-WISHES = Wishes(
-    volume_m=(-0.15, -0.15, -0.9, 1.3, 1.3, 0.9), voxel_m=0.02, preset="rm", up=(0, 1, 0), albedo="estimated"
-)
+WISHES = Wishes(volume_m=(-0.15, -0.15, -0.9, 1.3, 1.3, 0.9), voxel_m=0.02, preset="rm", up=(0, 1, 0), indirect="none")
 _EVERY = 4  # of how many pixels one is shaded: shading is smooth
 _DIRECTIONS = spherical_fibonacci(2048)
 

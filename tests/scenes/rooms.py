@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
 from tests.scenes.analytic import Floats, Shape, look, look_at, room, sphere
+from tests.scenes.plain_light import PLAIN_LIGHT
 
 CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
 VOXEL_M = 0.02
@@ -23,7 +24,8 @@ ROOM: list[Shape] = [
 
 
 def wishes(poses: str, **more: object) -> Wishes:
-    return Wishes(poses=poses, volume_m=BOUNDS, voxel_m=VOXEL_M, **more)  # type: ignore[arg-type]
+    """Of the plain model of light, unless `more` names another."""
+    return Wishes(poses=poses, volume_m=BOUNDS, voxel_m=VOXEL_M, **{**PLAIN_LIGHT, **more})  # type: ignore[arg-type]
 
 
 def view_at(step: float) -> Floats:

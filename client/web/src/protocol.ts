@@ -79,6 +79,7 @@ export interface Wishes {
   bands?: number;
   albedo?: "constant" | "estimated";
   indirect?: "none" | "observed";
+  /** Plain least squares with rays of 10 cm; one albedo and no indirect light, whatever the fields above say. */
   as_thesis?: boolean;
   /** Denoising of the lightness used for light estimation; the composite keeps the camera's image. */
   denoise?: "bilateral" | "none" | "tv_l1";

@@ -46,7 +46,7 @@ async def measure(url: str, source: Source, pid: int) -> dict[str, Any]:
 
     empty_mb = resident_mb(pid)
     client = await StreamClient.connect(url, tap=count)
-    await client.hello(source.camera, Wishes(up=source.up, albedo="estimated", indirect="observed"))
+    await client.hello(source.camera, Wishes(up=source.up))
     sending = asyncio.create_task(_send(client, source))
     answered = 0
     async for answer in client.answers():

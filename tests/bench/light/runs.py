@@ -20,6 +20,7 @@ from server.client_session import ClientSession
 from server.opencl.device import Device
 from server.pipeline import FrameResult
 from server.quality.settings import read_wishes
+from tests.scenes.plain_light import PLAIN_LIGHT
 
 PRESETS = ("rm", "reg4", "reg8", "art1", "art4", "art8", "gr15", "gr15fast")
 REFERENCE: Preset = "rm"
@@ -41,9 +42,9 @@ class Exposed:
 
 
 def wishes_for(source: Source, frames: range) -> Wishes:
-    """What `probeless run` would wish for this source."""
+    """As `probeless run`, but of one albedo, without indirect light."""
     volume_m = default_volume(source, frames)
-    return Wishes(preset=REFERENCE, volume_m=volume_m, voxel_m=default_voxel(volume_m), up=source.up)
+    return Wishes(preset=REFERENCE, volume_m=volume_m, voxel_m=default_voxel(volume_m), up=source.up, **PLAIN_LIGHT)
 
 
 def at_preset(wishes: Wishes, preset: str) -> Wishes:

@@ -35,6 +35,7 @@ from tests.bench.report.drawing import side_by_side
 from tests.bench.report.finished import Part
 from tests.bench.report.run import Run
 from tests.bench.truth.composite_truth import linear_from_codes
+from tests.scenes.plain_light import PLAIN_LIGHT
 
 Floats = NDArray[np.float64]
 
@@ -164,9 +165,9 @@ def turning_part(run: Run) -> Part:
 
 
 def turning_wishes(light: Floats) -> Wishes:
-    """The light is given."""
+    """The light is given, nothing else lights."""
     given = tuple((float(r), float(g), float(b)) for r, g, b in light)
-    return Wishes(volume_m=VOLUME_M, voxel_m=VOXEL_M, up=(0.0, 1.0, 0.0), light=given)
+    return Wishes(volume_m=VOLUME_M, voxel_m=VOXEL_M, up=(0.0, 1.0, 0.0), light=given, **PLAIN_LIGHT)
 
 
 def shadow_at(turn: Turn, with_slab: list[Codes], without: list[Codes], end: int) -> Floats:

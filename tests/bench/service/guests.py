@@ -19,11 +19,12 @@ import trimesh
 from client.streaming.client import Answer, ClientError, RoomPlace, StreamClient
 from protocol.frames import IDENTITY, CameraModel, RgbdFrame
 from protocol.messages import Acknowledged, Wishes
+from tests.scenes.plain_light import PLAIN_LIGHT
 
 CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
 WALL_M = 2.0
 BOUNDS = (-1.2, -0.9, 1.5, 1.2, 0.9, 2.4)
-WISHES = Wishes(poses="given", volume_m=BOUNDS, voxel_m=0.02, preset="gr15fast", up=(0, -1, 0))
+WISHES = Wishes(poses="given", volume_m=BOUNDS, voxel_m=0.02, preset="gr15fast", up=(0, -1, 0), **PLAIN_LIGHT)
 FIRST_PX, LAST_PX = 30, 155
 FULL_S = 15.0
 """Until the whole wall is shown."""

@@ -31,6 +31,7 @@ from protocol.messages import Acknowledged, Composite, Dropped, Preset, Wishes
 from tests.bench.report.finished import Part
 from tests.bench.report.run import Run
 from tests.bench.service.process import Served, Unusual, children, resident_mb, serving
+from tests.scenes.plain_light import PLAIN_LIGHT
 
 STREAMING, WATCHING = 8, 24
 SCENE = "synthetic:room?frames=20&size=160x120"
@@ -181,6 +182,7 @@ class _Streamer:
             voxel_m=VOXEL_M,
             preset=SETTING,
             up=self._source.up,
+            **PLAIN_LIGHT,
         )
         self.session = (await self._client.hello(self._source.camera, wishes)).session
 

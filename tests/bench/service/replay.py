@@ -72,7 +72,7 @@ async def record(url: str, path: Path, count: int) -> None:
         file = stack.enter_context(path.open("wb"))
         client = await StreamClient.connect(url, lambda message: write_message(file, message))
         bounds = default_volume(source, range(len(source)))
-        wishes = Wishes(volume_m=bounds, voxel_m=0.03, up=source.up, lossless=True, albedo="estimated")
+        wishes = Wishes(volume_m=bounds, voxel_m=0.03, up=source.up, lossless=True, indirect="none")
         await client.hello(source.camera, wishes)
         reading = asyncio.create_task(_read(client))
         for index in range(count):

@@ -25,6 +25,7 @@ from server.scene.vase import vase_glb
 from tests.bench.report.finished import Part
 from tests.bench.report.run import Run
 from tests.bench.service.process import resident_mb, serving
+from tests.scenes.plain_light import PLAIN_LIGHT
 
 SOURCES = ("synthetic:room?frames=40", "synthetic:table?frames=40")
 """A room that fills the picture, and a table whose surroundings have no depth."""
@@ -68,7 +69,7 @@ async def stream(
     client = await StreamClient.connect(url)
     center = np.mean([looked_at(frame, source.camera.depth_scale_m) for frame in shown], axis=0)
     low, high = center - SIDE_M / 2, center + SIDE_M / 2
-    wishes = Wishes(volume_m=(*low.tolist(), *high.tolist()), voxel_m=VOXEL_M, up=source.up)
+    wishes = Wishes(volume_m=(*low.tolist(), *high.tolist()), voxel_m=VOXEL_M, up=source.up, **PLAIN_LIGHT)
     await client.hello(source.camera, wishes)
     await client.place_object("vase", "glb", vase_glb(), position_m=tuple(center.tolist()))
     sending = asyncio.create_task(_send(client, shown, count))

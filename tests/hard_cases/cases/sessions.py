@@ -21,6 +21,7 @@ from tests.scenes.analytic import look_at
 from tests.scenes.bad_depth import BAD_DEPTH, CAMERA, PYRAMID, SIZE, WISHES, assert_sound, frame_of, good_depth
 from tests.scenes.lights import unit
 from tests.scenes.meshes import soup_of
+from tests.scenes.plain_light import PLAIN_LIGHT
 
 SESSIONS = Family("sessions")
 _TABLE = "synthetic:table?light=1&frames=12&size=160x120"
@@ -61,7 +62,7 @@ def _table_light(trial: Trial, preset: str, saturated: slice | None = None) -> F
     """Dominant direction after 12 frames, some columns of each picture saturated."""
     source = _table()
     bounds = default_volume(source, range(len(source)))
-    wishes = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), preset=preset)
+    wishes = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), preset=preset, **PLAIN_LIGHT)
     pipeline = ClientSession(trial.device, source.camera, wishes)
     try:
         for frame in source:

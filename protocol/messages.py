@@ -165,6 +165,8 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     `outliers` reduces the weight of bad fits."""
     plan: Literal["needed", "everything"] = "needed"
     """`everything`: also run effects whose change would be invisible, to check the bounds of culling."""
+    cache: Literal["on", "off"] = "on"
+    """`off`: transfer is computed anew in every frame, to compare with what is kept at places of the world."""
     answer: Literal["picture", "layer", "light"] = "picture"
     """`layer`: virtual content separate from the camera's image, for clients that compose it with their newest image.
     `light`: only the light, for clients that render virtual objects themselves."""

@@ -88,7 +88,14 @@ class Pipeline:
         self._alignment = alignment
         self._objects = objects
         self._geometry = Geometry(engine, camera, wishes, room.reconstruction)
-        self._transfer = SampledTransfer(engine, camera, settings.sampling, settings.rays, settings.bands)
+        self._transfer = SampledTransfer(
+            engine,
+            camera,
+            settings.sampling,
+            settings.rays,
+            settings.bands,
+            is_cached=settings.has_caches and not room.light.needs_transfer,
+        )
         self._cache = FrameCache(engine)
         self._renderer = Renderer(engine, self._cache, settings)
         self._reuse = None if settings.plan == "everything" else TemporalReuse(engine, camera, poses=wishes.poses)
@@ -135,8 +142,9 @@ class Pipeline:
         objects = room.objects.placed(volume.volume_from_world())
         is_shaded = bool(objects) and request.is_drawn
         with stage("radiance_transfer"):  # 5.1.2, eq. 5.2; 7.3.3
-            samples, is_kept = self._sample_transfer(context, reuse, is_shaded)
-        left_out = self._left_out(frame, reuse, is_kept, is_shaded)
+            needs_transfer = is_shaded or room.light.needs_transfer or self._settings.plan == "everything"
+            samples, is_kept = self._sample_transfer(context, reuse, is_shaded, needs_transfer)
+        left_out = self._left_out(frame, reuse, is_kept, is_shaded, needs_transfer)
         with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
             light = self._estimate_light(context, samples, left_out)
             self._look_up_places(context, is_still=reuse.keeps_geometry and "estimate_light" in left_out)
@@ -179,9 +187,12 @@ class Pipeline:
         )
 
     def _sample_transfer(
-        self, context: FrameContext, reuse: ReuseDecision, is_shaded: bool
+        self, context: FrameContext, reuse: ReuseDecision, is_shaded: bool, needs_transfer: bool
     ) -> tuple[TransferSamples, bool]:
         """The samples of this frame, and whether a still view needed no new ones."""
+        if not needs_transfer:
+            self._transfer.skip_frame()
+            return NO_SAMPLES, False
         if reuse.reason is not None:
             kept = self._cache.find(TransferSamples, reuse.samples_version) if is_shaded else NO_SAMPLES
             if kept is not None:
@@ -200,7 +211,7 @@ class Pipeline:
         return samples, False
 
     def _left_out(
-        self, frame: RgbdFrame, reuse: ReuseDecision, is_kept: bool, is_shaded: bool
+        self, frame: RgbdFrame, reuse: ReuseDecision, is_kept: bool, is_shaded: bool, needs_transfer: bool
     ) -> dict[str, CullReason]:
         is_learning = self._settings.plan == "everything" or not self._room.light.is_given
         return spine_left_out(
@@ -208,6 +219,7 @@ class Pipeline:
             reuse.echo if is_shaded else None,
             keeps_geometry=reuse.keeps_geometry,
             keeps_transfer=is_kept,
+            needs_transfer=needs_transfer,
             light_is_given=not is_learning,
             denoises=self._settings.denoise != "none",
             has_depth=frame.has_depth,
@@ -218,7 +230,7 @@ class Pipeline:
     ) -> LightEstimate:
         """The light with this frame, or as it stands."""
         engine, light = self._engine, self._room.light
-        if "estimate_light" in left_out or samples.transfer is None:
+        if "estimate_light" in left_out:
             return light.estimate()
         radiance = self._denoised(context)
         distant = remove_lamps(engine, radiance, context.surface, context.volume, self._room.lamps.lamps)  # B4

@@ -5,6 +5,7 @@
 // surface the picture is albedo times R, so the factor that leaves the albedo alone is R' / R; it needs no tone mapper.
 // With light from surfaces (7.3.3), R and R' include one bounce: visible surface sends the radiance that the camera saw.
 #include "direction_sets.clh"
+#include "met.clh"
 #include "open_shading.clh"
 #include "real_shading.clh"
 #include "samples.clh"
@@ -43,12 +44,12 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, global const floa
 }
 
 // Light that a sample of real surface gains from other real surface whose shading virtual objects changed (eq. 7.6: R'_ID - R_ID),
-// added to the ratio. It traces every `scene.every`-th of its blocked directions; neighbours begin with different ones.
+// added to the ratio. met [rows][cols][most]: some of its blocked directions, and where they meet surface (indirect.cl).
 // ratio, shaded [rows][cols]: of shadow_real; changed: that ratio. returned: bound on the change of radiance from a blocked
-// direction; a sample that it can change by at most `spare` times `least` [rows][cols] (at most `shaded`) traces none.
+// direction; a sample that it can change by at most `spare` times `least` [rows][cols] (at most `shaded`) gains nothing.
 // -> bounced [rows][cols] (rgb, w = 1), w = 0 as in ratio.
-kernel void bounce_real(SURROUNDINGS_PARAMETERS, SAMPLE_BUFFERS, global const float4 *shaded, const float returned,
-                        const float spare, global const float4 *least, global float4 *bounced) {
+kernel void bounce_real(SURROUNDINGS_PARAMETERS, SAMPLE_BUFFERS, const int most, global const uint *met, global const float4 *shaded,
+                        const float returned, const float spare, global const float4 *least, global float4 *bounced) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     const Grid grid = scene.samples;
@@ -69,28 +70,16 @@ kernel void bounce_real(SURROUNDINGS_PARAMETERS, SAMPLE_BUFFERS, global const fl
     }
     const Volume volume = SOLIDS_OF_SCENE;
     const Arriving arrives = ARRIVING_OF_SCENE;
-    const int count = arrives.count, every = scene.every;
-    const float voxel_m = volume.voxel_m;
-    const float3 origin = positions[pixel].xyz + voxel_m * normal.xyz;
+    const float3 origin = positions[pixel].xyz + volume.voxel_m * normal.xyz;
     float4 sum = (float4)(0.0f);
-    int chosen[LANES];
-    float met[LANES];
-    float3 at[LANES];
-    int waiting = 0, hidden = (col + 2 * row) % every;
-    for (int j = 0; j < count; j++) {
-        const int from = sets[sample * INTERLEAVE + j % INTERLEAVE] * count + j;
-        const int is_hidden_one = dot(normal.xyz, directions[from].xyz) > 0.0f && !((free_mask[sample * MASK_WORDS + (j >> 5)] >> (j & 31)) & 1);
-        if (is_hidden_one && hidden++ % every == 0) chosen[waiting++] = from;
-        if (waiting == 0 || (waiting < LANES && j < count - 1)) continue;
-        for (int lane = waiting; lane < LANES; lane++) chosen[lane] = chosen[0];
-        meet_surface(volume, arrives, origin, normal.xyz, chosen, met, at);
-        for (int lane = 0; lane < waiting; lane++) {
-            if (met[lane] < 0.0f) continue;
-            const float3 change = change_at(arrives.changed, at[lane] * voxel_m, SAME_POINT * voxel_m) - 1.0f;
-            const float3 more = any(change != 0.0f) ? change * sent_at(volume, arrives, at[lane], 0) : (float3)(0.0f);
-            sum += dot(normal.xyz, directions[chosen[lane]].xyz) * (float4)(more, 1.0f);
-        }
-        waiting = 0;
+    for (int i = 0; i < most && met[sample * most + i] != NO_MORE_MET; i++) {
+        const uint there = met[sample * most + i];
+        const int j = direction_of_met(there);
+        const float3 direction = arrives.directions[sets[sample * INTERLEAVE + j % INTERLEAVE] * arrives.count + j].xyz;
+        const float3 at_m = origin + distance_of_met(there) * direction;
+        const float3 change = change_at(arrives.changed, at_m, SAME_POINT * volume.voxel_m) - 1.0f;
+        const float3 more = any(change != 0.0f) ? change * sent_at(volume, arrives, at_m / volume.voxel_m, 0) : (float3)(0.0f);
+        sum += dot(normal.xyz, direction) * (float4)(more, 1.0f);
     }
     const float3 gained = part_hidden * sum.xyz / fmax(sum.w, 1e-6f);
     const float3 without = fmax(shaded[sample].xyz, floor);

@@ -25,7 +25,8 @@
 // -> transfer [rows][cols][COEFFICIENTS], openness [rows][cols]: free fraction of the cosine-weighted sky (-1 where there is no
 // surface), flatness [rows][cols]: fraction of the window on the sample's own surface, free_mask [rows][cols][MASK_WORDS]: bit j =
 // direction j lies above the surface and is free, sets [rows][cols][INTERLEAVE]: direction j is that of set sets[j % INTERLEAVE].
-// With IS_CHOSEN only the samples `chosen` [chosen_count] are computed, one item each; the others keep their values.
+// With IS_CHOSEN only the samples `chosen` [chosen_count] are computed, one item each; the others keep their values. With HAS_CACHE
+// those that are `found` (transfer_cache.cl) keep theirs.
 kernel void transfer_radiance(const TransferParameters parameters, global const float4 *positions, global const float4 *normals,
                               global const uchar *labels, global const int *slots, global const ulong *solid, global const uchar *octets,
                               global const float4 *directions, global const float *basis, global const float16 *cameras,
@@ -37,6 +38,9 @@ kernel void transfer_radiance(const TransferParameters parameters, global const 
 #endif
 #ifdef IS_CHOSEN
                               , global const int *chosen
+#endif
+#ifdef HAS_CACHE
+                              , global const int *found
 #endif
 ) {
     const Grid grid = parameters.grid;
@@ -50,6 +54,9 @@ kernel void transfer_radiance(const TransferParameters parameters, global const 
     const int row = get_global_id(1);
     if (col >= grid.cols || row >= grid.rows) return;
     const int sample = row * grid.cols + col;
+#endif
+#ifdef HAS_CACHE
+    if (found[sample] >= 0) return;
 #endif
     const int pixel = sample_pixel(grid, row, col), width = grid.width, count = parameters.count;
     const Volume volume = make_volume(parameters.volume, slots, solid, octets, 0);

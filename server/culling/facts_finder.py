@@ -45,10 +45,12 @@ class FactsFinder:
         split: SplitLight,
         shown: NDArray[np.uint8],
         gain: float,
+        *,
+        has_indirect: bool,
     ) -> SceneFacts:
         """Facts about a frame. sh: [bands^2, 3] of the whole `light`, in the first picture's units; `split`: in discs;
-        shown: [h, w, 3] sRGB."""
-        exposure, has_indirect = context.exposure, samples.indirect is not None
+        shown: [h, w, 3] sRGB. has_indirect: surfaces light one another."""
+        exposure = context.exposure
         picture_most = _most_shown(shown)
         self._brightest = max(self._brightest, picture_most / exposure)
         whole = exposure * sh

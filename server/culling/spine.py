@@ -6,6 +6,7 @@ from server.culling.reason import CullReason
 
 GIVEN_LIGHT = CullReason("the light is given, and nothing else is learnt from the picture", 0.0)
 NO_DEPTH = CullReason("a client without depth adds nothing to the room's light", 0.0)
+NOT_SHADED = CullReason("nothing virtual is drawn, and the light is not estimated from transfer", 0.0)
 LOST = CullReason("the camera is lost", 255.0)
 
 GEOMETRY_STAGES = ("locate", "raycast", "merge_depth")
@@ -18,6 +19,7 @@ def spine_left_out(
     *,
     keeps_geometry: bool,
     keeps_transfer: bool,
+    needs_transfer: bool,
     light_is_given: bool,
     denoises: bool,
     has_depth: bool,
@@ -25,9 +27,12 @@ def spine_left_out(
     """Stages of the spine that a frame leaves out, each with its reason.
 
     reason: why a still view is kept; None if it is not. echo: frames that the light has not used.
-    light_is_given: the light is known, and nothing else is learnt from the picture.
+    needs_transfer: whether virtual objects or the light estimate use it. light_is_given: the light is known, and
+    nothing else is learnt from the picture.
     """
     left_out: dict[str, CullReason] = {}
+    if not needs_transfer:
+        left_out["transfer_radiance"] = NOT_SHADED
     if not has_depth:
         left_out["estimate_light"] = NO_DEPTH
     if light_is_given:

@@ -106,6 +106,7 @@ def bounce_real(
     context: FrameContext,
     transfer: Transfer,
     scene: TracedScene,
+    indirect: Indirect,
     ratio: RealShadow,
     returned: ReturnedRadiance,
     faint: FaintShadows,
@@ -115,6 +116,7 @@ def bounce_real(
 ) -> BouncedShadow:
     """`ratio` with what real things then send to one another, less or more (eq. 7.6)."""
     engine, lit = context.engine, replace(scene, point_lights=lights)
+    assert indirect.met is not None
 
     def bounced(shadow: RealShadow) -> RealShadow:
         return differential.bounce_real(
@@ -125,6 +127,7 @@ def bounce_real(
             transfer,
             lit,
             shadow,
+            indirect.met,
             returned,
             faint.sample_share,
             ratio,

@@ -169,7 +169,10 @@ class Renderer:
         if spine.objects:
             light = take_discs(self._engine, light, spine.split, rays, context.exposure)  # 7.2.3
         gain = averages.gain if averages is not None else 1.0
-        facts = self._facts.find(context, spine.objects, samples, light, spine.sh, spine.split, shown, gain)
+        has_indirect = settings.indirect != "none"
+        facts = self._facts.find(
+            context, spine.objects, samples, light, spine.sh, spine.split, shown, gain, has_indirect=has_indirect
+        )
         given = _given(context, spine, light, averages, facts)
         effects = make_plan(EFFECTS, PictureParts, given, facts, everything=self._everything, stages=spine.left_out)
         parts, plan = effects.execute(given), effects.described()
@@ -221,7 +224,7 @@ def _given(
         SharpLight: light if light.discs else SOFT,
         RealDepthViews: spine.depth_views or TRACED,
         Transfer: samples.transfer or NO_OBJECT,
-        Indirect: samples.indirect or NO_INDIRECT,
+        Indirect: samples.indirect or (NO_OBJECT if facts.indirect else NO_INDIRECT),
         ReturnedRadiance: facts.returned,
         Averages: _to_match(averages),
     }

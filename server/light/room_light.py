@@ -59,6 +59,11 @@ class RoomLight:
         """Whether the light is known beforehand."""
         return self._given is not None
 
+    @property
+    def needs_transfer(self) -> bool:
+        """Whether it is estimated from the radiance transfer of the samples."""
+        return self._harmonics is not None and self._given is None
+
     def give(self, light: LightEstimate) -> None:
         """Take this light (S2)."""
         self._given = self._colored(light)
@@ -139,7 +144,7 @@ class RoomLight:
     def update(
         self, context: FrameContext, radiance: cl_array.Array, samples: TransferSamples, up: NDArray[np.float64]
     ) -> LightEstimate:
-        """The light with one more frame, whose samples have transfer.
+        """The light with one more frame, whose samples have transfer if `needs_transfer`.
 
         radiance: [h, w] float4 as in Measurement, without what lamps add. up: [3] unit, world.
         """

@@ -139,6 +139,11 @@ TRANSFER_PARAMETERS = Struct(
 )
 """Parameters of radiance_transfer.cl. cached_normals_at: byte of the cache's surface at which its normals begin."""
 
+TRANSFER_CACHE_PARAMETERS = Struct(
+    "TransferCacheParameters", grid=GRID, eye="float4", spacing="float", now="int", period="int", places="int"
+)
+"""Parameters of transfer_cache.cl. eye: where the camera is, volume metres; spacing: metres between samples at a metre."""
+
 LOOK_UP_PARAMETERS = Struct(
     "LookUpParameters",
     grid=GRID,
@@ -160,10 +165,12 @@ GATHER_PARAMETERS = Struct(
     volume=VOLUME_SHAPE,
     count="int",
     every="int",
+    most="int",
     reach_m="float",
     least_cosine="float",
 )
-"""Parameters of indirect.cl. count: directions of one set; every: a sample traces every n-th blocked direction."""
+"""Parameters of indirect.cl. count: directions of one set; every: a sample traces every n-th blocked direction, `most` in
+all."""
 
 VIEW_TRANSFER_PARAMETERS = Struct(
     "ViewTransferParameters",
@@ -222,6 +229,7 @@ STRUCTS = (
     VIEW_PARAMETERS,
     DIRECT_PARAMETERS,
     TRANSFER_PARAMETERS,
+    TRANSFER_CACHE_PARAMETERS,
     LOOK_UP_PARAMETERS,
     GATHER_PARAMETERS,
     VIEW_TRANSFER_PARAMETERS,

@@ -40,6 +40,8 @@ class Settings:
     denoise_iterations: int
     plan: Literal["needed", "everything"]
     """Whether to leave out effects whose change is bounded by less than a display unit."""
+    has_caches: bool
+    """Whether what belongs to places of the world is kept from frame to frame."""
     smooth_depth: bool
     """Whether merged depth is filtered by the last median (D''')."""
 
@@ -63,6 +65,7 @@ def read_wishes(wishes: Wishes) -> Settings:
         denoise=wishes.denoise,
         denoise_iterations=wishes.denoise_iterations,
         plan=wishes.plan,
+        has_caches=wishes.cache == "on" and wishes.plan != "everything" and not wishes.as_thesis,
         smooth_depth=wishes.smooth_depth,
     )
 

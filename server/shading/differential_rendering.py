@@ -26,10 +26,6 @@ from server.volume.raycast import Surface
 
 VIRTUAL_STRIDE = 2
 """Occlusion of virtual surfaces is traced at every second pixel; the unoccluded part is exact at every pixel."""
-BOUNCE_EVERY = 4
-"""A sample traces every BOUNCE_EVERY-th of its blocked directions; its neighbours trace the others."""
-
-
 MOST_POINTS = 8192
 """At most this many points on objects are lit one by one; the others see an even light."""
 
@@ -93,23 +89,26 @@ def bounce_real(
     transfer: Transfer,
     scene: TracedScene,
     shadow: RealShadow,
+    met: cl_array.Array,
     returned: float = math.inf,
     spare: float = 0.0,
     least: RealShadow | None = None,
 ) -> RealShadow:
     """`shadow` with the change of the light between real surfaces (eq. 7.6: R'_ID - R_ID).
 
-    returned: bound on the change of the radiance that any real surface sends. Where it is at most `spare` times R (of
-    `least`, or else of `shadow`), no ray is traced.
+    met: of Indirect. returned: bound on the change of the radiance that any real surface sends. Where it is at most
+    `spare` times R (of `least`, or else of `shadow`), a sample gains nothing.
     """
     bounced = engine.buffers(_Buffers).bounced.array((transfer.rows, transfer.cols))
     shadowed = replace(scene, changed=Changed(camera, camera_from_volume, surface.positions, shadow))
     engine.launch(
         engine.kernel("differential_rendering.cl", "bounce_real", **_sample_defines(engine, transfer, scene)),
         (transfer.cols, transfer.rows),
-        shadowed.parameters(engine, sample_grid(camera, transfer), BOUNCE_EVERY),
+        shadowed.parameters(engine, sample_grid(camera, transfer)),
         *shadowed.surroundings_arguments(engine),
         *sample_arguments(engine, surface, transfer),
+        met.shape[2],
+        met,
         shadow.shaded,
         returned,
         spare,

@@ -29,6 +29,8 @@ LEAST_COSINE = 0.05
 class _Buffers(StageBuffers):
     hits = BufferDescription(cl_types.float4)
     """[rows, cols] as gather_hits returns it."""
+    met = BufferDescription(np.uint32)
+    """[rows, cols, most] as gather_hits returns it."""
     no_hits = BufferDescription(cl_types.float4)
     """[rows, cols] zeros."""
 
@@ -41,6 +43,8 @@ class Indirect:
     """[rows, cols] float4, see gather_hits."""
     mean: NDArray[np.float64]
     """[3] mean radiance of the surfaces that were met; used for surface that no picture shows."""
+    met: cl_array.Array | None = None
+    """[rows, cols, most] uint32: which directions met surface, and how far away (met.clh)."""
 
 
 def observe_indirect(
@@ -51,10 +55,14 @@ def observe_indirect(
     transfer: Transfer,
     rays: Directions,
     reach_m: float,
+    found: cl_array.Array | None = None,
 ) -> Indirect:
-    """Indirect light at the samples of `transfer`, from the surfaces that block their directions."""
-    hits = gather_hits(engine, camera, volume, surface, transfer, rays, reach_m)
-    return Indirect(hits, mean_sent(engine, hits))
+    """Indirect light at the samples of `transfer`, from the surfaces that block their directions.
+
+    `found`: of transfer_cache.py; samples that were found there keep their values.
+    """
+    hits = gather_hits(engine, camera, volume, surface, transfer, rays, reach_m, found=found)
+    return Indirect(hits, mean_sent(engine, hits), room_for_met(engine, transfer, rays))
 
 
 def gather_hits(
@@ -66,12 +74,15 @@ def gather_hits(
     rays: Directions,
     reach_m: float,
     every: int = EVERY,
+    found: cl_array.Array | None = None,
 ) -> cl_array.Array:
     """[rows, cols] float4: sums over a sample's blocked directions that meet surface with a colour: cosine times
-    radiance (rgb) and cosine (w), both times `every`."""
-    hits = engine.buffers(_Buffers).hits.array((transfer.rows, transfer.cols))
+    radiance (rgb) and cosine (w), both times `every`. The directions that met surface are in `room_for_met`."""
+    hits, met = room_for_hits(engine, transfer), room_for_met(engine, transfer, rays, every)
     words = transfer.free_mask.shape[2]
     defines = {"MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": transfer.interleave}
+    if found is not None:
+        defines["HAS_CACHE"] = 1
     engine.launch(
         engine.kernel("indirect.cl", "gather_hits", **defines),
         (transfer.cols, transfer.rows),
@@ -80,6 +91,7 @@ def gather_hits(
             volume=volume.shape,
             count=rays.count,
             every=every,
+            most=met.shape[2],
             reach_m=reach_m,
             least_cosine=LEAST_COSINE,
         ),
@@ -91,8 +103,20 @@ def gather_hits(
         volume.colors,
         rays.on_device(engine),
         hits,
+        met,
+        *(() if found is None else (found,)),
     )
     return hits
+
+
+def room_for_hits(engine: Engine, transfer: Transfer) -> cl_array.Array:
+    """The array [rows, cols] float4 that `gather_hits` fills."""
+    return engine.buffers(_Buffers).hits.array((transfer.rows, transfer.cols))
+
+
+def room_for_met(engine: Engine, transfer: Transfer, rays: Directions, every: int = EVERY) -> cl_array.Array:
+    """The array [rows, cols, most] uint32 that `gather_hits` fills beside, see Indirect.met."""
+    return engine.buffers(_Buffers).met.array((transfer.rows, transfer.cols, -(-rays.count // every)))
 
 
 def no_hits(engine: Engine, transfer: Transfer) -> cl_array.Array:

@@ -143,17 +143,17 @@ def transfer_radiance(
     state: VisibilityState | None = None,
     turn: int = 0,
     chosen: NDArray[np.int32] | None = None,
+    found: cl_array.Array | None = None,
 ) -> Transfer:
     """Transfer of the real world without virtual objects at every `stride`-th pixel, by rays of at most `reach_m`.
 
     `caches`: visibility from earlier frames, needed where `rays` are interleaved; this frame's is added.
     `state`: voxels that are known to be open, where no ray is traced. `turn`: selects the direction sets, modulo TURNS.
     `chosen` [k]: only these samples (row * cols + col) are traced; the others keep their values.
+    `found`: of transfer_cache.py; samples that were found there keep their values.
     """
     cols, rows = camera.width // stride, camera.height // stride
-    buffers = engine.buffers(TransferBuffers)
-    sets = buffers.sets[rows, cols].array((rows, cols, rays.interleave))
-    result = room_for_transfer(engine, rows, cols, stride, rays, sets)
+    buffers, result = engine.buffers(TransferBuffers), traced_transfer(engine, camera, stride, rays)
     words = result.free_mask.shape[2]
     defines = {"BANDS": result.bands, "MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": rays.interleave}
     if state is not None:
@@ -162,6 +162,9 @@ def transfer_radiance(
     if chosen is not None:
         defines["IS_CHOSEN"] = 1
         only = (*only, buffers.chosen[rows, cols].upload(np.resize(chosen, rows * cols)))
+    if found is not None:
+        defines["HAS_CACHE"] = 1
+        only = (*only, found)
     engine.launch(
         engine.kernel("radiance_transfer.cl", "transfer_radiance", **defines),
         (cols, rows) if chosen is None else (len(chosen),),
@@ -187,10 +190,17 @@ def transfer_radiance(
         result.openness,
         result.flatness,
         result.free_mask,
-        sets,
+        result.sets,
         *only,
     )
     return result
+
+
+def traced_transfer(engine: Engine, camera: CameraModel, stride: int, rays: Directions) -> Transfer:
+    """What `transfer_radiance` returns, before it has run."""
+    cols, rows = camera.width // stride, camera.height // stride
+    sets = engine.buffers(TransferBuffers).sets[rows, cols].array((rows, cols, rays.interleave))
+    return room_for_transfer(engine, rows, cols, stride, rays, sets)
 
 
 def room_for_transfer(

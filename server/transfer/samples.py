@@ -13,6 +13,7 @@ from server.transfer.indirect import Indirect, observe_indirect
 from server.transfer.radiance_transfer import Directions, Transfer
 from server.transfer.real_depth_views import RealDepthViews
 from server.transfer.sampling import Sampling, TransferSampler
+from server.transfer.transfer_cache import TransferCache
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
 
@@ -35,11 +36,15 @@ NO_SAMPLES = TransferSamples(None, None)
 class SampledTransfer:
     """Radiance transfer of one session, with the indirect light at the samples."""
 
-    def __init__(self, engine: Engine, camera: CameraModel, sampling: Sampling, rays: int, bands: int) -> None:
+    def __init__(
+        self, engine: Engine, camera: CameraModel, sampling: Sampling, rays: int, bands: int, *, is_cached: bool = False
+    ) -> None:
+        """`is_cached`: transfer of earlier frames is used at the places where it was found (transfer_cache.py)."""
         self._engine = engine
         self._camera = camera
         self._bands = bands
         self._sampler = TransferSampler(engine, camera, sampling, rays, bands)
+        self._cache = TransferCache(engine) if is_cached else None
         self._mean_sent = np.zeros(3)
 
     def use(self, sampling: Sampling, rays: int) -> None:
@@ -81,11 +86,18 @@ class SampledTransfer:
         with_indirect: bool,
     ) -> TransferSamples:
         """Transfer of the real world without virtual objects (eq. 5.2). up: [3] unit, world axes."""
-        transfer = self._sampler.transfer(volume, surface, volume_from_camera, up, ray_length_m)
-        if not with_indirect:
-            return TransferSamples(transfer, None)
-        rays = self._sampler.rays
-        sent = observe_indirect(self._engine, self._camera, volume, surface, transfer, rays, ray_length_m)
-        if sent.mean.any():  # where almost nothing is blocked, whether a surface is met is noise
-            self._mean_sent = sent.mean
-        return TransferSamples(transfer, replace(sent, mean=self._mean_sent))
+        engine, camera, rays = self._engine, self._camera, self._sampler.rays
+        cache, found = self._cache if self._sampler.may_be_cached else None, None
+        if cache:
+            stride = self._sampler.sampling.stride
+            found = cache.find(camera, volume, surface, volume_from_camera, stride, rays, ray_length_m)
+        transfer = self._sampler.transfer(volume, surface, volume_from_camera, up, ray_length_m, found)
+        sent = None
+        if with_indirect:
+            sent = observe_indirect(engine, camera, volume, surface, transfer, rays, ray_length_m, found)
+            if sent.mean.any():  # where almost nothing is blocked, whether a surface is met is noise
+                self._mean_sent = sent.mean
+            sent = replace(sent, mean=self._mean_sent)
+        if cache:
+            cache.store()
+        return TransferSamples(transfer, sent)

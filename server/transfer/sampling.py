@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pyopencl.array import Array
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
@@ -91,6 +92,12 @@ class TransferSampler:
         return self._image_space.depth_views if self._image_space else None
 
     @property
+    def may_be_cached(self) -> bool:
+        """Whether every frame traces all directions of a sample by rays: else earlier frames are used in other ways."""
+        sampling = self.sampling
+        return sampling.interleave == 1 and not sampling.image_space and not sampling.visibility_state
+
+    @property
     def period(self) -> int:
         """Number of frames after which a still view gets the same samples again."""
         return (TURNS if self.sampling.turning else 1) * self.sampling.interleave
@@ -106,8 +113,12 @@ class TransferSampler:
         volume_from_camera: NDArray[np.float64],
         up: NDArray[np.float64],
         reach_m: float,
+        found: Array | None = None,
     ) -> Transfer:
-        """Transfer of the real world without virtual objects; rays of at most `reach_m`; `up` unit, world axes."""
+        """Transfer of the real world without virtual objects; rays of at most `reach_m`; `up` unit, world axes.
+
+        found: of transfer_cache.py, samples that keep their values; only where `may_be_cached`.
+        """
         engine, camera, sampling = self._engine, self._camera, self.sampling
         self._frame += 1
         turn = (
@@ -123,7 +134,17 @@ class TransferSampler:
             self._state = self._state or VisibilityState(engine, volume, camera, up)
             self._state.validate(volume_from_camera, reach_m)
         result = transfer_radiance(
-            engine, camera, volume, surface, sampling.stride, self.rays, reach_m, self._caches, self._state, turn
+            engine,
+            camera,
+            volume,
+            surface,
+            sampling.stride,
+            self.rays,
+            reach_m,
+            self._caches,
+            self._state,
+            turn,
+            found=found,
         )
         if self._state:
             self._state.learn(surface, camera, sampling.stride, result.openness)

@@ -356,9 +356,11 @@ def bounced_wall(
     hits = engine.workspace.upload("test_hits", float4(np.ones_like(ratio), valid))
     shadow = RealShadow(stride, engine.workspace.upload("test_ratio", float4(ratio, valid)), shaded)
     light = upload_light(engine, lights.uniform(), rays, indirect=Indirect(hits, np.ones(3)))
+    met = observe_indirect(engine, CAMERA, volume, surface, transfer, rays, ROOM_M).met
+    assert met is not None
     traced = trace_scene(engine, volume, light, rays, ROOM_M, [])
     returned = float(np.abs(FLOOR_RATIO - 1).max())
-    bounced = bounce_real(engine, CAMERA, inverse_rigid(view), surface, transfer, traced, shadow, returned, spare)
+    bounced = bounce_real(engine, CAMERA, inverse_rigid(view), surface, transfer, traced, shadow, met, returned, spare)
     return download4(engine, bounced.values).astype(float), points, normals[..., :3]
 
 

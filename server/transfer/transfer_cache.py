@@ -1,0 +1,174 @@
+"""Radiance transfer that earlier frames found at places of the world. Kernel: transfer_cache.cl.
+
+Transfer and the light from surfaces belong to a place of the scanned surface, not to a frame. Each is kept under a cell of the world that is
+about as large as the distance between samples there, so that a moving camera finds again what it saw a frame, or a turn, ago. A
+sample that finds nothing is traced and stored; a cell is traced again after PERIOD frames at most, because the scan grows.
+So an entry is off by at most what the scan has changed in PERIOD frames, and it belongs to a point within a cell of the sample's. Surface
+that moves is no exception: what its samples see of the scan depends on where they are only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cl_array
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.opencl.buffers import BufferDescription, StageBuffers
+from server.opencl.engine import Engine, float4
+from server.opencl.structs import TRANSFER_CACHE_PARAMETERS
+from server.transfer.indirect import room_for_hits, room_for_met
+from server.transfer.radiance_transfer import Directions, Transfer, sample_grid, traced_transfer
+from server.volume.raycast import Surface
+from server.volume.volume import Volume
+
+PERIOD = 16
+"""Frames after which a cell is traced again: half a second at 30 frames/s."""
+PLACES_A_SAMPLE = 8
+"""Size of the table, in samples of a frame; a power of two follows. Views of the last seconds fit, and few cells collide."""
+MOST_PLACES = 1 << 20
+"""Of 232 bytes each with the defaults."""
+_WORDS_BESIDE = 17
+"""Words of an entry besides mask, coefficients and directions that met surface, as in transfer_cache.cl."""
+_UNCLAIMED = 0xFFFFFFFF
+
+
+class _Buffers(StageBuffers):
+    entries = BufferDescription(np.uint32)
+    """[places, words]."""
+    claims = BufferDescription(np.uint32)
+    """[places] the sample that fills a place in this frame."""
+    found = BufferDescription(np.int32)
+    """[rows, cols] as find_samples returns it."""
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """One frame's samples and what its kernels share."""
+
+    surface: Surface
+    transfer: Transfer
+    hits: cl_array.Array
+    met: cl_array.Array
+    parameters: np.void
+    defines: dict[str, int]
+
+
+class TransferCache:
+    """One session's. Call `find`, trace what was not found, then `store`."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        self._buffers = engine.buffers(_Buffers)
+        self._of: tuple[object, ...] = ()
+        self._now = 0
+        self._frame: _Frame | None = None
+
+    def find(
+        self,
+        camera: CameraModel,
+        volume: Volume,
+        surface: Surface,
+        volume_from_camera: NDArray[np.float64],
+        stride: int,
+        rays: Directions,
+        reach_m: float,
+    ) -> cl_array.Array:
+        """[rows, cols] int32: at least 0 where a sample was found. Its values are then in the arrays that
+        `transfer_radiance` and `gather_hits` return, which leave it out.
+
+        What was found by other rays, in another volume or by another camera model is forgotten.
+        """
+        engine, transfer = self._engine, traced_transfer(self._engine, camera, stride, rays)
+        places = places_for(transfer.rows * transfer.cols)
+        hits, met = room_for_hits(engine, transfer), room_for_met(engine, transfer, rays)
+        defines = {"BANDS": transfer.bands, "MASK_WORDS": transfer.free_mask.shape[2], "MOST_MET": met.shape[2]}
+        words = _WORDS_BESIDE + defines["MASK_WORDS"] + transfer.bands**2 + defines["MOST_MET"]
+        self._forget_others(camera, volume, stride, rays, reach_m, places, words)
+        self._now += 1
+        parameters = TRANSFER_CACHE_PARAMETERS(
+            grid=sample_grid(camera, transfer),
+            eye=float4(*volume_from_camera[:3, 3], 0.0),
+            spacing=stride / camera.fx,
+            now=self._now,
+            period=PERIOD,
+            places=places,
+        )
+        self._frame = _Frame(surface, transfer, hits, met, parameters, defines)
+        found = self._buffers.found.array((transfer.rows, transfer.cols))
+        engine.launch(
+            engine.kernel("transfer_cache.cl", "find_samples", **defines),
+            (transfer.cols, transfer.rows),
+            parameters,
+            surface.positions,
+            surface.normals,
+            self._buffers.entries.array((places, words)),
+            transfer.coefficients,
+            transfer.openness,
+            transfer.flatness,
+            transfer.free_mask,
+            transfer.sets,
+            hits,
+            met,
+            found,
+        )
+        return found
+
+    def store(self) -> None:
+        """Keep what the samples that `find` had not found have now."""
+        engine, frame, buffers = self._engine, self._frame, self._buffers
+        assert frame is not None
+        transfer, surface = frame.transfer, frame.surface
+        entries, claims, found = buffers.entries.current, buffers.claims.current, buffers.found.current
+        size = (transfer.cols, transfer.rows)
+        engine.launch(
+            engine.kernel("transfer_cache.cl", "claim_entries", **frame.defines),
+            size,
+            frame.parameters,
+            surface.positions,
+            surface.normals,
+            entries,
+            claims,
+            found,
+        )
+        engine.launch(
+            engine.kernel("transfer_cache.cl", "store_samples", **frame.defines),
+            size,
+            frame.parameters,
+            surface.positions,
+            surface.normals,
+            entries,
+            transfer.coefficients,
+            transfer.openness,
+            transfer.flatness,
+            transfer.free_mask,
+            transfer.sets,
+            frame.hits,
+            frame.met,
+            found,
+            claims,
+        )
+
+    def _forget_others(
+        self,
+        camera: CameraModel,
+        volume: Volume,
+        stride: int,
+        rays: Directions,
+        reach_m: float,
+        places: int,
+        words: int,
+    ) -> None:
+        asked = (camera, stride, rays.count, rays.interleave, rays.basis.shape[2], reach_m)
+        if self._of and self._of[0] is volume and self._of[1:] == asked:
+            return
+        self._of = (volume, *asked)
+        self._buffers.entries.upload(np.zeros((places, words), np.uint32))
+        self._buffers.claims.upload(np.full(places, _UNCLAIMED, np.uint32))
+
+
+def places_for(samples: int) -> int:
+    """Places of the table for so many samples of a frame: a power of two."""
+    return min(1 << (PLACES_A_SAMPLE * max(samples, 1) - 1).bit_length(), MOST_PLACES)

@@ -147,7 +147,7 @@ class Pipeline:
         left_out = self._left_out(frame, reuse, is_kept, is_shaded, needs_transfer)
         with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
             light = self._estimate_light(context, samples, left_out)
-            self._look_up_places(context, is_still=reuse.keeps_geometry and "estimate_light" in left_out)
+            self._look_up_places(context, is_still=reuse.keeps_geometry)
         with stage("rendering"):  # 7.1-7.2, the effects that this frame calls for
             spine = self._spine_outputs(context, frame, objects, samples, left_out)
             rendered = self._renderer.render(context, spine, self._settings, reuse, request)

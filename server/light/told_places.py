@@ -2,30 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from server.frame_context import FrameContext
 from server.light.light_message import LightPlaces
-from server.light.place_light import LitPlace, Place
+from server.light.place_light import LitPlace, Place, PlaceLight
 from server.light.room_light import RoomLight
 from server.light.view_middle import view_middle
 
 MOST_OBJECTS = 64
-"""Objects with a light of their own, which costs 0.3 ms and 1 kB each in every frame; the others have `Light.sh`."""
+"""Objects with a light of their own, which costs 2 ms and 1 kB each where the light has changed; the others have
+`Light.sh`."""
+
+KEPT_FRAMES = 3
+"""Frames for which a place is not looked up again while the light stays and the scan grows."""
 
 Floats = NDArray[np.float64]
+Key = tuple[str, int, bytes]
 
 
 class ToldPlaces:
-    """Kept between frames: a still view of unchanged light is not looked up again."""
+    """Kept between frames: while the light stays, a place is not looked up again at once."""
 
     def __init__(self) -> None:
         self.newest = LightPlaces()
         """World axes of the room, metres; where the camera is lost, those of the last frame that was placed."""
-        self._known_by: tuple[Floats, ...] = ()
+        self._light: Floats = np.zeros(0)
+        self._frames = 0
 
     def update(
         self,
@@ -38,19 +44,32 @@ class ToldPlaces:
     ) -> None:
         """Look up the light at all places. asked: [n, 3] world; objects: the middle of each by name.
 
-        `is_still`: geometry and light are those of the frame before.
+        `is_still`: the geometry is that of the frame before.
         """
         origin = context.volume.origin_world
         middle = view_middle(context.engine, context.surface, context.volume_from_camera)
         view = (context.volume_from_camera[:3, 3] if middle is None else middle) + origin
         places = _places(view, asked, objects)
-        positions = np.array([place.position for place in places])
-        known_by = positions, light.estimate().sh
-        if is_still and _are_equal(known_by, self._known_by):
-            return
-        found = light.arriving_at(context.engine, context.volume, positions)
-        self.newest = LightPlaces(view, [LitPlace(*pair) for pair in zip(places, found, strict=True)])
-        self._known_by = known_by
+        kept = self._kept(light.estimate().sh, is_still=is_still)
+        new = [place for place in places if _key(place) not in kept]
+        if new:
+            positions = np.array([place.position for place in new])
+            found = light.arriving_at(context.engine, context.volume, positions)
+            kept |= {_key(place): one for place, one in zip(new, found, strict=True)}
+        self.newest = LightPlaces(view, [LitPlace(place, kept[_key(place)]) for place in places])
+
+    def _kept(self, sh: Floats, *, is_still: bool) -> dict[Key, PlaceLight]:
+        """What was found under the same light, whose coefficients are `sh`, and still holds."""
+        is_same, self._light = np.array_equal(sh, self._light), sh
+        self._frames = self._frames if is_still else self._frames + 1
+        if is_same and self._frames < KEPT_FRAMES:
+            return {_key(lit.place): lit.light for lit in self.newest.lit}
+        self._frames = 0
+        return {}
+
+
+def _key(place: Place) -> Key:
+    return place.of, place.index, place.position.tobytes()
 
 
 def _places(view: Floats, asked: Floats, objects: Mapping[str, Floats]) -> list[Place]:
@@ -60,7 +79,3 @@ def _places(view: Floats, asked: Floats, objects: Mapping[str, Floats]) -> list[
         *(Place("place", index, position) for index, position in enumerate(asked)),
         *(Place("object", index, position, name) for index, (name, position) in enumerate(lit)),
     ]
-
-
-def _are_equal(some: Sequence[Floats], others: Sequence[Floats]) -> bool:
-    return len(some) == len(others) and all(np.array_equal(*pair) for pair in zip(some, others, strict=True))

@@ -163,12 +163,18 @@ class Patches:
         self.weights[rows] = np.minimum(weights + 1.0, MOST_WEIGHT)
         self.seen_in[rows] = self._frame
 
-    def trace(self, engine: Engine, volume: Volume) -> Ints:
-        """Trace the rays of patches that have none yet, and of those traced longest ago. Returns their rows."""
+    @property
+    def fresh(self) -> int:
+        """Number of patches whose rays were not traced yet."""
+        return int(((self.weights > 0) & (self.traced_in < 0)).sum())
+
+    def trace(self, engine: Engine, volume: Volume, frames: int = 1) -> Ints:
+        """Trace the rays of patches that have none yet, and of those traced longest ago, TRACED_A_FRAME for each of
+        `frames`. Returns their rows."""
         alive = np.flatnonzero(self.weights > 0)
         order = alive[np.argsort(self.traced_in[alive], kind="stable")]
         fresh = int((self.traced_in[order] < 0).sum())
-        rows = order[: max(fresh, TRACED_A_FRAME)]
+        rows = order[: max(fresh, frames * TRACED_A_FRAME)]
         if len(rows) == 0:
             return rows
         self.directions[rows] = hemisphere_rays(self.normals[rows], rows)

@@ -40,6 +40,11 @@ STEADY, CHANGED = 0.2, 0.3
 """Changes of log radiance, root mean square over the ways that patches face of their median: up to the first (.19 at
 most in the real kitchen, whose exposure varies, .03 in rooms) nothing is forgotten, from the second (a lamp that goes
 45 degrees around a table makes .32) everything is."""
+SOLVE_EVERY = 3
+"""Frames that one solution takes in, as long as the light is steady and little of the room is new: what frames show is
+summed in between. The goal is that a change is followed within three."""
+NEW_SHARE = 0.1
+"""Share of new patches, or of frames that were not taken in, from which a frame is solved at once."""
 LEAST_FACING = 5
 """Patches that face one way, for a median."""
 
@@ -67,6 +72,8 @@ class RoomModel:
         self._transport = Transport()
         self._unknowns, self._distant = Unknowns(), Unknowns()
         self._shell: Shell | None = None
+        self._waiting = self._frames = 0
+        self._beyond: tuple[bytes, int, tuple[Floats, Floats, list[ShellLamp]]] | None = None
 
     @property
     def is_known(self) -> bool:
@@ -79,12 +86,23 @@ class RoomModel:
         seen = gather_patches(engine, context.camera, context.surface, context.scene_radiance, volume)
         if not seen.count:
             return
-        self._patches.forget(self._change(seen) if switches.memory else 1.0)
+        change = self._change(seen) if switches.memory else 1.0
+        self._patches.forget(change)
         self._patches.add(seen)
-        traced = self._patches.trace(engine, volume)
+        self._waiting, self._frames = self._waiting + 1, self._frames + 1
+        if not self._is_due(change):
+            return
+        traced = self._patches.trace(engine, volume, self._waiting)
+        self._waiting, self._beyond = 0, None
         camera = context.volume_from_camera[:3, 3] + volume.origin_world
         with engine.profile.host():
             self._solve(traced, camera, up)
+
+    def _is_due(self, change: float) -> bool:
+        """Whether to solve with this frame. change: share of the evidence that it contradicts."""
+        if not self.is_known or change > 0.0 or self._waiting >= SOLVE_EVERY:
+            return True
+        return self._waiting > NEW_SHARE * self._frames or self._patches.fresh > NEW_SHARE * self.patches
 
     def _solve(self, traced: NDArray[np.int64], camera: Floats, up: Floats) -> None:
         patches, transport, switches, rows = self._patches, self._transport, self._switches, self._patches.used
@@ -147,8 +165,15 @@ class RoomModel:
     def beyond(self, position: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
         """The light from the shell as seen from `position` [3] (world), with no surface in between.
 
-        [bands^2, 3] the whole, [bands^2, 3] what its lamps leave, and the lamps; needs `is_known`.
+        [bands^2, 3] the whole, [bands^2, 3] what its lamps leave, and the lamps; needs `is_known`. Kept until the next
+        solution.
         """
+        asked = position.tobytes(), bands
+        if self._beyond is None or self._beyond[:2] != asked:
+            self._beyond = *asked, self._seen_beyond(position, bands)
+        return self._beyond[2]
+
+    def _seen_beyond(self, position: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
         assert self._shell is not None
         directions = look_up_directions()[0]
         start = np.broadcast_to(position, directions.shape)

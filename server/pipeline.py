@@ -207,7 +207,7 @@ class Pipeline:
             with_indirect=self._settings.indirect != "none",
         )
         if reuse.reason is not None:
-            self._cache.keep(samples, reuse.samples_version)
+            self._cache.keep(samples, reuse.samples_version, frozenset({"cells"}))
         return samples, False
 
     def _left_out(

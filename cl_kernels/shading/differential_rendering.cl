@@ -79,7 +79,7 @@ kernel void bounce_real(SURROUNDINGS_PARAMETERS, SAMPLE_BUFFERS, const int most,
         const float3 at_m = origin + distance_of_met(there) * direction;
         const float3 change = change_at(arrives.changed, at_m, SAME_POINT * volume.voxel_m) - 1.0f;
         const float3 more = any(change != 0.0f) ? change * sent_at(volume, arrives, at_m / volume.voxel_m, 0) : (float3)(0.0f);
-        sum += dot(normal.xyz, direction) * (float4)(more, 1.0f);
+        sum += fmax(dot(normal.xyz, direction), 0.0f) * (float4)(more, 1.0f);  // a cell's normal may differ from the sample's
     }
     const float3 gained = part_hidden * sum.xyz / fmax(sum.w, 1e-6f);
     const float3 without = fmax(shaded[sample].xyz, floor);

@@ -1,5 +1,5 @@
 // Shadow maps along the sharp lights of a room, and shading with them (thesis 7.2.3, fig. 7.7).
-// Provides begin_maps, halve_maps, trace_discs, light_virtual, light_real, light_points_by_discs, light_samples, mix_direct,
+// Provides begin_maps, halve_maps, trace_discs, keep_parts, light_virtual, light_real, light_points_by_discs, light_samples, mix_direct,
 // unmix_direct.
 #include "arriving.clh"
 #include "camera.clh"
@@ -95,12 +95,26 @@ static float4 real_parts(const Volume volume, const float reach_m, const DirectL
 
 // Samples of a surface: positions, normals [h][w] (w = 0 without surface). ray_places [RAY_SETS][RAYS].
 // -> parts [rows][cols]: the fraction of each disc's light that real surface does not block (xyz: discs 0 to 2, w = 1 valid).
-kernel void trace_discs(const Grid grid, global const float4 *positions, global const float4 *normals, const int is_virtual, DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *parts) {
+// With HAS_CELLS, samples whose cell kept its parts in frame `since` or later get those; the others ask to fill their cell's:
+// cells [rows][cols] (-1 none); claims, kept, frames [cells]: see Cells.
+kernel void trace_discs(const Grid grid, global const float4 *positions, global const float4 *normals, const int is_virtual, DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *parts
+#ifdef HAS_CELLS
+                        , const int since, global const int *cells, global uint *claims, global const float4 *kept, global const int *frames
+#endif
+) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= grid.cols || row >= grid.rows) return;
     const int pixel = sample_pixel(grid, row, col);
     const float4 position = positions[pixel], normal = normals[pixel];
+#ifdef HAS_CELLS
+    const int sample = row * grid.cols + col, place = cells[sample];
+    if (place >= 0 && frames[place] >= since) {
+        parts[sample] = kept[place];
+        return;
+    }
+    if (place >= 0) atomic_min(&claims[place], (uint)sample);
+#endif
     const Volume volume = VOLUME_OF_PARAMETERS;
     const DirectLights lights = DIRECT_OF_PARAMETERS;
     float4 result = (float4)(0.0f);
@@ -108,6 +122,17 @@ kernel void trace_discs(const Grid grid, global const float4 *positions, global 
         result = real_parts(volume, reach_m, lights, position.xyz, normal.xyz, is_virtual,
                             ray_places + RAYS * ((row & 3) * 4 + (col & 3)));
     parts[row * grid.cols + col] = result;
+}
+
+// The first sample of those that ask for a cell fills it. Arguments as in trace_discs; now: number of this frame.
+kernel void keep_parts(const int count, const int now, global const float4 *parts, global const int *cells, global uint *claims,
+                       global float4 *kept, global int *frames) {
+    const int sample = get_global_id(0);
+    if (sample >= count || cells[sample] < 0 || claims[cells[sample]] != (uint)sample) return;
+    const int place = cells[sample];
+    claims[place] = 0xffffffffu;
+    kept[place] = parts[sample];
+    frames[place] = now;
 }
 
 // The first three of four of LANES neighbours from vectors[i] on, those past `last` 0; `known` where w > 0.

@@ -132,19 +132,23 @@ kernel void claim_entries(const TransferCacheParameters p, global const float4 *
 }
 
 // Arguments as in find_samples and claim_entries; the arrays of samples now hold values of this frame. The first traced frame of a
-// cell is told earlier by a part of the period, so that cells do not all become too old at once.
+// cell is told earlier by a part of the period, so that cells do not all become too old at once. disc_frames [places]: see
+// shadow_map.cl; 0 where an entry is new. -> found: the place of the sample's entry, else NOT_STORED.
 kernel void store_samples(const TransferCacheParameters p, global const float4 *positions, global const float4 *normals, global uint *entries,
                           global const float *transfer, global const float *openness, global const float *flatness,
                           global const uint *free_mask, global const uchar *sets, global const float4 *hits, global const uint *met,
-                          global const int *found, global uint *claims) {
+                          global uint *claims, global int *disc_frames, global int *found) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= p.grid.cols || row >= p.grid.rows) return;
     const int sample = row * p.grid.cols + col, pixel = sample_pixel(p.grid, row, col);
     if (found[sample] >= NOT_STORED) return;
     const int place = -2 - found[sample];
-    if (claims[place] != (uint)sample) return;
+    const int is_first = claims[place] == (uint)sample;
+    found[sample] = is_first ? place : NOT_STORED;
+    if (!is_first) return;
     claims[place] = 0xffffffffu;
+    disc_frames[place] = 0;
     const float3 position = positions[pixel].xyz, normal = normals[pixel].xyz;
     const Cell cell = cell_of(p, position, normal);
     global uint *entry = entries + (size_t)place * WORDS;

@@ -81,7 +81,7 @@ def light_objects(context: FrameContext, scene: TracedScene, maps: ShadowMaps | 
 def light_samples(context: FrameContext, transfer: Transfer, maps: ShadowMaps) -> DirectSamples:
     """What the discs bring to the samples of real surface, with objects and without."""
     samples = SampleGrid(transfer.stride, transfer.openness)
-    parts = shadow_maps.trace_real(context.engine, context.camera, context.surface, samples, maps)
+    parts = shadow_maps.trace_real(context.engine, context.camera, context.surface, samples, maps, transfer.cells)
     return shadow_maps.light_samples(context.engine, context.camera, context.surface, parts, maps)
 
 
@@ -217,6 +217,7 @@ def direct_virtual(context: FrameContext, virtual: VirtualSurface, maps: ShadowM
 
 def direct_real(
     context: FrameContext,
+    transfer: Transfer,
     ratio: RealShadow,
     maps: ShadowMaps,
     bounced: BouncedShadow | None,
@@ -225,7 +226,7 @@ def direct_real(
 ) -> DirectReal:
     """What virtual things take from real ones of the whole light, its discs at every pixel (7.2.3)."""
     engine, camera, surface, shadow = context.engine, context.camera, context.surface, bounced or ratio
-    parts = shadow_maps.trace_real(engine, camera, surface, shadow, maps)
+    parts = shadow_maps.trace_real(engine, camera, surface, shadow, maps, transfer.cells)
     upsampling = context.sampling.upsampling
     return DirectReal(
         shadow_maps.light_real(engine, camera, surface, shadow, parts, maps, refined, upsampling, changed)

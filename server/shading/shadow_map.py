@@ -34,6 +34,7 @@ from server.shading.differential_rendering import MOST_POINTS, VIRTUAL_STRIDE, R
 from server.shading.traced_scene import DeviceLight, ball_around
 from server.shading.virtual_point_lights import PlacedPoints, VirtualPointLights
 from server.transfer.auxiliary_views import view_axes
+from server.transfer.radiance_transfer import Cells
 from server.transfer.sample_grid import SampleGrid, grid_of
 from server.transfer.sampling import Upsampling
 from server.volume.raycast import Surface
@@ -99,6 +100,8 @@ class ShadowMaps:
     of half its angle), irradiance (w: _rows); as the light is at the ball's centre."""
     ball: Floats
     """Centre and radius of the ball around all objects, volume metres."""
+    discs: bytes
+    """Of `rows`, but for irradiance: equal where what hides the discs is the same."""
     objects: cl_array.Array
     """[MOST_LIGHTS, texels of the pyramid] float2: coverage, mean depth in metres from the ball's centre."""
     traced: list[tuple[Surface, SampleGrid]] = field(default_factory=list)
@@ -142,9 +145,8 @@ def draw_shadow_maps(
     axes = view_axes(np.stack([disc.direction for disc in discs]))
     rows = _rows(discs, axes, float(ball[3]))
     uploaded = engine.buffers(_Buffers).rows.upload(rows.view(cl_types.float4)[..., 0])
-    return ShadowMaps(
-        volume, light, reach_m, uploaded, ball, _draw_objects(engine, axes, rows, uploaded, ball, objects)
-    )
+    drawn = _draw_objects(engine, axes, rows, uploaded, ball, objects)
+    return ShadowMaps(volume, light, reach_m, uploaded, ball, rows[:, :3].tobytes(), drawn)
 
 
 def most_irradiance(light: DeviceLight, objects: Sequence[Placed]) -> Floats:
@@ -192,14 +194,22 @@ def light_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, 
 
 
 def trace_real(
-    engine: Engine, camera: CameraModel, surface: Surface, ratio: SampleGrid, maps: ShadowMaps
+    engine: Engine,
+    camera: CameraModel,
+    surface: Surface,
+    ratio: SampleGrid,
+    maps: ShadowMaps,
+    cells: Cells | None = None,
 ) -> SampleGrid:
-    """The part of each disc that real surfaces do not block, at the samples of `ratio`: float4, w = 1 valid."""
+    """The part of each disc that real surfaces do not block, at the samples of `ratio`: float4, w = 1 valid.
+
+    cells: of these samples; parts are kept there until the discs change.
+    """
     for traced, parts in maps.traced:
         if traced is surface and (parts.stride, parts.values.shape) == (ratio.stride, ratio.values.shape):
             return parts
     parts = SampleGrid(ratio.stride, engine.buffers(_Buffers).real_parts.array(ratio.values.shape))
-    _trace_discs(engine, camera, surface.positions, surface.normals, parts, maps, is_virtual=False)
+    _trace_discs(engine, camera, surface.positions, surface.normals, parts, maps, is_virtual=False, cells=cells)
     maps.traced[:] = [(surface, parts)]  # the next call writes the same array
     return parts
 
@@ -341,9 +351,15 @@ def _trace_discs(
     parts: SampleGrid,
     maps: ShadowMaps,
     is_virtual: bool,
+    cells: Cells | None = None,
 ) -> None:
+    defines, kept = {}, ()
+    if cells is not None:
+        since = engine.state(_KeptDiscs).since(maps.discs, cells.now)
+        defines = {"HAS_CELLS": 1}
+        kept = (since, cells.places, cells.claims, cells.disc_parts, cells.disc_frames)
     engine.launch(
-        _kernel(engine, "trace_discs"),
+        _kernel(engine, "trace_discs", **defines),
         (parts.cols, parts.rows),
         grid_of(parts, camera),
         positions,
@@ -352,7 +368,26 @@ def _trace_discs(
         *maps.arguments(engine),
         *maps.trace_arguments(engine),
         parts.values,
+        *kept,
     )
+    if cells is not None:
+        count = parts.rows * parts.cols
+        kept = (cells.places, cells.claims, cells.disc_parts, cells.disc_frames)
+        engine.launch(_kernel(engine, "keep_parts"), (count,), count, cells.now, parts.values, *kept)
+
+
+class _KeptDiscs:
+    """Which discs the parts that cells keep are of."""
+
+    def __init__(self) -> None:
+        self._discs: bytes = b""
+        self._since = 1
+
+    def since(self, discs: bytes, now: int) -> int:
+        """The first frame with these discs, of those that follow one another up to `now`."""
+        if discs != self._discs or now < self._since:
+            self._discs, self._since = discs, now
+        return self._since
 
 
 def _rows(discs: Sequence[DirectLight], axes: Floats, radius_m: float) -> NDArray[np.float32]:

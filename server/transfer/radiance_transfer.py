@@ -106,6 +106,22 @@ def direction_sets(count: int, bands: int, interleave: int = 1) -> Directions:
 
 
 @dataclass(frozen=True)
+class Cells:
+    """The cells of the world that samples lie in (transfer_cache.py), and what else is kept there."""
+
+    places: cl_array.Array
+    """[rows, cols] int32: place of each sample's cell, -1 without one."""
+    claims: cl_array.Array
+    """[cells] uint32: UINT_MAX but while a kernel decides which sample fills a cell."""
+    disc_parts: cl_array.Array
+    """[cells] float4: as of trace_discs in shadow_map.cl."""
+    disc_frames: cl_array.Array
+    """[cells] int32: frame in which they were traced; 0: never."""
+    now: int
+    """Number of this frame, from 1."""
+
+
+@dataclass(frozen=True)
 class Transfer:
     """Radiance transfer on the device; sample i along an axis lies at pixel stride / 2 + i stride."""
 
@@ -124,6 +140,8 @@ class Transfer:
     sets: cl_array.Array | None = None
     """[rows, cols, interleave] uint8: direction j is that of set sets[j % interleave]; None: all are of the sample's
     own set (direction_sets.clh)."""
+    cells: Cells | None = None
+    """None: nothing is kept from frame to frame."""
 
     @property
     def interleave(self) -> int:

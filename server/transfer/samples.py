@@ -99,5 +99,5 @@ class SampledTransfer:
                 self._mean_sent = sent.mean
             sent = replace(sent, mean=self._mean_sent)
         if cache:
-            cache.store()
+            transfer = replace(transfer, cells=cache.store())
         return TransferSamples(transfer, sent)

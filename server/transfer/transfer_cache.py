@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
@@ -20,7 +21,7 @@ from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, float4
 from server.opencl.structs import TRANSFER_CACHE_PARAMETERS
 from server.transfer.indirect import room_for_hits, room_for_met
-from server.transfer.radiance_transfer import Directions, Transfer, sample_grid, traced_transfer
+from server.transfer.radiance_transfer import Cells, Directions, Transfer, sample_grid, traced_transfer
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
 
@@ -41,7 +42,10 @@ class _Buffers(StageBuffers):
     claims = BufferDescription(np.uint32)
     """[places] the sample that fills a place in this frame."""
     found = BufferDescription(np.int32)
-    """[rows, cols] as find_samples returns it."""
+    """[rows, cols] as find_samples and store_samples return it."""
+    disc_parts = BufferDescription(cl_types.float4)
+    disc_frames = BufferDescription(np.int32)
+    """[places] of Cells."""
 
 
 @dataclass(frozen=True)
@@ -116,8 +120,8 @@ class TransferCache:
         )
         return found
 
-    def store(self) -> None:
-        """Keep what the samples that `find` had not found have now."""
+    def store(self) -> Cells:
+        """Keep what the samples that `find` had not found have now. Returns the cells of all samples."""
         engine, frame, buffers = self._engine, self._frame, self._buffers
         assert frame is not None
         transfer, surface = frame.transfer, frame.surface
@@ -147,9 +151,14 @@ class TransferCache:
             transfer.sets,
             frame.hits,
             frame.met,
-            found,
             claims,
+            buffers.disc_frames.current,
+            found,
         )
+        kept = buffers.disc_parts.current, buffers.disc_frames.current
+        assert found is not None
+        assert claims is not None
+        return Cells(found, claims, *kept, self._now)
 
     def _forget_others(
         self,
@@ -167,6 +176,8 @@ class TransferCache:
         self._of = (volume, *asked)
         self._buffers.entries.upload(np.zeros((places, words), np.uint32))
         self._buffers.claims.upload(np.full(places, _UNCLAIMED, np.uint32))
+        self._buffers.disc_parts.array((places,))
+        self._buffers.disc_frames.upload(np.zeros(places, np.int32))
 
 
 def places_for(samples: int) -> int:

@@ -95,33 +95,29 @@ static float4 real_parts(const Volume volume, const float reach_m, const DirectL
 
 // Samples of a surface: positions, normals [h][w] (w = 0 without surface). ray_places [RAY_SETS][RAYS].
 // -> parts [rows][cols]: the fraction of each disc's light that real surface does not block (xyz: discs 0 to 2, w = 1 valid).
-// With HAS_CELLS, samples whose cell kept its parts in frame `since` or later get those; the others ask to fill their cell's:
+// With has_cells, samples whose cell kept its parts in frame `since` or later get those; the others ask to fill their cell's:
 // cells [rows][cols] (-1 none); claims, kept, frames [cells]: see Cells.
-kernel void trace_discs(const Grid grid, global const float4 *positions, global const float4 *normals, const int is_virtual, DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *parts
-#ifdef HAS_CELLS
-                        , const int since, global const int *cells, global uint *claims, global const float4 *kept, global const int *frames
-#endif
-) {
+kernel void trace_discs(const Grid grid, global const float4 *positions, global const float4 *normals, const int is_virtual, DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *parts,
+                        const int has_cells, const int since, global const int *cells, global uint *claims, global const float4 *kept,
+                        global const int *frames) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= grid.cols || row >= grid.rows) return;
     const int pixel = sample_pixel(grid, row, col);
     const float4 position = positions[pixel], normal = normals[pixel];
-#ifdef HAS_CELLS
-    const int sample = row * grid.cols + col, place = cells[sample];
+    const int sample = row * grid.cols + col, place = has_cells ? cells[sample] : -1;
     if (place >= 0 && frames[place] >= since) {
         parts[sample] = kept[place];
         return;
     }
     if (place >= 0) atomic_min(&claims[place], (uint)sample);
-#endif
     const Volume volume = VOLUME_OF_PARAMETERS;
     const DirectLights lights = DIRECT_OF_PARAMETERS;
     float4 result = (float4)(0.0f);
     if (position.w > 0.0f && normal.w > 0.0f)
         result = real_parts(volume, reach_m, lights, position.xyz, normal.xyz, is_virtual,
                             ray_places + RAYS * ((row & 3) * 4 + (col & 3)));
-    parts[row * grid.cols + col] = result;
+    parts[sample] = result;
 }
 
 // The first sample of those that ask for a cell fills it. Arguments as in trace_discs; now: number of this frame.

@@ -112,6 +112,7 @@ def prepare(options: CaptureOptions, lossless: bool = False, answer: str | None 
         tone_mapping=choices.tone_mapping or DEFAULTS.tone_mapping,
         robustness=robustness,
         plan=choices.plan or DEFAULTS.plan,
+        cache=choices.cache or DEFAULTS.cache,
         answer=answer_kind or DEFAULTS.answer,
         lossless=lossless,
     )

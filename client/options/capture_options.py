@@ -106,6 +106,10 @@ ToneMapping = Annotated[
 Plan = Annotated[
     str | None, typer.Option(metavar="needed|everything", help="everything: also effects whose change is invisible")
 ]
+Cache = Annotated[
+    str | None,
+    typer.Option(metavar="on|off", help="off: nothing is kept at places of the world, to compare; default: on"),
+]
 Mesh = Annotated[bool, typer.Option("--mesh", help="write mesh.ply and mesh.glb")]
 BudgetMs = Annotated[float | None, typer.Option(metavar="N", help="choose the operating point for this frame time")]
 MaxLightError = Annotated[
@@ -179,6 +183,7 @@ class CaptureOptions:
     edges: Edges = None
     tone_mapping: ToneMapping = None
     plan: Plan = None
+    cache: Cache = None
     budget_ms: BudgetMs = None
     max_light_error: MaxLightError = None
 

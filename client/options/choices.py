@@ -25,6 +25,7 @@ class Choices:
     edges: Literal["smooth", "hard"] | None
     tone_mapping: Literal["light", "average"] | None
     plan: Literal["needed", "everything"] | None
+    cache: Literal["on", "off"] | None
     exposure: Literal["auto", "constant"] | None
     upsampling: Literal["bilateral", "bicubic"] | None
     interleave: Literal[1, 2, 4, 8] | None
@@ -42,6 +43,7 @@ def choices_of(options: CaptureOptions) -> Choices:
         edges=choice("--edges", options.edges, ("smooth", "hard")),
         tone_mapping=choice("--tone-mapping", options.tone_mapping, ("light", "average")),
         plan=choice("--plan", options.plan, ("needed", "everything")),
+        cache=choice("--cache", options.cache, ("on", "off")),
         exposure=choice("--exposure", options.exposure, ("auto", "constant")),
         upsampling=choice("--upsampling", options.upsampling, ("bilateral", "bicubic")),
         interleave=choice("--interleave", options.interleave, (1, 2, 4, 8)),

@@ -115,8 +115,8 @@ def bounce_real(
     samples: DirectSamples | None,
 ) -> BouncedShadow:
     """`ratio` with what real things then send to one another, less or more (eq. 7.6)."""
-    engine, lit = context.engine, replace(scene, point_lights=lights)
-    assert indirect.met is not None
+    engine, lit, met = context.engine, replace(scene, point_lights=lights), indirect.met
+    assert met is not None
 
     def bounced(shadow: RealShadow) -> RealShadow:
         return differential.bounce_real(
@@ -127,7 +127,7 @@ def bounce_real(
             transfer,
             lit,
             shadow,
-            indirect.met,
+            met,
             returned,
             faint.sample_share,
             ratio,

@@ -11,26 +11,24 @@ from server.frame_context import FrameContext
 from server.light.light_message import LightPlaces
 from server.light.place_light import LitPlace, Place, PlaceLight
 from server.light.room_light import RoomLight
+from server.light.shell.room_model import SOLVE_EVERY
 from server.light.view_middle import view_middle
 
 MOST_OBJECTS = 64
 """Objects with a light of their own, which costs 2 ms and 1 kB each where the light has changed; the others have
 `Light.sh`."""
 
-KEPT_FRAMES = 3
-"""Frames for which a place is not looked up again while the light stays and the scan grows."""
-
 Floats = NDArray[np.float64]
 Key = tuple[str, int, bytes]
 
 
 class ToldPlaces:
-    """Kept between frames: while the light stays, a place is not looked up again at once."""
+    """Kept between frames: a place is looked up again where the light or the scan has changed."""
 
     def __init__(self) -> None:
         self.newest = LightPlaces()
         """World axes of the room, metres; where the camera is lost, those of the last frame that was placed."""
-        self._light: Floats = np.zeros(0)
+        self._sh: Floats = np.zeros(0)
         self._frames = 0
 
     def update(
@@ -50,7 +48,7 @@ class ToldPlaces:
         middle = view_middle(context.engine, context.surface, context.volume_from_camera)
         view = (context.volume_from_camera[:3, 3] if middle is None else middle) + origin
         places = _places(view, asked, objects)
-        kept = self._kept(light.estimate().sh, is_still=is_still)
+        kept = self._kept(light, is_still=is_still)
         new = [place for place in places if _key(place) not in kept]
         if new:
             positions = np.array([place.position for place in new])
@@ -58,11 +56,12 @@ class ToldPlaces:
             kept |= {_key(place): one for place, one in zip(new, found, strict=True)}
         self.newest = LightPlaces(view, [LitPlace(place, kept[_key(place)]) for place in places])
 
-    def _kept(self, sh: Floats, *, is_still: bool) -> dict[Key, PlaceLight]:
-        """What was found under the same light, whose coefficients are `sh`, and still holds."""
-        is_same, self._light = np.array_equal(sh, self._light), sh
+    def _kept(self, light: RoomLight, *, is_still: bool) -> dict[Key, PlaceLight]:
+        """What was found under the same light and still holds: in a still view, and between solutions of the model."""
+        sh = light.estimate().sh
+        is_same, self._sh = np.array_equal(sh, self._sh), sh
         self._frames = self._frames if is_still else self._frames + 1
-        if is_same and self._frames < KEPT_FRAMES:
+        if is_same and (is_still or (light.has_model and self._frames < SOLVE_EVERY)):
             return {_key(lit.place): lit.light for lit in self.newest.lit}
         self._frames = 0
         return {}

@@ -142,7 +142,8 @@ TRANSFER_PARAMETERS = Struct(
 TRANSFER_CACHE_PARAMETERS = Struct(
     "TransferCacheParameters", grid=GRID, eye="float4", spacing="float", now="int", period="int", places="int"
 )
-"""Parameters of transfer_cache.cl. eye: where the camera is, volume metres; spacing: metres between samples at a metre."""
+"""Parameters of transfer_cache.cl. eye: where the camera is, volume metres; spacing: metres between samples that are a
+metre away."""
 
 LOOK_UP_PARAMETERS = Struct(
     "LookUpParameters",
@@ -169,8 +170,8 @@ GATHER_PARAMETERS = Struct(
     reach_m="float",
     least_cosine="float",
 )
-"""Parameters of indirect.cl. count: directions of one set; every: a sample traces every n-th blocked direction, `most` in
-all."""
+"""Parameters of indirect.cl. count: directions of one set; every: a sample traces every n-th blocked direction, `most`
+in all."""
 
 VIEW_TRANSFER_PARAMETERS = Struct(
     "ViewTransferParameters",

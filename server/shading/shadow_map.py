@@ -353,13 +353,10 @@ def _trace_discs(
     is_virtual: bool,
     cells: Cells | None = None,
 ) -> None:
-    defines, kept = {}, ()
-    if cells is not None:
-        since = engine.state(_KeptDiscs).since(maps.discs, cells.now)
-        defines = {"HAS_CELLS": 1}
-        kept = (since, cells.places, cells.claims, cells.disc_parts, cells.disc_frames)
+    since = engine.state(_KeptDiscs).since(maps.discs, cells.now) if cells else 0
+    kept = (cells.places, cells.claims, cells.disc_parts, cells.disc_frames) if cells else (engine.unused,) * 4
     engine.launch(
-        _kernel(engine, "trace_discs", **defines),
+        _kernel(engine, "trace_discs"),
         (parts.cols, parts.rows),
         grid_of(parts, camera),
         positions,
@@ -368,11 +365,12 @@ def _trace_discs(
         *maps.arguments(engine),
         *maps.trace_arguments(engine),
         parts.values,
+        cells is not None,
+        since,
         *kept,
     )
     if cells is not None:
         count = parts.rows * parts.cols
-        kept = (cells.places, cells.claims, cells.disc_parts, cells.disc_frames)
         engine.launch(_kernel(engine, "keep_parts"), (count,), count, cells.now, parts.values, *kept)
 
 

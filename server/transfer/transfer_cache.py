@@ -1,10 +1,10 @@
-"""Radiance transfer that earlier frames found at places of the world. Kernel: transfer_cache.cl.
+"""World-space cache of radiance transfer. Kernel: transfer_cache.cl.
 
-Transfer and the light from surfaces belong to a place of the scanned surface, not to a frame. Each is kept under a cell of the world that is
-about as large as the distance between samples there, so that a moving camera finds again what it saw a frame, or a turn, ago. A
-sample that finds nothing is traced and stored; a cell is traced again after PERIOD frames at most, because the scan grows.
-So an entry is off by at most what the scan has changed in PERIOD frames, and it belongs to a point within a cell of the sample's. Surface
-that moves is no exception: what its samples see of the scan depends on where they are only.
+Transfer and the light from surfaces belong to a place of the scanned surface, not to a frame. They are kept by cell of
+the world. A cell is about as large as the distance between samples, so a moving camera finds again what it saw a frame,
+or a turn, ago. A sample that finds nothing is traced and stored. A cell is traced again after PERIOD frames at most,
+because the scan grows. So an entry is off by what the scan has changed in PERIOD frames, and belongs to a point in the
+same cell. Surface that moves is no exception: what a point sees of the scan depends on where it is only.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from server.volume.volume import Volume
 PERIOD = 16
 """Frames after which a cell is traced again: half a second at 30 frames/s."""
 PLACES_A_SAMPLE = 8
-"""Size of the table, in samples of a frame; a power of two follows. Views of the last seconds fit, and few cells collide."""
+"""Size of the table, in samples of a frame, rounded up to a power of two. Views of the last seconds fit, and few cells
+collide."""
 MOST_PLACES = 1 << 20
 """Of 232 bytes each with the defaults."""
 _WORDS_BESIDE = 17
@@ -56,6 +57,10 @@ class _Frame:
     transfer: Transfer
     hits: cl_array.Array
     met: cl_array.Array
+    places: int
+    """In the table."""
+    words: int
+    """Of an entry."""
     parameters: np.void
     defines: dict[str, int]
 
@@ -100,7 +105,7 @@ class TransferCache:
             period=PERIOD,
             places=places,
         )
-        self._frame = _Frame(surface, transfer, hits, met, parameters, defines)
+        self._frame = _Frame(surface, transfer, hits, met, places, words, parameters, defines)
         found = self._buffers.found.array((transfer.rows, transfer.cols))
         engine.launch(
             engine.kernel("transfer_cache.cl", "find_samples", **defines),
@@ -124,8 +129,10 @@ class TransferCache:
         """Keep what the samples that `find` had not found have now. Returns the cells of all samples."""
         engine, frame, buffers = self._engine, self._frame, self._buffers
         assert frame is not None
-        transfer, surface = frame.transfer, frame.surface
-        entries, claims, found = buffers.entries.current, buffers.claims.current, buffers.found.current
+        transfer, surface, places = frame.transfer, frame.surface, frame.places
+        entries, claims = buffers.entries.array((places, frame.words)), buffers.claims.array((places,))
+        parts, frames = buffers.disc_parts.array((places,)), buffers.disc_frames.array((places,))
+        found = buffers.found.array((transfer.rows, transfer.cols))
         size = (transfer.cols, transfer.rows)
         engine.launch(
             engine.kernel("transfer_cache.cl", "claim_entries", **frame.defines),
@@ -152,13 +159,10 @@ class TransferCache:
             frame.hits,
             frame.met,
             claims,
-            buffers.disc_frames.current,
+            frames,
             found,
         )
-        kept = buffers.disc_parts.current, buffers.disc_frames.current
-        assert found is not None
-        assert claims is not None
-        return Cells(found, claims, *kept, self._now)
+        return Cells(found, claims, parts, frames, self._now)
 
     def _forget_others(
         self,

@@ -118,6 +118,8 @@ export interface Wishes {
   robustness?: Array<"memory" | "normals" | "normals_printed" | "openness" | "outliers">;
   /** `everything`: also run effects whose change would be invisible, to check the bounds of culling. */
   plan?: "everything" | "needed";
+  /** `off`: transfer is computed anew in every frame, to compare with what is kept at places of the world. */
+  cache?: "off" | "on";
   /**
    * `layer`: virtual content separate from the camera's image, for clients that compose it with their newest image.
    * `light`: only the light, for clients that render virtual objects themselves.

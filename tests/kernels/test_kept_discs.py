@@ -1,0 +1,94 @@
+"""What real surface leaves of the discs of a light is kept by cell of the world, until the discs change."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.maths.direct_lights import DirectLight, SplitLight
+from server.opencl.engine import Engine
+from server.shading.shadow_map import ShadowMaps, draw_shadow_maps, trace_real
+from server.shading.traced_scene import take_discs, upload_light
+from server.transfer.radiance_transfer import Cells, direction_sets
+from server.transfer.sample_grid import SampleGrid
+from server.volume.raycast import Surface
+from server.volume.volume import Volume
+from tests.scenes import lights
+from tests.scenes.analytic import Floats
+from tests.scenes.shaded_floor import placed
+from tests.scenes.solids import box, download4, fill_volume, float4, floor, upload_surface
+
+SIDE = 16
+RAYS = direction_sets(81, 4)
+FLOOR_Y = 0.1
+BOARD = box((0.3, 0.5, 0.2), (0.6, 0.54, 0.5))
+NOBODY = 0xFFFFFFFF
+LIGHT = DirectLight(lights.unit((0.3, 1.0, 0.2)), np.ones(3), float(np.radians(15.0)))
+
+
+def maps_of(engine: Engine, volume: Volume, disc: DirectLight) -> ShadowMaps:
+    light = upload_light(engine, lights.uniform(), RAYS)
+    light = take_discs(engine, light, SplitLight(lights.uniform(), (disc,)), RAYS)
+    return draw_shadow_maps(engine, volume, light, [placed(engine, box((0.8, 0.2, 0.8), (0.85, 0.3, 0.85)))], 10.0)
+
+
+def shared_cells(engine: Engine, now: int) -> Cells:
+    """Each cell has two samples beside each other, the last column none."""
+    places = np.arange(SIDE * SIDE, dtype=np.int32).reshape(SIDE, SIDE) // 2
+    places[:, -1] = -1
+    space, count = engine.workspace, SIDE * SIDE // 2
+    return Cells(
+        space.upload("places", places),
+        space.upload("claims", np.full(count, NOBODY, np.uint32)),
+        space.upload("kept_parts", float4(np.full((count, 3), 0.25))),
+        space.upload("kept_frames", np.zeros(count, np.int32)),
+        now,
+    )
+
+
+def floor_under_a_board(engine: Engine) -> tuple[Volume, Surface, CameraModel, SampleGrid]:
+    volume = fill_volume(engine, (floor(FLOOR_Y), BOARD), 0.02)
+    x, z = np.meshgrid(np.linspace(0.2, 0.7, SIDE), np.linspace(0.1, 0.6, SIDE))
+    points = np.stack([x, np.full_like(x, FLOOR_Y), z], axis=-1)
+    surface = upload_surface(engine, points, np.broadcast_to([0.0, 1.0, 0.0], points.shape), np.ones(x.shape, bool))
+    camera = CameraModel(width=SIDE, height=SIDE, fx=10.0, fy=10.0, cx=0.0, cy=0.0)
+    return volume, surface, camera, SampleGrid(1, engine.workspace.upload("ones", float4(np.ones((SIDE, SIDE, 3)))))
+
+
+def test_parts_are_kept_until_the_discs_change(engine: Engine) -> None:
+    volume, surface, camera, samples = floor_under_a_board(engine)
+
+    def traced(disc: DirectLight, cells: Cells | None = None) -> Floats:
+        maps = maps_of(engine, volume, disc)
+        return download4(engine, trace_real(engine, camera, surface, samples, maps, cells).values).astype(float)
+
+    def shared(parts: Floats) -> Floats:
+        """As the first sample of each cell has it."""
+        firsts = np.repeat(parts[:, ::2], 2, axis=1)
+        firsts[:, -1] = parts[:, -1]
+        return firsts
+
+    def frames(cells: Cells) -> NDArray[np.int32]:
+        return np.asarray(engine.download(cells.disc_frames).reshape(SIDE, -1)[:, :-1])
+
+    exact = traced(LIGHT).copy()
+    assert 0.05 < (exact[..., 0] < 0.5).mean() < 0.95
+    assert (exact != shared(exact)).any()
+    cells = shared_cells(engine, 1)
+    np.testing.assert_array_equal(traced(LIGHT, cells), exact)
+    assert (frames(cells) == 1).all()
+    assert (engine.download(cells.claims) == NOBODY).all()
+
+    brighter = replace(LIGHT, irradiance=np.array([2.0, 1.0, 0.5]))
+    np.testing.assert_array_equal(traced(brighter, replace(cells, now=2)), shared(exact))
+    assert (frames(cells) == 1).all()
+
+    moved = replace(LIGHT, direction=lights.unit((-0.3, 1.0, 0.2)))
+    other = traced(moved).copy()
+    assert np.abs(other - exact).max() > 0.3
+    np.testing.assert_array_equal(traced(moved, replace(cells, now=3)), other)
+    assert (frames(cells) == 3).all()
+    np.testing.assert_array_equal(traced(moved, replace(cells, now=4)), shared(other))

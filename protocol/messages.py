@@ -393,7 +393,7 @@ class Plan(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Timings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Milliseconds under the thesis's row names (table 6.2): device plus host time; total is wall time."""
+    """What a frame cost: milliseconds under the thesis's row names (table 6.2), device plus host time, and counts."""
 
     input: float = 0.0
     reconstruct: float = 0.0
@@ -403,6 +403,26 @@ class Timings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     light_estimation: float = 0.0
     rendering: float = 0.0
     total: float = 0.0
+    """Wall time."""
+    host: float = 0.0
+    """Milliseconds of `total` in which no kernel ran: the host's own work. Rows above contain some of it."""
+    launches: int = 0
+    """Kernels."""
+    reads: int = 0
+    """Times that the host waited for memory of the device."""
+    read_bytes: int = 0
+
+
+TIMING_ROWS = (
+    "input",
+    "reconstruct",
+    "surface",
+    "dynamic_geometry",
+    "radiance_transfer",
+    "light_estimation",
+    "rendering",
+)
+"""The rows of `Timings` that add up to about the total."""
 
 
 class DirectedLight(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

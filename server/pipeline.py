@@ -333,8 +333,7 @@ class Pipeline:
     ) -> FrameResult:
         """The answer, once the device is done."""
         self._engine.queue.finish()
-        rows, self.kernel_ms = self._engine.profile.collect()
-        timings = Timings(**rows, total=(time.perf_counter() - started) * 1e3)
+        timings = self._timings(started)
         self._frames += 1
         self._room.changes += 1
         lamps_left_out = self._room.lamps.left_out() if geometry.tracking != "lost" else ()
@@ -349,6 +348,14 @@ class Pipeline:
             notes=(*geometry.notes, *notes, *_light_notes(light), *self._place_notes()),
             is_reused=geometry.is_held,
         )
+
+    def _timings(self, started: float) -> Timings:
+        profile = self._engine.profile
+        launches, reads, read_bytes = profile.launches, profile.reads, profile.read_bytes
+        rows, self.kernel_ms = profile.collect()
+        total = (time.perf_counter() - started) * 1e3
+        host = max(total - sum(self.kernel_ms.values()), 0.0)
+        return Timings(**rows, total=total, host=host, launches=launches, reads=reads, read_bytes=read_bytes)
 
     def _light_message(self, frame: RgbdFrame, geometry: GeometryFrame, light: LightEstimate, volume: Volume) -> Light:
         """The light in the client's world."""

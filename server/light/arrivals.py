@@ -6,16 +6,20 @@ import numpy as np
 import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
-from server.opencl.buffers import BufferDescription, StageBuffers
+from server.opencl.buffers import KeyedBufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
 
 
 class _Buffers(StageBuffers):
-    points = BufferDescription(cl_types.float4)
-    normals = BufferDescription(cl_types.float4)
-    directions = BufferDescription(cl_types.float4)
-    arrivals = BufferDescription(cl_types.float4)
+    """By the number of points, rounded up to a power of two, so that a steady stream allocates nothing."""
+
+    points = KeyedBufferDescription(cl_types.float4)
+    normals = KeyedBufferDescription(cl_types.float4)
+    directions = KeyedBufferDescription(cl_types.float4)
+    """By the number of sets, rounded, and of directions."""
+    arrivals = KeyedBufferDescription(cl_types.float4)
+    """By the number of points, rounded, and of directions."""
 
 
 def trace_arrivals(
@@ -31,28 +35,32 @@ def trace_arrivals(
     where nothing is met. directions: [sets, m, 3] unit, world axes; point i takes set i modulo sets. normals: [n, 3],
     directions below their plane are skipped (0); None: of none.
     """
-    buffers, (sets, per_set, _) = engine.buffers(_Buffers), directions.shape
-    planes = np.zeros((len(points), 4)) if normals is None else np.pad(normals, ((0, 0), (0, 1)), constant_values=1.0)
-    arrivals = buffers.arrivals.array((len(points), per_set))
+    buffers, (sets, per_set, _), count = engine.buffers(_Buffers), directions.shape, len(points)
+    room, room_of_sets = _rounded(count), _rounded(sets)
+    planes = np.zeros((count, 4)) if normals is None else np.pad(normals, ((0, 0), (0, 1)), constant_values=1.0)
+    arrivals = buffers.arrivals[room, per_set].array((room, per_set))
     engine.launch(
         engine.kernel("arrivals.cl", "trace_arrivals", LANES=engine.lanes),
-        (-(-per_set // engine.lanes), len(points)),
+        (-(-per_set // engine.lanes), count),
         *volume.arguments(),
         volume.colors,
-        len(points),
+        count,
         per_set,
         sets,
-        buffers.points.upload(_padded(points)),
-        buffers.normals.upload(planes.astype(np.float32).view(cl_types.float4)[:, 0]),
-        buffers.directions.upload(_padded(directions)),
+        buffers.points[room].upload(_float4(points, room)),
+        buffers.normals[room].upload(_float4(planes, room)),
+        buffers.directions[room_of_sets, per_set].upload(_float4(directions, room_of_sets)),
         arrivals,
     )
-    result: NDArray[np.float32] = engine.download(arrivals).view(np.float32).reshape(len(points), per_set, 4)
-    return result
+    return np.asarray(engine.download(arrivals).view(np.float32).reshape(room, per_set, 4)[:count])
 
 
-def _padded(vectors: NDArray[np.float64]) -> NDArray[np.void]:
-    """[...] float4 of [..., 3]."""
-    padded: NDArray[np.float32] = np.zeros((*vectors.shape[:-1], 4), np.float32)
-    padded[..., :3] = vectors
+def _rounded(count: int) -> int:
+    return 1 << max(count - 1, 0).bit_length()
+
+
+def _float4(vectors: NDArray[np.float64], room: int) -> NDArray[np.void]:
+    """[room, ...] float4 of [n, ..., 3 or 4], the rest zeros."""
+    padded: NDArray[np.float32] = np.zeros((room, *vectors.shape[1:-1], 4), np.float32)
+    padded[: len(vectors), ..., : vectors.shape[-1]] = vectors
     return padded.view(cl_types.float4)[..., 0]

@@ -93,6 +93,7 @@ class Engine:
 
     def download(self, array: cl_array.Array) -> NDArray[Any]:
         """Copy to the host; waits for everything queued before."""
+        self.profile.count_read(array.nbytes)
         result: NDArray[Any] = array.get()
         return result
 

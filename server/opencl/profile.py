@@ -17,10 +17,22 @@ class Profile:
         self.row = "input"
         self._events: list[tuple[str, str, cl.Event]] = []
         self._host_ms: dict[str, float] = defaultdict(float)
+        self.reads = self.read_bytes = 0
+        """Times that the host has waited for memory since the last `forget`, and their bytes."""
 
     def add_event(self, kernel: str, event: cl.Event) -> None:
         """Count a launched kernel or copy under the current row."""
         self._events.append((self.row, kernel, event))
+
+    @property
+    def launches(self) -> int:
+        """Kernels since the last `collect`."""
+        return len(self._events)
+
+    def count_read(self, size: int) -> None:
+        """The host waits for `size` bytes of the device."""
+        self.reads += 1
+        self.read_bytes += size
 
     @contextmanager
     def stage(self, row: str) -> Iterator[None]:
@@ -47,6 +59,7 @@ class Profile:
         """Leave out what a frame that failed has left."""
         self._events.clear()
         self._host_ms.clear()
+        self.reads = self.read_bytes = 0
 
     def collect(self) -> tuple[dict[str, float], dict[str, float]]:
         """Milliseconds per row and per kernel since the last call. Every event must have finished."""

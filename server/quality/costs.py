@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections import deque
 from statistics import median
 
-from msgspec import structs
-
-from protocol.messages import Timings
+from protocol.messages import TIMING_ROWS, Timings
 from server.quality.pareto_front import ParetoPoint
 
 WINDOW = 9
@@ -22,9 +20,8 @@ USUAL_SPREAD = 1.1
 
 def rows_of(timings: Timings) -> dict[str, float]:
     """The rows, and the rest of the total as `other`."""
-    rows: dict[str, float] = structs.asdict(timings)
-    total = rows.pop("total")
-    return {**rows, "other": max(total - sum(rows.values()), 0.0)}
+    rows: dict[str, float] = {name: getattr(timings, name) for name in TIMING_ROWS}
+    return {**rows, "other": max(timings.total - sum(rows.values()), 0.0)}
 
 
 class CostModel:

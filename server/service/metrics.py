@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
-from protocol.messages import Timings
+from protocol.messages import TIMING_ROWS, Timings
 
 if TYPE_CHECKING:
     from server.service.room_persistence import RoomPersistence
 
 BUCKETS_MS = (0.5, 1, 2, 5, 10, 20, 35, 50, 75, 100, 150, 250, 500, 1000, 2500, 5000)
-STAGES = Timings.__struct_fields__
+STAGES = (*TIMING_ROWS, "total", "host")
 
 
 class Metrics:
@@ -33,6 +33,11 @@ class Metrics:
         self.overhead_cpu_ms = self._histogram(
             "overhead_cpu_ms", "Milliseconds of the processor that a session's thread took outside of the pipeline"
         )
+        self.launches = Counter("probeless_launches", "Kernels of all frames", registry=self._registry)
+        self.reads = Counter(
+            "probeless_reads", "Times that frames waited for memory of the device", registry=self._registry
+        )
+        self.read_bytes = Counter("probeless_read_bytes", "Bytes of these reads", registry=self._registry)
         self.processed = Counter("probeless_frames_processed", "Frames composited", registry=self._registry)
         self.dropped = Counter("probeless_frames_dropped", "Frames dropped", ("reason",), registry=self._registry)
         self.sessions = Gauge("probeless_sessions", "Capturing sessions", registry=self._registry)
@@ -76,9 +81,12 @@ class Metrics:
                 Gauge(f"probeless_{name}", help_text, registry=self._registry).set_function(value)
 
     def observe_stages(self, timings: Timings) -> None:
-        """Add one frame's timings to the stage histograms."""
+        """Add what one frame cost."""
         for stage in STAGES:
             self.stage_ms.labels(stage).observe(getattr(timings, stage))
+        self.launches.inc(timings.launches)
+        self.reads.inc(timings.reads)
+        self.read_bytes.inc(timings.read_bytes)
 
     def render(self) -> bytes:
         """All metrics in Prometheus's text format."""

@@ -24,9 +24,10 @@ AT_FIELDS = [
     *"of index position sh sh_std sh_webxr dominant_direction dominant_intensity spread_deg".split(),  # noqa: SIM905
     *"valid seen".split(),  # noqa: SIM905
 ]
-ROWS = (
-    "input reconstruct surface dynamic_geometry radiance_transfer light_estimation rendering total".split()  # noqa: SIM905
-)
+ROWS = [
+    *"input reconstruct surface dynamic_geometry radiance_transfer light_estimation rendering total".split(),  # noqa: SIM905
+    *"host launches reads read_bytes".split(),  # noqa: SIM905
+]
 
 
 def output_of(frame: int, notes: tuple[str, ...] = (), light: Light | None = None) -> FrameOutput:

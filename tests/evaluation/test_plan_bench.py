@@ -63,7 +63,10 @@ def differences(
 ) -> list[tuple[float, int, bool]]:
     """Of each frame: what is stated, what is found, and whether the plan is the known one."""
     source = source or GallerySource(name)
-    planned, full = (play(device, source, wishes_of(source, plan=plan)) for plan in ("needed", "everything"))
+    wishes = wishes_of(
+        source, cache="off"
+    )  # what caches change is measured apart (tests/pipeline/test_transfer_cache.py)
+    planned, full = (play(device, source, structs.replace(wishes, plan=plan)) for plan in ("needed", "everything"))
     found = []
     for index, (_, a), (_, b) in zip(range(frames), planned, full, strict=False):
         most = greatest(a.plan, np.abs(a.color.astype(int) - b.color))

@@ -79,3 +79,16 @@ def test_launched_kernels_are_counted(engine: Engine) -> None:
     assert set(rows) == {"reconstruct", "surface"}
     assert rows["reconstruct"] == pytest.approx(kernels["halve_depth"]) != 0
     assert rows["surface"] == pytest.approx(kernels["clear_depth"]) != 0
+
+
+def test_launches_and_reads_are_counted(engine: Engine) -> None:
+    depth = engine.workspace.upload("depth", np.ones((16, 16), np.float32))
+    halved = engine.workspace.array("halved", (8, 8), np.float32)
+    for _ in range(3):
+        engine.launch(engine.kernel("track.cl", "halve_depth", ROWS=16), (8, 8), 8, 8, 16, depth, 0.05, halved)
+    engine.download(halved)
+    engine.download(depth)
+    profile = engine.profile
+    assert (profile.launches, profile.reads, profile.read_bytes) == (3, 2, 4 * (64 + 256))
+    profile.collect()
+    assert (profile.launches, profile.reads, profile.read_bytes) == (0, 0, 0)

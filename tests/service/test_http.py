@@ -8,7 +8,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from protocol.messages import Composite, Error, Hello, Timings
+from protocol.messages import TIMING_ROWS, Composite, Error, Hello
 from server.service.app import create_app
 from server.service.self_check import CheckFailed
 from server.service.serve import BackgroundServer
@@ -98,9 +98,16 @@ def test_a_wrong_answer_of_the_device_is_named(lab) -> None:
 
 def test_metrics_have_every_row_before_the_first_frame(server) -> None:
     found = rows(server)
-    for stage in Timings.__struct_fields__:
+    for stage in (*TIMING_ROWS, "total", "host"):
         assert found["probeless_stage_ms_count", stage] == 0
-    for name in ("decode_ms_count", "encode_ms_count", "queue_age_ms_count", "frames_processed_total", "sessions"):
+    for name in (
+        "decode_ms_count",
+        "encode_ms_count",
+        "queue_age_ms_count",
+        "frames_processed_total",
+        "reads_total",
+        "sessions",
+    ):
         assert found[f"probeless_{name}",] == 0
     for reason in ("replaced", "refused", "unreadable", "invalid"):
         assert found["probeless_frames_dropped_total", reason] == 0

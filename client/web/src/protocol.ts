@@ -300,7 +300,7 @@ export interface Welcome {
   depth_codecs: Array<"raw" | "zdelta" | "zranks" | "zstd-delta" | "zstd-ranks">;
 }
 
-/** Milliseconds under the thesis's row names (table 6.2): device plus host time; total is wall time. */
+/** What a frame cost: milliseconds under the thesis's row names (table 6.2), device plus host time, and counts. */
 export interface Timings {
   input: number;
   reconstruct: number;
@@ -309,7 +309,15 @@ export interface Timings {
   radiance_transfer: number;
   light_estimation: number;
   rendering: number;
+  /** Wall time. */
   total: number;
+  /** Milliseconds of `total` in which no kernel ran: the host's own work. Rows above contain some of it. */
+  host: number;
+  /** Kernels. */
+  launches: number;
+  /** Times that the host waited for memory of the device. */
+  reads: number;
+  read_bytes: number;
 }
 
 /** An effect that did not run, the reason, and a bound on the change, in display units (1 is 1/255). */

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from client.objects.object_file import ObjectFile
 from client.objects.placing import place_objects
+from protocol.messages import TIMING_ROWS
 from server.client_session import ClientSession
 from server.maths.light_direction import direction_error_deg
 from server.opencl.device import Device
@@ -80,7 +81,7 @@ def measure_point(device: Device, scene: SweptScene, knob: str, settings: dict[s
         kept
     ]
     same_bands = [(_cut(found, true), true) for found, true in lights]
-    rows = [structs.asdict(result.timings) for result in results[kept]]
+    rows = [{n: getattr(result.timings, n) for n in (*TIMING_ROWS, "total")} for result in results[kept]]
     pictures = [(shot, result.color) for shot, result in zip(shots, results, strict=True) if shot.composite is not None]
     pictures = pictures[kept]
     return MeasuredPoint(

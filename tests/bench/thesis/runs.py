@@ -11,7 +11,6 @@ from statistics import median
 from typing import Any
 
 import cv2
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +18,7 @@ from client.sources.volume import default_volume, default_voxel
 from client.synthetic.export import guest_ply
 from client.synthetic.source import SyntheticSource, open_synthetic
 from protocol.frames import CameraModel, RgbdFrame
-from protocol.messages import Wishes
+from protocol.messages import TIMING_ROWS, Wishes
 from server.client_session import ClientSession
 from server.opencl.device import Device
 from server.pipeline import FrameResult
@@ -91,8 +90,8 @@ def no_times() -> Times:
 
 def note_times(times: Times, answer: Answer) -> None:
     """Add a frame's."""
-    for name, value in msgspec.structs.asdict(answer.result.timings).items():
-        times[name].append(value)
+    for name in (*TIMING_ROWS, "total"):
+        times[name].append(getattr(answer.result.timings, name))
     times["cpu"].append(answer.cpu_ms)
 
 

@@ -21,7 +21,7 @@ from rich.table import Table
 from client.errors import OptionError, RunError
 from client.progress import note, say
 
-SUITES = ("geometry", "light", "rendering", "accuracy", "stability", "plan", "service", "client")
+SUITES = ("geometry", "light", "rendering", "accuracy", "stability", "plan", "speed", "service", "client")
 OWN_PACKAGES = ("tests", "client", "server", "protocol", "cl_kernels")
 _CHECKOUT = Path(__file__).resolve().parents[2]
 

@@ -35,9 +35,11 @@ from server.light.shell.sources import Sources
 from server.light.shell.switches import Switches
 
 LOGIT = float(np.log(weights.MEAN_ALBEDO / (1 - weights.MEAN_ALBEDO)))
-RELAXATION = 0.5
+RELAXATION, LEAST_RELAXATION = 0.5, 0.05
 """Share of a Gauss-Newton step that is taken: whole ones turn back and forth where few patches share the light of two
-cells."""
+cells. It falls while steps turn back, and rises again, by TURNING_BACK and GOING_ON: the albedo that makes a surface
+white and the chroma that tells its material follow the light, and are not in the step's derivatives."""
+TURNING_BACK, GOING_ON = 0.7, 1.1
 MOST_STEP = 3.0
 """Greatest change of an unknown logarithm in a whole step."""
 _COLUMNS = 8  # of an inverse, to tell its norm
@@ -76,10 +78,23 @@ class Unknowns:
     step: float = float("inf")
     """By how much the last step changed the logarithm of what patches receive, root mean square."""
 
+    relaxation: float = RELAXATION
+    """Share of the last step that was taken."""
+    last: Floats = field(default_factory=_empty)
+    """[k] the last whole step of z."""
+
     @property
     def known(self) -> int:
         """Sources that have been solved for."""
         return len(self.z)
+
+    def relax(self, change: Floats) -> float:
+        """The share of the step `change` [k] of z to take."""
+        turns_back = float(change[: len(self.last)] @ self.last) < 0
+        factor = TURNING_BACK if turns_back else GOING_ON
+        self.relaxation = float(np.clip(self.relaxation * factor, LEAST_RELAXATION, RELAXATION))
+        self.last = change.copy()
+        return self.relaxation
 
     def solve(self, curvature: Floats, right: Floats) -> Floats:
         """[k + albedos] the whole Gauss-Newton step; keeps the curvature."""
@@ -144,7 +159,8 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     matrix[np.diag_indices_from(matrix)] += diagonal
     target = np.concatenate([prior - z, LOGIT - unknowns.materials[nodes]])
     change = unknowns.solve(matrix, right + diagonal * target)
-    change *= RELAXATION * min(1.0, MOST_STEP / max(float(np.abs(change).max()), 1e-12))
+    change *= min(1.0, MOST_STEP / max(float(np.abs(change).max()), 1e-12))
+    change *= unknowns.relax(change[:count])
     unknowns.step = float(np.sqrt(np.mean((parts @ (scale[:count] * change[:count])) ** 2)))
     unknowns.z = z + change[:count]
     unknowns.materials[nodes] += change[count:]
@@ -238,10 +254,11 @@ class _Surfaces:
         """
         is_white = offsets >= whitest
         variance = spreads.surface**2 * (1 + np.minimum(offsets / spreads.surface, 0.0) ** 2)
-        variance = np.where(is_white, weights.WHITE**2, variance)
+        beyond = np.where(is_white, 1 / weights.WHITE**2, 0.0)  # precision of a second prior, about `whitest`
+        variance = variance / (1 + variance * beyond)
         keeps = 1 / (1 + spreads.region**2 * regions.totals)
         totals = np.bincount(regions.surfaces, keeps * regions.totals)
-        return _Surfaces(regions, keeps, np.where(is_white, whitest, 0.0), variance / (1 + variance * totals))
+        return _Surfaces(regions, keeps, variance * beyond * whitest, variance / (1 + variance * totals))
 
     def sums(self, by_region: NDArray[Any]) -> NDArray[Any]:
         """[surfaces, ...] of sums over regions [regions, ...]."""

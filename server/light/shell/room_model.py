@@ -45,6 +45,9 @@ SOLVE_EVERY = 3
 summed in between. The goal is that a change is followed within three."""
 NEW_SHARE = 0.1
 """Share of new patches, or of frames that were not taken in, from which a frame is solved at once."""
+STILL = 0.005
+"""Change of the mean log radiance of patches, root mean square, or of what they receive by the last step, up to which
+the solution stays as it is: half a per cent is less than a code of a picture."""
 LEAST_FACING = 5
 """Patches that face one way, for a median."""
 
@@ -73,6 +76,8 @@ class RoomModel:
         self._unknowns, self._distant = Unknowns(), Unknowns()
         self._shell: Shell | None = None
         self._waiting = self._frames = 0
+        self._solved = np.zeros(0, np.int64), np.zeros((0, 3))
+        """Rows of the patches of the last solution, and what they showed."""
         self._beyond: tuple[bytes, int, tuple[Floats, Floats, list[ShellLamp]]] | None = None
 
     @property
@@ -100,9 +105,16 @@ class RoomModel:
 
     def _is_due(self, change: float) -> bool:
         """Whether to solve with this frame. change: share of the evidence that it contradicts."""
-        if not self.is_known or change > 0.0 or self._waiting >= SOLVE_EVERY:
+        if not self.is_known or change > 0.0 or self._patches.fresh > NEW_SHARE * self.patches:
             return True
-        return self._waiting > NEW_SHARE * self._frames or self._patches.fresh > NEW_SHARE * self.patches
+        return self._waiting > min(SOLVE_EVERY - 1, NEW_SHARE * self._frames) and not self._is_still()
+
+    def _is_still(self) -> bool:
+        """Whether what patches show has not changed since the last solution, which has settled."""
+        rows, shown = self._solved
+        moved = self._patches.logarithms[rows] - shown
+        is_same = self._patches.fresh == 0 and float(np.sqrt(np.mean(moved**2))) <= STILL
+        return is_same and self._unknowns.step <= STILL and self._distant.step <= STILL
 
     def _solve(self, traced: NDArray[np.int64], camera: Floats, up: Floats) -> None:
         patches, transport, switches, rows = self._patches, self._transport, self._switches, self._patches.used
@@ -121,6 +133,7 @@ class RoomModel:
                 step(unknowns, evidence, sources, switches)
                 if unknowns.step < (MOVED if is_followed else FIRST_MOVED):
                     break
+        self._solved = rows, patches.logarithms[rows]
 
     def estimate(self, bands: int) -> LightEstimate:
         """The light from beyond the scan."""

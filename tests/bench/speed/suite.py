@@ -1,0 +1,52 @@
+"""`probeless bench speed`: what a frame costs, with what is kept at places of the world and without.
+
+Each frame goes to every setting before the next one does, so that load of the machine meets all alike. Milliseconds are
+of the machine that the page names; two cores are meant.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+from server.opencl.device import open_device
+from tests.bench.report.finished import ROOT, Finished, Part
+from tests.bench.report.report import Report
+from tests.bench.report.run import Run, data_folder, data_source
+from tests.bench.speed.frames import Stage, measure_moving, measure_rest
+
+OUT = ROOT / "out" / "bench" / "speed"
+KITCHEN = "rgbd_7scenes_redkitchen"
+ON_TABLE_M = (-0.6, 0.0, 1.8)
+"""Where the kitchen's table is free."""
+OBJECT, OBJECT_SCALE = "mesh/Duck.glb", 0.1
+
+
+def run_suite(quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
+    """Measure; `say` gets progress."""
+    run = Run(open_device(None), quick, say)
+    OUT.mkdir(parents=True, exist_ok=True)
+    finished = Finished(OUT, run.device.name, quick)
+    report = Report(run.device.name)
+    for name, measure in {"moving camera": _moving, "camera at rest": _rest}.items():
+        part = finished.part(name, lambda measure=measure: measure(run), say)  # type: ignore[misc]
+        report.rows += part.rows
+        report.unmeasured += part.unmeasured
+        report.sizes |= part.sizes
+    result = report.as_dict()
+    (OUT / "result.json").write_text(json.dumps(result, indent=1, allow_nan=False))
+    finished.forget()
+    return result
+
+
+def _kitchen() -> Stage:
+    return Stage(data_source(KITCHEN), data_folder(OBJECT), ON_TABLE_M, OBJECT_SCALE)
+
+
+def _moving(run: Run) -> Part:
+    return measure_moving(run.device, _kitchen(), range(run.of(24, 200)), run.say)
+
+
+def _rest(run: Run) -> Part:
+    return measure_rest(run.device, _kitchen(), 100, run.of(72, 120), run.say)

@@ -75,7 +75,7 @@ lint: .venv/installed-test
 	$(BIN)/mypy
 
 # Each suite measures, then writes its page of docs/benchmarks with the commit and the date.
-SUITES := geometry light rendering accuracy plan stability service client
+SUITES := geometry light rendering accuracy plan speed stability service client
 bench: .venv/installed-bench
 	set -e; for suite in $(SUITES); do \
 		$(BIN)/probeless bench $$suite; $(BIN)/python -m tests.bench.$$suite.doc; done

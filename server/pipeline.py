@@ -336,7 +336,7 @@ class Pipeline:
         timings = self._timings(started)
         self._frames += 1
         self._room.changes += 1
-        lamps_left_out = self._room.lamps.left_out() if geometry.tracking != "lost" else ()
+        others = (*self._transfer.left_out(), *self._room.lamps.left_out()) if geometry.tracking != "lost" else ()
         return FrameResult(
             color=rendered.picture,
             layer=rendered.layer,
@@ -344,7 +344,7 @@ class Pipeline:
             world_from_camera=self._alignment.in_client(geometry.world_from_camera),
             tracking=geometry.tracking,
             timings=timings,
-            plan=structs.replace(rendered.plan, left_out=(*rendered.plan.left_out, *lamps_left_out)),
+            plan=structs.replace(rendered.plan, left_out=(*rendered.plan.left_out, *others)),
             notes=(*geometry.notes, *notes, *_light_notes(light), *self._place_notes()),
             is_reused=geometry.is_held,
         )

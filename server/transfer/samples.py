@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from protocol.messages import LeftOut
 from server.opencl.engine import Engine
 from server.transfer.indirect import Indirect, observe_indirect
 from server.transfer.radiance_transfer import Directions, Transfer
 from server.transfer.real_depth_views import RealDepthViews
 from server.transfer.sampling import Sampling, TransferSampler
-from server.transfer.transfer_cache import TransferCache
+from server.transfer.transfer_cache import PERIOD, TransferCache
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
 
@@ -46,6 +47,7 @@ class SampledTransfer:
         self._sampler = TransferSampler(engine, camera, sampling, rays, bands)
         self._cache = TransferCache(engine) if is_cached else None
         self._mean_sent = np.zeros(3)
+        self._has_found = False
 
     def use(self, sampling: Sampling, rays: int) -> None:
         """Change the sampling. Visibility of earlier frames is forgotten."""
@@ -74,6 +76,12 @@ class SampledTransfer:
     def skip_frame(self) -> None:
         """Advance the sequence of direction sets for a frame without transfer."""
         self._sampler.pass_frame()
+        self._has_found = False
+
+    def left_out(self) -> tuple[LeftOut, ...]:
+        """What of the last frame's transfer may have been found instead of traced."""
+        reason = f"traced at most {PERIOD} frames ago at the same place of the world"
+        return (LeftOut(effect="transfer_of_known_places", reason=reason, error_bound=None),) if self._has_found else ()
 
     def sample(
         self,
@@ -88,6 +96,7 @@ class SampledTransfer:
         """Transfer of the real world without virtual objects (eq. 5.2). up: [3] unit, world axes."""
         engine, camera, rays = self._engine, self._camera, self._sampler.rays
         cache, found = self._cache if self._sampler.may_be_cached else None, None
+        self._has_found = cache is not None
         if cache:
             stride = self._sampler.sampling.stride
             found = cache.find(camera, volume, surface, volume_from_camera, stride, rays, ray_length_m)

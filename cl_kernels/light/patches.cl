@@ -7,20 +7,21 @@
 
 // One item a block of step x step pixels. The surface is that of the block's middle pixel: static, a plane to within tolerance_m.
 // positions, normals [h][w]; labels [h][w]; radiance [h][w] (w > 0 usable, -1 outside the picture)
-// -> places [rows][cols]: the middle's position and the share of the block on its surface, 0 where there is none;
-// facing [rows][cols]: mean unit normal, and the share of those pixels that are clipped;
-// shown [rows][cols]: mean logarithm of radiance over usable pixels (where most are clipped, over those) and the variance of
+// -> seen_patches [3][rows][cols], first the middle's position and the share of the block on its surface, 0 where there is none;
+// then the mean unit normal, and the share of those pixels that are clipped;
+// then the mean logarithm of radiance over usable pixels (where most are clipped, over those) and the variance of
 // its mean over the channels.
 kernel void gather_patches(const int cols, const int rows, const int step, const int width, const float tolerance_m,
                            global const float4 *positions, global const float4 *normals, global const uchar *labels,
-                           global const float4 *radiance, global float4 *places, global float4 *facing, global float4 *shown) {
+                           global const float4 *radiance, global float4 *seen_patches) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= cols || row >= rows) return;
     const int block = row * cols + col;
     const int middle = (row * step + step / 2) * width + col * step + step / 2;
     const float4 position = positions[middle], normal = normals[middle];
-    places[block] = facing[block] = shown[block] = (float4)(0.0f);
+    global float4 *place = seen_patches + block, *facing = place + rows * cols, *shown = facing + rows * cols;
+    *place = *facing = *shown = (float4)(0.0f);
     if (position.w <= 0.0f || normal.w <= 0.0f || labels[middle] != LABEL_STATIC) return;
     float3 direction = (float3)(0.0f), usable = (float3)(0.0f), clipped = (float3)(0.0f);
     float squares = 0.0f;
@@ -49,7 +50,7 @@ kernel void gather_patches(const int cols, const int rows, const int step, const
     const int is_clipped = clipped_count > usable_count;
     const float3 mean = is_clipped ? clipped / clipped_count : usable / usable_count;
     const float level = (mean.x + mean.y + mean.z) / 3.0f;
-    places[block] = (float4)(position.xyz, (float)on_surface / (step * step));
-    facing[block] = (float4)(normalize(direction), (float)clipped_count / (usable_count + clipped_count));
-    shown[block] = (float4)(mean, is_clipped ? 0.0f : fmax(squares / usable_count - level * level, 0.0f));
+    *place = (float4)(position.xyz, (float)on_surface / (step * step));
+    *facing = (float4)(normalize(direction), (float)clipped_count / (usable_count + clipped_count));
+    *shown = (float4)(mean, is_clipped ? 0.0f : fmax(squares / usable_count - level * level, 0.0f));
 }

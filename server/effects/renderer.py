@@ -152,9 +152,13 @@ class Renderer:
             plan = _reused(cached.plan, spine.left_out, reuse.reason)
             return _composed(context, shown, cached.parts, plan, request)
         parts, plan = self._run_effects(context, spine, settings, shown)
+        result = _composed(context, shown, parts, plan, request)
+        if parts.changed is not None:  # read last: nothing waits for what the plan says of it
+            share = float(self._engine.download(parts.changed).mean())
+            plan, told = (_with_share(p, share, has_sharp_shadows=bool(parts.light.discs)) for p in (plan, result.plan))
+            result = replace(result, plan=told)
         if reuse.reason is not None and spine.period <= TURNS:
             self._cache.keep(CachedEffects(parts, plan), reuse.version, LASTING)
-        result = _composed(context, shown, parts, plan, request)
         if reuse.is_checkpoint and request.answer != "light" and spine.objects:
             return replace(result, reference=self._reference(context, shown, parts, reuse))
         return result
@@ -175,11 +179,7 @@ class Renderer:
         )
         given = _given(context, spine, light, averages, facts)
         effects = make_plan(EFFECTS, PictureParts, given, facts, everything=self._everything, stages=spine.left_out)
-        parts, plan = effects.execute(given), effects.described()
-        if parts.changed is not None:
-            share = float(self._engine.download(parts.changed).mean())
-            plan = _with_share(plan, share, has_sharp_shadows=bool(light.discs))
-        return parts, plan
+        return effects.execute(given), effects.described()
 
     def _averages(
         self, context: FrameContext, spine: SpineOutputs, settings: Settings, light: DeviceLight

@@ -27,7 +27,7 @@ from server.volume.volume import Volume
 
 PERIOD = 16
 """Frames after which a cell is traced again: half a second at 30 frames/s."""
-PLACES_A_SAMPLE = 8
+PLACES_A_SAMPLE = 4
 """Size of the table, in samples of a frame, rounded up to a power of two. Views of the last seconds fit, and few cells
 collide."""
 MOST_PLACES = 1 << 20

@@ -46,9 +46,8 @@ Ints = NDArray[np.int64]
 
 
 class _Buffers(StageBuffers):
-    places = BufferDescription(cl_types.float4)
-    facing = BufferDescription(cl_types.float4)
-    shown = BufferDescription(cl_types.float4)
+    seen = BufferDescription(cl_types.float4)
+    """[3, rows, cols] as gather_patches returns it."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +77,7 @@ def gather_patches(
     """The patches in one picture; radiance: [h, w] float4 as in Measurement, in the units of the first picture."""
     step = max(2, camera.width // _BLOCKS_ACROSS)
     cols, rows = camera.width // step, camera.height // step
-    buffers, size = engine.buffers(_Buffers), (rows, cols)
-    places, facing, shown = buffers.places.array(size), buffers.facing.array(size), buffers.shown.array(size)
+    seen = engine.buffers(_Buffers).seen.array((3, rows, cols))
     engine.launch(
         engine.kernel("patches.cl", "gather_patches"),
         (cols, rows),
@@ -92,13 +90,9 @@ def gather_patches(
         surface.normals,
         surface.labels,
         radiance,
-        places,
-        facing,
-        shown,
+        seen,
     )
-    at, towards, show = (
-        engine.download(a).view(np.float32).reshape(-1, 4).astype(np.float64) for a in (places, facing, shown)
-    )
+    at, towards, show = engine.download(seen).view(np.float32).reshape(3, -1, 4).astype(np.float64)
     used = at[:, 3] >= LEAST_SHARE
     return Seen(at[used, :3] + volume.origin_world, towards[used, :3], show[used, :3], show[used, 3], towards[used, 3])
 

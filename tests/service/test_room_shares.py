@@ -73,10 +73,11 @@ def test_clients_of_a_room_get_equal_shares_and_what_is_asked_between_waits_for_
         share = scheduler.join("study")
 
         def frame() -> None:
-            with scheduler.acquire(share), room.lock:
+            with scheduler.acquire(share):
                 began = time.perf_counter()
-                busy(FRAME_S)
-                had_s[client] += time.perf_counter() - began  # more than FRAME_S where the machine is busy
+                with room.lock:
+                    busy(FRAME_S)
+                had_s[client] += time.perf_counter() - began  # what it is charged: a busy machine makes it long
                 had[client] += 1
 
         return frame
@@ -87,10 +88,12 @@ def test_clients_of_a_room_get_equal_shares_and_what_is_asked_between_waits_for_
             waited_s.append(time.perf_counter() - began)
         time.sleep(FRAME_S)
 
+    def shares_are_equal() -> bool:
+        return all(abs(3 * seconds - sum(had_s.values())) < SHARE * sum(had_s.values()) for seconds in had_s.values())
+
     with at_work([frame_of(client) for client in range(3)] + [move]):
-        until(lambda: sum(had.values()) >= TURNS)
-        shares = {client: seconds / sum(had_s.values()) for client, seconds in had_s.items()}
-    assert all(abs(3 * shares.get(client, 0.0) - 1) < SHARE for client in range(3)), shares
+        # one that a busy machine kept away is behind, and has its time back later
+        until(lambda: sum(had.values()) >= TURNS and shares_are_equal())
     assert len(waited_s) > TURNS / 10
     frame_s = sum(had_s.values()) / sum(had.values())
     assert sorted(waited_s)[len(waited_s) // 2] < 5 * frame_s

@@ -18,6 +18,7 @@ from server.light.light_estimation import LEAST_OPENNESS, Evidence, LightEstimat
 from server.light.place_light import PlaceLight
 from server.light.shell.known_room import KnownRoom
 from server.light.shell.room_model import RoomModel
+from server.light.shell.solution import Solution
 from server.light.shell.switches import Switches
 from server.maths.direct_lights import SplitLight, split_light
 from server.maths.sh import LUMINANCE
@@ -79,7 +80,12 @@ class RoomLight:
     @property
     def has_model(self) -> bool:
         """Whether the light of the room is known by place: not where one light is given or estimated for all of it."""
-        return self._model.is_known and self._given is None and self._harmonics is None
+        return self._solution is not None
+
+    @property
+    def _solution(self) -> Solution | None:
+        is_by_place = self._given is None and self._harmonics is None
+        return self._model.solution if is_by_place else None
 
     def seen_by_objects(
         self, position: NDArray[np.float64], origin_world: NDArray[np.float64]
@@ -88,10 +94,11 @@ class RoomLight:
 
         origin_world: [3] of the volume, in whose space discs have their places.
         """
-        if not self.has_model:
+        solution = self._solution
+        if solution is None:
             sh = self.estimate().sh
             return sh, split_light(sh)
-        whole, rest, lamps = self._model.beyond(position, self._settings.bands)
+        whole, rest, lamps = solution.beyond(position, self._settings.bands)
         if self._settings.light_color == "white":
             whole, rest = _whitened(whole), _whitened(rest)
             lamps = [replace(lamp, radiance=_whitened(lamp.radiance)) for lamp in lamps]
@@ -100,8 +107,8 @@ class RoomLight:
 
     def arriving_at(self, engine: Engine, volume: Volume, positions: NDArray[np.float64]) -> tuple[PlaceLight, ...]:
         """The light that arrives at each of `positions` [n, 3] (world metres), in units of the first picture."""
-        if self.has_model:
-            found = self._model.arriving_at(engine, volume, positions)
+        if solution := self._solution:
+            found = solution.arriving_at(engine, volume, positions)
             if self._settings.light_color == "white":
                 found = [replace(light, sh=_whitened(light.sh)) for light in found]
             return tuple(found)
@@ -114,8 +121,8 @@ class RoomLight:
         self, engine: Engine, volume: Volume, position: NDArray[np.float64], directions: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """[m, 3] radiance that arrives at `position` [3] (world metres) from unit `directions` [m, 3] (world axes)."""
-        if self.has_model:
-            radiance = self._model.radiance_at(engine, volume, position, directions)
+        if solution := self._solution:
+            radiance = solution.radiance_at(engine, volume, position, directions)
             return _whitened(radiance) if self._settings.light_color == "white" else radiance
         beyond = distant_light(self.estimate().sh)
         radiance, _ = arriving_radiance(engine, volume, position[None], directions, beyond)
@@ -166,7 +173,7 @@ class RoomLight:
                 self._harmonics.update(tiles)
             return self.estimate()
         self._model.update(context, up)
-        if self._model.is_known:
+        if self._model.solution is not None:
             self._remembered = None
         return self.estimate()
 

@@ -11,7 +11,7 @@ from server.light.shell import weights
 from server.light.shell.distant import distant_light
 from server.light.shell.evidence import DARKEST, log_chroma, materials_of
 from server.light.shell.objective import LOGIT, Unknowns, step
-from server.light.shell.patches import PATCH_M
+from server.light.shell.patches import PATCH_M, RAYS, Patches
 from server.light.shell.shell import (
     BEHIND_M,
     CAMERA_M,
@@ -28,7 +28,7 @@ from server.light.shell.shell import (
 )
 from server.light.shell.sources import distant_sources
 from server.light.shell.switches import Switches
-from server.light.shell.transport import SATURATED, Transport
+from server.light.shell.transport import SATURATED, Transport, meet
 from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
 from tests.reference.room_objective import level_objective
 from tests.scenes.analytic import Floats
@@ -44,7 +44,7 @@ def light_at(room: ShellRoom, place: Floats) -> Floats:
     """[16] luminance of the light found at `place`, with the scanned surface's own."""
     directions = np.broadcast_to(DIRECTIONS, (1, *DIRECTIONS.shape))
     _, arrivals = sent(place[None], directions, None, np.zeros(3))
-    met = room.transport.meet(room.shell, place[None], directions, arrivals)
+    met = meet(room.shell, room.transport.hidden, place[None], directions, arrivals)
     cells = room.unknowns.radiance
     radiance = (met.known + np.einsum("nmc,nmcr->nmr", met.shares, cells[np.maximum(met.columns, 0)]))[0]
     return np.asarray(BASIS @ radiance @ LUMINANCE)
@@ -287,7 +287,14 @@ def test_what_rays_meet() -> None:
     transport, shell = Transport(), Shell(np.eye(3), np.zeros(3), np.full(3, 4.0), 0.0, np.zeros((2, 3)))
     directions = np.array([[[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0, 0, -1.0]]])
     arrivals = np.array([[[0.2, 0.3, 0.4, 1.0], [0, 0, 0, -1.0], [1, SATURATED, 0.5, 1.5], [0, 0, 0, 0]]])
-    met = transport.meet(shell, np.array([[2.0, 2.0, 2.0]]), directions, arrivals, learn=True)
+    patches, middle = Patches(), np.array([[2.0, 2.0, 2.0]])
+    patches.positions[:1], patches.weights[0], patches.traced_in[0] = middle, 1.0, 1
+    patches.directions[0], patches.arrivals[0] = (
+        np.tile(directions[0], (RAYS // 4, 1)),
+        np.tile(arrivals[0], (RAYS // 4, 1)),
+    )
+    transport.update(patches, np.array([0]), shell)
+    met = meet(shell, transport.hidden, middle, directions, arrivals)
     (known, back, bright, free), shares = met.columns[0], met.shares[0]
     assert (known == -1).all()
     np.testing.assert_allclose(shares.sum(axis=-1), [0, 1, 1, 1])

@@ -6,6 +6,7 @@ the surface that was seen, not the number of frames. Kernels: patches.cl, arriva
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +40,10 @@ LEAST_SHARE = 0.6
 _BLOCKS_ACROSS = 40  # blocks of pixels along a picture's width
 _TOLERANCE_VOXELS = 1.5
 _FORGOTTEN = 1e-3  # frames: a patch of less weight is none
+_CHANGED_BY_FRAMES = (
+    *("weights", "positions", "normals", "logarithms", "variances", "clipped"),
+    *("keys", "regions", "seen_in", "traced_in", "_rows"),
+)
 _FACINGS = 1.2  # normals are rounded to multiples of 1 / 1.2: 26 ways to face
 
 Floats = NDArray[np.float64]
@@ -177,6 +182,13 @@ class Patches:
         self.arrivals[rows] = trace_arrivals(engine, volume, origins, None, directions)
         self.traced_in[rows] = self._frame
         return rows
+
+    def copy(self) -> Patches:
+        """What frames add does not reach it. Rays, which `trace` alone changes, are shared."""
+        other = copy(self)
+        for name in _CHANGED_BY_FRAMES:
+            setattr(other, name, getattr(self, name).copy())
+        return other
 
     def known(self) -> KnownPatches:
         """All but their rays."""

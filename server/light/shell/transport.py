@@ -6,6 +6,7 @@ was met from its back or without a colour. Scanned surface sends what the camera
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,13 +61,14 @@ class Transport:
         self.at_least: Floats = np.zeros((COLUMNS, 3))
         """[COLUMNS, 3] mean clipped radiance of saturated cells."""
         self._counts = np.zeros(COLUMNS)
-        self._hidden: dict[int, int] = {}
+        self.hidden: dict[int, int] = {}
+        """Columns of the cells of hidden and of saturated surface, by their keys."""
         self._shell: Shell | None = None
 
     @property
     def columns(self) -> int:
         """Cells that exist."""
-        return CELLS + len(self._hidden)
+        return CELLS + len(self.hidden)
 
     def update(self, patches: Patches, traced: Ints, shell: Shell) -> None:
         """Fold in the patches whose rays were traced; all patches, where the shell has changed."""
@@ -74,10 +76,12 @@ class Transport:
         self._shell = shell
         if len(rows) == 0:
             return
-        directions = patches.directions[rows].astype(np.float64)
-        met = self.meet(
-            shell, patches.positions[rows], directions, patches.arrivals[rows].astype(np.float64), learn=True
-        )
+        origins, directions = patches.positions[rows], patches.directions[rows].astype(np.float64)
+        arrivals = patches.arrivals[rows].astype(np.float64)
+        for is_bright, keys in enumerate(_hidden_keys(origins, directions, arrivals)):
+            self._add_cells(keys, is_saturated=bool(is_bright))
+        met = meet(shell, self.hidden, origins, directions, arrivals)
+        self._note_bright(met)
         place = COLUMNS * np.arange(len(rows))[:, None, None] + np.maximum(met.columns, 0)
         sums = np.bincount(place.ravel(), met.shares.ravel() / RAYS, len(rows) * COLUMNS)
         self.shares[rows] = sums.reshape(len(rows), COLUMNS)
@@ -85,53 +89,67 @@ class Transport:
         self.beyond[rows] = _beyond(directions, np.where(is_free, met.columns[..., 0], KNOWN))
         self.known[rows] = met.known.mean(axis=1)
 
-    def meet(self, shell: Shell, origins: Floats, directions: Floats, arrivals: Floats, *, learn: bool = False) -> Met:
-        """What rays from `origins` [n, 3] (world) along `directions` [n, m, 3] meet; arrivals [n, m, 4] as traced.
+    def _add_cells(self, keys: Ints, *, is_saturated: bool) -> None:
+        for key in np.unique(keys):
+            if int(key) not in self.hidden and len(self.hidden) < MOST_HIDDEN:
+                self.is_saturated[self.columns] = is_saturated
+                self.hidden[int(key)] = self.columns
 
-        learn: cells that did not exist are added, and saturated ones note their radiance.
-        """
-        distance, radiance = arrivals[..., 3], arrivals[..., :3]
-        is_bright = (distance > 0) & (radiance.max(axis=-1) >= SATURATED)
-        is_back = distance < 0
-        is_free = distance == 0
-        columns = np.full((*distance.shape, CORNERS), KNOWN, np.int64)
-        shares = np.zeros((*distance.shape, CORNERS))
-        starts = np.broadcast_to(origins[:, None], directions.shape)
-        columns[is_free], shares[is_free] = shell.exits(starts[is_free], directions[is_free])
-        ends = starts + np.abs(distance)[..., None] * directions
-        for kind, chosen in ((0, is_back), (1, is_bright)):
-            columns[chosen] = self._hidden_columns(ends[chosen], kind, learn=learn)[:, None]
-            shares[chosen, 0] = 1.0
-        if learn and is_bright.any():
-            self._note_bright(columns[is_bright, 0], radiance[is_bright])
-        known = np.where(((distance > 0) & ~is_bright)[..., None], radiance, 0.0)
-        return Met(columns, shares, known, np.where(is_bright[..., None], radiance, 0.0))
-
-    def _hidden_columns(self, points: Floats, kind: int, *, learn: bool) -> Ints:
-        """[n] columns of the cells around `points` [n, 3], NO_CELL where there is none yet."""
-        if len(points) == 0:
-            return np.zeros(0, np.int64)
-        parts = np.floor(points / HIDDEN_M).astype(np.int64) + _MIDDLE
-        numbers = (parts[:, 0] * 2 * _MIDDLE + parts[:, 1]) * 2 * _MIDDLE + parts[:, 2]
-        keys, inverse = np.unique(2 * numbers + kind, return_inverse=True)
-        columns = np.array([self._hidden_column(int(key), learn=learn) for key in keys])
-        return np.asarray(columns[inverse.ravel()], np.int64)
-
-    def _hidden_column(self, key: int, *, learn: bool) -> int:
-        if key not in self._hidden and learn:
-            if len(self._hidden) >= MOST_HIDDEN:
-                return COLUMNS - 1
-            self._hidden[key] = self.columns
-            self.is_saturated[self._hidden[key]] = key % 2 == 1
-        return self._hidden.get(key, NO_CELL)
-
-    def _note_bright(self, columns: Ints, radiance: Floats) -> None:
+    def _note_bright(self, met: Met) -> None:
+        is_bright = met.at_least.max(axis=-1) > 0
+        columns, radiance = met.columns[is_bright, 0], met.at_least[is_bright]
         counts = np.bincount(columns, minlength=COLUMNS).astype(np.float64)
         sums = np.stack([np.bincount(columns, channel, COLUMNS) for channel in radiance.T], axis=1)
         total = self._counts + counts
         share = np.where(total > 0, counts / np.maximum(total, 1.0), 0.0)[:, None]
         self.at_least += share * (sums / np.maximum(counts, 1.0)[:, None] - self.at_least)
         self._counts = np.minimum(total, _MOST_COUNTED)
+
+
+def meet(shell: Shell, hidden: Mapping[int, int], origins: Floats, directions: Floats, arrivals: Floats) -> Met:
+    """What rays from `origins` [n, 3] (world) along `directions` [n, m, 3] meet; arrivals [n, m, 4] as traced.
+
+    hidden: as of Transport.
+    """
+    distance, radiance = arrivals[..., 3], arrivals[..., :3]
+    is_bright, is_free = _is_bright(arrivals), distance == 0
+    columns = np.full((*distance.shape, CORNERS), KNOWN, np.int64)
+    shares = np.zeros((*distance.shape, CORNERS))
+    starts = np.broadcast_to(origins[:, None], directions.shape)
+    columns[is_free], shares[is_free] = shell.exits(starts[is_free], directions[is_free])
+    back, bright = _hidden_keys(origins, directions, arrivals)
+    for chosen, keys in ((distance < 0, back), (is_bright, bright)):
+        columns[chosen] = _columns_of(hidden, keys)[:, None]
+        shares[chosen, 0] = 1.0
+    known = np.where(((distance > 0) & ~is_bright)[..., None], radiance, 0.0)
+    return Met(columns, shares, known, np.where(is_bright[..., None], radiance, 0.0))
+
+
+def _is_bright(arrivals: Floats) -> NDArray[np.bool_]:
+    return np.asarray((arrivals[..., 3] > 0) & (arrivals[..., :3].max(axis=-1) >= SATURATED))
+
+
+def _hidden_keys(origins: Floats, directions: Floats, arrivals: Floats) -> tuple[Ints, Ints]:
+    """Keys of the cells of hidden surface and of saturated surface, one of each ray that meets such."""
+    row, ray = np.nonzero(arrivals[..., 3] < 0)
+    bright_row, bright_ray = np.nonzero(_is_bright(arrivals))
+    distance = np.abs(arrivals[..., 3, None])
+    back = origins[row] + distance[row, ray] * directions[row, ray]
+    bright = origins[bright_row] + distance[bright_row, bright_ray] * directions[bright_row, bright_ray]
+    return 2 * _cell_numbers(back), 2 * _cell_numbers(bright) + 1
+
+
+def _cell_numbers(points: Floats) -> Ints:
+    parts = np.floor(points / HIDDEN_M).astype(np.int64) + _MIDDLE
+    return np.asarray((parts[:, 0] * 2 * _MIDDLE + parts[:, 1]) * 2 * _MIDDLE + parts[:, 2])
+
+
+def _columns_of(hidden: Mapping[int, int], keys: Ints) -> Ints:
+    """[n] columns by the `keys` [n] of cells; where there is no such cell NO_CELL, or the last one if no more fit."""
+    found, inverse = np.unique(keys, return_inverse=True)
+    other = COLUMNS - 1 if len(hidden) >= MOST_HIDDEN else NO_CELL
+    columns = np.array([hidden.get(int(key), other) for key in found], np.int64)
+    return np.asarray(columns[inverse.ravel()])
 
 
 def _beyond(directions: Floats, columns: Ints) -> NDArray[np.float32]:

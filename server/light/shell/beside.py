@@ -1,0 +1,39 @@
+"""Work beside the frames: in a thread of its own, at lower priority than what draws."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Generic, TypeVar
+
+Result = TypeVar("Result")
+
+NICENESS = 10
+"""Of the thread: the frames' threads have about nine times its share of a busy processor."""
+
+
+class Beside(Generic[Result]):
+    """One piece of work, begun when this is made."""
+
+    def __init__(self, work: Callable[[], Result]) -> None:
+        self._future: Future[Result] = Future()
+        threading.Thread(target=self._run, args=(work,), name="beside").start()
+
+    def result(self) -> Result:
+        """Wait for it. Raises what the work raised."""
+        return self._future.result()
+
+    def _run(self, work: Callable[[], Result]) -> None:
+        try:
+            _yield_to_others()
+            self._future.set_result(work())
+        except BaseException as error:  # raised again where the result is asked for
+            self._future.set_exception(error)
+
+
+def _yield_to_others() -> None:
+    """Lower this thread's priority, where the system has one for each thread (Linux)."""
+    if hasattr(os, "setpriority") and os.uname().sysname == "Linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)

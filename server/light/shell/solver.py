@@ -1,0 +1,65 @@
+"""From patches to a solution, step by step: each begins where the last one ended."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.light.shell.evidence import evidence_of
+from server.light.shell.objective import Unknowns, step
+from server.light.shell.patches import PATCH_M, Patches
+from server.light.shell.shell import Shell, closed_sides, shell_around
+from server.light.shell.solution import Solution
+from server.light.shell.sources import distant_sources, near_sources
+from server.light.shell.switches import Switches
+from server.light.shell.transport import Transport
+
+MOST_STEPS = 16
+"""Gauss-Newton steps of a solution: one, and others while the last one changed what patches receive by more than
+MOVED."""
+MOVED, FIRST_MOVED = 0.05, 0.01
+"""Of a logarithm; the second in a first solution, which the others follow."""
+LEAST_PATCHES = 12
+"""Patches below which nothing is said."""
+
+Floats = NDArray[np.float64]
+
+
+class Solver:
+    """Used by one thread at a time."""
+
+    def __init__(self, switches: Switches) -> None:
+        self._switches = switches
+        self._transport = Transport()
+        self._near, self._distant = Unknowns(), Unknowns()
+        self._shell: Shell | None = None
+
+    def begin_with(self, shell: Shell | None) -> None:
+        """Keep the size and place of the shell of an earlier solution."""
+        self._shell = shell
+
+    def solve(self, patches: Patches, traced: NDArray[np.int64], camera: Floats, up: Floats) -> Solution | None:
+        """The next solution; None where too few patches are known.
+
+        traced: rows of the patches whose rays are new. camera: [3] world metres; up: [3] unit, world.
+        """
+        rows, switches = patches.used, self._switches
+        if len(rows) < LEAST_PATCHES:
+            return None
+        positions, normals = patches.positions[rows], patches.normals[rows]
+        self._shell = shell = shell_around(positions, normals, camera[None], up, PATCH_M, self._shell)
+        self._transport.update(patches, traced, shell)
+        closed = closed_sides(positions, normals, shell.axes, PATCH_M)
+        evidence = evidence_of(patches, rows, switches)
+        near = near_sources(self._transport, shell, rows)
+        distant = distant_sources(self._transport, closed, rows, with_indirect=switches.indirect)
+        settled = MOVED if self._near.known > 0 and switches.memory else FIRST_MOVED
+        for unknowns, sources in ((self._near, near), (self._distant, distant)):
+            for _ in range(MOST_STEPS):
+                step(unknowns, evidence, sources, switches)
+                if unknowns.step < settled:
+                    break
+        hidden = dict(self._transport.hidden)
+        return Solution(shell, hidden, replace(self._near), replace(self._distant), rows, patches.logarithms[rows])

@@ -149,7 +149,8 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     light_at: tuple[Vector3, ...] = ()
     """World positions, metres: places at which the arriving light is told in `light.at`, at most MAX_LIGHT_PLACES."""
     lamps: Literal["auto", "on", "off"] = "auto"
-    """Whether to search for lights inside the room; `auto`: only if distant light does not explain the image."""
+    """Whether to search for lights inside the room; `auto`: only where one light is estimated for all places (`albedo`
+    constant, no indirect light) and does not explain the image."""
     exposure: Literal["auto", "constant"] = "auto"
     """`auto`: the frame's exposure if given, else estimated; `constant`: the same for all frames."""
     edges: Literal["smooth", "hard"] = "smooth"

@@ -84,7 +84,10 @@ PanoramaFile = Annotated[
     ),
 ]
 Lamps = Annotated[
-    str | None, typer.Option(metavar="on|off", help="search for lights inside the room; default: if needed")
+    str | None,
+    typer.Option(
+        metavar="on|off", help="search for lights inside the room; default: where one light is estimated for all of it"
+    ),
 ]
 Exposure = Annotated[
     str | None, typer.Option(metavar="auto|constant", help="default: auto, of the frame if given, else estimated")

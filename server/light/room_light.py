@@ -61,6 +61,11 @@ class RoomLight:
         return self._given is not None
 
     @property
+    def estimates_one_light(self) -> bool:
+        """Whether what it estimates is one light for the whole room, and not a light by place."""
+        return self._harmonics is not None
+
+    @property
     def needs_transfer(self) -> bool:
         """Whether it is estimated from the radiance transfer of the samples."""
         return self._harmonics is not None and self._given is None

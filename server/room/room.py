@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from msgspec import structs
@@ -20,7 +21,7 @@ from server.meshing.surface import MeshingError
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.quality.sampling_settings import SamplingSettings
-from server.quality.settings import read_wishes
+from server.quality.settings import Settings, read_wishes
 from server.room.room_objects import RoomObjects
 from server.tracking.alignment import Markers
 from server.tracking.reconstruction import Reconstruction
@@ -54,7 +55,7 @@ class Room:
         self.engine = Engine(device)
         self.reconstruction = Reconstruction(self.engine, is_shared=name is not None)
         self.light = RoomLight(settings)
-        self.lamps = LampFinder(self.engine, settings.lamps)
+        self.lamps = LampFinder(self.engine, self._wants_lamps(settings))
         self.objects = RoomObjects(self.engine)
         self.markers = Markers()
         self.changes = 0
@@ -62,6 +63,11 @@ class Room:
         self.key_digest: bytes | None = None
         """Digest of the room's key (room_registry.py); empty without a key, None until the first client enters."""
         self._wishes = wishes
+
+    def _wants_lamps(self, settings: Settings) -> Literal["auto", "on", "off"]:
+        """The model of the room has its own lamps, on its shell: only one light for all places lacks them."""
+        is_needed = settings.lamps != "auto" or self.light.estimates_one_light
+        return settings.lamps if is_needed else "off"
 
     @property
     def wishes(self) -> Wishes:

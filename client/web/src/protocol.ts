@@ -97,7 +97,10 @@ export interface Wishes {
   light_axes?: "webxr" | "world";
   /** World positions, metres: places at which the arriving light is told in `light.at`, at most MAX_LIGHT_PLACES. */
   light_at?: Array<[number, number, number]>;
-  /** Whether to search for lights inside the room; `auto`: only if distant light does not explain the image. */
+  /**
+   * Whether to search for lights inside the room; `auto`: only where one light is estimated for all places (`albedo`
+   * constant, no indirect light) and does not explain the image.
+   */
   lamps?: "auto" | "off" | "on";
   /** `auto`: the frame's exposure if given, else estimated; `constant`: the same for all frames. */
   exposure?: "auto" | "constant";

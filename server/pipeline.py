@@ -146,11 +146,16 @@ class Pipeline:
             samples, is_kept = self._sample_transfer(context, reuse, is_shaded, needs_transfer)
         left_out = self._left_out(frame, reuse, is_kept, is_shaded, needs_transfer)
         with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
-            light = self._estimate_light(context, samples, left_out)
-            self._look_up_places(context, is_still=reuse.keeps_geometry)
+            self._begin_light(context, left_out)
+            is_drawn_first = room.light.has_model  # with the light of the frames before
+            if not is_drawn_first:
+                light = self._light(context, samples, left_out, is_still=reuse.keeps_geometry)
         with stage("rendering"):  # 7.1-7.2, the effects that this frame calls for
             spine = self._spine_outputs(context, frame, objects, samples, left_out)
             rendered = self._renderer.render(context, spine, self._settings, reuse, request)
+        if is_drawn_first:
+            with stage("light_estimation"):  # while the device draws
+                light = self._light(context, samples, left_out, is_still=reuse.keeps_geometry)
         if not room.light.is_given and frame.has_depth:  # B4, for the frames to come
             with stage("light_estimation"):
                 room.lamps.work(self._camera, context.scene_radiance, context.surface, volume)
@@ -224,6 +229,20 @@ class Pipeline:
             denoises=self._settings.denoise != "none",
             has_depth=frame.has_depth,
         )
+
+    def _begin_light(self, context: FrameContext, left_out: dict[str, CullReason]) -> None:
+        """Let the device gather what `_light` needs of the frame."""
+        if "estimate_light" not in left_out:
+            self._room.light.begin(context)
+        self._told.begin(context)
+
+    def _light(
+        self, context: FrameContext, samples: TransferSamples, left_out: dict[str, CullReason], *, is_still: bool
+    ) -> LightEstimate:
+        """The light with this frame, and what arrives at the places of which this client is told."""
+        light = self._estimate_light(context, samples, left_out)
+        self._look_up_places(context, is_still=is_still)
+        return light
 
     def _estimate_light(
         self, context: FrameContext, samples: TransferSamples, left_out: dict[str, CullReason]
@@ -333,18 +352,18 @@ class Pipeline:
     ) -> FrameResult:
         """The answer, once the device is done."""
         self._engine.queue.finish()
-        timings = self._timings(started)
+        timings, plan = self._timings(started), rendered.told_plan()
         self._frames += 1
         self._room.changes += 1
         others = (*self._transfer.left_out(), *self._room.lamps.left_out()) if geometry.tracking != "lost" else ()
         return FrameResult(
-            color=rendered.picture,
+            color=rendered.picture(),
             layer=rendered.layer,
             light=self._light_message(frame, geometry, light, volume),
             world_from_camera=self._alignment.in_client(geometry.world_from_camera),
             tracking=geometry.tracking,
             timings=timings,
-            plan=structs.replace(rendered.plan, left_out=(*rendered.plan.left_out, *others)),
+            plan=structs.replace(plan, left_out=(*plan.left_out, *others)),
             notes=(*geometry.notes, *notes, *_light_notes(light), *self._place_notes()),
             is_reused=geometry.is_held,
         )

@@ -32,10 +32,11 @@ from server.maths.direct_lights import SplitLight
 from server.objects.rasterize import Placed
 from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
+from server.opencl.pending_read import PendingRead
 from server.quality.settings import Settings
 from server.reuse.frame_cache import FrameCache
 from server.reuse.temporal_reuse import ReuseDecision
-from server.shading.composite import CompositeInputs, composite, shown_picture
+from server.shading.composite import CompositeInputs, composite, composite_on_device, shown_picture
 from server.shading.layer import Layer, compose_layer
 from server.shading.tone_mapping import AverageMemory, Averages, measure_averages
 from server.shading.traced_scene import DeviceLight, take_discs, upload_light
@@ -99,13 +100,33 @@ class SpineOutputs:
 
 @dataclass(frozen=True)
 class RenderResult:
-    """What was requested, the rest None."""
+    """What was requested, the rest None. The device may be at work on it."""
 
-    picture: Picture | None
+    drawing: PendingRead | Picture | None
     layer: Layer | None
     plan: Plan
+    """Without `changes`."""
+    changes: Changes | None = None
     reference: Picture | None = None
     """At a checkpoint: the virtual things over what the camera saw when the view began."""
+
+    def picture(self) -> Picture | None:
+        """The picture, waited for."""
+        return self.drawing.result() if isinstance(self.drawing, PendingRead) else self.drawing
+
+    def told_plan(self) -> Plan:
+        """The plan as it turned out, waited for."""
+        return _with_changes(self.plan, self.changes) if self.changes else self.plan
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Where virtual things change real surface."""
+
+    cells: PendingRead
+    """Of the picture: 1 where they do."""
+    has_sharp_shadows: bool
+    """Beside `cells`."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +135,7 @@ class CachedEffects:
 
     parts: PictureParts
     plan: Plan
+    changes: Changes | None
 
 
 @dataclass(frozen=True)
@@ -150,15 +172,14 @@ class Renderer:
         cached = self._cache.find(CachedEffects, reuse.version) if reuse.reason is not None else None
         if cached is not None and reuse.reason is not None:
             plan = _reused(cached.plan, spine.left_out, reuse.reason)
-            return _composed(context, shown, cached.parts, plan, request)
+            return replace(_composed(context, shown, cached.parts, plan, request), changes=cached.changes)
         parts, plan = self._run_effects(context, spine, settings, shown)
         result = _composed(context, shown, parts, plan, request)
-        if parts.changed is not None:  # read last: nothing waits for what the plan says of it
-            share = float(self._engine.download(parts.changed).mean())
-            plan, told = (_with_share(p, share, has_sharp_shadows=bool(parts.light.discs)) for p in (plan, result.plan))
-            result = replace(result, plan=told)
+        if parts.changed is not None:
+            changes = Changes(self._engine.begin_download(parts.changed), has_sharp_shadows=bool(parts.light.discs))
+            result = replace(result, changes=changes)
         if reuse.reason is not None and spine.period <= TURNS:
-            self._cache.keep(CachedEffects(parts, plan), reuse.version, LASTING)
+            self._cache.keep(CachedEffects(parts, plan, result.changes), reuse.version, LASTING)
         if reuse.is_checkpoint and request.answer != "light" and spine.objects:
             return replace(result, reference=self._reference(context, shown, parts, reuse))
         return result
@@ -274,9 +295,12 @@ def _composed(
     """The picture, the layer, or both."""
     engine, inputs = context.engine, composite_inputs(context, parts)
     layer = compose_layer(engine, inputs) if request.answer == "layer" else None
-    picture = composite(engine, shown, inputs) if request.wants_picture else None
-    ends = [name for name, end in ((COMPOSE_LAYER, layer), (COMPOSITE, picture)) if end is not None]
-    return RenderResult(picture, layer, structs.replace(plan, run=(*plan.run, *ends)))
+    drawing: PendingRead | Picture | None = None
+    if request.wants_picture:
+        on_device = None if inputs.is_nothing else composite_on_device(engine, shown, inputs)
+        drawing = shown if on_device is None else engine.begin_download(on_device)
+    ends = [name for name, end in ((COMPOSE_LAYER, layer), (COMPOSITE, drawing)) if end is not None]
+    return RenderResult(drawing, layer, structs.replace(plan, run=(*plan.run, *ends)))
 
 
 def _reused(plan: Plan, left_out: Mapping[str, CullReason], reason: CullReason) -> Plan:
@@ -286,9 +310,10 @@ def _reused(plan: Plan, left_out: Mapping[str, CullReason], reason: CullReason) 
     return structs.replace(plan, run=(), left_out=(*held, *others))
 
 
-def _with_share(plan: Plan, share: float, *, has_sharp_shadows: bool) -> Plan:
-    """The plan as it turned out. share: of the picture's cells in which real surface changes."""
-    aside = ", sharp shadows aside" if has_sharp_shadows else ""
+def _with_changes(plan: Plan, changes: Changes) -> Plan:
+    """The plan with the share of the picture in which real surface changes."""
+    share = float(changes.cells.result().mean())
+    aside = ", sharp shadows aside" if changes.has_sharp_shadows else ""
     reason = f"virtual things change {100 * share:.0f} % of the picture{aside}, and hardly the rest"
     said = (
         structs.replace(left, reason=reason) if left.effect == FAINT_SHADOWS.name else left for left in plan.left_out

@@ -153,6 +153,11 @@ class RoomLight:
     def _colored(self, estimate: LightEstimate) -> LightEstimate:
         return estimate.whitened() if self._settings.light_color == "white" else estimate
 
+    def begin(self, context: FrameContext) -> None:
+        """Let the device gather what a frame says of the light; `update` takes it in."""
+        if not self._given and not self._harmonics:
+            self._model.begin(context)
+
     def update(
         self, context: FrameContext, radiance: cl_array.Array, samples: TransferSamples, up: NDArray[np.float64]
     ) -> LightEstimate:

@@ -12,7 +12,7 @@ from server.light.light_message import LightPlaces
 from server.light.place_light import LitPlace, Place, PlaceLight
 from server.light.room_light import RoomLight
 from server.light.shell.room_model import SOLVE_EVERY
-from server.light.view_middle import view_middle
+from server.light.view_middle import ViewMiddle
 
 MOST_OBJECTS = 64
 """Objects with a light of their own, which costs 2 ms and 1 kB each where the light has changed; the others have
@@ -28,8 +28,13 @@ class ToldPlaces:
     def __init__(self) -> None:
         self.newest = LightPlaces()
         """World axes of the room, metres; where the camera is lost, those of the last frame that was placed."""
+        self._middle: ViewMiddle | None = None
         self._sh: Floats = np.zeros(0)
         self._frames = 0
+
+    def begin(self, context: FrameContext) -> None:
+        """Let the device find the middle of a frame's view; `update` needs it."""
+        self._middle = ViewMiddle(context.engine, context.surface)
 
     def update(
         self,
@@ -45,8 +50,9 @@ class ToldPlaces:
         `is_still`: the geometry is that of the frame before.
         """
         origin = context.volume.origin_world
-        middle = view_middle(context.engine, context.surface, context.volume_from_camera)
-        view = (context.volume_from_camera[:3, 3] if middle is None else middle) + origin
+        eye = context.volume_from_camera[:3, 3]
+        middle = self._middle.seen_from(eye) if self._middle else None
+        view = (eye if middle is None else middle) + origin
         places = _places(view, asked, objects)
         kept = self._kept(light, is_still=is_still)
         new = [place for place in places if _key(place) not in kept]

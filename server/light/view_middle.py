@@ -22,18 +22,20 @@ class _Buffers(StageBuffers):
     """[rows] positions summed along a row, and their number."""
 
 
-def view_middle(
-    engine: Engine, surface: Surface, volume_from_camera: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
-    """[3] volume metres: SHARE of the way from the camera to the mean of the seen surface; None if there is none."""
-    height, width = surface.positions.shape
-    rows = len(range(STEP_PX // 2, height, STEP_PX))
-    sums = engine.buffers(_Buffers).sums.array((rows,))
-    kernel = engine.kernel("view_middle.cl", "sum_positions")
-    engine.launch(kernel, (rows,), width, rows, STEP_PX, surface.positions, sums)
-    total = engine.download(sums).view(np.float32).reshape(rows, 4).astype(np.float64).sum(axis=0)
-    if total[3] == 0:
-        return None
-    eye = volume_from_camera[:3, 3]
-    middle: NDArray[np.float64] = eye + SHARE * (total[:3] / total[3] - eye)
-    return middle
+class ViewMiddle:
+    """Of one picture; begun when this is made."""
+
+    def __init__(self, engine: Engine, surface: Surface) -> None:
+        height, width = surface.positions.shape
+        rows = len(range(STEP_PX // 2, height, STEP_PX))
+        sums = engine.buffers(_Buffers).sums.array((rows,))
+        kernel = engine.kernel("view_middle.cl", "sum_positions")
+        engine.launch(kernel, (rows,), width, rows, STEP_PX, surface.positions, sums)
+        self._sums = engine.begin_download(sums)
+
+    def seen_from(self, eye: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """[3] volume metres: SHARE of the way from `eye` [3] to the mean of the seen surface; None if there is none."""
+        total = self._sums.result().view(np.float32).reshape(-1, 4).astype(np.float64).sum(axis=0)
+        if total[3] == 0:
+            return None
+        return np.asarray(eye + SHARE * (total[:3] / total[3] - eye))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from server.opencl.buffers import BufferDescription, Group, StageBuffers, Workspace
 from server.opencl.device import Device
+from server.opencl.pending_read import PendingRead
 from server.opencl.profile import Profile
 from server.opencl.program import Define, define_options
 
@@ -96,6 +97,10 @@ class Engine:
         self.profile.count_read(array.nbytes)
         result: NDArray[Any] = array.get()
         return result
+
+    def begin_download(self, array: cl_array.Array) -> PendingRead:
+        """The same without waiting: the host goes on while the device works."""
+        return PendingRead(self.queue, array, self.profile)
 
     def close(self) -> None:
         """Wait for the device and give its memory back."""

@@ -20,14 +20,15 @@ SHARP_LIGHT = tuple((float(r), float(g), float(b)) for r, g, b in _LAMP)
 
 
 def warm_up(device: Device) -> None:
-    """Process an object under light that is estimated, also as in the thesis, and under a given sharp light, with all
-    kinds of presets.
+    """Process an object under light that is estimated (also as in the thesis, and with one albedo) and under a given sharp
+    light, with all kinds of presets.
 
     Raises CheckFailed if the self-check finds a wrong result.
     """
     wishes = Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.02, answer="layer")
     _run(device, wishes)
     _run(device, structs.replace(wishes, as_thesis=True))
+    _run(device, structs.replace(wishes, albedo="constant", indirect="none"))  # with a search for lamps
     _run(device, structs.replace(wishes, preset="art4"))
     _run(device, structs.replace(wishes, preset="gr15fast", light=SHARP_LIGHT))
     check_answers(device)

@@ -182,10 +182,13 @@ def srgb_table(engine: Engine) -> cl_array.Array:
 
 def composite(engine: Engine, shown: NDArray[np.uint8], mixture: CompositeInputs) -> NDArray[np.uint8]:
     """Picture [h, w, 3] sRGB of the camera picture `shown` with what is virtual; unchanged where nothing virtual is."""
-    if mixture.is_nothing:
-        return shown
+    return shown if mixture.is_nothing else engine.download(composite_on_device(engine, shown, mixture))
+
+
+def composite_on_device(engine: Engine, shown: NDArray[np.uint8], mixture: CompositeInputs) -> cl_array.Array:
+    """The same where something is virtual, not read yet; valid until the next call."""
     buffers, camera = engine.buffers(_Buffers), mixture.camera
     picture = buffers.picture.array((camera.height, camera.width, 3))
     others = (buffers.shown.upload(shown), srgb_table(engine), picture)
     launch_mixture(engine, "composite.cl", "composite", mixture, mixture_parameters(mixture), *others)
-    return engine.download(picture)
+    return picture

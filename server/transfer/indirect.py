@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
+from server.opencl.pending_read import PendingRead
 from server.opencl.structs import GATHER_PARAMETERS
 from server.transfer.radiance_transfer import Directions, Transfer, own_sets, sample_grid
 from server.volume.raycast import Surface
@@ -55,14 +56,15 @@ def observe_indirect(
     transfer: Transfer,
     rays: Directions,
     reach_m: float,
+    mean: MeanSent,
     found: cl_array.Array | None = None,
 ) -> Indirect:
     """Indirect light at the samples of `transfer`, from the surfaces that block their directions.
 
-    `found`: of transfer_cache.py; samples that were found there keep their values.
+    `mean`: of the session. `found`: of transfer_cache.py; samples that were found there keep their values.
     """
     hits = gather_hits(engine, camera, volume, surface, transfer, rays, reach_m, found=found)
-    return Indirect(hits, mean_sent(engine, hits), room_for_met(engine, transfer, rays))
+    return Indirect(hits, mean.update(engine, hits), room_for_met(engine, transfer, rays))
 
 
 def gather_hits(
@@ -124,7 +126,23 @@ def no_hits(engine: Engine, transfer: Transfer) -> cl_array.Array:
     return engine.buffers(_Buffers).no_hits.constant(np.zeros((transfer.rows, transfer.cols), cl_types.float4))
 
 
-def mean_sent(engine: Engine, hits: cl_array.Array) -> NDArray[np.float64]:
-    """[3] mean radiance of all surfaces in `hits`; 0 without any."""
-    total = engine.download(hits).view(np.float32).reshape(-1, 4).sum(axis=0, dtype=np.float64)
+class MeanSent:
+    """Mean radiance of all surfaces that rays meet: that of the last picture, so that no frame waits for its own."""
+
+    def __init__(self) -> None:
+        self._mean: NDArray[np.float64] = np.zeros(3)
+        self._hits: PendingRead | None = None
+
+    def update(self, engine: Engine, hits: cl_array.Array) -> NDArray[np.float64]:
+        """[3] for the picture of `hits`; the first waits for its own mean. 0 before any surface was met."""
+        last, self._hits = self._hits, engine.begin_download(hits)
+        mean = mean_sent((last or self._hits).result())
+        if mean.any():  # where almost nothing is blocked, whether a surface is met is noise
+            self._mean = mean
+        return self._mean
+
+
+def mean_sent(hits: NDArray[np.void]) -> NDArray[np.float64]:
+    """[3] mean radiance of all surfaces in `hits` [rows, cols] float4; 0 without any."""
+    total = hits.view(np.float32).reshape(-1, 4).sum(axis=0, dtype=np.float64)
     return np.asarray(total[:3] / total[3] if total[3] > 0 else np.zeros(3))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from protocol.messages import LeftOut
 from server.opencl.engine import Engine
-from server.transfer.indirect import Indirect, observe_indirect
+from server.transfer.indirect import Indirect, MeanSent, observe_indirect
 from server.transfer.radiance_transfer import Directions, Transfer
 from server.transfer.real_depth_views import RealDepthViews
 from server.transfer.sampling import Sampling, TransferSampler
@@ -46,7 +46,7 @@ class SampledTransfer:
         self._bands = bands
         self._sampler = TransferSampler(engine, camera, sampling, rays, bands)
         self._cache = TransferCache(engine) if is_cached else None
-        self._mean_sent = np.zeros(3)
+        self._mean_sent = MeanSent()
         self._has_found = False
 
     def use(self, sampling: Sampling, rays: int) -> None:
@@ -103,10 +103,9 @@ class SampledTransfer:
         transfer = self._sampler.transfer(volume, surface, volume_from_camera, up, ray_length_m, found)
         sent = None
         if with_indirect:
-            sent = observe_indirect(engine, camera, volume, surface, transfer, rays, ray_length_m, found)
-            if sent.mean.any():  # where almost nothing is blocked, whether a surface is met is noise
-                self._mean_sent = sent.mean
-            sent = replace(sent, mean=self._mean_sent)
+            sent = observe_indirect(
+                engine, camera, volume, surface, transfer, rays, ray_length_m, self._mean_sent, found
+            )
         if cache:
             transfer = replace(transfer, cells=cache.store())
         return TransferSamples(transfer, sent)

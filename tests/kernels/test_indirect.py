@@ -180,7 +180,7 @@ def test_a_wall_sends_its_colour_to_the_floor(
     engine, rays = kind(device), direction_sets(81, 2)
     volume, surface, camera, transfer = floor_before_the_wall(engine, rays, distance_m)
     hits = gather_hits(engine, camera, volume, surface, transfer, rays, ROOM_M, every)
-    np.testing.assert_allclose(mean_sent(engine, hits), WALL, atol=ROUNDING)
+    np.testing.assert_allclose(mean_sent(engine.download(hits)), WALL, atol=ROUNDING)
     cosines = 81 / 4  # of the whole sky: a direction stands for 4 pi / 81 sr
     shape = wall_seen_from(distance_m + VOXEL_M, SIDE_M, SIDE_M - 0.1)
     share = download4(engine, hits)[..., 3].mean() / cosines
@@ -198,7 +198,7 @@ def test_what_has_no_colour_is_not_seen(device: Device, kind: type[Engine]) -> N
     for has_color in (x >= 0, x >= SIDE_M / 2):
         paint(engine, volume, np.full((*x.shape, 3), WALL), has_color)
         hits = gather_hits(engine, camera, volume, surface, transfer, rays, ROOM_M, 1)
-        np.testing.assert_allclose(mean_sent(engine, hits), WALL, atol=ROUNDING)
+        np.testing.assert_allclose(mean_sent(engine.download(hits)), WALL, atol=ROUNDING)
         met.append(download4(engine, hits)[..., 3].mean())
     assert met[1] == pytest.approx(met[0] / 2, rel=0.1)
     engine.close()
@@ -218,7 +218,7 @@ def test_released_bricks_count_as_not_seen(device: Device, kind: type[Engine]) -
     volume.slots_device.set(np.full_like(slots, AWAY_SLOT), engine.queue)
     hits = gather_hits(engine, camera, volume, surface, transfer, rays, ROOM_M, 1)
     assert not download4(engine, hits).any()
-    assert not mean_sent(engine, hits).any()
+    assert not mean_sent(engine.download(hits)).any()
     engine.close()
 
 
@@ -267,4 +267,4 @@ def test_left_out_it_is_dark(engine: Engine) -> None:
     hits = no_hits(engine, transfer_with(engine, np.zeros((7, 9, 81), bool)))
     assert hits.shape == (7, 9)
     assert not download4(engine, hits).any()
-    assert not mean_sent(engine, hits).any()
+    assert not mean_sent(engine.download(hits)).any()

@@ -45,7 +45,7 @@ def test_matches_twin(engine: Engine, size: tuple[int, int]) -> None:
     surface = upload_surface(engine, positions[..., :3], normals[..., :3], labels > 0)
     surface.labels.set(labels, engine.queue)
     seen_radiance = engine.workspace.upload("test_radiance", float4(radiance[..., :3], radiance[..., 3]))
-    found = stage.gather_patches(engine, camera, surface, seen_radiance, volume)
+    found = stage.PatchesInPicture(engine, camera, surface, seen_radiance, volume).seen()
     step = max(2, width // 40)
     places, facing, shown = (a.reshape(-1, 4) for a in twin(positions, normals, labels, radiance, step, 1.5 * VOXEL_M))
     # Pixels at the very tolerance may fall on either side of it in float32.

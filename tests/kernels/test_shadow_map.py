@@ -34,7 +34,7 @@ from server.shading.shadow_map import (
 )
 from server.shading.traced_scene import DeviceLight, take_discs, trace_scene, upload_light
 from server.shading.virtual_point_lights import place_points
-from server.transfer.indirect import observe_indirect
+from server.transfer.indirect import MeanSent, observe_indirect
 from server.transfer.radiance_transfer import Directions, direction_sets, transfer_radiance
 from server.transfer.sample_grid import SampleGrid
 from tests.reference import shadow_map as twin
@@ -469,7 +469,7 @@ def test_an_umbra_keeps_what_surfaces_send(engine: Engine) -> None:
     volume, _ = floor_beside_a_wall(engine)
     surface = upload_surface(engine, points, np.broadcast_to(UP, points.shape), np.ones((16, 16), bool))
     transfer = transfer_radiance(engine, camera, volume, surface, 1, rays, FAR_M)
-    indirect = observe_indirect(engine, camera, volume, surface, transfer, rays, FAR_M)
+    indirect = observe_indirect(engine, camera, volume, surface, transfer, rays, FAR_M, MeanSent())
     rest = upload_light(engine, even, rays, indirect=indirect)
     split = take_discs(engine, rest, SplitLight(even, (light,)), rays)
     objects, context = [placed(engine, bar)], context_of(engine, camera, surface, volume, rays, FAR_M)

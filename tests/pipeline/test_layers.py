@@ -40,9 +40,9 @@ def test_lights_are_the_same_however_frames_are_answered(device: Device, name: s
 
 def test_a_light_is_found_without_drawing(device: Device) -> None:
     source = GallerySource("sharp-sun", width=80)
-    # What a frame leaves to the next depends on its answer.
+    # What a frame leaves to the next depends on its answer: its caches, and what surfaces send in the mean.
     wishes = msgspec.structs.replace(wishes_of(source), cache="off")
-    first, watched = played(device, source, answered(wishes, "light"), 2, watched=(1,))
+    first, _, watched = played(device, source, answered(wishes, "light"), 3, watched=(1, 2))
     assert first.color is None
     assert first.layer is None
     assert first.plan.run == ()
@@ -53,7 +53,7 @@ def test_a_light_is_found_without_drawing(device: Device) -> None:
     assert watched.color is not None
     assert watched.layer is None
     assert watched.plan.run[-1] == "composite"
-    drawn = played(device, source, wishes, 2)[1].color
+    drawn = played(device, source, wishes, 3)[2].color
     np.testing.assert_array_equal(watched.color, drawn)
 
 

@@ -52,7 +52,7 @@ Ints = NDArray[np.int64]
 
 class _Buffers(StageBuffers):
     seen = BufferDescription(cl_types.float4)
-    """[3, rows, cols] as gather_patches returns it."""
+    """[3, rows, cols] as gather_patches writes it."""
 
 
 @dataclass(frozen=True)
@@ -76,30 +76,39 @@ class Seen:
         return len(self.positions)
 
 
-def gather_patches(
-    engine: Engine, camera: CameraModel, surface: Surface, radiance: cl_array.Array, volume: Volume
-) -> Seen:
-    """The patches in one picture; radiance: [h, w] float4 as in Measurement, in the units of the first picture."""
-    step = max(2, camera.width // _BLOCKS_ACROSS)
-    cols, rows = camera.width // step, camera.height // step
-    seen = engine.buffers(_Buffers).seen.array((3, rows, cols))
-    engine.launch(
-        engine.kernel("patches.cl", "gather_patches"),
-        (cols, rows),
-        cols,
-        rows,
-        step,
-        camera.width,
-        _TOLERANCE_VOXELS * volume.voxel_m,
-        surface.positions,
-        surface.normals,
-        surface.labels,
-        radiance,
-        seen,
-    )
-    at, towards, show = engine.download(seen).view(np.float32).reshape(3, -1, 4).astype(np.float64)
-    used = at[:, 3] >= LEAST_SHARE
-    return Seen(at[used, :3] + volume.origin_world, towards[used, :3], show[used, :3], show[used, 3], towards[used, 3])
+class PatchesInPicture:
+    """What one picture shows of patches; begun when this is made."""
+
+    def __init__(
+        self, engine: Engine, camera: CameraModel, surface: Surface, radiance: cl_array.Array, volume: Volume
+    ) -> None:
+        """radiance: [h, w] float4 as in Measurement, in the units of the first picture."""
+        step = max(2, camera.width // _BLOCKS_ACROSS)
+        cols, rows = camera.width // step, camera.height // step
+        seen = engine.buffers(_Buffers).seen.array((3, rows, cols))
+        engine.launch(
+            engine.kernel("patches.cl", "gather_patches"),
+            (cols, rows),
+            cols,
+            rows,
+            step,
+            camera.width,
+            _TOLERANCE_VOXELS * volume.voxel_m,
+            surface.positions,
+            surface.normals,
+            surface.labels,
+            radiance,
+            seen,
+        )
+        self._seen = engine.begin_download(seen)
+        self._origin_world = volume.origin_world.copy()
+
+    def seen(self) -> Seen:
+        """The patches."""
+        at, towards, show = self._seen.result().view(np.float32).reshape(3, -1, 4).astype(np.float64)
+        used = at[:, 3] >= LEAST_SHARE
+        positions = at[used, :3] + self._origin_world
+        return Seen(positions, towards[used, :3], show[used, :3], show[used, 3], towards[used, 3])
 
 
 class Patches:

@@ -16,7 +16,7 @@ from server.light.shell.beside import Beside
 from server.light.shell.distant import distant_light
 from server.light.shell.known_room import KnownRoom
 from server.light.shell.objective import Unknowns
-from server.light.shell.patches import Patches, Seen, gather_patches
+from server.light.shell.patches import Patches, PatchesInPicture, Seen
 from server.light.shell.shell import Shell
 from server.light.shell.solution import Solution
 from server.light.shell.solver import LEAST_PATCHES, Solver
@@ -49,6 +49,7 @@ class RoomModel:
         self._solver = Solver(self._switches)
         self._solution: Solution | None = None
         self._next: Beside[Solution | None] | None = None
+        self._picture: PatchesInPicture | None = None
         self._begun_with: Shell | None = None
         self._waiting = self._frames = 0
 
@@ -57,10 +58,17 @@ class RoomModel:
         """The newest; None before anything has been solved."""
         return self._solution
 
+    def begin(self, context: FrameContext) -> None:
+        """Let the device gather what a frame shows."""
+        self._picture = PatchesInPicture(
+            context.engine, context.camera, context.surface, context.scene_radiance, context.volume
+        )
+
     def update(self, context: FrameContext, up: Floats) -> None:
-        """Fold in one frame; take a solution over, or begin the next. up: [3] unit, world."""
+        """Fold in the frame that was begun; take a solution over, or begin the next. up: [3] unit, world."""
         engine, volume, switches = context.engine, context.volume, self._switches
-        seen = gather_patches(engine, context.camera, context.surface, context.scene_radiance, volume)
+        assert self._picture is not None
+        seen, self._picture = self._picture.seen(), None
         if not seen.count:
             return
         change = self._change(seen) if switches.memory else 1.0
@@ -77,12 +85,12 @@ class RoomModel:
             return
         traced = self._patches.trace(engine, volume, self._waiting)
         self._waiting = 0
-        self._begin(traced, context.volume_from_camera[:3, 3] + volume.origin_world, up)
+        self._begin_solution(traced, context.volume_from_camera[:3, 3] + volume.origin_world, up)
         if must_follow or is_young:
             with engine.profile.host():
                 self._take_over()
 
-    def _begin(self, traced: NDArray[np.int64], camera: Floats, up: Floats) -> None:
+    def _begin_solution(self, traced: NDArray[np.int64], camera: Floats, up: Floats) -> None:
         patches = self._patches.copy()
         self._next = Beside(lambda: self._solver.solve(patches, traced, camera, up))
 

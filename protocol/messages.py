@@ -394,7 +394,10 @@ class Plan(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Timings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a frame cost: milliseconds under the thesis's row names (table 6.2), device plus host time, and counts."""
+    """What a frame cost: milliseconds under the thesis's row names (table 6.2), which add up to the total, and counts.
+
+    While a kernel runs, time counts under the row that launched it, else under the row that the host is at.
+    """
 
     input: float = 0.0
     reconstruct: float = 0.0
@@ -406,7 +409,7 @@ class Timings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     total: float = 0.0
     """Wall time."""
     host: float = 0.0
-    """Milliseconds of `total` in which no kernel ran: the host's own work. Rows above contain some of it."""
+    """Milliseconds of `total` in which no kernel ran: the host's own work. The rows contain it."""
     launches: int = 0
     """Kernels."""
     reads: int = 0
@@ -423,7 +426,7 @@ TIMING_ROWS = (
     "light_estimation",
     "rendering",
 )
-"""The rows of `Timings` that add up to about the total."""
+"""The rows of `Timings` that add up to the total."""
 
 
 class DirectedLight(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -118,8 +117,8 @@ class Pipeline:
 
         Raises ValueError with one line for a frame that is refused; the state is then as it was.
         """
-        started, engine, room, stage = time.perf_counter(), self._engine, self._room, self._engine.profile.stage
-        engine.profile.forget()
+        engine, room, stage = self._engine, self._room, self._engine.profile.stage
+        engine.profile.begin()
         check_size(self._camera, frame)
         volume = self._geometry.volume_for(self._alignment.in_room(frame))
 
@@ -136,7 +135,7 @@ class Pipeline:
         room.begin(geometry.world_from_camera, self._settings.bands)
         self._alignment.note_view(room.objects.up, geometry.world_from_camera)
         if geometry.tracking == "lost":
-            return self._lost_frame(frame, geometry, volume, notes, request, started)
+            return self._lost_frame(frame, geometry, volume, notes, request)
 
         context = self._context(geometry, volume)
         objects = room.objects.placed(volume.volume_from_world())
@@ -162,7 +161,7 @@ class Pipeline:
 
         if self._reuse is not None:
             self._reuse.observe(reuse, spine.sh, rendered.reference)
-        return self._result(frame, geometry, volume, light, rendered, notes, started)
+        return self._result(frame, geometry, volume, light, rendered, notes)
 
     def _decide_reuse(self, frame: RgbdFrame, volume: Volume) -> ReuseDecision:
         """What of earlier frames holds for this one, now that it was measured."""
@@ -324,7 +323,6 @@ class Pipeline:
         volume: Volume,
         notes: tuple[str, ...],
         request: RenderRequest,
-        started: float,
     ) -> FrameResult:
         """The camera's own picture and the last light: where the camera is lost, nothing can be drawn or learnt."""
         self._losses += 1
@@ -338,7 +336,7 @@ class Pipeline:
         )
         layer = NOTHING if request.answer == "layer" else None
         rendered = RenderResult(picture, layer, Plan(run=(), left_out=left_out))
-        return self._result(frame, geometry, volume, self._room.light.estimate(), rendered, notes, started)
+        return self._result(frame, geometry, volume, self._room.light.estimate(), rendered, notes)
 
     def _result(
         self,
@@ -348,16 +346,16 @@ class Pipeline:
         light: LightEstimate,
         rendered: RenderResult,
         notes: tuple[str, ...],
-        started: float,
     ) -> FrameResult:
         """The answer, once the device is done."""
+        picture, plan = rendered.picture(), rendered.told_plan()
         self._engine.queue.finish()
-        timings, plan = self._timings(started), rendered.told_plan()
+        timings = self._timings()
         self._frames += 1
         self._room.changes += 1
         others = (*self._transfer.left_out(), *self._room.lamps.left_out()) if geometry.tracking != "lost" else ()
         return FrameResult(
-            color=rendered.picture(),
+            color=picture,
             layer=rendered.layer,
             light=self._light_message(frame, geometry, light, volume),
             world_from_camera=self._alignment.in_client(geometry.world_from_camera),
@@ -368,13 +366,15 @@ class Pipeline:
             is_reused=geometry.is_held,
         )
 
-    def _timings(self, started: float) -> Timings:
+    def _timings(self) -> Timings:
         profile = self._engine.profile
         launches, reads, read_bytes = profile.launches, profile.reads, profile.read_bytes
-        rows, self.kernel_ms = profile.collect()
-        total = (time.perf_counter() - started) * 1e3
-        host = max(total - sum(self.kernel_ms.values()), 0.0)
-        return Timings(**rows, total=total, host=host, launches=launches, reads=reads, read_bytes=read_bytes)
+        times = profile.collect()
+        self.kernel_ms = times.kernels
+        host = max(times.total - sum(times.kernels.values()), 0.0)
+        return Timings(
+            **times.rows, total=times.total, host=host, launches=launches, reads=reads, read_bytes=read_bytes
+        )
 
     def _light_message(self, frame: RgbdFrame, geometry: GeometryFrame, light: LightEstimate, volume: Volume) -> Light:
         """The light in the client's world."""

@@ -104,8 +104,7 @@ class LampFinder:
 
     def _step(self, search: Steps[Found]) -> None:
         try:
-            with self._engine.profile.host():  # its kernels count twice, they are a third of it
-                self._next_takes = next(search)
+            self._next_takes = next(search)
         except StopIteration as end:
             self._take(end.value)
 

@@ -179,8 +179,7 @@ class RoomLight:
                 context.volume.voxel_m,
                 self._least_openness,
             )
-            with engine.profile.host():
-                self._harmonics.update(tiles)
+            self._harmonics.update(tiles)
             return self.estimate()
         self._model.update(context, up)
         if self._model.solution is not None:

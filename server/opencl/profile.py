@@ -1,33 +1,65 @@
-"""The one place for times: device events and host spans, summed under the thesis's row names."""
+"""The one place for times: a frame's wall time by the thesis's row names, and device time by kernel.
+
+While a kernel runs, time counts under the row that launched it; while none runs, under the row that the host is at. So
+the rows of a frame add up to its wall time, and host work beside a running kernel costs nothing.
+"""
 
 from __future__ import annotations
 
 import time
+from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import pyopencl as cl
 
 
+@dataclass(frozen=True)
+class _Launch:
+    row: str
+    kernel: str
+    event: cl.Event
+    enqueued_s: float
+    """Host clock, just after it was enqueued."""
+
+
+@dataclass(frozen=True)
+class FrameTimes:
+    """Milliseconds."""
+
+    rows: dict[str, float]
+    """They add up to the total."""
+    kernels: dict[str, float]
+    total: float
+
+
 class Profile:
-    """Times of one frame. Device time comes from events; host time of a row counts only what the device did not do."""
+    """Times of one frame."""
 
     def __init__(self) -> None:
         self.row = "input"
-        self._events: list[tuple[str, str, cl.Event]] = []
-        self._host_ms: dict[str, float] = defaultdict(float)
+        self._launches: list[_Launch] = []
+        self._depth = 0
+        self.begin()
+
+    def begin(self) -> None:
+        """A frame begins; what one that failed has left is forgotten."""
+        self._launches.clear()
+        self._began_s = time.perf_counter()
+        self._entered: list[tuple[float, str]] = [(self._began_s, self.row)]
         self.reads = self.read_bytes = 0
-        """Times that the host has waited for memory since the last `forget`, and their bytes."""
+        """Times that the host has waited for memory since then, and their bytes."""
 
     def add_event(self, kernel: str, event: cl.Event) -> None:
-        """Count a launched kernel or copy under the current row."""
-        self._events.append((self.row, kernel, event))
+        """Count a kernel, just launched, under the current row."""
+        self._launches.append(_Launch(self.row, kernel, event, time.perf_counter()))
 
     @property
     def launches(self) -> int:
-        """Kernels since the last `collect`."""
-        return len(self._events)
+        """Kernels since the frame began."""
+        return len(self._launches)
 
     def count_read(self, size: int) -> None:
         """The host waits for `size` bytes of the device."""
@@ -36,38 +68,62 @@ class Profile:
 
     @contextmanager
     def stage(self, row: str) -> Iterator[None]:
-        """Events launched inside count under `row`."""
+        """Kernels launched inside count under `row`; the host's time too, and until the next stage begins."""
         outer, self.row = self.row, row
+        self._depth += 1
+        self._enter(row)
         try:
             yield
         except Exception as error:
             error.add_note(f"in stage {row}")
             raise
         finally:
+            self._depth -= 1
             self.row = outer
+            if self._depth > 0:
+                self._enter(outer)
 
-    @contextmanager
-    def host(self) -> Iterator[None]:
-        """Time spent inside, on the host with nothing queued, counts under the current row."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._host_ms[self.row] += (time.perf_counter() - start) * 1e3
+    def _enter(self, row: str) -> None:
+        self._entered.append((time.perf_counter(), row))
 
-    def forget(self) -> None:
-        """Leave out what a frame that failed has left."""
-        self._events.clear()
-        self._host_ms.clear()
-        self.reads = self.read_bytes = 0
-
-    def collect(self) -> tuple[dict[str, float], dict[str, float]]:
-        """Milliseconds per row and per kernel since the last call. Every event must have finished."""
-        rows: dict[str, float] = defaultdict(float, self._host_ms)
+    def collect(self) -> FrameTimes:
+        """Times of the frame, which ends with this. Every kernel must have finished."""
+        ended_s = time.perf_counter()
+        rows: dict[str, float] = defaultdict(float)
         kernels: dict[str, float] = defaultdict(float)
-        for row, kernel, event in self._events:
-            spent_ms = (event.profile.end - event.profile.start) * 1e-6
-            rows[row] += spent_ms
-            kernels[kernel] += spent_ms
-        self.forget()
-        return dict(rows), dict(kernels)
+        free_s = self._began_s
+        for launch, begin_s, end_s in self._intervals(ended_s):
+            self._add_idle(rows, free_s, begin_s)
+            spent_ms = (end_s - begin_s) * 1e3
+            rows[launch.row] += spent_ms
+            kernels[launch.kernel] += spent_ms
+            free_s = end_s
+        self._add_idle(rows, free_s, ended_s)
+        total = (ended_s - self._began_s) * 1e3
+        self.begin()
+        return FrameTimes(dict(rows), dict(kernels), total)
+
+    def _intervals(self, ended_s: float) -> list[tuple[_Launch, float, float]]:
+        """When each kernel ran, on the host's clock and within the frame, one after the other."""
+        if not self._launches:
+            return []
+        clocks = [launch.event.profile for launch in self._launches]
+        # An event is stamped as queued just before the host reads its own clock: the least difference is the clocks'.
+        offset_s = min(one.enqueued_s - clock.queued * 1e-9 for one, clock in zip(self._launches, clocks, strict=True))
+        found = []
+        last_s = self._began_s
+        for launch, clock in zip(self._launches, clocks, strict=True):
+            begin_s = min(max(clock.start * 1e-9 + offset_s, last_s), ended_s)
+            last_s = min(max(clock.end * 1e-9 + offset_s, begin_s), ended_s)
+            found.append((launch, begin_s, last_s))
+        return found
+
+    def _add_idle(self, rows: dict[str, float], begin_s: float, end_s: float) -> None:
+        """Count the time from `begin_s` to `end_s`, in which no kernel runs, under the rows that the host is at."""
+        times = [entered_s for entered_s, _ in self._entered]
+        number = max(bisect_right(times, begin_s) - 1, 0)
+        while begin_s < end_s:
+            until_s = min(times[number + 1], end_s) if number + 1 < len(times) else end_s
+            if until_s > begin_s:
+                rows[self._entered[number][1]] += (until_s - begin_s) * 1e3
+            begin_s, number = max(until_s, begin_s), number + 1

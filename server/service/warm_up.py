@@ -20,8 +20,8 @@ SHARP_LIGHT = tuple((float(r), float(g), float(b)) for r, g, b in _LAMP)
 
 
 def warm_up(device: Device) -> None:
-    """Process an object under light that is estimated (also as in the thesis, and with one albedo) and under a given sharp
-    light, with all kinds of presets.
+    """Process an object under light that is estimated, also as in the thesis and with one albedo, and under a given
+    sharp light, with all kinds of presets.
 
     Raises CheckFailed if the self-check finds a wrong result.
     """

@@ -46,7 +46,7 @@ def test_every_item_runs_once(engine: Engine, size: tuple[int, ...]) -> None:
 def test_nothing_to_do_is_not_launched(engine: Engine) -> None:
     visits = engine.workspace.upload("visits", np.zeros(1, np.int32))
     engine.launch(engine.kernel("engine_test.cl", "count_visits"), (0, 5), 0, 5, 1, visits)
-    assert engine.profile.collect() == ({}, {})
+    assert engine.profile.collect().kernels == {}
 
 
 def test_arguments_arrive(engine: Engine) -> None:

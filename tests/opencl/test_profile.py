@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,57 +11,97 @@ import pytest
 from server.opencl.engine import Engine
 from server.opencl.profile import Profile
 
+SKEW_S = 1234.5
+"""Of the device's clock behind the host's."""
+
 
 @dataclass(frozen=True)
 class FakeEvent:
-    """An event that took `spent_ns` on the device."""
+    """Times on the device's clock, nanoseconds."""
 
-    spent_ns: int
+    queued: int
+    start: int
+    end: int
 
     @property
-    def profile(self) -> Any:
-        return type("Times", (), {"start": 5_000_000, "end": 5_000_000 + self.spent_ns})
+    def profile(self) -> FakeEvent:
+        return self
 
 
-def add(profile: Profile, kernel: str, spent_ms: float) -> None:
-    profile.add_event(kernel, FakeEvent(round(spent_ms * 1e6)))  # type: ignore[arg-type]
+class Clock:
+    """In place of time.perf_counter; seconds, and it stands still but for `wait`."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_s = 50.0
+        self._free_s = 0.0
+        monkeypatch.setattr(time, "perf_counter", lambda: self.now_s)
+
+    def wait(self, ms: float) -> None:
+        self.now_s += ms * 1e-3
+
+    def finish(self) -> None:
+        self.now_s = max(self.now_s, self._free_s)
+
+    def launch(self, profile: Profile, kernel: str, spent_ms: float) -> None:
+        """A kernel that begins when those before have ended."""
+        start_s = max(self.now_s, self._free_s)
+        self._free_s = start_s + spent_ms * 1e-3
+        times = [round((at_s - SKEW_S) * 1e9) for at_s in (self.now_s, start_s, self._free_s)]
+        profile.add_event(kernel, FakeEvent(*times))  # type: ignore[arg-type]
 
 
-def test_rows_sum_their_events() -> None:
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    return Clock(monkeypatch)
+
+
+def test_rows_sum_their_kernels(clock: Clock) -> None:
     profile = Profile()
-    add(profile, "measure", 1.0)
+    clock.launch(profile, "measure", 1.0)
     with profile.stage("surface"):
-        add(profile, "raycast", 2.0)
+        clock.launch(profile, "raycast", 2.0)
         with profile.stage("rendering"):
-            add(profile, "composite", 4.0)
-            add(profile, "measure", 8.0)
-        add(profile, "raycast", 16.0)
-    add(profile, "measure", 32.0)
-    rows, kernels = profile.collect()
-    assert rows == pytest.approx({"input": 33.0, "surface": 18.0, "rendering": 12.0})
-    assert kernels == pytest.approx({"measure": 41.0, "raycast": 18.0, "composite": 4.0})
-    assert profile.collect() == ({}, {})
+            clock.launch(profile, "composite", 4.0)
+            clock.launch(profile, "measure", 8.0)
+        clock.launch(profile, "raycast", 16.0)
+    clock.launch(profile, "measure", 32.0)
+    clock.finish()
+    times = profile.collect()
+    assert times.rows == pytest.approx({"input": 33.0, "surface": 18.0, "rendering": 12.0})
+    assert times.kernels == pytest.approx({"measure": 41.0, "raycast": 18.0, "composite": 4.0})
+    assert times.total == pytest.approx(63.0)
+    assert profile.collect().rows == {}
 
 
-def test_an_error_inside_a_stage_leaves_it() -> None:
+def test_an_error_inside_a_stage_leaves_it(clock: Clock) -> None:
     profile = Profile()
     with pytest.raises(ValueError, match="frame"), profile.stage("surface"):
         raise ValueError("frame")
-    add(profile, "measure", 1.0)
-    assert profile.collect()[0] == pytest.approx({"input": 1.0})
+    profile.begin()
+    clock.launch(profile, "measure", 1.0)
+    clock.finish()
+    assert profile.collect().rows == pytest.approx({"input": 1.0})
 
 
-def test_host_time_counts_under_its_row() -> None:
+def test_host_time_counts_under_its_row_where_no_kernel_runs(clock: Clock) -> None:
     profile = Profile()
+    clock.wait(1.0)
+    with profile.stage("surface"):
+        clock.wait(2.0)
+        clock.launch(profile, "raycast", 10.0)
+    clock.wait(3.0)  # beside raycast, as what follows
     with profile.stage("light_estimation"):
-        add(profile, "accumulate", 3.0)
-        for _ in range(2):
-            with profile.host():
-                time.sleep(0.01)
-    rows, kernels = profile.collect()
-    assert kernels == pytest.approx({"accumulate": 3.0})
-    assert set(rows) == {"light_estimation"}
-    assert 23.0 <= rows["light_estimation"] < 1000.0
+        clock.wait(5.0)
+        clock.finish()  # two more for raycast
+        clock.wait(7.0)
+        with profile.stage("rendering"):
+            clock.wait(0.5)
+        clock.launch(profile, "accumulate", 20.0)
+        clock.finish()
+    clock.wait(0.25)
+    times = profile.collect()
+    assert times.rows == pytest.approx({"input": 1.0, "surface": 12.0, "light_estimation": 27.25, "rendering": 0.5})
+    assert times.total == pytest.approx(sum(times.rows.values()))
 
 
 def test_launched_kernels_are_counted(engine: Engine) -> None:
@@ -75,10 +114,12 @@ def test_launched_kernels_are_counted(engine: Engine) -> None:
     with engine.profile.stage("surface"):
         engine.launch(engine.kernel("register.cl", "clear_depth"), (256,), 256, *depths)
     engine.queue.finish()
-    rows, kernels = engine.profile.collect()
-    assert set(rows) == {"reconstruct", "surface"}
-    assert rows["reconstruct"] == pytest.approx(kernels["halve_depth"]) != 0
-    assert rows["surface"] == pytest.approx(kernels["clear_depth"]) != 0
+    times = engine.profile.collect()
+    assert set(times.rows) == {"input", "reconstruct", "surface"}
+    assert set(times.kernels) == {"halve_depth", "clear_depth"}
+    assert times.rows["reconstruct"] >= times.kernels["halve_depth"] > 0
+    assert times.rows["surface"] >= times.kernels["clear_depth"] > 0
+    assert sum(times.rows.values()) == pytest.approx(times.total)
 
 
 def test_launches_and_reads_are_counted(engine: Engine) -> None:
@@ -88,6 +129,7 @@ def test_launches_and_reads_are_counted(engine: Engine) -> None:
         engine.launch(engine.kernel("track.cl", "halve_depth", ROWS=16), (8, 8), 8, 8, 16, depth, 0.05, halved)
     engine.download(halved)
     engine.download(depth)
+    engine.begin_download(depth)  # nobody waits for it
     profile = engine.profile
     assert (profile.launches, profile.reads, profile.read_bytes) == (3, 2, 4 * (64 + 256))
     profile.collect()

@@ -89,14 +89,14 @@ def test_nothing_is_traced_where_nothing_virtual_is_drawn(device: Device, shares
     """The light of a room has rays of its own."""
     source = GallerySource("nothing", width=80)
     wishes = wishes_of(source, light=None)
-    for _, result in play(device, source, wishes):
+    for pipeline, result in play(device, source, wishes):
         left_out = {left.effect: left for left in result.plan.left_out}
         assert left_out["transfer_radiance"].reason == NOT_SHADED.reason
-        assert result.timings.radiance_transfer < 1.0
+        assert "transfer_radiance" not in pipeline.kernel_ms
         assert left_out["bounce_real"].reason == "there is no virtual object"
     assert not shares
     for plan in ({"plan": "everything"}, {"albedo": "constant", "indirect": "none"}):
-        *_, (_, result) = play(device, source, structs.replace(wishes, **plan))
+        *_, (pipeline, result) = play(device, source, structs.replace(wishes, **plan))
         assert "transfer_radiance" not in {left.effect for left in result.plan.left_out}
-        assert result.timings.radiance_transfer > 0
+        assert "transfer_radiance" in pipeline.kernel_ms
     assert not shares

@@ -303,7 +303,11 @@ export interface Welcome {
   depth_codecs: Array<"raw" | "zdelta" | "zranks" | "zstd-delta" | "zstd-ranks">;
 }
 
-/** What a frame cost: milliseconds under the thesis's row names (table 6.2), device plus host time, and counts. */
+/**
+ * What a frame cost: milliseconds under the thesis's row names (table 6.2), which add up to the total, and counts.
+ *
+ * While a kernel runs, time counts under the row that launched it, else under the row that the host is at.
+ */
 export interface Timings {
   input: number;
   reconstruct: number;
@@ -314,7 +318,7 @@ export interface Timings {
   rendering: number;
   /** Wall time. */
   total: number;
-  /** Milliseconds of `total` in which no kernel ran: the host's own work. Rows above contain some of it. */
+  /** Milliseconds of `total` in which no kernel ran: the host's own work. The rows contain it. */
   host: number;
   /** Kernels. */
   launches: number;

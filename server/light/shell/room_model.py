@@ -79,16 +79,14 @@ class RoomModel:
         is_young = self._waiting > NEW_SHARE * self._frames
         if not must_follow and not is_young and self._waiting < SOLVE_EVERY:
             return
-        with engine.profile.host():
-            self._take_over()
+        self._take_over()
         if not must_follow and self._is_still():
             return
         traced = self._patches.trace(engine, volume, self._waiting)
         self._waiting = 0
         self._begin_solution(traced, context.volume_from_camera[:3, 3] + volume.origin_world, up)
         if must_follow or is_young:
-            with engine.profile.host():
-                self._take_over()
+            self._take_over()
 
     def _begin_solution(self, traced: NDArray[np.int64], camera: Floats, up: Floats) -> None:
         patches = self._patches.copy()

@@ -58,7 +58,7 @@ def _walk(
     for index, pose in enumerate(poses):
         fuse_frame(engine, volume, CAMERA, LIVING_ROOM.frame(index, CAMERA, pose))
         engine.queue.finish()
-        engine.profile.forget()
+        engine.profile.begin()
         most_released, full_frames = max(most_released, volume.released_bricks), full_frames + volume.is_full
         if index % 20 == 0:
             progress(f"room memory, {name}: frame {index} of {len(poses)}, {volume.allocated_bricks} bricks")

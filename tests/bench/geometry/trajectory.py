@@ -90,7 +90,7 @@ def consistency(
     for index, pose in enumerate(poses):
         geometry.scan(replace(source[index], world_from_camera=pose))
         engine.queue.finish()
-        engine.profile.forget()
+        engine.profile.begin()
     assert geometry.volume is not None
     apart = []
     for index in range(0, len(poses), step):
@@ -117,7 +117,7 @@ def track_source(
     for done, index in enumerate(frames):
         result = geometry.scan(source[index])
         engine.queue.finish()
-        _, kernel_ms = engine.profile.collect()
+        kernel_ms = engine.profile.collect().kernels
         track.poses.append(result.world_from_camera)
         track.statuses.append(result.tracking)
         track.notes.append(result.notes)

@@ -85,7 +85,7 @@ class Tracking:
 
     def process(self, frame: RgbdFrame, turn: Turn) -> None:
         self._tracking.turn = turn
-        self._engine.profile.forget()
+        self._engine.profile.begin()
         result = self._geometry.scan(frame)
         if result.tracking == "lost":
             raise RuntimeError(f"frame {frame.index}: {'; '.join(result.notes)}")

@@ -84,7 +84,7 @@ def _drawing(engine: Engine, objects: list[Placed]) -> Callable[[], None]:
     def draw() -> None:
         rasterize(engine, CAMERA, np.eye(4), objects)
         engine.queue.finish()
-        engine.profile.forget()
+        engine.profile.begin()
 
     return draw
 

@@ -108,7 +108,7 @@ def _fused(trial: Trial, volume: Volume, depth_m: float, frames: int) -> None:
         integrate(trial.engine, volume, CAMERA, pose, measurement)
         if frame % 100 == 99:
             trial.engine.queue.finish()
-            trial.engine.profile.forget()
+            trial.engine.profile.begin()
 
 
 def _told(volume: Volume, depth_m: float) -> tuple[Floats, Floats]:

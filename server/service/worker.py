@@ -268,13 +268,14 @@ class Worker:
             return self._timed(lambda: composite_message(frame, result, plan, lossless=lossless))
 
         answer: tuple[bytes, ...] = (light,)
-        if wishes.answer == "layer":
-            answer = (light, self._timed(lambda: layer_message(frame, result, plan)))
-        elif wishes.answer == "picture":
-            answer = (light, composite(lossless=wishes.lossless))
+        if wishes.answer != "light":  # which does not wait until the picture is encoded
+            self._outbox.send(light)
+            drawn = self._timed(lambda: layer_message(frame, result, plan)) if wishes.answer == "layer" else None
+            answer = (light, drawn or composite(lossless=wishes.lossless))
         if wishes.lossless:
             self._answers.append((frame.frame, answer))
-        self._send_answer(answer)
+        self._mailbox.note_answered()
+        self._outbox.send(answer[-1])
         if self._outbox.is_watched() and result.color is not None:
             is_shown = wishes.answer == "picture" and not wishes.lossless
             self._outbox.publish((light, answer[-1] if is_shown else composite(lossless=False)))

@@ -18,6 +18,7 @@ from tests.bench.accuracy.knobs import KNOBS, points
 from tests.bench.accuracy.points import MeasuredPoint, measure_point, words_of
 from tests.bench.report import sweep
 from tests.bench.report.sweep import SweepError, Task, run_sweep
+from tests.data import data_folder
 
 
 def point(task: Task, total_ms: float = 10.0) -> MeasuredPoint:
@@ -97,3 +98,15 @@ def test_a_point_of_the_stage(device: Device, monkeypatch: pytest.MonkeyPatch) -
 def test_what_only_some_suites_take_is_refused_by_the_others() -> None:
     with pytest.raises(OptionError, match="--scenes: bench plan has no such option"):
         run_bench("plan", as_json=False, quick=True, options={"scenes": "stage", "out": None})
+
+
+def test_a_point_of_a_closed_room_is_judged_at_its_places(device: Device) -> None:
+    """Against what is rendered there: a light from beyond the scan says little in a room."""
+    data_folder("rooms")
+    scene = accuracy_scenes.scene_named("closed-r1_ceiling", device, quick=True)
+    assert len(scene.wishes.light_at) == 3
+    found = measure_point(device, scene, "usual", {}, 6)
+    assert found.frames == [4, 6, 8, 10]
+    assert len(found.direction_deg) == len(found.irradiance) == 4
+    assert np.mean(found.direction_deg) < 20  # seen: 6; the sky's, 85
+    assert len(found.ssim) == 1  # every fifth frame has a true picture, every second is shown

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from importlib.util import find_spec
 from pathlib import Path
+from statistics import mean
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -30,7 +31,10 @@ SETTLING = 2
 
 
 class MeasuredPoint(Struct, frozen=True, kw_only=True):
-    """A line of points.jsonl. Every list has an entry a frame, or none where there is no truth or no such metric."""
+    """A line of points.jsonl. Every list has an entry a frame whose truth is known; none where there is no such metric.
+
+    Errors of light are means over the places where it is judged.
+    """
 
     scene: str
     knob: str
@@ -77,22 +81,19 @@ def measure_point(device: Device, scene: SweptScene, knob: str, settings: dict[s
     finally:
         pipeline.close()
     kept = slice(min(SETTLING, frames - 1), None)
-    lights = [(np.array(r.light.sh_all or r.light.sh), shot.light) for r, shot in zip(results, shots, strict=True)][
-        kept
-    ]
-    same_bands = [(_cut(found, true), true) for found, true in lights]
+    lights = [lights_of(result, shot) for result, shot in zip(results, shots, strict=True)][kept]
     rows = [{n: getattr(result.timings, n) for n in (*TIMING_ROWS, "total")} for result in results[kept]]
-    pictures = [(shot, result.color) for shot, result in zip(shots, results, strict=True) if shot.composite is not None]
-    pictures = pictures[kept]
+    drawn = [*zip(shots, results, strict=True)][kept]
+    pictures = [(shot, result.color) for shot, result in drawn if shot.composite is not None]
     return MeasuredPoint(
         scene=scene.name,
         knob=knob,
         settings=settings,
         words=words_of(settings),
         frames=[shot.frame.index for shot in shots][kept],
-        direction_deg=[direction_error_deg(*pair) for pair in same_bands],
-        irradiance=[irradiance_error(*pair) for pair in same_bands],
-        msad=[environment_difference(*pair) for pair in same_bands],
+        direction_deg=[mean(direction_error_deg(*pair) for pair in places) for places in lights],
+        irradiance=[mean(irradiance_error(*pair) for pair in places) for places in lights],
+        msad=[mean(environment_difference(*pair) for pair in places) for places in lights],
         flip=[_flip(*pair) for pair in pictures] if find_spec("flip_evaluator") else [],
         ssim=[_ssim(*pair) for pair in pictures],
         jod=[_jod(*pair) for pair in pictures] if find_spec("pycvvdp") else [],
@@ -100,6 +101,14 @@ def measure_point(device: Device, scene: SweptScene, knob: str, settings: dict[s
         cpu_ms=cpu_ms[kept],
         device_bytes=device_bytes,
     )
+
+
+def lights_of(result: FrameResult, shot: Shot) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Found and true light [n, 3] of a frame: at each place, or the one from beyond the scan."""
+    if shot.light.ndim == 2:
+        return [(_cut(np.array(result.light.sh_all or result.light.sh), shot.light), shot.light)]
+    found = [np.array(light.sh) for light in result.light.at if light.of == "place"]
+    return [(_cut(light, true), true) for light, true in zip(found, shot.light, strict=True)]
 
 
 def words_of(settings: dict[str, Any]) -> str:

@@ -4,15 +4,19 @@
 - `stage-market`: the same in colours, everything estimated, as `probeless run` would with nothing else said.
 - `lit-room`: the room's reconstructed geometry under known lights, another one each frame (thesis 5.3.1); light only.
 - `room-key`, `room-studio`: path-traced (mitsuba_room), with global illumination; where the data set is at hand.
+- `closed-...`: path-traced closed rooms (rooms), with lamps or a window inside, all estimated; the light is judged at
+  the places on table and floor; where the data set is at hand.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
@@ -29,6 +33,8 @@ from protocol.messages import Wishes
 from server.maths.sh import spherical_fibonacci
 from server.opencl.device import Device
 from server.shading.composite import srgb_codes
+from tests.bench.light.closed_rooms import NEAR, room_wishes
+from tests.bench.light.closed_rooms import OBJECTS as CLOSED_OBJECTS
 from tests.bench.rendering.composites import changed_pixels
 from tests.bench.report.run import data_folder
 from tests.bench.truth.mitsuba_room import OBJECTS, RoomSet
@@ -42,7 +48,7 @@ class Shot:
 
     frame: RgbdFrame
     light: Floats
-    """[16, 3]."""
+    """[16, 3] from beyond the scan; [places, 16, 3] that arrives at the places of `wishes.light_at`, if there are."""
     composite: NDArray[np.uint8] | None = None
     """[h, w, 3] sRGB codes with the objects in it."""
     changed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), np.bool_))
@@ -135,6 +141,33 @@ def _mitsuba(light: str) -> SweptScene:
     return SweptScene(f"room-{light}", source.camera, wishes, make, lambda _folder: files)
 
 
+def _closed_room(folder: str) -> SweptScene:
+    room = data_folder("rooms") / folder
+    source = open_source(str(room))
+    probes = json.loads((room / "probes.json").read_text())["probes"][:NEAR]
+    light = np.array([probe["sh"] for probe in probes])
+
+    def make(frames: int) -> list[Shot]:
+        shots = []
+        for index in range(0, min(_CLOSED_STEP * frames, len(source)), _CLOSED_STEP):
+            frame, name = source[index], f"{index:06d}.png"
+            if not (room / "with_objects" / name).exists():
+                shots.append(Shot(frame, light))
+                continue
+            true = cv2.imread(str(room / "with_objects" / name))
+            changed = cv2.imread(str(room / "changed" / name), cv2.IMREAD_GRAYSCALE) > 0
+            shots.append(Shot(frame, light, np.ascontiguousarray(true[..., ::-1]), changed))
+        return shots
+
+    wishes = room_wishes(source, np.array([probe["position"] for probe in probes]))
+    files = [room / name for name in CLOSED_OBJECTS]
+    return SweptScene(f"closed-{folder}", source.camera, wishes, make, lambda _folder: files)
+
+
+_CLOSED_STEP = 2  # every fifth frame has a true picture: of twelve shots, three
+CLOSED_ROOMS = ("r1_ceiling", "r2_spots", "r3_two", "r4_window")
+
+
 SCENES: dict[str, Callable[[Device, str], SweptScene]] = {
     "stage": lambda _device, size: _stage("stage", "texture=paper&light=7", size, albedo="constant", indirect="none"),
     "stage-market": lambda _device, size: _stage(
@@ -143,5 +176,8 @@ SCENES: dict[str, Callable[[Device, str], SweptScene]] = {
     "lit-room": _lit_room,
     "room-key": lambda _device, _size: _mitsuba("key"),
     "room-studio": lambda _device, _size: _mitsuba("studio"),
+    **{f"closed-{name}": lambda _device, _size, name=name: _closed_room(name) for name in CLOSED_ROOMS},  # type: ignore[misc]
 }
-QUICK_SCENES = ("stage", "lit-room")
+QUICK_SCENES = ("stage", "lit-room", "closed-r1_ceiling")
+ESTIMATED = tuple(name for name in SCENES if name not in ("stage", "lit-room"))
+"""In which nothing is told of albedos and indirect light."""

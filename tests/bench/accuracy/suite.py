@@ -19,7 +19,7 @@ from tests.bench.accuracy.budget import budget_part
 from tests.bench.accuracy.knobs import points
 from tests.bench.accuracy.points import MeasuredPoint
 from tests.bench.accuracy.report import write_report
-from tests.bench.accuracy.scenes import QUICK_SCENES, SCENES
+from tests.bench.accuracy.scenes import CLOSED_ROOMS, ESTIMATED, QUICK_SCENES, SCENES
 from tests.bench.accuracy.thesis import THESIS_PARTS
 from tests.bench.report.finished import CODE, ROOT, Finished, Part, UnmeasurableError, code_digest
 from tests.bench.report.report import Report, Row, Unmeasured
@@ -28,7 +28,9 @@ from tests.bench.report.sweep import ENGINES, Engine, Task, run_sweep
 
 OUT = ROOT / "out" / "bench" / "accuracy"
 FRAMES, QUICK_FRAMES = 12, 5
-_OF_DATA = {"room-key": "mitsuba_room", "room-studio": "mitsuba_room"}
+_OF_DATA = {"room-key": "mitsuba_room", "room-studio": "mitsuba_room"} | {
+    f"closed-{name}": "rooms" for name in CLOSED_ROOMS
+}
 
 
 def run_suite(
@@ -86,7 +88,7 @@ def _sweep(run: Run, names: Sequence[str], folder: Path, device: str | None, eng
         Task(scene=name, knob=knob, settings=settings, frames=frames, quick=run.quick, device=device)
         for name in names
         for knob, settings in points(run.quick)
-        if name in ("stage-market", "room-key", "room-studio") or knob != "model"
+        if name in ESTIMATED or knob != "model"
     ]
     digest = f"{run.device.name} {code_digest(ROOT / part for part in CODE)}"
     key = hashlib.sha256(digest.encode()).hexdigest()[:16]

@@ -327,17 +327,25 @@ def devices() -> None:
 
 @app.command()
 def tune(device: o.DeviceOption = None) -> None:
-    """Measure accuracy against time on this device, for --budget-ms, --max-light-error and --preset auto."""
+    """Measure accuracy against time on this device, for --budget-ms, --max-light-error and --preset auto.
+
+    Without --device it also says which device of this machine is the fastest.
+    """
+    from client.tuning.devices import comparison
     from client.tuning.tune import lines_of
     from client.tuning.tune import tune as measure
     from server.opencl.device import open_device
     from server.quality.pareto_front import write_front
 
+    opened = open_device(device)
     with progress_bar("points") as progress:
-        front = measure(open_device(device), progress)
+        front = measure(opened, progress)
     for line in lines_of(front):
         say(line)
     say(f"kept in {write_front(front)}")
+    if device is None:
+        for line in comparison(opened, note):
+            say(line)
 
 
 @app.command()

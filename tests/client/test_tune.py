@@ -7,10 +7,12 @@ from pathlib import Path
 import pytest
 
 from client.cli import run_command
+from client.tuning import devices as tune_devices
 from client.tuning import scenes as tune_scenes
 from client.tuning import tune as tuning
+from client.tuning.scenes import Stage
 from client.tuning.tune import lines_of, tune
-from server.opencl.device import Device
+from server.opencl.device import Device, open_device
 from server.quality.pareto_front import read_front, write_front
 from server.quality.sampling_settings import SamplingSettings
 
@@ -68,3 +70,26 @@ def test_without_a_front_the_server_says_what_to_do(device: Device) -> None:
 
     with pytest.raises(ValueError, match="probeless tune"):
         ClientSession(device, open_synthetic(TABLE).camera, Wishes(preset="auto", budget_ms=50.0))
+
+
+def test_the_fastest_device_is_told(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    other = open_device(device.name)
+    other.name = "Vendor / other"
+    times = {device.name: 40.0, other.name: 30.0}
+    monkeypatch.setattr(tune_devices, "frame_ms", lambda one, _stage: times[one.name])
+    monkeypatch.setattr(tune_devices, "other_devices", lambda _device: [])
+    assert not list(tune_devices.comparison(device, lambda _: None))
+    monkeypatch.setattr(tune_devices, "other_devices", lambda _device: [other])
+    said: list[str] = []
+    _, fastest, slowest, advice = tune_devices.comparison(device, said.append)
+    assert "comparing 2 devices" in said[0]
+    assert fastest.split() == ["30.0", "ms", "Vendor", "/", "other"]
+    assert device.name in slowest
+    assert '--device "Vendor / other"' in advice
+    times[device.name] = 20.0
+    assert len(list(tune_devices.comparison(device, said.append))) == 3
+
+
+def test_a_frame_of_the_usual_settings_is_timed(device: Device) -> None:
+    assert 0 < tune_devices.frame_ms(device, Stage()) < 60_000
+    assert device.name not in {other.name for other in tune_devices.other_devices(device)}

@@ -6,11 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from client.gallery.source import GallerySource
 from protocol.frames import RgbdFrame
 from protocol.messages import TIMING_ROWS
-from server.opencl.device import Device
+from server.opencl.device import Device, open_device
+from tests.bench.speed import devices
 from tests.bench.speed.frames import DEFAULT, EMPTY, FAST, WARM_UP, WITHOUT, Stage, measure_moving, measure_rest
 
 
@@ -39,9 +41,9 @@ def test_a_moving_camera_has_all_rows(device: Device, tmp_path: Path) -> None:
         assert rows[f"moving camera, {DEFAULT}: {row}, median"] >= 0
     assert rows[f"moving camera, {DEFAULT}: radiance_transfer, median"] > 0
     assert 20 < rows["moving camera: kernels launched, median"] < 200
-    assert 3 <= rows["moving camera: blocking reads, median"] < 40
+    assert 1 <= rows["moving camera: blocking reads, median"] < 40
     assert 0 < rows["moving camera: host's own time, median"] < rows[f"moving camera, {DEFAULT}: frame, 95 % of them"]
-    assert rows["moving camera: share of the frame that no row tells"] < 100
+    assert abs(rows["moving camera: share of the frame that no row tells"]) < 0.1
     assert rows["moving camera: frame without caches / with, median"] > 0
     assert len(said) == 2
     flips = [value for name, value in rows.items() if "FLIP" in name]
@@ -56,3 +58,21 @@ def test_a_camera_at_rest_is_timed_once_nothing_is_computed_again(device: Device
     settling = measure_rest(device, small_stage(tmp_path), 0, 6, lambda _text: None)
     assert not settling.rows
     assert "did not settle within 6 frames" in settling.unmeasured[0].reason
+
+
+def test_devices_are_measured_side_by_side(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage, frames = small_stage(tmp_path), range(WARM_UP + 3)
+    monkeypatch.setattr(devices, "other_devices", lambda _device: [])
+    (alone,) = devices.measure_devices(device, stage, frames, lambda _text: None).unmeasured
+    assert "one usable OpenCL device" in alone.reason
+    again = open_device(device.name)
+    again.name = "another"
+    monkeypatch.setattr(devices, "other_devices", lambda _device: [again])
+    monkeypatch.setattr(devices, "LEAST_MS", 0.0)
+    monkeypatch.setattr(devices, "MUCH", 1.0)
+    part = devices.measure_devices(device, stage, frames, lambda _text: None)
+    rows = {row.name: row.value for row in part.rows}
+    for name in (device.name, "another"):
+        assert rows[f"{name}: kernels, sum of medians"] > 0
+        assert 0 < rows[f"{name}: host's own time, median"] < rows[f"{name}: frame, median"]
+    assert 0.1 < rows[f"raycast: {device.name} over another"] < 10

@@ -14,6 +14,7 @@ from server.opencl.device import open_device
 from tests.bench.report.finished import ROOT, Finished, Part
 from tests.bench.report.report import Report
 from tests.bench.report.run import Run, data_folder, data_source
+from tests.bench.speed.devices import measure_devices
 from tests.bench.speed.frames import Stage, measure_moving, measure_rest
 
 OUT = ROOT / "out" / "bench" / "speed"
@@ -29,7 +30,7 @@ def run_suite(quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
     OUT.mkdir(parents=True, exist_ok=True)
     finished = Finished(OUT, run.device.name, quick)
     report = Report(run.device.name)
-    for name, measure in {"moving camera": _moving, "camera at rest": _rest}.items():
+    for name, measure in {"moving camera": _moving, "camera at rest": _rest, "devices": _devices}.items():
         part = finished.part(name, lambda measure=measure: measure(run), say)  # type: ignore[misc]
         report.rows += part.rows
         report.unmeasured += part.unmeasured
@@ -50,3 +51,7 @@ def _moving(run: Run) -> Part:
 
 def _rest(run: Run) -> Part:
     return measure_rest(run.device, _kitchen(), 100, run.of(72, 120), run.say)
+
+
+def _devices(run: Run) -> Part:
+    return measure_devices(run.device, _kitchen(), range(run.of(16, 60)), run.say)

@@ -92,11 +92,11 @@ def _open_pipeline(
     device_name: str | None, camera: CameraModel, wishes: Wishes, note: Callable[[str], None]
 ) -> ClientSession:
     device = open_device(device_name)
-    if wishes.preset == "auto":
-        from client.tuning.tune import ensure_front
+    from client.tuning.tune import note_of_front
 
-        ensure_front(device, note)
     try:
+        if wishes.preset == "auto" and (said := note_of_front(device)):
+            note(said)
         return ClientSession(device, camera, wishes)
     except ValueError as error:
         raise RunError(str(error)) from error

@@ -5,10 +5,9 @@ from __future__ import annotations
 import datetime
 from collections.abc import Callable, Iterator, Sequence
 
-from client.progress import progress_bar
 from client.tuning.scenes import FRAMES, LIT_FRAMES, SETTLING, SIZE, LitRoom, Stage
 from server.opencl.device import Device
-from server.quality.pareto_front import NoFrontError, ParetoFront, ParetoPoint, own_version, read_front, write_front
+from server.quality.pareto_front import ParetoFront, ParetoPoint, own_version, read_front
 from server.quality.sampling_settings import SamplingSettings
 
 POINTS: tuple[SamplingSettings, ...] = (
@@ -49,15 +48,15 @@ def tune(device: Device, progress: Progress, points: Sequence[SamplingSettings] 
     return ParetoFront(device=device.name, version=own_version(), measured=today, scene=scene, points=tuple(measured))
 
 
-def ensure_front(device: Device, note: Callable[[str], None]) -> None:
-    """Measure the device unless a saved front exists. Raises OSError if the front cannot be saved."""
-    try:
-        read_front(device.name)
-    except NoFrontError:
-        note(f"measuring accuracy against time on {device.name} once, some minutes ...")
-        with progress_bar("frames") as progress:
-            path = write_front(tune(device, progress))
-        note(f"saved in {path}")
+def note_of_front(device: Device) -> str | None:
+    """What is to be said of the front that a budget begins with; None where it is the device's own."""
+    front = read_front(device.name)
+    if front.device == device.name:
+        return None
+    return (
+        f"{device.name} was not measured: what frames cost is learnt while they run, from times of {front.device}; "
+        "`probeless tune` measures it, in some minutes"
+    )
 
 
 def lines_of(front: ParetoFront) -> Iterator[str]:

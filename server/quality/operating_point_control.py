@@ -38,8 +38,15 @@ class OperatingPointControl:
     """Controller of one session. Call `observe` after every frame; `chosen` is the point of the next one."""
 
     def __init__(
-        self, front: ParetoFront, budget_ms: float | None = None, max_light_error_deg: float | None = None
+        self,
+        front: ParetoFront,
+        budget_ms: float | None = None,
+        max_light_error_deg: float | None = None,
+        *,
+        is_own: bool = True,
     ) -> None:
+        """`is_own`: the front was measured on this device; otherwise its times are those of another."""
+        self._is_own = is_own
         self._ladder = front.best()
         self._costs = CostModel()
         self._budget_ms = budget_ms
@@ -83,7 +90,8 @@ class OperatingPointControl:
     def _begin(self) -> int:
         last = len(self._ladder) - 1
         if self._budget_ms is not None:
-            self._reason = f"the first frames of a budget of {self._budget_ms:g} ms: what the scene costs is not known"
+            unknown = "what the scene costs" if self._is_own else "what frames cost on this device"
+            self._reason = f"the first frames of a budget of {self._budget_ms:g} ms: {unknown} is not known"
             return self._most_accurate(BEGIN * self._budget_ms)
         best_deg = self._ladder[last].light_error_deg
         most_deg = best_deg + GOOD_ENOUGH_DEG if self._max_error_deg is None else self._max_error_deg
@@ -159,7 +167,10 @@ class OperatingPointControl:
 
 
 def control_for(device: Device, wishes: Wishes) -> OperatingPointControl | None:
-    """The controller of a session with preset `auto`, else None. Raises NoFrontError for an unmeasured device."""
+    """The controller of a session with preset `auto`, else None. Raises FrontError."""
     if wishes.preset != "auto":
         return None
-    return OperatingPointControl(read_front(device.name), wishes.budget_ms, wishes.max_light_error_deg)
+    front = read_front(device.name)
+    return OperatingPointControl(
+        front, wishes.budget_ms, wishes.max_light_error_deg, is_own=front.device == device.name
+    )

@@ -1,4 +1,8 @@
-"""Accuracy against time on one device: measured operating points, kept in the user's cache directory (U1)."""
+"""Accuracy against time on one device: measured operating points, kept in the user's cache directory (U1).
+
+A device that was not measured begins with the front that comes with the program, of another machine: errors are of
+sampling and hold everywhere; times are learnt row by row while frames run.
+"""
 
 from __future__ import annotations
 
@@ -56,8 +60,12 @@ class ParetoFront(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         return tuple(found)
 
 
-class NoFrontError(ValueError):
-    """The device has no measured front; the message says what to do."""
+class FrontError(ValueError):
+    """A front cannot be read; the message says what to do."""
+
+
+SHIPPED = Path(__file__).with_name("shipped_front.json")
+"""Written by `probeless tune` on the machine that it names."""
 
 
 def _is_better(a: ParetoPoint, b: ParetoPoint) -> bool:
@@ -93,15 +101,14 @@ def write_front(front: ParetoFront) -> Path:
 
 
 def read_front(device: str) -> ParetoFront:
-    """Read the device's front. Raises NoFrontError if it is missing or unreadable."""
-    path = front_path(device)
+    """The front of the device, else the one that comes with the program. Raises FrontError if it is unreadable."""
+    own = front_path(device)
+    path = own if own.exists() else SHIPPED
     advice = "run `probeless tune`, or choose a --preset"
     try:
         front = msgspec.json.decode(path.read_bytes(), type=ParetoFront)
-    except FileNotFoundError:
-        raise NoFrontError(f"what accuracy costs on {device} was not measured yet: {advice}") from None
     except (OSError, msgspec.MsgspecError) as error:
-        raise NoFrontError(f"{path} cannot be read ({error}): {advice}") from error
+        raise FrontError(f"{path} cannot be read ({error}): {advice}") from error
     if not front.points:
-        raise NoFrontError(f"{path} has no points: {advice}")
+        raise FrontError(f"{path} has no points: {advice}")
     return front

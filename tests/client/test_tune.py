@@ -5,13 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 
 from client.cli import run_command
+from client.synthetic.source import open_synthetic
 from client.tuning import devices as tune_devices
 from client.tuning import scenes as tune_scenes
 from client.tuning import tune as tuning
 from client.tuning.scenes import Stage
 from client.tuning.tune import lines_of, tune
+from protocol.messages import Wishes
+from server.client_session import ClientSession
 from server.opencl.device import Device, open_device
 from server.quality.pareto_front import read_front, write_front
 from server.quality.sampling_settings import SamplingSettings
@@ -51,25 +55,30 @@ def test_points_are_measured_and_kept(device: Device) -> None:
     assert all(any(line.endswith(point.settings) for line in lines) for point in FEW)
 
 
-def test_a_first_budget_measures_the_device(tmp_path: Path, capsys: pytest.CaptureFixture[str], device: Device) -> None:
-    """And a second one does not; every frame says its point."""
-    for again in (False, True):
-        assert run_command(["run", TABLE, "--out", str(tmp_path / "out"), "--budget-ms", "60000"]) == 0
-        assert ("measuring accuracy against time" in capsys.readouterr().err) is not again
-    rows = (tmp_path / "out" / "timings.jsonl").read_text().splitlines()
-    assert len(rows) == 4
-    assert all('"reason": "the first frames of a budget of 60000 ms' in row for row in rows)
-    best = read_front(device.name).best()[-1].point.settings
-    assert all(f'"settings": "{best}"' in row for row in rows)
+def test_a_budget_begins_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str], device: Device) -> None:
+    """Before the device is measured and after; every frame says its point."""
+    for is_measured in (False, True):
+        if is_measured:
+            write_front(structs.replace(read_front(device.name), device=device.name))
+        out = tmp_path / f"out{is_measured}"
+        assert run_command(["run", TABLE, "--out", str(out), "--budget-ms", "60000"]) == 0
+        assert ("was not measured" in capsys.readouterr().err) is not is_measured
+        rows = (out / "timings.jsonl").read_text().splitlines()
+        assert len(rows) == 4
+        unknown = "what the scene costs" if is_measured else "what frames cost on this device"
+        best = read_front(device.name).best()[-1].point.settings
+        for row in rows:
+            assert f'"reason": "the first frames of a budget of 60000 ms: {unknown} is not known"' in row
+            assert f'"settings": "{best}"' in row
 
 
-def test_without_a_front_the_server_says_what_to_do(device: Device) -> None:
-    from client.synthetic.source import open_synthetic
-    from protocol.messages import Wishes
-    from server.client_session import ClientSession
-
-    with pytest.raises(ValueError, match="probeless tune"):
-        ClientSession(device, open_synthetic(TABLE).camera, Wishes(preset="auto", budget_ms=50.0))
+def test_a_server_begins_at_once_too(device: Device) -> None:
+    source = open_synthetic(TABLE)
+    session = ClientSession(device, source.camera, Wishes(preset="auto", budget_ms=50.0))
+    point = session.process(source[0]).plan.point
+    session.close()
+    assert point is not None
+    assert point.reason.endswith("what frames cost on this device is not known")
 
 
 def test_the_fastest_device_is_told(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

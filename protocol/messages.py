@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-from protocol.frames import CameraModel, ColorEncoding, check_rigid
+from protocol.frames import GREATEST_PLACE_M, CameraModel, ColorEncoding, check_rigid
 from protocol.limits import (
     MAX_IMAGE_PIXELS,
     MAX_IMAGE_SIDE_PX,
@@ -264,7 +264,9 @@ class Frame(Message, frozen=True, kw_only=True, omit_defaults=True, tag="frame")
     """
 
     def __post_init__(self) -> None:
-        _require_finite("frame", timestamp_s=self.timestamp_s, world_from_camera=self.world_from_camera)
+        _require_finite("frame", timestamp_s=self.timestamp_s)
+        if self.world_from_camera is not None:
+            check_rigid("frame.world_from_camera", self.world_from_camera, GREATEST_PLACE_M)
         if self.color is None and (self.depth is not None or self.world_from_camera is None):
             raise ValueError("frame.color may be left out only where there is a pose and no depth")
 

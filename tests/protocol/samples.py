@@ -253,11 +253,14 @@ SERVER: dict[str, ServerMessage] = {
 def random_frame(random: np.random.Generator) -> Frame:
     """A frame with every field drawn at random within what the types allow."""
     width, height = (int(side) for side in random.integers(1, 40, 2))
-    pose = random.normal(0, 10.0 ** random.integers(-6, 7), 16)
+    pose = np.eye(4)
+    turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
+    pose[:3, :3] = turn * np.sign(np.linalg.det(turn))
+    pose[:3, 3] = random.uniform(-1, 1, 3) * 10.0 ** random.integers(-6, 5)
     return Frame(
         frame=int(random.integers(0, 2**53, endpoint=True)),
         timestamp_s=float(random.normal(0, 1e6)),
-        world_from_camera=None if random.random() < 0.3 else tuple(pose.tolist()),
+        world_from_camera=None if random.random() < 0.3 else tuple(pose.ravel().tolist()),
         color=ColorImage(width=width, height=height, codec="jpeg", data=random.bytes(random.integers(0, 5000))),
         depth=DepthImage(width=width, height=height, codec="zdelta", data=random.bytes(random.integers(0, 5000))),
         exposure=None if random.random() < 0.5 else float(random.exponential()),

@@ -50,10 +50,14 @@ def test_the_depth_picture_has_its_own_lens_s_size() -> None:
         ({"height": 4097}, "height is 4097, must be 8 to 4096"),
         ({"width": 1921, "height": 1200}, "1921x1200 pixels, more than 2304000 in all"),
         ({"width": 4096, "height": 4096}, "4096x4096 pixels, more than 2304000 in all"),
-        ({"fx": 0.0}, "fx is 0.0, must be positive and finite"),
-        ({"fy": float("inf")}, "fy is inf, must be positive and finite"),
-        ({"cx": float("nan")}, "must be finite"),
-        ({"distortion": (0.0, 0.0, float("inf"), 0.0, 0.0)}, "must be finite"),
+        ({"fx": 0.0}, "fx is 0, must be more than 0 and at most .* 1 degree for"),
+        ({"fx": 1e-37}, "fx 1e-37 and .* farther than 85 degrees"),
+        ({"fy": float("inf")}, "fy is inf, must be"),
+        ({"fy": float("nan")}, "fy is nan, must be"),
+        ({"cx": float("nan")}, "cx nan see farther than 85 degrees"),
+        ({"cy": 1e30}, r"cy 1e\+30 see farther than 85 degrees"),
+        ({"distortion": (0.0, 0.0, float("inf"), 0.0, 0.0)}, "distortion has inf, more than 100"),
+        ({"distortion": (0.0, float("nan"), 0.0, 0.0, 0.0)}, "distortion has nan, more than 100"),
     ],
 )
 def test_refuses_a_lens(model: Any, change: dict[str, Any], reason: str) -> None:
@@ -64,10 +68,10 @@ def test_refuses_a_lens(model: Any, change: dict[str, Any], reason: str) -> None
 
 
 def test_takes_the_largest_picture() -> None:
-    assert CameraModel(**LENS | {"width": 1920, "height": 1200}).width == 1920
+    assert CameraModel(**LENS | {"width": 1920, "height": 1200, "fx": 900.0, "fy": 900.0}).width == 1920
 
 
-@pytest.mark.parametrize("scale", [0.0, -0.001, float("nan"), float("inf")])
+@pytest.mark.parametrize("scale", [0.0, -0.001, 1e-38, 2.0, float("nan"), float("inf")])
 def test_refuses_a_depth_scale(scale: float) -> None:
     with pytest.raises(ValueError, match="depth_scale_m"):
         CameraModel(**LENS, depth_scale_m=scale)

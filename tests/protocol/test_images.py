@@ -28,7 +28,7 @@ LINEAR = msgspec.structs.replace(CAMERA, color_encoding="linear16")
 
 
 def _camera(width: int, height: int) -> CameraModel:
-    return msgspec.structs.replace(CAMERA, width=width, height=height)
+    return msgspec.structs.replace(CAMERA, width=width, height=height, fx=width, fy=width)
 
 
 def _smooth(seed: int = 0) -> NDArray[np.uint8]:

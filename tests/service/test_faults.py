@@ -8,12 +8,17 @@ import msgspec
 import pytest
 
 from protocol.codec import encode
+from protocol.frames import IDENTITY
 from protocol.images import encode_color
 from protocol.limits import MAX_MESSAGE_BYTES
 from protocol.messages import Acknowledged, Dropped, Error
 from tests.service.fakes import EXPLODE_MM, PATIENCE_S, frame_message, rgbd_frame
 from tests.service.http import rows
 from tests.service.wrong_messages import HELLO, after_control, serves_frames
+
+
+def moved(by_m: float) -> list[float]:
+    return [by_m if place == 3 else value for place, value in enumerate(IDENTITY)]
 
 
 def altered(message, **changes) -> bytes:
@@ -95,6 +100,8 @@ def test_garbage_in_a_session_ends_only_that_session(dial) -> None:
     [
         (altered(frame_message(7), world_from_camera=[0.0] * 15), Dropped, "$.world_from_camera"),
         (altered(frame_message(7), timestamp_s=float("inf")), Dropped, "frame.timestamp_s"),
+        (altered(frame_message(7), world_from_camera=[-1.0, *IDENTITY[1:]]), Dropped, "not a rotation"),
+        (altered(frame_message(7), world_from_camera=moved(1e5)), Dropped, "moves by 100000 m"),
         (msgpack.packb({"type": "quality", "request": 7, "preset": "best"}), Acknowledged, "$.preset"),
         (msgpack.packb({"type": "remove_object", "request": 7, "object": "x" * 65}), Acknowledged, "$.object"),
     ],

@@ -340,7 +340,7 @@ def test_a_picture_is_what_it_would_be_if_read_here(parsers: Parsers, codec: str
 
 def test_a_larger_picture_after_a_smaller_leaves_nothing_of_it(parsers: Parsers) -> None:
     for side in (32, 512, 64):
-        camera = msgspec.structs.replace(CAMERA, width=side, height=side)
+        camera = msgspec.structs.replace(CAMERA, width=side, height=side, fx=side, fy=side)
         rgb = np.full((side, side, 3), side % 256, np.uint8)
         np.testing.assert_array_equal(parsers.color_reader(camera).decode(encode_color(rgb, "png")), rgb)
 

@@ -54,11 +54,14 @@ test-slow: .venv/installed-all
 	$(PYTEST) $(PARALLEL) -m "slow and not cluster"
 	$(PYTEST) -m "slow and cluster" tests/cluster
 
+# Kernels and the pipeline; what the others need a device for does not depend on which.
+ON_EVERY_DEVICE := $(addprefix tests/,kernels opencl pipeline hard_cases)
+
 # The loader of OpenCL finds PoCL in any case, and Intel's runtime by this folder.
 test-second-device: export OCL_ICD_VENDORS := $(CURDIR)/.venv/opencl
 test-second-device: export PROBELESS_TEST_DEVICE := intel
 test-second-device: .venv/installed-all
-	$(PYTEST) $(PARALLEL) -m device
+	$(PYTEST) $(PARALLEL) -m device $(ON_EVERY_DEVICE)
 
 slow-list: .venv/installed-all
 	mkdir -p out

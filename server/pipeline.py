@@ -133,7 +133,8 @@ class Pipeline:
             geometry = self._geometry.keep(frame, measurement, volume)
         else:
             geometry = self._geometry.update(frame, measurement, volume, unaligned)  # ch. 4, eq. 4.1-4.5
-        room.begin(geometry.world_from_camera, self._settings.bands)
+        is_fresh = frame.has_depth and geometry.tracking != "lost" and not reuse.keeps_geometry
+        notes += room.orient(engine, geometry, self._settings.bands, has_surface=is_fresh)
         self._alignment.note_view(room.objects.up, geometry.world_from_camera)
         if geometry.tracking == "lost":
             return self._lost_frame(frame, geometry, volume, notes, request, started)

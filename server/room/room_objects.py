@@ -77,6 +77,12 @@ class RoomObjects:
                 self._objects.place(object_id, mesh, placement)
             self._waiting.clear()
 
+    def turn(self, up: NDArray[np.float64]) -> None:
+        """Set another up direction, after `begin`: objects turn about the points they were placed at. up: [3] unit."""
+        assert self._objects is not None
+        with self._change():
+            self._objects.turn(up)
+
     def inventory(self) -> Inventory:
         """Snapshot of all objects. Thread-safe."""
         with self._changing:

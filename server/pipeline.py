@@ -33,7 +33,9 @@ from server.quality.settings import Settings
 from server.reuse.frame_cache import FrameCache
 from server.reuse.temporal_reuse import NO_REUSE, ReuseDecision, SceneVersion, TemporalReuse
 from server.room.client_objects import ClientObjects
+from server.room.frame_view import frame_view, surface_on_ray
 from server.room.room import Room
+from server.room.spots import SpotView
 from server.shading.composite import shown_picture
 from server.shading.layer import NOTHING, Layer
 from server.tracking.alignment import Alignment
@@ -127,7 +129,7 @@ class Pipeline:
             measurement = measure(engine, self._camera, frame)
             unaligned = self._alignment.settle(frame, measurement)
             frame = self._alignment.in_room(frame)
-            notes = self._objects.place_waiting()
+            notes = self._objects.place_waiting(frame.index)
             reuse = self._decide_reuse(frame, volume)
         if reuse.keeps_geometry:
             geometry = self._geometry.keep(frame, measurement, volume)
@@ -138,6 +140,9 @@ class Pipeline:
         self._alignment.note_view(room.objects.up, geometry.world_from_camera)
         if geometry.tracking == "lost":
             return self._lost_frame(frame, geometry, volume, notes, request, started)
+        if reuse.reason is None:
+            notes += self._objects.place_on_spots(frame.index, lambda: self._spot_view(frame, geometry, volume))
+        notes += self._objects.check_placed(volume)
 
         context = self._context(geometry, volume)
         objects = room.objects.placed(volume.volume_from_world())
@@ -159,6 +164,13 @@ class Pipeline:
         if self._reuse is not None:
             self._reuse.observe(reuse, spine.sh, rendered.reference)
         return self._result(frame, geometry, volume, light, rendered, notes, started)
+
+    def _spot_view(self, frame: RgbdFrame, geometry: GeometryFrame, volume: Volume) -> SpotView:
+        """This frame, for places that are found in it."""
+        engine = self._engine
+        seen = frame_view(engine, self._camera, geometry, volume, self._room.objects.up, frame.index)
+        place = self._alignment.room_from_client
+        return SpotView(seen, lambda origin, direction: surface_on_ray(engine, volume, origin, direction), place)
 
     def _decide_reuse(self, frame: RgbdFrame, volume: Volume) -> ReuseDecision:
         """What of earlier frames holds for this one, now that it was measured."""

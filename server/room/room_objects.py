@@ -43,7 +43,8 @@ class Inventory:
     """Includes waiting objects, in order of placement."""
     has_begun: bool
     pending: tuple[str, ...]
-    """Names of objects that were acknowledged but are not placed yet, since their client is not aligned."""
+    """Names of objects that were acknowledged but are not placed yet, since their client is not aligned or has not seen
+    their spot."""
 
 
 class RoomObjects:
@@ -157,7 +158,7 @@ class RoomObjects:
                 del self._waiting[self._waiting_index(object_id)]
 
     def add_pending(self, object_id: str) -> None:
-        """Note an object that was acknowledged, but cannot be placed before its client is aligned with the room."""
+        """Note an object that was acknowledged, but cannot be placed before its client is aligned or sees its spot."""
         with self._change():
             self._pending[object_id] = None
             while len(self._pending) > MAX_PENDING:
@@ -175,8 +176,8 @@ class RoomObjects:
             return ()
         return (
             one_line(
-                "objects that were not placed, because their client was not aligned with the room; place them again or "
-                f"remove them: {', '.join(names)}"
+                "objects that were not placed, because their client was not aligned with the room or did not see their "
+                f"spot; place them again or remove them: {', '.join(names)}"
             ),
         )
 

@@ -29,7 +29,7 @@ class ObjectsInView:
         """Whether the last light told of all objects."""
 
     def note(self, light: Light, world_from_camera: NDArray[np.float64]) -> None:
-        """Note one frame by its answer. `light.at` has the objects' places, world_from_camera [4, 4] is the camera's."""
+        """Note one frame by its answer, of which `light.at` has the objects' places. world_from_camera: [4, 4]."""
         self._is_complete = sum(lit.of == "object" for lit in light.at) < TOLD_OBJECTS
         camera_from_world = inverse_rigid(world_from_camera)
         for lit in light.at:

@@ -15,7 +15,9 @@ from protocol.messages import ObjectFormat, Spot, SpotKind
 
 FORMATS = ("glb", "gltf", "obj", "ply", "stl")
 LARGEST_SCALE = 1000.0
-_USE = "FILE[@PLACE[,SIZE[,yaw_deg]]] with PLACE x,y,z, pixel:U,V[:FRAME], floor, table or auto and SIZE a scale or 0.3m"
+_USE = (
+    "FILE[@PLACE[,SIZE[,yaw_deg]]] with PLACE x,y,z, pixel:U,V[:FRAME], floor, table or auto and SIZE a scale or 0.3m"
+)
 
 
 @dataclass(frozen=True)
@@ -37,8 +39,8 @@ class ObjectFile:
 def parse_object(text: str) -> ObjectFile:
     """Parse `FILE[@PLACE[,SIZE[,yaw_deg]]]`; FILE may contain an @. Raises ObjectError.
 
-    PLACE: `x,y,z`, `pixel:U,V[:FRAME]`, `floor`, `table` or `auto`. SIZE: a scale, or a height such as `0.3m`; with `auto`
-    only a height.
+    PLACE: `x,y,z`, `pixel:U,V[:FRAME]`, `floor`, `table` or `auto`. SIZE: a scale, or a height such as `0.3m`; with
+    `auto` only a height.
     """
     if "@" not in text or Path(text).is_file():
         return ObjectFile(_existing(text), None)

@@ -1,7 +1,7 @@
 """Horizontal surfaces of a scan: floors, tables, shelves, and where on them there is room.
 
-Level points are grouped by height, then into connected areas on a horizontal grid. A cell is free if surface was seen in
-it and nothing stands over it.
+Level points are grouped by height, then into connected areas on a horizontal grid. A cell is free if surface was seen
+in it and nothing stands over it.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ def find_horizontal_surfaces(points: Floats, normals: Floats, up: Floats) -> lis
         return []
     axes = _axes(up)
     along = points @ axes.T
-    low = along[:, :2].min(axis=0) - CELL_M
-    rows, columns = (int(count) for count in np.ceil((along[:, :2].max(axis=0) - low) / CELL_M) + 2)
+    low = along[:, :2].min(axis=0) - 2 * CELL_M  # two empty cells around, for the closing of gaps
+    rows, columns = (int(count) for count in np.ceil((along[:, :2].max(axis=0) - low) / CELL_M) + 3)
     grid = _Grid(axes, low, (rows, columns))
     level = along[normals @ up > np.cos(np.radians(MOST_TILT_DEG))]
     found: list[HorizontalSurface] = []
@@ -152,7 +152,7 @@ def _areas(grid: _Grid, level: Floats, above: Floats) -> list[HorizontalSurface]
 
 
 def _plane(points: Floats) -> tuple[float, Floats]:
-    """Height in the middle of `points` [n, 3] along the axes, and slope [2], by least squares: up may be 1 degree off."""
+    """Height in the middle of `points` [n, 3] along the axes, and slope [2]: up may be a degree off."""
     offset = points - points.mean(axis=0)
     slope = np.linalg.lstsq(offset[:, :2], offset[:, 2], rcond=None)[0]
     residual = offset[:, 2] - offset[:, :2] @ slope

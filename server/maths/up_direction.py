@@ -32,8 +32,8 @@ objects stand, and a depth camera bends large walls by up to 3 degrees."""
 LEAST_SHARE = 0.25
 """Least share of all normals that horizontal surface and walls must have. Of evenly distributed normals, 9 % do."""
 LEAST_FIXED = 0.09
-"""Least share of all normals that must fix the less certain tilt: horizontal surface, or the smaller of two walls. Evenly
-distributed normals give 0.045."""
+"""Least share of all normals that must fix the less certain tilt: horizontal surface, or the smaller of two walls.
+Evenly distributed normals give 0.045."""
 _RARE = 5e-5  # share of all normals below which a bin is noise of the measurement
 
 
@@ -98,8 +98,8 @@ def _level_and_wall(normals: Floats, up: Floats, width_deg: float) -> tuple[NDAr
 def _scatter(normals: Floats, weights: Floats) -> tuple[Floats, Floats]:
     """Eigenvalues [3], ascending, and eigenvectors in columns [3, 3] of the sum of weighted n n^T.
 
-    With walls positive and horizontal surface negative, the first vector minimises the sum of cos^2 over walls plus sin^2
-    over horizontal surface (Gupta et al.); the step to the second value says how well the scan fixes it.
+    With walls positive and horizontal surface negative, the first vector minimises the sum of cos^2 over walls plus
+    sin^2 over horizontal surface (Gupta et al.); the step to the second value says how well the scan fixes it.
     """
     values, vectors = np.linalg.eigh((normals * weights[:, None]).T @ normals)
     return values, vectors

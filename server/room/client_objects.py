@@ -18,7 +18,7 @@ from server.tracking.alignment import Alignment
 from server.volume.volume import Volume
 
 EAGER, PAUSE = 10, 10
-"""A spot that is not in view is sought in each of the first frames, then in one of so many: 20 ms at 640x480."""
+"""A spot that is not in view is sought in each of the first frames, then in one of so many: 30 ms each at 640x480."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +108,8 @@ class ClientObjects:
     def place_on_spots(self, index: int, view: Callable[[], SpotView]) -> tuple[str, ...]:
         """Place the objects whose spots are in view. Returns notes, one line each.
 
-        index: the client's number of this frame, view: makes its view, which shows the room as it is now; called only if
-        a spot is to be sought.
+        index: the client's number of this frame, view: makes its view, which shows the room as it is now; called only
+        if a spot is to be sought.
         """
         if not self._waiting or not self._alignment.is_settled:
             return ()

@@ -1,7 +1,7 @@
 """Finds the spot on which an object is to be placed in one frame: a pixel's surface, a ray's, a floor, a table.
 
-On horizontal surface an object gets a place where its whole floor fits, nothing stands, and all of it is in the picture,
-as near to the middle of the picture as there is one. Where there is none that large, it gets the freest place. `auto`
+On horizontal surface an object gets a place where its whole floor fits, nothing stands, and all of it is in the
+picture, as near to the middle of the picture as there is one. Where there is none that large, it gets the freest place. `auto`
 takes the largest table, else the floor, at the model's own size if that fits, else at the largest size that does.
 """
 
@@ -26,7 +26,8 @@ Floats = NDArray[np.float64]
 EDGE_SHARE = 0.04
 """Of the picture's width and height: what is in the picture keeps so far from its edges."""
 ROOMY = 1.3
-"""Free radius around an `auto` object, in those of its floor: it does not stand at the very edge of a table."""
+"""Free radius that is sought around an object, in those of its floor, so that it does not stand at the very edge of a
+table. `auto` has no less, another spot has the floor's own if there is no more."""
 SHRINK = 0.85
 """Step of the sizes that are tried."""
 SMALLEST_M = 0.03
@@ -120,12 +121,11 @@ def _table_words(table: HorizontalSurface, floor: HorizontalSurface | None) -> s
     return f"a table of {table.area_m2:.1f} m2, {table.height_m - floor.height_m:.2f} m over the floor"
 
 
-def _on_surface(
-    frame: FrameView, mesh: Mesh, scale: float, surface: HorizontalSurface, words: str, roomy: float = 1.0
-) -> FoundSpot:
+def _on_surface(frame: FrameView, mesh: Mesh, scale: float, surface: HorizontalSurface, words: str) -> FoundSpot:
     """At a given size: a place where it fits, else the freest one."""
     diagonal, height = (scale * size for size in model_size(mesh))
-    index = _best_place(frame, surface, roomy * diagonal / 2, height)
+    places = (_best_place(frame, surface, room * diagonal / 2, height) for room in (ROOMY, 1.0))
+    index = next((place for place in places if place is not None), None)
     if index is None:
         fits = surface.radii_m >= diagonal / 2
         index = int(np.argmax(np.where(fits, np.inf, surface.radii_m)))
@@ -152,19 +152,19 @@ def _auto(
     if asked.scale is not None:
         places = [(surface, words) for surface, words in named if _fits(frame, mesh, asked.scale, surface)]
         surface, words = (places or named)[0]
-        return _on_surface(frame, mesh, asked.scale, surface, words, ROOMY if places else 1.0)
+        return _on_surface(frame, mesh, asked.scale, surface, words)
     unit, own = guessed_unit(mesh)
     size_m = own * max(float(side) for side in np.subtract(*mesh.bounds[::-1]))
     said = "" if unit == "m" else f", its numbers taken as {unit}"
     for surface, words in named:
         if _fits(frame, mesh, own, surface):
-            found = _on_surface(frame, mesh, own, surface, words, ROOMY)
+            found = _on_surface(frame, mesh, own, surface, words)
             return _with_size(found, mesh, f"its own size{said}")
     for surface, words in named:
         scale = own * SHRINK
         while scale * size_m / own >= SMALLEST_M:
             if _fits(frame, mesh, scale, surface):
-                found = _on_surface(frame, mesh, scale, surface, words, ROOMY)
+                found = _on_surface(frame, mesh, scale, surface, words)
                 return _with_size(found, mesh, f"at its own {size_m:.2f} m{said} it does not fit there")
             scale *= SHRINK
     raise SpotUnseen("no horizontal surface in view has room for it yet")

@@ -24,8 +24,8 @@ FRAMES = 10
 PAUSE = 20
 """Without a direction after FRAMES, one frame of so many is searched: less than 1 ms a frame in the mean."""
 PATCHES_ACROSS = 80
-"""Patches in a row of the picture whose normals are averaged: 8 pixels of 640, 5 cm at 3 m. The normals of single pixels
-deviate by 10 degrees there in one frame of a Kinect."""
+"""Patches in a row of the picture whose normals are averaged: 8 pixels of 640, 4 cm at 3 m. The normals of single
+pixels deviate by 10 degrees there in one frame of a Kinect."""
 LEAST_COVERED, LEAST_FLAT = 0.75, 0.8
 """Least share of a patch with surface, and least length of its mean normal: 0.8 is a deviation of 37 degrees."""
 TOLD_DEG = 1.0

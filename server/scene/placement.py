@@ -69,8 +69,8 @@ def requested_placement(
 ) -> Placement | SpotPlacement:
     """The placement of a request: at a position, or at a spot; `height_m` takes the place of `scale`.
 
-    On an `auto` spot without a height the size is chosen. Raises ValueError as Placement does, and for a flat model with
-    a height.
+    On an `auto` spot without a height the size is chosen. Raises ValueError as Placement does, and for a flat model
+    with a height.
     """
     if height_m is not None:
         scale = scale_of_height(mesh, height_m)

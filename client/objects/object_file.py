@@ -105,11 +105,11 @@ def _spot(text: str, place: str) -> tuple[Spot | None, list[str]]:
         return Spot(on=cast(SpotKind, first)), words
     if not first.startswith("pixel:"):
         return None, [first, *words]
-    v, _, frame = (words[0] if words else "").partition(":")
+    v, colon, frame = (words[0] if words else "").partition(":")
     pixel = _number(text, first.removeprefix("pixel:")), _number(text, v)
-    if frame and not frame.isdecimal():
+    if colon and not frame.isdecimal():
         raise ObjectError(f"--object {text}: {frame!r} is no number of a frame; expected {_USE}")
-    return Spot(on="pixel", pixel=pixel, frame=int(frame) if frame else None), words[1:]
+    return Spot(on="pixel", pixel=pixel, frame=int(frame) if colon else None), words[1:]
 
 
 def _size(text: str, word: str) -> tuple[float, float | None]:

@@ -1,8 +1,8 @@
 """Finds the spot on which an object is to be placed in one frame: a pixel's surface, a ray's, a floor, a table.
 
 On horizontal surface an object gets a place where its whole floor fits, nothing stands, and all of it is in the
-picture, as near to the middle of the picture as there is one. Where there is none that large, it gets the freest place. `auto`
-takes the largest table, else the floor, at the model's own size if that fits, else at the largest size that does.
+picture, as near to the middle of the picture as there is one. Where there is none that large, it gets the freest place.
+`auto` takes the largest table, else the floor, at the model's own size if that fits, else at the largest that does.
 """
 
 from __future__ import annotations

@@ -169,8 +169,11 @@ class Pipeline:
         """This frame, for places that are found in it."""
         engine = self._engine
         seen = frame_view(engine, self._camera, geometry, volume, self._room.objects.up, frame.index)
-        place = self._alignment.room_from_client
-        return SpotView(seen, lambda origin, direction: surface_on_ray(engine, volume, origin, direction), place)
+        return SpotView(
+            frame=seen,
+            meet=lambda origin, direction: surface_on_ray(engine, volume, origin, direction),
+            room_from_client=self._alignment.room_from_client,
+        )
 
     def _decide_reuse(self, frame: RgbdFrame, volume: Volume) -> ReuseDecision:
         """What of earlier frames holds for this one, now that it was measured."""

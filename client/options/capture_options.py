@@ -67,8 +67,8 @@ Object = Annotated[
     list[str] | None,
     typer.Option(
         metavar="FILE[@PLACE[,SIZE[,yaw]]]",
-        help="virtual object; may be repeated. PLACE: x,y,z, pixel:U,V[:FRAME], floor, table or auto; SIZE: a scale or a "
-        "height such as 0.3m",
+        help="virtual object; may be repeated. PLACE: x,y,z, pixel:U,V[:FRAME], floor, table or auto; SIZE: a scale, "
+        "or a height such as 0.3m",
     ),
 ]
 Up = Annotated[

@@ -42,6 +42,8 @@ class HorizontalSurface:
     height_m: float
     """Along up, from the world's origin."""
     area_m2: float
+    points: int
+    """How many of the points it has: its size in the picture."""
     centers: Floats
     """[k, 3] world: the middles of its free cells, each at the surface's height around it."""
     radii_m: Floats
@@ -70,7 +72,10 @@ class _Grid:
 
 
 def find_horizontal_surfaces(points: Floats, normals: Floats, up: Floats) -> list[HorizontalSurface]:
-    """All of at least LEAST_AREA_M2, largest first. points, normals: [n, 3] world, of one frame; up: [3] unit."""
+    """All of at least LEAST_AREA_M2, the largest in the picture first.
+
+    points, normals: [n, 3] world, of the pixels of one frame; up: [3] unit.
+    """
     if not len(points):
         return []
     axes = _axes(up)
@@ -88,7 +93,7 @@ def find_horizontal_surfaces(points: Floats, normals: Floats, up: Floats) -> lis
         above = along[(along[:, 2] > height_m + BAND_M) & (along[:, 2] < height_m + OVER_M)]
         found += _areas(grid, level[is_here], above)
         level = level[~is_here]
-    return sorted(found, key=lambda surface: -surface.area_m2)
+    return sorted(found, key=lambda surface: -surface.points)
 
 
 def floor_of(surfaces: list[HorizontalSurface], heights_m: Floats, camera_m: float) -> HorizontalSurface | None:
@@ -107,7 +112,7 @@ def floor_of(surfaces: list[HorizontalSurface], heights_m: Floats, camera_m: flo
 
 
 def tables_of(surfaces: list[HorizontalSurface], floor: HorizontalSurface | None) -> list[HorizontalSurface]:
-    """Those off the floor, largest first."""
+    """Those off the floor, in their order."""
     return [s for s in surfaces if floor is None or s.height_m > floor.height_m + STEP_M]
 
 
@@ -147,7 +152,7 @@ def _areas(grid: _Grid, level: Floats, above: Floats) -> list[HorizontalSurface]
         middles = grid.low + (cells + 0.5) * CELL_M
         heights = height_m + (middles - own[:, :2].mean(axis=0)) @ slope
         centers = np.column_stack([middles, heights]) @ grid.axes
-        found.append(HorizontalSurface(height_m, area_m2, centers, radii[tuple(cells.T)].astype(np.float64)))
+        found.append(HorizontalSurface(height_m, area_m2, len(own), centers, radii[tuple(cells.T)].astype(np.float64)))
     return found
 
 

@@ -138,7 +138,7 @@ class ClientObjects:
         asked, mesh = waiting.placement, waiting.mesh
         assert isinstance(asked, SpotPlacement)
         try:
-            found = find_spot(view, mesh, asked)
+            found = find_spot(view, mesh, asked, self._room.objects.floors(besides=object_id))
         except SpotUnseen as reason:
             return [f"object {object_id!r} waits: {reason}"] if waiting.tries == 0 else []
         except ValueError as error:

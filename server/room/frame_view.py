@@ -74,12 +74,15 @@ class FrameView:
         points, normals = (every[::step, ::step][chosen] for every in (self.positions, self.normals))
         return points.astype(np.float64), normals.astype(np.float64)
 
-    def pixels(self, points: Floats) -> Floats:
-        """[..., 2] u, v of points [..., 3] in the rectified picture; NaN behind the camera."""
-        camera_from_room = inverse_rigid(self.room_from_camera)
+    def project(self, points: Floats) -> Floats:
+        """[..., 3] u, v and depth of points [..., 3] in the rectified picture; NaN behind the camera."""
+        camera, camera_from_room = self.camera, inverse_rigid(self.room_from_camera)
         in_camera = points @ camera_from_room[:3, :3].T + camera_from_room[:3, 3]
-        z = np.where(in_camera[..., 2:] > 1e-6, in_camera[..., 2:], np.nan)
-        return np.asarray(in_camera[..., :2] / z * (self.camera.fx, self.camera.fy) + (self.camera.cx, self.camera.cy))
+        z = np.where(in_camera[..., 2] > 1e-6, in_camera[..., 2], np.nan)
+        u, v = (
+            f * in_camera[..., k] / z + c for k, (f, c) in enumerate([(camera.fx, camera.cx), (camera.fy, camera.cy)])
+        )
+        return np.stack([u, v, z], axis=-1)
 
 
 def frame_view(

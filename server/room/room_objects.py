@@ -15,7 +15,7 @@ from server.objects.rasterize import Placed
 from server.objects.scene_objects import SceneObjects, check_room
 from server.opencl.engine import Engine
 from server.scene.mesh import Mesh
-from server.scene.placement import Placement, check_size
+from server.scene.placement import Placement, bottom_center, check_size, model_size
 
 Place = NDArray[np.float64] | Placement
 """world_from_model [4, 4], or the requested placement while the up direction is unknown."""
@@ -193,6 +193,18 @@ class RoomObjects:
             name: entry.world_from_model[:3, :3] @ np.mean(entry.mesh.bounds, axis=0) + entry.world_from_model[:3, 3]
             for name, entry in entries.items()
         }
+
+    def floors(self, besides: str) -> NDArray[np.float64]:
+        """[k, 4] world metres: the middle of the floor of each placed object but one, and half its diagonal."""
+        entries = self._objects.entries() if self._objects else {}
+        rows = [np.zeros((0, 4))]
+        for name, entry in entries.items():
+            if name != besides:
+                linear = entry.world_from_model[:3, :3]
+                middle = linear @ bottom_center(entry.mesh) + entry.world_from_model[:3, 3]
+                radius_m = 0.5 * model_size(entry.mesh)[0] * float(np.linalg.norm(linear[:, 0]))
+                rows.append(np.array([[*middle, radius_m]]))
+        return np.concatenate(rows)
 
     def clear(self) -> None:
         """Remove all objects."""

@@ -1,14 +1,15 @@
 """Finds the spot on which an object is to be placed in one frame: a pixel's surface, a ray's, a floor, a table.
 
 On horizontal surface an object gets a place where its whole floor fits, nothing stands, and all of it is in the
-picture, as near to the middle of the picture as there is one. Where there is none that large, it gets the freest place.
-`auto` takes the largest table, else the floor, at the model's own size if that fits, else at the largest that does.
+picture and not hidden, clear of other objects, as near to the middle of the picture as there is one. Where there is
+none that large, it gets the freest place. `auto` takes the largest table, else the floor, at the model's own size if
+that fits, else at the largest that does.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -26,8 +27,13 @@ Floats = NDArray[np.float64]
 EDGE_SHARE = 0.04
 """Of the picture's width and height: what is in the picture keeps so far from its edges."""
 ROOMY = 1.3
-"""Free radius that is sought around an object, in those of its floor, so that it does not stand at the very edge of a
-table. `auto` has no less, another spot has the floor's own if there is no more."""
+"""Free radius that is sought around an object, in those of its floor: it does not stand at the very edge of a table.
+ `auto` has no less, other spots have the floor's own if there is no more."""
+HIDDEN_M = 0.1
+"""What is nearer than a point of the object by more hides it: more than a depth camera's noise, and than the table's
+own edge differs from a cell."""
+BESIDE_M = 1.0
+"""Objects whose heights differ by more do not get into each other's way."""
 SHRINK = 0.85
 """Step of the sizes that are tried."""
 SMALLEST_M = 0.03
@@ -61,7 +67,7 @@ class SpotView:
 
     @cached_property
     def surfaces(self) -> tuple[list[HorizontalSurface], HorizontalSurface | None]:
-        """Tables, largest first, and the floor if it is in view."""
+        """Tables, the largest in the picture first, and the floor if it is in view."""
         points, normals = self.frame.surface_points()
         up = self.frame.up
         found = find_horizontal_surfaces(points, normals, up)
@@ -69,14 +75,19 @@ class SpotView:
         return tables_of(found, floor), floor
 
 
-def find_spot(view: SpotView, mesh: Mesh, asked: SpotPlacement) -> FoundSpot:
-    """The place of an object in this frame. Raises SpotUnseen; ValueError, one line, if no frame can show it."""
+def find_spot(view: SpotView, mesh: Mesh, asked: SpotPlacement, taken: Floats) -> FoundSpot:
+    """The place of an object in this frame. Raises SpotUnseen; ValueError, one line, if no frame can show it.
+
+    taken: [k, 4] room metres: of the objects that are there, the middle of the floor and its radius.
+    """
     spot = asked.spot
     if spot.on == "pixel":
         return FoundSpot(_in_pixel(view, spot), asked.scale or 1.0, _on_pixel(spot))
     if spot.on == "ray":
         return FoundSpot(_on_ray(view, spot), asked.scale or 1.0, "on the surface that its ray meets")
-    tables, floor = view.surfaces
+    found, ground = view.surfaces
+    tables = [_clear_of(taken, table, view.frame.up) for table in found]
+    floor = None if ground is None else _clear_of(taken, ground, view.frame.up)
     if spot.on == "auto":
         return _auto(view.frame, mesh, asked, tables, floor)
     if spot.on == "floor":
@@ -115,6 +126,17 @@ def _on_ray(view: SpotView, spot: Spot) -> Floats:
     return point
 
 
+def _clear_of(taken: Floats, surface: HorizontalSurface, up: Floats) -> HorizontalSurface:
+    """The surface with less room around what stands at its height."""
+    radii = surface.radii_m
+    for x, y, z, radius_m in taken:
+        offset = surface.centers - (x, y, z)
+        heights = offset @ up
+        away = np.linalg.norm(offset - heights[:, None] * up, axis=1)
+        radii = np.where(np.abs(heights) < BESIDE_M, np.minimum(radii, away - radius_m), radii)
+    return replace(surface, radii_m=radii)
+
+
 def _table_words(table: HorizontalSurface, floor: HorizontalSurface | None) -> str:
     if floor is None:
         return f"a table of {table.area_m2:.1f} m2"
@@ -130,7 +152,7 @@ def _on_surface(frame: FrameView, mesh: Mesh, scale: float, surface: HorizontalS
         fits = surface.radii_m >= diagonal / 2
         index = int(np.argmax(np.where(fits, np.inf, surface.radii_m)))
         words += (
-            "; not all of it is in the picture"
+            "; not all of it is in view"
             if fits.any()
             else f"; its floor of {diagonal:.2f} m does not fit on what is free of it, "
             f"{2 * surface.radii_m.max():.2f} m: give a smaller size"
@@ -155,7 +177,7 @@ def _auto(
         return _on_surface(frame, mesh, asked.scale, surface, words)
     unit, own = guessed_unit(mesh)
     size_m = own * max(float(side) for side in np.subtract(*mesh.bounds[::-1]))
-    said = "" if unit == "m" else f", its numbers taken as {unit}"
+    said = "" if unit == "m" else f"; its numbers are taken as {unit}"
     for surface, words in named:
         if _fits(frame, mesh, own, surface):
             found = _on_surface(frame, mesh, own, surface, words)
@@ -165,7 +187,7 @@ def _auto(
         while scale * size_m / own >= SMALLEST_M:
             if _fits(frame, mesh, scale, surface):
                 found = _on_surface(frame, mesh, scale, surface, words)
-                return _with_size(found, mesh, f"at its own {size_m:.2f} m{said} it does not fit there")
+                return _with_size(found, mesh, f"at its own {size_m:.2f} m it does not fit there{said}")
             scale *= SHRINK
     raise SpotUnseen("no horizontal surface in view has room for it yet")
 
@@ -189,21 +211,31 @@ def _best_place(frame: FrameView, surface: HorizontalSurface, radius_m: float, h
         return None
     centers = surface.centers[wide]
     size = np.array([frame.camera.width, frame.camera.height])
-    corners = frame.pixels(centers[:, None] + _hull(frame.up, radius_m, height_m))
+    hull = frame.project(centers[:, None] + _hull(frame.up, radius_m, height_m))
     edge = EDGE_SHARE * size
-    is_in = ((corners >= edge) & (corners <= size - 1 - edge)).all(axis=(1, 2))  # NaN compares false
+    is_in = ((hull[..., :2] >= edge) & (hull[..., :2] <= size - 1 - edge)).all(axis=(1, 2))  # NaN compares false
+    inside = np.flatnonzero(is_in)
+    is_in = np.zeros(len(wide), np.bool_)
+    is_in[inside] = ~_is_hidden(frame, hull[inside])
     if not is_in.any():
         return None
-    middle = frame.pixels(centers + 0.5 * height_m * frame.up)
+    middle = frame.project(centers + 0.5 * height_m * frame.up)[:, :2]
     away = np.linalg.norm(middle - (size - 1) / 2, axis=1)
     return int(wide[np.argmin(np.where(is_in, away, np.inf))])
 
 
+def _is_hidden(frame: FrameView, hull: Floats) -> NDArray[np.bool_]:
+    """[n] whether something real is before one of the points of a hull, [n, k, 3] as in `FrameView.project`."""
+    u, v = hull[..., :2].round().astype(np.int64).transpose(2, 0, 1)
+    depth_m = frame.depth_m[v, u]
+    return np.asarray(((depth_m > 0) & (depth_m < hull[..., 2] - HIDDEN_M)).any(axis=1))
+
+
 def _hull(up: Floats, radius_m: float, height_m: float) -> Floats:
-    """[8, 3] offsets of points around a standing cylinder from the middle of its floor."""
+    """[12, 3] offsets of points around a standing cylinder from the middle of its floor."""
     across = np.eye(3)[int(np.argmin(np.abs(up)))]
     first = np.cross(up, across)
     first /= np.linalg.norm(first)
     second = np.cross(up, first)
     ring = radius_m * np.array([first, second, -first, -second])
-    return np.concatenate([ring, ring + height_m * up])
+    return np.concatenate([ring, ring + 0.5 * height_m * up, ring + height_m * up])

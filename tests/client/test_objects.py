@@ -113,7 +113,16 @@ def test_a_height_in_place_of_the_scale(tmp_path: Path) -> None:
     "place",
     [
         *("auto,2", "auto,0m", "auto,-1m", "auto,nanm", "auto,m", "table,", "table,1,2,3", "floor,1m,x", "walls"),
-        *("pixel:1", "pixel:1,x", "pixel:1,2:", "pixel:1,2:-3", "pixel:1,2:3.5", "pixel:nan,2", "1,2,3,2000m", "ray:1,2"),
+        *(
+            "pixel:1",
+            "pixel:1,x",
+            "pixel:1,2:",
+            "pixel:1,2:-3",
+            "pixel:1,2:3.5",
+            "pixel:nan,2",
+            "1,2,3,2000m",
+            "ray:1,2",
+        ),
     ],
 )
 def test_spots_that_are_none(place: str, tmp_path: Path) -> None:

@@ -135,7 +135,7 @@ class Pipeline:
             geometry = self._geometry.keep(frame, measurement, volume)
         else:
             geometry = self._geometry.update(frame, measurement, volume, unaligned)  # ch. 4, eq. 4.1-4.5
-        is_fresh = frame.has_depth and geometry.tracking != "lost" and not reuse.keeps_geometry
+        is_fresh = frame.has_depth and geometry.tracking != "lost" and reuse.reason is None
         notes += room.orient(engine, geometry, self._settings.bands, has_surface=is_fresh)
         self._alignment.note_view(room.objects.up, geometry.world_from_camera)
         if geometry.tracking == "lost":

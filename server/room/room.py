@@ -88,8 +88,8 @@ class Room:
     def orient(self, engine: Engine, geometry: GeometryFrame, bands: int, *, has_surface: bool) -> tuple[str, ...]:
         """Set what is up, and with it the axes of a given light (S2), by one frame. Returns notes.
 
-        `has_surface`: whether the frame has depth, a pose, and geometry of its own. The first frame sets up in any
-        case; see UpFinder for what the next ones do.
+        `has_surface`: whether the frame has depth, a pose, and nothing of it is reused from the last one. The first
+        frame sets up in any case; see UpFinder for what the next ones do.
         """
         world_from_camera = geometry.world_from_camera
         notes = self._up_finder.look(engine, geometry.surface if has_surface else None, world_from_camera)

@@ -112,9 +112,11 @@ def test_a_spot_is_passed_on_and_a_bad_one_refused(dial, lab) -> None:
     spot = Spot(on="pixel", pixel=(3.0, 4.0), frame=7)
     wire.say(PlaceObject(request=1, object="chair", format="glb", data=b"mesh", spot=spot, scale=2.0, yaw_deg=30.0))
     wire.say(PlaceObject(request=2, object="vase", format="glb", data=b"mesh", spot=Spot(on="auto")))
-    assert [wire.hear().error for _ in range(2)] == [None, None]
+    wire.say(PlaceObject(request=4, object="cup", format="glb", data=b"mesh", spot=Spot(on="auto"), height_m=0.25))
+    assert [wire.hear().error for _ in range(3)] == [None] * 3
     assert lab.log[0][3] == SpotPlacement(spot, 2.0, 30.0)
     assert lab.log[1][3] == SpotPlacement(Spot(on="auto"), None, 0.0)  # its size is chosen
+    assert lab.log[2][3] == SpotPlacement(Spot(on="auto"), 0.25, 0.0)
     place = {"type": "place_object", "request": 3, "object": "junk", "format": "glb", "data": b"mesh"}
     for wrong, words in (
         ({"spot": {"on": "pixel"}}, "spot.pixel is needed"),

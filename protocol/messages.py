@@ -46,6 +46,7 @@ Tracking = Literal["given", "tracked", "lost"]
 MeshFormat = Literal["ply", "glb"]
 PanoramaFormat = Literal["hdr", "exr"]
 LightPlace = Literal["view", "place", "object"]
+SpotKind = Literal["pixel", "ray", "floor", "table", "auto"]
 ObjectFormat = Literal["glb", "obj", "ply", "stl"]
 ColorCodec = Literal["jpeg", "png", "raw", "h264"]
 DepthCodec = Literal["raw", "zdelta", "zranks", "zstd-delta", "zstd-ranks"]
@@ -141,7 +142,7 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """x0, y0, z0, x1, y1, z1 in world metres; None: the view of the first frame."""
     voxel_m: Annotated[float, Meta(gt=0, le=1)] | None = None
     up: Vector3 | None = None
-    """World direction; None: the first camera's -y."""
+    """World direction; None: found from the scan, else the first camera's -y, as the notes of the answers say."""
     light: tuple[Rgb, ...] | None = None
     """Radiance SH to render with instead of an estimate: 1, 4, 9 ... coefficients; None: estimate one."""
     light_axes: Literal["world", "webxr"] = "world"
@@ -271,20 +272,57 @@ class Frame(Message, frozen=True, kw_only=True, omit_defaults=True, tag="frame")
             raise ValueError("frame.color may be left out only where there is a pose and no depth")
 
 
-class PlaceObject(Message, frozen=True, kw_only=True, tag="place_object"):
-    """Place a virtual object; acknowledged."""
+class Spot(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
+    """A place that the server finds in what it sees, in the next frame that shows it."""
+
+    on: SpotKind
+    """`pixel`: the surface seen in a pixel; `ray`: the scanned surface that a ray meets first; `floor`; `table`: the
+    largest horizontal surface in view off the floor; `auto`: on a table, else the floor, at a size that fits there."""
+    pixel: tuple[float, float] | None = None
+    """u, v of the rectified picture; only with `pixel`."""
+    frame: Index | None = None
+    """The frame of `pixel`, which is still to be sent; None: the next one."""
+    origin_m: Vector3 | None = None
+    """World; only with `ray`, like the next field."""
+    direction: Vector3 | None = None
+    """World, of any length."""
+
+    def __post_init__(self) -> None:
+        _require_finite("spot", pixel=self.pixel, origin_m=self.origin_m, direction=self.direction)
+        has_ray = self.origin_m is not None and self.direction is not None
+        if (self.pixel is not None) != (self.on == "pixel") or (self.frame is not None and self.on != "pixel"):
+            raise ValueError("spot.pixel is needed on a pixel, and it and spot.frame are of no other spot")
+        if has_ray != (self.on == "ray") or (self.origin_m is None) != (self.direction is None):
+            raise ValueError("spot.origin_m and spot.direction are needed on a ray, and are of no other spot")
+        if self.direction is not None and math.hypot(*self.direction) < 1e-6:
+            raise ValueError("spot.direction must not be zero")
+
+
+class PlaceObject(Message, frozen=True, kw_only=True, omit_defaults=True, tag="place_object"):
+    """Place a virtual object; acknowledged. With `spot`, the answer to the frame in which it is found tells where."""
 
     request: Index
     object: Name
     format: ObjectFormat
     data: Annotated[bytes, Meta(max_length=MAX_MESH_BYTES)]
     position_m: Vector3 | None = None
-    """World position of the bottom centre of the model's box; None: the vertices are world coordinates already."""
+    """World position of the bottom centre of the model's box; None, without `spot`: the vertices are world coordinates
+    already."""
     scale: Annotated[float, Meta(gt=0, le=1000)] = 1.0
+    """Not used on an `auto` spot."""
     yaw_deg: float = 0.0
+    spot: Spot | None = None
+    """In place of `position_m`."""
+    height_m: Annotated[float, Meta(gt=0, le=1000)] | None = None
+    """Height of the placed model, in place of `scale`."""
 
     def __post_init__(self) -> None:
         _require_finite("place_object", position_m=self.position_m, scale=self.scale, yaw_deg=self.yaw_deg)
+        _require_finite("place_object", height_m=self.height_m)
+        if self.spot is not None and self.position_m is not None:
+            raise ValueError("place_object has a position_m and a spot: leave one out")
+        if self.spot is None and self.position_m is None and self.height_m is not None:
+            raise ValueError("place_object.height_m needs a position_m or a spot")
 
 
 class MoveObject(Message, frozen=True, kw_only=True, tag="move_object"):

@@ -21,7 +21,7 @@ from server.room.client_objects import ClientObjects
 from server.room.room import Room
 from server.room.viewpoint import imagined_frame
 from server.scene.mesh import Mesh
-from server.scene.placement import Placement
+from server.scene.placement import Placement, SpotPlacement
 from server.tracking.alignment import Alignment
 
 
@@ -50,7 +50,7 @@ class ClientSession:
         self._engine = Engine(device, beside=self._room.engine)
         reconstruction = self._room.reconstruction
         self._alignment = Alignment(self._engine, camera, reconstruction, self._room.markers, hello)
-        self._objects = ClientObjects(self._room, self._alignment)
+        self._objects = ClientObjects(self._room, self._alignment, camera.width, camera.height)
         self._pipeline = Pipeline(
             self._engine, camera, wishes, self._quality.settings, self._room, self._alignment, self._objects
         )
@@ -77,8 +77,11 @@ class ClientSession:
                 plan = structs.replace(plan, point=point)
             return replace(result, plan=plan, notes=(*result.notes, *self._differences, *self._pending_notes()))
 
-    def place_object(self, object_id: str, mesh: Mesh, placement: Placement) -> tuple[str, ...]:
-        """Put a mesh into the room, in place of one with the same id; returns notes. Raises ValueError."""
+    def place_object(self, object_id: str, mesh: Mesh, placement: Placement | SpotPlacement) -> tuple[str, ...]:
+        """Put a mesh into the room, in place of one with the same id; returns notes. Raises ValueError.
+
+        At a spot, it is placed in the next frame that shows it; that frame's notes say where, or why not.
+        """
         with self._room.lock:
             return self._objects.place(object_id, mesh, placement)
 

@@ -32,7 +32,9 @@ from server.quality.settings import Settings
 from server.reuse.frame_cache import FrameCache
 from server.reuse.temporal_reuse import NO_REUSE, ReuseDecision, SceneVersion, TemporalReuse
 from server.room.client_objects import ClientObjects
+from server.room.frame_view import frame_view, surface_on_ray
 from server.room.room import Room
+from server.room.spots import SpotView
 from server.shading.composite import shown_picture
 from server.shading.layer import NOTHING, Layer
 from server.tracking.alignment import Alignment
@@ -126,16 +128,20 @@ class Pipeline:
             measurement = measure(engine, self._camera, frame)
             unaligned = self._alignment.settle(frame, measurement)
             frame = self._alignment.in_room(frame)
-            notes = self._objects.place_waiting()
+            notes = self._objects.place_waiting(frame.index)
             reuse = self._decide_reuse(frame, volume)
         if reuse.keeps_geometry:
             geometry = self._geometry.keep(frame, measurement, volume)
         else:
             geometry = self._geometry.update(frame, measurement, volume, unaligned)  # ch. 4, eq. 4.1-4.5
-        room.begin(geometry.world_from_camera, self._settings.bands)
+        is_fresh = frame.has_depth and geometry.tracking != "lost" and reuse.reason is None
+        notes += room.orient(engine, geometry, self._settings.bands, has_surface=is_fresh)
         self._alignment.note_view(room.objects.up, geometry.world_from_camera)
         if geometry.tracking == "lost":
             return self._lost_frame(frame, geometry, volume, notes, request)
+        if reuse.reason is None:
+            notes += self._objects.place_on_spots(frame.index, lambda: self._spot_view(frame, geometry, volume))
+        notes += self._objects.check_placed(volume)
 
         context = self._context(geometry, volume)
         objects = room.objects.placed(volume.volume_from_world())
@@ -162,6 +168,16 @@ class Pipeline:
         if self._reuse is not None:
             self._reuse.observe(reuse, spine.sh, rendered.reference)
         return self._result(frame, geometry, volume, light, rendered, notes)
+
+    def _spot_view(self, frame: RgbdFrame, geometry: GeometryFrame, volume: Volume) -> SpotView:
+        """This frame, for places that are found in it."""
+        engine = self._engine
+        seen = frame_view(engine, self._camera, geometry, volume, self._room.objects.up, frame.index)
+        return SpotView(
+            frame=seen,
+            meet=lambda origin, direction: surface_on_ray(engine, volume, origin, direction),
+            room_from_client=self._alignment.room_from_client,
+        )
 
     def _decide_reuse(self, frame: RgbdFrame, volume: Volume) -> ReuseDecision:
         """What of earlier frames holds for this one, now that it was measured."""

@@ -10,6 +10,8 @@ from typing import Protocol
 from client.commands.stopping import stop_on_interrupt
 from client.display.output_folder import FrameOutput
 from client.errors import RunError
+from client.objects.in_view import ObjectsInView
+from client.objects.object_file import object_id
 from client.objects.placing import place_objects
 from client.options.capture import Capture
 from client.sources.frame_source import is_live
@@ -31,8 +33,11 @@ class Run:
     """An open pipeline for a capture; a context manager."""
 
     def __init__(self, capture: Capture, device_name: str | None, note: Callable[[str], None]) -> None:
-        """`note` receives notes on objects. Raises UserError, DeviceError or MeshError, each with one line."""
+        """`note` receives notes on objects and frames, each line once. Raises UserError, DeviceError or MeshError, each
+        with one line."""
         self._capture = capture
+        self._note = note
+        self._told: set[str] = set()
         self._pipeline = _open_pipeline(device_name, capture.source.camera, capture.wishes, note)
         try:
             place_objects(self._pipeline, capture.objects, note)
@@ -42,10 +47,21 @@ class Run:
 
     def outputs(self) -> Iterator[FrameOutput]:
         """One output per frame, in order; a live source ends with Ctrl-C. Raises UserError."""
-        source = self._capture.source
+        source, objects = self._capture.source, self._capture.objects
+        in_view = ObjectsInView(source.camera, objects, [object_id(number) for number in range(len(objects))])
         with stop_on_interrupt(is_live(source)) as stopping:
             positions = takewhile(lambda _: not stopping.is_set(), self._capture.frames)
-            yield from process_frames(self._pipeline, (source[i] for i in positions))
+            for output in process_frames(self._pipeline, (source[i] for i in positions)):
+                self._tell(output.notes)
+                in_view.note(output.light, output.world_from_camera)
+                yield output
+        self._tell(in_view.problems())
+
+    def _tell(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            if line not in self._told:
+                self._told.add(line)
+                self._note(line)
 
     def mesh(self, progress: Callable[[int, int], None]) -> dict[MeshFormat, bytes]:
         """Mesh files of the surface fused so far; `progress` receives parts done and total. Raises MeshingError."""

@@ -23,7 +23,8 @@ from client.display.output_folder import FrameOutput, OutputWriter
 from client.display.stream_statistics import STAGES, StreamStatistics
 from client.display.stream_view import StreamView
 from client.errors import OutputError, SourceError
-from client.objects.object_file import ObjectFile, pack_mesh
+from client.objects.in_view import ObjectsInView
+from client.objects.object_file import ObjectFile, object_id, pack_mesh
 from client.options.light_places import PanoramaOut, write_panorama
 from client.sources.frame_source import ENDLESS, Source, is_live
 from client.streaming.adaptive import Adaptive, AnsweredFrame
@@ -171,6 +172,7 @@ class _Stream:
         total = None if job.frames.stop >= ENDLESS else len(job.frames)
         self._bar = progress.add_task(job.source.name, total=total, note="connecting")
         self._summary = StreamSummary()
+        self._in_view = ObjectsInView(job.source.camera, (), ())
         self._printed: set[str] = set()
 
     async def run(self, tap: Callable[[ClientMessage | ServerMessage], None] | None) -> StreamSummary:
@@ -199,9 +201,20 @@ class _Stream:
         self._summary.session = welcome.session
 
     async def _place_objects(self, client: StreamClient, meshes: list[tuple[ObjectFormat, bytes]]) -> None:
-        for number, (item, (format_, data)) in enumerate(zip(self._job.objects, meshes, strict=True)):
-            name = f"object-{number}" if self._job.room is None else f"{self._summary.session}-object-{number}"
-            done = await client.place_object(name, format_, data, item.position_m, item.scale, item.yaw_deg)
+        prefix = "" if self._job.room is None else f"{self._summary.session}-"
+        names = [prefix + object_id(number) for number in range(len(meshes))]
+        self._in_view = ObjectsInView(self._job.source.camera, self._job.objects, names)
+        for name, item, (format_, data) in zip(names, self._job.objects, meshes, strict=True):
+            done = await client.place_object(
+                name,
+                format_,
+                data,
+                item.position_m,
+                item.scale,
+                item.yaw_deg,
+                spot=item.spot,
+                height_m=item.height_m,
+            )
             if done.error is not None:
                 raise ClientError(f"{item.path}: {done.error}")
             for note in done.notes:
@@ -223,6 +236,8 @@ class _Stream:
             sending.cancel()
             await asyncio.gather(receiving, sending, return_exceptions=True)
         self._summary.seconds = time.perf_counter() - start_s
+        for line in self._in_view.problems():
+            self._print_once(line)
 
     async def _send(self, client: StreamClient) -> None:
         """Send all frames and wait for the last answer, also if reading the source fails."""
@@ -319,8 +334,11 @@ class _Stream:
         self._view.show(shown_s, answer.light, drawn, picture, coding, reconnected)
         waited_ms = 0.0 if drawn is None else drawn.waited_ms
         self._statistics.note_answer(answer.light.frame, returned_s, shown_s, computed_s, size, waited_ms / 1e3)
-        for note in () if drawn is None else drawn.notes:
-            self._print_once(note)
+        if drawn is not None:
+            pose = np.array(drawn.world_from_camera, np.float64).reshape(4, 4)
+            self._in_view.note(answer.light, pose)
+            for note in drawn.notes:
+                self._print_once(note)
         self._summary.answered += 1
         self._summary.light = answer.light
         self._advance()

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 from client.errors import ObjectError
 from client.objects import obj_to_glb
 from client.objects.glb import check_glb, gltf_to_glb
 from protocol.limits import MAX_MESH_BYTES
-from protocol.messages import ObjectFormat
+from protocol.messages import ObjectFormat, Spot, SpotKind
 
 FORMATS = ("glb", "gltf", "obj", "ply", "stl")
 LARGEST_SCALE = 1000.0
-_USE = "FILE[@x,y,z[,scale[,yaw_deg]]]"
+_USE = (
+    "FILE[@PLACE[,SIZE[,yaw_deg]]] with PLACE x,y,z, pixel:U,V[:FRAME], floor, table or auto and SIZE a scale or 0.3m"
+)
 
 
 @dataclass(frozen=True)
@@ -23,22 +26,42 @@ class ObjectFile:
 
     path: Path
     position_m: tuple[float, float, float] | None
-    """World position of the bottom centre of the model's box; None: the vertices are world coordinates."""
+    """World position of the bottom centre of the model's box; None, without `spot`: the vertices are world
+    coordinates."""
     scale: float = 1.0
     yaw_deg: float = 0.0
+    spot: Spot | None = None
+    """In place of `position_m`: found in the frames."""
+    height_m: float | None = None
+    """In place of `scale`."""
 
 
 def parse_object(text: str) -> ObjectFile:
-    """Parse `FILE[@x,y,z[,scale[,yaw_deg]]]`; FILE may contain an @. Raises ObjectError."""
+    """Parse `FILE[@PLACE[,SIZE[,yaw_deg]]]`; FILE may contain an @. Raises ObjectError.
+
+    PLACE: `x,y,z`, `pixel:U,V[:FRAME]`, `floor`, `table` or `auto`. SIZE: a scale, or a height such as `0.3m`; with
+    `auto` only a height.
+    """
     if "@" not in text or Path(text).is_file():
         return ObjectFile(_existing(text), None)
     name, _, place = text.rpartition("@")
-    numbers = _numbers(text, place)
-    scale = numbers[3] if len(numbers) > 3 else 1.0
-    if not 0 < scale <= LARGEST_SCALE:
-        raise ObjectError(f"--object {text}: the scale must be more than 0 and at most {LARGEST_SCALE:g}")
-    yaw_deg = numbers[4] if len(numbers) > 4 else 0.0
-    return ObjectFile(_existing(name), (numbers[0], numbers[1], numbers[2]), scale, yaw_deg)
+    spot, words = _spot(text, place)
+    position = None
+    if spot is None:
+        x, y, z, *words = [*words, "", "", ""] if len(words) < 3 else words
+        position = (_number(text, x), _number(text, y), _number(text, z))
+    if len(words) > 2:
+        raise ObjectError(f"--object {text}: too many numbers; expected {_USE}")
+    scale, height_m = _size(text, words[0]) if words else (1.0, None)
+    if spot is not None and spot.on == "auto" and words and height_m is None:
+        raise ObjectError(f"--object {text}: auto chooses the size; leave the scale out, or give a height such as 0.3m")
+    yaw_deg = _number(text, words[1]) if len(words) > 1 else 0.0
+    return ObjectFile(_existing(name), position, scale, yaw_deg, spot, height_m)
+
+
+def object_id(number: int) -> str:
+    """Name of the n-th `--object` in the session; the same in `run` and `stream`."""
+    return f"object-{number}"
 
 
 def pack_mesh(path: Path) -> tuple[ObjectFormat, bytes]:
@@ -75,14 +98,36 @@ def _existing(name: str) -> Path:
     return path
 
 
-def _numbers(text: str, place: str) -> list[float]:
+def _spot(text: str, place: str) -> tuple[Spot | None, list[str]]:
+    """The spot that `place` names, if it names one, and the words after it."""
+    first, *words = place.split(",")
+    if first in {"floor", "table", "auto"}:
+        return Spot(on=cast(SpotKind, first)), words
+    if not first.startswith("pixel:"):
+        return None, [first, *words]
+    v, colon, frame = (words[0] if words else "").partition(":")
+    pixel = _number(text, first.removeprefix("pixel:")), _number(text, v)
+    if colon and not frame.isdecimal():
+        raise ObjectError(f"--object {text}: {frame!r} is no number of a frame; expected {_USE}")
+    return Spot(on="pixel", pixel=pixel, frame=int(frame) if colon else None), words[1:]
+
+
+def _size(text: str, word: str) -> tuple[float, float | None]:
+    """Scale, and height in metres if the word is one."""
+    size = _number(text, word.removesuffix("m"))
+    if not 0 < size <= LARGEST_SCALE:
+        raise ObjectError(f"--object {text}: the scale or height must be more than 0 and at most {LARGEST_SCALE:g}")
+    return (1.0, size) if word.endswith("m") else (size, None)
+
+
+def _number(text: str, word: str) -> float:
     try:
-        numbers = [float(word) for word in place.split(",")]
+        number = float(word)
     except ValueError:
-        raise ObjectError(f"--object {text}: {place!r} is not numbers; expected {_USE}") from None
-    if not 3 <= len(numbers) <= 5 or not all(math.isfinite(x) for x in numbers):
-        raise ObjectError(f"--object {text}: {place!r} must be 3 to 5 finite numbers; expected {_USE}")
-    return numbers
+        number = math.nan
+    if not math.isfinite(number):
+        raise ObjectError(f"--object {text}: {word!r} is no finite number; expected {_USE}")
+    return number
 
 
 def _pack_glb(path: Path, data: bytes) -> tuple[ObjectFormat, bytes]:

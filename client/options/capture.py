@@ -77,6 +77,7 @@ def prepare(options: CaptureOptions, lossless: bool = False, answer: str | None 
         light = _GivenLight(read_light(Path(options.light), source.radiance_of_white))
     poses = _poses(choices.poses, source)
     frames = parse_frames(options.frames, len(source))
+    _refuse_other_frames(objects, frames)
     visible_volume = volume or default_volume(source, frames)
     voxel = options.voxel or default_voxel(visible_volume)
     is_path_known = source.has_poses and not is_live(source)
@@ -156,6 +157,16 @@ def parse_frames(text: str | None, count: int) -> range:
     if not 0 <= start < stop <= count:
         raise OptionError(f"--frames {text}: the source has frames 0:{count}")
     return range(start, stop)
+
+
+def _refuse_other_frames(objects: tuple[ObjectFile, ...], frames: range) -> None:
+    """Raise OptionError for an object on a pixel of a frame that is not processed."""
+    for item in objects:
+        frame = None if item.spot is None else item.spot.frame
+        if frame is not None and frame not in frames:
+            raise OptionError(
+                f"--object {item.path.name}: frame {frame} of its pixel is none of {frames.start}:{frames.stop}"
+            )
 
 
 def parse_volume(text: str | None) -> Volume | None:

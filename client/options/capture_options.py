@@ -64,10 +64,15 @@ Denoise = Annotated[
 ]
 DenoiseIterations = Annotated[int, typer.Option(min=1, max=1000, help="iterations of TV-L1")]
 Object = Annotated[
-    list[str] | None, typer.Option(metavar="FILE[@x,y,z[,scale[,yaw]]]", help="virtual object; may be repeated")
+    list[str] | None,
+    typer.Option(
+        metavar="FILE[@PLACE[,SIZE[,yaw]]]",
+        help="virtual object; may be repeated. PLACE: x,y,z, pixel:U,V[:FRAME], floor, table or auto; SIZE: a scale, "
+        "or a height such as 0.3m",
+    ),
 ]
 Up = Annotated[
-    str | None, typer.Option(metavar="x,y,z", help="up direction; default: of the source, else the camera's -y")
+    str | None, typer.Option(metavar="x,y,z", help="up direction; default: of the source, else found from the scan")
 ]
 LightFile = Annotated[str | None, typer.Option("--light", metavar="FILE", help="use this light instead of an estimate")]
 Panorama = Annotated[str | None, typer.Option(metavar="FILE", help="use the light of this panorama")]

@@ -44,6 +44,7 @@ from protocol.messages import (
     RequestMesh,
     RequestPanorama,
     ServerMessage,
+    Spot,
     Vector3,
     Watch,
     Welcome,
@@ -255,8 +256,15 @@ class StreamClient:
         position_m: Vector3 | None = None,
         scale: float = 1.0,
         yaw_deg: float = 0.0,
+        *,
+        spot: Spot | None = None,
+        height_m: float | None = None,
     ) -> Acknowledged:
-        """Place the mesh file `data` in the scene; `error` of the acknowledgement says why it was refused."""
+        """Place the mesh file `data` in the scene; `error` of the acknowledgement says why it was refused.
+
+        `spot`: in place of a position, a place that the server finds in the next frame that shows it, whose notes say
+        where. `height_m` is in place of `scale`.
+        """
         request = next(self._requests)
         return await self._ask(
             PlaceObject(
@@ -267,6 +275,8 @@ class StreamClient:
                 position_m=position_m,
                 scale=scale,
                 yaw_deg=yaw_deg,
+                spot=spot,
+                height_m=height_m,
             )
         )
 

@@ -32,6 +32,8 @@ class SceneObject:
     digest: bytes
     world_from_model: NDArray[np.float64]
     """[4, 4]."""
+    placement: Placement | None = None
+    """The request that `world_from_model` follows from; None: it was given as a matrix."""
 
 
 class SceneObjects:
@@ -49,9 +51,9 @@ class SceneObjects:
 
         Raises ValueError, one line, for an impossible placement or a full scene; the scene is then unchanged.
         """
-        self.put(object_id, mesh, world_from_model(mesh, placement, self.up))
+        self.put(object_id, mesh, world_from_model(mesh, placement, self.up), placement)
 
-    def put(self, object_id: str, mesh: Mesh, matrix: NDArray[np.float64]) -> None:
+    def put(self, object_id: str, mesh: Mesh, matrix: NDArray[np.float64], placement: Placement | None = None) -> None:
         """As place(), with world_from_model `matrix` [4, 4]. Raises MeshError if the scene is full."""
         others = (entry.mesh for name, entry in self._entries.items() if name != object_id)
         check_room(others, mesh)
@@ -65,15 +67,22 @@ class SceneObjects:
         self._uses[digest] += 1
         if object_id in self._entries:
             self.remove(object_id)
-        self._entries[object_id] = SceneObject(mesh, digest, matrix)
+        self._entries[object_id] = SceneObject(mesh, digest, matrix, placement)
 
     def move(self, object_id: str, placement: Placement) -> None:
         """Move an object. Raises KeyError for an unknown id, ValueError as place() does."""
-        self.move_to(object_id, world_from_model(self._entries[object_id].mesh, placement, self.up))
+        self.move_to(object_id, world_from_model(self._entries[object_id].mesh, placement, self.up), placement)
 
-    def move_to(self, object_id: str, matrix: NDArray[np.float64]) -> None:
+    def move_to(self, object_id: str, matrix: NDArray[np.float64], placement: Placement | None = None) -> None:
         """As move(), with world_from_model `matrix` [4, 4]."""
-        self._entries[object_id] = replace(self._entries[object_id], world_from_model=matrix)
+        self._entries[object_id] = replace(self._entries[object_id], world_from_model=matrix, placement=placement)
+
+    def turn(self, up: NDArray[np.float64]) -> None:
+        """Set another up direction [3], unit: objects turn about the points they were placed at."""
+        self.up = up
+        for object_id, entry in self._entries.items():
+            if entry.placement is not None:
+                self.move(object_id, entry.placement)
 
     def remove(self, object_id: str) -> None:
         """Remove an object. Raises KeyError for an unknown id."""

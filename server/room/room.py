@@ -12,6 +12,7 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from protocol.messages import Wishes
+from server.geometry.geometry import GeometryFrame
 from server.light.lamp_finder import LampFinder
 from server.light.room_light import RoomLight
 from server.light.static_light import static_estimate
@@ -23,6 +24,7 @@ from server.opencl.engine import Engine
 from server.quality.sampling_settings import SamplingSettings
 from server.quality.settings import Settings, read_wishes
 from server.room.room_objects import RoomObjects
+from server.room.up_finder import UpFinder
 from server.tracking.alignment import Markers
 from server.tracking.reconstruction import Reconstruction
 
@@ -63,6 +65,9 @@ class Room:
         self.key_digest: bytes | None = None
         """Digest of the room's key (room_registry.py); empty without a key, None until the first client enters."""
         self._wishes = wishes
+        self._up_finder = UpFinder(None if wishes.up is None else np.array(wishes.up) / np.linalg.norm(wishes.up))
+        self._first_view = np.zeros(3)
+        """[3] world: direction of the first frame's view."""
 
     def _wants_lamps(self, settings: Settings) -> Literal["auto", "on", "off"]:
         """The model of the room has its own lamps, on its shell: only one light for all places lacks them."""
@@ -86,15 +91,30 @@ class Room:
             if getattr(wishes, name) != getattr(self._wishes, name)
         )
 
-    def begin(self, world_from_camera: NDArray[np.float64], bands: int) -> None:
-        """The first frame gives the up direction, unless the wishes do, and the axes of a given light (S2)."""
-        if self.objects.has_begun:
-            return
-        up = np.array(self._wishes.up or -world_from_camera[:3, 1], np.float64)
-        up /= np.linalg.norm(up)
-        given = static_estimate(self._wishes, bands, webxr_from_world(up, world_from_camera[:3, 2]))
+    def orient(self, engine: Engine, geometry: GeometryFrame, bands: int, *, has_surface: bool) -> tuple[str, ...]:
+        """Set what is up, and with it the axes of a given light (S2), by one frame. Returns notes.
+
+        `has_surface`: whether the frame has depth, a pose, and nothing of it is reused from the last one. The first
+        frame sets up in any case; see UpFinder for what the next ones do.
+        """
+        world_from_camera = geometry.world_from_camera
+        notes = self._up_finder.look(engine, geometry.surface if has_surface else None, world_from_camera)
+        up = self._up_finder.up
+        if not self.objects.has_begun:
+            self._first_view = world_from_camera[:3, 2].copy()
+            self.objects.begin(up)
+        elif (up == self.objects.up).all():
+            return notes
+        else:
+            self.objects.turn(up)
+        given = static_estimate(self._wishes, bands, webxr_from_world(up, self._first_view))
         if given:
             self.light.give(given)
+        return notes
+
+    def resume_up(self, up: NDArray[np.float64]) -> None:
+        """Restore a saved up direction [3], which then stays."""
+        self._up_finder = UpFinder(up)
         self.objects.begin(up)
 
     def scene_mesh(

@@ -15,7 +15,7 @@ from server.objects.rasterize import Placed
 from server.objects.scene_objects import SceneObjects, check_room
 from server.opencl.engine import Engine
 from server.scene.mesh import Mesh
-from server.scene.placement import Placement, check_size
+from server.scene.placement import Placement, bottom_center, check_size, model_size
 
 Place = NDArray[np.float64] | Placement
 """world_from_model [4, 4], or the requested placement while the up direction is unknown."""
@@ -43,7 +43,8 @@ class Inventory:
     """Includes waiting objects, in order of placement."""
     has_begun: bool
     pending: tuple[str, ...]
-    """Names of objects that were acknowledged but are not placed yet, since their client is not aligned."""
+    """Names of objects that were acknowledged but are not placed yet, since their client is not aligned or has not seen
+    their spot."""
 
 
 class RoomObjects:
@@ -76,6 +77,12 @@ class RoomObjects:
             for object_id, mesh, placement in self._waiting:
                 self._objects.place(object_id, mesh, placement)
             self._waiting.clear()
+
+    def turn(self, up: NDArray[np.float64]) -> None:
+        """Set another up direction, after `begin`: objects turn about the points they were placed at. up: [3] unit."""
+        assert self._objects is not None
+        with self._change():
+            self._objects.turn(up)
 
     def inventory(self) -> Inventory:
         """Snapshot of all objects. Thread-safe."""
@@ -151,7 +158,7 @@ class RoomObjects:
                 del self._waiting[self._waiting_index(object_id)]
 
     def add_pending(self, object_id: str) -> None:
-        """Note an object that was acknowledged, but cannot be placed before its client is aligned with the room."""
+        """Note an object that was acknowledged, but cannot be placed before its client is aligned or sees its spot."""
         with self._change():
             self._pending[object_id] = None
             while len(self._pending) > MAX_PENDING:
@@ -169,8 +176,8 @@ class RoomObjects:
             return ()
         return (
             one_line(
-                "objects that were not placed, because their client was not aligned with the room; place them again or "
-                f"remove them: {', '.join(names)}"
+                "objects that were not placed, because their client was not aligned with the room or did not see their "
+                f"spot; place them again or remove them: {', '.join(names)}"
             ),
         )
 
@@ -186,6 +193,18 @@ class RoomObjects:
             name: entry.world_from_model[:3, :3] @ np.mean(entry.mesh.bounds, axis=0) + entry.world_from_model[:3, 3]
             for name, entry in entries.items()
         }
+
+    def floors(self, besides: str) -> NDArray[np.float64]:
+        """[k, 4] world metres: the middle of the floor of each placed object but one, and half its diagonal."""
+        entries = self._objects.entries() if self._objects else {}
+        rows = [np.zeros((0, 4))]
+        for name, entry in entries.items():
+            if name != besides:
+                linear = entry.world_from_model[:3, :3]
+                middle = linear @ bottom_center(entry.mesh) + entry.world_from_model[:3, 3]
+                radius_m = 0.5 * model_size(entry.mesh)[0] * float(np.linalg.norm(linear[:, 0]))
+                rows.append(np.array([[*middle, radius_m]]))
+        return np.concatenate(rows)
 
     def clear(self) -> None:
         """Remove all objects."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.messages import Spot
 from server.scene.mesh import Mesh, UpAxis
 
 Matrix = NDArray[np.float64]
@@ -38,6 +39,60 @@ class Placement:
             raise ValueError("an object's position, scale and yaw must be finite")
         if self.scale <= 0:
             raise ValueError(f"an object's scale is {self.scale}, must be positive")
+
+
+@dataclass(frozen=True)
+class SpotPlacement:
+    """A placement whose position is still to be found in a frame, in the client's world. `scale`: None, the size that
+    fits. Raises ValueError as Placement does.
+    """
+
+    spot: Spot
+    scale: float | None = None
+    yaw_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.at((0.0, 0.0, 0.0), self.scale or 1.0)
+
+    def at(self, position_m: tuple[float, float, float], scale: float) -> Placement:
+        """The placement, once position and scale are known."""
+        return Placement(position_m, scale, self.yaw_deg)
+
+
+def requested_placement(
+    mesh: Mesh,
+    position_m: tuple[float, float, float] | None,
+    spot: Spot | None,
+    scale: float = 1.0,
+    height_m: float | None = None,
+    yaw_deg: float = 0.0,
+) -> Placement | SpotPlacement:
+    """The placement of a request: at a position, or at a spot; `height_m` takes the place of `scale`.
+
+    On an `auto` spot without a height the size is chosen. Raises ValueError as Placement does, and for a flat model
+    with a height.
+    """
+    if height_m is not None:
+        scale = scale_of_height(mesh, height_m)
+    if spot is None:
+        return Placement(position_m, scale, yaw_deg)
+    return SpotPlacement(spot, None if spot.on == "auto" and height_m is None else scale, yaw_deg)
+
+
+def scale_of_height(mesh: Mesh, height_m: float) -> float:
+    """The scale at which the model is `height_m` high. Raises ValueError, one line, for a model without height."""
+    own = model_size(mesh)[1]
+    if own <= 0:
+        raise ValueError("the model is flat, a height does not say its size: give a scale")
+    return height_m / own
+
+
+def model_size(mesh: Mesh) -> tuple[float, float]:
+    """Diagonal of the floor of the model's box, and its height, in model metres."""
+    low, high = mesh.bounds
+    size = high - low
+    height = float(size["xyz".index(mesh.up_axis)])
+    return math.sqrt(max(float(size @ size) - height**2, 0.0)), height
 
 
 def world_from_model(mesh: Mesh, placement: Placement, up: NDArray[np.float64]) -> Matrix:

@@ -35,7 +35,7 @@ from protocol.messages import (
 )
 from server.meshing.files import mesh_files
 from server.scene.mesh import Mesh
-from server.scene.placement import Placement
+from server.scene.placement import Placement, requested_placement
 from server.service.connection import POLICY, UNAUTHORIZED, Refusal
 from server.service.load_shedding import LoadShedding, SamplingRequest
 from server.service.mailbox import Mailbox, PanoramaOrder, QueuedMessage
@@ -340,10 +340,14 @@ def apply_control(
 def _apply(pipeline: ClientSession, message: SceneControl, load_mesh: Callable[[bytes, str], Mesh]) -> tuple[str, ...]:
     match message:
         case PlaceObject():
-            return pipeline.place_object(message.object, load_mesh(message.data, message.format), _placement(message))
+            mesh = load_mesh(message.data, message.format)
+            place, size = (message.position_m, message.spot), (message.scale, message.height_m)
+            return pipeline.place_object(
+                message.object, mesh, requested_placement(mesh, *place, *size, message.yaw_deg)
+            )
         case MoveObject():
             with _object_known(message.object):
-                pipeline.move_object(message.object, _placement(message))
+                pipeline.move_object(message.object, Placement(message.position_m, message.scale, message.yaw_deg))
         case RemoveObject():
             with _object_known(message.object):
                 pipeline.remove_object(message.object)
@@ -358,7 +362,3 @@ def _object_known(name: str) -> Iterator[None]:
         yield
     except KeyError as error:
         raise ValueError(f"there is no object {name!r} in this session: place it first") from error
-
-
-def _placement(message: PlaceObject | MoveObject) -> Placement:
-    return Placement(position_m=message.position_m, scale=message.scale, yaw_deg=message.yaw_deg)

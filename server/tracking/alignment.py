@@ -91,6 +91,10 @@ class Alignment:
         """Whether to fuse the client's frames."""
         self.webxr_from_client: Floats | None = None
         """[3, 3] rotation into axes with +y up and the first view as close to -z as possible; None before a frame."""
+        self._up: Floats | None = None
+        """Of `webxr_from_client`, in the room."""
+        self._first_view = np.zeros(3)
+        """Direction in the client's world."""
 
     def in_room(self, frame: RgbdFrame) -> RgbdFrame:
         """The frame with its pose in the room's world; a missing pose is computed from a marker if one is seen."""
@@ -123,10 +127,15 @@ class Alignment:
         return None if self.webxr_from_client is None else self.webxr_from_client @ self.client_from_room[:3, :3]
 
     def note_view(self, up: Floats, room_from_camera: Floats) -> None:
-        """Derive `webxr_from_client` from a view, until the client's place in the room is settled. up: [3] unit."""
-        if self.webxr_from_client is None or not self.is_settled:
-            rotation = self.client_from_room[:3, :3]
-            self.webxr_from_client = webxr_from_world(rotation @ up, rotation @ room_from_camera[:3, 2])
+        """Derive `webxr_from_client` from a view until the client's place in the room is settled, and from the first
+        view where up has changed. up: [3] unit, in the room."""
+        rotation = self.client_from_room[:3, :3]
+        if self._up is None or not self.is_settled:
+            self._first_view = rotation @ room_from_camera[:3, 2]
+        elif (up == self._up).all():
+            return
+        self._up = up
+        self.webxr_from_client = webxr_from_world(rotation @ up, self._first_view)
 
     def in_client(self, room_from_camera: Floats) -> Floats:
         """A camera pose in the client's world."""

@@ -139,7 +139,11 @@ def test_mesh_is_written_and_an_empty_one_told(tmp_path: Path, probeless: Probel
     np.testing.assert_allclose(meshes[0].extents, [1.2, 0.25, 0.8], atol=0.1)  # the table and its things
     np.testing.assert_allclose(meshes[1].extents[1], meshes[0].extents[1], atol=1e-6)  # turned about up only
     volume[1] = "5,5,5,6,6,6"
-    assert_one_line(probeless("run", TABLE, "--frames", "0:2", *volume, tmp_path), 1, "there is no surface to mesh")
+    done = probeless("run", TABLE, "--frames", "0:2", *volume, tmp_path)
+    assert done.returncode == 1
+    noted, told = done.stderr.splitlines()
+    assert "no usable surface has been seen yet" in noted
+    assert "there is no surface to mesh" in told
 
 
 def test_debug_shows_the_traceback_wherever_it_stands(probeless: Probeless) -> None:

@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from client.sources.frame_source import ENDLESS, is_live
 from client.sources.oak.poses import FLU_FROM_CAMERA, UP, PoseTrail, world_from_lens
 from client.sources.oak.source import OakSource
 from protocol.frames import CameraModel, RgbdFrame
+from tests.client.lights import light_of
 
 CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
 
@@ -130,7 +132,7 @@ def test_run_of_a_camera_ends_at_ctrl_c(oak: OakSource, monkeypatch: pytest.Monk
             given.append(frame.index)
             if frame.index == 2:
                 os.kill(os.getpid(), signal.SIGINT)
-            yield frame
+            yield SimpleNamespace(notes=(), light=light_of(frame.index), world_from_camera=np.eye(4))
 
     monkeypatch.setattr("client.commands.run.process_frames", outputs)
     run = Run.__new__(Run)

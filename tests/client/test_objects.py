@@ -15,6 +15,7 @@ import trimesh
 from client.errors import ObjectError
 from client.objects.object_file import pack_mesh, parse_object
 from protocol.limits import MAX_MESH_BYTES
+from protocol.messages import Spot
 from server.scene.mesh import load_mesh
 from server.scene.vase import HEIGHT_M, vase_glb
 from tests.data import data_folder
@@ -78,6 +79,58 @@ def test_at_sign_in_the_name(tmp_path: Path) -> None:
     file.write_bytes(b"")
     assert parse_object(str(file)).position_m is None
     assert parse_object(f"{file}@1,2,3").path == file
+
+
+@pytest.mark.parametrize(
+    ("place", "spot"),
+    [
+        ("floor", Spot(on="floor")),
+        ("table", Spot(on="table")),
+        ("auto", Spot(on="auto")),
+        ("pixel:320,240.5", Spot(on="pixel", pixel=(320.0, 240.5))),
+        ("pixel:320,240:12", Spot(on="pixel", pixel=(320.0, 240.0), frame=12)),
+    ],
+)
+def test_spots(place: str, spot: Spot, tmp_path: Path) -> None:
+    file = tmp_path / "sofa.glb"
+    file.write_bytes(b"")
+    plain = parse_object(f"{file}@{place}")
+    assert (plain.spot, plain.position_m, plain.scale, plain.height_m, plain.yaw_deg) == (spot, None, 1.0, None, 0.0)
+    sized = parse_object(f"{file}@{place},0.3m,-45")
+    assert (sized.spot, sized.height_m, sized.yaw_deg) == (spot, 0.3, -45.0)
+    if place != "auto":
+        assert parse_object(f"{file}@{place},2").scale == 2.0
+
+
+def test_a_height_in_place_of_the_scale(tmp_path: Path) -> None:
+    file = tmp_path / "sofa.glb"
+    file.write_bytes(b"")
+    found = parse_object(f"{file}@1,2,3,0.75m,90")
+    assert (found.position_m, found.scale, found.height_m, found.yaw_deg) == ((1.0, 2.0, 3.0), 1.0, 0.75, 90.0)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        *("auto,2", "auto,0m", "auto,-1m", "auto,nanm", "auto,m", "table,", "table,1,2,3", "floor,1m,x", "walls"),
+        *(
+            "pixel:1",
+            "pixel:1,x",
+            "pixel:1,2:",
+            "pixel:1,2:-3",
+            "pixel:1,2:3.5",
+            "pixel:nan,2",
+            "1,2,3,2000m",
+            "ray:1,2",
+        ),
+    ],
+)
+def test_spots_that_are_none(place: str, tmp_path: Path) -> None:
+    file = tmp_path / "sofa.glb"
+    file.write_bytes(b"")
+    with pytest.raises(ObjectError, match="--object") as caught:
+        parse_object(f"{file}@{place}")
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -82,6 +82,13 @@ def test_everything_said(source: str) -> None:
     assert wishes.lossless
 
 
+def test_an_object_on_a_pixel_of_a_frame_that_is_not_processed(source: str) -> None:
+    asked = f"{source}/meta.json@pixel:3,4:"
+    assert prepare(CaptureOptions(source, frames="1:5", object=[asked + "4"])).objects[0].spot is not None
+    with pytest.raises(OptionError, match="frame 5 of its pixel is none of 1:5"):
+        prepare(CaptureOptions(source, frames="1:5", object=[asked + "5"]))
+
+
 def test_run_and_stream_choose_the_same_volume(source: str) -> None:
     options = CaptureOptions(source, frames="1:5")
     assert prepare(options).wishes.volume_m == prepare(options, lossless=True).wishes.volume_m

@@ -9,7 +9,7 @@ import pytest
 
 from client.commands.run import process_frames
 from client.errors import RunError
-from client.objects.placing import object_id
+from client.objects.object_file import object_id
 from protocol.frames import RgbdFrame
 from protocol.messages import Plan, Timings
 from tests.client.lights import light_of

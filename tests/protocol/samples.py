@@ -36,6 +36,7 @@ from protocol.messages import (
     RequestMesh,
     RequestPanorama,
     ServerMessage,
+    Spot,
     Timings,
     Watch,
     Welcome,
@@ -104,6 +105,21 @@ CLIENT: dict[str, ClientMessage] = {
     ),
     "frame_without_pose": Frame(frame=8, timestamp_s=0.5, world_from_camera=None, color=COLOR, depth=DEPTH),
     "place_object": PlaceObject(request=1, object="sofa", format="glb", data=b"glTF\x02", position_m=(0.5, 0.25, 1.5)),
+    "place_object_on_pixel": PlaceObject(
+        request=8, object="sofa", format="glb", data=b"glTF", spot=Spot(on="pixel", pixel=(320.0, 120.5), frame=12)
+    ),
+    "place_object_on_ray": PlaceObject(
+        request=9,
+        object="sofa",
+        format="obj",
+        data=b"v",
+        scale=2.0,
+        yaw_deg=-45.0,
+        spot=Spot(on="ray", origin_m=(0.5, 1.5, 0.0), direction=(0.0, -0.5, -1.0)),
+    ),
+    "place_object_on_table": PlaceObject(
+        request=10, object="vase", format="ply", data=b"ply", spot=Spot(on="table"), height_m=0.25
+    ),
     "move_object": MoveObject(request=2, object="sofa", position_m=(0.0, 0.0, 1.0), scale=2.0, yaw_deg=-90.0),
     "remove_object": RemoveObject(request=3, object="sofa"),
     "quality": Quality(request=4, preset="auto", budget_ms=40.0),

@@ -50,6 +50,7 @@ def test_there_are_earlier_bytes() -> None:
         "light",
         "light_of_an_exposure",
         "frame",
+        "place_object",
     }
 
 

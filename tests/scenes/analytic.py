@@ -91,6 +91,23 @@ def room(low: ArrayLike, high: ArrayLike) -> Shape:
     return meet
 
 
+def box(low: ArrayLike, high: ArrayLike) -> Shape:
+    """A box seen from outside."""
+    corners = np.array([low, high], np.float64)
+
+    def hit(origin: Floats, directions: Floats) -> tuple[Floats, Floats]:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slabs = np.sort((corners[:, None] - origin[None]) / directions.reshape(-1, 3)[None], axis=0)
+        slabs = np.where(np.isnan(slabs), np.array([-np.inf, np.inf])[:, None, None], slabs)
+        axis = slabs[0].argmax(axis=1)
+        enter, leave = slabs[0].max(axis=1), slabs[1].min(axis=1)
+        distances = np.where((enter < leave) & (enter > 0), enter, np.inf)
+        normals = -np.sign(np.take_along_axis(directions.reshape(-1, 3), axis[:, None], 1)) * np.eye(3)[axis]
+        return distances.reshape(directions.shape[:-1]), normals.reshape(directions.shape)
+
+    return hit
+
+
 def plane(point: ArrayLike, normal: ArrayLike) -> Shape:
     """An endless plane through `point`."""
     unit = np.asarray(normal, np.float64) / np.linalg.norm(normal)

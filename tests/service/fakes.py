@@ -6,8 +6,10 @@ import queue
 import threading
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import encode_color, encode_depth
@@ -202,8 +204,25 @@ def terrain(side: int) -> SceneMesh:
 FAKE_DEVICE = SimpleNamespace(name="a fake device", memory=SimpleNamespace(bytes_held=4096))
 
 
-def fake_mesh(data: bytes, format_: str) -> tuple[str, bytes]:
+class FakeMesh(NamedTuple):
+    """What was to be read; a cube of one metre."""
+
+    format: str
+    data: bytes
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """As of a Mesh."""
+        return np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+
+    @property
+    def up_axis(self) -> str:
+        """As of a Mesh."""
+        return "y"
+
+
+def fake_mesh(data: bytes, format_: str) -> FakeMesh:
     """The `mesh_loader` of a service under test."""
     if data == b"no mesh":
         raise ValueError("the object is no GLB: its first bytes are not glTF")
-    return format_, data
+    return FakeMesh(format_, data)

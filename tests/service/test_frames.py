@@ -17,7 +17,9 @@ from protocol.messages import (
     PlaceObject,
     Quality,
     RemoveObject,
+    Spot,
 )
+from server.scene.placement import SpotPlacement
 from server.service import mailbox
 from tests.service.fakes import CAMERA, POSE, REFUSE_MM, fake_light, frame_message, rgbd_frame
 
@@ -102,6 +104,32 @@ def test_control_messages_are_never_dropped_and_precede_later_frames(dial, lab) 
     _, _, mesh, placement = lab.log[1]
     assert mesh == ("glb", b"mesh")
     assert (placement.position_m, placement.scale, placement.yaw_deg) == ((1.0, 2.0, 3.0), 1.0, 30.0)
+
+
+def test_a_spot_is_passed_on_and_a_bad_one_refused(dial, lab) -> None:
+    wire = dial()
+    wire.greet()
+    spot = Spot(on="pixel", pixel=(3.0, 4.0), frame=7)
+    wire.say(PlaceObject(request=1, object="chair", format="glb", data=b"mesh", spot=spot, scale=2.0, yaw_deg=30.0))
+    wire.say(PlaceObject(request=2, object="vase", format="glb", data=b"mesh", spot=Spot(on="auto")))
+    wire.say(PlaceObject(request=4, object="cup", format="glb", data=b"mesh", spot=Spot(on="auto"), height_m=0.25))
+    assert [wire.hear().error for _ in range(3)] == [None] * 3
+    assert lab.log[0][3] == SpotPlacement(spot, 2.0, 30.0)
+    assert lab.log[1][3] == SpotPlacement(Spot(on="auto"), None, 0.0)  # its size is chosen
+    assert lab.log[2][3] == SpotPlacement(Spot(on="auto"), 0.25, 0.0)
+    place = {"type": "place_object", "request": 3, "object": "junk", "format": "glb", "data": b"mesh"}
+    for wrong, words in (
+        ({"spot": {"on": "pixel"}}, "spot.pixel is needed"),
+        ({"spot": {"on": "table", "pixel": [1.0, 2.0]}}, "spot.pixel is needed on a pixel"),
+        ({"spot": {"on": "ray", "origin_m": [0.0, 0.0, 0.0]}}, "spot.origin_m and spot.direction are needed"),
+        ({"spot": {"on": "ray", "origin_m": [0, 0, 0], "direction": [0, 0, 0]}}, "direction must not be zero"),
+        ({"spot": {"on": "shelf"}}, "Invalid enum value 'shelf'"),
+        ({"spot": {"on": "floor"}, "position_m": [0.0, 0.0, 1.0]}, "leave one out"),
+        ({"height_m": 0.3}, "height_m needs a position_m or a spot"),
+        ({"spot": {"on": "floor"}, "height_m": 0.0}, "height_m"),
+    ):
+        wire.socket.send(msgspec.msgpack.encode(place | wrong))
+        assert words in wire.hear().error
 
 
 def test_reading_stops_while_too_much_is_unread_and_goes_on_later(dial, lab, monkeypatch) -> None:

@@ -14,12 +14,12 @@ from client.display.output_folder import FrameOutput, OutputWriter
 from client.objects.object_file import ObjectFile, pack_mesh
 from client.options.light_places import PanoramaOut
 from protocol.frames import CameraModel, RgbdFrame
-from protocol.messages import Wishes
+from protocol.messages import Spot, Wishes
 from server.client_session import ClientSession
 from server.meshing.files import mesh_files
 from server.opencl.device import Device
 from server.scene.mesh import load_mesh
-from server.scene.placement import Placement
+from server.scene.placement import requested_placement
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 
@@ -61,8 +61,9 @@ def run_in_process(device: Device, scene: Scene, folder: Path) -> None:
     """The frames through the pipeline, without a network."""
     pipeline = ClientSession(device, CAMERA, WISHES)
     format_, data = pack_mesh(scene.item.path)
-    placement = Placement(scene.item.position_m, scene.item.scale, scene.item.yaw_deg)
-    pipeline.place_object("object-0", load_mesh(data, format_), placement)
+    mesh, item = load_mesh(data, format_), scene.item
+    placement = requested_placement(mesh, item.position_m, item.spot, item.scale, item.height_m, item.yaw_deg)
+    pipeline.place_object("object-0", mesh, placement)
     with OutputWriter(folder) as writer:
         for frame in (scene.source[i] for i in range(FRAMES)):
             result = {**vars(pipeline.process(frame))}
@@ -74,10 +75,13 @@ def run_in_process(device: Device, scene: Scene, folder: Path) -> None:
     pipeline.close()
 
 
-@pytest.fixture
-def scene(tmp_path: Path) -> Scene:
+@pytest.fixture(params=["position", "pixel"])
+def scene(tmp_path: Path, request: pytest.FixtureRequest) -> Scene:
     (tmp_path / "box.obj").write_text(BOX)
-    return Scene(CornerSource(), ObjectFile(tmp_path / "box.obj", (0.1, 0.2, 1.2), 0.1, 20.0))
+    if request.param == "position":
+        return Scene(CornerSource(), ObjectFile(tmp_path / "box.obj", (0.1, 0.2, 1.2), 0.1, 20.0))
+    spot = Spot(on="pixel", pixel=(60.0, 60.0), frame=1)
+    return Scene(CornerSource(), ObjectFile(tmp_path / "box.obj", None, 1.0, 20.0, spot, height_m=0.1))
 
 
 def comparable(folder: Path) -> dict[str, bytes]:

@@ -83,7 +83,7 @@ export class Capturing implements Sink {
     return seen === undefined || world_from_camera === null ? null : { ...seen, up: this.up, world_from_camera };
   }
 
-  /** Up direction of a room that another client has opened, in the axes of this session. */
+  /** Up direction that the server tells, in the axes of this session: given, found, or that of a room. */
   noteUp(up: Vector3): void {
     this.up = up;
   }

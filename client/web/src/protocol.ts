@@ -89,7 +89,7 @@ export interface Wishes {
   /** x0, y0, z0, x1, y1, z1 in world metres; null: the view of the first frame. */
   volume_m?: [number, number, number, number, number, number] | null;
   voxel_m?: number | null;
-  /** World direction; null: the first camera's -y. */
+  /** World direction; null: found from the scan, else the first camera's -y, as the notes of the answers say. */
   up?: [number, number, number] | null;
   /** Radiance SH to render with instead of an estimate: 1, 4, 9 ... coefficients; null: estimate one. */
   light?: Array<[number, number, number]> | null;
@@ -221,17 +221,42 @@ export interface Frame {
   exposure?: number | null;
 }
 
-/** Place a virtual object; acknowledged. */
+/** A place that the server finds in what it sees, in the next frame that shows it. */
+export interface Spot {
+  /**
+   * `pixel`: the surface seen in a pixel; `ray`: the scanned surface that a ray meets first; `floor`; `table`: the
+   * largest horizontal surface in view off the floor; `auto`: on a table, else the floor, at a size that fits there.
+   */
+  on: "auto" | "floor" | "pixel" | "ray" | "table";
+  /** u, v of the rectified picture; only with `pixel`. */
+  pixel?: [number, number] | null;
+  /** The frame of `pixel`, which is still to be sent; null: the next one. */
+  frame?: number | null;
+  /** World; only with `ray`, like the next field. */
+  origin_m?: [number, number, number] | null;
+  /** World, of any length. */
+  direction?: [number, number, number] | null;
+}
+
+/** Place a virtual object; acknowledged. With `spot`, the answer to the frame in which it is found tells where. */
 export interface PlaceObject {
   type: "place_object";
   request: number;
   object: string;
   format: "glb" | "obj" | "ply" | "stl";
   data: Uint8Array;
-  /** World position of the bottom centre of the model's box; null: the vertices are world coordinates already. */
+  /**
+   * World position of the bottom centre of the model's box; null, without `spot`: the vertices are world coordinates
+   * already.
+   */
   position_m?: [number, number, number] | null;
+  /** Not used on an `auto` spot. */
   scale?: number;
   yaw_deg?: number;
+  /** In place of `position_m`. */
+  spot?: Spot | null;
+  /** Height of the placed model, in place of `scale`. */
+  height_m?: number | null;
 }
 
 /** Move an existing object; acknowledged. */

@@ -84,7 +84,7 @@ def _rebuild_volume(room: Room, kept: StoredVolume, slot: SaveSlot) -> None:
 
 def _rebuild_objects(room: Room, state: RoomState, slot: SaveSlot) -> None:
     if state.up is not None:
-        room.objects.begin(state.up)
+        room.resume_up(state.up)
     for kept in state.objects:
         place = kept.world_from_model if kept.world_from_model is not None else kept.placement or Placement()
         try:

@@ -141,19 +141,14 @@ export class RecordedSource implements Source {
   }
 }
 
-/** Wishes of the session: geometry and exposure as recorded, and always the up direction. */
+/** Wishes of the session: geometry and exposure as recorded, and what is up if the recording says it. */
 function wishesOf({ wishes, frame }: RecordedFrame): Wishes {
   const { poses, volume_m, voxel_m, exposure, denoise, lamps } = wishes;
-  const asked: Wishes = { up: wishes.up ?? upOf(frame.world_from_camera), poses: poses ?? (frame.world_from_camera === null ? "track" : "given") };
+  const asked: Wishes = { up: wishes.up ?? null, poses: poses ?? (frame.world_from_camera === null ? "track" : "given") };
   for (const [name, value] of Object.entries({ volume_m, voxel_m, exposure, denoise, lamps })) {
     if (value !== undefined) Object.assign(asked, { [name]: value });
   }
   return asked;
-}
-
-/** The first camera's -y, which is the server's default. */
-function upOf(pose: readonly number[] | null): [number, number, number] {
-  return pose === null ? [0, -1, 0] : [-pose[1]!, -pose[5]!, -pose[9]!];
 }
 
 const pause = (milliseconds: number): Promise<void> => new Promise((resolve) => setTimeout(resolve, milliseconds));

@@ -24,7 +24,7 @@ SAME_SURFACE = 0.01
 """Relative difference of depth up to which neighbouring pixels show one surface: 2 cm at 2 m, a Kinect's noise."""
 _ACROSS_PX = 320
 """Pixels in a row from which horizontal surfaces are sought."""
-_RAY = CameraModel(width=8, height=8, fx=1e4, fy=1e4, cx=0.0, cy=0.0)
+_RAY = CameraModel(width=8, height=8, fx=400.0, fy=400.0, cx=0.0, cy=0.0)
 """Pixel (0, 0) of the smallest camera looks along the optical axis."""
 
 

@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Protocol
 
 from client.commands.stopping import stop_on_interrupt
-from client.display.output_folder import FrameOutput
+from client.display.frame_output import FrameOutput, captured_of
 from client.errors import RunError
 from client.objects.placing import place_objects
 from client.options.capture import Capture
@@ -45,7 +45,12 @@ class Run:
         source = self._capture.source
         with stop_on_interrupt(is_live(source)) as stopping:
             positions = takewhile(lambda _: not stopping.is_set(), self._capture.frames)
-            yield from process_frames(self._pipeline, (source[i] for i in positions))
+            yield from process_frames(self._pipeline, (source[i] for i in positions), source.camera)
+
+    @property
+    def device(self) -> str:
+        """Name of the OpenCL device."""
+        return self._pipeline.device_name
 
     def mesh(self, progress: Callable[[int, int], None]) -> dict[MeshFormat, bytes]:
         """Mesh files of the surface fused so far; `progress` receives parts done and total. Raises MeshingError."""
@@ -67,8 +72,8 @@ class Run:
         self._pipeline.close()
 
 
-def process_frames(pipeline: Processor, frames: Iterable[RgbdFrame]) -> Iterator[FrameOutput]:
-    """The output of each frame. Raises RunError with the number of a frame that the pipeline refuses."""
+def process_frames(pipeline: Processor, frames: Iterable[RgbdFrame], camera: CameraModel) -> Iterator[FrameOutput]:
+    """The output of each frame of this camera. Raises RunError with the number of a frame that the pipeline refuses."""
     for frame in frames:
         try:
             result = pipeline.process(frame)
@@ -85,6 +90,7 @@ def process_frames(pipeline: Processor, frames: Iterable[RgbdFrame]) -> Iterator
             timings=result.timings,
             plan=result.plan,
             notes=result.notes,
+            captured=captured_of(frame, camera),
         )
 
 

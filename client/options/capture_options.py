@@ -110,6 +110,8 @@ Cache = Annotated[
     str | None,
     typer.Option(metavar="on|off", help="off: nothing is kept at places of the world, to compare; default: on"),
 ]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace an earlier run in the output folder")]
+VideoFileOption = Annotated[bool, typer.Option("--video", help="write video.mp4 (H.264); needs PyAV")]
 Mesh = Annotated[bool, typer.Option("--mesh", help="write mesh.ply and mesh.glb")]
 BudgetMs = Annotated[float | None, typer.Option(metavar="N", help="choose the operating point for this frame time")]
 MaxLightError = Annotated[

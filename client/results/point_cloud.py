@@ -1,0 +1,149 @@
+"""The scan as the page of results shows it: a coloured point cloud of bounded size, gathered while frames arrive.
+
+Every frame adds a grid of its depth pixels to cells of equal size; a cell shows the mean of its points. Where cells
+become too many, they are doubled.
+"""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from client.display.frame_output import Captured
+from protocol.frames import CameraModel
+
+MOST_CELLS = 150_000
+"""Nine bytes each: 1.8 MB of base64."""
+FIRST_CELL_M = 0.008
+"""Finer than a pixel of a depth camera at 4 m."""
+SAMPLES = 20_000
+"""Depth pixels of a frame that are used: 2 ms."""
+_PENDING = 200_000
+"""Points that are gathered before they are sorted into cells."""
+FARTHEST_M = 10.0
+"""Depth beyond it is mostly noise, and would make the scan small on the page."""
+_CERTAIN_FRAMES = 5
+"""From this many frames on, cells that were met only once are left out: noise, and things that moved."""
+_HALF = 1 << 20
+"""Cells to each side of the world's origin: 21 bits an axis."""
+
+
+@dataclass(frozen=True)
+class _Cells:
+    keys: NDArray[np.int64]
+    """[n] distinct."""
+    sums: NDArray[np.float64]
+    """[n, 7] of x, y, z (world, metres), r, g, b (sRGB codes) and number of points."""
+
+
+class PointCloud:
+    """Gathers the points of frames."""
+
+    def __init__(self, camera: CameraModel) -> None:
+        self._camera = camera
+        self._rays: dict[tuple[int, int], tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]] = {}
+        lens = camera.depth_lens
+        self._stride = max(1, round((lens.width * lens.height / SAMPLES) ** 0.5))
+        self._cell_m = FIRST_CELL_M
+        self._cells = _Cells(np.zeros(0, np.int64), np.zeros((0, 7)))
+        self._pending: list[NDArray[np.float64]] = []
+        self._frames = 0
+
+    def add(self, captured: Captured, world_from_camera: NDArray[np.float64]) -> None:
+        """Add a frame; [4, 4] metres. A frame without depth adds nothing."""
+        if captured.depth is None:
+            return
+        self._pending.append(self._points(captured, captured.depth, world_from_camera))
+        self._frames += 1
+        if sum(map(len, self._pending)) > _PENDING:
+            self._merge()
+
+    def packed(self) -> dict[str, Any] | None:
+        """The cloud: `count`, `cell_m`, the box `least` and `most` (world, metres), and base64 of [count, 3]: `places`,
+        little-endian uint16 where 0 and 65535 are the sides of the box, and `colors`, uint8 sRGB. None: no points.
+        """
+        self._merge()
+        sums = self._cells.sums
+        if self._frames >= _CERTAIN_FRAMES:
+            sums = sums[sums[:, 6] > 1]
+        if len(sums) == 0:
+            return None
+        means = sums[:, :6] / sums[:, 6:]
+        least, most = means[:, :3].min(0), means[:, :3].max(0)
+        steps = (means[:, :3] - least) / np.maximum(most - least, 1e-6) * 65535
+        return {
+            "count": len(means),
+            "cell_m": self._cell_m,
+            "least": [round(x, 4) for x in least.tolist()],
+            "most": [round(x, 4) for x in most.tolist()],
+            "places": _base64(steps.round().astype("<u2")),
+            "colors": _base64(means[:, 3:].round().astype(np.uint8)),
+        }
+
+    def _points(
+        self, captured: Captured, depth: NDArray[np.uint16], world_from_camera: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """[n, 6] world x, y, z and r, g, b of a grid of pixels, another one for each frame."""
+        shift = self._frames * 7  # 7 has no divisor in common with usual strides: the grids of a still camera differ
+        rows, columns, rays = self._grid((shift % self._stride, shift // self._stride % self._stride))
+        z = depth[rows, columns] * self._camera.depth_scale_m
+        used = (z > 0) & (z < FARTHEST_M) & (depth[rows, columns] < 65535)
+        in_depth = rays[used] * z[used, None]
+        color_from_depth = self._camera.color_from_depth
+        in_color = in_depth @ color_from_depth[:3, :3].T + color_from_depth[:3, 3]
+        codes, is_seen = self._colors(captured.color, in_color)
+        in_world = in_color[is_seen] @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+        return np.hstack([in_world, codes])
+
+    def _colors(
+        self, color: NDArray[np.uint8], points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Colours of those points (colour camera, metres) that the picture shows, and which these are."""
+        camera = self._camera
+        z = np.maximum(points[:, 2], 1e-6)
+        u = np.rint(camera.fx * points[:, 0] / z + camera.cx).astype(np.intp)
+        v = np.rint(camera.fy * points[:, 1] / z + camera.cy).astype(np.intp)
+        is_seen = (points[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < color.shape[1]) & (v < color.shape[0])
+        return color[v[is_seen], u[is_seen]], is_seen
+
+    def _grid(self, first: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+        """Rows, columns [n] and rays [n, 3] with z = 1 (depth camera) of every `stride`-th pixel from `first` on."""
+        if first not in self._rays:
+            lens = self._camera.depth_lens
+            grid = np.mgrid[first[0] : lens.height : self._stride, first[1] : lens.width : self._stride]
+            rows, columns = grid.reshape(2, -1)
+            matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
+            pixels = np.stack([columns, rows], 1).astype(np.float64)[:, None]
+            flat = cv2.undistortPoints(pixels, matrix, np.array(lens.distortion))[:, 0]
+            self._rays[first] = rows, columns, np.column_stack([flat, np.ones(len(flat))])
+        return self._rays[first]
+
+    def _merge(self) -> None:
+        """Sort what is pending into cells, larger ones if they are too many."""
+        if not self._pending:
+            return
+        points = np.vstack(self._pending)
+        self._pending.clear()
+        new = np.column_stack([points, np.ones(len(points))])
+        self._cells = _gathered(np.vstack([self._cells.sums, new]), self._cell_m)
+        while len(self._cells.keys) > MOST_CELLS:
+            self._cell_m *= 2
+            self._cells = _gathered(self._cells.sums, self._cell_m)
+
+
+def _gathered(sums: NDArray[np.float64], cell_m: float) -> _Cells:
+    """Sums [n, 7] of points whose means lie in one cell, added."""
+    steps = np.floor(sums[:, :3] / sums[:, 6:] / cell_m).clip(-_HALF, _HALF - 1).astype(np.int64) + _HALF
+    keys = (steps[:, 0] << 42) | (steps[:, 1] << 21) | steps[:, 2]
+    distinct, cells = np.unique(keys, return_inverse=True)
+    added = np.stack([np.bincount(cells, sums[:, i], len(distinct)) for i in range(7)], 1).astype(np.float64)
+    return _Cells(distinct, added)
+
+
+def _base64(values: NDArray[Any]) -> str:
+    return base64.b64encode(values.tobytes()).decode("ascii")

@@ -19,7 +19,9 @@ from protocol.messages import TIMING_ROWS, ArrivingLight, LeftOut, Light
 STAGES = tuple(name for name in TIMING_ROWS if name != "total")
 VISIBLE_CODES = 8
 """Change of an 8-bit code from which on a pixel counts as changed."""
-_DIGITS = 4
+NEARLY_ALL = 0.96
+"""Share of the changed pixels that counts: the rest is noise and faint shadow."""
+_DIGITS, _POSE_DIGITS = 4, 6
 
 
 class Table:
@@ -49,24 +51,26 @@ class FrameRows:
 
     def add(self, output: FrameOutput, has_camera_picture: bool) -> None:
         """Add a frame; `has_camera_picture`: whether the camera's own picture was written."""
-        row = self._light_row(output.light)
-        row["picture"] = 2 if has_camera_picture else 1
-        row["changed"] = _changed(output) if has_camera_picture else 0
-        row["pose"] = rounded(output.world_from_camera[:3].ravel().tolist(), 6)
-        row["tracking"] = output.tracking
-        row["ms"] = rounded(getattr(output.timings, name) for name in STAGES)
-        row["total"], row["host"] = rounded((output.timings.total, output.timings.host))
-        row["run"] = [self._effects.position(name) for name in output.plan.run]
-        row["out"] = [self._left_out.position(_left_out(effect)) for effect in output.plan.left_out]
         point = output.plan.point
-        row["point"] = None if point is None else self._points.position((point.settings, point.reason))
+        drawn: dict[str, Any] = {
+            "picture": 2 if has_camera_picture else 1,
+            "changed": _changed(output) if has_camera_picture else None,
+            "pose": rounded(output.world_from_camera[:3].ravel().tolist(), _POSE_DIGITS),
+            "tracking": output.tracking,
+            "ms": rounded(getattr(output.timings, name) for name in STAGES),
+            "total": rounded((output.timings.total,))[0],
+            "host": rounded((output.timings.host,))[0],
+            "run": [self._effects.position(name) for name in output.plan.run],
+            "out": [self._left_out.position(_left_out(effect)) for effect in output.plan.left_out],
+            "point": None if point is None else self._points.position((point.settings, point.reason)),
+        }
         if output.notes:
-            row["notes"] = list(output.notes)
-        self._append(row)
+            drawn["notes"] = list(output.notes)
+        self._append({**self._light_row(output.light), "drawn": drawn})
 
     def add_light(self, light: Light) -> None:
         """Add a frame of which only the light is known."""
-        self._append(self._light_row(light))
+        self._append({**self._light_row(light), "drawn": None})
 
     def tables(self) -> dict[str, Any]:
         """What rows refer to by position."""
@@ -114,11 +118,20 @@ def _light(light: Light | ArrivingLight, place: int, position: tuple[float, floa
     }
 
 
-def _changed(output: FrameOutput) -> float:
-    """Share of the pixels that virtual content changes visibly."""
+def _changed(output: FrameOutput) -> list[float] | None:
+    """Share of the pixels that virtual content changes visibly, and between which columns nearly all of them lie.
+
+    Columns are shares of the width. None: there are no such pixels.
+    """
     assert output.captured is not None
-    change = cv2.absdiff(output.color, output.captured.color).max(2)
-    return round(float(np.mean(change > VISIBLE_CODES)), 4)
+    is_changed = cv2.absdiff(output.color, output.captured.color).max(2) > VISIBLE_CODES
+    columns = np.count_nonzero(is_changed, 0).cumsum()
+    if columns[-1] == 0:
+        return None
+    outer = (1 - NEARLY_ALL) / 2
+    first, last = (int(np.searchsorted(columns, share * columns[-1])) for share in (outer, 1 - outer))
+    width = is_changed.shape[1]
+    return [round(float(columns[-1]) / is_changed.size, 5), round(first / width, 3), round((last + 1) / width, 3)]
 
 
 def _left_out(effect: LeftOut) -> tuple[str, str, float | None]:

@@ -1,7 +1,7 @@
 """The scan as the page of results shows it: a coloured point cloud of bounded size, gathered while frames arrive.
 
 Every frame adds a grid of its depth pixels to cells of equal size; a cell shows the mean of its points. Where cells
-become too many, they are doubled.
+become too many, they are enlarged.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from client.display.frame_output import Captured
 from protocol.frames import CameraModel
 
-MOST_CELLS = 150_000
-"""Nine bytes each: 1.8 MB of base64."""
+MOST_CELLS = 250_000
+"""Nine bytes each: 3 MB of base64."""
+ENLARGED = 2**0.5
+"""By this much at a time: it halves the number of cells on a surface."""
 FIRST_CELL_M = 0.008
 """Finer than a pixel of a depth camera at 4 m."""
 SAMPLES = 20_000
@@ -78,7 +80,7 @@ class PointCloud:
         steps = (means[:, :3] - least) / np.maximum(most - least, 1e-6) * 65535
         return {
             "count": len(means),
-            "cell_m": self._cell_m,
+            "cell_m": round(self._cell_m, 5),
             "least": [round(x, 4) for x in least.tolist()],
             "most": [round(x, 4) for x in most.tolist()],
             "places": _base64(steps.round().astype("<u2")),
@@ -132,7 +134,7 @@ class PointCloud:
         new = np.column_stack([points, np.ones(len(points))])
         self._cells = _gathered(np.vstack([self._cells.sums, new]), self._cell_m)
         while len(self._cells.keys) > MOST_CELLS:
-            self._cell_m *= 2
+            self._cell_m *= ENLARGED
             self._cells = _gathered(self._cells.sums, self._cell_m)
 
 

@@ -19,6 +19,7 @@ declare module "three" {
     normalize(): this;
     length(): number;
     distanceTo(other: Vector3): number;
+    dot(other: Vector3): number;
   }
   export class Quaternion {
     copy(other: Quaternion): this;

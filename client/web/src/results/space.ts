@@ -32,8 +32,12 @@ const [FRUSTUM, BALL, ARROW] = [0.06, 0.022, 0.07];
 const OUTLIERS = 0.03;
 /** Size of a point in cells: without gaps on a surface that is seen at a slant. */
 const POINT = 2.3;
-/** Of the scan's size: where the overview is taken from. */
-const [AWAY, ABOVE] = [0.68, 0.4];
+/** Vertical field of view of an overview. */
+const FOV_DEG = 45;
+/** Points that an overview is fitted to. */
+const FITTED = 2000;
+/** Share of the picture beyond what is fitted, and how often the fit is improved. */
+const [MARGIN, ROUNDS] = [1.08, 6];
 const KEY_TURN = Math.PI / 24;
 
 export class Space {
@@ -45,10 +49,13 @@ export class Space {
   private readonly controls: OrbitControls;
   private readonly frustum: LineSegments;
   private readonly balls = new Map<number, Ball>();
-  private readonly middle: Vector3;
+  /** What an overview shows: the path and some of the points, up is +y. */
+  private readonly content: readonly Vector3[];
   private readonly size: number;
   private pose: readonly number[] | null = null;
   private isThrough = false;
+  /** Whether nobody has turned it since. */
+  private isOverview = false;
   private isAsked = false;
 
   /** Throws Error where the browser has no WebGL. */
@@ -60,15 +67,19 @@ export class Space {
     this.renderer.setClearColor(0x12161c, 1);
     const path = data.frames.flatMap(({ drawn }) => (drawn === null ? [] : [positionOf(drawn.pose)]));
     const places = data.scan === null ? null : placesOf(data.scan);
-    const box = boxOf(places, path);
-    this.size = Math.max(0.2, box.least.distanceTo(box.most));
     this.world.quaternion.copy(new Quaternion().setFromUnitVectors(new Vector3(...data.up), new Vector3(0, 1, 0)));
     this.scene.add(this.world);
-    this.middle = box.least.clone().add(box.most).multiplyScalar(0.5).applyQuaternion(this.world.quaternion);
-    this.camera = new PerspectiveCamera(50, 1, 0.002 * this.size, 20 * this.size);
+    const content = [...(places === null ? [] : mostOf(places)), ...path];
+    this.content = content.map((each) => each.clone().applyQuaternion(this.world.quaternion));
+    const { least, most } = boxOf(content);
+    this.size = Math.max(0.2, least.distanceTo(most));
+    this.camera = new PerspectiveCamera(FOV_DEG, 1, 0.002 * this.size, 20 * this.size);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.addEventListener("change", () => this.redraw());
-    this.controls.addEventListener("start", () => this.leaveCamera());
+    this.controls.addEventListener("start", () => {
+      this.leaveCamera();
+      this.isOverview = false;
+    });
     if (data.scan !== null && places !== null) this.world.add(pointsOf(data.scan, places));
     if (path.length > 1) this.world.add(pathOf(path));
     this.frustum = frustumOf(data.camera, FRUSTUM * this.size);
@@ -101,19 +112,22 @@ export class Space {
     back.y = 0;
     if (back.length() < 0.05) back.set(0, 0, 1);
     back.normalize();
-    this.controls.target.copy(this.middle);
-    const side = new Vector3(back.z, 0, -back.x).multiplyScalar(0.35);
-    this.camera.position.copy(this.middle).add(back.add(side).multiplyScalar(AWAY * this.size)).add(new Vector3(0, ABOVE * this.size, 0));
+    const away = back.clone().add(new Vector3(back.z, 0, -back.x).multiplyScalar(0.35)).add(new Vector3(0, 0.6, 0)).normalize();
     this.camera.up.set(0, 1, 0);
-    this.camera.fov = 50;
+    this.camera.fov = FOV_DEG;
     this.camera.updateProjectionMatrix();
+    const { target, distance } = fitting(this.content, away, FOV_DEG, this.camera.aspect);
+    this.controls.target.copy(target);
+    this.camera.position.copy(target).add(away.multiplyScalar(distance));
     this.controls.update();
+    this.isOverview = true;
     this.redraw();
   }
 
   /** Look through the camera of the frame that is shown, and follow it. */
   through(): void {
     this.isThrough = true;
+    this.isOverview = false;
     this.onThrough(true);
     this.lookThrough();
     this.redraw();
@@ -169,6 +183,7 @@ export class Space {
     event.preventDefault();
     event.stopPropagation();
     this.leaveCamera();
+    this.isOverview = false;
     this.turn(...turn);
   }
 
@@ -190,6 +205,7 @@ export class Space {
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
+    if (this.isOverview) this.overview();
     this.redraw();
   }
 
@@ -243,16 +259,46 @@ class Ball {
   }
 }
 
-/** What the path and nearly all points lie in. */
-function boxOf(places: Float32Array | null, path: readonly Vector3[]): { least: Vector3; most: Vector3 } {
-  const corners = [...path, ...(places === null ? [] : [OUTLIERS, 1 - OUTLIERS].map((share) => quantile(places, share)))];
-  if (corners.length === 0) corners.push(new Vector3(-1, -1, -1), new Vector3(1, 1, 1));
-  const [least, most] = [corners[0]!.clone(), corners[0]!.clone()];
-  for (const corner of corners) {
-    least.min(corner);
-    most.max(corner);
+function boxOf(content: readonly Vector3[]): { least: Vector3; most: Vector3 } {
+  const [least, most] = [(content[0] ?? new Vector3()).clone(), (content[0] ?? new Vector3()).clone()];
+  for (const each of content) {
+    least.min(each);
+    most.max(each);
   }
   return { least, most };
+}
+
+/** Some of the points, without those that lie far outside. */
+function mostOf(places: Float32Array): Vector3[] {
+  const [least, most] = [quantile(places, OUTLIERS), quantile(places, 1 - OUTLIERS)];
+  const count = places.length / 3;
+  const some = Array.from({ length: Math.min(count, FITTED) }, (_, i) => Math.floor((i * count) / Math.min(count, FITTED)));
+  return some.map((i) => new Vector3(places[3 * i], places[3 * i + 1], places[3 * i + 2]).max(least).min(most));
+}
+
+/** Where to look, and from how far away in direction `away`, so that all content is in the picture and fills it. */
+function fitting(content: readonly Vector3[], away: Vector3, fov_deg: number, aspect: number): { target: Vector3; distance: number } {
+  const right = new Vector3(away.z, 0, -away.x).normalize();
+  const over = new Vector3(away.y * right.z - away.z * right.y, away.z * right.x - away.x * right.z, away.x * right.y - away.y * right.x);
+  const tall = Math.tan((fov_deg * Math.PI) / 360);
+  const seen = content.map((each) => new Vector3(each.dot(right), each.dot(over), each.dot(away)));
+  const { least, most } = boxOf(seen);
+  const middle = least.clone().add(most).multiplyScalar(0.5);
+  let distance = Math.max(0.1, least.distanceTo(most));
+  for (let round = 0; round < ROUNDS; round++) {
+    const drawn = boxOf(seen.map((each) => projected(each, middle, distance)));
+    middle.x += ((drawn.least.x + drawn.most.x) / 2) * distance;
+    middle.y += ((drawn.least.y + drawn.most.y) / 2) * distance;
+    distance *= (MARGIN * Math.max((drawn.most.x - drawn.least.x) / aspect, drawn.most.y - drawn.least.y)) / (2 * tall);
+  }
+  const target = right.clone().multiplyScalar(middle.x).add(over.clone().multiplyScalar(middle.y)).add(away.clone().multiplyScalar(middle.z));
+  return { target, distance };
+}
+
+/** On a plane at distance 1 from the eye, which is `distance` from `middle`; what is nearly behind the eye counts as near. */
+function projected(place: Vector3, middle: Vector3, distance: number): Vector3 {
+  const depth = Math.max(0.2 * distance, distance - (place.z - middle.z));
+  return new Vector3((place.x - middle.x) / depth, (place.y - middle.y) / depth, 0);
 }
 
 function quantile(places: Float32Array, share: number): Vector3 {

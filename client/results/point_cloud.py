@@ -26,8 +26,8 @@ FIRST_CELL_M = 0.008
 """Finer than a pixel of a depth camera at 4 m."""
 LARGEST_CELL_M = 0.05
 """For points that are few; larger ones show no shapes."""
-SAMPLES = 20_000
-"""Depth pixels of a frame that are used: 2 ms."""
+SAMPLES = 12_000
+"""Depth pixels of a frame that are used."""
 DENSE_FRAMES, DENSER = 6, 2
 """So many frames are sampled at a grid that is so much finer, so that a short run has a scan to be seen."""
 _PENDING = 200_000
@@ -35,9 +35,9 @@ _PENDING = 200_000
 FARTHEST_M = 10.0
 """Depth beyond it is mostly noise, and would make the scan small on the page."""
 _CERTAIN_FRAMES = 5
-"""From this many frames on, cells that were met only once are left out: noise, and things that moved."""
+"""From this many frames on, cells that were met in one frame only are left out: noise, and things that moved."""
 _MOST_LEFT_OUT = 0.3
-"""Share of the cells: if more were met only once, there are too few points for cells of this size."""
+"""Share of the cells: if more were met in one frame only, there are too few points for cells of this size."""
 _HALF = 1 << 20
 """Cells to each side of the world's origin: 21 bits an axis."""
 
@@ -47,7 +47,7 @@ class _Cells:
     keys: NDArray[np.int64]
     """[n] distinct."""
     sums: Floats
-    """[n, 7] of x, y, z (world, metres), r, g, b (sRGB codes) and number of points."""
+    """[n, 8] of x, y, z (world, metres), r, g, b (sRGB codes), number of points and number of frames."""
 
 
 class PointCloud:
@@ -59,7 +59,7 @@ class PointCloud:
         lens = camera.depth_lens
         self._usual_stride = max(1, round((lens.width * lens.height / SAMPLES) ** 0.5))
         self._cell_m = FIRST_CELL_M
-        self._cells = _Cells(np.zeros(0, np.int64), np.zeros((0, 7)))
+        self._cells = _Cells(np.zeros(0, np.int64), np.zeros((0, 8)))
         self._pending: list[Floats] = []
         self._frames = 0
 
@@ -67,7 +67,8 @@ class PointCloud:
         """Add a frame; [4, 4] metres. A frame without depth adds nothing."""
         if captured.depth is None:
             return
-        self._pending.append(self._points(captured, captured.depth, world_from_camera))
+        points = self._points(captured, captured.depth, world_from_camera)
+        self._pending.append(np.column_stack([points, np.ones((len(points), 2))]))
         self._frames += 1
         if sum(map(len, self._pending)) > _PENDING:
             self._merge()
@@ -80,7 +81,7 @@ class PointCloud:
         sums, cell_m = self._certain()
         if len(sums) == 0:
             return None
-        means = sums[:, :6] / sums[:, 6:]
+        means = sums[:, :6] / sums[:, 6:7]
         least, most = means[:, :3].min(0), means[:, :3].max(0)
         steps = (means[:, :3] - least) / np.maximum(most - least, 1e-6) * 65535
         return {
@@ -97,10 +98,10 @@ class PointCloud:
         cells, cell_m = self._cells, self._cell_m
         if self._frames < _CERTAIN_FRAMES:
             return cells.sums, cell_m
-        while np.mean(cells.sums[:, 6] < 2) > _MOST_LEFT_OUT and cell_m < LARGEST_CELL_M:
+        while np.mean(cells.sums[:, 7] < 2) > _MOST_LEFT_OUT and cell_m < LARGEST_CELL_M:
             cell_m *= ENLARGED
             cells = _gathered(cells.sums, cell_m)
-        return cells.sums[cells.sums[:, 6] > 1], cell_m
+        return cells.sums[cells.sums[:, 7] > 1], cell_m
 
     def _points(self, captured: Captured, depth: NDArray[np.uint16], world_from_camera: Floats) -> Floats:
         """[n, 6] world x, y, z and r, g, b of a grid of pixels, another one for each frame."""
@@ -141,22 +142,30 @@ class PointCloud:
         """Sort what is pending into cells, larger ones if they are too many."""
         if not self._pending:
             return
-        points = np.vstack(self._pending)
+        parts = [self._cells.sums, *self._pending]
+        parts_of_rows = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        self._cells = _gathered(np.vstack(parts), self._cell_m, parts_of_rows)
         self._pending.clear()
-        new = np.column_stack([points, np.ones(len(points))])
-        self._cells = _gathered(np.vstack([self._cells.sums, new]), self._cell_m)
         while len(self._cells.keys) > MOST_CELLS:
             self._cell_m *= ENLARGED
             self._cells = _gathered(self._cells.sums, self._cell_m)
 
 
-def _gathered(sums: Floats, cell_m: float) -> _Cells:
-    """Sums [n, 7] of points whose means lie in one cell, added."""
-    steps = np.floor(sums[:, :3] / sums[:, 6:] / cell_m).clip(-_HALF, _HALF - 1).astype(np.int64) + _HALF
+def _gathered(sums: Floats, cell_m: float, parts: NDArray[np.intp] | None = None) -> _Cells:
+    """Sums [n, 8] of points whose means lie in one cell, added.
+
+    `parts` [n], ascending: what one frame adds has one number, and counts as one frame in each of its cells.
+    """
+    steps = np.floor(sums[:, :3] / sums[:, 6:7] / cell_m).clip(-_HALF, _HALF - 1).astype(np.int64) + _HALF
     keys = (steps[:, 0] << 42) | (steps[:, 1] << 21) | steps[:, 2]
-    distinct, cells = np.unique(keys, return_inverse=True)
-    added = np.stack([np.bincount(cells, sums[:, i], len(distinct)) for i in range(7)], 1).astype(np.float64)
-    return _Cells(distinct, added)
+    order = np.argsort(keys, kind="stable")  # in a cell, parts stay in their order
+    keys, sums = keys[order], sums[order]
+    is_first = np.concatenate([[True], keys[1:] != keys[:-1]])[: len(keys)]
+    if parts is not None:
+        of = parts[order]
+        sums[1:][~is_first[1:] & (of[1:] == of[:-1]), 7] = 0
+    starts = np.flatnonzero(is_first)
+    return _Cells(keys[starts], np.add.reduceat(sums, starts, 0) if len(starts) else sums)
 
 
 def _base64(values: NDArray[Any]) -> str:

@@ -17,8 +17,8 @@ from client.options.capture import prepare, refuse_color, refuse_depth_noise
 from client.options.capture_options import CaptureOptions, capturing
 from client.options.light_places import parse_panorama_out, write_panorama
 from client.progress import Stopwatch, note, progress_bar, say, track
+from client.results.extras import check_extras
 from client.results.names import PAGE_NAME
-from client.results.video_file import require_encoder
 from protocol.messages import Light
 
 USAGE_STATUS, FAILURE_STATUS, INTERRUPTED_STATUS = 2, 1, 130
@@ -87,14 +87,14 @@ def run(
     out: Annotated[Path, typer.Option(metavar="DIR", help="output folder")],
     overwrite: o.Overwrite = False,
     video: o.VideoFileOption = False,
+    rerun: o.RerunOption = None,
     mesh: o.Mesh = False,
     panorama_out: o.PanoramaFile = None,
     device: o.DeviceOption = None,
 ) -> None:
     """Run the pipeline in one process, without a network."""
     panorama = parse_panorama_out(panorama_out)
-    if video:
-        require_encoder()
+    check_extras(video, rerun)
     capture = prepare(options)
     from client.commands.run import Run
     from client.display.output_folder import OutputWriter
@@ -106,7 +106,7 @@ def run(
         find_library()  # a missing library is an error before the frames, not after
     watch, light = Stopwatch(), None
     description = describe(capture.source, capture.total, capture.objects)
-    writing = OutputWriter(out, description, overwrite=overwrite, video=video)
+    writing = OutputWriter(out, description, overwrite=overwrite, video=video, rerun=rerun)
     with writing as writer, Run(capture, device, note) as pipeline:
         writer.note_device(pipeline.device)
         for output in track(pipeline.outputs(), capture.total):
@@ -149,6 +149,7 @@ def stream(
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="output folder")] = None,
     overwrite: o.Overwrite = False,
     video: o.VideoFileOption = False,
+    rerun: o.RerunOption = None,
     record: Annotated[Path | None, typer.Option(metavar="FILE", help="write all messages into a recording")] = None,
     lossless: Annotated[
         bool, typer.Option("--lossless", help="raw colour and exact depth; wait for every answer")
@@ -189,10 +190,9 @@ def stream(
         raise OptionError("--device: the server has the device; name it there with probeless serve --device")
     if mesh and out is None:
         raise OptionError("--mesh writes files: say where with --out")
-    if video and out is None:
-        raise OptionError("--video writes a file: say where with --out")
-    if video:
-        require_encoder()
+    if (video or rerun is not None) and out is None:
+        raise OptionError("--video and --rerun go with --out DIR; name a folder")
+    check_extras(video, rerun)
     refuse_depth_noise(depth_noise, lossless)
     refuse_color(color, lossless)
     panorama = parse_panorama_out(panorama_out)
@@ -218,6 +218,7 @@ def stream(
         sending=Sending(adapt, depth_noise, view, color == "h264"),
         overwrite=overwrite,
         video=video,
+        rerun=rerun,
     )
     written = f", written to {out}: open {out / PAGE_NAME} in a browser" if out is not None else ""
     speed = done.answered / done.seconds if done.seconds > 0 else 0.0

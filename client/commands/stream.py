@@ -112,6 +112,7 @@ def stream(
     console: Console | None = None,
     overwrite: bool = False,
     video: bool = False,
+    rerun: Path | None = None,
 ) -> StreamSummary:
     """Send `frames` of the source (default: all) to the server and write the answers into the folder `out`, if given.
 
@@ -119,6 +120,7 @@ def stream(
     soon as the window has room. `lossless` sends raw colour, waits for each answer, and receives exact pictures.
     `mesh` requests the scene's mesh after the last answer and writes it into `out`; `panorama` the light at a place.
     `record`: file for all messages. `overwrite`: `out` may hold an earlier run. `video`: write video.mp4 into `out`.
+    `rerun`: file of a recording for the rerun viewer, with `out`.
     `room`: the room to share. `access`: access options that the URL does not contain. `console`: default stderr.
     Raises ClientError, UserError, each with one line.
     """
@@ -131,7 +133,8 @@ def stream(
         writer = None
         if out is not None:
             total = None if job.frames.stop >= ENDLESS else len(job.frames)
-            writing = OutputWriter(out, describe(source, total, objects), overwrite=overwrite, video=video)
+            said = describe(source, total, objects)
+            writing = OutputWriter(out, said, overwrite=overwrite, video=video, rerun=rerun)
             writer = stack.enter_context(writing)
         statistics, progress = StreamStatistics(), _progress(console)
         view = stack.enter_context(StreamView(console, progress, statistics, job.sending.view))

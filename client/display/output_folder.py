@@ -23,6 +23,7 @@ from client.results.camera_pictures import encode_camera_picture
 from client.results.description import RunDescription
 from client.results.names import PAGE_NAME, VIDEO_NAME
 from client.results.page import ResultsPage
+from client.results.rerun_file import RerunFile
 from client.results.video_file import VideoFile
 from client.sources.poses import quaternion
 from protocol.messages import ArrivingLight, Light, MeshFormat
@@ -38,10 +39,16 @@ class OutputWriter:
     """Writes frames as they arrive; a context manager, whose end writes the page of what there is by then."""
 
     def __init__(
-        self, folder: Path, page: RunDescription | None = None, *, overwrite: bool = False, video: bool = False
+        self,
+        folder: Path,
+        page: RunDescription | None = None,
+        *,
+        overwrite: bool = False,
+        video: bool = False,
+        rerun: Path | None = None,
     ) -> None:
         """`page`: what the page says of the run; None: no page. `overwrite`: remove the files of an earlier run.
-        `video`: write video.mp4, which needs PyAV.
+        `video`: write video.mp4, which needs PyAV. `rerun`: write this recording, which needs rerun-sdk and `page`.
 
         Raises OutputError if the folder cannot be written, or holds an earlier run that may not be overwritten.
         """
@@ -53,6 +60,7 @@ class OutputWriter:
                 _refuse_earlier_run(folder)
             (folder / "frames").mkdir(parents=True, exist_ok=True)
             _remove_earlier_run(folder)
+            self._rerun = None if rerun is None or page is None else RerunFile(rerun, page)
             self._files = {name: (folder / name).open("w", encoding="utf-8", newline="\n") for name in _LINE_FILES}
         except OSError as error:
             raise _unwritable(folder, error) from error
@@ -76,6 +84,8 @@ class OutputWriter:
             raise _unwritable(self.folder, error) from error
         if self._video is not None:
             self._video.add(output.color, output.timestamp_s)
+        if self._rerun is not None:
+            self._rerun.add(output)
 
     def _write_camera_picture(self, output: FrameOutput) -> bool:
         """Write the camera's own picture where the composite is another one."""
@@ -94,9 +104,13 @@ class OutputWriter:
             raise _unwritable(self.folder, error) from error
         if self._page is not None:
             self._page.add_light(light)
+        if self._rerun is not None:
+            self._rerun.add_light(light)
 
     def write_mesh(self, files: Mapping[MeshFormat, bytes]) -> None:
         """Write mesh.ply and mesh.glb. Raises OutputError."""
+        if self._rerun is not None:
+            self._rerun.add_mesh(files)
         try:
             for format_, data in files.items():
                 (self.folder / f"mesh.{format_}").write_bytes(data)
@@ -110,6 +124,8 @@ class OutputWriter:
         """
         for file in self._files.values():
             file.close()
+        if self._rerun is not None and self._page is not None:
+            self._rerun.close(self._page.scan())
         has_video = self._video is not None and self._video.close()
         if self._page is not None and len(self._page):
             try:

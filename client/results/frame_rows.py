@@ -124,7 +124,8 @@ def _changed(output: FrameOutput) -> list[float] | None:
     Columns are shares of the width. None: there are no such pixels.
     """
     assert output.captured is not None
-    is_changed = cv2.absdiff(output.color, output.captured.color).max(2) > VISIBLE_CODES
+    red, green, blue = cv2.split(cv2.absdiff(output.color, output.captured.color))
+    is_changed = cv2.max(cv2.max(red, green), blue) > VISIBLE_CODES
     columns = np.count_nonzero(is_changed, 0).cumsum()
     if columns[-1] == 0:
         return None

@@ -17,7 +17,7 @@ from client.display.frame_output import FrameOutput
 from client.results.description import RunDescription
 from client.results.frame_rows import FrameRows
 from client.results.names import PAGE_NAME
-from client.results.point_cloud import PointCloud
+from client.results.point_cloud import ColoredPoints, PointCloud
 from protocol.messages import Light, Vector3
 
 PAGE = Path(__file__).parents[1] / "web" / "dist" / "results.html"
@@ -50,6 +50,10 @@ class ResultsPage:
         if output.captured is not None and output.tracking != "lost":
             self._cloud.add(output.captured, output.world_from_camera)
 
+    def scan(self) -> ColoredPoints | None:
+        """The scan so far; None: no depth was seen."""
+        return self._cloud.points()
+
     def add_light(self, light: Light) -> None:
         """Add a frame without a picture."""
         self._rows.add_light(light)
@@ -73,7 +77,7 @@ class ResultsPage:
         yield "]}"
 
     def _head(self, ended: str, video: str | None) -> dict[str, Any]:
-        said = self._description
+        said, scan = self._description, self.scan()
         camera = {name: getattr(said.camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
         return {
             "source": said.source,
@@ -86,7 +90,7 @@ class ResultsPage:
             "camera": camera,
             "up": self._up_direction(),
             "tables": self._rows.tables(),
-            "scan": self._cloud.packed(),
+            "scan": None if scan is None else scan.packed(),
         }
 
     def _up_direction(self) -> list[float]:

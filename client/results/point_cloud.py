@@ -50,6 +50,33 @@ class _Cells:
     """[n, 8] of x, y, z (world, metres), r, g, b (sRGB codes), number of points and number of frames."""
 
 
+@dataclass(frozen=True)
+class ColoredPoints:
+    """A point cloud."""
+
+    places_m: Floats
+    """[n, 3] world."""
+    colors: NDArray[np.uint8]
+    """[n, 3] sRGB codes."""
+    cell_m: float
+    """Distance of neighbours."""
+
+    def packed(self) -> dict[str, Any]:
+        """As the page reads it: `count`, `cell_m`, the box `least` and `most` (world, m), and base64 of [count, 3]:
+        `places`, little-endian uint16 where 0 and 65535 are the sides of the box, and `colors`, uint8 sRGB.
+        """
+        least, most = self.places_m.min(0), self.places_m.max(0)
+        steps = (self.places_m - least) / np.maximum(most - least, 1e-6) * 65535
+        return {
+            "count": len(steps),
+            "cell_m": round(self.cell_m, 5),
+            "least": [round(x, 4) for x in least.tolist()],
+            "most": [round(x, 4) for x in most.tolist()],
+            "places": _base64(steps.round().astype("<u2")),
+            "colors": _base64(self.colors),
+        }
+
+
 class PointCloud:
     """Gathers the points of frames."""
 
@@ -73,25 +100,14 @@ class PointCloud:
         if sum(map(len, self._pending)) > _PENDING:
             self._merge()
 
-    def packed(self) -> dict[str, Any] | None:
-        """The cloud: `count`, `cell_m`, the box `least` and `most` (world, metres), and base64 of [count, 3]: `places`,
-        little-endian uint16 where 0 and 65535 are the sides of the box, and `colors`, uint8 sRGB. None: no points.
-        """
+    def points(self) -> ColoredPoints | None:
+        """The cloud so far; None: there are no points."""
         self._merge()
         sums, cell_m = self._certain()
         if len(sums) == 0:
             return None
         means = sums[:, :6] / sums[:, 6:7]
-        least, most = means[:, :3].min(0), means[:, :3].max(0)
-        steps = (means[:, :3] - least) / np.maximum(most - least, 1e-6) * 65535
-        return {
-            "count": len(means),
-            "cell_m": round(cell_m, 5),
-            "least": [round(x, 4) for x in least.tolist()],
-            "most": [round(x, 4) for x in most.tolist()],
-            "places": _base64(steps.round().astype("<u2")),
-            "colors": _base64(means[:, 3:].round().astype(np.uint8)),
-        }
+        return ColoredPoints(means[:, :3], means[:, 3:].round().astype(np.uint8), cell_m)
 
     def _certain(self) -> tuple[Floats, float]:
         """Sums of the cells that are shown, and their size."""

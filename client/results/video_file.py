@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from client.errors import OptionError, OutputError
+from client.errors import OutputError
 
 TICKS_PER_S = 90_000
 """Time base of MPEG; every usual frame rate is a whole number of ticks."""
@@ -20,12 +19,6 @@ KEY_PICTURE_EVERY = 30
 """Pictures: so that a player finds each place quickly."""
 LONGEST_PAUSE_S = 5.0
 """A longer time between two frames is shown as this."""
-
-
-def require_encoder() -> None:
-    """Raises OptionError where PyAV is missing."""
-    if find_spec("av") is None:
-        raise OptionError("--video needs PyAV, which is not installed: make install-video, or pip install av")
 
 
 class VideoFile:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-
 import numpy as np
 import pytest
 
@@ -16,11 +14,9 @@ CAMERA = CameraModel(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5
 
 
 def places_of(cloud: PointCloud) -> np.ndarray:
-    packed = cloud.packed()
-    assert packed is not None
-    steps = np.frombuffer(base64.b64decode(packed["places"]), "<u2").reshape(packed["count"], 3)
-    least, most = np.array(packed["least"]), np.array(packed["most"])
-    return least + (most - least) * steps / 65535
+    points = cloud.points()
+    assert points is not None
+    return points.places_m
 
 
 def slope(shape: tuple[int, int] = (120, 160)) -> np.ndarray:
@@ -47,9 +43,9 @@ def test_a_depth_camera_of_its_own() -> None:
     color[:, :, 0] = np.arange(160)
     cloud = PointCloud(camera)
     cloud.add(Captured(color, np.full((60, 80), 1000, np.uint16)), np.eye(4))
-    places, packed = places_of(cloud), cloud.packed()
-    assert packed is not None
-    red = np.frombuffer(base64.b64decode(packed["colors"]), np.uint8).reshape(-1, 3)[:, 0]
+    places, points = places_of(cloud), cloud.points()
+    assert points is not None
+    red = points.colors[:, 0]
     assert np.abs(150 * places[:, 0] / places[:, 2] + 79.5 - red).max() < 1.6  # half a pixel, and a cell of 1.2 px
     assert places[:, 0].min() == pytest.approx(0.1 - 39.5 / 75, abs=0.02)
 
@@ -59,7 +55,7 @@ def test_what_is_not_measured_adds_nothing() -> None:
     color = np.zeros((120, 160, 3), np.uint8)
     for depth in (np.zeros((120, 160), np.uint16), np.full((120, 160), 65535, np.uint16), None):
         cloud.add(Captured(color, depth), np.eye(4))
-    assert cloud.packed() is None
+    assert cloud.points() is None
 
 
 def test_there_are_never_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,11 +66,11 @@ def test_there_are_never_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
         pose = np.eye(4)
         pose[0, 3] = step
         cloud.add(Captured(np.zeros((120, 160, 3), np.uint8), slope()), pose)
-    packed = cloud.packed()
-    assert packed is not None
-    assert 200 < packed["count"] <= 1000
-    assert packed["cell_m"] > 0.008
-    assert packed["most"][0] > 6  # what the last frame alone has seen is left out
+    points = cloud.points()
+    assert points is not None
+    assert 200 < len(points.places_m) <= 1000
+    assert points.cell_m > 0.008
+    assert points.places_m[:, 0].max() > 6  # what the last frame alone has seen is left out
 
 
 def test_what_moved_on_is_left_out() -> None:

@@ -9,7 +9,8 @@ import pytest
 
 from client.cli import run_command
 from client.errors import OptionError
-from client.results.video_file import VideoFile, require_encoder
+from client.results.extras import check_extras
+from client.results.video_file import VideoFile
 from tests.client.results_page import data_of, write_run, write_until
 
 av = pytest.importorskip("av")
@@ -72,9 +73,9 @@ def test_without_a_frame_there_is_no_video(tmp_path: Path) -> None:
 def test_without_the_extra_one_line_says_what_installs_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("client.results.video_file.find_spec", lambda _name: None)
+    monkeypatch.setattr("client.results.extras.find_spec", lambda _name: None)
     with pytest.raises(OptionError, match="make install-video, or pip install av"):
-        require_encoder()
+        check_extras(True, None)
     assert run_command(["run", "synthetic:table", "--out", str(tmp_path), "--video"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not list(tmp_path.iterdir())
@@ -101,4 +102,4 @@ def test_how_colour_is_sent_has_its_earlier_name_too(words: list[str], monkeypat
 
 def test_video_is_a_flag_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["stream", "synthetic:table", "--server", "http://127.0.0.1:9", "--video"]) == 2
-    assert "say where with --out" in capsys.readouterr().err
+    assert "go with --out DIR" in capsys.readouterr().err

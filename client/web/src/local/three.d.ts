@@ -141,6 +141,7 @@ declare module "three" {
   }
   export class WebGLRenderer {
     constructor(options: { canvas: HTMLCanvasElement | OffscreenCanvas; context?: WebGL2RenderingContext; antialias?: boolean });
+    getContext(): WebGL2RenderingContext;
     setPixelRatio(ratio: number): void;
     setSize(width: number, height: number, updateStyle: boolean): void;
     outputColorSpace: string;

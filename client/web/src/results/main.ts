@@ -5,6 +5,7 @@ import { Charts } from "./charts";
 import { setSplit, showNone, startCompare } from "./compare";
 import { readData, type FrameRow, type RunData } from "./data";
 import { Lights } from "./lights";
+import { Pace } from "./pace";
 import { showPlan } from "./plan";
 import { Player } from "./player";
 import { Space } from "./space";
@@ -24,12 +25,14 @@ function start(): void {
   const lights = new Lights(data, poses[0]!);
   const space = startSpace(data);
   const charts = new Charts(data, (index) => player.seek(index));
-  const player = new Player(data, (index) => {
-    const frame = data.frames[index]!;
-    lights.show(frame.lights, poses[index]!);
-    space?.show(frame);
+  const slow = [
+    new Pace((index) => lights.show(data.frames[index]!.lights, poses[index]!)),
+    ...(space === null ? [] : [new Pace((index) => space.show(data.frames[index]!))]),
+  ];
+  const player = new Player(data, (index, isPlaying) => {
     charts.show(index);
-    showPlan(data, frame.drawn);
+    showPlan(data, data.frames[index]!.drawn);
+    for (const each of slow) each.ask(index, isPlaying);
   });
   byId("modes").hidden = data.frames.every(({ drawn }) => drawn?.picture !== 2);
   const first = telling(data.frames);

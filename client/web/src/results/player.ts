@@ -30,10 +30,10 @@ export class Player {
   private asked = 0;
   private waitingSince = 0;
 
-  /** `onFrame`: called for each frame that is shown. */
+  /** `onFrame`: called for each frame that is shown, and where playing stops. */
   constructor(
     data: RunData,
-    private readonly onFrame: (index: number) => void,
+    private readonly onFrame: (index: number, isPlaying: boolean) => void,
   ) {
     this.frames = data.frames;
     this.times = showTimes(data.frames.map(({ time }) => time), data.fps);
@@ -64,7 +64,7 @@ export class Player {
     this.isPlaying = isPlaying;
     play.classList.toggle("playing", isPlaying);
     play.setAttribute("aria-label", isPlaying ? "Pause" : "Play");
-    if (!isPlaying) return;
+    if (!isPlaying) return this.onFrame(this.index, false);
     this.at = this.times[this.index]!;
     this.asked = performance.now();
     requestAnimationFrame(this.tick);
@@ -99,7 +99,7 @@ export class Player {
     scrub.setAttribute("aria-valuetext", text);
     const time = make("span", "", `${clock(this.times[index]!)} / ${clock(this.end)}`);
     where.replaceChildren(make("strong", "", `Frame ${frame.frame}`), " ", make("span", "", `${index + 1} of ${this.frames.length}`), " ", time);
-    this.onFrame(index);
+    this.onFrame(index, this.isPlaying);
     void this.draw(index);
     for (let next = 1; next <= this.pictures.ahead; next++) {
       for (const file of this.filesOf((index + next) % this.frames.length)) void this.pictures.load(file);

@@ -42,6 +42,7 @@ const KEY_TURN = Math.PI / 24;
 
 export class Space {
   private readonly renderer: WebGLRenderer;
+  private readonly gl: WebGL2RenderingContext;
   private readonly scene = new Scene();
   /** Holds what is in world axes; turned so that up is up. */
   private readonly world = new Group();
@@ -56,7 +57,8 @@ export class Space {
   private isThrough = false;
   /** Whether nobody has turned it since. */
   private isOverview = false;
-  private isAsked = false;
+  private drawing: Promise<void> | null = null;
+  private isVisible = false;
 
   /** Throws Error where the browser has no WebGL. */
   constructor(
@@ -64,6 +66,7 @@ export class Space {
     private readonly data: RunData,
   ) {
     this.renderer = new WebGLRenderer({ canvas, antialias: true });
+    this.gl = this.renderer.getContext();
     this.renderer.setClearColor(0x12161c, 1);
     const path = data.frames.flatMap(({ drawn }) => (drawn === null ? [] : [positionOf(drawn.pose)]));
     const places = data.scan === null ? null : placesOf(data.scan);
@@ -75,7 +78,7 @@ export class Space {
     this.size = Math.max(0.2, least.distanceTo(most));
     this.camera = new PerspectiveCamera(FOV_DEG, 1, 0.002 * this.size, 20 * this.size);
     this.controls = new OrbitControls(this.camera, canvas);
-    this.controls.addEventListener("change", () => this.redraw());
+    this.controls.addEventListener("change", () => void this.redraw());
     this.controls.addEventListener("start", () => {
       this.leaveCamera();
       this.isOverview = false;
@@ -84,6 +87,10 @@ export class Space {
     if (path.length > 1) this.world.add(pathOf(path));
     this.frustum = frustumOf(data.camera, FRUSTUM * this.size);
     this.world.add(this.frustum);
+    new IntersectionObserver(([entry]) => {
+      this.isVisible = entry?.isIntersecting ?? true;
+      void this.redraw();
+    }).observe(canvas);
     new ResizeObserver(() => this.fit()).observe(canvas);
     canvas.addEventListener("keydown", (event) => this.onKey(event));
     this.overview();
@@ -92,15 +99,15 @@ export class Space {
   /** Called with whether the view is the camera's, when that changes. */
   onThrough: (isThrough: boolean) => void = () => {};
 
-  /** Show where the camera stands and the light of a frame. */
-  show({ drawn, lights }: FrameRow): void {
+  /** Show where the camera stands and the light of a frame; resolves when that is drawn, or nobody would see it. */
+  show({ drawn, lights }: FrameRow): Promise<void> {
     this.pose = drawn?.pose ?? null;
     this.frustum.visible = this.pose !== null && drawn?.tracking !== "lost" && !this.isThrough;
     if (this.pose !== null) setPose(this.frustum, this.pose);
     for (const [place, ball] of this.balls) ball.group.visible = lights.some((light) => light.place === place);
     for (const light of lights) this.showLight(light);
     if (this.isThrough) this.lookThrough();
-    this.redraw();
+    return this.redraw();
   }
 
   /** All of the scan, from behind and above the first camera. */
@@ -121,7 +128,7 @@ export class Space {
     this.camera.position.copy(target).add(away.multiplyScalar(distance));
     this.controls.update();
     this.isOverview = true;
-    this.redraw();
+    void this.redraw();
   }
 
   /** Look through the camera of the frame that is shown, and follow it. */
@@ -130,7 +137,7 @@ export class Space {
     this.isOverview = false;
     this.onThrough(true);
     this.lookThrough();
-    this.redraw();
+    void this.redraw();
   }
 
   private leaveCamera(): void {
@@ -195,7 +202,7 @@ export class Space {
     from.set(Math.sin(polar) * Math.sin(angle), Math.cos(polar), Math.sin(polar) * Math.cos(angle));
     this.camera.position.copy(this.controls.target).add(from.multiplyScalar(distance));
     this.controls.update();
-    this.redraw();
+    void this.redraw();
   }
 
   private fit(): void {
@@ -206,19 +213,28 @@ export class Space {
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
     if (this.isOverview) this.overview();
-    this.redraw();
+    void this.redraw();
   }
 
-  /** Draw before the next repaint, once however often it was asked for. */
-  private redraw(): void {
-    if (this.isAsked) return;
-    this.isAsked = true;
-    requestAnimationFrame(() => {
-      this.isAsked = false;
-      this.renderer.render(this.scene, this.camera);
-    });
+  /** Draw before the next repaint, once however often it was asked for; resolves when it is drawn. */
+  private redraw(): Promise<void> {
+    if (!this.isVisible) return Promise.resolve();
+    return (this.drawing ??= this.drawOnce());
+  }
+
+  private async drawOnce(): Promise<void> {
+    await nextFrame();
+    this.drawing = null; // what is asked for from now on is drawn again
+    this.renderer.render(this.scene, this.camera);
+    const sync = this.gl.fenceSync(this.gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    if (sync === null) return;
+    this.gl.flush();
+    while (this.gl.getSyncParameter(sync, this.gl.SYNC_STATUS) === this.gl.UNSIGNALED) await nextFrame();
+    this.gl.deleteSync(sync);
   }
 }
+
+const nextFrame = (): Promise<unknown> => new Promise((done) => requestAnimationFrame(done));
 
 /** A matt white ball in the light of a place, and an arrow from where most light comes. */
 class Ball {

@@ -3,7 +3,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 DATA ?= ../shared/data
 
-.PHONY: mutation-check help install install-all install-bench install-cluster install-devices install-oak install-video demo \
+.PHONY: mutation-check help install install-all install-bench install-cluster install-devices install-oak install-rerun \
+	install-video demo \
 	test test-all test-rest test-slow test-second-device slow-list lint bench check-races web package lock clean
 help:
 	@echo "make demo      the main job: server, streaming client, pictures in out/demo"
@@ -15,7 +16,8 @@ help:
 	@echo "make package   the npm package of client/web, into out"
 	@echo "make check-races   the kernels in a simulator that finds data races (downloads it)"
 	@echo "make install   the program alone, as .venv/bin/probeless; with an extra: install-oak (reads an OAK camera),"
-	@echo "               install-video (H.264), install-cluster (Ray Serve, for many machines), install-bench,"
+	@echo "               install-video (H.264), install-rerun (recordings for its viewer), install-bench,"
+	@echo "               install-cluster (Ray Serve, for many machines),"
 	@echo "               install-devices (Intel's OpenCL for processors, as a second device), install-all"
 
 install: .venv/installed
@@ -24,6 +26,7 @@ install-bench: .venv/installed-bench
 install-cluster: .venv/installed-cluster
 install-devices: .venv/installed-devices
 install-oak: .venv/installed-oak
+install-rerun: .venv/installed-rerun
 install-video: .venv/installed-video
 
 demo: .venv/installed
@@ -109,8 +112,10 @@ lock: .venv/installed-test
 		--constraint requirements.lock pyproject.toml -o requirements-oak.lock
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh --extra video \
 		--constraint requirements-test.lock pyproject.toml -o requirements-video.lock
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh --extra rerun \
+		--constraint requirements-test.lock pyproject.toml -o requirements-rerun.lock
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --all-extras \
-		$(patsubst %,--constraint requirements%,.lock -test.lock -bench.lock -cluster.lock -oak.lock -video.lock) \
+		$(patsubst %,--constraint requirements%,.lock -test.lock -bench.lock -cluster.lock -oak.lock -video.lock -rerun.lock) \
 		pyproject.toml -o requirements-all.lock
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh --extra devices \
 		--constraint requirements-all.lock pyproject.toml -o requirements-devices.lock
@@ -131,6 +136,10 @@ lock: .venv/installed-test
 
 .venv/installed-oak: requirements-oak.lock .venv/installed
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-oak.lock
+	@touch $@
+
+.venv/installed-rerun: requirements-rerun.lock .venv/installed
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-rerun.lock
 	@touch $@
 
 .venv/installed-video: requirements-video.lock .venv/installed

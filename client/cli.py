@@ -13,10 +13,12 @@ import typer
 from client.display.light_words import light_lines
 from client.errors import OptionError
 from client.options import capture_options as o
-from client.options.capture import prepare, refuse_depth_noise, refuse_video
+from client.options.capture import prepare, refuse_color, refuse_depth_noise
 from client.options.capture_options import CaptureOptions, capturing
 from client.options.light_places import parse_panorama_out, write_panorama
 from client.progress import Stopwatch, note, progress_bar, say, track
+from client.results.extras import check_extras
+from client.results.names import PAGE_NAME
 from protocol.messages import Light
 
 USAGE_STATUS, FAILURE_STATUS, INTERRUPTED_STATUS = 2, 1, 130
@@ -32,8 +34,14 @@ app = typer.Typer(
 
 def main() -> None:
     """Entry point: run the command; every error is one line."""
-    arguments = [word for word in sys.argv[1:] if word != "--debug"]
+    arguments = _renamed([word for word in sys.argv[1:] if word != "--debug"])
     sys.exit(run_command(arguments, debug="--debug" in sys.argv[1:]))
+
+
+def _renamed(arguments: list[str]) -> list[str]:
+    """The arguments with `--video h264` as `--color h264`, its name since `--video` writes a file."""
+    joined = "\0".join(arguments).replace("--video\0h264", "--color\0h264").replace("--video=h264", "--color=h264")
+    return joined.split("\0") if arguments else []
 
 
 def run_command(arguments: list[str], debug: bool = False) -> int:
@@ -77,22 +85,30 @@ def common(
 def run(
     options: CaptureOptions,
     out: Annotated[Path, typer.Option(metavar="DIR", help="output folder")],
+    overwrite: o.Overwrite = False,
+    video: o.VideoFileOption = False,
+    rerun: o.RerunOption = None,
     mesh: o.Mesh = False,
     panorama_out: o.PanoramaFile = None,
     device: o.DeviceOption = None,
 ) -> None:
     """Run the pipeline in one process, without a network."""
     panorama = parse_panorama_out(panorama_out)
+    check_extras(video, rerun)
     capture = prepare(options)
     from client.commands.run import Run
     from client.display.output_folder import OutputWriter
+    from client.results.description import describe
 
     if mesh:
         from server.meshing.surface import find_library
 
         find_library()  # a missing library is an error before the frames, not after
     watch, light = Stopwatch(), None
-    with OutputWriter(out) as writer, Run(capture, device, note) as pipeline:
+    description = describe(capture.source, capture.total, capture.objects)
+    writing = OutputWriter(out, description, overwrite=overwrite, video=video, rerun=rerun)
+    with writing as writer, Run(capture, device, note) as pipeline:
+        writer.note_device(pipeline.device)
         for output in track(pipeline.outputs(), capture.total):
             writer.write(output)
             watch.frames += 1
@@ -102,7 +118,7 @@ def run(
                 writer.write_mesh(pipeline.mesh(progress))
         if panorama is not None:
             write_panorama(panorama.path, pipeline.panorama(panorama.format, panorama.position_m))
-    say(f"{watch.summary()}, written to {out}")
+    say(f"{watch.summary()}, written to {out}: open {out / PAGE_NAME} in a browser")
     _say_light(light)
 
 
@@ -131,6 +147,9 @@ def stream(
         str, typer.Option(metavar="URL", help="as the server prints it: http://localhost:8080/?token=...")
     ],
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="output folder")] = None,
+    overwrite: o.Overwrite = False,
+    video: o.VideoFileOption = False,
+    rerun: o.RerunOption = None,
     record: Annotated[Path | None, typer.Option(metavar="FILE", help="write all messages into a recording")] = None,
     lossless: Annotated[
         bool, typer.Option("--lossless", help="raw colour and exact depth; wait for every answer")
@@ -140,8 +159,11 @@ def stream(
         float | None,
         typer.Option(metavar="M", help="noise of the sensor at 1 m; depth may be rounded by this times z^2"),
     ] = None,
-    video: Annotated[
-        str | None, typer.Option(metavar="h264", help="colour as video instead of JPEG; both sides need PyAV")
+    color: Annotated[
+        str | None,
+        typer.Option(
+            metavar="jpeg|h264", help="how colour is sent; h264: as video, both sides need PyAV; default: jpeg"
+        ),
     ] = None,
     answer: Annotated[
         str | None,
@@ -168,8 +190,11 @@ def stream(
         raise OptionError("--device: the server has the device; name it there with probeless serve --device")
     if mesh and out is None:
         raise OptionError("--mesh writes files: say where with --out")
+    if (video or rerun is not None) and out is None:
+        raise OptionError("--video and --rerun go with --out DIR; name a folder")
+    check_extras(video, rerun)
     refuse_depth_noise(depth_noise, lossless)
-    refuse_video(video, lossless)
+    refuse_color(color, lossless)
     panorama = parse_panorama_out(panorama_out)
     capture = prepare(options, lossless=lossless, answer=answer)
     from client.commands.stream import Sending
@@ -190,9 +215,12 @@ def stream(
         panorama=panorama,
         room=room_place(room, room_from_world, marker, room_key),
         access=Access(token, tls_fingerprint, tls_ca),
-        sending=Sending(adapt, depth_noise, view, video is not None),
+        sending=Sending(adapt, depth_noise, view, color == "h264"),
+        overwrite=overwrite,
+        video=video,
+        rerun=rerun,
     )
-    written = f", written to {out}" if out is not None else ""
+    written = f", written to {out}: open {out / PAGE_NAME} in a browser" if out is not None else ""
     speed = done.answered / done.seconds if done.seconds > 0 else 0.0
     say(
         f"{done.answered} frames answered in {done.seconds:.1f} s ({speed:.1f} frames/s), {done.skipped} skipped, "

@@ -12,6 +12,7 @@ from client.commands.stream import StreamSummary, stream
 from client.objects.object_file import ObjectFile
 from client.options.source import open_source
 from client.progress import say
+from client.results.names import PAGE_NAME
 from client.sources.frame_source import Source
 from client.sources.volume import default_volume, default_voxel
 from protocol.messages import Wishes
@@ -43,7 +44,7 @@ def run_demo(out: Path, device_name: str | None, keep: bool, port: int = 0) -> N
     with _prepared(FRAMES) as demo, BackgroundServer(service, port=port, authenticator=authenticator) as server:
         say(f"watch it at {server.way_in}")
         done = _stream(demo, server.way_in, out)
-        say(f"{done.answered} frames in {done.seconds:.1f} s, pictures in {out / 'frames'}")
+        say(f"{done.answered} frames in {done.seconds:.1f} s, pictures in {out / 'frames'}, open {out / PAGE_NAME}")
         if keep:
             say(f"still streaming to {server.way_in}; end with Ctrl-C")
             with _prepared(FRAMES_TO_WATCH) as endless:
@@ -52,7 +53,7 @@ def run_demo(out: Path, device_name: str | None, keep: bool, port: int = 0) -> N
 
 
 def _stream(demo: Demo, url: str, out: Path | None) -> StreamSummary:
-    return stream(demo.source, url, demo.objects, demo.wishes, out, realtime=out is None)
+    return stream(demo.source, url, demo.objects, demo.wishes, out, realtime=out is None, overwrite=True)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Protocol
 
 from client.commands.stopping import stop_on_interrupt
-from client.display.output_folder import FrameOutput
+from client.display.frame_output import FrameOutput, captured_of
 from client.errors import RunError
 from client.objects.in_view import ObjectsInView
 from client.objects.object_file import object_id
@@ -51,7 +51,7 @@ class Run:
         in_view = ObjectsInView(source.camera, objects, [object_id(number) for number in range(len(objects))])
         with stop_on_interrupt(is_live(source)) as stopping:
             positions = takewhile(lambda _: not stopping.is_set(), self._capture.frames)
-            for output in process_frames(self._pipeline, (source[i] for i in positions)):
+            for output in process_frames(self._pipeline, (source[i] for i in positions), source.camera):
                 self._tell(output.notes)
                 in_view.note(output.light, output.world_from_camera)
                 yield output
@@ -62,6 +62,11 @@ class Run:
             if line not in self._told:
                 self._told.add(line)
                 self._note(line)
+
+    @property
+    def device(self) -> str:
+        """Name of the OpenCL device."""
+        return self._pipeline.device_name
 
     def mesh(self, progress: Callable[[int, int], None]) -> dict[MeshFormat, bytes]:
         """Mesh files of the surface fused so far; `progress` receives parts done and total. Raises MeshingError."""
@@ -83,8 +88,8 @@ class Run:
         self._pipeline.close()
 
 
-def process_frames(pipeline: Processor, frames: Iterable[RgbdFrame]) -> Iterator[FrameOutput]:
-    """The output of each frame. Raises RunError with the number of a frame that the pipeline refuses."""
+def process_frames(pipeline: Processor, frames: Iterable[RgbdFrame], camera: CameraModel) -> Iterator[FrameOutput]:
+    """The output of each frame of this camera. Raises RunError with the number of a frame that the pipeline refuses."""
     for frame in frames:
         try:
             result = pipeline.process(frame)
@@ -101,6 +106,7 @@ def process_frames(pipeline: Processor, frames: Iterable[RgbdFrame]) -> Iterator
             timings=result.timings,
             plan=result.plan,
             notes=result.notes,
+            captured=captured_of(frame, camera),
         )
 
 

@@ -18,21 +18,23 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from client.commands.stopping import stop_on_interrupt
-from client.display.layers import decode_layer, put_over, shown_picture
-from client.display.output_folder import FrameOutput, OutputWriter
+from client.display.frame_output import FrameOutput, captured_of
+from client.display.layers import decode_layer, put_over
+from client.display.output_folder import OutputWriter
 from client.display.stream_statistics import STAGES, StreamStatistics
 from client.display.stream_view import StreamView
 from client.errors import OutputError, SourceError
 from client.objects.in_view import ObjectsInView
 from client.objects.object_file import ObjectFile, object_id, pack_mesh
 from client.options.light_places import PanoramaOut, write_panorama
+from client.results.description import describe
 from client.sources.frame_source import ENDLESS, Source, is_live
 from client.streaming.adaptive import Adaptive, AnsweredFrame
 from client.streaming.client import Access, Answer, ClientError, RoomPlace, StreamClient
 from client.streaming.coding import Coding, picture_bytes
 from client.streaming.video import IS_POSSIBLE, VideoEncoder
-from protocol.frames import CameraModel
-from protocol.images import Color, decode_color
+from protocol.frames import CameraModel, RgbdFrame
+from protocol.images import decode_color
 from protocol.messages import (
     ClientMessage,
     Dropped,
@@ -49,6 +51,9 @@ from protocol.recording import write_message
 
 POLL_S = 0.002
 """Interval of checking whether the next frame of a live source may be sent."""
+
+MOST_CAPTURED = 64
+"""Frames kept until they are answered; more have been lost with a connection."""
 
 
 @dataclass
@@ -106,13 +111,17 @@ def stream(
     access: Access | None = None,
     sending: Sending | None = None,
     console: Console | None = None,
+    overwrite: bool = False,
+    video: bool = False,
+    rerun: Path | None = None,
 ) -> StreamSummary:
     """Send `frames` of the source (default: all) to the server and write the answers into the folder `out`, if given.
 
     `realtime` keeps the source's frame rate and skips frames while the server is busy; otherwise every frame is sent as
     soon as the window has room. `lossless` sends raw colour, waits for each answer, and receives exact pictures.
     `mesh` requests the scene's mesh after the last answer and writes it into `out`; `panorama` the light at a place.
-    `record`: file for all messages.
+    `record`: file for all messages. `overwrite`: `out` may hold an earlier run. `video`: write video.mp4 into `out`.
+    `rerun`: file of a recording for the rerun viewer, with `out`.
     `room`: the room to share. `access`: access options that the URL does not contain. `console`: default stderr.
     Raises ClientError, UserError, each with one line.
     """
@@ -122,7 +131,12 @@ def stream(
     console = console or Console(stderr=True)
     with _recorder(record) as tap, contextlib.ExitStack() as stack:
         stopping = stack.enter_context(stop_on_interrupt(is_live(source)))
-        writer = stack.enter_context(OutputWriter(out)) if out is not None else None
+        writer = None
+        if out is not None:
+            total = None if job.frames.stop >= ENDLESS else len(job.frames)
+            said = describe(source, total, objects)
+            writing = OutputWriter(out, said, overwrite=overwrite, video=video, rerun=rerun)
+            writer = stack.enter_context(writing)
         statistics, progress = StreamStatistics(), _progress(console)
         view = stack.enter_context(StreamView(console, progress, statistics, job.sending.view))
         return asyncio.run(_Stream(job, writer, progress, stopping, statistics, view).run(tap))
@@ -165,8 +179,8 @@ class _Stream:
         self._fixed = Coding(depth_noise_per_m=job.sending.depth_noise_per_m)
         self._in_flight: dict[int, tuple[float, int]] = {}
         """Frame number -> time of sending and bytes, for unanswered frames."""
-        self._pictures: dict[int, Color] = {}
-        """Camera pictures of unanswered frames; layers are composed over them."""
+        self._captured: dict[int, RgbdFrame] = {}
+        """Unanswered frames; layers are composed over their pictures, and the page of results shows them."""
         self._last_sent_s = -math.inf
         self._began_s = 0.0
         total = None if job.frames.stop >= ENDLESS else len(job.frames)
@@ -199,6 +213,8 @@ class _Stream:
     def _note_welcome(self, welcome: Welcome) -> None:
         self._summary.server, self._summary.device = welcome.server, welcome.device
         self._summary.session = welcome.session
+        if self._writer is not None:
+            self._writer.note_device(welcome.device)
 
     async def _place_objects(self, client: StreamClient, meshes: list[tuple[ObjectFormat, bytes]]) -> None:
         prefix = "" if self._job.room is None else f"{self._summary.session}-"
@@ -279,8 +295,10 @@ class _Stream:
         sent_s = self._last_sent_s = time.perf_counter()
         size = picture_bytes(message)
         self._in_flight[frame.index] = sent_s, size
-        if self._job.wishes.answer == "layer":
-            self._pictures[frame.index] = frame.color
+        if self._writer is not None or self._job.wishes.answer == "layer":
+            self._captured[frame.index] = frame
+            if len(self._captured) > MOST_CAPTURED:
+                del self._captured[next(iter(self._captured))]
         self._statistics.note_sent(frame.index, captured_s, sent_s, size)
         await client.send_encoded(message)
         self._summary.sent += 1
@@ -345,7 +363,7 @@ class _Stream:
 
     def _write_answer(self, answer: Answer) -> NDArray[np.uint8] | None:
         """Write an answer if there is a folder. Returns its picture if that was decoded."""
-        own = self._pictures.pop(answer.light.frame, None)
+        own = self._captured.pop(answer.light.frame, None)
         if answer.drawn is None:
             if self._writer is not None:
                 self._writer.write_light(answer.light)
@@ -373,7 +391,7 @@ class _Stream:
             raise ClientError(f"frame {dropped.frame}: {dropped.reason}")
         self._summary.dropped += 1
         self._in_flight.pop(dropped.frame, None)
-        self._pictures.pop(dropped.frame, None)
+        self._captured.pop(dropped.frame, None)
         self._statistics.forget(dropped.frame)
         self._print_once(f"frame {dropped.frame}: {dropped.reason}")
         self._advance()
@@ -393,10 +411,10 @@ def open_video(welcome: Welcome) -> VideoEncoder:
     """Encoder of colour. Raises ClientError if the server or this client lacks PyAV."""
     if "h264" not in welcome.codecs:
         raise ClientError(
-            f"{welcome.server} reads no H.264 (it lacks PyAV: make install-video there); leave out --video"
+            f"{welcome.server} reads no H.264 (it lacks PyAV: make install-video there); leave out --color"
         )
     if not IS_POSSIBLE:
-        raise ClientError("--video h264 needs PyAV, which is not installed: make install-video, or pip install av")
+        raise ClientError("--color h264 needs PyAV, which is not installed: make install-video, or pip install av")
     return VideoEncoder()
 
 
@@ -407,16 +425,17 @@ def _adaptive(job: _Job, delay_s: float) -> Adaptive | None:
     return Adaptive(1 / job.source.fps, delay_s, job.sending.depth_noise_per_m)
 
 
-def frame_output(answer: Answer, camera: CameraModel, own: Color | None = None) -> FrameOutput:
-    """An answer for the output folder: its decoded picture, or its layer composed over the frame's picture `own`.
+def frame_output(answer: Answer, camera: CameraModel, own: RgbdFrame | None = None) -> FrameOutput:
+    """An answer for the output folder: its decoded picture, or its layer composed over the picture of its frame `own`.
 
     Raises ProtocolError if it cannot be decoded.
     """
     drawn = answer.drawn
     assert drawn is not None
+    captured = None if own is None else captured_of(own, camera)
     if isinstance(drawn, Layer):
-        assert own is not None
-        color = put_over(decode_layer(drawn, camera), shown_picture(own, camera), camera)
+        assert captured is not None
+        color = put_over(decode_layer(drawn, camera), captured.color, camera)
     else:
         color = np.asarray(decode_color(drawn.color, camera, "srgb8"), np.uint8)
     return FrameOutput(
@@ -429,6 +448,7 @@ def frame_output(answer: Answer, camera: CameraModel, own: Color | None = None) 
         timings=drawn.timings,
         plan=drawn.plan,
         notes=drawn.notes,
+        captured=captured,
     )
 
 

@@ -1,4 +1,4 @@
-"""Output folder of `run` and `stream`: pictures, lights, trajectory, timings and the scene's mesh.
+"""Output folder of `run` and `stream`: pictures, lights, trajectory, timings, the scene's mesh, and a page of it all.
 
 Equal inputs give equal bytes: PNG parameters and JSON separators are fixed, floats are the shortest of Python.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TextIO
@@ -18,47 +17,58 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from client.errors import OutputError
+from client.display.frame_output import FrameOutput
+from client.errors import OutputError, UserError
+from client.results.camera_pictures import encode_camera_picture
+from client.results.description import RunDescription
+from client.results.names import PAGE_NAME, VIDEO_NAME
+from client.results.page import ResultsPage
+from client.results.rerun_file import RerunFile
+from client.results.video_file import VideoFile
 from client.sources.poses import quaternion
-from protocol.messages import ArrivingLight, Light, MeshFormat, Plan, Timings
+from protocol.messages import ArrivingLight, Light, MeshFormat
 
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 3, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT)
 _LINE_FILES = ("light.jsonl", "trajectory.txt", "timings.jsonl")
-_MESH_FILES = ("mesh.ply", "mesh.glb")
-_OWN_PICTURE = re.compile(r"\d{6,}\.png")
-
-
-@dataclass(frozen=True)
-class FrameOutput:
-    """Results of one frame."""
-
-    frame: int
-    """Position in the source; names the picture."""
-    timestamp_s: float
-    color: NDArray[np.uint8]
-    """[height, width, 3] composite, 8-bit sRGB."""
-    light: Light
-    world_from_camera: NDArray[np.float64]
-    """[4, 4] metres."""
-    tracking: str
-    """given, tracked or lost."""
-    timings: Timings
-    plan: Plan
-    notes: tuple[str, ...] = ()
+_WHOLE_FILES = ("mesh.ply", "mesh.glb", PAGE_NAME, VIDEO_NAME)
+_PICTURES = {"frames": re.compile(r"\d{6,}\.png"), "camera": re.compile(r"\d{6,}\.jpg")}
+"""Folder -> names of the pictures in it that are ours."""
 
 
 class OutputWriter:
-    """Writes frames as they arrive; a context manager. Results of an earlier run in the folder are replaced."""
+    """Writes frames as they arrive; a context manager, whose end writes the page of what there is by then."""
 
-    def __init__(self, folder: Path) -> None:
-        """Raises OutputError if the folder cannot be written."""
+    def __init__(
+        self,
+        folder: Path,
+        page: RunDescription | None = None,
+        *,
+        overwrite: bool = False,
+        video: bool = False,
+        rerun: Path | None = None,
+    ) -> None:
+        """`page`: what the page says of the run; None: no page. `overwrite`: remove the files of an earlier run.
+        `video`: write video.mp4, which needs PyAV. `rerun`: write this recording, which needs rerun-sdk and `page`.
+
+        Raises OutputError if the folder cannot be written, or holds an earlier run that may not be overwritten.
+        """
         self.folder = folder
+        self._page = None if page is None else ResultsPage(page)
+        self._video = VideoFile(folder / VIDEO_NAME, 0.0 if page is None else page.fps) if video else None
         try:
+            if not overwrite:
+                _refuse_earlier_run(folder)
             (folder / "frames").mkdir(parents=True, exist_ok=True)
             _remove_earlier_run(folder)
+            self._rerun = None if rerun is None or page is None else RerunFile(rerun, page)
             self._files = {name: (folder / name).open("w", encoding="utf-8", newline="\n") for name in _LINE_FILES}
         except OSError as error:
             raise _unwritable(folder, error) from error
+
+    def note_device(self, name: str) -> None:
+        """Name of the OpenCL device, for the page."""
+        if self._page is not None:
+            self._page.device = name
 
     def write(self, output: FrameOutput) -> None:
         """Write one frame. Raises OutputError if the disk refuses or a number is not finite."""
@@ -68,8 +78,23 @@ class OutputWriter:
             self._line("light.jsonl", _json(light_row(output.light), output.frame))
             self._line("trajectory.txt", trajectory_row(output.timestamp_s, output.world_from_camera))
             self._line("timings.jsonl", _json(timings_row(output), output.frame))
+            if self._page is not None:
+                self._page.add(output, self._write_camera_picture(output))
         except OSError as error:
             raise _unwritable(self.folder, error) from error
+        if self._video is not None:
+            self._video.add(output.color, output.timestamp_s)
+        if self._rerun is not None:
+            self._rerun.add(output)
+
+    def _write_camera_picture(self, output: FrameOutput) -> bool:
+        """Write the camera's own picture where the composite is another one."""
+        if output.captured is None or np.array_equal(output.captured.color, output.color):
+            return False
+        folder = self.folder / "camera"
+        folder.mkdir(exist_ok=True)
+        (folder / f"{output.frame:06d}.jpg").write_bytes(encode_camera_picture(output.captured.color))
+        return True
 
     def write_light(self, light: Light) -> None:
         """Write the light of a frame without a picture. Raises OutputError."""
@@ -77,18 +102,36 @@ class OutputWriter:
             self._line("light.jsonl", _json(light_row(light), light.frame))
         except OSError as error:
             raise _unwritable(self.folder, error) from error
+        if self._page is not None:
+            self._page.add_light(light)
+        if self._rerun is not None:
+            self._rerun.add_light(light)
 
     def write_mesh(self, files: Mapping[MeshFormat, bytes]) -> None:
         """Write mesh.ply and mesh.glb. Raises OutputError."""
+        if self._rerun is not None:
+            self._rerun.add_mesh(files)
         try:
             for format_, data in files.items():
                 (self.folder / f"mesh.{format_}").write_bytes(data)
         except OSError as error:
             raise _unwritable(self.folder, error) from error
 
-    def close(self) -> None:
+    def close(self, ended: str = "") -> None:
+        """Write the page, if there is a frame, and close all files; `ended`: "" or why the run ended early.
+
+        Raises OutputError.
+        """
         for file in self._files.values():
             file.close()
+        if self._rerun is not None and self._page is not None:
+            self._rerun.close(self._page.scan())
+        has_video = self._video is not None and self._video.close()
+        if self._page is not None and len(self._page):
+            try:
+                self._page.write(self.folder, ended, VIDEO_NAME if has_video else None)
+            except OSError as error:
+                raise _unwritable(self.folder, error) from error
 
     def _line(self, name: str, text: str) -> None:
         file: TextIO = self._files[name]
@@ -101,7 +144,11 @@ class OutputWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        try:
+            self.close(_why(error))
+        except OutputError:
+            if error is None:  # or the error before it is the one to tell
+                raise
 
 
 def encode_png(color: NDArray[np.uint8]) -> bytes:
@@ -172,15 +219,33 @@ def _json(row: dict[str, Any], frame: int) -> str:
         raise OutputError(f"frame {frame}: a number is NaN or infinite and was not written") from error
 
 
+def _why(error: BaseException | None) -> str:
+    """Why a run ended early, in one line; "" if it did not."""
+    if error is None:
+        return ""
+    if isinstance(error, UserError):
+        return " ".join(str(error).split())
+    return "interrupted" if isinstance(error, KeyboardInterrupt) else "stopped by an error"
+
+
+def _refuse_earlier_run(folder: Path) -> None:
+    """Raises OutputError if the folder holds the results of a run; what was begun and has no frame is none."""
+    if any((folder / name).is_file() and (folder / name).stat().st_size > 0 for name in _LINE_FILES):
+        raise OutputError(
+            f"{folder}: holds an earlier run; name another folder with --out, or replace what is in it with --overwrite"
+        )
+
+
 def _remove_earlier_run(folder: Path) -> None:
-    """Remove pictures and meshes of an earlier, perhaps longer run, which could be mistaken for new ones."""
+    """Remove files of an earlier, perhaps longer run, which could be mistaken for new ones."""
     if not (folder / "light.jsonl").is_file():
         return
-    for name in _MESH_FILES:
+    for name in _WHOLE_FILES:
         (folder / name).unlink(missing_ok=True)
-    for picture in (folder / "frames").iterdir():
-        if _OWN_PICTURE.fullmatch(picture.name):
-            picture.unlink()
+    for where, names in _PICTURES.items():
+        for picture in (folder / where).iterdir() if (folder / where).is_dir() else ():
+            if names.fullmatch(picture.name):
+                picture.unlink()
 
 
 def _unwritable(folder: Path, error: OSError) -> OutputError:

@@ -130,17 +130,17 @@ def refuse_depth_noise(noise_per_m: float | None, lossless: bool) -> None:
         raise OptionError("--depth-noise rounds depth and --lossless keeps every bit; leave one out")
 
 
-def refuse_video(codec: str | None, lossless: bool) -> None:
+def refuse_color(codec: str | None, lossless: bool) -> None:
     """Raise OptionError for an unknown codec, one that cannot be encoded here, or together with `--lossless`."""
     from client.streaming.video import IS_POSSIBLE
 
     if codec is None:
         return
-    choice("--video", codec, ("h264",))
+    choice("--color", codec, ("jpeg", "h264"))
     if lossless:
-        raise OptionError("--video loses a little of each picture and --lossless keeps every bit; leave one out")
-    if not IS_POSSIBLE:
-        raise OptionError("--video h264 needs PyAV, which is not installed: make install-video, or pip install av")
+        raise OptionError("--color loses a little of each picture and --lossless keeps every bit; leave one out")
+    if codec == "h264" and not IS_POSSIBLE:
+        raise OptionError("--color h264 needs PyAV, which is not installed: make install-video, or pip install av")
 
 
 def parse_frames(text: str | None, count: int) -> range:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import typer
@@ -117,6 +118,12 @@ Plan = Annotated[
 Cache = Annotated[
     str | None,
     typer.Option(metavar="on|off", help="off: nothing is kept at places of the world, to compare; default: on"),
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace an earlier run in the output folder")]
+VideoFileOption = Annotated[bool, typer.Option("--video", help="write video.mp4 (H.264); needs PyAV")]
+RerunOption = Annotated[
+    Path | None,
+    typer.Option("--rerun", metavar="FILE.rrd", help="recording for the rerun viewer; needs rerun-sdk"),
 ]
 Mesh = Annotated[bool, typer.Option("--mesh", help="write mesh.ply and mesh.glb")]
 BudgetMs = Annotated[float | None, typer.Option(metavar="N", help="choose the operating point for this frame time")]

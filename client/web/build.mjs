@@ -1,4 +1,4 @@
-// `node build.mjs [FOLDER]` bundles the page into FOLDER (default dist); `--tests` bundles the tests into .test, `--library`
+// `node build.mjs [FOLDER]` bundles the pages into FOLDER (default dist); `--tests` bundles the tests into .test, `--library`
 // what the npm package offers into lib; `--types` finishes the types that tsc has put there.
 // The same sources and the pinned packages give the same bytes on every machine.
 import { copyFile, mkdir, readdir, readFile, rm, writeFile } from "node:fs/promises";
@@ -25,8 +25,32 @@ async function buildPage(folder) {
     preserveSymlinks: true, // or the names of chunks depend on where a linked node_modules lies
   });
   await copyFile("src/index.html", join(folder, "index.html"));
+  await buildResults(join(folder, "results.html"));
   const licences = await Promise.all(["@msgpack/msgpack", "fzstd", "three"].map((name) => readFile(`node_modules/${name}/LICENSE`, "utf8")));
   await writeFile(join(folder, "LICENSES.txt"), licences.join("\n----\n\n"));
+}
+
+/** The page of results in one file: browsers load no modules for a page that comes from disk. */
+async function buildResults(file) {
+  const { outputFiles } = await build({
+    entryPoints: { script: "src/results/main.ts", style: "src/results/style.css" },
+    outdir: ".",
+    write: false,
+    bundle: true,
+    minify: true,
+    format: "iife",
+    target: "es2022",
+    charset: "utf8",
+    legalComments: "none",
+    logLevel: "warning",
+  });
+  let page = await readFile("src/results/page.html", "utf8");
+  for (const { path, text } of outputFiles) {
+    const name = path.endsWith(".css") ? "style" : "script";
+    page = page.replace(`/*${name}*/`, () => text.replaceAll("</script", "<\\/script").replaceAll("<!--", "<\\!--"));
+  }
+  const licence = await readFile("node_modules/three/LICENSE", "utf8");
+  await writeFile(file, `${page}<!-- Contains three.js:\n\n${licence.trim()}\n-->\n`);
 }
 
 async function buildLibrary(folder) {

@@ -127,7 +127,7 @@ def test_run_of_a_camera_ends_at_ctrl_c(oak: OakSource, monkeypatch: pytest.Monk
     monkeypatch.setattr("client.sources.oak.source.open_oak", lambda _options: oak)
     given: list[int] = []
 
-    def outputs(_pipeline: object, frames: object) -> object:
+    def outputs(_pipeline: object, frames: object, _camera: object) -> object:
         for frame in frames:
             given.append(frame.index)
             if frame.index == 2:

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from client.display.output_folder import FrameOutput, OutputWriter
+from client.display.frame_output import FrameOutput
+from client.display.output_folder import OutputWriter
 from client.errors import OutputError
 from protocol.messages import LeftOut, Light, Plan, Timings
 from tests.client.lights import light_of
@@ -47,8 +48,8 @@ def output_of(frame: int, notes: tuple[str, ...] = (), light: Light | None = Non
     )
 
 
-def write(folder: Path, *outputs: FrameOutput) -> Path:
-    with OutputWriter(folder) as writer:
+def write(folder: Path, *outputs: FrameOutput, overwrite: bool = False) -> Path:
+    with OutputWriter(folder, overwrite=overwrite) as writer:
         for output in outputs:
             writer.write(output)
     return folder
@@ -131,8 +132,22 @@ def test_what_is_not_finite_is_never_written(value: float, tmp_path: Path) -> No
 def test_an_earlier_run_is_replaced_but_other_files_stay(tmp_path: Path) -> None:
     write(tmp_path, output_of(0), output_of(1))
     (tmp_path / "frames" / "mine.png").write_text("keep")
-    write(tmp_path, output_of(0))
+    write(tmp_path, output_of(0), overwrite=True)
     assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == ["000000.png", "mine.png"]
+    assert len(lines(tmp_path / "light.jsonl")) == 1
+
+
+def test_an_earlier_run_is_kept_unless_it_may_be_overwritten(tmp_path: Path) -> None:
+    write(tmp_path, output_of(0), output_of(1))
+    with pytest.raises(OutputError, match=r"holds an earlier run; name another folder .* --overwrite") as caught:
+        OutputWriter(tmp_path)
+    assert "\n" not in str(caught.value)
+    assert len(list((tmp_path / "frames").iterdir())) == len(lines(tmp_path / "light.jsonl")) == 2
+
+
+def test_a_run_that_ended_before_its_first_frame_is_none(tmp_path: Path) -> None:
+    write(tmp_path)
+    write(tmp_path, output_of(0))
     assert len(lines(tmp_path / "light.jsonl")) == 1
 
 

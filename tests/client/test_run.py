@@ -10,9 +10,11 @@ import pytest
 from client.commands.run import process_frames
 from client.errors import RunError
 from client.objects.object_file import object_id
-from protocol.frames import RgbdFrame
+from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Plan, Timings
 from tests.client.lights import light_of
+
+CAMERA = CameraModel(width=32, height=24, fx=30, fy=30, cx=15.5, cy=11.5)
 
 
 def frame_of(index: int) -> RgbdFrame:
@@ -37,13 +39,14 @@ class Double:
 
 
 def test_results_keep_their_frame() -> None:
-    outputs = list(process_frames(Double(), map(frame_of, (3, 4))))
+    outputs = list(process_frames(Double(), map(frame_of, (3, 4)), CAMERA))
     assert [o.frame for o in outputs] == [3, 4]
     assert [o.timestamp_s for o in outputs] == [3 / 30, 4 / 30]
     assert [int(o.color[0, 0, 0]) for o in outputs] == [3, 4]
     assert [o.light.frame for o in outputs] == [3, 4]
     assert [o.timings.total for o in outputs] == [3, 4]
     assert [o.notes for o in outputs] == [("note 3",), ("note 4",)]
+    assert [o.captured.color.max() for o in outputs] == [0, 0]
 
 
 def test_frames_are_read_one_at_a_time() -> None:
@@ -54,13 +57,13 @@ def test_frames_are_read_one_at_a_time() -> None:
             read.append(index)
             yield frame_of(index)
 
-    outputs = process_frames(Double(), frames())
+    outputs = process_frames(Double(), frames(), CAMERA)
     next(outputs)
     assert read == [0]
 
 
 def test_refused_frame_is_named() -> None:
-    outputs = process_frames(Double(), map(frame_of, (4, 5, 6)))
+    outputs = process_frames(Double(), map(frame_of, (4, 5, 6)), CAMERA)
     next(outputs)
     with pytest.raises(RunError, match="frame 5: the pose is not rigid"):
         next(outputs)

@@ -10,9 +10,11 @@ import pytest
 from rich.console import Console
 
 from client.commands.stream import stream
-from client.display.output_folder import FrameOutput, OutputWriter
+from client.display.frame_output import FrameOutput, captured_of
+from client.display.output_folder import OutputWriter
 from client.objects.object_file import ObjectFile, pack_mesh
 from client.options.light_places import PanoramaOut
+from client.results.description import describe
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Spot, Wishes
 from server.client_session import ClientSession
@@ -64,11 +66,12 @@ def run_in_process(device: Device, scene: Scene, folder: Path) -> None:
     mesh, item = load_mesh(data, format_), scene.item
     placement = requested_placement(mesh, item.position_m, item.spot, item.scale, item.height_m, item.yaw_deg)
     pipeline.place_object("object-0", mesh, placement)
-    with OutputWriter(folder) as writer:
+    with OutputWriter(folder, describe(scene.source, FRAMES, [scene.item])) as writer:
         for frame in (scene.source[i] for i in range(FRAMES)):
             result = {**vars(pipeline.process(frame))}
             assert result.pop("layer") is None  # not wished for
             result.pop("is_reused")  # of the server alone
+            result["captured"] = captured_of(frame, CAMERA)
             writer.write(FrameOutput(frame=frame.index, timestamp_s=frame.timestamp_s, **result))
         writer.write_mesh(mesh_files(pipeline.scene_mesh()))
         (folder / "sky.exr").write_bytes(pipeline.panorama("exr", PLACE)[0])
@@ -85,8 +88,9 @@ def scene(tmp_path: Path, request: pytest.FixtureRequest) -> Scene:
 
 
 def comparable(folder: Path) -> dict[str, bytes]:
-    """Every file that must be the same; times never are."""
-    paths = [path for path in folder.rglob("*") if path.is_file() and path.name != "timings.jsonl"]
+    """Every file that must be the same; times never are, nor is the page that shows them."""
+    timed = ("timings.jsonl", "index.html")
+    paths = [path for path in folder.rglob("*") if path.is_file() and path.name not in timed]
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 

@@ -11,9 +11,11 @@ from rich.console import Console
 
 from client.commands import stream as streaming
 from client.commands.stream import stream
-from client.display.output_folder import FrameOutput, OutputWriter
+from client.display.frame_output import FrameOutput, captured_of
+from client.display.output_folder import OutputWriter
 from client.errors import ObjectError, OutputError, SourceError
 from client.objects.object_file import ObjectFile
+from client.results.description import describe
 from client.streaming.client import ClientError
 from protocol.messages import Bye, Composite, Frame, Hello, Light, PlaceObject, Welcome
 from protocol.recording import read_messages
@@ -25,11 +27,13 @@ TRIANGLE_OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 
 def run_in_process(source: FakeSource, frames: range, folder: Path) -> None:
     """What the pipeline makes of the frames without a network."""
-    with OutputWriter(folder) as writer:
+    with OutputWriter(folder, describe(source, len(frames), ())) as writer:
+        writer.note_device("a fake device")
         for i in frames:
             frame = source[i]
             result = {**vars(fake_result(frame))}
             assert result.pop("layer") is None  # not wished for
+            result["captured"] = captured_of(frame, source.camera)
             writer.write(FrameOutput(frame=frame.index, timestamp_s=frame.timestamp_s, **result))
 
 
@@ -38,7 +42,7 @@ def test_lossless_stream_writes_the_bytes_of_an_in_process_run(server, tmp_path:
     run_in_process(source, frames, tmp_path / "run")
     summary = quietly(source, server.url, out=tmp_path / "stream", lossless=True, frames=frames)
     assert files(tmp_path / "stream") == files(tmp_path / "run")
-    assert sorted(files(tmp_path / "run"))[:2] == ["frames/000002.png", "frames/000005.png"]
+    assert sorted(files(tmp_path / "run"))[3:6] == ["camera/000011.jpg", "frames/000002.png", "frames/000005.png"]
     assert (summary.sent, summary.answered, summary.skipped, summary.dropped) == (4, 4, 0, 0)
     assert (summary.device, summary.session) == ("a fake device", "session-1")
 

@@ -84,7 +84,7 @@ def test_a_server_says_what_it_reads(dial: Callable[[], Wire], monkeypatch: pyte
 
 def test_a_client_is_told_of_a_server_without_it(server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("protocol.colors.IS_POSSIBLE", False)
-    with pytest.raises(ClientError, match=r"reads no H\.264 .* leave out --video"):
+    with pytest.raises(ClientError, match=r"reads no H\.264 .* leave out --color"):
         quietly(FakeSource(2), server.url, sending=VIDEO)
 
 

@@ -1,0 +1,4 @@
+"""Names of files in an output folder that a person opens."""
+
+PAGE_NAME = "index.html"
+VIDEO_NAME = "video.mp4"

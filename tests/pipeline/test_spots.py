@@ -189,6 +189,17 @@ def test_an_object_is_not_put_behind_something(session: ClientSession, width_m: 
     assert np.isinf(distances).all()
 
 
+def test_where_all_places_are_hidden_it_is_told(session: ClientSession) -> None:
+    """A board close to the camera hides the upper part of the picture, so the top of a vase wherever it stands."""
+    board = box((-2.0, -1.0, 0.3), (2.0, -0.264, 0.35))
+    vase = shape_of(trimesh.creation.box((0.1, 0.1, 0.3)))
+    session.place_object("cube", cube(0.05), on("table"))
+    session.place_object("vase", vase, on("table"))
+    low, high = see(session, scene=[*FURNISHED, board])
+    assert "not all of it is in view" not in low
+    assert "not all of it is in view" in high
+
+
 def test_one_that_does_not_fit_is_placed_and_told(session: ClientSession) -> None:
     session.place_object("large", cube(), on("table", 20.0))
     (told,) = see(session)

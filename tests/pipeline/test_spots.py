@@ -19,7 +19,7 @@ from protocol.messages import Spot, SpotKind
 from server.client_session import ClientSession
 from server.maths.rigid import inverse_rigid
 from server.opencl.device import Device
-from server.room.client_objects import EAGER
+from server.room.client_objects import EAGER, MOST_SEARCHES
 from server.room.room import Room
 from server.scene.mesh import Mesh, load_mesh
 from server.scene.placement import Placement, SpotPlacement, requested_placement
@@ -221,6 +221,17 @@ def test_a_spot_that_is_not_in_view_waits_and_is_told_once(session: ClientSessio
     told = [see(session, index) for index in range(EAGER + 2, EAGER + 12)]
     assert set(standing(session)) == {"cube"}
     assert len([notes for notes in told if notes]) == 1
+
+
+def test_many_searches_take_several_frames(session: ClientSession) -> None:
+    for number in range(MOST_SEARCHES + 3):
+        session.place_object(f"{number}", cube(0.02), on("table"))
+    session.place_object("pixel", cube(0.02), on("pixel", pixel=(10.0, 10.0)))
+    see(session)
+    assert len(standing(session)) == MOST_SEARCHES + 1
+    assert "pixel" in standing(session)
+    see(session, 1)
+    assert len(standing(session)) == MOST_SEARCHES + 4
 
 
 def test_a_waiting_object_is_moved_and_removed(session: ClientSession) -> None:

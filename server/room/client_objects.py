@@ -20,6 +20,9 @@ from server.volume.volume import Volume
 EAGER, PAUSE = 10, 10
 """A spot that is not in view is sought in each of the first frames, then in one of so many: 30 ms each at 640x480."""
 
+MOST_SEARCHES = 32
+"""Objects for which horizontal surface is searched in one frame, at some 10 ms each; others wait for the next one."""
+
 
 @dataclass(frozen=True)
 class _Waiting:
@@ -28,7 +31,12 @@ class _Waiting:
     mesh: Mesh
     placement: Placement | SpotPlacement
     tries: int = 0
-    """Frames since the request for a spot."""
+    """Frames in which its spot could have been sought."""
+
+    @property
+    def is_search(self) -> bool:
+        """Whether finding its spot takes a search of the frame's surfaces."""
+        return isinstance(self.placement, SpotPlacement) and self.placement.spot.on not in {"pixel", "ray"}
 
     def is_due(self, index: int) -> bool:
         """Whether its spot is to be sought in the client's frame `index`."""
@@ -113,13 +121,16 @@ class ClientObjects:
         """
         if not self._waiting or not self._alignment.is_settled:
             return ()
-        due = {name: one for name, one in self._waiting.items() if one.is_due(index)}
-        self._waiting |= {name: replace(one, tries=one.tries + 1) for name, one in self._waiting.items()}
-        notes = list[str]()
-        seen = view() if due else None
-        for object_id, waiting in due.items():
-            assert seen is not None
-            notes += self._find(object_id, waiting, seen)
+        seen, searches, notes = None, 0, list[str]()
+        for object_id, waiting in list(self._waiting.items()):
+            if waiting.is_due(index):
+                searches += waiting.is_search
+                if waiting.is_search and searches > MOST_SEARCHES:
+                    continue
+                seen = seen or view()
+                notes += self._find(object_id, waiting, seen)
+            if object_id in self._waiting:
+                self._waiting[object_id] = replace(waiting, tries=waiting.tries + 1)
         return tuple(notes)
 
     def check_placed(self, volume: Volume) -> tuple[str, ...]:

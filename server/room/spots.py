@@ -155,7 +155,7 @@ def _on_surface(frame: FrameView, mesh: Mesh, scale: float, surface: HorizontalS
             "; not all of it is in view"
             if fits.any()
             else f"; its floor of {diagonal:.2f} m does not fit on what is free of it, "
-            f"{2 * surface.radii_m.max():.2f} m: give a smaller size"
+            f"{max(2 * surface.radii_m.max(), 0.0):.2f} m: give a smaller size"
         )
     return FoundSpot(surface.centers[index], scale, f"on {words}")
 

@@ -95,10 +95,10 @@ class UpFinder:
         )
 
 
-def patch_normals(normals: NDArray[np.generic]) -> Floats:
+def patch_normals(normals: NDArray[np.generic], across: int = PATCHES_ACROSS) -> Floats:
     """[n, 3] unit mean normals of the flat patches of a picture; normals: [h, w] float4 as in Surface."""
     height, width = normals.shape
-    size = max(round(width / PATCHES_ACROSS), 1)
+    size = max(round(width / across), 1)
     rows, columns = height // size, width // size
     values = normals.view(np.float32).reshape(height, width, 4)[: rows * size, : columns * size]
     means = cv2.resize(values, (columns, rows), interpolation=cv2.INTER_AREA).reshape(-1, 4).astype(np.float64)

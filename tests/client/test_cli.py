@@ -146,6 +146,21 @@ def test_mesh_is_written_and_an_empty_one_told(tmp_path: Path, probeless: Probel
     assert "there is no surface to mesh" in told
 
 
+def test_objects_are_placed_and_what_nobody_sees_is_named(tmp_path: Path, probeless: Probeless) -> None:
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "cube.obj")
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "far.obj")
+    objects = ["--object", tmp_path / "cube.obj@auto", "--object", tmp_path / "far.obj@0,0,50,0.3m"]
+    done = probeless("run", TABLE, "--frames", "0:2", "--voxel", "0.02", *objects, "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    placed, outside, unseen = (line for line in done.stderr.splitlines() if "obj" in line)
+    assert "object 'object-0' stands at" in placed
+    assert "0.10 m high (scale 1: its own size)" in placed
+    assert "object 'object-1' is at 0.00,0.15,50.00, outside of the scanned volume" in outside
+    assert "far.obj was never in view: its middle is at 0.00,0.15,50.00" in unseen
+    wrong = probeless("run", TABLE, "--object", tmp_path / "cube.obj@pixel:500,3", "--out", tmp_path)
+    assert_one_line(wrong, 1, "pixel 500,3 is beyond the picture of 160x120 pixels")
+
+
 def test_debug_shows_the_traceback_wherever_it_stands(probeless: Probeless) -> None:
     for words in (["--debug", "run", "/nowhere", "--out", "x"], ["run", "/nowhere", "--out", "x", "--debug"]):
         done = probeless(*words)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from msgspec import structs
+from pyopencl.cltypes import float4
 from scipy.spatial.transform import Rotation
 
 from client.options.source import open_source
@@ -16,7 +17,7 @@ from protocol.messages import Wishes
 from server.client_session import ClientSession
 from server.opencl.device import Device
 from server.room.room import Room
-from server.room.up_finder import FRAMES, PAUSE
+from server.room.up_finder import FRAMES, PAUSE, patch_normals
 from server.scene.placement import Placement
 from server.service.room_store import RoomStore
 from tests.data import data_folder
@@ -56,6 +57,16 @@ def objects_up(session: ClientSession, name: str = "cube") -> tuple[Floats, Floa
     low, high = CUBE.bounds
     middle = np.array([*(low[:2] + high[:2]) / 2, low[2], 1.0])
     return place[:3, 2], (place @ middle)[:3]
+
+
+def test_patches_are_flat_and_covered() -> None:
+    """Of a picture of three patches across: a wall, one half wall and half floor, one with holes."""
+    picture = np.zeros((8, 24, 4), np.float32)
+    picture[..., 2:] = (-1, 1)
+    picture[:, 12:16] = (0, -1, 0, 1)
+    picture[::2, 16:] = 0
+    normals = patch_normals(picture.view(float4).reshape(8, 24), across=3)
+    np.testing.assert_allclose(normals, [[0, 0, -1]])
 
 
 def test_one_frame_of_a_rolled_camera_shows_it(session: ClientSession) -> None:

@@ -97,11 +97,14 @@ def comparable(folder: Path) -> dict[str, bytes]:
 def test_lossless_stream_gives_the_bits_of_an_in_process_run(device: Device, scene: Scene, tmp_path: Path) -> None:
     run_in_process(device, scene, tmp_path / "run")
     with BackgroundServer(Service(device)) as server:
-        quiet = Console(file=io.StringIO())
+        said = io.StringIO()
+        quiet = Console(file=said)
         panorama = PanoramaOut(tmp_path / "stream" / "sky.exr", "exr", PLACE)
         options = {"lossless": True, "mesh": True, "panorama": panorama, "console": quiet}
         stream(scene.source, server.url, [scene.item], WISHES, tmp_path / "stream", **options)
     run, streamed = comparable(tmp_path / "run"), comparable(tmp_path / "stream")
+    assert ("object 'object-0' stands at" in said.getvalue()) == (scene.item.spot is not None)
+    assert "never in view" not in said.getvalue()
     assert len([name for name in run if name.endswith(".png")]) == FRAMES
     assert run.keys() == streamed.keys() >= {"mesh.ply", "mesh.glb", "sky.exr"}
     assert [name for name in run if run[name] != streamed[name]] == []

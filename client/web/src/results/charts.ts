@@ -4,8 +4,8 @@ import { byId, context2d, make, setText } from "../dom";
 import { milliseconds, plain } from "../words";
 import type { DrawnRow, RunData } from "./data";
 
-/** Of the tallest bars, which are cut: frames that compile kernels take a hundred times as long. */
-const CUT = 0.97;
+/** Bars of more medians than this are cut: frames that compile kernels take a hundred times as long. */
+const CUT = 3;
 const HEADROOM = 1.15;
 /** Pixels: left and below, for numbers. */
 const [LEFT, BELOW, ABOVE] = [44, 18, 6];
@@ -28,10 +28,9 @@ export class Charts {
   ) {
     this.stages = [...data.tables.stages, "other"];
     this.stacks = data.frames.map(({ drawn }) => (drawn === null ? null : stackOf(drawn)));
-    const sums = this.stacks.flatMap((stack) => (stack === null ? [] : [sumOf(stack)])).sort((a, b) => a - b);
-    const usual = sums[Math.min(sums.length - 1, Math.floor(CUT * sums.length))] ?? 1;
-    const tallest = sums.at(-1) ?? 1;
-    this.top = HEADROOM * (tallest > 2 * usual ? (sums[Math.max(0, Math.ceil(CUT * sums.length) - 2)] ?? usual) : tallest) || 1;
+    const sums = this.stacks.flatMap((stack) => (stack === null ? [] : [sumOf(stack)]));
+    const tallest = sums.reduce((a, b) => Math.max(a, b), 0);
+    this.top = HEADROOM * topOf(sums);
     this.noteCut(tallest);
     this.addRows();
     this.addStrips();
@@ -194,6 +193,12 @@ export class Charts {
     context.lineWidth = 1.5;
     context.strokeRect(LEFT + this.index * step - 0.5, 1, Math.max(1, step), this.bars.clientHeight - BELOW);
   }
+}
+
+/** The tallest bar that is not cut. */
+export function topOf(sums: readonly number[]): number {
+  const most = CUT * medianOf(sums);
+  return sums.filter((sum) => sum <= most).reduce((a, b) => Math.max(a, b), 0) || 1;
 }
 
 /** Milliseconds by stage, and what is left of the wall time. */

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import sys
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -107,7 +109,7 @@ def run(
     watch, light = Stopwatch(), None
     description = describe(capture.source, capture.total, capture.objects)
     writing = OutputWriter(out, description, overwrite=overwrite, video=video, rerun=rerun)
-    with writing as writer, Run(capture, device, note) as pipeline:
+    with _telling_of_interrupts(out), writing as writer, Run(capture, device, note) as pipeline:
         writer.note_device(pipeline.device)
         for output in track(pipeline.outputs(), capture.total):
             writer.write(output)
@@ -118,7 +120,7 @@ def run(
                 writer.write_mesh(pipeline.mesh(progress))
         if panorama is not None:
             write_panorama(panorama.path, pipeline.panorama(panorama.format, panorama.position_m))
-    say(f"{watch.summary()}, written to {out}: open {out / PAGE_NAME} in a browser")
+    say(f"{watch.summary()}{_written_to(out)}")
     _say_light(light)
 
 
@@ -202,31 +204,50 @@ def stream(
     from client.options.room_options import room_place
     from client.streaming.client import Access
 
-    done = send(
-        capture.source,
-        server,
-        capture.objects,
-        capture.wishes,
-        out,
-        lossless,
-        record,
-        frames=capture.frames,
-        mesh=mesh,
-        panorama=panorama,
-        room=room_place(room, room_from_world, marker, room_key),
-        access=Access(token, tls_fingerprint, tls_ca),
-        sending=Sending(adapt, depth_noise, view, color == "h264"),
-        overwrite=overwrite,
-        video=video,
-        rerun=rerun,
-    )
-    written = f", written to {out}: open {out / PAGE_NAME} in a browser" if out is not None else ""
+    with _telling_of_interrupts(out):
+        done = send(
+            capture.source,
+            server,
+            capture.objects,
+            capture.wishes,
+            out,
+            lossless,
+            record,
+            frames=capture.frames,
+            mesh=mesh,
+            panorama=panorama,
+            room=room_place(room, room_from_world, marker, room_key),
+            access=Access(token, tls_fingerprint, tls_ca),
+            sending=Sending(adapt, depth_noise, view, color == "h264"),
+            overwrite=overwrite,
+            video=video,
+            rerun=rerun,
+        )
     speed = done.answered / done.seconds if done.seconds > 0 else 0.0
     say(
         f"{done.answered} frames answered in {done.seconds:.1f} s ({speed:.1f} frames/s), {done.skipped} skipped, "
-        f"{done.dropped} dropped{written}"
+        f"{done.dropped} dropped{_written_to(out)}"
     )
     _say_light(done.light)
+
+
+@contextmanager
+def _telling_of_interrupts(out: Path | None) -> Iterator[None]:
+    """After Ctrl-C, a note that says where the page of what was made is."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if out is not None and (out / PAGE_NAME).is_file():
+            note(f"interrupted; {out / PAGE_NAME} shows the frames until here")
+        raise
+
+
+def _written_to(out: Path | None) -> str:
+    """Where results are, and what to open to see them."""
+    if out is None:
+        return ""
+    page = out / PAGE_NAME
+    return f", written to {out}: open {page} in a browser" if page.is_file() else f", written to {out}"
 
 
 def _say_light(light: Light | None) -> None:

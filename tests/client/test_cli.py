@@ -21,6 +21,7 @@ import trimesh
 from client.cli import main, run_command
 from server.light.panorama import read_panorama
 from tests.client import folders
+from tests.client.results_page import data_of
 from tests.data import ROOT
 
 PROGRAM = Path(sys.executable).with_name("probeless")
@@ -139,11 +140,12 @@ def test_mesh_is_written_and_an_empty_one_told(tmp_path: Path, probeless: Probel
     np.testing.assert_allclose(meshes[0].extents, [1.2, 0.25, 0.8], atol=0.1)  # the table and its things
     np.testing.assert_allclose(meshes[1].extents[1], meshes[0].extents[1], atol=1e-6)  # turned about up only
     volume[1] = "5,5,5,6,6,6"
-    done = probeless("run", TABLE, "--frames", "0:2", *volume, tmp_path)
+    done = probeless("run", TABLE, "--frames", "0:2", "--overwrite", *volume, tmp_path)
     assert done.returncode == 1
     noted, told = done.stderr.splitlines()
     assert "no usable surface has been seen yet" in noted
     assert "there is no surface to mesh" in told
+    assert "there is no surface to mesh" in data_of(tmp_path)["ended"]
 
 
 def test_objects_are_placed_and_what_nobody_sees_is_named(tmp_path: Path, probeless: Probeless) -> None:
@@ -157,7 +159,7 @@ def test_objects_are_placed_and_what_nobody_sees_is_named(tmp_path: Path, probel
     assert "0.10 m high (scale 1: its own size)" in placed
     assert "object 'object-1' is at 0.00,0.15,50.00, outside of the scanned volume" in outside
     assert "far.obj was never in view: its middle is at 0.00,0.15,50.00" in unseen
-    wrong = probeless("run", TABLE, "--object", tmp_path / "cube.obj@pixel:500,3", "--out", tmp_path)
+    wrong = probeless("run", TABLE, "--object", tmp_path / "cube.obj@pixel:500,3", "--overwrite", "--out", tmp_path)
     assert_one_line(wrong, 1, "pixel 500,3 is beyond the picture of 160x120 pixels")
 
 
@@ -210,6 +212,11 @@ def test_run_writes_what_is_promised(tmp_path: Path) -> None:
     assert [at["position"] for at in lights[-1]["at"][1:]] == [[-0.1, 0.0, 0.8], [0.0, -0.2, 1.0]]
     assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == 3
     assert len((tmp_path / "timings.jsonl").read_text().splitlines()) == 3
+    assert f"open {tmp_path / 'index.html'}" in done.stdout
+    assert [row["frame"] for row in data_of(tmp_path)["frames"]] == [1, 2, 3]
+    again = probeless_process("run", TABLE, "--frames", "1:2", "--out", tmp_path)
+    assert_one_line(again, 1, "--overwrite")
+    assert len(list((tmp_path / "frames").iterdir())) == 3
 
 
 def test_interrupt_ends_quietly_with_130(tmp_path: Path) -> None:
@@ -223,6 +230,11 @@ def test_interrupt_ends_quietly_with_130(tmp_path: Path) -> None:
     assert process.returncode == 130, err
     assert out == ""
     assert "Traceback" not in err
+    assert err.count("\n") == 1
+    assert f"interrupted; {tmp_path / 'index.html'} shows" in err
+    page = data_of(tmp_path)
+    assert page["ended"] == "interrupted"
+    assert len(page["frames"]) == len(list((tmp_path / "frames").iterdir())) >= 2
 
 
 def test_an_error_of_the_program_itself_is_told_too(
@@ -244,3 +256,6 @@ def test_demo_ends_by_itself_with_pictures(tmp_path: Path) -> None:
     pictures = sorted((tmp_path / "demo" / "frames").glob("*.png"))
     assert len(pictures) >= 10
     assert min(p.stat().st_size for p in pictures) >= 10_000
+    page = data_of(tmp_path / "demo")
+    assert (page["ended"], page["objects"]) == ("", ["vase.glb"])
+    assert len(page["frames"]) == len(pictures) == len(list((tmp_path / "demo" / "camera").iterdir()))

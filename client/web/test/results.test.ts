@@ -2,6 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
+import { niceStep, topOf } from "../src/results/charts";
 import { frameAt, lastDuration, showTimes } from "../src/results/clock";
 import { cameraFile, compositeFile, type FrameRow, fromBase64, type LightRow } from "../src/results/data";
 import { Pace } from "../src/results/pace";
@@ -91,4 +92,11 @@ test("what is slow is drawn less often while frames are played, and the last one
   assert.deepEqual(drawn, [0]);
   pace.ask(4, false); // and where playing stops
   assert.deepEqual(drawn, [0, 4]);
+});
+
+test("a frame that compiles does not flatten the chart", () => {
+  assert.equal(topOf([3000, 150, 160, 200, 140]), 200);
+  assert.equal(topOf([100, 150, 250]), 250);
+  assert.equal(topOf([]), 1);
+  assert.deepEqual([0.7, 1, 13, 30, 61].map(niceStep), [1, 1, 20, 50, 100]);
 });

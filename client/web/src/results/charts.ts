@@ -4,8 +4,8 @@ import { byId, context2d, make, setText } from "../dom";
 import { milliseconds, plain } from "../words";
 import type { DrawnRow, RunData } from "./data";
 
-/** Of the tallest bars, which are cut: frames that compile kernels take a hundred times as long. */
-const CUT = 0.97;
+/** Bars of more medians than this are cut: frames that compile kernels take a hundred times as long. */
+const CUT = 3;
 const HEADROOM = 1.15;
 /** Pixels: left and below, for numbers. */
 const [LEFT, BELOW, ABOVE] = [44, 18, 6];
@@ -26,12 +26,11 @@ export class Charts {
     private readonly data: RunData,
     onPick: (index: number) => void,
   ) {
-    this.stages = [...data.tables.stages, "other"];
+    this.stages = data.tables.stages;
     this.stacks = data.frames.map(({ drawn }) => (drawn === null ? null : stackOf(drawn)));
-    const sums = this.stacks.flatMap((stack) => (stack === null ? [] : [sumOf(stack)])).sort((a, b) => a - b);
-    const usual = sums[Math.min(sums.length - 1, Math.floor(CUT * sums.length))] ?? 1;
-    const tallest = sums.at(-1) ?? 1;
-    this.top = HEADROOM * (tallest > 2 * usual ? (sums[Math.max(0, Math.ceil(CUT * sums.length) - 2)] ?? usual) : tallest) || 1;
+    const sums = this.stacks.flatMap((stack) => (stack === null ? [] : [sumOf(stack)]));
+    const tallest = sums.reduce((a, b) => Math.max(a, b), 0);
+    this.top = HEADROOM * topOf(sums);
     this.noteCut(tallest);
     this.addRows();
     this.addStrips();
@@ -74,7 +73,7 @@ export class Charts {
   private addRows(): void {
     const body = byId("stages");
     const add = (i: number, name: string, median: number): void => {
-      const row = make("tr", i < 0 ? "total" : i === this.stages.length - 1 ? "stage-other" : `stage-${i}`);
+      const row = make("tr", i < 0 ? "total" : `stage-${i}`);
       const head = make("th", "", name);
       head.setAttribute("scope", "row");
       if (i >= 0) head.prepend(make("span", "swatch"));
@@ -83,7 +82,7 @@ export class Charts {
       body.append(row);
       this.cells.set(i, { now });
     };
-    this.stages.forEach((name, i) => add(i, name === "other" ? "Host, waiting" : plain(name), medianOf(this.stacks.map((stack) => stack?.[i] ?? null))));
+    this.stages.forEach((name, i) => add(i, plain(name), medianOf(this.stacks.map((stack) => stack?.[i] ?? null))));
     add(-1, "Total (wall)", medianOf(this.data.frames.map(({ drawn }) => drawn?.total ?? null)));
   }
 
@@ -140,7 +139,7 @@ export class Charts {
     context.scale(ratio, ratio);
     this.drawAxis(context, clientWidth, clientHeight);
     const [width, height] = [clientWidth - LEFT, clientHeight - BELOW - ABOVE];
-    const colors = this.stages.map((_, i) => stageColor(i, this.stages.length));
+    const colors = this.stages.map((_, i) => stageColor(i));
     const step = width / this.stacks.length;
     const columns = Math.max(1, Math.min(this.stacks.length, Math.floor(width)));
     for (let column = 0; column < columns; column++) {
@@ -196,10 +195,15 @@ export class Charts {
   }
 }
 
+/** The tallest bar that is not cut. */
+export function topOf(sums: readonly number[]): number {
+  const most = CUT * medianOf(sums);
+  return sums.filter((sum) => sum <= most).reduce((a, b) => Math.max(a, b), 0) || 1;
+}
+
 /** Milliseconds by stage, and what is left of the wall time. */
-function stackOf({ ms, total }: DrawnRow): Float64Array {
-  const rest = Math.max(0, total - ms.reduce((a, b) => a + b, 0));
-  return Float64Array.from([...ms, rest]);
+function stackOf({ ms }: DrawnRow): Float64Array {
+  return Float64Array.from(ms);
 }
 
 const sumOf = (stack: Float64Array): number => stack.reduce((a, b) => a + b, 0);
@@ -239,7 +243,7 @@ function fitted(canvas: HTMLCanvasElement): [CanvasRenderingContext2D, number, n
 
 const style = (name: string, element: Element = document.documentElement): string => getComputedStyle(element).getPropertyValue(name).trim();
 
-function stageColor(i: number, count: number): string {
-  const element = document.querySelector(i === count - 1 ? "#stages .stage-other" : `#stages .stage-${i}`);
+function stageColor(i: number): string {
+  const element = document.querySelector(`#stages .stage-${i}`);
   return element === null ? "#888" : style("--stage", element);
 }

@@ -32,6 +32,7 @@ function start(): void {
   const player = new Player(data, (index, isPlaying) => {
     charts.show(index);
     showPlan(data, data.frames[index]!.drawn);
+    if (space !== null) space.isPlaying = isPlaying;
     for (const each of slow) each.ask(index, isPlaying);
   });
   byId("modes").hidden = data.frames.every(({ drawn }) => drawn?.picture !== 2);

@@ -138,7 +138,7 @@ export class Player {
     const target = event.target as HTMLElement;
     const step = event.shiftKey ? FAR : 1;
     if (event.key === " " && !["BUTTON", "SELECT"].includes(target.tagName)) this.toggle();
-    else if (event.key === "b" || event.key === "B") flip();
+    else if ((event.key === "b" || event.key === "B") && target.tagName !== "SELECT") flip();
     else if (["INPUT", "SELECT"].includes(target.tagName) || target.id === "view") return; // these have arrow keys of their own
     else if (event.key === "ArrowLeft") this.seek(this.index - step);
     else if (event.key === "ArrowRight") this.seek(this.index + step);

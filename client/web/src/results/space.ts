@@ -96,6 +96,8 @@ export class Space {
     this.overview();
   }
 
+  /** While frames are played, nothing is drawn that nobody sees. */
+  isPlaying = false;
   /** Called with whether the view is the camera's, when that changes. */
   onThrough: (isThrough: boolean) => void = () => {};
 
@@ -218,7 +220,7 @@ export class Space {
 
   /** Draw before the next repaint, once however often it was asked for; resolves when it is drawn. */
   private redraw(): Promise<void> {
-    if (!this.isVisible) return Promise.resolve();
+    if (this.isPlaying && !this.isVisible) return Promise.resolve();
     return (this.drawing ??= this.drawOnce());
   }
 

@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from client.display.light_words import light_lines
-from client.errors import OptionError
+from client.errors import OWN_PACKAGES, OptionError
 from client.options import capture_options as o
 from client.options.capture import prepare, refuse_color, refuse_depth_noise
 from client.options.capture_options import CaptureOptions, capturing
@@ -24,7 +24,6 @@ from client.results.names import PAGE_NAME
 from protocol.messages import Light
 
 USAGE_STATUS, FAILURE_STATUS, INTERRUPTED_STATUS = 2, 1, 130
-OWN_PACKAGES = {"client", "server", "protocol"}
 
 app = typer.Typer(
     add_completion=False,
@@ -99,8 +98,8 @@ def run(
     check_extras(video, rerun)
     capture = prepare(options)
     from client.commands.run import Run
-    from client.display.output_folder import OutputWriter
     from client.results.description import describe
+    from client.results.output_folder import OutputWriter
 
     if mesh:
         from server.meshing.surface import find_library

@@ -1,5 +1,8 @@
 """Errors that a user can cause; each message is one line that says what was wrong and what to do."""
 
+OWN_PACKAGES = {"client", "server", "protocol"}
+"""Errors of classes in them have a message for the user."""
+
 
 class UserError(Exception):
     """Base class; the command line prints the message and exits with a status other than 0."""

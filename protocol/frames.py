@@ -77,9 +77,8 @@ class CameraModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     def __post_init__(self) -> None:
         _check_lens("camera", self)
-        least, most = DEPTH_SCALE_M
-        if not least <= self.depth_scale_m <= most:
-            raise ValueError(f"camera.depth_scale_m is {self.depth_scale_m:g} m, must be {least:g} to {most:g}")
+        if not (math.isfinite(self.depth_scale_m) and self.depth_scale_m > 0):
+            raise ValueError(f"camera.depth_scale_m is {self.depth_scale_m}, must be positive and finite")
 
     @property
     def is_distorted(self) -> bool:
@@ -103,22 +102,39 @@ def _check_lens(owner: str, lens: CameraModel | DepthCamera) -> None:
             raise ValueError(f"{owner}.{name} is {getattr(lens, name)}, must be 8 to {MAX_IMAGE_SIDE_PX}")
     if lens.width * lens.height > MAX_IMAGE_PIXELS:
         raise ValueError(f"{owner} has {lens.width}x{lens.height} pixels, more than {MAX_IMAGE_PIXELS} in all")
-    for axis, size in (("x", lens.width), ("y", lens.height)):
-        _check_axis(owner, axis, size, getattr(lens, f"f{axis}"), getattr(lens, f"c{axis}"))
-    for number in lens.distortion:
-        if not abs(number) <= GREATEST_DISTORTION:
-            raise ValueError(f"{owner}.distortion has {number:g}, more than {GREATEST_DISTORTION:g}")
+    for name in ("fx", "fy"):
+        value = getattr(lens, name)
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{owner}.{name} is {value}, must be positive and finite")
+    if not np.isfinite((lens.cx, lens.cy, *lens.distortion)).all():
+        raise ValueError(f"{owner}.cx, {owner}.cy and {owner}.distortion must be finite")
+
+
+def check_physical(camera: CameraModel) -> None:
+    """Raises ValueError, one line, for a camera that there cannot be; a stranger's could end the server (float32)."""
+    least, most = DEPTH_SCALE_M
+    if not least <= camera.depth_scale_m <= most:
+        raise ValueError(f"camera.depth_scale_m is {camera.depth_scale_m:g} m, must be {least:g} to {most:g}")
+    lenses: dict[str, CameraModel | DepthCamera] = {"camera": camera}
+    if camera.depth is not None:
+        lenses["camera.depth"] = camera.depth
+    for owner, lens in lenses.items():
+        for axis, size in (("x", lens.width), ("y", lens.height)):
+            _check_axis(owner, axis, size, getattr(lens, f"f{axis}"), getattr(lens, f"c{axis}"))
+        for number in lens.distortion:
+            if abs(number) > GREATEST_DISTORTION:
+                raise ValueError(f"{owner}.distortion has {number:g}, more than {GREATEST_DISTORTION:g}")
 
 
 def _check_axis(owner: str, axis: str, size: int, focal_px: float, center_px: float) -> None:
     most_px = size / (2 * math.tan(math.radians(LEAST_FIELD_OF_VIEW_DEG / 2)))
-    if not 0 < focal_px <= most_px:
+    if focal_px > most_px:
         raise ValueError(
-            f"{owner}.f{axis} is {focal_px:g}, must be more than 0 and at most {most_px:.4g}: "
+            f"{owner}.f{axis} is {focal_px:g}, must be at most {most_px:.4g}: "
             f"{LEAST_FIELD_OF_VIEW_DEG:g} degree for {size} pixels"
         )
     farthest_px = max(abs(center_px), abs(size - 1 - center_px))
-    if not farthest_px <= math.tan(math.radians(GREATEST_ANGLE_DEG)) * focal_px:
+    if farthest_px > math.tan(math.radians(GREATEST_ANGLE_DEG)) * focal_px:
         raise ValueError(
             f"{owner}.f{axis} {focal_px:g} and {owner}.c{axis} {center_px:g} see farther than {GREATEST_ANGLE_DEG:g} "
             "degrees from the axis: are they in pixels?"

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-from protocol.frames import GREATEST_PLACE_M, CameraModel, ColorEncoding, check_rigid
+from protocol.frames import GREATEST_PLACE_M, CameraModel, ColorEncoding, check_physical, check_rigid
 from protocol.limits import (
     MAX_IMAGE_PIXELS,
     MAX_IMAGE_SIDE_PX,
@@ -231,6 +231,7 @@ class Hello(Message, frozen=True, kw_only=True, omit_defaults=True, tag="hello")
     """`welcome.key` of a session to resume. It continues unchanged; all other fields of this message are ignored."""
 
     def __post_init__(self) -> None:
+        check_physical(self.camera)
         if self.room_from_world is not None:
             check_rigid("hello.room_from_world", self.room_from_world)
         if self.room is None and (self.room_from_world, self.marker, self.room_key) != (None, None, None):

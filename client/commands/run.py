@@ -8,12 +8,12 @@ from types import TracebackType
 from typing import Protocol
 
 from client.commands.stopping import stop_on_interrupt
-from client.display.frame_output import FrameOutput, captured_of
 from client.errors import RunError
 from client.objects.in_view import ObjectsInView
 from client.objects.object_file import object_id
 from client.objects.placing import place_objects
 from client.options.capture import Capture
+from client.results.frame_output import FrameOutput, captured_of
 from client.sources.frame_source import is_live
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import MeshFormat, PanoramaFormat, Vector3, Wishes

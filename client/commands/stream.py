@@ -18,9 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from client.commands.stopping import stop_on_interrupt
-from client.display.frame_output import FrameOutput, captured_of
 from client.display.layers import decode_layer, put_over
-from client.display.output_folder import OutputWriter
 from client.display.stream_statistics import STAGES, StreamStatistics
 from client.display.stream_view import StreamView
 from client.errors import OutputError, SourceError
@@ -28,6 +26,8 @@ from client.objects.in_view import ObjectsInView
 from client.objects.object_file import ObjectFile, object_id, pack_mesh
 from client.options.light_places import PanoramaOut, write_panorama
 from client.results.description import describe
+from client.results.frame_output import FrameOutput, captured_of
+from client.results.output_folder import OutputWriter
 from client.sources.frame_source import ENDLESS, Source, is_live
 from client.streaming.adaptive import Adaptive, AnsweredFrame
 from client.streaming.client import Access, Answer, ClientError, RoomPlace, StreamClient

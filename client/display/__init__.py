@@ -1,1 +1,1 @@
-"""Answers on this side: layers composed over camera pictures, the terminal view, the output folder."""
+"""Answers on this side: layers composed over camera pictures, the terminal view."""

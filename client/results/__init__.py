@@ -1,1 +1,1 @@
-"""What there is to see in an output folder: its page `index.html`, the camera's pictures and the video."""
+"""What a run leaves in its output folder: frames and rows, its page `index.html`, the camera's pictures, the video."""

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from client.display.frame_output import FrameOutput
+from client.results.frame_output import FrameOutput
 from protocol.messages import TIMING_ROWS, ArrivingLight, LeftOut, Light
 
 STAGES = tuple(name for name in TIMING_ROWS if name != "total")

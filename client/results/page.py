@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from client.display.frame_output import FrameOutput
 from client.results.description import RunDescription
+from client.results.frame_output import FrameOutput
 from client.results.frame_rows import FrameRows
 from client.results.names import PAGE_NAME
 from client.results.point_cloud import ColoredPoints, PointCloud

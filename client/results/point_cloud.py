@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from client.display.frame_output import Captured
+from client.results.frame_output import Captured
 from protocol.frames import CameraModel
 
 Floats = NDArray[np.float64]

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from client.display.frame_output import FrameOutput
 from client.errors import OutputError
 from client.results.description import RunDescription
+from client.results.frame_output import FrameOutput
 from client.results.frame_rows import STAGES
 from client.results.point_cloud import ColoredPoints
 from protocol.messages import ArrivingLight, Light, MeshFormat

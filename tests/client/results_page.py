@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from client.display.frame_output import Captured, FrameOutput
-from client.display.output_folder import OutputWriter
 from client.results.description import RunDescription
+from client.results.frame_output import Captured, FrameOutput
+from client.results.output_folder import OutputWriter
 from protocol.frames import CameraModel
 from protocol.messages import ArrivingLight, LeftOut, Light, OperatingPoint, Plan, Timings
 from tests.client.lights import light_of

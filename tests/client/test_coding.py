@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from client.errors import OptionError
-from client.options.capture import refuse_video
+from client.options.capture import refuse_color
 from client.streaming.coding import Coding, frame_message, picture_bytes
 from client.streaming.depth_rounding import round_depth
 from client.streaming.video import VideoEncoder
@@ -105,14 +105,14 @@ def test_pictures_of_odd_sides_stay_jpeg_beside_video() -> None:
 @pytest.mark.parametrize(("codec", "lossless", "words"), [("hevc", False, "h264"), ("h264", True, "--lossless")])
 def test_video_that_cannot_be_is_refused(codec: str, lossless: bool, words: str) -> None:
     with pytest.raises(OptionError, match=words):
-        refuse_video(codec, lossless)
+        refuse_color(codec, lossless)
 
 
 def test_without_its_library_video_is_refused_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("client.streaming.video.IS_POSSIBLE", False)
     with pytest.raises(OptionError, match="needs PyAV, which is not installed: make install-video"):
-        refuse_video("h264", False)
-    refuse_video(None, False)
+        refuse_color("h264", False)
+    refuse_color(None, False)
 
 
 @pytest.mark.data

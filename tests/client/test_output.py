@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from client.display.frame_output import FrameOutput
-from client.display.output_folder import OutputWriter
 from client.errors import OutputError
+from client.results.frame_output import FrameOutput
+from client.results.output_folder import OutputWriter
 from protocol.messages import LeftOut, Light, Plan, Timings
 from tests.client.lights import light_of
 from tests.protocol.samples import SERVER

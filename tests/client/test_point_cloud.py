@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from client.display.frame_output import Captured
 from client.results import point_cloud
+from client.results.frame_output import Captured
 from client.results.point_cloud import PointCloud
 from protocol.frames import CameraModel, DepthCamera
 

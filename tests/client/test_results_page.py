@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
-from client.display.output_folder import OutputWriter
 from client.errors import SourceError
 from client.results.camera_pictures import LONGEST_SIDE_PX, encode_camera_picture
 from client.results.frame_rows import STAGES, rounded
+from client.results.output_folder import OutputWriter
 from client.results.page import PAGE
 from tests.client.results_page import DESCRIPTION, NOTE, OBJECT, data_of, output_of, write_run, write_until
 

@@ -138,7 +138,7 @@ def test_stream_writes_the_mesh_after_the_last_answer(server, lab, tmp_path: Pat
     written = files(tmp_path)
     assert {format_: written[f"mesh.{format_}"] for format_ in ("ply", "glb")} == mesh_files(lab.mesh)
     assert lab.log[-1] == ("mesh",)
-    quietly(FakeSource(3), server.url, out=tmp_path, lossless=True)
+    quietly(FakeSource(3), server.url, out=tmp_path, lossless=True, overwrite=True)
     assert not [name for name in files(tmp_path) if name.startswith("mesh")], (
         "an earlier run's mesh would pass for ours"
     )

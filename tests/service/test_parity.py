@@ -10,11 +10,11 @@ import pytest
 from rich.console import Console
 
 from client.commands.stream import stream
-from client.display.frame_output import FrameOutput, captured_of
-from client.display.output_folder import OutputWriter
 from client.objects.object_file import ObjectFile, pack_mesh
 from client.options.light_places import PanoramaOut
 from client.results.description import describe
+from client.results.frame_output import FrameOutput, captured_of
+from client.results.output_folder import OutputWriter
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Spot, Wishes
 from server.client_session import ClientSession

@@ -11,11 +11,11 @@ from rich.console import Console
 
 from client.commands import stream as streaming
 from client.commands.stream import stream
-from client.display.frame_output import FrameOutput, captured_of
-from client.display.output_folder import OutputWriter
 from client.errors import ObjectError, OutputError, SourceError
 from client.objects.object_file import ObjectFile
 from client.results.description import describe
+from client.results.frame_output import FrameOutput, captured_of
+from client.results.output_folder import OutputWriter
 from client.streaming.client import ClientError
 from protocol.messages import Bye, Composite, Frame, Hello, Light, PlaceObject, Welcome
 from protocol.recording import read_messages

@@ -81,5 +81,5 @@ test("what is no recording is told in one sentence", async () => {
 test("a recording of video is told to be one", async () => {
   const color = { width: 8, height: 4, codec: "h264" as const, data: new Uint8Array(9) };
   const video = encode({ type: "frame", frame: 0, timestamp_s: 0, world_from_camera: null, color, depth: null });
-  await assert.rejects(readAll([HELLO, video]), /kitchen.rec holds h264 video, .* \(stream --record without --video\)/);
+  await assert.rejects(readAll([HELLO, video]), /kitchen.rec holds h264 video, .* \(stream --record without --color h264\)/);
 });

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
 
-from client.display.output_folder import OutputWriter
+from client.results.output_folder import OutputWriter
 from tests.client.results_page import DESCRIPTION, OBJECT, output_of, write_run, write_until
 from tests.client.web.constants import PATIENCE_MS
 from tests.node import installed_modules

@@ -40,7 +40,7 @@ function read(file: File, at: number, bytes: Uint8Array): ClientMessage | { type
   if (message === null) return { type: "other" };
   const codec = message.type === "frame" ? message.color?.codec : null;
   if (codec && !SINGLE.has(codec)) {
-    throw new SourceError(`${file.name} holds ${codec} video, whose pictures build on one another: the page streams recordings of single pictures (stream --record without --video).`);
+    throw new SourceError(`${file.name} holds ${codec} video, whose pictures build on one another: the page streams recordings of single pictures (stream --record without --color h264).`);
   }
   return message;
 }

@@ -17,10 +17,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from client.display.frame_output import FrameOutput
-from client.errors import OutputError, UserError
+from client.errors import OWN_PACKAGES, OutputError
 from client.results.camera_pictures import encode_camera_picture
 from client.results.description import RunDescription
+from client.results.frame_output import FrameOutput
 from client.results.names import PAGE_NAME, VIDEO_NAME
 from client.results.page import ResultsPage
 from client.results.rerun_file import RerunFile
@@ -223,7 +223,7 @@ def _why(error: BaseException | None) -> str:
     """Why a run ended early, in one line; "" if it did not."""
     if error is None:
         return ""
-    if isinstance(error, UserError):
+    if type(error).__module__.split(".")[0] in OWN_PACKAGES:
         return " ".join(str(error).split())
     return "interrupted" if isinstance(error, KeyboardInterrupt) else "stopped by an error"
 

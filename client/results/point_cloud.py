@@ -30,6 +30,8 @@ SAMPLES = 12_000
 """Depth pixels of a frame that are used."""
 DENSE_FRAMES, DENSER = 6, 2
 """So many frames are sampled at a grid that is so much finer, so that a short run has a scan to be seen."""
+GRIDS = 5
+"""Grids of pixels that frames use in turn: those of a still camera differ, and few are kept."""
 _PENDING = 200_000
 """Points that are gathered before they are sorted into cells."""
 FARTHEST_M = 10.0
@@ -122,8 +124,8 @@ class PointCloud:
     def _points(self, captured: Captured, depth: NDArray[np.uint16], world_from_camera: Floats) -> Floats:
         """[n, 6] world x, y, z and r, g, b of a grid of pixels, another one for each frame."""
         stride = max(1, self._usual_stride // DENSER) if self._frames < DENSE_FRAMES else self._usual_stride
-        shift = self._frames * 7  # 7 has no divisor in common with usual strides: the grids of a still camera differ
-        rows, columns, rays = self._grid((shift % stride, shift // stride % stride), stride)
+        shift = self._frames % GRIDS
+        rows, columns, rays = self._grid((2 * shift % stride, shift % stride), stride)
         z = depth[rows, columns] * self._camera.depth_scale_m
         used = (z > 0) & (z < FARTHEST_M) & (depth[rows, columns] < 65535)
         in_depth = rays[used] * z[used, None]

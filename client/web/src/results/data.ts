@@ -89,7 +89,7 @@ export interface DrawnRow {
 /** The data in the page. Throws Error where there is none. */
 export function readData(): RunData {
   const text = document.getElementById("data")?.textContent ?? "";
-  if (!text.trim()) throw new Error("this page has no data: probeless run --out DIR writes one that has");
+  if (!text.startsWith("{")) throw new Error("this page has no data: probeless run --out DIR writes one that has");
   return JSON.parse(text) as RunData;
 }
 

@@ -37,7 +37,7 @@ const FOV_DEG = 45;
 /** Points that an overview is fitted to. */
 const FITTED = 2000;
 /** Share of the picture beyond what is fitted, and how often the fit is improved. */
-const [MARGIN, ROUNDS] = [1.08, 6];
+const [MARGIN, ROUNDS] = [1.08, 30];
 const KEY_TURN = Math.PI / 24;
 
 export class Space {
@@ -302,20 +302,26 @@ function fitting(content: readonly Vector3[], away: Vector3, fov_deg: number, as
   const seen = content.map((each) => new Vector3(each.dot(right), each.dot(over), each.dot(away)));
   const { least, most } = boxOf(seen);
   const middle = least.clone().add(most).multiplyScalar(0.5);
-  let distance = Math.max(0.1, least.distanceTo(most));
+  const reach = ({ x, y, z }: Vector3): number => Math.max(Math.abs(x - middle.x) / aspect, Math.abs(y - middle.y)) / tall + z - middle.z;
+  let distance = Math.max(0.1, MARGIN * seen.reduce((most, each) => Math.max(most, reach(each)), 0));
+  let best = { middle: middle.clone(), distance }; // all is in the picture, but perhaps not in its middle
   for (let round = 0; round < ROUNDS; round++) {
     const drawn = boxOf(seen.map((each) => projected(each, middle, distance)));
-    middle.x += ((drawn.least.x + drawn.most.x) / 2) * distance;
-    middle.y += ((drawn.least.y + drawn.most.y) / 2) * distance;
-    distance *= (MARGIN * Math.max((drawn.most.x - drawn.least.x) / aspect, drawn.most.y - drawn.least.y)) / (2 * tall);
+    const sides = [drawn.most.x, -drawn.least.x, drawn.most.y * aspect, -drawn.least.y * aspect];
+    if (distance < best.distance && Math.max(...sides) <= tall * aspect) best = { middle: middle.clone(), distance };
+    const filled = Math.max((drawn.most.x - drawn.least.x) / aspect, drawn.most.y - drawn.least.y) / (2 * tall);
+    middle.x += ((drawn.least.x + drawn.most.x) / 4) * distance;
+    middle.y += ((drawn.least.y + drawn.most.y) / 4) * distance;
+    distance *= (1 + MARGIN * filled) / 2; // by half the way, as what is near moves most
   }
-  const target = right.clone().multiplyScalar(middle.x).add(over.clone().multiplyScalar(middle.y)).add(away.clone().multiplyScalar(middle.z));
-  return { target, distance };
+  const { x, y, z } = best.middle;
+  const target = right.clone().multiplyScalar(x).add(over.clone().multiplyScalar(y)).add(away.clone().multiplyScalar(z));
+  return { target, distance: best.distance };
 }
 
 /** On a plane at distance 1 from the eye, which is `distance` from `middle`; what is nearly behind the eye counts as near. */
 function projected(place: Vector3, middle: Vector3, distance: number): Vector3 {
-  const depth = Math.max(0.2 * distance, distance - (place.z - middle.z));
+  const depth = Math.max(0.05 * distance, distance - (place.z - middle.z));
   return new Vector3((place.x - middle.x) / depth, (place.y - middle.y) / depth, 0);
 }
 

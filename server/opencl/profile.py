@@ -94,9 +94,8 @@ class Profile:
         free_s = self._began_s
         for launch, begin_s, end_s in self._intervals(ended_s):
             self._add_idle(rows, free_s, begin_s)
-            spent_ms = (end_s - begin_s) * 1e3
-            rows[launch.row] += spent_ms
-            kernels[launch.kernel] += spent_ms
+            rows[launch.row] += (end_s - begin_s) * 1e3
+            kernels[launch.kernel] += (launch.event.profile.end - launch.event.profile.start) * 1e-6
             free_s = end_s
         self._add_idle(rows, free_s, ended_s)
         total = (ended_s - self._began_s) * 1e3
@@ -108,8 +107,10 @@ class Profile:
         if not self._launches:
             return []
         clocks = [launch.event.profile for launch in self._launches]
-        # An event is stamped as queued just before the host reads its own clock: the least difference is the clocks'.
-        offset_s = min(one.enqueued_s - clock.queued * 1e-9 for one, clock in zip(self._launches, clocks, strict=True))
+        # An event is stamped as queued just before the host reads its own clock, and all have ended by now: the least
+        # of these differences is nearest to that of the clocks.
+        offsets = [one.enqueued_s - clock.queued * 1e-9 for one, clock in zip(self._launches, clocks, strict=True)]
+        offset_s = min(*offsets, ended_s - clocks[-1].end * 1e-9)
         found = []
         last_s = self._began_s
         for launch, clock in zip(self._launches, clocks, strict=True):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from msgspec import structs
@@ -23,6 +25,30 @@ from server.room.viewpoint import imagined_frame
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement, SpotPlacement
 from server.tracking.alignment import Alignment
+
+
+class FrameTurn(Protocol):
+    """The use of the device for one frame."""
+
+    def is_due(self) -> bool:
+        """Whether to let others use the device now, or to give the frame up."""
+
+    def give_way(self, *, may_end: bool) -> None:
+        """Returns when the frame may go on. May raise where the frame may be given up."""
+
+
+@dataclass(frozen=True)
+class _Yielding:
+    """A turn as the pacer of launches asks for it."""
+
+    turn: FrameTurn
+    may_end: Callable[[], bool]
+
+    def is_due(self) -> bool:
+        return self.turn.is_due()
+
+    def give_way(self) -> None:
+        self.turn.give_way(may_end=self.may_end())
 
 
 class ClientSession:
@@ -57,15 +83,18 @@ class ClientSession:
         self._has_told_pending = False
         self.device_name = device.name
 
-    def process(self, frame: RgbdFrame | Viewpoint, *, watched: bool = False) -> FrameResult:
+    def process(
+        self, frame: RgbdFrame | Viewpoint, *, watched: bool = False, turn: FrameTurn | None = None
+    ) -> FrameResult:
         """One frame through the pipeline. A viewpoint shows what others have scanned.
 
-        `watched`: somebody wants the picture, whatever the client wished to be answered by.
+        `watched`: somebody wants the picture, whatever the client wished to be answered by. `turn`: with whom the
+        device is shared while the frame is worked on; None: with nobody.
 
         Raises ValueError with one line for a frame that is refused; the session's state is then as it was. Waits while
-        another client's frame is in the room.
+        another client's frame is in the room. Raises what `turn` raises, after which only `close` may be called.
         """
-        with self._room.lock:
+        with self._room.lock, self._sharing_device(turn):
             if isinstance(frame, Viewpoint):
                 volume, place = self._room.reconstruction.volume, self._alignment.room_from_client
                 frame = imagined_frame(self._engine, self._camera, volume, frame, place)
@@ -76,6 +105,22 @@ class ClientSession:
                 self._pipeline.use(self._quality.settings)
                 plan = structs.replace(plan, point=point)
             return replace(result, plan=plan, notes=(*result.notes, *self._differences, *self._pending_notes()))
+
+    @contextmanager
+    def _sharing_device(self, turn: FrameTurn | None) -> Iterator[None]:
+        pacer = self._engine.pacer
+        pacer.yielding = None if turn is None else _Yielding(turn, self._may_end)
+        try:
+            yield
+        except BaseException:
+            self._room.changes += 1  # the frame may have changed a part of the room
+            raise
+        finally:
+            pacer.yielding = None
+
+    def _may_end(self) -> bool:
+        """Whether the frame can be given up where it is: what it works on is this client's alone."""
+        return self._owns_room or self._engine.profile.row == "radiance_transfer"
 
     def place_object(self, object_id: str, mesh: Mesh, placement: Placement | SpotPlacement) -> tuple[str, ...]:
         """Put a mesh into the room, in place of one with the same id; returns notes. Raises ValueError.

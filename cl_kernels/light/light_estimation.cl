@@ -3,6 +3,8 @@
 #ifndef COEFFICIENTS
 #error COEFFICIENTS must be defined: the number of spherical-harmonics coefficients
 #endif
+#include "groups.clh"
+
 #define TILE 8
 #define TILE_SAMPLES 64
 #define COLUMNS (COEFFICIENTS + 3)
@@ -87,7 +89,7 @@ kernel void accumulate_tiles(const int cols, const int rows, const int tile_cols
                              global const float4 *observed, global float *partial) {
     local float samples[COLUMNS + 1][TILE_SAMPLES];  // the last: weights
     const int item = get_local_id(0);
-    const int tile = get_group_id(0);
+    const int tile = group_number();
     const int col = (tile % tile_cols) * TILE + item % TILE;
     const int row = (tile / tile_cols) * TILE + item / TILE;
     const int inside = col < cols && row < rows;

@@ -21,6 +21,7 @@
 // `counts` [2 + tiles] pieces, fragments, and the pieces of each tile.
 #pragma OPENCL FP_CONTRACT OFF  // the same vertex must land on the same subpixel in every triangle that shares it
 #include "camera.clh"
+#include "groups.clh"
 #include "pieces.clh"
 #include "surface_point.clh"
 #include "textures.clh"
@@ -64,7 +65,7 @@ kernel void clear_picture(const int2 size, const int4 region, const int count, g
 kernel __attribute__((reqd_work_group_size(CHUNK, 1, 1)))
 void project_vertices(const global int2 *chunks, const global int8 *objects, const global float16 *matrices,
                       const float near_m, const global float *vertices, global int4 *projected) {
-    const int2 chunk = chunks[get_group_id(0)];
+    const int2 chunk = chunks[group_number()];
     const int8 object = objects[chunk.x];
     const int vertex = chunk.y + get_local_id(0);
     if (vertex >= object.s3) return;
@@ -138,7 +139,7 @@ void setup_triangles(const int2 size, const int2 room, const global int2 *chunks
                      global int8 *corners, global float4 *inverse_depths, global uint *nearest,
                      global int4 *fragments) {
     local int kept[2], first[2];
-    const int2 chunk = chunks[get_group_id(0)];
+    const int2 chunk = chunks[group_number()];
     const int8 object = objects[chunk.x];
     const int item = get_local_id(0), triangle = chunk.y + item;
     if (item < 2) kept[item] = 0;
@@ -180,7 +181,7 @@ kernel __attribute__((reqd_work_group_size(CHUNK, 1, 1)))
 void settle_triangles(const int2 size, const global int2 *chunks, const global int8 *objects,
                       const global int *triangles, const global int4 *projected, const global uint *nearest,
                       global int *visible) {
-    const int2 chunk = chunks[get_group_id(0)];
+    const int2 chunk = chunks[group_number()];
     const int8 object = objects[chunk.x];
     const int triangle = chunk.y + get_local_id(0);
     if (triangle >= object.s4) return;
@@ -258,7 +259,7 @@ void raster_tiles(const int2 size, const int4 region, const global int8 *corners
     local uint best[TILE * TILE];
     local int winners[TILE * TILE];
     const int item = get_local_id(0), columns = region.z - region.x;
-    const int2 place = region.xy + (int2)(get_group_id(0) % columns, get_group_id(0) / columns);
+    const int2 place = region.xy + (int2)(group_number() % columns, group_number() / columns);
     const int tile = place.y * tile_columns(size) + place.x;
     const int2 origin = TILE * place;
     const int2 pixel = origin + pixel_of(item);

@@ -1,6 +1,7 @@
 // TSDF integration (KinectFusion; thesis 4.2.1): weighted running means of projective signed distance and of colour.
 // Provides integrate.
 #include "camera.clh"
+#include "groups.clh"
 #include "lanes.clh"
 #include "radiance_marks.clh"
 #include "volume.clh"
@@ -74,7 +75,7 @@ kernel void integrate(const int count, const int width, const int height, const 
                       global uint *colors, global ulong *solid, global uchar *octets) {
     local int rows[BRICK * BRICK];  // bit x: that voxel is solid
     local uint halves[2];           // of the brick's solid cells
-    const int group = get_group_id(0);
+    const int group = group_number();
     const int item = get_local_id(0), items = get_local_size(0);
     const int index = allocated[min(group, count - 1)];
     const int3 brick = (int3)(index % bricks.x, (index / bricks.x) % bricks.y, index / (bricks.x * bricks.y));

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from server.opencl.buffers import BufferDescription, Group, StageBuffers, Workspace
 from server.opencl.device import Device
+from server.opencl.pacing import Pacer
 from server.opencl.pending_read import PendingRead
 from server.opencl.profile import Profile
 from server.opencl.program import Define, define_options
@@ -35,6 +37,7 @@ class Engine:
         self.workspace = Workspace(self.queue)
         device.memory.add(self.workspace)
         self.profile: Profile = beside.profile if beside else Profile()
+        self.pacer: Pacer = beside.pacer if beside else Pacer()
         self._kernels: dict[tuple[object, ...], cl.Kernel] = beside._kernels if beside else {}
         self._typed: dict[int, cl.Kernel] = beside._typed if beside else {}
         self._states: dict[type[Any], Any] = {}
@@ -58,10 +61,12 @@ class Engine:
         size: tuple[int, ...],
         *arguments: KernelArgument,
         local: tuple[int, ...] | None = None,
+        steps: int = 1,
     ) -> None:
         """Enqueue `kernel` over at least `size` work-items: rounded up to `local`, so kernels guard their range.
 
-        Python ints become int32, floats float32; numpy scalars and vector types pass as they are.
+        Python ints become int32, floats float32; numpy scalars and vector types pass as they are. `steps`: what a
+        work-item does at most, such as the number of its rays: a long launch is cut by it (pacing.py).
         """
         if 0 in size:
             return
@@ -71,8 +76,11 @@ class Engine:
             kernel.set_arg_types([_type_of(value) for value in arguments])
             self._typed[id(kernel)] = kernel
         passed: list[Any] = [a.data if isinstance(a, cl_array.Array) else a for a in arguments]
-        event = kernel(self.queue, rounded, local, *passed)
-        self.profile.add_event(kernel.function_name, event)
+        name = kernel.function_name
+        for offset, part in self.pacer.slices(name, rounded, local, steps):
+            event = kernel(self.queue, part, local, *passed, global_offset=offset if any(offset) else None)
+            self.pacer.enqueued(name, math.prod(part), steps, event)
+            self.profile.add_event(name, event)
 
     def state(self, kind: type[State]) -> State:
         """The one instance of `kind` that belongs to this engine, made on first use: what a stage keeps of the frame

@@ -3,6 +3,9 @@
 Start-time fair queuing (Goyal, Vin and Cheng 1996) with measured costs: the session with the least device time is next.
 A session with expensive frames therefore gets fewer of them and slows only itself. A session that was idle continues
 from the others' least device time minus a small credit, so idle time cannot be saved up.
+
+A frame that takes long is interrupted: after QUANTUM_S it lets sessions with less device time go first, as often as it
+takes. Other clients of its room wait until it has ended, since it may have changed the room by half.
 """
 
 from __future__ import annotations
@@ -17,6 +20,8 @@ CREDIT_S = 0.5
 """Device time that a returning session may be behind the others. Every session is idle between two frames."""
 AWAY_S = 5.0
 """A session that is idle for longer is not counted as sharing the device."""
+QUANTUM_S = 0.2
+"""Time that a frame has before it lets others go first: a usual frame is not interrupted."""
 _RATE = 0.2  # weight of a new frame in the running mean of costs
 
 
@@ -35,6 +40,28 @@ class SessionShare:
     """Time at which its last frame ended, by the scheduler's clock."""
 
 
+class Turn:
+    """A session's use of the device for one frame; made by Scheduler.acquire."""
+
+    def __init__(self, scheduler: Scheduler, share: SessionShare) -> None:
+        self._scheduler = scheduler
+        self._share = share
+        self.waited_s = 0.0
+        """Time before the frame could begin."""
+        self.spent_s = 0.0
+        """Device time of the frame before it was last resumed."""
+        self.resumed_s = 0.0
+        """When it was begun or last resumed, by the scheduler's clock."""
+
+    def is_due(self) -> bool:
+        """Whether the frame is to let another session go first."""
+        return self._scheduler.is_due(self, self._share)
+
+    def give_way(self) -> None:
+        """Let others use the device; returns when the frame may go on."""
+        self._scheduler.give_way(self, self._share)
+
+
 class Scheduler:
     """Thread-safe."""
 
@@ -45,6 +72,8 @@ class Scheduler:
         self._shares: list[SessionShare] = []
         self._waiting: list[SessionShare] = []
         self._working: list[SessionShare] = []
+        self._interrupted: list[SessionShare] = []
+        """Sessions within a frame that let others go first; they wait too."""
         self._changed = threading.Condition()
 
     def join(self, room: Hashable = None) -> SessionShare:
@@ -61,24 +90,52 @@ class Scheduler:
             self._shares.remove(share)
 
     @contextmanager
-    def acquire(self, share: SessionShare) -> Iterator[float]:
-        """Context in which the session may use the device. Yields the waiting time in seconds."""
-        began = self._clock()
+    def acquire(self, share: SessionShare) -> Iterator[Turn]:
+        """Context in which the session may use the device."""
+        turn, began_s = Turn(self, share), self._clock()
         with self._changed:
             share.used_s = max(share.used_s, self._least_used_s(share, share.used_s) - CREDIT_S)
-            self._waiting.append(share)
-            self._changed.wait_for(lambda: self._next() is share)
-            self._waiting.remove(share)
-            self._working.append(share)
-            self._changed.notify_all()  # with concurrent frames, another session may start too
-        started = self._clock()
+            self._wait(turn, share)
+        turn.waited_s = turn.resumed_s - began_s
         try:
-            yield started - began
+            yield turn
         finally:
             with self._changed:
-                self._charge(share, self._clock() - started)
-                self._working.remove(share)
-                self._changed.notify_all()
+                self._interrupt(turn, share)
+                self._note_frame(share, turn.spent_s)
+
+    def is_due(self, turn: Turn, share: SessionShare) -> bool:
+        """Whether the session that has the turn is to let another go first."""
+        spent_s = self._clock() - turn.resumed_s
+        if spent_s < QUANTUM_S:
+            return False
+        with self._changed:
+            return any(other.used_s < share.used_s + spent_s for other in self._able())
+
+    def give_way(self, turn: Turn, share: SessionShare) -> None:
+        """Interrupt the frame of the session that has the turn. Returns when it is next."""
+        with self._changed:
+            self._interrupt(turn, share)
+            self._interrupted.append(share)
+            self._wait(turn, share)
+            self._interrupted.remove(share)
+
+    def _wait(self, turn: Turn, share: SessionShare) -> None:
+        """Wait until the session is next, and give it the device."""
+        self._waiting.append(share)
+        self._changed.wait_for(lambda: self._next() is share)
+        self._waiting.remove(share)
+        self._working.append(share)
+        turn.resumed_s = self._clock()
+        self._changed.notify_all()  # with concurrent frames, another session may start too
+
+    def _interrupt(self, turn: Turn, share: SessionShare) -> None:
+        """Take the device from the session and charge what it has used."""
+        spent_s = self._clock() - turn.resumed_s
+        turn.spent_s += spent_s
+        self._charge(share, spent_s)
+        self._working.remove(share)
+        self._changed.notify_all()
 
     @property
     def busy(self) -> int:
@@ -108,15 +165,20 @@ class Scheduler:
         """The session that works next; None if every waiting session has to wait longer."""
         if len(self._working) >= self._concurrent_frames:
             return None
-        rooms = {share.room for share in self._working}
-        ready = [share for share in self._waiting if share.room not in rooms]
-        return min(ready, key=lambda share: share.used_s, default=None)
+        return min(self._able(), key=lambda share: share.used_s, default=None)
+
+    def _able(self) -> list[SessionShare]:
+        """Waiting sessions whose rooms no other session's frame is in."""
+        rooms = {share.room for share in (*self._working, *self._interrupted)}
+        return [share for share in self._waiting if share in self._interrupted or share.room not in rooms]
 
     def _charge(self, share: SessionShare, spent_s: float) -> None:
         share.used_s += spent_s
+        share.last_used_s = self._clock()
+
+    def _note_frame(self, share: SessionShare, cost_s: float) -> None:
         share.frames += 1
         if share.frames == 2:
-            share.cost_s = spent_s  # the first frame is not representative
+            share.cost_s = cost_s  # the first frame is not representative
         elif share.cost_s is not None:
-            share.cost_s += _RATE * (spent_s - share.cost_s)
-        share.last_used_s = self._clock()
+            share.cost_s += _RATE * (cost_s - share.cost_s)

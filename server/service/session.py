@@ -88,6 +88,11 @@ class EventLoopOutbox:
         finally:
             self.waited_s += self._loop.time() - began
 
+    @property
+    def has_ended(self) -> bool:
+        """Any thread: whether the session is at its end."""
+        return self._closed
+
     def is_watched(self) -> bool:
         """Worker thread: whether anybody watches this session."""
         return self._broadcast.is_watched(self.session)

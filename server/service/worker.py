@@ -36,14 +36,14 @@ from protocol.messages import (
 from server.meshing.files import mesh_files
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement, requested_placement
-from server.service.connection import POLICY, UNAUTHORIZED, Refusal
+from server.service.connection import POLICY, UNAUTHORIZED, ClientGone, Refusal
 from server.service.load_shedding import LoadShedding, SamplingRequest
 from server.service.mailbox import Mailbox, PanoramaOrder, QueuedMessage
 from server.service.mesh_message import mesh_parts
 from server.service.metrics import Metrics
 from server.service.result_encoding import composite_message, layer_message
 from server.service.room_registry import WrongRoomKey
-from server.service.scheduler import Scheduler
+from server.service.scheduler import Scheduler, Turn
 
 if TYPE_CHECKING:
     from server.client_session import ClientSession
@@ -68,6 +68,10 @@ class Outbox(Protocol):
     @property
     def waited_s(self) -> float:
         """Total time spent waiting for the socket."""
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the client has left for good: nobody waits for the frame that is worked on."""
 
     def is_watched(self) -> bool:
         """Whether the session has watchers."""
@@ -183,13 +187,14 @@ class Worker:
         except ProtocolError as error:
             return self._drop(frame, "unreadable", error)
         try:
-            with overhead.excluded(), self._context.scheduler.acquire(self._share) as waited_s:
+            with overhead.excluded(), self._context.scheduler.acquire(self._share) as turn:
                 self._waited_ms = (time.perf_counter() - self._arrived_s) * 1e3
-                result = pipeline.process(rgbd, watched=self._outbox.is_watched())
+                frame_turn = _FrameTurn(turn, self._outbox)
+                result = pipeline.process(rgbd, watched=self._outbox.is_watched(), turn=frame_turn)
                 self._adapt_sampling(pipeline)
         except ValueError as error:
             return self._drop(frame, "refused", error)
-        self._context.metrics.turn_ms.observe(waited_s * 1e3)
+        self._context.metrics.turn_ms.observe(turn.waited_s * 1e3)
         self._context.metrics.observe_stages(result.timings)
         self._context.metrics.processed.inc()
         self._deliver(frame, result)
@@ -301,6 +306,24 @@ class Worker:
         data = encode(structs.replace(make(), waited_ms=self._waited_ms))
         self._context.metrics.encode_ms.observe((time.perf_counter() - start_s) * 1e3)
         return data
+
+
+@dataclass(frozen=True)
+class _FrameTurn:
+    """A frame's use of the device, as long as its client is there."""
+
+    turn: Turn
+    outbox: Outbox
+
+    def is_due(self) -> bool:
+        return self.outbox.has_ended or self.turn.is_due()
+
+    def give_way(self, *, may_end: bool) -> None:
+        """Raises ClientGone."""
+        if self.outbox.has_ended and may_end:
+            raise ClientGone
+        if self.turn.is_due():
+            self.turn.give_way()
 
 
 class _Overhead:

@@ -64,6 +64,7 @@ def refine_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface,
         virtual.normal,
         virtual.object_index,
         occluded,
+        steps=scene.rays.count,
     )
     return occluded
 
@@ -100,6 +101,7 @@ def refine_real(
         surface.normals,
         ratio.shaded,
         refined,
+        steps=scene.rays.count,
     )
     return refined
 

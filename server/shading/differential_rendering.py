@@ -77,6 +77,7 @@ def shadow_real(
         indirect.hits if indirect else no_hits(engine, transfer),
         ratio,
         shaded,
+        steps=scene.rays.count,
     )
     return RealShadow(transfer.stride, ratio, shaded)
 
@@ -114,6 +115,7 @@ def bounce_real(
         spare,
         (least or shadow).shaded,
         bounced,
+        steps=scene.rays.count,
     )
     return replace(shadow, values=bounced)
 
@@ -135,6 +137,7 @@ def shadow_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface,
         virtual.normal,
         virtual.object_index,
         occluded.values,
+        steps=scene.rays.count,
     )
     return occluded
 
@@ -158,5 +161,6 @@ def light_points(engine: Engine, scene: TracedScene, placed: PlacedPoints | None
         placed.albedos,
         placed.offsets_m,
         radiances,
+        steps=scene.rays.count,
     )
     return replace(placed.point_lights, radiances=radiances)

@@ -107,6 +107,7 @@ def gather_hits(
         hits,
         met,
         *(() if found is None else (found,)),
+        steps=max(rays.count // every, 1),
     )
     return hits
 

@@ -210,6 +210,7 @@ def transfer_radiance(
         result.free_mask,
         result.sets,
         *only,
+        steps=rays.count,
     )
     return result
 

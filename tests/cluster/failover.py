@@ -50,6 +50,7 @@ from ray import serve  # noqa: E402
 from ray.cluster_utils import Cluster  # noqa: E402
 
 from client.streaming.client import Answer, RoomPlace, StreamClient  # noqa: E402
+from client.streaming.opening import ClientError  # noqa: E402
 from server.cluster.application import build  # noqa: E402
 from server.cluster.ray_directory import NAMESPACE, PREFIX  # noqa: E402
 from server.cluster.routing import room_id_of  # noqa: E402
@@ -137,14 +138,28 @@ async def play(url: str, cluster: Cluster, doomed: Any) -> dict[str, Any]:
 
 async def enter(url: str, room: str) -> Guest:
     """A client that streams, with an object in its room."""
-    client = await StreamClient.connect(url)
-    await client.hello(CAMERA, wishes("given"), room=RoomPlace(room), keep_s=KEEP_S)
+    client = await admitted(url, room)
     guest = Guest(room, client)
     guest.tasks = [asyncio.create_task(guest.receive()), asyncio.create_task(guest.send())]
     placed = await client.place_object("vase", "glb", vase_glb(), position_m=(-0.9, 0.6, 1.0))
     if placed.error is not None:
         raise RuntimeError(placed.error)
     return guest
+
+
+async def admitted(url: str, room: str) -> StreamClient:
+    """A client in its room. Hosts that have just begun compile their kernels, and the ingress says: try again."""
+    until_s = time.perf_counter() + PATIENCE_S
+    while True:
+        client = await StreamClient.connect(url)
+        try:
+            await client.hello(CAMERA, wishes("given"), room=RoomPlace(room), keep_s=KEEP_S)
+        except ClientError as error:
+            await client.close()
+            if "try again" not in str(error) or time.perf_counter() > until_s:
+                raise
+        else:
+            return client
 
 
 async def told(guest: Guest, has_moved: bool, killed: float) -> dict[str, Any]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,12 @@ from server.meshing.scene_mesh import SceneMesh
 from server.meshing.surface import MeshingError
 from server.shading.layer import Layer, LayerPart
 
+if TYPE_CHECKING:
+    from server.client_session import FrameTurn  # loads OpenCL, which a fake does not need
+
 PATIENCE_S = 60.0
+SLICE_S = 0.02
+"""Time between the slices of a held frame."""
 CAMERA = CameraModel(width=48, height=32, fx=40.0, fy=41.0, cx=23.5, cy=15.5)
 POSE = np.array([[0, -1, 0, 0.125], [1, 0, 0, 0.1], [0, 0, 1, -2.5], [0, 0, 0, 1]], np.float64)
 
@@ -46,6 +52,8 @@ class Lab:
 
     hold: bool = False
     """Each `process` waits for one `release`."""
+    slices: bool = False
+    """While it waits, it lets others use the device as frames do that take long."""
     entered: queue.Queue = field(default_factory=queue.Queue)
     """The index of each frame as its processing begins."""
     released: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
@@ -115,11 +123,11 @@ class FakePipeline:
             raise ValueError("there is no light yet: no frame has been placed in the room")
         return self.lab.panorama, position_m or (1.0, 2.0, 3.0)
 
-    def process(self, frame: RgbdFrame, *, watched: bool = False) -> FakeResult:
+    def process(self, frame: RgbdFrame, *, watched: bool = False, turn: FrameTurn | None = None) -> FakeResult:
         self.lab.log.append(("frame", frame.index))
         self.lab.entered.put(frame.index)
-        if self.lab.hold and not self.lab.released.acquire(timeout=PATIENCE_S):
-            raise RuntimeError("the test never released this frame")
+        if self.lab.hold:
+            self._work_until_released(turn)
         if frame.depth[0, 0] == REFUSE_MM:
             raise ValueError("no depth in this frame: point the camera at something")
         if frame.depth[0, 0] == EXPLODE_MM:
@@ -127,6 +135,15 @@ class FakePipeline:
         result = fake_result(frame)
         color = result.color if watched or self.answer == "picture" else None
         return replace(result, color=color, layer=fake_layer(frame) if self.answer == "layer" else None)
+
+    def _work_until_released(self, turn: FrameTurn | None) -> None:
+        """A frame that takes long; in slices, if the lab says so."""
+        end_s = time.monotonic() + PATIENCE_S
+        while not self.lab.released.acquire(timeout=SLICE_S):
+            if time.monotonic() > end_s:
+                raise RuntimeError("the test never released this frame")
+            if self.lab.slices and turn is not None and turn.is_due():
+                turn.give_way(may_end=True)
 
     def close(self) -> None:
         self.lab.closed.set()

@@ -49,6 +49,7 @@ class Device:
             self.scheduler._waiting.remove(chosen)
             self.clock.now += self.costs[names[id(chosen)]]
             self.scheduler._charge(chosen, self.costs[names[id(chosen)]])
+            self.scheduler._note_frame(chosen, self.costs[names[id(chosen)]])
             self.frames[names[id(chosen)]] += 1
         self.scheduler._waiting.clear()
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from playwright.sync_api import Page
 
 from protocol.frames import RgbdFrame, Viewpoint
-from server.client_session import ClientSession
+from server.client_session import ClientSession, FrameTurn
 from server.opencl.device import Device
 from server.pipeline import FrameResult
 from server.scene.mesh import Mesh
@@ -47,10 +47,12 @@ def watched_server(device: Device, seen: Seen) -> Iterator[BackgroundServer]:
     """The real service, which notes what comes. Its kernels are compiled, as those of any service that is ready."""
 
     class Watched(ClientSession):
-        def process(self, frame: RgbdFrame | Viewpoint, *, watched: bool = False) -> FrameResult:
+        def process(
+            self, frame: RgbdFrame | Viewpoint, *, watched: bool = False, turn: FrameTurn | None = None
+        ) -> FrameResult:
             assert isinstance(frame, RgbdFrame)
             seen.frames.append(frame)
-            return super().process(frame, watched=watched)
+            return super().process(frame, watched=watched, turn=turn)
 
         def place_object(self, object_id: str, mesh: Mesh, placement: Placement) -> tuple[str, ...]:
             notes = super().place_object(object_id, mesh, placement)

@@ -11,6 +11,7 @@ import pytest
 from msgspec import structs
 
 from protocol.frames import RgbdFrame
+from server.client_session import FrameTurn
 from server.service.serve import BackgroundServer
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.page import start_capture, wait_until
@@ -23,8 +24,8 @@ UP = cv2.Rodrigues(np.array([0.0, 0.0, 0.5]))[0] @ np.array([0.0, 1.0, 0.0])
 
 
 class _Leaning(FakePipeline):
-    def process(self, frame: RgbdFrame, *, watched: bool = False) -> FakeResult:
-        result = super().process(frame, watched=watched)
+    def process(self, frame: RgbdFrame, *, watched: bool = False, turn: FrameTurn | None = None) -> FakeResult:
+        result = super().process(frame, watched=watched, turn=turn)
         return dataclasses.replace(result, light=structs.replace(result.light, up=tuple(UP.tolist())))
 
 

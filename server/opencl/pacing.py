@@ -1,0 +1,137 @@
+"""Keeps a device answerable: long launches are enqueued in slices, and few of them ahead of the device.
+
+A device runs what is enqueued to its end, whoever waits. So that another session waits for a slice at most and not for
+a whole frame, a launch that may be long is cut along its slowest dimension, and the host enqueues the next slice only
+once what is on the device will soon have ended. Between two launches or slices it asks `yielding` whether to let others
+use the device. Each work-item runs once and does what it would have done: results are the same to the bit.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import pyopencl as cl
+
+Size = tuple[int, ...]
+
+SLICE_S = 0.05
+"""Longest slice. A launch of a usual frame is shorter and is not cut."""
+AHEAD_S = 0.1
+"""What may be enqueued ahead of the device, by expected time: enough for it never to wait for the host."""
+STEP_S = 20e-9
+"""Time of one step of one work-item on two cores of a processor, before a kernel's own is known, and at least this
+even where it was faster: a kernel that found nothing to do in one frame may find it in the next. Measured: 10 to 90 ns
+for a ray of transfer or a pixel of the ray cast. On a GPU it is less, which only cuts long launches into more slices.
+"""
+_FADING = 0.95
+"""The longest time of a kernel's step is remembered with this factor a launch."""
+
+
+class Yielding(Protocol):
+    """Who else wants the device."""
+
+    def is_due(self) -> bool:
+        """Whether others are to use the device now. Asked before each launch and slice: takes no time."""
+
+    def give_way(self) -> None:
+        """Called while the device has nothing of this frame; returns when the frame may go on. May raise to end it."""
+
+
+@dataclass
+class _StepTime:
+    """Seconds of one step of one work-item of a kernel."""
+
+    longest_s: float
+    usual_s: float
+
+
+@dataclass(frozen=True)
+class _Enqueued:
+    kernel: str
+    steps: int
+    """Of all its work-items."""
+    expected_s: float
+    event: cl.Event
+
+
+class Pacer:
+    """Belongs to a command queue."""
+
+    def __init__(self, slice_s: float = SLICE_S, ahead_s: float = AHEAD_S, step_s: float = STEP_S) -> None:
+        self._slice_s, self._ahead_s, self._step_s = slice_s, ahead_s, step_s
+        self._times: dict[str, _StepTime] = {}
+        self._ahead: deque[_Enqueued] = deque()
+        self.yielding: Yielding | None = None
+        """None: the frame has the device for itself."""
+
+    def slices(self, kernel: str, size: Size, local: Size, steps: int) -> Iterator[tuple[Size, Size]]:
+        """Offset and size of each slice of a launch, in work-items; `size` and all slices are multiples of `local`.
+
+        `steps`: inner steps of a work-item, such as rays. Waits before each slice while too much is enqueued already.
+        """
+        time = self._times.get(kernel)
+        longest_s = max(time.longest_s, self._step_s) if time else self._step_s
+        most_items = max(int(self._slice_s / (longest_s * steps)), 1)
+        for offset, part in cut(size, local, most_items):
+            self._make_room()
+            yield offset, part
+
+    def enqueued(self, kernel: str, items: int, steps: int, event: cl.Event) -> None:
+        """A slice of so many work-items was enqueued."""
+        time = self._times.get(kernel)
+        usual_s = time.usual_s if time else self._step_s
+        self._ahead.append(_Enqueued(kernel, items * steps, items * steps * usual_s, event))
+
+    def _make_room(self) -> None:
+        while self._ahead and self._ahead[0].event.command_execution_status == cl.command_execution_status.COMPLETE:
+            self._learn(self._ahead.popleft())
+        if self.yielding is not None and self.yielding.is_due():
+            self._drain(0.0)
+            self.yielding.give_way()
+        self._drain(self._ahead_s)
+
+    def _drain(self, ahead_s: float) -> None:
+        """Wait until no more than so much is on the device."""
+        while sum(one.expected_s for one in self._ahead) > ahead_s:
+            one = self._ahead.popleft()
+            one.event.wait()
+            self._learn(one)
+
+    def _learn(self, one: _Enqueued) -> None:
+        step_s = (one.event.profile.end - one.event.profile.start) * 1e-9 / one.steps
+        known = self._times.get(one.kernel)
+        if known is None:
+            self._times[one.kernel] = _StepTime(step_s, step_s)
+        else:
+            known.longest_s = max(step_s, _FADING * known.longest_s)
+            known.usual_s += 0.25 * (step_s - known.usual_s)
+
+
+def cut(size: Size, local: Size, most_items: int) -> Iterator[tuple[Size, Size]]:
+    """Offset and size of parts of a launch with at most `most_items` work-items each, where a work-group has no more.
+
+    A part is whole in the fastest dimensions as far as that is possible.
+    """
+    part = list(local)
+    for axis in range(len(size)):
+        others = 1
+        for other, extent in enumerate(part):
+            others *= extent if other != axis else 1
+        groups = max(most_items // (others * local[axis]), 1)
+        part[axis] = min(groups * local[axis], size[axis])
+        if part[axis] < size[axis]:
+            break
+    yield from _tiles(size, tuple(part))
+
+
+def _tiles(size: Size, part: Size) -> Iterator[tuple[Size, Size]]:
+    if not size:
+        yield (), ()
+        return
+    for slowest in range(0, size[-1], part[-1]):
+        extent = min(part[-1], size[-1] - slowest)
+        for offset, inner in _tiles(size[:-1], part[:-1]):
+            yield (*offset, slowest), (*inner, extent)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -36,6 +36,9 @@ class FrameTurn(Protocol):
     def give_way(self, *, may_end: bool) -> None:
         """Returns when the frame may go on. May raise where the frame may be given up."""
 
+    def released(self) -> AbstractContextManager[None]:
+        """Context in which others use the device."""
+
 
 @dataclass(frozen=True)
 class _Yielding:
@@ -49,6 +52,9 @@ class _Yielding:
 
     def give_way(self) -> None:
         self.turn.give_way(may_end=self.may_end())
+
+    def released(self) -> AbstractContextManager[None]:
+        return self.turn.released()
 
 
 class ClientSession:
@@ -150,6 +156,10 @@ class ClientSession:
         with self._room.lock:
             self._quality.request(preset, budget_ms, max_light_error_deg)
             self._pipeline.use(self._quality.settings)
+
+    def predicted_s(self, preset: Preset) -> float:
+        """What a frame at a preset is likely to take at least, before it was measured; 0 for `auto`."""
+        return self._quality.predicted_s(preset, self._camera.width, self._camera.height)
 
     def scene_mesh(self, progress: Callable[[int, int], None] = lambda _done, _total: None) -> SceneMesh:
         """The surface fused so far as triangles. Raises MeshingError, one line, where there is none."""

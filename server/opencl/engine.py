@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -40,6 +41,7 @@ class Engine:
         self.pacer: Pacer = beside.pacer if beside else Pacer()
         self._kernels: dict[tuple[object, ...], cl.Kernel] = beside._kernels if beside else {}
         self._typed: dict[int, cl.Kernel] = beside._typed if beside else {}
+        self._launched: set[tuple[object, ...]] = beside._launched if beside else set()
         self._states: dict[type[Any], Any] = {}
         self._buffers: dict[type[StageBuffers], StageBuffers] = {}
 
@@ -52,7 +54,9 @@ class Engine:
         """Kernel `name` of the kernel file `file`; retrieved once, because a kernel object carries its arguments."""
         key = (file, name, define_options(defines))  # as text: 1, 1.0 and True are equal in Python
         if key not in self._kernels:
-            self._kernels[key] = cl.Kernel(self.device.programs.get(file, defines), name)
+            with nullcontext() if self.device.programs.has(file, defines) else self.pacer.aside():
+                program = self.device.programs.get(file, defines)
+            self._kernels[key] = cl.Kernel(program, name)
         return self._kernels[key]
 
     def launch(
@@ -78,7 +82,11 @@ class Engine:
         passed: list[Any] = [a.data if isinstance(a, cl_array.Array) else a for a in arguments]
         name = kernel.function_name
         for offset, part in self.pacer.slices(name, rounded, local, steps):
-            event = kernel(self.queue, part, local, *passed, global_offset=offset if any(offset) else None)
+            shift = offset if any(offset) else None
+            variant = (id(kernel), local, shift is None)
+            with nullcontext() if variant in self._launched else self.pacer.aside():  # the first may compile it
+                event = kernel(self.queue, part, local, *passed, global_offset=shift)
+            self._launched.add(variant)
             self.pacer.enqueued(name, math.prod(part), steps, event)
             self.profile.add_event(name, event)
 

@@ -3,13 +3,15 @@
 A device runs what is enqueued to its end, whoever waits. So that another session waits for a slice at most and not for
 a whole frame, a launch that may be long is cut along its slowest dimension, and the host enqueues the next slice only
 once what is on the device will soon have ended. Between two launches or slices it asks `yielding` whether to let others
-use the device. Each work-item runs once and does what it would have done: results are the same to the bit.
+use the device; while kernels are compiled, others have it. Each work-item runs once and does what it would have done:
+results are the same to the bit.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -38,6 +40,9 @@ class Yielding(Protocol):
 
     def give_way(self) -> None:
         """Called while the device has nothing of this frame; returns when the frame may go on. May raise to end it."""
+
+    def released(self) -> AbstractContextManager[None]:
+        """Context in which the frame leaves the device to others."""
 
 
 @dataclass
@@ -84,6 +89,16 @@ class Pacer:
         time = self._times.get(kernel)
         usual_s = time.usual_s if time else self._step_s
         self._ahead.append(_Enqueued(kernel, items * steps, items * steps * usual_s, event))
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Context for what takes the host long, such as compiling: others may use the device meanwhile."""
+        if self.yielding is None:
+            yield
+            return
+        self._drain(0.0)
+        with self.yielding.released():
+            yield
 
     def _make_room(self) -> None:
         while self._ahead and self._ahead[0].event.command_execution_status == cl.command_execution_status.COMPLETE:

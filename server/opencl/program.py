@@ -49,9 +49,15 @@ class ProgramCache:
         exact = bool(device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT)
         self._options = [o for o in _OPTIONS if exact or "correctly-rounded" not in o]
 
+    def has(self, file: str, defines: dict[str, Define]) -> bool:
+        """Whether the program is built already."""
+        return (file, define_options(defines)) in self._programs
+
     def get(self, file: str, defines: dict[str, Define]) -> cl.Program:
         """The program built from the kernel file of that name with `defines`. Raises KernelBuildError."""
         key = (file, define_options(defines))
+        if key in self._programs:  # without the lock, which another thread may hold for as long as it compiles
+            return self._programs[key]
         with self._lock:
             if key not in self._programs:
                 self._programs[key] = self._build(*key)

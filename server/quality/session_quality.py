@@ -10,6 +10,10 @@ from server.quality.operating_point_control import OperatingPointControl, contro
 from server.quality.sampling_settings import SamplingSettings, requested_point
 from server.quality.settings import Settings, read_wishes
 
+RAY_S = 160e-9
+"""Time of one ray of transfer on one compute unit: 83 ns on two cores, in the kitchen and with rays through all of it.
+Other devices are taken to be as fast in each of their units, which is only to tell seconds from minutes."""
+
 
 class SessionQuality:
     """`settings` are those of the next frame. Call `observe` after each frame."""
@@ -44,6 +48,16 @@ class SessionQuality:
             self._control.observe(timings)
             self._sample_at(self._control.chosen.point)
         return point
+
+    def predicted_s(self, preset: Preset, width: int, height: int) -> float:
+        """Time of the transfer of a frame of this size at a preset, before it was measured; 0 for `auto`."""
+        if preset == "auto":
+            return 0.0
+        settings = read_wishes(self._sampling_of(preset).wishes(self.wishes))
+        sampling, rays = settings.sampling, settings.rays
+        rays_per_sample = rays if sampling.rays_per_frame else rays / sampling.interleave
+        samples = (width // sampling.stride) * (height // sampling.stride)
+        return samples * rays_per_sample * RAY_S / self._device.cl_device.max_compute_units
 
     def _sampling_of(self, preset: Preset) -> SamplingSettings:
         """The client's first settings if the preset is the same, else the preset's."""

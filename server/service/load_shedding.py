@@ -1,7 +1,8 @@
 """Load shedding: sessions that share an overloaded device use cheaper sampling before frames are dropped.
 
 A session that is alone gets what it requested. Steps depend on the frame period that the scheduler predicts. There is a
-minimum number of frames between steps, so that quality does not oscillate.
+minimum number of frames between steps, so that quality does not oscillate. Sampling whose frames would take seconds is
+not begun at all while others are there.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ MOST_STEPS = 4
 """Limit on steps of the budget."""
 FRAMES_BEFORE_FINER, FRAMES_BEFORE_CHEAPER = 40, 4
 """Minimum frames before a step to finer and to cheaper sampling."""
+MOST_FRAME_S = 1.0
+"""Predicted time of a frame above which a session that shares the device samples more cheaply before it is begun: the
+others of its room wait until it has ended."""
 FINER_BELOW = 0.4
 """Share of the target period below which there is time for the next finer step."""
 
@@ -85,6 +89,14 @@ class LoadShedding:
         if period > self._wanted_s:
             return self._step(+1, FRAMES_BEFORE_CHEAPER)
         return period < FINER_BELOW * self._wanted_s and self._step(-1, FRAMES_BEFORE_FINER)
+
+    def limit(self, sharing: int, predicted_s: Callable[[Preset], float]) -> bool:
+        """Call before each frame. `predicted_s`: time of a frame at a preset. True if the step changed."""
+        before = self.steps
+        if sharing > 1 and not self._is_fixed:
+            while self.steps < most_steps(self.requested) and predicted_s(self.granted.preset) > MOST_FRAME_S:
+                self.steps += 1
+        return self.steps != before
 
     def _step(self, by: int, patience: int) -> bool:
         to = min(max(self.steps + by, 0), most_steps(self.requested))

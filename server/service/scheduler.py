@@ -13,7 +13,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 
 CREDIT_S = 0.5
@@ -59,7 +59,12 @@ class Turn:
 
     def give_way(self) -> None:
         """Let others use the device; returns when the frame may go on."""
-        self._scheduler.give_way(self, self._share)
+        with self.released():
+            pass
+
+    def released(self) -> AbstractContextManager[None]:
+        """Context in which others use the device; the frame goes on after it when it is next."""
+        return self._scheduler.released(self, self._share)
 
 
 class Scheduler:
@@ -112,13 +117,18 @@ class Scheduler:
         with self._changed:
             return any(other.used_s < share.used_s + spent_s for other in self._able())
 
-    def give_way(self, turn: Turn, share: SessionShare) -> None:
-        """Interrupt the frame of the session that has the turn. Returns when it is next."""
+    @contextmanager
+    def released(self, turn: Turn, share: SessionShare) -> Iterator[None]:
+        """Context in which the frame of the session that has the turn is interrupted; at its end it waits again."""
         with self._changed:
             self._interrupt(turn, share)
             self._interrupted.append(share)
-            self._wait(turn, share)
-            self._interrupted.remove(share)
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._wait(turn, share)
+                self._interrupted.remove(share)
 
     def _wait(self, turn: Turn, share: SessionShare) -> None:
         """Wait until the session is next, and give it the device."""

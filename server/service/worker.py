@@ -186,6 +186,8 @@ class Worker:
             rgbd = self._decode(frame)
         except ProtocolError as error:
             return self._drop(frame, "unreadable", error)
+        if self._load_shedding.limit(self._context.scheduler.busy, pipeline.predicted_s):
+            self._sample_as_granted(pipeline)
         try:
             with overhead.excluded(), self._context.scheduler.acquire(self._share) as turn:
                 self._waited_ms = (time.perf_counter() - self._arrived_s) * 1e3
@@ -204,8 +206,11 @@ class Worker:
         """Apply the load-shedding step: cheaper sampling under load, the requested sampling otherwise."""
         scheduler, load_shedding = self._context.scheduler, self._load_shedding
         if load_shedding.observe(scheduler.busy, scheduler.period_s):
-            with contextlib.suppress(ValueError):  # not available on this device: keep the current sampling
-                pipeline.set_quality(*load_shedding.granted)
+            self._sample_as_granted(pipeline)
+
+    def _sample_as_granted(self, pipeline: ClientSession) -> None:
+        with contextlib.suppress(ValueError):  # not available on this device: keep the current sampling
+            pipeline.set_quality(*self._load_shedding.granted)
 
     def _send_mesh(self, pipeline: ClientSession, request: int) -> None:
         try:
@@ -324,6 +329,9 @@ class _FrameTurn:
             raise ClientGone
         if self.turn.is_due():
             self.turn.give_way()
+
+    def released(self) -> AbstractContextManager[None]:
+        return self.turn.released()
 
 
 class _Overhead:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
 
@@ -40,7 +42,7 @@ class Other:
     """Somebody who wants the device after each of the first launches and slices."""
 
     def __init__(self, engine: Engine, times: int) -> None:
-        self.engine, self.times, self.given = engine, times, 0
+        self.engine, self.times, self.given, self.releases = engine, times, 0, 0
         self.unfinished = 0
         """Kernels that were on the device while it was given away."""
 
@@ -49,7 +51,16 @@ class Other:
 
     def give_way(self) -> None:
         self.given += 1
-        self.unfinished += sum(launch.event.command_execution_status != 0 for launch in self.engine.profile._launches)
+        self._note()
+
+    @contextmanager
+    def released(self) -> Iterator[None]:
+        self.releases += 1
+        self._note()
+        yield
+
+    def _note(self) -> None:
+        self.unfinished += sum(one.event.command_execution_status != 0 for one in self.engine.profile._launches)
 
 
 @pytest.mark.parametrize(
@@ -154,3 +165,12 @@ def test_the_profile_counts_slices_of_one_kernel_together(engine: Engine) -> Non
     engine.launch(engine.kernel("pacing_test.cl", "number_groups"), (640,), groups)
     engine.queue.finish()
     assert set(engine.profile.collect().kernels) == {"number_groups"}
+
+
+def test_others_have_the_device_while_kernels_are_compiled(engine: Engine) -> None:
+    engine.pacer.yielding = other = Other(engine, 0)
+    groups = engine.workspace.upload("groups", np.zeros(640, np.int32))
+    for _ in range(3):
+        engine.launch(engine.kernel("pacing_test.cl", "number_groups", OF_THIS_TEST=1), (640,), groups)
+    assert (other.given, other.releases) == (0, 2), "once for the program, once for the first launch"
+    assert other.unfinished == 0

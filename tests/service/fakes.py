@@ -57,6 +57,8 @@ class Lab:
     entered: queue.Queue = field(default_factory=queue.Queue)
     """The index of each frame as its processing begins."""
     released: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
+    predicted_s: dict[str, float] = field(default_factory=dict)
+    """What a frame takes at a preset; 0 at others."""
     log: list = field(default_factory=list)
     """Everything asked of the pipelines, in order."""
     mesh: SceneMesh | None = None
@@ -108,6 +110,9 @@ class FakePipeline:
 
     def set_quality(self, preset: str, budget_ms: float | None, max_light_error_deg: float | None) -> None:
         self.lab.log.append(("preset", preset, budget_ms, max_light_error_deg))
+
+    def predicted_s(self, preset: str) -> float:
+        return self.lab.predicted_s.get(preset, 0.0)
 
     def scene_mesh(self) -> SceneMesh:
         self.lab.log.append(("mesh",))

@@ -120,6 +120,19 @@ def test_nobody_enters_the_room_of_an_interrupted_frame(scheduler: Scheduler, cl
     assert order == ["other room", "goes on", "same room"]
 
 
+def test_what_happens_while_it_is_released_is_not_its_time(scheduler: Scheduler, clock: Clock) -> None:
+    share = scheduler.join("study")
+    with scheduler.acquire(share) as turn:
+        clock.now_s += 1.0
+        with turn.released():
+            other = Frame(scheduler, scheduler.join(), "other", order := [])
+            until(lambda: order)
+            clock.now_s += 50.0
+            other.end()
+        clock.now_s += 1.0
+    assert share.used_s == 2.0
+
+
 def test_all_its_time_is_charged(scheduler: Scheduler, clock: Clock) -> None:
     share, others = scheduler.join(), scheduler.join()
     for _ in range(2):  # the first frame of a session tells nothing of its costs
@@ -157,6 +170,24 @@ def test_another_client_is_answered_while_a_long_frame_is_worked_on(server: Back
     assert slow.hear_until(Composite)[-1].frame == 1000
     for wire in (slow, quick):
         wire.hang_up()
+
+
+def test_sampling_that_takes_long_is_granted_to_those_who_are_alone(server: BackgroundServer, lab: Lab) -> None:
+    lab.predicted_s = {"art8": 200.0}
+    wire = Wire(server.url)
+    wire.greet(preset="art8")
+    wire.say(frame_message(0))
+    wire.hear_until(Composite)
+    assert ("preset", "gr15fast", None, None) not in lab.log
+    other = Wire(server.url)
+    other.greet()
+    other.say(frame_message(1))
+    other.hear_until(Composite)
+    wire.say(frame_message(2))
+    wire.hear_until(Composite)
+    assert lab.log.index(("preset", "gr15fast", None, None)) < lab.log.index(("frame", 2))
+    for one in (wire, other):
+        one.hang_up()
 
 
 def test_a_frame_is_given_up_when_its_client_has_left(server: BackgroundServer, lab: Lab) -> None:

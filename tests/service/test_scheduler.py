@@ -116,8 +116,8 @@ def run_in_threads(scheduler: Scheduler, shares: list[SessionShare], turns: int)
     def work(share: SessionShare) -> None:
         nonlocal most, most_of_room
         for _ in range(turns):
-            with scheduler.acquire(share) as waited_s:
-                assert waited_s >= 0
+            with scheduler.acquire(share) as turn:
+                assert turn.waited_s >= 0
                 with lock:
                     working.append(share)
                     most = max(most, len(working))
@@ -191,3 +191,19 @@ def test_budgets_shrink_instead_of_presets() -> None:
     shedding = LoadShedding(Wishes(preset="auto", budget_ms=300.0), 0.25)
     observe(shedding, FRAMES_BEFORE_CHEAPER, 8, 1.0)
     assert shedding.granted == SamplingRequest("auto", pytest.approx(180.0), None)
+
+
+TAKES_S = {"rm": 40.0, "art1": 9.0, "reg4": 0.8}
+
+
+def test_a_preset_whose_frames_take_seconds_is_not_begun_while_others_are_there() -> None:
+    shedding = LoadShedding(Wishes(preset="rm"), 0.25)
+    assert not shedding.limit(1, lambda preset: TAKES_S[preset])
+    assert shedding.granted.preset == "rm"
+    assert shedding.limit(2, lambda preset: TAKES_S[preset])
+    assert shedding.granted.preset == "reg4"
+    assert not shedding.limit(2, lambda preset: TAKES_S[preset])
+
+
+def test_lossless_sessions_begin_what_they_asked_for() -> None:
+    assert not LoadShedding(Wishes(preset="rm", lossless=True), 0.25).limit(8, lambda _preset: 40.0)

@@ -1,8 +1,9 @@
 """`probeless bench service`: what makes it a service a person would run for others.
 
-The way of one client; load; faults at random moments; bad bytes; two clients that see a plane each; replay. Servers are
-processes of their own, as in the field; clients run here, on the same cores. A run that was stopped goes on with the
-parts that are missing: finished ones lie in out/bench/service/parts, mutated messages in bytes.jsonl, logs beside them.
+The way of one client; load; frames of minutes; faults at random moments; bad bytes; two clients that see a plane each;
+replay. Servers are processes of their own, as in the field; clients run here, on the same cores. A run that was stopped
+goes on with the parts that are missing: finished ones lie in out/bench/service/parts, mutated messages in bytes.jsonl,
+logs beside them.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from tests.bench.service.bytes import decoder_part, socket_part
 from tests.bench.service.faults import FAULTS, fault_part, server_killed_part
 from tests.bench.service.http import http_part, schema_part
 from tests.bench.service.load import load_part, side_by_side_part
+from tests.bench.service.long_frames import long_frames_part
 from tests.bench.service.planes import planes_part
 from tests.bench.service.replay import replay_part
 from tests.bench.service.speed import speed_part
@@ -29,6 +31,7 @@ PARTS: dict[str, Callable[..., Part]] = {
     "speed": speed_part,
     "load": load_part,
     "side by side": side_by_side_part,
+    "long frames": long_frames_part,
     "server killed": server_killed_part,
     **{name: partial(fault_part, name) for name in FAULTS},
     "mutated messages": decoder_part,

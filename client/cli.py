@@ -17,18 +17,37 @@ from client.errors import OWN_PACKAGES, OptionError
 from client.options import capture_options as o
 from client.options.capture import prepare, refuse_color, refuse_depth_noise
 from client.options.capture_options import CaptureOptions, capturing
+from client.options.help import ALL, GroupedHelp
 from client.options.light_places import parse_panorama_out, write_panorama
 from client.progress import Stopwatch, note, progress_bar, say, track
 from client.results.extras import check_extras
 from client.results.names import PAGE_NAME
 from protocol.messages import Light
 
+RUN_EXAMPLES = """\
+probeless run synthetic:table --out out/table
+probeless run FOLDER --object Duck.glb@auto --out out/duck
+probeless run FOLDER --object Duck.glb@table,0.3m --frames 0:60 --video --out out/duck
+probeless run FOLDER --budget-ms 150 --out out/fast"""
+STREAM_EXAMPLES = """\
+probeless stream FOLDER --server URL --object Duck.glb@auto --out out/duck
+probeless stream oak --server URL --view
+probeless stream FOLDER --server URL --realtime --view
+probeless stream FOLDER --server URL --room office --poses track"""
+EXPLAIN_EXAMPLES = """\
+probeless explain FOLDER --object Duck.glb@auto
+probeless explain synthetic:room --preset art4 --frame 10"""
+SERVE_EXAMPLES = """\
+probeless serve
+probeless serve --host 0.0.0.0 --tls --objects models
+probeless serve --device nvidia --data /var/lib/probeless"""
 USAGE_STATUS, FAILURE_STATUS, INTERRUPTED_STATUS = 2, 1, 130
 
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,
     help="Lights virtual objects with the room's own light, with no light probe.",
 )
 
@@ -47,8 +66,10 @@ def _renamed(arguments: list[str]) -> list[str]:
 
 def run_command(arguments: list[str], debug: bool = False) -> int:
     """The exit status of a command line."""
+    state = {ALL: ALL in arguments}
+    words = ["--help" if word == ALL else word for word in arguments]
     try:
-        return typer.main.get_command(app).main(arguments, prog_name="probeless", standalone_mode=False) or 0
+        return typer.main.get_command(app).main(words, prog_name="probeless", standalone_mode=False, obj=state) or 0
     except KeyboardInterrupt:
         return INTERRUPTED_STATUS
     except BrokenPipeError:
@@ -81,7 +102,7 @@ def common(
     """Lights virtual objects with the room's own light, with no light probe."""
 
 
-@app.command()
+@app.command(cls=GroupedHelp, epilog=RUN_EXAMPLES)
 @capturing
 def run(
     options: CaptureOptions,
@@ -123,7 +144,7 @@ def run(
     _say_light(light)
 
 
-@app.command()
+@app.command(cls=GroupedHelp, epilog=EXPLAIN_EXAMPLES)
 @capturing
 def explain(
     options: CaptureOptions,
@@ -140,7 +161,7 @@ def explain(
         say(line)
 
 
-@app.command()
+@app.command(cls=GroupedHelp, epilog=STREAM_EXAMPLES)
 @capturing
 def stream(
     options: CaptureOptions,
@@ -155,7 +176,17 @@ def stream(
     lossless: Annotated[
         bool, typer.Option("--lossless", help="raw colour and exact depth; wait for every answer")
     ] = False,
-    adapt: Annotated[bool, typer.Option(help="adapt picture quality, size and rate to the link")] = True,
+    realtime: Annotated[
+        bool,
+        typer.Option(
+            "--realtime",
+            help="keep the source's frame rate, skip frames while the server is busy, adapt to the link, as with a "
+            "camera; default: every frame of a folder or recording is sent and answered",
+        ),
+    ] = False,
+    adapt: Annotated[
+        bool, typer.Option(help="of a camera or with --realtime: adapt picture quality, size and rate to the link")
+    ] = True,
     depth_noise: Annotated[
         float | None,
         typer.Option(metavar="M", help="noise of the sensor at 1 m; depth may be rounded by this times z^2"),
@@ -201,6 +232,7 @@ def stream(
     from client.commands.stream import Sending
     from client.commands.stream import stream as send
     from client.options.room_options import room_place
+    from client.sources.frame_source import is_live
     from client.streaming.client import Access
 
     with _telling_of_interrupts(out):
@@ -212,6 +244,7 @@ def stream(
             out,
             lossless,
             record,
+            realtime=realtime or is_live(capture.source),
             frames=capture.frames,
             mesh=mesh,
             panorama=panorama,
@@ -256,7 +289,7 @@ def _say_light(light: Light | None) -> None:
             say(line)
 
 
-@app.command()
+@app.command(cls=GroupedHelp, epilog=SERVE_EXAMPLES)
 def serve(
     host: Annotated[str, typer.Option(help="address to listen on; 0.0.0.0 for all")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free port")] = 8080,

@@ -17,8 +17,9 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from typer.main import get_command
 
-from client.cli import main, run_command
+from client.cli import app, main, run_command
 from server.light.panorama import read_panorama
 from tests.client import folders
 from tests.client.results_page import data_of
@@ -186,8 +187,31 @@ def test_help_names_every_command_and_option(probeless: Probeless) -> None:
         "--object --up --light --panorama --lamps --exposure --mesh --budget-ms --max-light-error --out"
     )
     for command in ("run", "stream"):
-        text = probeless(command, "--help").stdout
+        text = probeless(command, "--help-all").stdout
         assert [option for option in shared.split() if option not in text] == []
+
+
+@pytest.mark.parametrize("command", ["run", "stream", "explain", "serve"])
+def test_help_shows_on_one_page_what_people_need_first(probeless: Probeless, command: str) -> None:
+    text, everything = probeless(command, "--help").stdout, probeless(command, "--help-all").stdout
+    assert len(text.splitlines()) <= 60
+    assert f"probeless {command} --help-all shows every option" in text
+    assert "Examples:" in text
+    assert "Others:" not in everything, "each option has a group"
+    options = get_command(app).commands[command].params  # type: ignore[attr-defined]
+    names = [option.opts[-1] for option in options if option.param_type_name == "option" and option.name != "help"]
+    assert [name for name in names if f"  {name}" not in everything.replace(" / ", "  ")] == []
+    assert len(everything.splitlines()) > len(text.splitlines())
+
+
+@pytest.mark.parametrize("command", ["run", "stream"])
+def test_examples_of_the_help_are_command_lines(command: str) -> None:
+    """Each can be parsed: names of folders and files are not looked at."""
+    parser = get_command(app).commands[command]  # type: ignore[attr-defined]
+    for line in parser.epilog.splitlines():
+        words = line.split()
+        assert words[:2] == ["probeless", command]
+        parser.make_context(command, words[2:])
 
 
 def test_devices_lists_the_one_that_would_be_used(probeless: Probeless) -> None:

@@ -1,6 +1,7 @@
 """`stream`: a source over a real socket into a folder, at its own rate or losslessly."""
 
 import io
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from client.cli import run_command
 from client.commands import stream as streaming
 from client.commands.stream import stream
 from client.errors import ObjectError, OutputError, SourceError
@@ -62,6 +64,22 @@ def test_stream_writes_jpeg_quality_pictures_and_exact_numbers(server, tmp_path:
 def test_without_realtime_every_frame_is_answered(server) -> None:
     summary = quietly(FakeSource(30), server.url, realtime=False)
     assert (summary.sent, summary.answered, summary.skipped, summary.dropped) == (30, 30, 0, 0)
+
+
+def test_the_command_loses_no_frame_of_a_folder_while_the_server_is_busy(server, lab, capsys) -> None:
+    lab.hold = True
+    releasing = threading.Timer(0.5, lambda: lab.release(12))  # long after the source's 12 frames have passed
+    releasing.start()
+    assert run_command(["stream", "synthetic:table?frames=12", "--server", server.url]) == 0
+    assert "12 frames answered" in capsys.readouterr().out
+
+
+def test_the_command_keeps_the_rate_where_it_is_asked_to(server, lab, capsys) -> None:
+    lab.hold = True
+    releasing = threading.Timer(2.0, lambda: lab.release(12))
+    releasing.start()
+    assert run_command(["stream", "synthetic:table?frames=12", "--server", server.url, "--realtime"]) == 0
+    assert ", 0 skipped" not in capsys.readouterr().out
 
 
 def test_realtime_skips_frames_while_the_server_is_busy(server, lab, monkeypatch) -> None:

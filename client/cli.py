@@ -180,8 +180,7 @@ def stream(
         bool,
         typer.Option(
             "--realtime",
-            help="keep the source's frame rate, skip frames while the server is busy, adapt to the link, as with a "
-            "camera; default: every frame of a folder or recording is sent and answered",
+            help="as a camera: skip frames while the server is busy; default: all frames of a folder are answered",
         ),
     ] = False,
     adapt: Annotated[

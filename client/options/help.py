@@ -37,7 +37,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 """Options of all these commands, in the order in which they are shown."""
 FIRST = {
     *("frames", "poses", "up", "out", "overwrite", "video", "mesh", "object", "preset", "budget_ms", "device"),
-    *("light", "light_at", "panorama_out", "server", "realtime", "lossless", "room", "frame"),
+    *("light_at", "panorama_out", "server", "realtime", "lossless", "room", "frame"),
     *("host", "port", "tls", "objects", "data"),
 }
 """Options that `--help` shows; `--help-all` shows the others too."""

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from protocol.frames import CameraModel
-from server.light.shell import patches as stage
-from server.light.shell.patches import MOST_PATCHES, MOST_WEIGHT, PATCH_M, RAYS, Patches, Seen, hemisphere_rays
+from server.light.shell import picture as stage
+from server.light.shell.patches import MOST_PATCHES, MOST_WEIGHT, PATCH_M, RAYS, Patches, hemisphere_rays
+from server.light.shell.picture import Seen
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
+from tests.reference.patches import gather_clipped
 from tests.reference.patches import gather_patches as twin
 from tests.scenes.analytic import Floats
 from tests.scenes.solids import float4, upload_surface
@@ -45,7 +47,7 @@ def test_matches_twin(engine: Engine, size: tuple[int, int]) -> None:
     surface = upload_surface(engine, positions[..., :3], normals[..., :3], labels > 0)
     surface.labels.set(labels, engine.queue)
     seen_radiance = engine.workspace.upload("test_radiance", float4(radiance[..., :3], radiance[..., 3]))
-    found = stage.PatchesInPicture(engine, camera, surface, seen_radiance, volume).seen()
+    found = stage.PatchesInPicture(engine, camera, surface, seen_radiance, volume, np.eye(4)).seen()
     step = max(2, width // 40)
     places, facing, shown = (a.reshape(-1, 4) for a in twin(positions, normals, labels, radiance, step, 1.5 * VOXEL_M))
     # Pixels at the very tolerance may fall on either side of it in float32.
@@ -60,6 +62,61 @@ def test_matches_twin(engine: Engine, size: tuple[int, int]) -> None:
         np.testing.assert_allclose(found.clipped[~apart], facing[used, 3][~apart], atol=1e-5)
         np.testing.assert_allclose(found.variances[~apart], shown[used, 3][~apart], atol=2e-4)
         assert (found.clipped > 0.5).any()
+
+
+def test_clipped_surface_matches_twin(engine: Engine) -> None:
+    """Where it is, how it is turned, its radiance and its area across the line of sight."""
+    width, height, random = 331, 93, np.random.default_rng(4)
+    positions, normals, labels, radiance = made_up(width, height)
+    positions[..., :3] += random.choice([0.0, 0.0, 0.3], (height, width, 1)) * [0, 0, 1]
+    bright = random.random((height, width)) < 0.1
+    radiance[bright] = [1.0, 0.95, 0.92, 0.0]
+    camera = CameraModel(width=width, height=height, fx=200.0, fy=180.0, cx=width / 2, cy=height / 2)
+    volume = Volume(engine, (1.0, 2.0, 3.0, 2.0, 3.0, 4.0), VOXEL_M)
+    surface = upload_surface(engine, positions[..., :3], normals[..., :3], labels > 0)
+    surface.labels.set(labels, engine.queue)
+    seen_radiance = engine.workspace.upload("test_radiance", float4(radiance[..., :3], radiance[..., 3]))
+    pose = np.eye(4)
+    pose[:3, 2], pose[:3, 0], pose[:3, 3] = [0.6, 0.0, 0.8], [0.8, 0.0, -0.6], [0.3, 0.2, -1.0]
+    found = stage.PatchesInPicture(engine, camera, surface, seen_radiance, volume, pose).seen().bright
+    places, facing, shown = (
+        a.reshape(-1, 4)
+        for a in gather_clipped(positions, normals, labels, radiance, max(2, width // 40), pose, (200.0, 180.0))
+    )
+    used = places[:, 3] > 0
+    assert 30 < used.sum() < len(used)
+    np.testing.assert_allclose(found.positions - volume.origin_world, places[used, :3], atol=1e-5)
+    np.testing.assert_allclose(found.areas_m2, places[used, 3], rtol=1e-4)
+    np.testing.assert_allclose(found.normals, facing[used, :3], atol=1e-5)
+    np.testing.assert_allclose(found.radiance, shown[used, :3], atol=1e-5)
+    np.testing.assert_allclose(found.eye, pose[:3, 3] + volume.origin_world)
+
+
+def test_the_area_of_a_clipped_ball_is_that_of_its_disc(engine: Engine) -> None:
+    """Seen aside of the middle of a picture, where its image is an ellipse."""
+    width, height, focal, radius_m = 320, 240, 280.0, 0.1
+    center = np.array([0.5, 0.3, 1.5])
+    y, x = np.mgrid[:height, :width]
+    rays = np.stack([(x + 0.5 - width / 2) / focal, (y + 0.5 - height / 2) / focal, np.ones_like(x, float)], -1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    along = rays @ center
+    root = radius_m**2 - (center @ center - along**2)
+    hit = root > 0
+    positions = (along - np.sqrt(np.maximum(root, 0.0)))[..., None] * rays
+    normals = (positions - center) / radius_m
+    camera = CameraModel(width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)
+    volume = Volume(engine, (0.0, 0.0, 0.0, 1.0, 1.0, 1.0), VOXEL_M)
+    surface = upload_surface(engine, positions, normals, hit)
+    surface.labels.set(hit.astype(np.uint8), engine.queue)
+    seen_radiance = engine.workspace.upload(
+        "test_radiance", float4(np.ones((height, width, 3)), np.zeros((height, width)))
+    )
+    bright = stage.PatchesInPicture(engine, camera, surface, seen_radiance, volume, np.eye(4)).seen().bright
+    # Its near half is nearer than its middle by up to the radius: the disc that stands for it is smaller by that.
+    assert 0.85 < bright.areas_m2.sum() / (np.pi * radius_m**2) < 1.0
+    away = np.arcsin(radius_m / np.linalg.norm(center))
+    sky = (bright.areas_m2 / ((bright.positions - bright.eye) ** 2).sum(axis=1)).sum()
+    np.testing.assert_allclose(sky, 2 * np.pi * (1 - np.cos(away)), rtol=0.02)
 
 
 def one(position: Floats, radiance: float, normal: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Seen:

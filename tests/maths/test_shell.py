@@ -32,7 +32,7 @@ from server.light.shell.transport import SATURATED, Transport, meet
 from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
 from tests.reference.room_objective import level_objective
 from tests.scenes.analytic import Floats
-from tests.scenes.shell_room import CAMERA, KNOWN, SIZE_M, UP, Lamp, ShellRoom, make_room, sent
+from tests.scenes.shell_room import CAMERA, KNOWN, NO_EMITTERS, SIZE_M, UP, Lamp, ShellRoom, make_room, sent
 
 LAMP = Lamp((3.0, 0.9), 0.7, (16.0, 15.0, 14.0))
 AMBIENT = (0.3, 0.3, 0.3)
@@ -94,7 +94,7 @@ def test_a_brighter_picture_is_a_brighter_light() -> None:
         room.patches.logarithms[used] += np.log(factor)
         room.patches.arrivals[used, :, :3] *= factor
         room.transport = Transport()
-        room.transport.update(room.patches, used, room.shell)
+        room.transport.update(room.patches, NO_EMITTERS, used, room.shell)
         room.solve(5)
         rooms.append(room.unknowns.radiance[:CELLS])
     np.testing.assert_allclose(rooms[1], 2 * rooms[0], rtol=2e-3)  # the Gram matrix is summed in float32
@@ -169,7 +169,7 @@ def spoilt(case: str) -> ShellRoom:
     elif case == "nothing but surface":
         patches.arrivals[used, :, :3], patches.arrivals[used, :, 3] = KNOWN, 1.0
     room.transport = Transport()
-    room.transport.update(patches, patches.used, room.shell)
+    room.transport.update(patches, NO_EMITTERS, patches.used, room.shell)
     return room
 
 
@@ -189,8 +189,7 @@ def test_the_solve_is_stable(case: str) -> None:
     assert (np.diag(covariance) > 0).all()
     # A cell is known at least as well as beforehand.
     near = room.near
-    deviation = np.where(near.is_saturated, weights.LAMP_SPREAD, near.deviation)
-    assert (np.sqrt(np.diag(covariance)) <= 1.01 * deviation).all()
+    assert (np.sqrt(np.diag(covariance)) <= 1.01 * near.deviation).all()
     assert condition < 1e7
     assert condition > 0.1 * np.linalg.cond(unknowns.curvature.astype(np.float64), 1)
     assert np.isfinite(unknowns.step)
@@ -286,24 +285,26 @@ def test_scanned_walls_close_their_sides() -> None:
 def test_what_rays_meet() -> None:
     transport, shell = Transport(), Shell(np.eye(3), np.zeros(3), np.full(3, 4.0), 0.0, np.zeros((2, 3)))
     directions = np.array([[[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0, 0, -1.0]]])
-    arrivals = np.array([[[0.2, 0.3, 0.4, 1.0], [0, 0, 0, -1.0], [1, SATURATED, 0.5, 1.5], [0, 0, 0, 0]]])
+    arrivals = np.array([[[0.2, 0.3, 0.4, 1.0], [0, 0, 0, -1.0], [1, SATURATED, 0.95, 1.5], [0, 0, 0, 0]]])
     patches, middle = Patches(), np.array([[2.0, 2.0, 2.0]])
     patches.positions[:1], patches.weights[0], patches.traced_in[0] = middle, 1.0, 1
     patches.directions[0], patches.arrivals[0] = (
         np.tile(directions[0], (RAYS // 4, 1)),
         np.tile(arrivals[0], (RAYS // 4, 1)),
     )
-    transport.update(patches, np.array([0]), shell)
+    transport.update(patches, NO_EMITTERS, np.array([0]), shell)
     met = meet(shell, transport.hidden, middle, directions, arrivals)
     (known, back, bright, free), shares = met.columns[0], met.shares[0]
     assert (known == -1).all()
     np.testing.assert_allclose(shares.sum(axis=-1), [0, 1, 1, 1])
     back, bright = back[0], bright[0]
     np.testing.assert_array_equal(met.known[0, 0], [0.2, 0.3, 0.4])
+    np.testing.assert_array_equal(met.known[0, 2], [1, SATURATED, 0.95])
+    np.testing.assert_array_equal(met.is_saturated[0], [False, False, True, False])
     assert not transport.is_saturated[back]
     assert back >= CELLS
     assert transport.is_saturated[bright]
-    np.testing.assert_allclose(transport.at_least[bright], [1, SATURATED, 0.5])
+    np.testing.assert_allclose(transport.clipped[bright], [1, SATURATED, 0.95])
     cells, _ = shell.exits(np.array([2.0, 2.0, 2.0]), np.array([0.0, 0, -1.0]))
     np.testing.assert_array_equal(free, cells)
     assert transport.columns == CELLS + 2

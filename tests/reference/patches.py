@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-STATIC, AGREEMENT, CLIPPED, DARKEST = 1, 0.9, 0.5, 0.002
+STATIC, AGREEMENT, CLIPPED, DARKEST, ALL_CLIPPED, CLIPPED_DEPTH_M = 1, 0.9, 0.5, 0.002, 0.9, 0.15
 
 
 def gather_patches(
@@ -37,4 +37,41 @@ def gather_patches(
             places[row, col] = *at[:3], on.mean()
             facing[row, col] = *(normal / np.linalg.norm(normal)), share
             shown[row, col] = *logarithms.mean(0), 0.0 if chosen is clipped else logarithms.mean(1).var()
+    return places, facing, shown
+
+
+def gather_clipped(
+    positions: Floats,
+    normals: Floats,
+    labels: NDArray[np.uint8],
+    radiance: Floats,
+    step: int,
+    pose: Floats,
+    focal_px: tuple[float, float],
+) -> tuple[Floats, Floats, Floats]:
+    """The last three planes of the kernel, [rows, cols, 4] each. pose: [4, 4] of the camera in the surface's space."""
+    rows, cols = labels.shape[0] // step, labels.shape[1] // step
+    places, facing, shown = (np.zeros((rows, cols, 4)) for _ in range(3))
+    away = positions[..., :3] - pose[:3, 3]
+    distance, depth = np.linalg.norm(away, axis=-1), away @ pose[:3, 2]
+    color = radiance[..., :3]
+    clipped = (radiance[..., 3] <= 0) & (radiance[..., 3] > -1) & (color.max(-1) > CLIPPED)
+    clipped &= (color.min(-1) >= ALL_CLIPPED * color.max(-1)) & (positions[..., 3] > 0) & (labels == STATIC)
+    # A pixel whose ray is r = (x, y, 1) has the solid angle 1 / (fx fy |r|^3), and |r| is distance over depth.
+    areas = distance**2 / (focal_px[0] * focal_px[1]) * (depth / np.maximum(distance, 1e-9)) ** 3
+    for row in range(rows):
+        for col in range(cols):
+            block = slice(row * step, (row + 1) * step), slice(col * step, (col + 1) * step)
+            own = clipped[block]
+            if not own.any():
+                continue
+            own = own & (distance[block] <= distance[block][own].min() + CLIPPED_DEPTH_M)
+            weights = np.where(own, areas[block], 0.0)
+            total = weights.sum()
+            turned = normals[block][..., :3] * (normals[block][..., 3:] > 0)
+            means = [
+                np.einsum("yx,yxr->r", weights, of) / total for of in (positions[block][..., :3], turned, color[block])
+            ]
+            places[row, col] = *means[0], total
+            facing[row, col, :3], shown[row, col, :3] = means[1], means[2]
     return places, facing, shown

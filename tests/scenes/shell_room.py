@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from server.light.shell.bright_surface import BrightSurface
 from server.light.shell.evidence import Evidence, evidence_of
 from server.light.shell.objective import Unknowns, step
-from server.light.shell.patches import PATCH_M, Patches, Seen, hemisphere_rays
+from server.light.shell.patches import PATCH_M, Patches, hemisphere_rays
+from server.light.shell.picture import Seen
 from server.light.shell.shell import Shell, closed_sides, shell_around
 from server.light.shell.sources import Sources, distant_sources, near_sources
 from server.light.shell.switches import Switches
@@ -23,6 +25,7 @@ UP = np.array([0.0, 0.0, 1.0])
 SPACING_M = 0.2
 KNOWN = np.array([0.22, 0.2, 0.18])
 """Radiance that the scanned surfaces send."""
+NO_EMITTERS = BrightSurface().seen_by()
 ALBEDOS = {0: (0.6, 0.3, 0.2), 1: (0.55, 0.55, 0.5), 2: (0.3, 0.4, 0.6)}
 """Of the wall x = 0, the wall y = 0 and the floor: red, white and blue."""
 
@@ -125,5 +128,5 @@ def make_room(
     patches.traced_in[rows] = 1
     shell = shell_around(at, facing, np.stack([CAMERA, SIZE_M - 1.0]), UP, PATCH_M, None)
     transport = Transport()
-    transport.update(patches, rows, shell)
+    transport.update(patches, NO_EMITTERS, rows, shell)
     return ShellRoom(patches, transport, shell, Unknowns())

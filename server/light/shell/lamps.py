@@ -1,7 +1,9 @@
-"""Bright parts of the shell as lights with a place and a size, which cast shadows; the rest stays soft.
+"""Saturated surface and bright parts of the shell as lights with a place and a size, which cast shadows; the rest stays
+soft.
 
-A mode of the radiance above the shell's median, found by a mean shift over the shell, becomes one disc. Its window is
-Gaussian, so that a lamp moves and grows with the evidence and does not jump between cells.
+Saturated cells that touch become one disc. A mode of the radiance above the shell's median, found by a mean shift over
+the shell, becomes another. Its window is Gaussian, so that a lamp moves and grows with the evidence and does not jump
+between cells.
 """
 
 from __future__ import annotations
@@ -10,7 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
+from server.light.shell.bright_surface import CELL_M, Emitters
 from server.maths.direct_lights import DirectLight, lamp_at
 from server.maths.dominant import MOST_LIGHTS
 
@@ -19,7 +24,10 @@ WINDOW_M = 0.5
 WEAK, STRONG = 0.05, 0.15
 """Shares of the radiance that arrives from the shell: a lamp below the first is none, one above the second is taken out
 whole. Between them it fades in."""
-LEAST_RADIUS_M = 0.05
+LEAST_RADIUS_M, LEAST_BULB_M = 0.05, 0.02
+"""Of a disc on the shell, and of one of saturated surface: smaller ones have shadows as sharp."""
+TOUCHING_M = 1.5 * CELL_M
+"""Distance of emitters that are parts of one window."""
 _SHIFTS = 12
 
 Floats = NDArray[np.float64]
@@ -40,16 +48,50 @@ class ShellLamp:
         return lamp_at(self.center - origin_world, self.radius_m, self.radiance)
 
 
-def find_lamps(position: Floats, ends: Floats, radiance: Floats) -> tuple[list[ShellLamp], Floats]:
-    """At most MOST_LIGHTS lamps seen from `position` [3], and the radiance [m, 3] that they leave.
+def emitting_lamps(position: Floats, emitters: Emitters, radiance: Floats, others: float) -> list[ShellLamp]:
+    """At most MOST_LIGHTS lamps of saturated surface, strongest first at `position` [3].
 
-    ends: [m, 3] where evenly spread directions from there end on the shell; radiance: [m, 3].
+    radiance: [k, 3] that emitters send; others: radiance of all else times its solid angle, summed over channels.
+    """
+    if not emitters.count:
+        return []
+    _, _, areas = emitters.seen_from(position[None])
+    sent = emitters.solid_angles(position[None])[0] * emitters.presence * radiance.sum(axis=1)
+    total = float(sent.sum()) + others
+    lamps = []
+    for own in _touching(emitters.centers):
+        share = sent[own] / max(float(sent[own].sum()), 1e-12)
+        fade = np.clip((float(sent[own].sum()) / total - WEAK) / (STRONG - WEAK), 0.0, 1.0)
+        area = float(areas[0, own].sum())
+        if fade > 0 and area > 0:
+            center = share @ emitters.centers[own]
+            power = (emitters.presence[own] * areas[0, own]) @ radiance[own]
+            radius_m = max(float(np.sqrt(area / np.pi)), LEAST_BULB_M)
+            lamps.append((fade * sent[own].sum(), ShellLamp(center, radius_m, fade * power / (np.pi * radius_m**2))))
+    lamps.sort(key=lambda one: -one[0])
+    return [lamp for _, lamp in lamps[:MOST_LIGHTS]]
+
+
+def _touching(centers: Floats) -> list[NDArray[np.int64]]:
+    """Numbers of the `centers` [k, 3] of each group of which each is near another."""
+    near = ((centers[:, None] - centers) ** 2).sum(axis=-1) <= TOUCHING_M**2
+    count, groups = connected_components(csr_matrix(near), directed=False)
+    return [np.flatnonzero(groups == group) for group in range(count)]
+
+
+def find_lamps(
+    position: Floats, ends: Floats, radiance: Floats, most: int = MOST_LIGHTS, emitted: float = 0.0
+) -> tuple[list[ShellLamp], Floats]:
+    """At most `most` lamps seen from `position` [3], and the radiance [m, 3] that they leave.
+
+    ends: [m, 3] where evenly spread directions from there end on the shell; radiance: [m, 3]. emitted: what comes from
+    elsewhere, as a sum of radiance over such directions and channels.
     """
     rest = radiance.copy()
     floor = np.median(radiance, axis=0)
-    total = float(radiance.sum())
+    total = float(radiance.sum()) + emitted
     lamps: list[ShellLamp] = []
-    for _ in range(MOST_LIGHTS):
+    for _ in range(most):
         excess = np.maximum(rest - floor, 0.0)
         weights = excess.sum(axis=1)
         if weights.sum() <= WEAK * total:

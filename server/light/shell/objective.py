@@ -6,10 +6,10 @@ Patch p of surface shows, for the mean logarithm of the channels y and two chrom
     q_p = sum_k T_pk u_k + (h_p / E_p) q(h_p) + c_r(p) + e'_p,    T_pk = A_pk x_k / E_p        (2)
 
 with A_pk the share of p's cosine-weighted hemisphere that is source k (sources.py), x_k = exp(z_k) its radiance
-(saturated ones: x_k = b_k (1 + exp(z_k)), b_k what the clipped picture shows), h_p what known surface brings, E_p the
-sum in (1), u_k the chroma of source k. s is the logistic function, B_p m the logit of the albedo of materials, bilinear
-on a grid over the chroma of albedo. o_f is what surface f (segments.py: a floor, a painted stripe) has besides, d_r and
-c_r what region r of it has; they are eliminated exactly. Minimised is
+(of saturated surface x_k = b_k exp(z_k), beyond b_k, which the clipped picture shows), h_p what photographed surface
+brings, E_p the sum in (1), u_k the chroma of source k. s is the logistic function, B_p m the logit of the albedo of
+materials, bilinear on a grid over the chroma of albedo. o_f is what surface f (segments.py: a floor, a painted stripe)
+has besides, d_r and c_r what region r of it has; they are eliminated exactly. Minimised is
 
     sum_p huber(e_p / S_p) + sum_k ((z_k - n_k) / s_k)^2 + sum_(k,l) rho(z_k - z_l)
     + sum_g ((m_g - m) / s_m)^2 + sum_f tau(o_f) + sum_r (d_r / s_d)^2
@@ -121,12 +121,11 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     """One Gauss-Newton step, in place. Sources that are new begin at their prior."""
     switches, count = switches or Switches(), sources.count
     unknowns.mean = float(np.log(evidence.mean / weights.MEAN_ALBEDO))
-    prior = np.where(sources.is_saturated, np.log(weights.LAMP_EXCESS), unknowns.mean + sources.offset)
-    deviation = np.where(sources.is_saturated, weights.LAMP_SPREAD, sources.deviation)
-    z = np.concatenate([unknowns.z, prior[unknowns.known :]])
+    prior = np.where(sources.is_saturated, 0.0, unknowns.mean) + sources.offset
+    z = np.concatenate([unknowns.z, (prior + sources.begin)[unknowns.known :]])
     cell_chroma = np.concatenate([unknowns.chroma, np.zeros((count - unknowns.known, 2))])
 
-    level, slope = _levels(z, sources)
+    level = _levels(z, sources)
     known_logs = log_chroma(np.log(np.maximum(sources.known, DARKEST)))
     known = np.where(sources.known.max(axis=1) > 0, np.exp(known_logs[:, 0]), 0.0)
     arriving = np.maximum(sources.shares @ level + known, DARKEST)
@@ -142,7 +141,6 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     counts[(known == 0) & (sources.shares.sum(axis=1) <= sources.least_share)] = 0.0
 
     design = np.concatenate([parts, (1 - albedo)[:, None] * materials], axis=1)
-    scale = np.concatenate([slope / level, np.ones(len(nodes))])
     gram = _gram(design, counts)
     spreads = _albedo_spreads(switches)
     regions = _regions(design, counts, evidence)
@@ -150,25 +148,25 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     surfaces = _Surfaces.of(offsets, whitest, regions, spreads)
     residual = residual - surfaces.center[evidence.surfaces]
     matrix, vector = _without_regions(gram, design, counts, residual[:, None], regions, spreads.region, surfaces)
-    matrix, right = matrix * np.outer(scale, scale), vector[:, 0] * scale
+    right = vector[:, 0]
     differences = z[sources.pairs[:, 0]] - z[sources.pairs[:, 1]]
     strength = weights.SMOOTHNESS / np.sqrt(1 + (differences / weights.EDGE) ** 2)
     _add_smoothness(matrix, sources.pairs, strength)
     right[:count] -= _smoothness_gradient(sources.pairs, strength * differences, count)
-    diagonal = np.concatenate([1 / deviation**2, np.full(len(nodes), 1 / spreads.material**2)])
+    diagonal = np.concatenate([1 / sources.deviation**2, np.full(len(nodes), 1 / spreads.material**2)])
     matrix[np.diag_indices_from(matrix)] += diagonal
     target = np.concatenate([prior - z, LOGIT - unknowns.materials[nodes]])
     change = unknowns.solve(matrix, right + diagonal * target)
     change *= min(1.0, MOST_STEP / max(float(np.abs(change).max()), 1e-12))
     change *= unknowns.relax(change[:count])
-    unknowns.step = float(np.sqrt(np.mean((parts @ (scale[:count] * change[:count])) ** 2)))
+    unknowns.step = float(np.sqrt(np.mean((parts @ change[:count]) ** 2)))
     unknowns.z = z + change[:count]
     unknowns.materials[nodes] += change[count:]
-    offsets = surfaces.offsets(residual - design @ (scale * change), counts)
+    offsets = surfaces.offsets(residual - design @ change, counts)
     unknowns.offsets[evidence.rows] = offsets[evidence.surfaces]
     seen = np.where(evidence.is_clipped[:, None], parts @ cell_chroma, evidence.chroma - known_part)
     unknowns.chroma = _solve_chroma(parts, gram[:count, :count], counts, seen, regions, spreads.chroma, sources.pairs)
-    logs = np.concatenate([np.log(_levels(unknowns.z, sources)[0])[:, None], unknowns.chroma], axis=1)
+    logs = np.concatenate([np.log(_levels(unknowns.z, sources))[:, None], unknowns.chroma], axis=1)
     unknowns.radiance = np.exp(logs @ _FROM_CHROMA.T)
 
 
@@ -184,12 +182,10 @@ def _albedo_spreads(switches: Switches) -> _AlbedoSpreads:
     return _AlbedoSpreads() if switches.albedos else _AlbedoSpreads(*[weights.ONE_ALBEDO] * 4)
 
 
-def _levels(z: Floats, sources: Sources) -> tuple[Floats, Floats]:
-    """[k] radiance of sources and its derivative by z."""
-    slope = np.exp(z)
-    at_least = np.exp(np.log(np.maximum(sources.at_least, DARKEST)).mean(axis=1))
-    level = np.where(sources.is_saturated, at_least * (1 + slope), slope)
-    return level, np.where(sources.is_saturated, at_least * slope, slope)
+def _levels(z: Floats, sources: Sources) -> Floats:
+    """[k] radiance of sources."""
+    clipped = np.exp(np.log(np.maximum(sources.clipped, DARKEST)).mean(axis=1))
+    return np.asarray(np.where(sources.is_saturated, clipped, 1.0) * np.exp(z))
 
 
 def _huber(ratio: Floats) -> Floats:

@@ -1,26 +1,21 @@
 """Evidence about a room's light: what small patches of its surface show, and what reaches each of them.
 
 A patch is what one cell of a grid in the world holds of surface that faces one way. Frames add to it, so memory follows
-the surface that was seen, not the number of frames. Kernels: patches.cl, arrivals.cl.
+the surface that was seen, not the number of frames. Kernel: arrivals.cl.
 """
 
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass
 
 import numpy as np
-import pyopencl.array as cl_array
-import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
-from protocol.frames import CameraModel
 from server.light.arrivals import trace_arrivals
 from server.light.shell.known_room import KnownPatches
+from server.light.shell.picture import Seen
 from server.maths.sh import GOLDEN_TURN
-from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
-from server.volume.raycast import Surface
 from server.volume.volume import Volume
 
 PATCH_M = 0.15
@@ -35,10 +30,6 @@ TRACED_A_FRAME = 64
 """Patches whose rays are traced in a frame once all are: the scan behind them goes on growing."""
 MOST_WEIGHT = 30.0
 """Frames that a patch's mean remembers."""
-LEAST_SHARE = 0.6
-"""Of a block of pixels that must lie on one surface."""
-_BLOCKS_ACROSS = 40  # blocks of pixels along a picture's width
-_TOLERANCE_VOXELS = 1.5
 _FORGOTTEN = 1e-3  # frames: a patch of less weight is none
 _CHANGED_BY_FRAMES = (
     *("weights", "positions", "normals", "logarithms", "variances", "clipped"),
@@ -48,67 +39,6 @@ _FACINGS = 1.2  # normals are rounded to multiples of 1 / 1.2: 26 ways to face
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
-
-class _Buffers(StageBuffers):
-    seen = BufferDescription(cl_types.float4)
-    """[3, rows, cols] as gather_patches writes it."""
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What one picture shows of patches, on the host, world space."""
-
-    positions: Floats
-    """[n, 3] metres."""
-    normals: Floats
-    """[n, 3] unit."""
-    logarithms: Floats
-    """[n, 3] mean log radiance, RGB."""
-    variances: Floats
-    """[n] of the mean over the channels within the patch."""
-    clipped: Floats
-    """[n] share of the pixels that are clipped."""
-
-    @property
-    def count(self) -> int:
-        """Number of patches."""
-        return len(self.positions)
-
-
-class PatchesInPicture:
-    """What one picture shows of patches; begun when this is made."""
-
-    def __init__(
-        self, engine: Engine, camera: CameraModel, surface: Surface, radiance: cl_array.Array, volume: Volume
-    ) -> None:
-        """radiance: [h, w] float4 as in Measurement, in the units of the first picture."""
-        step = max(2, camera.width // _BLOCKS_ACROSS)
-        cols, rows = camera.width // step, camera.height // step
-        seen = engine.buffers(_Buffers).seen.array((3, rows, cols))
-        engine.launch(
-            engine.kernel("patches.cl", "gather_patches"),
-            (cols, rows),
-            cols,
-            rows,
-            step,
-            camera.width,
-            _TOLERANCE_VOXELS * volume.voxel_m,
-            surface.positions,
-            surface.normals,
-            surface.labels,
-            radiance,
-            seen,
-        )
-        self._seen = engine.begin_download(seen)
-        self._origin_world = volume.origin_world.copy()
-
-    def seen(self) -> Seen:
-        """The patches."""
-        at, towards, show = self._seen.result().view(np.float32).reshape(3, -1, 4).astype(np.float64)
-        used = at[:, 3] >= LEAST_SHARE
-        positions = at[used, :3] + self._origin_world
-        return Seen(positions, towards[used, :3], show[used, :3], show[used, 3], towards[used, 3])
 
 
 class Patches:

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from server.frame_context import FrameContext
 from server.light.light_estimation import LightEstimate
 from server.light.shell.beside import Beside
+from server.light.shell.bright_surface import BrightSurface
 from server.light.shell.distant import distant_light
 from server.light.shell.known_room import KnownRoom
 from server.light.shell.objective import Unknowns
-from server.light.shell.patches import Patches, PatchesInPicture, Seen
+from server.light.shell.patches import Patches
+from server.light.shell.picture import PatchesInPicture, Seen
 from server.light.shell.shell import Shell
 from server.light.shell.solution import Solution
 from server.light.shell.solver import LEAST_PATCHES, Solver
@@ -45,7 +47,7 @@ class RoomModel:
 
     def __init__(self, switches: Switches | None = None) -> None:
         self._switches = switches or Switches()
-        self._patches = Patches()
+        self._patches, self._bright = Patches(), BrightSurface()
         self._solver = Solver(self._switches)
         self._solution: Solution | None = None
         self._next: Beside[Solution | None] | None = None
@@ -61,7 +63,12 @@ class RoomModel:
     def begin(self, context: FrameContext) -> None:
         """Let the device gather what a frame shows."""
         self._picture = PatchesInPicture(
-            context.engine, context.camera, context.surface, context.scene_radiance, context.volume
+            context.engine,
+            context.camera,
+            context.surface,
+            context.scene_radiance,
+            context.volume,
+            context.volume_from_camera,
         )
 
     def update(self, context: FrameContext, up: Floats) -> None:
@@ -73,7 +80,9 @@ class RoomModel:
             return
         change = self._change(seen) if switches.memory else 1.0
         self._patches.forget(change)
+        self._bright.forget(change)
         self._patches.add(seen)
+        self._bright.add(seen.bright, seen.positions)
         self._waiting, self._frames = self._waiting + 1, self._frames + 1
         must_follow = self._must_follow(change)
         is_young = self._waiting > NEW_SHARE * self._frames
@@ -83,14 +92,15 @@ class RoomModel:
         if not must_follow and self._is_still():
             return
         traced = self._patches.trace(engine, volume, self._waiting)
+        self._bright.trace(engine, volume, self._patches, traced)
         self._waiting = 0
         self._begin_solution(traced, context.volume_from_camera[:3, 3] + volume.origin_world, up)
         if must_follow or is_young:
             self._take_over()
 
     def _begin_solution(self, traced: NDArray[np.int64], camera: Floats, up: Floats) -> None:
-        patches = self._patches.copy()
-        self._next = Beside(lambda: self._solver.solve(patches, traced, camera, up))
+        patches, bright = self._patches.copy(), self._bright.seen_by()
+        self._next = Beside(lambda: self._solver.solve(patches, bright, traced, camera, up))
 
     def _take_over(self) -> None:
         """The solution that was begun last, waited for."""

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from server.light.arrivals import trace_arrivals
 from server.light.place_light import VALID_SPREAD_DEG, PlaceLight
-from server.light.shell.lamps import ShellLamp, find_lamps
+from server.light.shell.bright_surface import Emitters
+from server.light.shell.lamps import ShellLamp, emitting_lamps, find_lamps
 from server.light.shell.objective import Unknowns
-from server.light.shell.shell import Shell
+from server.light.shell.shell import CORNERS, Shell
 from server.light.shell.spread import spread_deg
-from server.light.shell.transport import KNOWN, NO_CELL, Met, meet
+from server.light.shell.transport import KNOWN, NO_CELL, Met, bright_keys, columns_of, meet
+from server.maths.dominant import MOST_LIGHTS
 from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
@@ -40,12 +42,25 @@ def _basis(bands: int = BANDS) -> Floats:
 
 
 @dataclass(frozen=True)
+class _Rays:
+    """[m] rays from a place, and what they meet."""
+
+    basis: Floats
+    """[bands^2, m] weights that project their radiance on spherical harmonics."""
+    columns: NDArray[np.int64]
+    shares: Floats
+    known: Floats
+    """As in Met."""
+
+
+@dataclass(frozen=True)
 class Solution:
     """Of the whole objective at one frame; it never changes. World axes and metres."""
 
     shell: Shell
     hidden: Mapping[int, int]
     """As of Transport."""
+    emitters: Emitters
     near: Unknowns
     """With all that is not scanned on the shell."""
     distant: Unknowns
@@ -64,9 +79,8 @@ class Solution:
     def arriving_at(self, engine: Engine, volume: Volume, positions: Floats) -> list[PlaceLight]:
         """The light at each of `positions` [n, 3] (world)."""
         met = self._looked_up(engine, volume, positions, look_up_directions())
-        radiance = self._radiance_of(met)
-        places = zip(positions, radiance, met.columns, met.shares, strict=True)
-        return [self._arriving(position, one, columns, shares) for position, one, columns, shares in places]
+        rays = self._with_emitters(engine, volume, positions, met)
+        return [self._arriving(position, of_place) for position, of_place in zip(positions, rays, strict=True)]
 
     def beyond(self, position: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
         """The light from the shell as seen from `position` [3] (world), with no surface in between.
@@ -85,29 +99,70 @@ class Solution:
         cells, shares = self.shell.exits(start, directions)
         ends = position + self.shell.distances(start, directions).min(axis=-1)[:, None] * directions
         radiance = np.einsum("mc,mcr->mr", shares, self.near.radiance[cells])
-        lamps, rest = find_lamps(position, ends, radiance)
-        return _basis(bands) @ radiance, _basis(bands) @ rest, lamps
+        sent = self._sent_by_emitters
+        emitting = emitting_lamps(position, self.emitters, sent, 4 * np.pi / DIRECTIONS * float(radiance.sum()))
+        towards = sh_basis(self.emitters.seen_from(position[None])[0][0], bands)
+        solid_angles = self.emitters.presence * self.emitters.solid_angles(position[None])[0]
+        emitted = solid_angles @ sent
+        lamps, rest = find_lamps(
+            position, ends, radiance, MOST_LIGHTS - len(emitting), DIRECTIONS / (4 * np.pi) * float(emitted.sum())
+        )
+        whole = _basis(bands) @ radiance + towards.T @ (solid_angles[:, None] * sent)
+        return whole, _basis(bands) @ rest, [*emitting, *lamps]
+
+    @property
+    def _sent_by_emitters(self) -> Floats:
+        """[k, 3] radiance beyond what is photographed."""
+        columns = columns_of(self.hidden, bright_keys(self.emitters.centers))
+        is_known = (columns >= 0) & (columns < self.near.known)
+        return np.where(is_known[:, None], self.near.radiance[np.where(is_known, columns, 0)], 0.0)
 
     def _looked_up(self, engine: Engine, volume: Volume, positions: Floats, directions: Floats) -> Met:
         """What rays [n, m] meet; cells that the solution does not have are NO_CELL."""
         arrivals = trace_arrivals(engine, volume, positions - volume.origin_world, None, directions)
         turned = np.broadcast_to(directions[0], (len(positions), *directions[0].shape))
         met = meet(self.shell, self.hidden, positions, turned, arrivals.astype(np.float64))
-        return replace(met, columns=np.where(met.columns < self.near.known, met.columns, NO_CELL))
+        is_known = met.columns < self.near.known
+        columns, shares = np.where(is_known, met.columns, NO_CELL), np.where(is_known, met.shares, 0.0)
+        return replace(met, columns=columns, shares=shares)
 
-    def _radiance_of(self, met: Met) -> Floats:
-        """[n, m, 3]."""
+    def _with_emitters(self, engine: Engine, volume: Volume, positions: Floats, met: Met) -> list[_Rays]:
+        """What evenly spread rays from `positions` [n, 3] met, and a ray to each emitter."""
+        emitters = self.emitters
+        solid_angles = emitters.solid_angles(positions)
+        weights = emitters.weights(solid_angles / (4 * np.pi), DIRECTIONS)
+        place, ray = np.nonzero(met.is_saturated)
+        ends = positions[place] + met.distances[place, ray, None] * look_up_directions()[0, ray]
+        shares = met.shares.copy()
+        shares[place, ray] *= emitters.left_to_others(weights, place, ends)[:, None]
+        columns = columns_of(self.hidden, bright_keys(emitters.centers))
+        columns = np.where(columns < self.near.known, columns, NO_CELL)
+        brought = weights * solid_angles * emitters.visible(engine, volume, positions) * (columns >= 0)
+        towards = sh_basis(emitters.seen_from(positions)[0].reshape(-1, 3), BANDS)
+        towards = towards.reshape(*brought.shape, BANDS * BANDS)
+        return [
+            _Rays(
+                np.concatenate([_basis(), towards[k].T * brought[k]], axis=1),
+                np.concatenate([met.columns[k], np.repeat(columns[:, None], CORNERS, axis=1)]),
+                np.concatenate([shares[k], np.eye(1, CORNERS).repeat(len(columns), axis=0)]),
+                np.concatenate([met.known[k], np.zeros((len(columns), 3))]),
+            )
+            for k in range(len(positions))
+        ]
+
+    def _radiance_of(self, met: Met | _Rays) -> Floats:
+        """[..., 3]."""
         cells = self.near.radiance[np.maximum(met.columns, 0)]
-        radiance = met.known + np.einsum("nmc,nmcr->nmr", met.shares, cells)
-        mean = np.exp(self.near.mean)
-        is_new = (met.columns[..., 0] == NO_CELL)[..., None]  # surface of which no patch has received light
-        unseen = np.where(met.at_least.max(axis=-1, keepdims=True) > 0, met.at_least, mean)
-        return np.where(is_new, unseen, np.maximum(radiance, met.at_least))
+        radiance = met.known + np.einsum("...c,...cr->...r", met.shares, cells)
+        is_new = (met.columns[..., 0] == NO_CELL) & (met.known.max(axis=-1) <= 0)
+        # Where it is new, no patch has received light from there.
+        return np.asarray(np.where(is_new[..., None], np.exp(self.near.mean), radiance))
 
-    def _arriving(self, position: Floats, radiance: Floats, columns: NDArray[np.int64], shares: Floats) -> PlaceLight:
-        sh = _basis() @ radiance
+    def _arriving(self, position: Floats, rays: _Rays) -> PlaceLight:
+        radiance = self._radiance_of(rays)
+        sh = rays.basis @ radiance
         luminance = radiance @ LUMINANCE
-        covariance, _ = self.near.covariance_of(self._gradient(columns, shares))
+        covariance, _ = self.near.covariance_of(self._gradient(rays))
         std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         tint = radiance.mean(axis=0) / max(float(luminance.mean()), 1e-12)
         angle = spread_deg(sh @ LUMINANCE, covariance)
@@ -117,15 +172,15 @@ class Solution:
             std=np.outer(std, tint),
             spread_deg=angle,
             valid=angle <= VALID_SPREAD_DEG,
-            seen=float((columns[:, 0] == KNOWN).mean()),
+            seen=float((rays.columns[:DIRECTIONS, 0] == KNOWN).mean()),
         )
 
-    def _gradient(self, columns: NDArray[np.int64], shares: Floats) -> Floats:
-        """[bands^2, known] of coefficients of luminance by z, for rays that end in `shares` [m, 4] of cells."""
-        ray, corner = np.nonzero(columns >= 0)
-        cells = columns[ray, corner]
-        sent = shares[ray, corner] * (self.near.radiance @ LUMINANCE)[cells]
+    def _gradient(self, rays: _Rays) -> Floats:
+        """[bands^2, known] of coefficients of luminance by z."""
+        ray, corner = np.nonzero(rays.columns >= 0)
+        cells = rays.columns[ray, corner]
+        sent = rays.shares[ray, corner] * (self.near.radiance @ LUMINANCE)[cells]
         bands = BANDS * BANDS
         place = cells * bands + np.arange(bands)[:, None]
-        sums = np.bincount(place.ravel(), (_basis()[:, ray] * sent).ravel(), self.near.known * bands)
+        sums = np.bincount(place.ravel(), (rays.basis[:, ray] * sent).ravel(), self.near.known * bands)
         return np.asarray(sums.reshape(-1, bands).T)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from server.light.shell.bright_surface import EmittersSeen
 from server.light.shell.evidence import evidence_of
 from server.light.shell.objective import Unknowns, step
 from server.light.shell.patches import PATCH_M, Patches
@@ -40,7 +41,9 @@ class Solver:
         """Keep the size and place of the shell of an earlier solution."""
         self._shell = shell
 
-    def solve(self, patches: Patches, traced: NDArray[np.int64], camera: Floats, up: Floats) -> Solution | None:
+    def solve(
+        self, patches: Patches, bright: EmittersSeen, traced: NDArray[np.int64], camera: Floats, up: Floats
+    ) -> Solution | None:
         """The next solution; None where too few patches are known.
 
         traced: rows of the patches whose rays are new. camera: [3] world metres; up: [3] unit, world.
@@ -50,7 +53,7 @@ class Solver:
             return None
         positions, normals = patches.positions[rows], patches.normals[rows]
         self._shell = shell = shell_around(positions, normals, camera[None], up, PATCH_M, self._shell)
-        self._transport.update(patches, traced, shell)
+        self._transport.update(patches, bright, traced, shell)
         closed = closed_sides(positions, normals, shell.axes, PATCH_M)
         evidence = evidence_of(patches, rows, switches)
         near = near_sources(self._transport, shell, rows)
@@ -61,5 +64,5 @@ class Solver:
                 step(unknowns, evidence, sources, switches)
                 if unknowns.step < settled:
                     break
-        hidden = dict(self._transport.hidden)
-        return Solution(shell, hidden, replace(self._near), replace(self._distant), rows, patches.logarithms[rows])
+        hidden, shown = dict(self._transport.hidden), patches.logarithms[rows]
+        return Solution(shell, hidden, bright.emitters, replace(self._near), replace(self._distant), rows, shown)

@@ -27,13 +27,15 @@ class Sources:
     """[n, k] of a patch's cosine-weighted hemisphere."""
     known: Floats
     """[n, 3] radiance that photographed surface brings."""
-    at_least: Floats
-    """[k, 3] what saturated sources send at least, 0 for others."""
+    clipped: Floats
+    """[k, 3] radiance of saturated sources as pictures show it, 0 for others."""
     is_saturated: NDArray[np.bool_]
     offset: Floats
-    """[k] prior mean of the log radiance, over that of the mean light."""
+    """[k] prior mean of the log radiance, over that of the mean light; of saturated ones, of their relative excess."""
     deviation: Floats
     """[k] standard deviation of it."""
+    begin: Floats
+    """[k] where steps begin, over the prior mean."""
     pairs: Ints
     """[m, 2] neighbours."""
     least_share: float = 0.0
@@ -48,16 +50,31 @@ class Sources:
 def near_sources(transport: Transport, shell: Shell, rows: Ints) -> Sources:
     """All that is not scanned lies on the shell, for the patches in `rows` [n]."""
     count = transport.columns
-    deviation = np.full(count, weights.CELL_HIDDEN)
+    offset, deviation, begin = _priors(transport)
     deviation[:CELLS] = np.where(shell.is_low, weights.CELL_LOW, weights.CELL_HIGH)
     return Sources(
         shares=transport.shares[rows, :count].astype(np.float64),
         known=transport.known[rows],
-        at_least=transport.at_least[:count],
+        clipped=transport.clipped[:count],
         is_saturated=transport.is_saturated[:count],
-        offset=np.zeros(count),
+        offset=offset,
         deviation=deviation,
+        begin=begin,
         pairs=_PAIRS,
+    )
+
+
+def _priors(transport: Transport) -> tuple[Floats, Floats, Floats]:
+    """[k] offset, deviation and begin of Sources; those of hidden surface for the shell's cells."""
+    count = transport.columns
+    is_saturated, lit = transport.is_saturated[:count], transport.lit[:count]
+    offset = lit * np.log(weights.LIT_EXCESS) + (1 - lit) * np.log(weights.LAMP_EXCESS)
+    spread = lit * weights.LIT_SPREAD + (1 - lit) * weights.LAMP_SPREAD
+    begin = (1 - lit) * (weights.LAMP_BEGIN - np.log(weights.LAMP_EXCESS))
+    return (
+        np.where(is_saturated, offset, 0.0),
+        np.where(is_saturated, spread, weights.CELL_HIDDEN),
+        np.where(is_saturated, begin, 0.0),
     )
 
 
@@ -73,15 +90,16 @@ def distant_sources(transport: Transport, closed: Floats, rows: Ints, *, with_in
     known = transport.known[rows]
     if not with_indirect:
         near[:, CELLS:], known = 0.0, np.zeros_like(known)
-    deviation = np.full(count, weights.CELL_HIDDEN)
+    offset, deviation, begin = _priors(transport)
     deviation[:CELLS] = weights.CELL_LOW
     return Sources(
         shares=np.concatenate([beyond, near], axis=1),
         known=known,
-        at_least=np.concatenate([np.zeros((LOBES, 3)), transport.at_least[:count]]),
+        clipped=np.concatenate([np.zeros((LOBES, 3)), transport.clipped[:count]]),
         is_saturated=np.concatenate([np.zeros(LOBES, bool), transport.is_saturated[:count]]),
-        offset=np.concatenate([np.full(LOBES, weights.LOBE), np.zeros(count)]),
+        offset=np.concatenate([np.full(LOBES, weights.LOBE), offset]),
         deviation=np.concatenate([np.full(LOBES, weights.LOBE_SPREAD), deviation]),
+        begin=np.concatenate([np.zeros(LOBES), begin]),
         pairs=_PAIRS + LOBES,
         least_share=0.0 if with_indirect else LEAST_OPENNESS,
     )

@@ -1,6 +1,6 @@
 """How radiance travels in a room: from which unknown cells a patch receives light, and what it is known to receive.
 
-Unknown cells are those of the shell, saturated surface (at least as bright as the picture could show), and surface that
+Unknown cells are those of the shell, what saturated surface sends beyond what the picture could show, and surface that
 was met from its back or without a colour. Scanned surface sends what the camera saw it send.
 """
 
@@ -12,16 +12,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from server.light.shell.bright_surface import CELL_M, EmittersSeen
 from server.light.shell.patches import MOST_PATCHES, RAYS, Patches
 from server.light.shell.shell import CELLS, CORNERS, SIDE, SIDES, Shell
 from server.maths.lobes import LOBES, lobes_along
 
 HIDDEN_M = 0.6
-"""Side of the cells of saturated and of hidden surface: a lamp, a window pane, a piece of furniture."""
+"""Side of the cells of hidden surface: a piece of furniture. Those of saturated surface are smaller (CELL_M)."""
 MOST_HIDDEN = 128
 """Cells of either kind together; what does not fit shares the last one."""
-SATURATED = 0.97
-"""Radiance of a channel from which a picture's values are lower bounds: code 252 of 255."""
+SATURATED, ALL_CHANNELS = 0.97, 0.9
+"""Radiance of the strongest channel from which a picture's values are lower bounds, code 252 of 255, and the share of
+it that the weakest has then: where another channel is not clipped, the surface is hardly brighter than it looks."""
 COLUMNS = CELLS + MOST_HIDDEN
 KNOWN, NO_CELL = -1, -2
 """In place of a cell: photographed surface; hidden or saturated surface that no patch has received light from."""
@@ -41,9 +43,11 @@ class Met:
     shares: Floats
     """[..., CORNERS] of them, with sum 1 or, where KNOWN, 0."""
     known: Floats
-    """[..., 3] radiance of known surface, 0 elsewhere."""
-    at_least: Floats
-    """[..., 3] what saturated surface sends at least, 0 elsewhere."""
+    """[..., 3] radiance of photographed surface, 0 elsewhere."""
+    is_saturated: NDArray[np.bool_]
+    """[...] whether that is a lower bound: the cell's is added to it."""
+    distances: Floats
+    """[...] metres; 0 where no surface is met."""
 
 
 class Transport:
@@ -52,14 +56,17 @@ class Transport:
     def __init__(self) -> None:
         self.shares: NDArray[np.float32] = np.zeros((MOST_PATCHES, COLUMNS), np.float32)
         """[patches, COLUMNS] share of a patch's cosine-weighted rays that end in each cell."""
+        self._by_rays: NDArray[np.float32] = np.zeros((MOST_PATCHES, COLUMNS), np.float32)  # less saturated cells
         self.beyond: NDArray[np.float32] = np.zeros((MOST_PATCHES, SIDES, LOBES), np.float32)
         """[patches, SIDES, LOBES] what white surface would show of distant lobes, by the side of the shell they come
         in at."""
         self.known: Floats = np.zeros((MOST_PATCHES, 3))
         """[patches, 3] radiance that known surface brings."""
         self.is_saturated = np.zeros(COLUMNS, bool)
-        self.at_least: Floats = np.zeros((COLUMNS, 3))
-        """[COLUMNS, 3] mean clipped radiance of saturated cells."""
+        self.clipped: Floats = np.zeros((COLUMNS, 3))
+        """[COLUMNS, 3] mean radiance of saturated cells as pictures show it."""
+        self.lit: Floats = np.ones(COLUMNS)
+        """[COLUMNS] from 0 to 1: how far the light that arrives there explains that it is saturated."""
         self._counts = np.zeros(COLUMNS)
         self.hidden: dict[int, int] = {}
         """Columns of the cells of hidden and of saturated surface, by their keys."""
@@ -70,24 +77,49 @@ class Transport:
         """Cells that exist."""
         return CELLS + len(self.hidden)
 
-    def update(self, patches: Patches, traced: Ints, shell: Shell) -> None:
+    def update(self, patches: Patches, bright: EmittersSeen, traced: Ints, shell: Shell) -> None:
         """Fold in the patches whose rays were traced; all patches, where the shell has changed."""
         rows = traced if shell is self._shell else patches.used
         self._shell = shell
-        if len(rows) == 0:
-            return
+        if len(rows):
+            self._update_rays(patches, rows, shell)
+        if len(patches.used):
+            self._update_emitters(patches, bright, patches.used)
+
+    def _update_rays(self, patches: Patches, rows: Ints, shell: Shell) -> None:
+        """What evenly spread rays meet, but for saturated surface."""
         origins, directions = patches.positions[rows], patches.directions[rows].astype(np.float64)
         arrivals = patches.arrivals[rows].astype(np.float64)
         for is_bright, keys in enumerate(_hidden_keys(origins, directions, arrivals)):
             self._add_cells(keys, is_saturated=bool(is_bright))
         met = meet(shell, self.hidden, origins, directions, arrivals)
-        self._note_bright(met)
-        place = COLUMNS * np.arange(len(rows))[:, None, None] + np.maximum(met.columns, 0)
-        sums = np.bincount(place.ravel(), met.shares.ravel() / RAYS, len(rows) * COLUMNS)
-        self.shares[rows] = sums.reshape(len(rows), COLUMNS)
+        self._note_clipped(met.columns[met.is_saturated, 0], met.known[met.is_saturated])
+        shares = np.where(met.is_saturated[..., None], 0.0, met.shares)
+        self._by_rays[rows] = _summed(met.columns, shares / RAYS)
         is_free = patches.arrivals[rows, :, 3] == 0
         self.beyond[rows] = _beyond(directions, np.where(is_free, met.columns[..., 0], KNOWN))
         self.known[rows] = met.known.mean(axis=1)
+
+    def _update_emitters(self, patches: Patches, bright: EmittersSeen, rows: Ints) -> None:
+        """Saturated surface: each emitter by a ray of its own, what is large or no emitter by evenly spread rays."""
+        emitters = bright.emitters
+        keys = bright_keys(emitters.centers)
+        self._add_cells(keys, is_saturated=True)
+        columns = columns_of(self.hidden, keys)
+        self._note_clipped(columns, emitters.radiance)
+        self.lit[columns] = emitters.lit_by(patches)
+        shares = emitters.shares(patches.positions[rows], patches.normals[rows])
+        weights = emitters.weights(shares, RAYS)
+        sums = self._by_rays[rows].astype(np.float64)
+        np.add.at(sums.T, columns, (weights * shares * bright.visible[rows]).T)
+        arrivals = patches.arrivals[rows]
+        row, ray = np.nonzero(_is_bright(arrivals))
+        if len(row):
+            distance = arrivals[row, ray, 3, None].astype(np.float64)
+            ends = patches.positions[rows[row]] + distance * patches.directions[rows[row], ray]
+            counts = emitters.left_to_others(weights, row, ends)
+            np.add.at(sums, (row, columns_of(self.hidden, bright_keys(ends))), counts / RAYS)
+        self.shares[rows] = sums
 
     def _add_cells(self, keys: Ints, *, is_saturated: bool) -> None:
         for key in np.unique(keys):
@@ -95,15 +127,26 @@ class Transport:
                 self.is_saturated[self.columns] = is_saturated
                 self.hidden[int(key)] = self.columns
 
-    def _note_bright(self, met: Met) -> None:
-        is_bright = met.at_least.max(axis=-1) > 0
-        columns, radiance = met.columns[is_bright, 0], met.at_least[is_bright]
+    def _note_clipped(self, columns: Ints, radiance: Floats) -> None:
+        """Fold in the clipped `radiance` [n, 3] of saturated cells `columns` [n]."""
         counts = np.bincount(columns, minlength=COLUMNS).astype(np.float64)
         sums = np.stack([np.bincount(columns, channel, COLUMNS) for channel in radiance.T], axis=1)
         total = self._counts + counts
         share = np.where(total > 0, counts / np.maximum(total, 1.0), 0.0)[:, None]
-        self.at_least += share * (sums / np.maximum(counts, 1.0)[:, None] - self.at_least)
+        self.clipped += share * (sums / np.maximum(counts, 1.0)[:, None] - self.clipped)
         self._counts = np.minimum(total, _MOST_COUNTED)
+
+
+def _summed(columns: Ints, shares: Floats) -> Floats:
+    """[n, COLUMNS] sums over rays of `shares` of `columns`, [n, m, CORNERS] each."""
+    place = COLUMNS * np.arange(len(columns))[:, None, None] + np.maximum(columns, 0)
+    sums = np.bincount(place.ravel(), shares.ravel(), len(columns) * COLUMNS)
+    return np.asarray(sums.reshape(-1, COLUMNS), np.float64)
+
+
+def bright_keys(points: Floats) -> Ints:
+    """[n] keys of the cells of saturated surface at points [n, 3]."""
+    return np.asarray(2 * _cell_numbers(points, CELL_M) + 1)
 
 
 def meet(shell: Shell, hidden: Mapping[int, int], origins: Floats, directions: Floats, arrivals: Floats) -> Met:
@@ -119,14 +162,15 @@ def meet(shell: Shell, hidden: Mapping[int, int], origins: Floats, directions: F
     columns[is_free], shares[is_free] = shell.exits(starts[is_free], directions[is_free])
     back, bright = _hidden_keys(origins, directions, arrivals)
     for chosen, keys in ((distance < 0, back), (is_bright, bright)):
-        columns[chosen] = _columns_of(hidden, keys)[:, None]
+        columns[chosen] = columns_of(hidden, keys)[:, None]
         shares[chosen, 0] = 1.0
-    known = np.where(((distance > 0) & ~is_bright)[..., None], radiance, 0.0)
-    return Met(columns, shares, known, np.where(is_bright[..., None], radiance, 0.0))
+    known = np.where((distance > 0)[..., None], radiance, 0.0)
+    return Met(columns, shares, known, is_bright, np.abs(distance))
 
 
-def _is_bright(arrivals: Floats) -> NDArray[np.bool_]:
-    return np.asarray((arrivals[..., 3] > 0) & (arrivals[..., :3].max(axis=-1) >= SATURATED))
+def _is_bright(arrivals: NDArray[np.floating]) -> NDArray[np.bool_]:
+    most, least = arrivals[..., :3].max(axis=-1), arrivals[..., :3].min(axis=-1)
+    return np.asarray((arrivals[..., 3] > 0) & (most >= SATURATED) & (least >= ALL_CHANNELS * most))
 
 
 def _hidden_keys(origins: Floats, directions: Floats, arrivals: Floats) -> tuple[Ints, Ints]:
@@ -136,15 +180,15 @@ def _hidden_keys(origins: Floats, directions: Floats, arrivals: Floats) -> tuple
     distance = np.abs(arrivals[..., 3, None])
     back = origins[row] + distance[row, ray] * directions[row, ray]
     bright = origins[bright_row] + distance[bright_row, bright_ray] * directions[bright_row, bright_ray]
-    return 2 * _cell_numbers(back), 2 * _cell_numbers(bright) + 1
+    return 2 * _cell_numbers(back, HIDDEN_M), bright_keys(bright)
 
 
-def _cell_numbers(points: Floats) -> Ints:
-    parts = np.floor(points / HIDDEN_M).astype(np.int64) + _MIDDLE
+def _cell_numbers(points: Floats, side_m: float) -> Ints:
+    parts = np.floor(points / side_m).astype(np.int64) + _MIDDLE
     return np.asarray((parts[:, 0] * 2 * _MIDDLE + parts[:, 1]) * 2 * _MIDDLE + parts[:, 2])
 
 
-def _columns_of(hidden: Mapping[int, int], keys: Ints) -> Ints:
+def columns_of(hidden: Mapping[int, int], keys: Ints) -> Ints:
     """[n] columns by the `keys` [n] of cells; where there is no such cell NO_CELL, or the last one if no more fit."""
     found, inverse = np.unique(keys, return_inverse=True)
     other = COLUMNS - 1 if len(hidden) >= MOST_HIDDEN else NO_CELL

@@ -29,8 +29,13 @@ above it (a lamp is 50 times the mean), and of surface that was not seen."""
 LOBE, LOBE_SPREAD = -1.0, 2.0
 """Mean and standard deviation of the log radiance of distant lobes, about the mean's: most of a sky is darker than its
 mean, and a sun is 50 times it."""
-LAMP_EXCESS, LAMP_SPREAD = 0.2, 1.0
-"""Of saturated cells: excess over the clipped radiance, relative to it, and the standard deviation of its log."""
+LIT_EXCESS, LIT_SPREAD = 0.2, 1.0
+"""Of saturated surface that may be lit paint: radiance beyond what the picture shows, relative to that, and the
+standard deviation of its log."""
+LAMP_EXCESS, LAMP_SPREAD = 1.0, 2.0
+"""Of lamps and panes: a bulb is 200 times as bright as a picture shows it."""
+LAMP_BEGIN = 4.0
+"""Log of a lamp's excess where steps begin: one that begins low brings so little light that the first steps miss it."""
 SMOOTHNESS, EDGE = 1.0, 0.5
 """Weight of the squared difference of neighbouring cells' log radiance, and the difference from which it grows
 linearly: the rims of lamps and windows."""

@@ -18,7 +18,7 @@ from server.light.shell.transport import Transport
 from server.maths.sh import LUMINANCE
 from tests.hard_cases.catalogue import Family, Found, Trial
 from tests.scenes.lights import unit
-from tests.scenes.shell_room import Lamp, ShellRoom, make_room
+from tests.scenes.shell_room import NO_EMITTERS, Lamp, ShellRoom, make_room
 
 Floats = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def corner(change: Callable[[ShellRoom], None] | None = None) -> ShellRoom:
     if change is not None:
         change(room)
         room.transport = Transport()
-        room.transport.update(room.patches, room.patches.used, room.shell)
+        room.transport.update(room.patches, NO_EMITTERS, room.patches.used, room.shell)
     return room
 
 

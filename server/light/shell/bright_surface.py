@@ -1,0 +1,260 @@
+"""Saturated surface as emitters with a place and a size: lamps and windows that a picture shows clipped.
+
+Rays that are spread evenly miss a bulb, or meet it once: its share of what a patch receives would be noise. Each cell
+of a grid that holds clipped surface is therefore one emitter, towards which every patch has a ray of its own. What
+pictures show of it is averaged over frames, so that it moves with the evidence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.light.arrivals import trace_arrivals
+from server.light.shell.patches import MOST_PATCHES, MOST_WEIGHT, Patches
+from server.light.shell.picture import SeenBright
+from server.light.shell.weights import MEAN_ALBEDO
+from server.opencl.engine import Engine
+from server.volume.volume import Volume
+
+CELL_M = 0.3
+"""Side of the grid's cells: half a window pane. From a metre away its light comes from one direction."""
+MOST_EMITTERS = 64
+"""The largest in a room; rays meet the others by chance."""
+PRESENCE = 10.0
+"""Frames that whether a cell is clipped is remembered for: a lamp that is switched off is none half a second later."""
+LEAST_PRESENCE, MOST_PRESENCE = 0.25, 0.75
+"""Shares of the frames that show it clipped: up to the first a cell is no emitter, from the second it is one."""
+ENOUGH_RAYS = 4.0
+"""Of evenly spread rays that meet an emitter: with more, their count is better than one ray to its middle."""
+ROUND, FLAT = 2 / 3, 0.9
+"""Length of the mean normal of half a sphere, as a picture shows it, and of a plane with a scan's noise."""
+MOVED_M = 0.05
+"""Distance from which visibility is traced again: a bulb's size."""
+NEARBY_M = 0.25
+"""Standard deviation of the distance of surface that receives the same light."""
+UNLIT, LIT = 0.25, 0.5
+"""Of what a saturated surface sends: where less than the first arrives nearby it is a lamp, where more than the second,
+it may be bright paint in that light."""
+_LEAST_COSINE = 0.2
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Emitters:
+    """Cells of saturated surface at one frame. [k] emitters, world axes and metres."""
+
+    keys: NDArray[np.int64]
+    """[k, 3] of the grid."""
+    centers: Floats
+    """[k, 3]."""
+    facing: Floats
+    """[k, 3] unit."""
+    flatness: Floats
+    """[k] from 0, sends evenly in all directions, to 1, a plane that sends to its front as its cosine."""
+    areas_m2: Floats
+    """[k] as seen from the front."""
+    radiance: Floats
+    """[k, 3] as clipped."""
+    presence: Floats
+    """[k] from 0 to 1: how far it counts."""
+
+    @property
+    def count(self) -> int:
+        """Number of emitters."""
+        return len(self.areas_m2)
+
+    def seen_from(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """Unit directions [n, k, 3] from `points` [n, 3], distances [n, k] and areas across them [n, k]."""
+        away = self.centers[None] - points[:, None]
+        distances = np.maximum(np.linalg.norm(away, axis=-1), 1e-6)
+        directions = away / distances[..., None]
+        cosines = np.maximum(-np.einsum("nkr,kr->nk", directions, self.facing), 0.0)
+        return directions, distances, self.areas_m2 * ((1 - self.flatness) + self.flatness * cosines)
+
+    def shares(self, points: Floats, normals: Floats) -> Floats:
+        """[n, k] that emitters fill of the cosine-weighted hemispheres of `points` with unit `normals`, [n, 3] each."""
+        directions, distances, areas = self.seen_from(points)
+        cosines = np.maximum(np.einsum("nkr,nr->nk", directions, normals), 0.0)
+        return np.asarray(cosines * areas / (np.pi * distances**2 + areas))
+
+    def lit_by(self, patches: Patches) -> Floats:
+        """[k] from 0 to 1: how far the light on surface nearby that faces alike explains what each sends."""
+        rows = patches.used[patches.clipped[patches.used] < 0.5]
+        apart = ((self.centers[:, None] - patches.positions[rows]) ** 2).sum(axis=-1)
+        alike = np.maximum(self.facing @ patches.normals[rows].T, 0.0) ** 2 * np.exp(-apart / (2 * NEARBY_M**2))
+        shown = np.exp(patches.logarithms[rows].mean(axis=1))
+        arriving = alike @ shown / (alike.sum(axis=1) + 1.0) / MEAN_ALBEDO
+        share = arriving / np.maximum(self.radiance.mean(axis=1), 1e-6)
+        return np.asarray(self.flatness * np.clip((share - UNLIT) / (LIT - UNLIT), 0.0, 1.0))
+
+    def solid_angles(self, points: Floats) -> Floats:
+        """[n, k] steradians."""
+        _, distances, areas = self.seen_from(points)
+        return np.asarray(areas / (distances**2 + areas / (2 * np.pi)))
+
+    def weights(self, shares: Floats, rays: int) -> Floats:
+        """[n, k] how far a ray to each emitter counts, not evenly spread `rays`, of which `shares` [n, k] meet it."""
+        return np.asarray(self.presence / (1 + shares * rays / ENOUGH_RAYS))
+
+    def left_to_others(self, weights: Floats, rows: Ints, ends: Floats) -> Floats:
+        """[m] how far rays count that meet saturated surface at `ends` [m, 3]; weights: [n, k], and whose row of it."""
+        numbers = {tuple(key): number for number, key in enumerate(self.keys.tolist())}
+        found, inverse = np.unique(_keys(ends), axis=0, return_inverse=True)
+        number = np.array([numbers.get(tuple(key), -1) for key in found.tolist()], np.int64)[inverse.ravel()]
+        result = np.ones(len(ends))
+        own = number >= 0
+        result[own] -= weights[rows[own], number[own]]
+        return result
+
+    def visible(self, engine: Engine, volume: Volume, points: Floats) -> NDArray[np.bool_]:
+        """[n, k] whether nothing stands between `points` [n, 3] and an emitter."""
+        directions, distances, areas = self.seen_from(points)
+        arrivals = trace_arrivals(engine, volume, points - volume.origin_world, None, directions)
+        met = np.abs(arrivals[..., 3])
+        own = np.sqrt(areas) + 2 * volume.voxel_m  # what is as near to its middle is the emitter itself
+        return np.asarray((met == 0) | (met >= distances - own))
+
+
+@dataclass(frozen=True)
+class EmittersSeen:
+    """Emitters and which patches see them."""
+
+    emitters: Emitters
+    visible: Floats
+    """[MOST_PATCHES, k] 1 or 0."""
+
+
+class BrightSurface:
+    """Of a room, in rows of its arrays. Frames add to it."""
+
+    def __init__(self) -> None:
+        n = MOST_EMITTERS
+        self._rows: dict[tuple[int, ...], int] = {}
+        self._areas, self._squares = np.zeros(n), np.zeros(n)
+        """Sums over frames of the area, and of its square: the mean of areas weighted by themselves is little disturbed
+        by frames that show a part."""
+        self._centers, self._normals, self._radiance = (np.zeros((n, 3)) for _ in range(3))
+        """Sums over frames weighted by the square of the area."""
+        self._sums = self._areas, self._squares, self._centers, self._normals, self._radiance
+        self._presence, self._frames = np.zeros(n), np.zeros(n)
+        self.visibility: NDArray[np.int8] = np.full((MOST_PATCHES, n), -1, np.int8)
+        """Of each emitter from each patch: 1, visible; 0, not; -1, not traced."""
+        self._traced_at = np.full((n, 3), np.inf)
+
+    def forget(self, share: float) -> None:
+        """Take `share` of their weight from all: the light has changed."""
+        for values in (*self._sums, self._presence, self._frames):
+            np.multiply(values, 1.0 - share, out=values)
+
+    def add(self, bright: SeenBright, positions: Floats) -> None:
+        """Fold a picture in; positions: [m, 3] of all surface that it shows, clipped or not."""
+        keys, inverse = np.unique(_keys(bright.positions), axis=0, return_inverse=True)
+        inverse = inverse.ravel()
+        shown = {tuple(key): number for number, key in enumerate(keys.tolist())}
+        self._note_presence(positions, shown)
+        for key, number in shown.items():
+            own = inverse == number
+            self._add_to(key, bright, own)
+
+    def _note_presence(self, positions: Floats, shown: dict[tuple[int, ...], int]) -> None:
+        """Of a cell that shows as clipped, or where surface is in view that does not."""
+        for key, row in self._rows.items():
+            center, radius_m = self._centers[row] / max(self._squares[row], 1e-12), np.sqrt(self._area(row) / np.pi)
+            nearest = np.linalg.norm(positions - center, axis=1).min(initial=np.inf)
+            if key in shown or nearest <= radius_m:
+                self._frames[row] = min(self._frames[row] + 1, PRESENCE)
+                self._presence[row] += (float(key in shown) - self._presence[row]) / self._frames[row]
+
+    def _add_to(self, key: tuple[int, ...], bright: SeenBright, own: NDArray[np.bool_]) -> None:
+        areas = bright.areas_m2[own]
+        across = float(areas.sum())
+        center, normal = areas @ bright.positions[own] / across, areas @ bright.normals[own] / across
+        line = center - bright.eye
+        line /= max(float(np.linalg.norm(line)), 1e-6)
+        length = float(np.linalg.norm(normal))
+        flatness = _flatness(length)
+        cosine = max(-float(normal @ line) / max(length, 1e-6), _LEAST_COSINE)
+        area = across / float(1 - flatness + flatness * cosine)
+        row = self._row_of(key, area)
+        if row < 0:
+            return
+        keep = 1.0 - 1.0 / MOST_WEIGHT
+        values: tuple[float | Floats, ...] = 1 / area, 1.0, center, normal, areas @ bright.radiance[own] / across
+        for sums, value in zip(self._sums, values, strict=True):
+            sums[row] = keep * sums[row] + area**2 * value
+
+    def _row_of(self, key: tuple[int, ...], area: float) -> int:
+        """Its row; a new one takes that of the smallest, if that is smaller. -1: none."""
+        if key in self._rows:
+            return self._rows[key]
+        if len(self._rows) < MOST_EMITTERS:
+            row = len(self._rows)
+        else:
+            smallest = min(self._rows, key=lambda other: self._area(self._rows[other]))
+            row = self._rows[smallest]
+            if self._area(row) >= area:
+                return -1
+            del self._rows[smallest]
+        for sums in self._sums:
+            sums[row] = 0.0
+        self._presence[row] = self._frames[row] = 1.0
+        self.visibility[:, row], self._traced_at[row] = -1, np.inf
+        self._rows[key] = row
+        return row
+
+    def _area(self, row: int) -> float:
+        return float(self._squares[row] / max(self._areas[row], 1e-12))
+
+    def emitters(self) -> tuple[Emitters, Ints]:
+        """Those that count, and their rows [k]."""
+        presence = np.clip((self._presence - LEAST_PRESENCE) / (MOST_PRESENCE - LEAST_PRESENCE), 0.0, 1.0)
+        keys = [key for key, row in self._rows.items() if presence[row] > 0 and self._squares[row] > 0]
+        rows = np.array([self._rows[key] for key in keys], np.int64)
+        weights = self._squares[rows][:, None]
+        normals = self._normals[rows] / weights
+        lengths = np.linalg.norm(normals, axis=1)
+        found = Emitters(
+            keys=np.array(keys, np.int64).reshape(-1, 3),
+            centers=self._centers[rows] / weights,
+            facing=normals / np.maximum(lengths, 1e-6)[:, None],
+            flatness=_flatness(lengths),
+            areas_m2=self._squares[rows] / self._areas[rows],
+            radiance=self._radiance[rows] / weights,
+            presence=presence[rows],
+        )
+        return found, rows
+
+    def seen_by(self) -> EmittersSeen:
+        """The emitters, as patches see them; frames do not change it."""
+        emitters, rows = self.emitters()
+        return EmittersSeen(emitters, (self.visibility[:, rows] > 0).astype(np.float64))
+
+    def trace(self, engine: Engine, volume: Volume, patches: Patches, traced: Ints) -> None:
+        """Trace which patches see which emitters: those in `traced` anew, of the others what is not known."""
+        emitters, rows = self.emitters()
+        if not emitters.count:
+            return
+        moved = np.linalg.norm(emitters.centers - self._traced_at[rows], axis=1) > MOVED_M
+        self._traced_at[rows[moved]] = emitters.centers[moved]
+        self.visibility[:, rows[moved]] = -1
+        self.visibility[traced] = -1
+        used = patches.used
+        unknown = used[(self.visibility[np.ix_(used, rows)] < 0).any(axis=1)]
+        if len(unknown):
+            origins = patches.positions[unknown] + volume.voxel_m * patches.normals[unknown]
+            self.visibility[np.ix_(unknown, rows)] = emitters.visible(engine, volume, origins)
+
+
+def _keys(points: Floats) -> Ints:
+    """[n, 3] cells of points [n, 3]."""
+    return np.asarray(np.floor(points / CELL_M).astype(np.int64))
+
+
+def _flatness(lengths: Floats | float) -> Floats:
+    """By the length of the mean normal."""
+    return np.clip((np.asarray(lengths) - ROUND) / (FLAT - ROUND), 0.0, 1.0)

@@ -15,15 +15,15 @@ from client.progress import say
 from client.results.names import PAGE_NAME
 from client.sources.frame_source import Source
 from client.sources.volume import default_volume, default_voxel
+from client.synthetic.scenes import desk
 from protocol.messages import Wishes
 from server.scene.vase import vase_glb
 from server.service.authenticator import Authenticator, new_token
 from server.service.serve import BackgroundServer, open_service
 
-SOURCE = "synthetic:table?light=7&frames="
+SOURCE = "synthetic:desk?frames="
 FRAMES, FRAMES_TO_WATCH = 30, 300
 """Frames on the same path: one second for the saved pictures, ten seconds for watching."""
-VASE_STANDS_AT_M = (0.1, 0.0, 0.12)
 
 
 @dataclass(frozen=True)
@@ -65,4 +65,4 @@ def _prepared(frames: int) -> Iterator[Demo]:
     with tempfile.TemporaryDirectory(prefix="probeless-") as folder:
         vase = Path(folder) / "vase.glb"
         vase.write_bytes(vase_glb())
-        yield Demo(source, (ObjectFile(vase, VASE_STANDS_AT_M),), wishes)
+        yield Demo(source, (ObjectFile(vase, desk.FREE_M),), wishes)

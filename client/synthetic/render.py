@@ -31,6 +31,8 @@ class LitSolid:
     grids: list[Grid]
     occluded: tuple[tuple[list[Grid], NDArray[np.float32]], ...]
     """(grids of this solid, table [total, 3] of the light that shadows remove)."""
+    bounced: tuple[list[Grid], NDArray[np.float32]] | None = None
+    """(grids of this solid, table [total, 3] of the light that surfaces send to each other); None: left out."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,9 @@ def irradiance(body: LitSolid, points: Floats, normals: Floats, light: DistantLi
         arriving[here] = clear
         for grids, table in body.occluded:
             arriving[here] -= grids[number].interpolate(table, points[here])
+        if body.bounced is not None:
+            grids, table = body.bounced
+            arriving[here] += grids[number].interpolate(table, points[here])
     return np.maximum(arriving, 0)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from client.synthetic.cache import cached
 from client.synthetic.camera_exposure import EXPOSURE_CURVES, FIRST_EXPOSURE
 from client.synthetic.lighting.bake import bake
+from client.synthetic.lighting.bounced import STEP_M, bounced
 from client.synthetic.lighting.harmonics import sphere_directions
 from client.synthetic.lighting.lamps import Lamp, room_lamps
 from client.synthetic.lighting.lights import RING_SIZE, DistantLight, ring_light
@@ -18,7 +19,7 @@ from client.synthetic.render import LitSolid, Rendering, camera_rays, look_at, r
 from client.synthetic.scenes import hand
 from client.synthetic.scenes.guests import GUESTS, bake_guests, guest_grids
 from client.synthetic.sensor_noise import kinect_like
-from client.synthetic.solids.charts import atlas
+from client.synthetic.solids.charts import Grid, atlas
 from client.synthetic.spec import Options, parse_spec, scene_of
 from protocol.frames import CameraModel, RgbdFrame
 
@@ -76,7 +77,7 @@ class SyntheticSource:
         )
         self.scene = scene_of(options)
         self.guests = GUESTS[options.guest]
-        self.lamps = room_lamps(options.lamps, options.place)
+        self.lamps = self.scene.lamps or room_lamps(options.lamps, options.place)
         self._rays = camera_rays(self.camera)
         self._grids = atlas([solid.charts for solid in self.scene.solids], self.scene.step_m)
         self._texel_light = lru_cache(maxsize=1)(self._shadowed_light)
@@ -148,6 +149,21 @@ class SyntheticSource:
         )
 
     @cached_property
+    def _bounced(self) -> NDArray[np.float32]:
+        """[total, 3] light that surfaces send to each other, on grids of their own."""
+        light, baked = self.light(0), self._texel_light(0)
+        bodies = [
+            LitSolid(body.solid, body.texture, grids, ((grids, baked),))
+            for body, grids in zip(self.scene.bodies, self._grids, strict=True)
+        ]
+        name = f"{self.scene.name}_{self.options.light}_bounced"
+        return cached(name, lambda: {"bounced": bounced(bodies, self._coarse, self.lamps, light)})["bounced"]
+
+    @cached_property
+    def _coarse(self) -> list[list[Grid]]:
+        return atlas([solid.charts for solid in self.scene.solids], STEP_M)
+
+    @cached_property
     def _static(self) -> hand.StaticVisibility:
         solids = self.scene.solids
         bits = cached("hand", lambda: {"open": hand.StaticVisibility(solids).open_bits})["open"]
@@ -164,6 +180,10 @@ class SyntheticSource:
             LitSolid(body.solid, body.texture if self.options.texture else None, grids, ((grids, baked),))
             for body, grids in zip(self.scene.bodies, self._grids, strict=True)
         ]
+        if self.scene.lamps:
+            bodies = [
+                replace(body, bounced=(grids, self._bounced)) for body, grids in zip(bodies, self._coarse, strict=True)
+            ]
         if self.options.name == "hand":
             bodies = self._with_hand(bodies, index, light)
         if self.guests:

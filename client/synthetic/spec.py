@@ -13,6 +13,7 @@ from client.synthetic.lighting.lamps import PLACES_M
 from client.synthetic.lighting.lights import RING_SIZE
 from client.synthetic.scenes import scene as scenes
 from client.synthetic.scenes.appearance import APPEARANCES
+from client.synthetic.scenes.desk import desk
 from client.synthetic.scenes.guests import GUESTS
 from client.synthetic.scenes.halves import halves
 from client.synthetic.scenes.stage import stage
@@ -27,6 +28,7 @@ SCENES: dict[str, Callable[[], scenes.Scene]] = {
     "hand": scenes.table,
     "light": scenes.table,
     "lamp": scenes.lamp_room,
+    "desk": desk,
     "halves": halves,
     "stage": stage,
 }
@@ -62,7 +64,7 @@ def parse_spec(spec: str) -> Options:
     name, _, query = spec.removeprefix("synthetic:").partition("?")
     if name not in SCENES:
         raise SourceError(f"{spec}: there is no such scene; use synthetic:{', synthetic:'.join(SCENES)}")
-    options = Options(name, texture=name in ("room", "halves", "stage"), lamps=int(name == "lamp"))
+    options = Options(name, texture=name in ("room", "desk", "halves", "stage"), lamps=int(name == "lamp"))
     keys = _KEYS | (_STAGE_KEYS if name == "stage" else {})
     for key, value in parse_qsl(query, keep_blank_values=True):
         if key not in keys:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from client.synthetic.lighting.lamps import Lamp
 from client.synthetic.scenes import textures
 from client.synthetic.solids.polyhedra import Solid, box, rotation_about, wedge
 from client.synthetic.solids.round import Cylinder, Sphere
@@ -40,6 +41,8 @@ class Scene:
     """Seconds -> (position, target), metres."""
     brightness: float = 1.0
     """Factor of the light; larger for rooms, which admit less of it."""
+    lamps: tuple[Lamp, ...] = ()
+    """Lamps that belong to the scene. Where there are any, surfaces light each other too (lighting/bounced.py)."""
 
     @property
     def solids(self) -> list[Solid]:

@@ -173,7 +173,8 @@ class SyntheticSource:
         """[total, 3] light that static shadows remove."""
         return self._transfer @ self.light(index).sh.astype(np.float32)
 
-    def _render(self, index: int) -> Rendering:
+    def lit_bodies(self, index: int) -> list[LitSolid]:
+        """Solids of a frame with the light that reaches them."""
         light = self.light(index)
         baked = self._texel_light(index if self.options.name == "light" else 0)
         bodies = [
@@ -188,6 +189,10 @@ class SyntheticSource:
             bodies = self._with_hand(bodies, index, light)
         if self.guests:
             bodies = self._with_guests(bodies, light)
+        return bodies
+
+    def _render(self, index: int) -> Rendering:
+        light, bodies = self.light(index), self.lit_bodies(index)
         return render(bodies, self.camera, self._rays, self.pose(index), light, self.lamps)
 
     def _with_hand(self, bodies: list[LitSolid], index: int, light: DistantLight) -> list[LitSolid]:

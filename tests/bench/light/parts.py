@@ -11,6 +11,7 @@ from pathlib import Path
 from tests.bench.light.closed_rooms import closed_rooms_part
 from tests.bench.light.e1 import SEQUENCES, sequence_part
 from tests.bench.light.honesty import honesty_part
+from tests.bench.light.lamp_in_view import lamps_in_view_part
 from tests.bench.light.places import halves_part, kitchen_part
 from tests.bench.light.robustness import robustness_part
 from tests.bench.light.room import room_part
@@ -45,6 +46,7 @@ PARTS: dict[str, Callable[[Run], Part]] = {
     ROOM: room_part,
     **{sequence.name: partial(sequence_part, sequence=sequence) for sequence in SEQUENCES},
     "closed rooms": closed_rooms_part,
+    "lamps in view": lamps_in_view_part,
     "half black room": halves_part,
     "robustness": robustness_part,
     "honesty": honesty_part,

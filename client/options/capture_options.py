@@ -126,6 +126,9 @@ RerunOption = Annotated[
     typer.Option("--rerun", metavar="FILE.rrd", help="recording for the rerun viewer; needs rerun-sdk"),
 ]
 Mesh = Annotated[bool, typer.Option("--mesh", help="write mesh.ply and mesh.glb")]
+Scene = Annotated[
+    bool, typer.Option("--scene", help="write scene.glb: scan, objects, lights, camera path; and scene.hdr")
+]
 BudgetMs = Annotated[float | None, typer.Option(metavar="N", help="choose the operating point for this frame time")]
 MaxLightError = Annotated[
     float | None, typer.Option(metavar="DEG", help="choose the operating point for this light error")

@@ -23,7 +23,10 @@ ROBUSTNESS: tuple[RobustnessName, ...] = ("openness", "normals", "memory", "outl
 """The wire has one more, `normals_printed`, for a comparison in `probeless bench light`."""
 
 SourceArgument = Annotated[
-    str, typer.Argument(metavar="SOURCE", help="data-set folder, synthetic:NAME, recording or oak[?vio=off]")
+    str,
+    typer.Argument(
+        metavar="SOURCE", help="data-set folder, capture of another program, synthetic:NAME, recording or oak[?vio=off]"
+    ),
 ]
 Frames = Annotated[str | None, typer.Option(metavar="A:B", help="half-open range of positions in the source")]
 PosesOption = Annotated[

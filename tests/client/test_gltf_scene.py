@@ -20,26 +20,10 @@ from client.cli import run_command
 from client.objects.object_file import pack_mesh
 from client.results.bright_parts import BrightPart, solid_angles, split
 from client.results.gltf_scene import PlacedObject, scene_glb
-from protocol.frames import CameraModel
 from server.light.panorama import panorama_directions
-from server.meshing.scene_mesh import SceneMesh
+from tests.client.gltf_scenes import CAMERA, GLTF_FROM_WORLD, SQUARE, square
 
 HEIGHT, WIDTH = 128, 256
-CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=66.0, cx=31.5, cy=23.5)
-GLTF_FROM_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""A world with +z up whose first camera looks along +y."""
-SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 2, 0], [0, 2, 0.0]], np.float32)
-
-
-def square() -> SceneMesh:
-    """A floor: one by two metres, its upper face seen, half sRGB grey."""
-    return SceneMesh(
-        vertices=SQUARE,
-        triangles=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
-        normals=np.array([[0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 0]], np.float32),
-        colors=np.full((4, 3), 128, np.uint8),
-        gltf_from_world=GLTF_FROM_WORLD,
-    )
 
 
 def cube_glb(picture: Any = None) -> bytes:

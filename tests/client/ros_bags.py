@@ -24,6 +24,8 @@ def ros_bag(
     depth: Literal["16UC1", "32FC1"] = "16UC1",
     depth_frame: str = OPTICAL,
     info: bool = True,
+    picture: str = "image_raw",
+    distortion: float = 0.0,
 ) -> Path:
     """A bag with a colour, its camera_info, an aligned depth, and the path of the robot that carries the camera."""
     from rosbags.rosbag2 import StoragePlugin, Writer
@@ -40,7 +42,7 @@ def ros_bag(
         def write(connection: Any, time_ns: int, message: Any) -> None:
             writer.write(connection, time_ns, store.serialize_cdr(message, connection.msgtype))
 
-        color = add("/camera/color/image_raw", "sensor_msgs/msg/Image")
+        color = add(f"/camera/color/{picture}", "sensor_msgs/msg/Image")
         aligned = add("/camera/aligned_depth_to_color/image_raw", "sensor_msgs/msg/Image")
         camera_info = add("/camera/color/camera_info", "sensor_msgs/msg/CameraInfo") if info else None
         static = add("/tf_static", "tf2_msgs/msg/TFMessage")
@@ -56,7 +58,7 @@ def ros_bag(
             if odometry is not None:
                 write(odometry, at + 1, make.odometry(at, body))
             if camera_info is not None:
-                write(camera_info, at + 2, make.info(at))
+                write(camera_info, at + 2, make.info(at, distortion))
             write(color, at + 3, make.image(at, OPTICAL, "bgr8", frame.color[..., ::-1]))
             values = frame.depth if depth == "16UC1" else frame.depth.astype(np.float32) / 1000
             write(aligned, at + 4, make.image(at + 3_000_000, depth_frame, depth, values))
@@ -79,13 +81,14 @@ class _Messages:
         header = self._header(at_ns, frame)
         return image(header, height, width, encoding, 0, padded.shape[1], padded.ravel())
 
-    def info(self, at_ns: int) -> Any:
+    def info(self, at_ns: int, k1: float) -> Any:
+        """K is of the raw picture: with distortion it is not that of the rectified one, P."""
         camera = self._camera
         region = self._types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1])
+        k = np.array([camera.fx + 9 * k1, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1])
         p = np.array([camera.fx, 0, camera.cx, 0, 0, camera.fy, camera.cy, 0, 0, 0, 1, 0])
         return self._types["sensor_msgs/msg/CameraInfo"](
-            *(self._header(at_ns, OPTICAL), camera.height, camera.width, "plumb_bob", np.zeros(5), k),
+            *(self._header(at_ns, OPTICAL), camera.height, camera.width, "plumb_bob", np.array([k1, 0, 0, 0, 0]), k),
             *(np.eye(3).ravel(), p, 0, 0, region),
         )
 

@@ -7,12 +7,15 @@ import zipfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
 from client.errors import SourceError
 from client.options.source import open_source
+from client.sources.files.ros_pictures import color_of, depth_of, is_color, is_depth
 from client.sources.frame_source import Source
 from tests.client import captures
 from tests.client.captures import UNSURE, Scene
@@ -173,6 +176,31 @@ def test_a_bag_without_a_path_is_tracked(tmp_path: Path, scene: Scene) -> None:
     assert len(source) == COUNT
     assert not source.has_poses
     assert source.up is None
+
+
+def test_a_rectified_picture_has_the_projection_and_a_raw_one_the_distortion(tmp_path: Path, scene: Scene) -> None:
+    pytest.importorskip("rosbags")
+    rectified = open_source(str(ros_bag(tmp_path / "a", scene, picture="image_rect_color", distortion=0.1))).camera
+    assert not rectified.is_distorted
+    assert rectified.fx == pytest.approx(scene.camera.fx)
+    raw = open_source(str(ros_bag(tmp_path / "b", scene, distortion=0.1))).camera
+    assert raw.distortion == (0.1, 0, 0, 0, 0)
+    assert raw.fx == pytest.approx(scene.camera.fx + 0.9)
+
+
+def test_compressed_pictures_of_ros(scene: Scene) -> None:
+    """A JPEG, and the PNG behind twelve bytes of compressed_depth_image_transport."""
+    frame = scene.frames[0]
+    color = SimpleNamespace(
+        format="rgb8; jpeg compressed bgr8", data=np.frombuffer(captures.jpeg(frame.color), np.uint8)
+    )
+    packed = bytes(12) + cv2.imencode(".png", frame.depth)[1].tobytes()
+    depth = SimpleNamespace(format="16UC1; compressedDepth png", data=np.frombuffer(packed, np.uint8))
+    assert (is_color(color), is_depth(color), is_color(depth), is_depth(depth)) == (True, False, False, True)
+    assert np.median(np.abs(color_of(color, "colour").astype(int) - frame.color)) <= 6
+    np.testing.assert_array_equal(depth_of(depth, "depth"), frame.depth)
+    with pytest.raises(SourceError, match="no PNG of 16 bits"):
+        depth_of(SimpleNamespace(format="16UC1; compressedDepth", data=np.zeros(40, np.uint8)), "depth")
 
 
 def test_what_a_bag_lacks_is_said(tmp_path: Path, scene: Scene) -> None:

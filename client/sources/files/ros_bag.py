@@ -116,7 +116,7 @@ def _open(path: Path, reader: Any) -> DecodedSource:
         frames = [frames[i] for i in placed]
         known = tuple(pose for pose in poses if pose is not None)
     times_s = tuple(picture.time_ns * 1e-9 for picture, _ in frames)
-    lens, distortion = _lens(path, info)
+    lens, distortion = _lens(path, info, color.connection.topic)
     first = _decoded_depth(path, reader, depth.connection, frames[0][1])
     camera = camera_of(path, lens, lens.resized(first.shape[1], first.shape[0]), distortion=distortion)
     read = partial(_read, path, reader, color.connection, depth.connection, frames)
@@ -186,9 +186,12 @@ def _parent(topic: str) -> str:
     return topic.rpartition("/")[0]
 
 
-def _lens(path: Path, info: Any) -> tuple[Lens, Distortion]:
+def _lens(path: Path, info: Any, topic: str) -> tuple[Lens, Distortion]:
+    """Of a rectified picture (image_proc: `image_rect` in its topic) the projection P holds, else K and D."""
     k, d = np.asarray(info.k, np.float64), np.asarray(info.d, np.float64)
-    if info.distortion_model not in ("", "plumb_bob", "rational_polynomial") or np.any(d[5:]):
+    if "image_rect" in topic:
+        k, d = np.asarray(info.p, np.float64)[[0, 1, 2, 4, 5, 6, 8, 9, 10]], np.zeros(0)
+    if np.any(d) and (info.distortion_model not in ("plumb_bob", "rational_polynomial") or np.any(d[5:])):
         raise SourceError(
             f"{path}: distortion {info.distortion_model} with {len(d)} coefficients is not read; record rectified "
             "pictures, or plumb_bob"

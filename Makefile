@@ -3,8 +3,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 DATA ?= ../shared/data
 
-.PHONY: mutation-check help install install-all install-bench install-cluster install-devices install-oak install-rerun \
-	install-video demo \
+.PHONY: mutation-check help install install-all install-bench install-cluster install-devices install-import \
+	install-oak install-rerun install-video demo \
 	test test-all test-rest test-slow test-second-device slow-list lint bench check-races web package lock clean
 help:
 	@echo "make demo      the main job: server, streaming client, pictures in out/demo"
@@ -17,6 +17,7 @@ help:
 	@echo "make check-races   the kernels in a simulator that finds data races (downloads it)"
 	@echo "make install   the program alone, as .venv/bin/probeless; with an extra: install-oak (reads an OAK camera),"
 	@echo "               install-video (H.264), install-rerun (recordings for its viewer), install-bench,"
+	@echo "               install-import (reads Record3D files and ROS 2 bags),"
 	@echo "               install-cluster (Ray Serve, for many machines),"
 	@echo "               install-devices (Intel's OpenCL for processors, as a second device), install-all"
 
@@ -27,6 +28,7 @@ install-cluster: .venv/installed-cluster
 install-devices: .venv/installed-devices
 install-oak: .venv/installed-oak
 install-rerun: .venv/installed-rerun
+install-import: .venv/installed-import
 install-video: .venv/installed-video
 
 demo: .venv/installed
@@ -114,8 +116,11 @@ lock: .venv/installed-test
 		--constraint requirements-test.lock pyproject.toml -o requirements-video.lock
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh --extra rerun \
 		--constraint requirements-test.lock pyproject.toml -o requirements-rerun.lock
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh --extra import \
+		--constraint requirements-bench.lock pyproject.toml -o requirements-import.lock
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --all-extras \
-		$(patsubst %,--constraint requirements%,.lock -test.lock -bench.lock -cluster.lock -oak.lock -video.lock -rerun.lock) \
+		$(patsubst %,--constraint requirements%,.lock -test.lock -bench.lock -cluster.lock -oak.lock -video.lock -rerun.lock \
+		-import.lock) \
 		pyproject.toml -o requirements-all.lock
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh --extra devices \
 		--constraint requirements-all.lock pyproject.toml -o requirements-devices.lock
@@ -140,6 +145,10 @@ lock: .venv/installed-test
 
 .venv/installed-rerun: requirements-rerun.lock .venv/installed
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-rerun.lock
+	@touch $@
+
+.venv/installed-import: requirements-import.lock .venv/installed
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-import.lock
 	@touch $@
 
 .venv/installed-video: requirements-video.lock .venv/installed

@@ -111,6 +111,7 @@ def run(
     video: o.VideoFileOption = False,
     rerun: o.RerunOption = None,
     mesh: o.Mesh = False,
+    scene: o.Scene = False,
     panorama_out: o.PanoramaFile = None,
     device: o.DeviceOption = None,
 ) -> None:
@@ -122,7 +123,7 @@ def run(
     from client.results.description import describe
     from client.results.output_folder import OutputWriter
 
-    if mesh:
+    if mesh or scene:
         from server.meshing.surface import find_library
 
         find_library()  # a missing library is an error before the frames, not after
@@ -138,6 +139,9 @@ def run(
         if mesh:
             with progress_bar("mesh") as progress:
                 writer.write_mesh(pipeline.mesh(progress))
+        if scene:
+            with progress_bar("scene") as progress:
+                writer.write_scene(pipeline.scene(progress))
         if panorama is not None:
             write_panorama(panorama.path, pipeline.panorama(panorama.format, panorama.position_m))
     say(f"{watch.summary()}{_written_to(out)}")

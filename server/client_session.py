@@ -9,11 +9,13 @@ from typing import Protocol
 
 import numpy as np
 from msgspec import structs
+from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame, Viewpoint
 from protocol.messages import Hello, PanoramaFormat, Preset, Vector3, Wishes
 from server.effects.renderer import RenderRequest
 from server.light.panorama_file import encode_panorama
+from server.maths.rigid import inverse_rigid
 from server.meshing.scene_mesh import SceneMesh
 from server.opencl.device import Device
 from server.opencl.engine import Engine
@@ -164,6 +166,13 @@ class ClientSession:
     def scene_mesh(self, progress: Callable[[int, int], None] = lambda _done, _total: None) -> SceneMesh:
         """The surface fused so far as triangles. Raises MeshingError, one line, where there is none."""
         return self._room.scene_mesh(self._alignment.webxr_from_room, progress)
+
+    def object_places(self) -> dict[str, NDArray[np.float64]]:
+        """world_from_model [4, 4] in the client's world of each object that stands, by its name, in their order."""
+        with self._room.lock:
+            client_from_room = inverse_rigid(self._alignment.room_from_client)
+            standing = [(each.object_id, each.place) for each in self._room.objects.kept()]
+        return {name: client_from_room @ place for name, place in standing if isinstance(place, np.ndarray)}
 
     def panorama(self, format_: PanoramaFormat, position_m: Vector3 | None = None) -> tuple[bytes, Vector3]:
         """The light that arrives at a place as a lat-long file, and that place, both in the client's world.

@@ -7,17 +7,24 @@ from itertools import takewhile
 from types import TracebackType
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from client.commands.stopping import stop_on_interrupt
 from client.errors import RunError
 from client.objects.in_view import ObjectsInView
-from client.objects.object_file import object_id
+from client.objects.object_file import object_id, pack_mesh
 from client.objects.placing import place_objects
 from client.options.capture import Capture
+from client.results.bright_parts import split
 from client.results.frame_output import FrameOutput, captured_of
+from client.results.gltf_scene import PlacedObject, scene_glb
+from client.results.names import ENVIRONMENT_NAME, SCENE_NAME
 from client.sources.frame_source import is_live
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import MeshFormat, PanoramaFormat, Vector3, Wishes
 from server.client_session import ClientSession
+from server.light.panorama_file import decode_hdr, encode_panorama
 from server.meshing.files import mesh_files
 from server.opencl.device import open_device
 from server.pipeline import FrameResult
@@ -38,6 +45,7 @@ class Run:
         self._capture = capture
         self._note = note
         self._told: set[str] = set()
+        self._path: list[tuple[float, NDArray[np.float64]]] = []
         self._pipeline = _open_pipeline(device_name, capture.source.camera, capture.wishes, note)
         try:
             place_objects(self._pipeline, capture.objects, note)
@@ -54,6 +62,8 @@ class Run:
             for output in process_frames(self._pipeline, (source[i] for i in positions), source.camera):
                 self._tell(output.notes)
                 in_view.note(output.light, output.world_from_camera)
+                if output.tracking != "lost":
+                    self._path.append((output.timestamp_s, output.world_from_camera))
                 yield output
         self._tell(in_view.problems())
 
@@ -71,6 +81,22 @@ class Run:
     def mesh(self, progress: Callable[[int, int], None]) -> dict[MeshFormat, bytes]:
         """Mesh files of the surface fused so far; `progress` receives parts done and total. Raises MeshingError."""
         return mesh_files(self._pipeline.scene_mesh(progress))
+
+    def scene(self, progress: Callable[[int, int], None]) -> dict[str, bytes]:
+        """scene.glb and scene.hdr of what was seen so far. Raises MeshingError, ObjectError or RunError."""
+        scan = self._pipeline.scene_mesh(progress)
+        lights, rest = split(decode_hdr(self.panorama("hdr", None)))
+        data = scene_glb(scan, self._placed(), lights, self._path, self._capture.source.camera, ENVIRONMENT_NAME)
+        return {SCENE_NAME: data, ENVIRONMENT_NAME: encode_panorama(rest, "hdr")}
+
+    def _placed(self) -> list[PlacedObject]:
+        """The objects that stand, named by their files."""
+        places, found = self._pipeline.object_places(), []
+        for number, item in enumerate(self._capture.objects):
+            if (place := places.get(object_id(number))) is not None:
+                format_, data = pack_mesh(item.path)
+                found.append(PlacedObject(f"{number} {item.path.stem}", item.path, format_, data, place))
+        return found
 
     def panorama(self, format_: PanoramaFormat, position_m: Vector3 | None) -> bytes:
         """The light that arrives at a place as a lat-long file; None: see `--panorama-out`. Raises RunError."""

@@ -23,7 +23,10 @@ ROBUSTNESS: tuple[RobustnessName, ...] = ("openness", "normals", "memory", "outl
 """The wire has one more, `normals_printed`, for a comparison in `probeless bench light`."""
 
 SourceArgument = Annotated[
-    str, typer.Argument(metavar="SOURCE", help="data-set folder, synthetic:NAME, recording or oak[?vio=off]")
+    str,
+    typer.Argument(
+        metavar="SOURCE", help="data-set folder, capture of another program, synthetic:NAME, recording or oak[?vio=off]"
+    ),
 ]
 Frames = Annotated[str | None, typer.Option(metavar="A:B", help="half-open range of positions in the source")]
 PosesOption = Annotated[
@@ -126,6 +129,9 @@ RerunOption = Annotated[
     typer.Option("--rerun", metavar="FILE.rrd", help="recording for the rerun viewer; needs rerun-sdk"),
 ]
 Mesh = Annotated[bool, typer.Option("--mesh", help="write mesh.ply and mesh.glb")]
+Scene = Annotated[
+    bool, typer.Option("--scene", help="write scene.glb: scan, objects, lights, camera path; and scene.hdr")
+]
 BudgetMs = Annotated[float | None, typer.Option(metavar="N", help="choose the operating point for this frame time")]
 MaxLightError = Annotated[
     float | None, typer.Option(metavar="DEG", help="choose the operating point for this light error")

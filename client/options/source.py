@@ -12,7 +12,8 @@ OAK_PREFIX = "oak?"
 
 
 def open_source(spec: str) -> Source:
-    """Open a data-set folder, `synthetic:NAME[?key=value&...]`, a recording, or `oak[?vio=off]`.
+    """Open a data-set folder, another program's capture, `synthetic:NAME[?key=value&...]`, a recording, or
+    `oak[?vio=off]`.
 
     Raises SourceError.
     """
@@ -31,10 +32,13 @@ def open_source(spec: str) -> Source:
     path = Path(spec).expanduser()
     if path.is_dir():
         from client.sources.datasets import open_folder
+        from client.sources.files.ros_bag import is_bag_folder
+        from client.sources.files.ros_bag import open_file as open_bag
 
-        return open_folder(path)
+        return open_bag(path) if is_bag_folder(path) else open_folder(path)
     if path.is_file():
+        from client.sources.files import open_file
         from client.sources.recording import open_recording
 
-        return open_recording(path)
+        return open_file(path) or open_recording(path)
     raise SourceError(f"{spec}: no such folder or file; give a data-set folder, a recording, synthetic:table or oak")

@@ -2,3 +2,4 @@
 
 PAGE_NAME = "index.html"
 VIDEO_NAME = "video.mp4"
+SCENE_NAME, ENVIRONMENT_NAME = "scene.glb", "scene.hdr"

@@ -21,7 +21,7 @@ from client.errors import OWN_PACKAGES, OutputError
 from client.results.camera_pictures import encode_camera_picture
 from client.results.description import RunDescription
 from client.results.frame_output import FrameOutput
-from client.results.names import PAGE_NAME, VIDEO_NAME
+from client.results.names import ENVIRONMENT_NAME, PAGE_NAME, SCENE_NAME, VIDEO_NAME
 from client.results.page import ResultsPage
 from client.results.rerun_file import RerunFile
 from client.results.video_file import VideoFile
@@ -30,7 +30,7 @@ from protocol.messages import ArrivingLight, Light, MeshFormat
 
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 3, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT)
 _LINE_FILES = ("light.jsonl", "trajectory.txt", "timings.jsonl")
-_WHOLE_FILES = ("mesh.ply", "mesh.glb", PAGE_NAME, VIDEO_NAME)
+_WHOLE_FILES = ("mesh.ply", "mesh.glb", SCENE_NAME, ENVIRONMENT_NAME, PAGE_NAME, VIDEO_NAME)
 _PICTURES = {"frames": re.compile(r"\d{6,}\.png"), "camera": re.compile(r"\d{6,}\.jpg")}
 """Folder -> names of the pictures in it that are ours."""
 
@@ -114,6 +114,14 @@ class OutputWriter:
         try:
             for format_, data in files.items():
                 (self.folder / f"mesh.{format_}").write_bytes(data)
+        except OSError as error:
+            raise _unwritable(self.folder, error) from error
+
+    def write_scene(self, files: Mapping[str, bytes]) -> None:
+        """Write scene.glb and scene.hdr. Raises OutputError."""
+        try:
+            for name, data in files.items():
+                (self.folder / name).write_bytes(data)
         except OSError as error:
             raise _unwritable(self.folder, error) from error
 

@@ -25,23 +25,35 @@ _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", 0xDA, b"\xff\xd9"
 
 def read_color(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """[height, width, 3] RGB, uint8 or uint16 as in the file. Raises SourceError."""
-    picture = _decode(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
+    return decode_color(_read_bytes(path), path)
+
+
+def decode_color(data: bytes, where: object) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """As `read_color`, of the bytes of a PNG or JPEG; `where` names them in errors. Raises SourceError."""
+    picture = _decode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH, where)
     if picture.dtype not in (np.uint8, np.uint16):
-        raise SourceError(f"{path}: colour must have 8 or 16 bits, not {picture.dtype}")
+        raise SourceError(f"{where}: colour must have 8 or 16 bits, not {picture.dtype}")
     return picture
 
 
 def read_depth(path: Path) -> NDArray[np.uint16]:
     """[height, width] uint16 in the unit of the data set, 0: no measurement (65535 becomes 0). Raises SourceError."""
-    picture = _decode(path, cv2.IMREAD_UNCHANGED)
+    picture = _decode(_read_bytes(path), cv2.IMREAD_UNCHANGED, path)
     if picture.dtype != np.uint16 or picture.ndim != 2:
         raise SourceError(f"{path}: depth must be one channel of 16 bits, not {picture.dtype} {picture.shape}")
     picture[picture == NO_DEPTH] = 0
     return picture
 
 
-def _decode(path: Path, flags: int) -> NDArray[Any]:
-    data = _read_bytes(path)
+def read_gray(path: Path) -> NDArray[np.uint8]:
+    """[height, width] uint8 of a picture of one channel, for example of confidences. Raises SourceError."""
+    picture = _decode(_read_bytes(path), cv2.IMREAD_UNCHANGED, path)
+    if picture.dtype != np.uint8 or picture.ndim != 2:
+        raise SourceError(f"{path}: must be one channel of 8 bits, not {picture.dtype} {picture.shape}")
+    return picture
+
+
+def _decode(data: bytes, flags: int, path: object) -> NDArray[Any]:
     _require_complete(data, path)
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -63,13 +75,13 @@ def _read_bytes(path: Path) -> bytes:
     return data
 
 
-def _require_size(picture: NDArray[Any], path: Path) -> None:
+def _require_size(picture: NDArray[Any], path: object) -> None:
     height, width = picture.shape[:2]
     if max(height, width) > MAX_IMAGE_SIDE_PX or height * width > MAX_IMAGE_PIXELS:
         raise SourceError(f"{path}: {width}x{height} is more than the {MAX_IMAGE_PIXELS} pixels a frame may have")
 
 
-def _require_complete(data: bytes, path: Path) -> None:
+def _require_complete(data: bytes, path: object) -> None:
     if data.startswith(_PNG_SIGNATURE):
         complete = _png_is_complete(data)
     elif data.startswith(_JPEG_START):

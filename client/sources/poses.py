@@ -45,7 +45,7 @@ def read_tum(path: Path) -> list[tuple[float, NDArray[np.float64]]]:
         if len(words) != 8:
             raise SourceError(f"{where}: expected 'timestamp tx ty tz qx qy qz qw', found {len(words)} words")
         values = np.array([float_of(word, where) for word in words])
-        poses.append((float(values[0]), _from_quaternion(values[1:4], values[4:8], where)))
+        poses.append((float(values[0]), from_quaternion(values[1:4], values[4:8], where)))
     return poses
 
 
@@ -106,7 +106,8 @@ def float_of(word: str, where: str) -> float:
         raise SourceError(f"{where}: {word!r} is not a number") from None
 
 
-def _from_quaternion(translation: NDArray[np.float64], xyzw: NDArray[np.float64], where: str) -> NDArray[np.float64]:
+def from_quaternion(translation: NDArray[np.float64], xyzw: NDArray[np.float64], where: str) -> NDArray[np.float64]:
+    """[4, 4] of a translation [3] and a quaternion (x, y, z, w). Raises SourceError with `where`."""
     norm = np.linalg.norm(xyzw)
     if not np.isfinite((*translation, norm)).all() or abs(norm - 1) > 0.01:
         raise SourceError(f"{where}: the pose has NaN or its quaternion is not of length 1")

@@ -14,6 +14,7 @@ import numpy as np
 
 from client.errors import SourceError
 from client.progress import note
+from client.sources.files import looked_for
 from protocol.codec import ProtocolError, decode_client
 from protocol.colors import ColorReader
 from protocol.frames import CameraModel, RgbdFrame
@@ -142,7 +143,7 @@ def _scan(path: Path) -> tuple[Hello | None, list[_FramePosition], list[tuple[fl
             left_over = path.stat().st_size - start
         except (msgpack.UnpackException, msgspec.ValidationError, ValueError) as error:
             raise SourceError(
-                f"{path}: is not a recording (byte {start}); give a data-set folder, a recording or synthetic:table"
+                f"{path}: is not a recording (byte {start}); looked for a file of stream --record; {looked_for()}"
             ) from error
     if left_over and start:
         note(f"{path}: ends inside a message; its {left_over} last bytes were left out")

@@ -39,6 +39,14 @@ def encode_panorama(radiance: Floats, format_: PanoramaFormat) -> bytes:
     return exr_bytes(radiance) if format_ == "exr" else _hdr_bytes(radiance)
 
 
+def decode_hdr(data: bytes) -> Floats:
+    """[h, w, 3] linear RGB radiance of a Radiance .hdr. Raises ValueError if it is none."""
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if picture is None or picture.dtype != np.float32 or picture.ndim != 3:
+        raise ValueError("is no Radiance .hdr picture")
+    return picture[..., ::-1].astype(np.float64)
+
+
 def _hdr_bytes(radiance: Floats) -> bytes:
     """Radiance RGBE: a common exponent, so that each channel is good to 1/256 of the brightest one."""
     done, data = cv2.imencode(".hdr", np.ascontiguousarray(radiance[..., ::-1], np.float32))

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Protocol
 
 from client.errors import SourceError
-from client.sources.datasets import ground_truth, redwood, seven_scenes, tum
-from client.sources.datasets.folder import FolderSource
+from client.sources.datasets import arkit_scenes, ground_truth, plain, redwood, seven_scenes, stray, tum
+from client.sources.frame_source import Source
 
 
 class Layout(Protocol):
@@ -18,13 +18,13 @@ class Layout(Protocol):
 
     def recognises(self, folder: Path) -> bool: ...
 
-    def open_folder(self, folder: Path) -> FolderSource: ...
+    def open_folder(self, folder: Path) -> Source: ...
 
 
-LAYOUTS: tuple[Layout, ...] = (ground_truth, tum, seven_scenes, redwood)
+LAYOUTS: tuple[Layout, ...] = (ground_truth, plain, tum, seven_scenes, stray, arkit_scenes, redwood)
 
 
-def open_folder(folder: Path) -> FolderSource:
+def open_folder(folder: Path) -> Source:
     """The data set in `folder`. Raises SourceError for an unknown layout or a damaged data set."""
     for layout in LAYOUTS:
         if layout.recognises(folder):

@@ -16,6 +16,12 @@ Every message of [the wire](../wire.md) with its fields, types, defaults and lim
 [JSON Schema](messages.schema.json), and in TypeScript (`client/web/src/protocol.ts`). On the wire each is a
 MessagePack map with a field `type`.
 """
+_DIRECTIVE = """\
+::: protocol.messages.{name}
+    options:
+      show_if_no_docstring: true
+      inherited_members: true
+"""
 
 
 def message_page() -> str:
@@ -33,7 +39,7 @@ def message_page() -> str:
     ]  # fmt: skip
     lines = [HEAD]
     for title, members in {**sent, "Structures in them": parts}.items():
-        lines += [f"## {title}\n", *(f"::: protocol.messages.{member.__name__}\n" for member in members)]
+        lines += [f"## {title}\n", *(_DIRECTIVE.format(name=member.__name__) for member in members)]
     return "\n".join(lines)
 
 

@@ -140,7 +140,9 @@ lock: .venv/installed-test
 	$(PYTHON) -m venv .venv
 
 .venv/installed: requirements.lock pyproject.toml | .venv/bin/python
-	test ! -e .venv/installed-client || $(BIN)/pip uninstall --quiet --yes opencv-python-headless
+	@$(PYTHON) server/opencl/linker.py
+	@echo "installing what requirements.lock lists into .venv: 730 MB, half a minute with a fast connection"
+	@test ! -e .venv/installed-client || $(BIN)/pip uninstall --quiet --yes opencv-python-headless
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	@touch $@
@@ -155,7 +157,7 @@ lock: .venv/installed-test
 
 # Where all is installed, the client is; its smaller OpenCV would replace the other one.
 .venv/installed-client: requirements-client.lock pyproject.toml | .venv/bin/python
-	test -e .venv/installed || { \
+	@test -e .venv/installed || { echo "installing the client into .venv: 280 MB"; \
 		$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-client.lock && \
 		$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .; }
 	@touch $@

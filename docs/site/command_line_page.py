@@ -42,7 +42,7 @@ def _command(name: str, command: Any) -> Iterator[str]:
         found = [parameters[key] for key in keys if key in parameters]
         rows = [row for parameter in found if (row := _row(parameter, context))]
         if rows:
-            yield f"### {title} {{ #{name}-{title.lower().replace(' ', '-')} }}\n\n| | |\n|---|---|"
+            yield f"### {title} {{ #{name}-{title.lower().replace(' ', '-')} }}\n\n| option | meaning |\n|---|---|"
             yield from rows
             yield ""
 

@@ -33,6 +33,8 @@ GENERATED = {
     "reference/messages.schema.json": message_schema,
 }
 _SOURCES = {page: source for source, page in KEPT_ELSEWHERE.items()}
+_NESTED = re.compile(r"^ {2,3}(?=- )", re.MULTILINE)
+"""Lists in lists; Python's Markdown wants four spaces before them."""
 _LINK = re.compile(r"(?<=\]\()(?!\w+:|#|/)([^)\s#]+)")
 
 
@@ -49,7 +51,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """The page with links between files of the repository as links between pages of the site."""
     uri = page.file.src_uri
     source = _SOURCES.get(uri, f"docs/{uri}")
-    return _LINK.sub(lambda link: _in_site(link[1], source, uri), markdown)
+    return _LINK.sub(lambda link: _in_site(link[1], source, uri), _NESTED.sub("    ", markdown))
 
 
 def _in_site(target: str, source: str, uri: str) -> str:

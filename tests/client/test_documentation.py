@@ -19,13 +19,15 @@ from server.opencl.device import open_device
 from server.scene.vase import vase_glb
 from server.service.serve import BackgroundServer
 from server.service.service import Service
-from tests.client.documented import GROUP, Command, code_in_sentences, commands
+from tests.client.documented import GROUP, Command, code_in_sentences, commands, pages
 from tests.data import ROOT
 
 COMMANDS = commands()
 OTHER_PROGRAMS = {"apt-get", "curl", "docker"}
 """Programs that are not ours; nothing of theirs is checked."""
 SCENE = "?size=160x120&frames=12"
+GENERATED = {f"docs/reference/{name}" for name in ("cli.md", "messages.md", "messages.schema.json")}
+"""Pages that docs/site makes when the site is built."""
 STANDS_FOR = {
     "SOURCE": f"synthetic:table{SCENE}",
     "FOLDER": f"synthetic:table{SCENE}",
@@ -37,7 +39,7 @@ EXTRAS = {"--video": ("av", "PyAV"), "--rerun": ("rerun", "rerun-sdk")}
 OPTIONS = {name for command in GROUP.commands.values() for each in command.params for name in each.opts}
 OPTIONS |= {name for command in GROUP.commands.values() for each in command.params for name in each.secondary_opts}
 OPTIONS |= {"--help", "--help-all", "--debug"}
-OPTIONS_OF_OTHERS = {"--build-arg", "--count", "--group-add", "--seed"}
+OPTIONS_OF_OTHERS = {"--build-arg", "--count", "--from", "--group-add", "--seed"}
 """Of other programs, that sentences name."""
 
 
@@ -45,6 +47,18 @@ def test_the_documentation_has_commands() -> None:
     programs = [command.program for command in COMMANDS]
     assert programs.count("probeless") > 40
     assert programs.count("make") > 8
+
+
+def test_the_readme_is_one_page() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 80
+
+
+def test_links_between_pages_lead_somewhere() -> None:
+    """Without the tools that build the site. Its test follows anchors, too."""
+    for page, text in pages():
+        for target in re.findall(r"\]\((?!\w+:|#)([^)\s#]+)", text):
+            path = ((ROOT / page).parent / target).resolve()
+            assert path.exists() or str(path.relative_to(ROOT)) in GENERATED, f"{page}: {target}"
 
 
 @pytest.mark.parametrize("command", [c for c in COMMANDS if c.program == "probeless"], ids=str)

@@ -60,6 +60,6 @@ def test_what_is_kept_elsewhere_is_in_the_site(site: Path) -> None:
     assert (site / "CITATION.cff").read_bytes() == (ROOT / "CITATION.cff").read_bytes()
 
 
-def test_nothing_is_loaded_from_elsewhere(site: Path) -> None:
+def test_no_script_or_style_is_linked_from_elsewhere(site: Path) -> None:
     start = (site / "index.html").read_text(encoding="utf-8")
     assert re.findall(r'(?:src|href)="https?://[^"]+\.(?:js|css|woff2?)"', start) == []

@@ -102,7 +102,7 @@ web: .venv/installed-test
 package: .venv/installed-test
 	$(BIN)/python -m client.web.build --package out
 
-# Warnings are errors (not with --quiet, which hides them from mkdocs itself): a link or an anchor that leads nowhere, a page that is in no menu.
+# Warnings are errors (not with --quiet, which hides them from mkdocs itself): a link or an anchor that leads nowhere.
 docs: .venv/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "open out/docs/index.html"

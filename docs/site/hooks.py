@@ -38,6 +38,15 @@ _NESTED = re.compile(r"^ {2,3}(?=- )", re.MULTILINE)
 _LINK = re.compile(r"(?<=\]\()(?!\w+:|#|/)([^)\s#]+)")
 
 
+def on_config(config: Any) -> Any:
+    """The menu, with pages that it does not name under "More"."""
+    named = set(re.findall(r"[\w./-]+\.md", str(config.nav)))
+    pages = (str(path.relative_to(ROOT / "docs")) for path in sorted((ROOT / "docs").rglob("*.md")))
+    if rest := [page for page in pages if page not in named]:
+        config.nav.append({"More": rest})
+    return config
+
+
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages."""
     for source, page in KEPT_ELSEWHERE.items():

@@ -19,7 +19,7 @@ from tests.data import ROOT
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The built site. A link or an anchor that leads nowhere, or a page that is in no menu, is an error here."""
+    """The built site. A link or an anchor that leads nowhere is an error here."""
     for module in ("mkdocs", "material", "mkdocstrings"):
         pytest.importorskip(module, reason=f"{module} is not installed (make install-docs)")
     folder = tmp_path_factory.mktemp("site")

@@ -3,8 +3,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 DATA ?= ../shared/data
 
-.PHONY: mutation-check help install install-all install-bench install-cluster install-devices install-import \
-	install-oak install-rerun install-video demo \
+.PHONY: mutation-check help install install-all install-bench install-client install-cluster install-devices \
+	install-docs install-import install-oak install-rerun install-video docs demo \
 	test test-all test-rest test-slow test-second-device slow-list lint bench check-races web package lock clean
 help:
 	@echo "make demo      the main job: server, streaming client, pictures in out/demo"
@@ -14,18 +14,22 @@ help:
 	@echo "make lint      formatting, types"
 	@echo "make bench     the benchmarks      make web    rebuild the page from its sources"
 	@echo "make package   the npm package of client/web, into out"
+	@echo "make docs      the documentation as a site, into out/docs"
 	@echo "make check-races   the kernels in a simulator that finds data races (downloads it)"
 	@echo "make install   the program alone, as .venv/bin/probeless; with an extra: install-oak (reads an OAK camera),"
 	@echo "               install-video (H.264), install-rerun (recordings for its viewer), install-bench,"
 	@echo "               install-import (reads Record3D files and ROS 2 bags),"
 	@echo "               install-cluster (Ray Serve, for many machines),"
+	@echo "               install-client (only what streams, records and shows: no OpenCL, no server),"
 	@echo "               install-devices (Intel's OpenCL for processors, as a second device), install-all"
 
 install: .venv/installed
 install-all: .venv/installed-all
 install-bench: .venv/installed-bench
+install-client: .venv/installed-client
 install-cluster: .venv/installed-cluster
 install-devices: .venv/installed-devices
+install-docs: .venv/installed-docs
 install-oak: .venv/installed-oak
 install-rerun: .venv/installed-rerun
 install-import: .venv/installed-import
@@ -99,6 +103,11 @@ web: .venv/installed-test
 package: .venv/installed-test
 	$(BIN)/python -m client.web.build --package out
 
+# Warnings are errors (not with --quiet, which hides them from mkdocs itself): a link or an anchor that leads nowhere.
+docs: .venv/installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "open out/docs/index.html"
+
 # The locks hold every package with its hash, for every platform and Python that pyproject.toml allows.
 lock: .venv/installed-test
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh \
@@ -118,9 +127,13 @@ lock: .venv/installed-test
 		--constraint requirements-test.lock pyproject.toml -o requirements-rerun.lock
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh --extra import \
 		--constraint requirements-bench.lock pyproject.toml -o requirements-import.lock
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh --extra docs \
+		--constraint requirements-test.lock pyproject.toml -o requirements-docs.lock
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --group client \
+		--constraint requirements.lock -o requirements-client.lock
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --all-extras \
 		$(patsubst %,--constraint requirements%,.lock -test.lock -bench.lock -cluster.lock -oak.lock -video.lock -rerun.lock \
-		-import.lock) \
+		-import.lock -docs.lock) \
 		pyproject.toml -o requirements-all.lock
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate --extra build --extra mesh --extra devices \
 		--constraint requirements-all.lock pyproject.toml -o requirements-devices.lock
@@ -131,12 +144,26 @@ lock: .venv/installed-test
 	$(PYTHON) -m venv .venv
 
 .venv/installed: requirements.lock pyproject.toml | .venv/bin/python
+	@$(PYTHON) server/opencl/linker.py
+	@echo "installing what requirements.lock lists into .venv: 730 MB, half a minute with a fast connection"
+	@test ! -e .venv/installed-client || $(BIN)/pip uninstall --quiet --yes opencv-python-headless
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	@touch $@
 
 .venv/installed-test: requirements-test.lock .venv/installed
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-test.lock
+	@touch $@
+
+.venv/installed-docs: requirements-docs.lock .venv/installed
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-docs.lock
+	@touch $@
+
+# Where all is installed, the client is; its smaller OpenCV would replace the other one.
+.venv/installed-client: requirements-client.lock pyproject.toml | .venv/bin/python
+	@test -e .venv/installed || { echo "installing the client into .venv: 280 MB"; \
+		$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-client.lock && \
+		$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .; }
 	@touch $@
 
 .venv/installed-oak: requirements-oak.lock .venv/installed

@@ -41,6 +41,10 @@ SERVE_EXAMPLES = """\
 probeless serve
 probeless serve --host 0.0.0.0 --tls --objects models
 probeless serve --device nvidia --data /var/lib/probeless"""
+PACKAGES_OF_THE_SERVER = frozenset(
+    {"pyopencl", "scipy", "trimesh", "fastapi", "starlette", "uvicorn", "prometheus_client", "cryptography"}
+)
+"""Dependencies that are not of the group `client` in pyproject.toml."""
 USAGE_STATUS, FAILURE_STATUS, INTERRUPTED_STATUS = 2, 1, 130
 
 app = typer.Typer(
@@ -88,6 +92,8 @@ def _one_line(error: Exception) -> str:
         text = f"{error.format_message()} (probeless --help lists what there is)"
     elif type(error).__module__.split(".")[0] in OWN_PACKAGES:
         text = str(error)
+    elif isinstance(error, ModuleNotFoundError) and str(error.name).split(".")[0] in PACKAGES_OF_THE_SERVER:
+        text = f"this needs {error.name}, which an installation of the client alone leaves out: make install"
     else:
         text = f"internal error, {type(error).__name__}: {error} (run again with --debug to see where)"
     return " ".join(text.split())

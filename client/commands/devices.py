@@ -6,6 +6,7 @@ from rich.console import Console
 from rich.table import Table
 
 from server.opencl.device import DeviceError, DeviceInfo, list_devices
+from server.opencl.linker import CANNOT_LINK
 
 
 def show_devices(console: Console | None = None) -> None:
@@ -15,7 +16,9 @@ def show_devices(console: Console | None = None) -> None:
     if infos:
         (console or Console()).print(_table(infos, chosen))
     if chosen is None:
-        raise DeviceError("no usable OpenCL device: install a driver, or PoCL with pip install 'pyopencl[pocl]'")
+        unlinked = [info.usable for info in infos if info.usable and CANNOT_LINK in info.usable]
+        advice = unlinked[0] if unlinked else "install a driver, or PoCL with pip install 'pyopencl[pocl]'"
+        raise DeviceError(f"no usable OpenCL device: {advice}")
 
 
 def why(info: DeviceInfo, chosen: DeviceInfo | None, infos: list[DeviceInfo]) -> str:

@@ -7,8 +7,9 @@ from threading import Lock
 
 import pyopencl as cl
 
+from server.opencl import linker
 from server.opencl.device_memory import DeviceMemory
-from server.opencl.pocl_cpu import name_unknown_cpu
+from server.opencl.pocl_cpu import is_pocl, name_unknown_cpu
 from server.opencl.program import KernelBuildError, ProgramCache
 
 _INSTALL = "install a vendor driver, or PoCL for the processor: pip install 'pyopencl[pocl]'"
@@ -82,7 +83,7 @@ def _why_unusable(device: cl.Device) -> str | None:
     except cl.Error as error:
         lines = [line for line in str(error).splitlines() if "error" in line] or [str(error).splitlines()[0]]
         return f"cannot compile: {lines[0].strip()}"
-    return None
+    return linker.why_not() if is_pocl(device.platform) else None
 
 
 def list_devices() -> list[DeviceInfo]:
@@ -118,7 +119,8 @@ def open_device(name: str | None = None) -> Device:
         if reason is None:
             return Device(device)
         reasons.append(f"{device.name.strip()}: {reason}")
-    raise DeviceError(f"no usable OpenCL device ({'; '.join(reasons)}): {_INSTALL}")
+    hint = "" if any(linker.CANNOT_LINK in reason for reason in reasons) else f": {_INSTALL}"
+    raise DeviceError(f"no usable OpenCL device ({'; '.join(reasons)}){hint}")
 
 
 __all__ = ["Device", "DeviceError", "DeviceInfo", "KernelBuildError", "list_devices", "open_device"]

@@ -43,6 +43,11 @@ def processor_name(cpuinfo: str) -> bytes:
     return next((name for name, needed in _NAMES if needed <= flags), b"x86-64")
 
 
+def is_pocl(platform: cl.Platform) -> bool:
+    """Whether a platform is PoCL."""
+    return "portable computing language" in str(platform.name).lower()
+
+
 def name_unknown_cpu(device: cl.Device) -> str | None:
     """If `device` is PoCL's CPU under a name that is none or too little, give it a better one; that one, else None."""
     known = known_name(device)

@@ -62,6 +62,9 @@ class Outbox(Protocol):
     def greet(self, device_name: str) -> None:
         """Welcome the client once its pipeline is built. Raises ClientGone."""
 
+    def answer_to(self, connection: int) -> None:
+        """What is sent from now on answers a message that came over the session's connection of that number."""
+
     def send(self, data: bytes) -> None:
         """Send to the capturing client; returns when the socket has accepted the data. Raises ClientGone."""
 
@@ -137,6 +140,7 @@ class Worker:
             self._colors.close()
 
     def _handle(self, pipeline: ClientSession, queued: QueuedMessage) -> None:
+        self._outbox.answer_to(queued.connection)
         if isinstance(queued.message, Frame):
             self._arrived_s = queued.arrived_s
             self._context.metrics.queue_age_ms.observe(queued.age_ms)

@@ -198,6 +198,9 @@ class Inbox:
     def greet(self, device_name: str) -> None:
         pass
 
+    def answer_to(self, connection: int) -> None:
+        pass
+
     def is_watched(self) -> bool:
         return False
 

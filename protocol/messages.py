@@ -643,8 +643,15 @@ class Panorama(Message, frozen=True, kw_only=True, tag="panorama"):
     """The file: Radiance `hdr` or OpenEXR `exr`."""
 
 
+NOT_SAVED = "not saved: "
+"""Begin of `acknowledged.error` where the request was applied in a room that could not be written to disk."""
+
+
 class Acknowledged(Message, frozen=True, kw_only=True, tag="acknowledged"):
-    """A control message was applied, or refused with `error`."""
+    """A control message was applied, or refused with `error`.
+
+    An `error` that begins with "not saved: ": applied, and lost if the server is killed before it can write its disk.
+    """
 
     request: Index
     error: Reason | None = None

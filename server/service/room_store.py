@@ -34,7 +34,14 @@ log = logging.getLogger(__name__)
 
 
 class RoomStoreError(Exception):
-    """A room could not be saved, loaded or deleted; one line. The room in memory is unchanged."""
+    """A room could not be saved, loaded or deleted; one line. The room in memory is unchanged.
+
+    `cause` is for clients: one line without paths of the server.
+    """
+
+    def __init__(self, message: str, cause: str) -> None:
+        super().__init__(message)
+        self.cause = cause
 
 
 class RoomStore:
@@ -165,8 +172,12 @@ def _or_store_error(what: str, work: Callable[[], T]) -> T:
         return work()
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
-        raise RoomStoreError(f"{what}: {error.strerror or error}{where}: is the disk full or not writable?") from error
+        cause = error.strerror or type(error).__name__
+        raise RoomStoreError(
+            f"{what}: {error.strerror or error}{where}: is the disk full or not writable?", cause
+        ) from error
     except DamagedFile as error:
-        raise RoomStoreError(f"{what}: {error}") from error
+        raise RoomStoreError(f"{what}: {error}", "an earlier file of the room is damaged") from error
     except cl.MemoryError as error:
-        raise RoomStoreError(f"{what}: the device has no memory left") from error
+        cause = "the device has no memory left"
+        raise RoomStoreError(f"{what}: {cause}", cause) from error

@@ -14,6 +14,7 @@ import trimesh
 from protocol.codec import decode_server
 from protocol.frames import IDENTITY
 from protocol.messages import (
+    NOT_SAVED,
     Acknowledged,
     Composite,
     Hello,
@@ -33,6 +34,7 @@ from server.service.scheduler import Scheduler
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 from server.service.worker import Worker, WorkerContext
+from tests.scenes.faulty_disk import FaultyDisk, full
 from tests.scenes.rooms import CAMERA, frame_at, view_at, wishes
 from tests.service import fakes
 from tests.service.fakes import PATIENCE_S, FakePipeline, Lab, fake_mesh, frame_message
@@ -123,6 +125,35 @@ def test_a_move_that_is_acknowledged_is_kept(
     wire.say(RemoveObject(request=20, object="a"))  # a whole save: the moves are of one before
     wire.hear_until(Acknowledged)
     assert kept(folder, device) == {"b"}
+    wire.hang_up()
+
+
+def test_what_could_not_be_saved_is_acknowledged_with_an_error(
+    server: BackgroundServer, folder: Path, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is done all the same; asking again tells whether it has been saved."""
+    wire = enter(server, room_from_world=IDENTITY)
+    disk = FaultyDisk(monkeypatch)
+    disk.only_writes = True
+    cube = PlaceObject(request=1, object="a", format="ply", data=CUBE, position_m=(0, 0, 1))
+    for request, after in (
+        (cube, {"a"}),
+        (MoveObject(request=2, object="a", position_m=(0.1, 0.2, 1.0)), {"a"}),
+        (RemoveObject(request=3, object="a"), set()),
+    ):
+        before = kept(folder, device), middle_of(folder, device, "a") if kept(folder, device) else None
+        disk.fail_at(1, full())
+        wire.say(request)
+        error = wire.hear_until(Acknowledged)[-1].error
+        assert error is not None
+        assert error.startswith(f"{NOT_SAVED}No space left on device; it is done, and lost if")
+        assert str(folder) not in error
+        assert (kept(folder, device), middle_of(folder, device, "a") if kept(folder, device) else None) == before
+        wire.say(request)
+        assert wire.hear_until(Acknowledged)[-1].error is None
+        assert kept(folder, device) == after
+        if isinstance(request, MoveObject):
+            assert middle_of(folder, device, "a") == pytest.approx(request.position_m)
     wire.hang_up()
 
 

@@ -563,7 +563,11 @@ export interface Panorama {
   data: Uint8Array;
 }
 
-/** A control message was applied, or refused with `error`. */
+/**
+ * A control message was applied, or refused with `error`.
+ *
+ * An `error` that begins with "not saved: ": applied, and lost if the server is killed before it can write its disk.
+ */
 export interface Acknowledged {
   type: "acknowledged";
   request: number;

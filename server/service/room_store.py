@@ -22,6 +22,7 @@ import pyopencl as cl
 from server.opencl.device import Device
 from server.room.room import Room
 from server.service.saving.checksummed_files import DamagedFile, sync_folder
+from server.service.saving.idle_times import IdleTimes
 from server.service.saving.retention import RetentionLimits, StorageUsage, StoredItem, items_to_remove, stored_items
 from server.service.saving.room_saves import SLOTS, RoomSaves, Saved, header_of
 from server.service.saving.save_slot import SaveSlot
@@ -47,8 +48,10 @@ class RoomStoreError(Exception):
 class RoomStore:
     """All rooms in one folder. Thread-safe; saves of one room are serialized."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, clock: Callable[[], float] = time.monotonic) -> None:
+        """`clock`: seconds; never set."""
         self._folder = folder
+        self._idle_times = IdleTimes(folder, clock)
         self._lock = threading.Lock()
         self._rooms: dict[str, RoomSaves] = {}
         self._removed = 0
@@ -105,20 +108,19 @@ class RoomStore:
             saves.note_used()
             self._rooms.pop(name, None)
 
-    def enforce_limits(self, limits: RetentionLimits, now_s: float | None = None) -> StorageUsage:
+    def enforce_limits(self, limits: RetentionLimits) -> StorageUsage:
         """Delete saves beyond `limits`, with one log line each. Returns the remaining disk usage.
 
-        `now_s`: Unix time. Of rooms in use, only damaged saves are deleted. Raises RoomStoreError.
+        Idle times grow by the time since the last call. Of rooms in use, only damaged saves are deleted. To be called
+        by one thread. Raises RoomStoreError.
         """
-        return _or_store_error(
-            "rooms were not tidied up", lambda: self._enforce_limits(limits, time.time() if now_s is None else now_s)
-        )
+        return _or_store_error("rooms were not tidied up", lambda: self._enforce_limits(limits))
 
-    def _enforce_limits(self, limits: RetentionLimits, now_s: float) -> StorageUsage:
+    def _enforce_limits(self, limits: RetentionLimits) -> StorageUsage:
         with self._lock:
             in_use = {saves.folder for saves in self._rooms.values()}
-        left = list(stored_items(self._folder, DELETED))
-        for piece, why in list(items_to_remove(left, limits, now_s, in_use)):
+        left = list(self._idle_times.updated(stored_items(self._folder, DELETED)))
+        for piece, why in list(items_to_remove(left, limits, in_use)):
             name = self._name_of(piece)
             with self._lock:
                 if piece.is_room and any(saves.folder == piece.folder for saves in self._rooms.values()):
@@ -127,6 +129,7 @@ class RoomStore:
             left.remove(piece)
             self._removed += 1
             log.warning("%s is removed from the disk: %s", name, why)
+        self._idle_times.write()
         rooms = sum(piece.is_room for piece in left)
         return StorageUsage(rooms, sum(piece.space_bytes for piece in left), self._removed)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -155,6 +156,34 @@ def test_what_could_not_be_saved_is_acknowledged_with_an_error(
         if isinstance(request, MoveObject):
             assert middle_of(folder, device, "a") == pytest.approx(request.position_m)
     wire.hang_up()
+
+
+@pytest.mark.usefixtures("open_umask")
+def test_a_room_without_a_frame_or_an_object_is_not_kept(
+    server: BackgroundServer, folder: Path, device: Device
+) -> None:
+    enter(server, room_from_world=IDENTITY).hang_up()
+    wire = enter(server, room_from_world=IDENTITY)  # after the first has been closed, or not
+    server.service._persistence._saver.save_all()
+    assert not folder.exists() or not list(folder.iterdir())
+    assert place(wire, 1, "a").error is None
+    assert kept(folder, device) == {"a"}
+    inside = list(folder.rglob("*"))
+    assert {path.stat().st_mode & 0o777 for path in inside if path.is_dir()} == {0o700}
+    assert {path.stat().st_mode & 0o777 for path in inside if path.is_file()} == {0o600}
+    (room,) = folder.iterdir()
+    room.chmod(0o755)  # of an earlier version
+    assert place(wire, 2, "b").error is None
+    assert room.stat().st_mode & 0o777 == 0o700
+    wire.hang_up()
+
+
+@pytest.fixture
+def open_umask() -> Iterator[None]:
+    """Lets all read what is made without a mode."""
+    before = os.umask(0)
+    yield
+    os.umask(before)
 
 
 def test_an_object_of_a_client_that_is_not_aligned_is_told_after_a_crash(

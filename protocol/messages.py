@@ -396,8 +396,8 @@ class Welcome(Message, frozen=True, kw_only=True, omit_defaults=True, tag="welco
     key: str | None = None
     """Secret key to resume the session (`hello.resume`), if the client set `keep_s`."""
     resumed: bool = False
-    """True after a resume. Earlier frames are not answered any more, unless the session is lossless. Requests are
-    answered if they are sent again."""
+    """True after a resume. What was sent over earlier connections is not answered any more; requests, and in a lossless
+    session frames, are answered if they are sent again."""
     room: Name | None = None
     codecs: tuple[ColorCodec, ...] = ("jpeg", "png", "raw")
     """Colour codecs that frames may use."""
@@ -643,8 +643,15 @@ class Panorama(Message, frozen=True, kw_only=True, tag="panorama"):
     """The file: Radiance `hdr` or OpenEXR `exr`."""
 
 
+NOT_SAVED = "not saved: "
+"""Begin of `acknowledged.error` where the request was applied in a room that could not be written to disk."""
+
+
 class Acknowledged(Message, frozen=True, kw_only=True, tag="acknowledged"):
-    """A control message was applied, or refused with `error`."""
+    """A control message was applied, or refused with `error`.
+
+    An `error` that begins with "not saved: ": applied, and lost if the server is killed before it can write its disk.
+    """
 
     request: Index
     error: Reason | None = None

@@ -36,6 +36,7 @@ from client.streaming.video import IS_POSSIBLE, VideoEncoder
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import decode_color
 from protocol.messages import (
+    NOT_SAVED,
     ClientMessage,
     Dropped,
     Error,
@@ -231,9 +232,9 @@ class _Stream:
                 spot=item.spot,
                 height_m=item.height_m,
             )
-            if done.error is not None:
+            if done.error is not None and not done.error.startswith(NOT_SAVED):
                 raise ClientError(f"{item.path}: {done.error}")
-            for note in done.notes:
+            for note in (*([] if done.error is None else [done.error]), *done.notes):
                 self._print_once(f"{item.path.name}: {note}")
 
     async def _exchange(self, client: StreamClient) -> None:

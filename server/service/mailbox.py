@@ -2,7 +2,8 @@
 
 If a client exceeds its window of unanswered frames, a newer frame replaces the oldest unread one, so that a slow worker
 gets recent pictures. Frames within the window are never replaced. Control messages are never replaced, and their order
-relative to later frames is kept.
+relative to later frames is kept. The window is of one connection: what came over a connection that was lost is still
+worked on, does not count and is not replaced.
 """
 
 from __future__ import annotations
@@ -50,6 +51,8 @@ class QueuedMessage:
     """One unread message and its arrival time by `time.perf_counter`."""
 
     message: Frame | Control
+    connection: int = 0
+    """Number of the session's connection over which it came."""
     arrived_s: float = field(default_factory=time.perf_counter)
 
     @property
@@ -88,6 +91,8 @@ class Mailbox:
         self._window = window
         self._on_taken = on_taken
         self._unanswered = 0
+        self._connection = self._taken_from = 0
+        """Number of the present connection, and of the one over which the message taken last came."""
         self._messages: deque[QueuedMessage] = deque()
         self._queued_bytes = 0
         self._frames_ahead = 0
@@ -109,7 +114,7 @@ class Mailbox:
                 _cancel(message)
                 return Receipt(None, 0)
             replaced = self._replace_unread() if isinstance(message, Frame) else None
-            self._messages.append(QueuedMessage(message))
+            self._messages.append(QueuedMessage(message, self._connection))
             self._queued_bytes += self._messages[-1].size_bytes
             self._changed.notify()
             return Receipt(replaced, self._frames_ahead)
@@ -121,17 +126,20 @@ class Mailbox:
             if self._closed:
                 return None
             queued = self._remove(0)
+            self._taken_from = queued.connection
             if isinstance(queued.message, Frame):
-                self._frames_ahead = sum(isinstance(other.message, Frame) for other in self._messages)
+                self._frames_ahead = sum(self._is_replaceable(other) for other in self._messages)
         if self._on_taken is not None:
             self._on_taken()
         return queued
 
     def take_while(self, kind: type[T]) -> list[T]:
-        """Remove the next messages while they are of type `kind`. Does not wait."""
+        """Remove the next messages while they are of type `kind` and of the last one's connection. Does not wait."""
         taken: list[T] = []
         with self._changed:
             while self._messages and isinstance(message := self._messages[0].message, kind):
+                if self._messages[0].connection != self._taken_from:
+                    break
                 taken.append(message)
                 self._remove(0)
         if taken and self._on_taken is not None:
@@ -141,7 +149,14 @@ class Mailbox:
     def note_answered(self) -> None:
         """Call before answering the last frame taken: the client may then send another."""
         with self._changed:
-            self._unanswered -= 1
+            if self._taken_from == self._connection:
+                self._unanswered -= 1
+
+    def begin_connection(self) -> None:
+        """The connection is lost; what comes from now on comes over another one, with a window of its own."""
+        with self._changed:
+            self._connection += 1
+            self._unanswered = self._frames_ahead = 0
 
     def close(self) -> None:
         """Discard unread messages and wake the reader."""
@@ -159,11 +174,15 @@ class Mailbox:
         if self._window is None or self._unanswered <= self._window:
             return None
         for index, queued in enumerate(self._messages):
-            if isinstance(queued.message, Frame):
+            if self._is_replaceable(queued):
                 self._remove(index)
                 self._unanswered -= 1
+                assert isinstance(queued.message, Frame)
                 return queued.message
         return None
+
+    def _is_replaceable(self, queued: QueuedMessage) -> bool:
+        return isinstance(queued.message, Frame) and queued.connection == self._connection
 
     def _remove(self, index: int) -> QueuedMessage:
         queued = self._messages[index]

@@ -72,17 +72,23 @@ class RoomPersistence:
                 raise ValueError(str(error)) from error
             raise
 
-    def save_now(self, name: str) -> None:
-        """Save a room before a change is acknowledged. The caller must be in the room."""
-        room = self._rooms.get(name) if self._rooms else None
-        if room is not None and self._saver is not None:
-            self._saver.save(room)
+    def save_now(self, name: str) -> str | None:
+        """Save a room before a change is acknowledged. The caller must be in the room.
 
-    def save_placements(self, name: str) -> None:
-        """Save only object placements before moves are acknowledged. The caller must be in the room."""
+        Returns why it was not saved, in words for clients, or None.
+        """
+        assert self._saver is not None
+        return self._saver.save(self._entered(name))
+
+    def save_placements(self, name: str) -> str | None:
+        """As `save_now`, but only object placements, before moves are acknowledged."""
+        assert self._saver is not None
+        return self._saver.save_placements(self._entered(name))
+
+    def _entered(self, name: str) -> Room:
         room = self._rooms.get(name) if self._rooms else None
-        if room is not None and self._saver is not None:
-            self._saver.save_placements(room)
+        assert room is not None
+        return room
 
     def save_and_release(self, room: Room) -> None:
         """Save a room that is about to close."""

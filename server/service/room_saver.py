@@ -59,25 +59,27 @@ class RoomSaver:
         for room in self._rooms():
             self.save(room)
 
-    def save(self, room: Room) -> bool:
-        """Save one room now; the caller keeps it open. Returns whether the save succeeded."""
-        return room.name is None or self._try(room.name, lambda: self._on_saved(room, self._store.save(room)))
+    def save(self, room: Room) -> str | None:
+        """Save one room now; the caller keeps it open. Returns why it was not saved, in words for clients, or None."""
+        return self._try(room.name, lambda: self._on_saved(room, self._store.save(room)))
 
-    def save_placements(self, room: Room) -> bool:
-        """Save only object placements, before moves are acknowledged. Returns whether the save succeeded."""
-        return room.name is None or self._try(room.name, lambda: self._store.save_placements(room))
+    def save_placements(self, room: Room) -> str | None:
+        """As `save`, but only object placements, before moves are acknowledged."""
+        return self._try(room.name, lambda: self._store.save_placements(room))
 
-    def _try(self, name: str, work: Callable[[], None]) -> bool:
+    def _try(self, name: str | None, work: Callable[[], None]) -> str | None:
+        if name is None:
+            return None  # it belongs to one session
         try:
             work()
         except RoomStoreError as error:
             if self.problems.get(name) != str(error):
                 log.warning("%s", error)
             self.problems[name] = str(error)
-            return False
+            return error.cause
         if self.problems.pop(name, None) is not None:
             log.info("room %r is saved again", name)
-        return True
+        return None
 
     def _run(self) -> None:
         tidied_s = float("-inf")

@@ -22,6 +22,7 @@ import pyopencl as cl
 from server.opencl.device import Device
 from server.room.room import Room
 from server.service.saving.checksummed_files import DamagedFile, sync_folder
+from server.service.saving.idle_times import IdleTimes
 from server.service.saving.retention import RetentionLimits, StorageUsage, StoredItem, items_to_remove, stored_items
 from server.service.saving.room_saves import SLOTS, RoomSaves, Saved, header_of
 from server.service.saving.save_slot import SaveSlot
@@ -34,14 +35,23 @@ log = logging.getLogger(__name__)
 
 
 class RoomStoreError(Exception):
-    """A room could not be saved, loaded or deleted; one line. The room in memory is unchanged."""
+    """A room could not be saved, loaded or deleted; one line. The room in memory is unchanged.
+
+    `cause` is for clients: one line without paths of the server.
+    """
+
+    def __init__(self, message: str, cause: str) -> None:
+        super().__init__(message)
+        self.cause = cause
 
 
 class RoomStore:
     """All rooms in one folder. Thread-safe; saves of one room are serialized."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, clock: Callable[[], float] = time.monotonic) -> None:
+        """`clock`: seconds; never set."""
         self._folder = folder
+        self._idle_times = IdleTimes(folder, clock)
         self._lock = threading.Lock()
         self._rooms: dict[str, RoomSaves] = {}
         self._removed = 0
@@ -98,20 +108,19 @@ class RoomStore:
             saves.note_used()
             self._rooms.pop(name, None)
 
-    def enforce_limits(self, limits: RetentionLimits, now_s: float | None = None) -> StorageUsage:
+    def enforce_limits(self, limits: RetentionLimits) -> StorageUsage:
         """Delete saves beyond `limits`, with one log line each. Returns the remaining disk usage.
 
-        `now_s`: Unix time. Of rooms in use, only damaged saves are deleted. Raises RoomStoreError.
+        Idle times grow by the time since the last call. Of rooms in use, only damaged saves are deleted. To be called
+        by one thread. Raises RoomStoreError.
         """
-        return _or_store_error(
-            "rooms were not tidied up", lambda: self._enforce_limits(limits, time.time() if now_s is None else now_s)
-        )
+        return _or_store_error("rooms were not tidied up", lambda: self._enforce_limits(limits))
 
-    def _enforce_limits(self, limits: RetentionLimits, now_s: float) -> StorageUsage:
+    def _enforce_limits(self, limits: RetentionLimits) -> StorageUsage:
         with self._lock:
             in_use = {saves.folder for saves in self._rooms.values()}
-        left = list(stored_items(self._folder, DELETED))
-        for piece, why in list(items_to_remove(left, limits, now_s, in_use)):
+        left = list(self._idle_times.updated(stored_items(self._folder, DELETED)))
+        for piece, why in list(items_to_remove(left, limits, in_use)):
             name = self._name_of(piece)
             with self._lock:
                 if piece.is_room and any(saves.folder == piece.folder for saves in self._rooms.values()):
@@ -120,6 +129,7 @@ class RoomStore:
             left.remove(piece)
             self._removed += 1
             log.warning("%s is removed from the disk: %s", name, why)
+        self._idle_times.write()
         rooms = sum(piece.is_room for piece in left)
         return StorageUsage(rooms, sum(piece.space_bytes for piece in left), self._removed)
 
@@ -165,8 +175,12 @@ def _or_store_error(what: str, work: Callable[[], T]) -> T:
         return work()
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
-        raise RoomStoreError(f"{what}: {error.strerror or error}{where}: is the disk full or not writable?") from error
+        cause = error.strerror or type(error).__name__
+        raise RoomStoreError(
+            f"{what}: {error.strerror or error}{where}: is the disk full or not writable?", cause
+        ) from error
     except DamagedFile as error:
-        raise RoomStoreError(f"{what}: {error}") from error
+        raise RoomStoreError(f"{what}: {error}", "an earlier file of the room is damaged") from error
     except cl.MemoryError as error:
-        raise RoomStoreError(f"{what}: the device has no memory left") from error
+        cause = "the device has no memory left"
+        raise RoomStoreError(f"{what}: {cause}", cause) from error

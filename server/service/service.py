@@ -34,7 +34,7 @@ from server.service.room_registry import RoomFactory, RoomRegistry, key_digest_o
 from server.service.saving.retention import StorageUsage
 from server.service.scheduler import Scheduler
 from server.service.session import MAX_INFLIGHT, CaptureSession, EventLoopOutbox
-from server.service.worker import WorkerContext
+from server.service.worker import WorkerContext, not_saved
 
 if TYPE_CHECKING:
     from server.client_session import ClientSession
@@ -128,8 +128,8 @@ class Service:
             load_mesh=mesh_loader or self._parsers.load_mesh,
             color_reader=self._parsers.color_reader,
             metrics=self.metrics,
-            save_room=self._persistence.save_now if self._persistence else lambda _name: None,
-            save_placements=self._persistence.save_placements if self._persistence else lambda _name: None,
+            save_room=self._persistence.save_now if self._persistence else not_saved,
+            save_placements=self._persistence.save_placements if self._persistence else not_saved,
         )
         self._preparing: asyncio.Task[None] | None = None
 

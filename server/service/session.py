@@ -25,7 +25,8 @@ log = logging.getLogger(__name__)
 class EventLoopOutbox:
     """Passes a worker's messages to the event loop and waits until the socket has accepted them.
 
-    While the client's connection is lost, messages are discarded; the client repeats unanswered requests on resume.
+    Answers to what came over a connection that was lost are discarded, also after the client has resumed its session:
+    it repeats unanswered requests, and gives up unanswered frames or repeats them.
     """
 
     def __init__(
@@ -43,7 +44,10 @@ class EventLoopOutbox:
         """
         self._key_digest = key_digest
         self._welcome = welcome
-        self._connection: Connection | None = connection
+        self._link: tuple[int, Connection | None] = 0, connection
+        """Number of the connection, and the connection while it is not lost; replaced together."""
+        self._answering = 0
+        """Number of the connection over which the message came that is being answered."""
         self._broadcast = broadcast
         self._is_resumable = is_resumable
         self._loop = asyncio.get_running_loop()
@@ -67,12 +71,16 @@ class EventLoopOutbox:
         if not self._closed:
             self._broadcast.open_session(self.session, welcome, self._welcome.room, self._key_digest)
 
+    def answer_to(self, connection: int) -> None:
+        """Worker thread: what is sent from now on answers a message of that connection."""
+        self._answering = connection
+
     def send(self, data: bytes) -> None:
         """Worker thread: send to the capturing client. Raises ClientGone if its loss ends the session."""
         if self._closed:
             raise ClientGone
-        connection = self._connection
-        if connection is None:
+        number, connection = self._link
+        if connection is None or number != self._answering:
             return
         self._sending = asyncio.run_coroutine_threadsafe(self._send_timed(connection, data), self._loop)
         try:
@@ -103,13 +111,13 @@ class EventLoopOutbox:
 
     def detach(self) -> None:
         """Event loop: the connection is lost; a worker that is sending is released."""
-        self._connection = None
+        self._link = self._link[0] + 1, None
         self._let_go()
 
     async def attach(self, connection: Connection) -> None:
         """Event loop: use the client's new connection. Raises ClientGone if it is lost too."""
         await connection.send(encode(structs.replace(self._welcome, resumed=True)))
-        self._connection = connection
+        self._link = self._link[0], connection
 
     def close(self) -> None:
         """Event loop: end the session; a worker that is sending is released."""
@@ -203,6 +211,7 @@ class CaptureSession:
     async def _wait_for_return(self, work: asyncio.Future[None]) -> bool:
         """Wait for the client to reconnect. Returns whether it did."""
         log.info("connection lost, session kept", extra={"seconds": self._keep_s})
+        self._mailbox.begin_connection()
         self._outbox.detach()
         if self._connection in self._done_with:
             self._done_with[self._connection].set()

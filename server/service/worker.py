@@ -18,6 +18,7 @@ from protocol.colors import ColorReader
 from protocol.frames import CameraModel, RgbdFrame, Viewpoint
 from protocol.images import decode_depth
 from protocol.messages import (
+    NOT_SAVED,
     Acknowledged,
     Composite,
     Dropped,
@@ -54,6 +55,8 @@ MAX_ANSWERS = 4
 """More than the frames a client may have unanswered (session.MAX_INFLIGHT)."""
 
 SceneControl = PlaceObject | MoveObject | RemoveObject | Quality
+SaveRoom = Callable[[str], str | None]
+"""Saves the room of that name and returns why it could not, one line for the client, or None."""
 
 
 class Outbox(Protocol):
@@ -61,6 +64,9 @@ class Outbox(Protocol):
 
     def greet(self, device_name: str) -> None:
         """Welcome the client once its pipeline is built. Raises ClientGone."""
+
+    def answer_to(self, connection: int) -> None:
+        """What is sent from now on answers a message that came over the session's connection of that number."""
 
     def send(self, data: bytes) -> None:
         """Send to the capturing client; returns when the socket has accepted the data. Raises ClientGone."""
@@ -80,6 +86,10 @@ class Outbox(Protocol):
         """Send a frame's light and composite to the watchers; returns at once."""
 
 
+def not_saved(_room: str) -> None:
+    """As a `SaveRoom` of a service that keeps its rooms in memory, which is no failure."""
+
+
 @dataclass(frozen=True)
 class WorkerContext:
     """What all workers of a service share."""
@@ -92,9 +102,9 @@ class WorkerContext:
     target_period_s: float = 0.25
     """See `Limits.target_period_s`."""
     color_reader: Callable[[CameraModel], ColorReader] = ColorReader
-    save_room: Callable[[str], None] = lambda _name: None
+    save_room: SaveRoom = not_saved
     """Saves a room before placing or removing an object is acknowledged; a crash loses no acknowledged change."""
-    save_placements: Callable[[str], None] = lambda _name: None
+    save_placements: SaveRoom = not_saved
     """Saves only object placements before moves are acknowledged; cheaper than `save_room`."""
 
 
@@ -111,7 +121,7 @@ class Worker:
         self._arrived_s = self._waited_ms = 0.0
         """Arrival time and waiting time of the newest frame."""
         self._load_shedding = LoadShedding(hello.wishes, context.target_period_s)
-        self._acknowledged: OrderedDict[int, bytes] = OrderedDict()
+        self._acknowledged: OrderedDict[int, Acknowledged] = OrderedDict()
         """Acknowledgements by request number: a client that lost its connection may repeat requests."""
         self._answers: deque[tuple[int, tuple[bytes, ...]]] = deque(maxlen=MAX_ANSWERS)
         """Last answers of a lossless session by frame number, which may be requested again."""
@@ -137,6 +147,7 @@ class Worker:
             self._colors.close()
 
     def _handle(self, pipeline: ClientSession, queued: QueuedMessage) -> None:
+        self._outbox.answer_to(queued.connection)
         if isinstance(queued.message, Frame):
             self._arrived_s = queued.arrived_s
             self._context.metrics.queue_age_ms.observe(queued.age_ms)
@@ -150,29 +161,41 @@ class Worker:
         elif isinstance(queued.message, MoveObject):
             self._handle_moves(pipeline, [queued.message, *self._mailbox.take_while(MoveObject)])
         else:
-            self._outbox.send(self._acknowledge(pipeline, queued.message))
+            done = self._applied(pipeline, queued.message)
+            if isinstance(queued.message, PlaceObject | RemoveObject):
+                (done,) = self._saved([done], self._context.save_room)
+            self._outbox.send(encode(done))
 
     def _handle_moves(self, pipeline: ClientSession, moves: list[MoveObject]) -> None:
         """Apply consecutive moves, save them together, then acknowledge each."""
-        answers = [self._acknowledge(pipeline, move) for move in moves]
-        if self._hello.room is not None:
-            self._context.save_placements(self._hello.room)
-        for answer in answers:
-            self._outbox.send(answer)
+        done = [self._applied(pipeline, move) for move in moves]
+        for acknowledged in self._saved(done, self._context.save_placements):
+            self._outbox.send(encode(acknowledged))
 
-    def _acknowledge(self, pipeline: ClientSession, message: SceneControl) -> bytes:
+    def _saved(self, done: list[Acknowledged], save: SaveRoom) -> list[Acknowledged]:
+        """Save what was applied, also if it was before. Where that fails, the acknowledgements say so."""
+        room = self._hello.room
+        if room is None or all(acknowledged.error is not None for acknowledged in done):
+            return done
+        cause = save(room)
+        if cause is None:
+            return done
+        error = one_line(
+            f"{NOT_SAVED}{cause}; it is done, and lost if the server is killed before it can save the room: "
+            "send the same request again to ask"
+        )
+        return [kept if kept.error is not None else structs.replace(kept, error=error) for kept in done]
+
+    def _applied(self, pipeline: ClientSession, message: SceneControl) -> Acknowledged:
         """Apply a request and return its acknowledgement. A repeated request is not applied again."""
         done = self._acknowledged.get(message.request)
         if done is None:
-            acknowledged = apply_control(pipeline, message, self._context.load_mesh)
-            room = self._hello.room
-            if room is not None and acknowledged.error is None and isinstance(message, PlaceObject | RemoveObject):
-                self._context.save_room(room)
-            if isinstance(message, Quality) and acknowledged.error is None:
+            done = apply_control(pipeline, message, self._context.load_mesh)
+            if isinstance(message, Quality) and done.error is None:
                 self._load_shedding.request(
                     SamplingRequest(message.preset, message.budget_ms, message.max_light_error_deg)
                 )
-            done = self._acknowledged[message.request] = encode(acknowledged)
+            self._acknowledged[message.request] = done
             if len(self._acknowledged) > MAX_ACKNOWLEDGEMENTS:
                 self._acknowledged.popitem(last=False)
         return done

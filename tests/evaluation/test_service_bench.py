@@ -16,9 +16,11 @@ from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.bench.service.bytes import Fed, _Kept, feed
 from tests.bench.service.faults import Tally, part_of
+from tests.bench.service.full_disk import Found, begin, disk_full_then_killed
 from tests.bench.service.guests import CAMERA, FIRST_PX, FULL_S, LAST_PX, WALL_M, Guest, clock_frame, clock_s
 from tests.bench.service.http import bad_request
 from tests.bench.service.load import growth, overhead
+from tests.bench.service.process import stop
 
 
 @pytest.mark.parametrize("shown_s", [0.0, 3.0, 12.0])
@@ -45,6 +47,18 @@ def test_what_a_room_has_fused_is_read_over_the_socket(device: Device) -> None:
     with BackgroundServer(Service(device)) as server:
         shown_s, fused_s = asyncio.run(stream(server.url))
     assert fused_s == pytest.approx(shown_s, abs=0.6)
+
+
+def test_a_full_disk_and_a_kill_take_nothing_that_was_acknowledged_without_an_error(tmp_path: Path) -> None:
+    found = Found()
+    served = begin(tmp_path / "log", str(tmp_path / "rooms"))
+    try:
+        served = disk_full_then_killed(served, "study", random.Random(1), found)
+    finally:
+        stop(served)
+    assert found.missing == []
+    assert found.kept >= 5
+    assert found.unsaved >= 1
 
 
 def samples(counts: dict[str, float]) -> dict[tuple[str, ...], float]:

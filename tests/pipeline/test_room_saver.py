@@ -64,10 +64,10 @@ def test_a_room_that_cannot_be_saved_is_told_once_and_tried_again(
     with caplog.at_level(logging.INFO):
         for _ in range(3):
             disk.fail_at(4, full())
-            assert not saver.save(room)
+            assert saver.save(room) == "No space left on device"
         assert len(caplog.records) == 1
         assert "No space left on device" in saver.problems["study"]
         disk.fails_at = 0
-        assert saver.save(room)
+        assert saver.save(room) is None
     assert not saver.problems
     assert caplog.records[-1].getMessage() == "room 'study' is saved again"

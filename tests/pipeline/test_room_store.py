@@ -22,6 +22,7 @@ from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import FrameResult
 from server.room.room import Room
+from server.room.room_objects import ObjectRecord
 from server.scene.placement import Placement
 from server.service.room_store import RoomStore, folder_name
 from server.service.saving.brick_files import merged, read_bricks, write_bricks
@@ -373,6 +374,7 @@ NAMES += ["x" * 64, "🛋" * 64, "set-aside-1", "forgotten-x", ".forgotten-x"]
 def test_names_stay_apart_and_inside_the_folder(device: Device, store: RoomStore, tmp_path: Path) -> None:
     for name in NAMES:
         room = Room(device, wishes("given"), name)
+        room.objects.restore(ObjectRecord("cube", CUBE, PLACE))
         store.save(room)
         room.close()
     assert store.names() == tuple(sorted(NAMES))

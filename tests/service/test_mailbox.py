@@ -45,6 +45,30 @@ def test_a_client_within_its_window_never_loses_a_frame() -> None:
     assert drain(mailbox, 2) == [frames[2], frames[3]]
 
 
+def test_frames_of_a_lost_connection_are_neither_counted_nor_replaced() -> None:
+    frames = [frame_message(i) for i in range(5)]
+    mailbox, _ = posted_while_one_is_worked_on(2, frames[:1])
+    mailbox.begin_connection()
+    assert [mailbox.post(frame).replaced for frame in frames[1:4]] == [None, None, frames[1]]
+    mailbox.note_answered()  # the one that was worked on: it was never of this window
+    assert mailbox.post(frames[4]).replaced is frames[2]
+    assert drain(mailbox, 3) == [frames[0], *frames[3:]]
+
+
+def test_messages_of_two_connections_are_not_taken_together() -> None:
+    mailbox = Mailbox(2)
+    moves = [MoveObject(request=i, object="vase", position_m=(0, 0, i)) for i in range(4)]
+    for move in moves[:2]:
+        mailbox.post(move)
+    mailbox.begin_connection()
+    for move in moves[2:]:
+        mailbox.post(move)
+    assert mailbox.take().message is moves[0]
+    assert mailbox.take_while(MoveObject) == moves[1:2]
+    assert mailbox.take().message is moves[2]
+    assert mailbox.take_while(MoveObject) == moves[3:]
+
+
 def test_lossless_keeps_every_frame_in_order() -> None:
     mailbox = Mailbox(None)
     frames = [frame_message(i) for i in range(5)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ import trimesh
 from protocol.codec import decode_server
 from protocol.frames import IDENTITY
 from protocol.messages import (
+    NOT_SAVED,
     Acknowledged,
     Composite,
     Hello,
@@ -33,6 +35,7 @@ from server.service.scheduler import Scheduler
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 from server.service.worker import Worker, WorkerContext
+from tests.scenes.faulty_disk import FaultyDisk, full
 from tests.scenes.rooms import CAMERA, frame_at, view_at, wishes
 from tests.service import fakes
 from tests.service.fakes import PATIENCE_S, FakePipeline, Lab, fake_mesh, frame_message
@@ -126,6 +129,63 @@ def test_a_move_that_is_acknowledged_is_kept(
     wire.hang_up()
 
 
+def test_what_could_not_be_saved_is_acknowledged_with_an_error(
+    server: BackgroundServer, folder: Path, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is done all the same; asking again tells whether it has been saved."""
+    wire = enter(server, room_from_world=IDENTITY)
+    disk = FaultyDisk(monkeypatch)
+    disk.only_writes = True
+    cube = PlaceObject(request=1, object="a", format="ply", data=CUBE, position_m=(0, 0, 1))
+    for request, after in (
+        (cube, {"a"}),
+        (MoveObject(request=2, object="a", position_m=(0.1, 0.2, 1.0)), {"a"}),
+        (RemoveObject(request=3, object="a"), set()),
+    ):
+        before = kept(folder, device), middle_of(folder, device, "a") if kept(folder, device) else None
+        disk.fail_at(1, full())
+        wire.say(request)
+        error = wire.hear_until(Acknowledged)[-1].error
+        assert error is not None
+        assert error.startswith(f"{NOT_SAVED}No space left on device; it is done, and lost if")
+        assert str(folder) not in error
+        assert (kept(folder, device), middle_of(folder, device, "a") if kept(folder, device) else None) == before
+        wire.say(request)
+        assert wire.hear_until(Acknowledged)[-1].error is None
+        assert kept(folder, device) == after
+        if isinstance(request, MoveObject):
+            assert middle_of(folder, device, "a") == pytest.approx(request.position_m)
+    wire.hang_up()
+
+
+@pytest.mark.usefixtures("open_umask")
+def test_a_room_without_a_frame_or_an_object_is_not_kept(
+    server: BackgroundServer, folder: Path, device: Device
+) -> None:
+    enter(server, room_from_world=IDENTITY).hang_up()
+    wire = enter(server, room_from_world=IDENTITY)  # after the first has been closed, or not
+    server.service._persistence._saver.save_all()
+    assert not folder.exists() or not list(folder.iterdir())
+    assert place(wire, 1, "a").error is None
+    assert kept(folder, device) == {"a"}
+    inside = list(folder.rglob("*"))
+    assert {path.stat().st_mode & 0o777 for path in inside if path.is_dir()} == {0o700}
+    assert {path.stat().st_mode & 0o777 for path in inside if path.is_file()} == {0o600}
+    (room,) = folder.iterdir()
+    room.chmod(0o755)  # of an earlier version
+    assert place(wire, 2, "b").error is None
+    assert room.stat().st_mode & 0o777 == 0o700
+    wire.hang_up()
+
+
+@pytest.fixture
+def open_umask() -> Iterator[None]:
+    """Lets all read what is made without a mode."""
+    before = os.umask(0)
+    yield
+    os.umask(before)
+
+
 def test_an_object_of_a_client_that_is_not_aligned_is_told_after_a_crash(
     server: BackgroundServer, folder: Path, device: Device
 ) -> None:
@@ -196,6 +256,9 @@ class Inbox:
         self.all_heard = threading.Event()
 
     def greet(self, device_name: str) -> None:
+        pass
+
+    def answer_to(self, connection: int) -> None:
         pass
 
     def is_watched(self) -> bool:

@@ -11,7 +11,8 @@ from types import SimpleNamespace
 import pytest
 
 from client.streaming.client import Answer, ClientError, RoomPlace, StreamClient
-from protocol.messages import Acknowledged, Composite, Dropped, Hello, MoveObject, PlaceObject, Welcome, Wishes
+from protocol.messages import Acknowledged, Composite, Dropped, Hello, Light, MoveObject, PlaceObject, Welcome, Wishes
+from server.service.serve import BackgroundServer
 from tests.service.fakes import CAMERA, EXPLODE_MM, PATIENCE_S, Lab, frame_message, rgbd_frame
 from tests.service.proxy import Proxy, impaired
 from tests.service.wire import Wire
@@ -81,6 +82,66 @@ def test_a_request_whose_acknowledgement_was_lost_is_not_done_again(server, prox
     second.say(move, move)
     assert [second.hear_until(Acknowledged)[-1].request for _ in range(2)] == [4, 4]
     assert [entry[0] for entry in lab.log].count("move") == 1
+    second.hang_up()
+
+
+def test_a_client_that_keeps_to_its_window_loses_no_frame_after_a_resume(server, proxy: Proxy, lab: Lab) -> None:
+    """Two frames and a request are on the way when the connection is cut: nothing of them is told to the next one."""
+    first = Wire(proxy.url)
+    welcome = greet(first)
+    lab.hold = True
+    move = MoveObject(request=1, object="vase", position_m=(0, 0, 2))
+    first.say(frame_message(0), move, frame_message(1))
+    lab.next_entered()
+    until_queued(server, 2)
+    proxy.cut()
+    second = Wire(server.url)
+    assert greet(second, resume=welcome.key).resumed
+    unanswered = [2, 3]
+    second.say(*map(frame_message, unanswered))
+    until_queued(server, 4)
+    lab.release(20)
+    answered: list[int] = []
+    while unanswered:
+        light, composite = second.hear(), second.hear()
+        assert isinstance(light, Light), light
+        assert isinstance(composite, Composite), composite
+        assert light.frame == composite.frame == unanswered.pop(0)
+        answered.append(composite.frame)
+        if (number := answered[-1] + 2) < 14:
+            unanswered.append(number)
+            second.say(frame_message(number))
+    assert answered == list(range(2, 14))
+    assert [entry[1] for entry in lab.log if entry[0] == "frame"] == list(range(14))  # what had arrived was worked on
+    second.hang_up()
+
+
+def until_queued(server: BackgroundServer, count: int) -> None:
+    """Wait until so many messages wait for the session's worker."""
+    (session,) = server.service._captures.values()
+    end_s = time.monotonic() + PATIENCE_S
+    while len(session._mailbox._messages) < count:
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
+def test_a_window_is_kept_to_after_a_resume(server, proxy: Proxy, lab: Lab) -> None:
+    """Who sends more than it allows is told so, of frames of this connection alone."""
+    first = Wire(proxy.url)
+    welcome = greet(first)
+    lab.hold = True
+    first.say(frame_message(0), frame_message(1))
+    lab.next_entered()
+    until_queued(server, 1)
+    proxy.cut()
+    second = Wire(server.url)
+    greet(second, resume=welcome.key)
+    second.say(*map(frame_message, (2, 3, 4)))
+    dropped = second.hear()
+    assert isinstance(dropped, Dropped)
+    assert dropped.frame == 2
+    lab.release(5)
+    assert [second.hear_until(Composite)[-1].frame for _ in range(2)] == [3, 4]
     second.hang_up()
 
 

@@ -3,7 +3,9 @@
 import io
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -18,7 +20,7 @@ from client.objects.object_file import ObjectFile
 from client.results.description import describe
 from client.results.frame_output import FrameOutput, captured_of
 from client.results.output_folder import OutputWriter
-from client.streaming.client import ClientError
+from client.streaming.client import ClientError, RoomPlace
 from protocol.messages import Bye, Composite, Frame, Hello, Light, PlaceObject, Welcome
 from protocol.recording import read_messages
 from tests.service.fakes import EXPLODE_MM, REFUSE_MM, fake_result, rgbd_frame
@@ -127,6 +129,17 @@ def test_damaged_source_ends_the_stream_after_its_good_frames(server, tmp_path: 
     with pytest.raises(SourceError, match="frame 2: the picture is truncated"):
         quietly(FakeSource(5, depths_mm={2: 0}), server.url, out=tmp_path, realtime=False)
     assert {"frames/000000.png", "frames/000001.png"} < files(tmp_path).keys()
+
+
+def test_an_object_that_the_server_could_not_save_is_there_and_it_is_said(start_server, lab, triangle: Path) -> None:
+    server = start_server(room_factory=lambda _wishes, name: SimpleNamespace(name=name, key_digest=None, close=print))
+    service, console = server.service, Console(file=io.StringIO(), width=400)
+    service._worker_context = replace(service._worker_context, save_room=lambda _name: "the disk is full")
+    objects = [ObjectFile(triangle, (1.0, 2.0, 3.0))]
+    summary = stream(FakeSource(1), server.url, objects, console=console, realtime=False, room=RoomPlace("study"))
+    assert summary.answered == 1
+    assert [entry[0] for entry in lab.log] == ["place", "frame"]
+    assert "triangle.obj: not saved: the disk is full; it is done, and lost if" in console.file.getvalue()
 
 
 @pytest.fixture

@@ -317,8 +317,8 @@ export interface Welcome {
   /** Secret key to resume the session (`hello.resume`), if the client set `keep_s`. */
   key: string | null;
   /**
-   * True after a resume. Earlier frames are not answered any more, unless the session is lossless. Requests are
-   * answered if they are sent again.
+   * True after a resume. What was sent over earlier connections is not answered any more; requests, and in a lossless
+   * session frames, are answered if they are sent again.
    */
   resumed: boolean;
   room: string | null;
@@ -563,7 +563,11 @@ export interface Panorama {
   data: Uint8Array;
 }
 
-/** A control message was applied, or refused with `error`. */
+/**
+ * A control message was applied, or refused with `error`.
+ *
+ * An `error` that begins with "not saved: ": applied, and lost if the server is killed before it can write its disk.
+ */
 export interface Acknowledged {
   type: "acknowledged";
   request: number;

@@ -38,6 +38,13 @@ test("a refused object is gone, and it is said why", () => {
   assert.deepEqual([scene.placed.length, scene.selected], [0, null]);
 });
 
+test("an object that could not be saved is there, and it is said", () => {
+  const { scene } = asked();
+  scene.place(MODEL, [0, 0, 0]);
+  assert.equal(scene.acknowledge(0, "not saved: the disk is full"), "Box: not saved: the disk is full");
+  assert.equal(scene.placed.length, 1);
+});
+
 test("a server that has begun anew is given everything again, where it stands now", () => {
   const { scene, log } = asked();
   const box = scene.place(MODEL, [0, 0, 0]);

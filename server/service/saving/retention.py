@@ -10,7 +10,7 @@ from pathlib import Path
 QUARANTINE_PREFIX = "set-aside-"
 """Name prefix of damaged saves in their room's folder."""
 IN_USE_S = 600.0
-"""A room used more recently may be open in another process."""
+"""A room that has been idle for less may be open in another process."""
 DAY_S = 86400.0
 
 
@@ -20,7 +20,7 @@ class RetentionLimits:
 
     space_bytes: int | None = None
     age_s: float | None = None
-    """Time since a client was in the room."""
+    """Time for which no client was in the room, while a server was running."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,10 @@ class StoredItem:
     folder: Path
     space_bytes: int
     used_s: float
-    """Unix time of the last use."""
+    """Time stamp of the last use, by the system's clock; for the order of items alone."""
     is_room: bool
+    idle_s: float = 0.0
+    """See IdleTimes."""
 
 
 def stored_items(folder: Path, skipped: str) -> Iterator[StoredItem]:
@@ -59,14 +61,14 @@ def stored_items(folder: Path, skipped: str) -> Iterator[StoredItem]:
 
 
 def items_to_remove(
-    pieces: list[StoredItem], limits: RetentionLimits, now_s: float, in_use: Collection[Path]
+    pieces: list[StoredItem], limits: RetentionLimits, in_use: Collection[Path]
 ) -> Iterator[tuple[StoredItem, str]]:
-    """Items to delete, each with the reason: damaged saves first, then rooms, oldest first."""
-    free = [p for p in pieces if not (p.is_room and (p.folder in in_use or now_s - p.used_s < IN_USE_S))]
+    """Items to delete, each with the reason: damaged saves first, then rooms, the longest idle first."""
+    free = [p for p in pieces if not (p.is_room and (p.folder in in_use or p.idle_s < IN_USE_S))]
     total_bytes = sum(piece.space_bytes for piece in pieces)
-    for piece in sorted(free, key=lambda piece: (piece.is_room, piece.used_s)):
-        if limits.age_s is not None and now_s - piece.used_s > limits.age_s:
-            why = f"not used for {(now_s - piece.used_s) / DAY_S:.0f} days"
+    for piece in sorted(free, key=lambda piece: (piece.is_room, -piece.idle_s, piece.used_s)):
+        if limits.age_s is not None and piece.idle_s > limits.age_s:
+            why = f"not used for {piece.idle_s / DAY_S:.0f} days"
         elif limits.space_bytes is not None and total_bytes > limits.space_bytes:
             why = f"rooms take {total_bytes / 2**20:.0f} MiB, more than {limits.space_bytes / 2**20:.0f}"
         else:

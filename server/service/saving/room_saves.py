@@ -61,10 +61,11 @@ class RoomSaves:
             os.utime(self.folder)
 
     def save(self, room: Room) -> Saved:
+        """Write what has changed. A room that never had a frame or an object is not written."""
         if time.monotonic() - self._noted_s > NOTE_USE_S:
             self.note_used()
         sequences = self._known_sequences()
-        if self._has_all(room):
+        if self._has_all(room) or (not any(sequences) and _is_empty(room)):
             return Saved(0, 0, 0.0)
         number = sequences.index(min(sequences))
         taken = snapshot(room, self._slots[number])
@@ -155,6 +156,12 @@ def header_of(slot: SaveSlot) -> Header | None:
         return slot.header()
     except DamagedFile:
         return None
+
+
+def _is_empty(room: Room) -> bool:
+    """Whether the room has nothing that its first client's `hello` would not make again."""
+    objects = room.objects.inventory()
+    return room.reconstruction.volume is None and not (objects.has_begun or objects.objects or objects.pending)
 
 
 def _is_same(a: Snapshot, b: Snapshot) -> bool:

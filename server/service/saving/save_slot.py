@@ -35,6 +35,8 @@ from server.volume.volume import Volume
 
 SAVE, PART = "save", "save.part"
 """The index file, which names all other files of a save."""
+FOLDER_MODE = 0o700
+"""Scans of rooms are for the server's user alone."""
 SPARE_BRICKS = 1024
 """Brick files are merged when they hold more than twice the live bricks plus this number."""
 
@@ -194,7 +196,10 @@ class SaveSlot:
         return name
 
     def _make_folder(self) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
+        for folder in (self.folder.parent, self.folder):
+            folder.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
+            if folder.stat().st_mode & 0o777 != FOLDER_MODE:
+                folder.chmod(FOLDER_MODE)  # made by an earlier version
         if not (self.folder / SAVE).exists():
             for folder in self.folder.parents[:3]:
                 sync_folder(folder)

@@ -19,6 +19,7 @@ from tests.bench.report.report import Report
 from tests.bench.report.run import Run
 from tests.bench.service.bytes import decoder_part, socket_part
 from tests.bench.service.faults import FAULTS, fault_part, server_killed_part
+from tests.bench.service.full_disk import full_disk_part
 from tests.bench.service.http import http_part, schema_part
 from tests.bench.service.load import load_part, side_by_side_part
 from tests.bench.service.long_frames import long_frames_part
@@ -33,6 +34,7 @@ PARTS: dict[str, Callable[..., Part]] = {
     "side by side": side_by_side_part,
     "long frames": long_frames_part,
     "server killed": server_killed_part,
+    "disk full, then killed": full_disk_part,
     **{name: partial(fault_part, name) for name in FAULTS},
     "mutated messages": decoder_part,
     "mutated messages over the socket": socket_part,

@@ -4,6 +4,9 @@
 import type { Asked } from "../session";
 import type { Vector3 } from "../sh";
 
+/** Begin of the error of a request that was applied, and that the server could not write to its disk. */
+const NOT_SAVED = "not saved: ";
+
 export interface Model {
   /** Name for the user. */
   name: string;
@@ -85,14 +88,15 @@ export class Scene {
     const slot = [...this.slots.values()].find((each) => each.underWay === request);
     if (slot === undefined) return null;
     slot.underWay = null;
-    if (error === null) {
+    const named = error === null ? null : `${slot.placed.model.name}: ${error}`;
+    if (error === null || error.startsWith(NOT_SAVED)) {
       this.advance(slot);
-      return null;
+      return named;
     }
     this.slots.delete(slot.placed.id); // it was never placed
     if (this.selected === slot.placed) this.selected = null;
     this.onChange();
-    return `${slot.placed.model.name}: ${error}`;
+    return named;
   }
 
   /** The server was restarted: place all objects again and ignore earlier requests. */

@@ -120,7 +120,7 @@ class Service:
             )
         else:
             self.rooms = RoomRegistry(room_factory or _real_room(device))
-        self.metrics.add_room_gauges(lambda: self.rooms.count, self._persistence)
+        self.metrics.add_room_metrics(lambda: self.rooms.count, self._persistence)
         self._worker_context = WorkerContext(
             open_pipeline=self._open_pipeline,
             scheduler=self._scheduler,

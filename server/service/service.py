@@ -155,6 +155,17 @@ class Service:
         return self._prepared.is_set() and self.failure is None and not self.shutdown.is_draining
 
     @property
+    def takes_sessions(self) -> bool:
+        """Whether a new client would be given a session now, as far as the server's own limits go."""
+        if not self.ready or self._sessions >= self.limits.sessions:
+            return False
+        try:
+            self._admit()
+        except Refusal:
+            return False
+        return True
+
+    @property
     def sessions(self) -> int:
         """Number of capturing sessions."""
         return self._sessions

@@ -67,9 +67,10 @@ def _add_stream(app: FastAPI, service: Service, authenticator: Authenticator) ->
 
     @app.websocket("/{path:path}")
     async def elsewhere(websocket: WebSocket) -> None:
-        connection = Connection(websocket)
+        connection = Connection(websocket, service.limits, service.note_refusal)
         if await connection.accept():
-            await connection.close(POLICY, f"there is no socket at this path; the stream is at {STREAM_PATH}")
+            reason = f"there is no socket at this path; the stream is at {STREAM_PATH}"
+            await connection.turn_away(Refusal(POLICY, reason))
 
 
 def _health_of(service: Service) -> Health:

@@ -12,6 +12,7 @@ from fastapi import WebSocket, WebSocketDisconnect
 from protocol.codec import ProtocolError, decode_client, encode, one_line
 from protocol.limits import SUBPROTOCOL, SUBPROTOCOL_PREFIX
 from protocol.messages import Acknowledged, Bye, ClientMessage, Dropped, Error, Index, ServerMessage
+from server.service.event_log import about
 from server.service.limits import DEFAULT_LIMITS, Limits
 from server.service.rate_limiter import RateLimiter
 
@@ -65,6 +66,8 @@ class Connection:
         self._closed = False
         self.is_lost = False
         """Whether the connection broke without a close frame from the client."""
+        self.dismissal = ""
+        """Why the server ended the connection of a client that did nothing wrong."""
 
     async def accept(self) -> bool:
         """Complete the handshake. False for a client of another protocol version, after an error that names ours."""
@@ -74,7 +77,7 @@ class Connection:
             return True
         # A browser shows the close reason only if the server selected one of the offered subprotocols.
         await self._websocket.accept(offered[0] if offered else None)
-        await self.close(PROTOCOL, _wrong_version(offered))
+        await self.turn_away(Refusal(PROTOCOL, _wrong_version(offered)))
         return False
 
     async def receive(self) -> ClientMessage | None:
@@ -122,14 +125,24 @@ class Connection:
 
     async def refuse(self, refusal: Refusal) -> None:
         """Close with the reason, both in an error message and in the close frame."""
-        self._on_refusal(refusal)
+        self._note(refusal)
         with contextlib.suppress(ClientGone, TimeoutError):
             async with asyncio.timeout(CLOSE_PATIENCE_S):
                 await self.send_message(Error(reason=refusal.reason, fatal=True))
         await self.close(refusal.code, refusal.reason)
 
+    async def turn_away(self, refusal: Refusal) -> None:
+        """Close with the reason in the close frame alone, for a client that may not read this protocol's messages."""
+        self._note(refusal)
+        await self.close(refusal.code, refusal.reason)
+
+    def _note(self, refusal: Refusal) -> None:
+        with about(address=self.address):
+            self._on_refusal(refusal)
+
     async def dismiss(self, code: int, reason: str) -> None:
         """Send bye and close; for a client that did nothing wrong."""
+        self.dismissal = reason
         with contextlib.suppress(ClientGone, TimeoutError):
             async with asyncio.timeout(CLOSE_PATIENCE_S):
                 await self.send_message(Bye(reason=reason))

@@ -69,7 +69,7 @@ class Metrics:
             self.parser_deaths.labels(kind)
         for stage in STAGES:
             self.stage_s.labels(stage)
-        for reason in ("replaced", "refused", "unreadable", "invalid"):
+        for reason in ("replaced", "refused", "unreadable", "invalid", "stopping"):
             self.dropped.labels(reason)
 
     def _counter(self, name: str, help_text: str, labels: tuple[str, ...] = ()) -> Counter:

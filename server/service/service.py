@@ -111,6 +111,7 @@ class Service:
         self._resumable_sessions: dict[str, CaptureSession] = {}
         """Sessions that survive a lost connection, by their keys."""
         self.shutdown.begin_hooks.append(self._stop_waiting_for_clients)
+        self.shutdown.answer_hooks.append(self._finish_frames)
         self._scheduler = Scheduler(concurrent_frames)
         self._factory = pipeline_factory or _real_pipeline()
         self._persistence = RoomPersistence(data, device, self.limits.room_retention) if data is not None else None
@@ -241,7 +242,7 @@ class Service:
         except Refusal as refusal:
             await connection.refuse(refusal)
         except ClientGone:
-            log.info("a client left")
+            log.info("a client left", extra={"address": connection.address})
         except Exception:  # reported to both sides
             log.exception("a connection failed")
             await connection.refuse(Refusal(INTERNAL, "the server failed; its log says why"))
@@ -295,7 +296,7 @@ class Service:
                         await session.run(self._threads)
                 finally:
                     del self._captures[name]
-                log.info("session closed")
+                log.info("session closed", extra={"reason": session.why_ended})
 
     @contextlib.contextmanager
     def _resumable(self, key: str | None, session: CaptureSession) -> Iterator[None]:
@@ -305,6 +306,9 @@ class Service:
             yield
         finally:
             self._resumable_sessions.pop(key or "", None)
+
+    async def _finish_frames(self) -> None:
+        await asyncio.gather(*(session.finish() for session in tuple(self._captures.values())))
 
     def _stop_waiting_for_clients(self) -> None:
         for session in tuple(self._resumable_sessions.values()):

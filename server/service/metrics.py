@@ -21,12 +21,18 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from protocol.messages import TIMING_ROWS, Timings
+from server.service import connection
 
 if TYPE_CHECKING:
     from server.service.room_persistence import RoomPersistence
 
 BUCKETS_S = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15, 0.25, 0.5, 1.0, 2.5, 5.0)
 STAGES = (*TIMING_ROWS, "total", "host")
+REFUSAL_CODES = (
+    *(connection.PROTOCOL, connection.UNSUPPORTED, connection.INVALID, connection.POLICY, connection.INTERNAL),
+    *(connection.TRY_LATER, connection.UNAUTHORIZED, connection.FORBIDDEN, connection.GONE),
+)
+"""There from the start: the rate of a series that begins with the first refusal leaves that one out."""
 
 # Without this there is a series beside each counter and histogram, which promlint takes for one without a unit.
 disable_created_metrics()  # type: ignore[no-untyped-call]
@@ -69,6 +75,8 @@ class Metrics:
             self.parser_deaths.labels(kind)
         for stage in STAGES:
             self.stage_s.labels(stage)
+        for code in REFUSAL_CODES:
+            self.refused.labels(str(code))
         for reason in ("replaced", "refused", "unreadable", "invalid", "stopping"):
             self.dropped.labels(reason)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+import subprocess
 from importlib.metadata import version
 from pathlib import Path
 
@@ -12,11 +14,10 @@ from protocol.messages import Composite
 from tests.service.fakes import frame_message
 from tests.service.http import get, rows
 from tests.service.promlint import problems
+from tests.service.wire import Wire
 
 
 def test_names_keep_to_prometheus_rules(start_server, tmp_path: Path) -> None:
-    from tests.service.wire import Wire
-
     server = start_server(data=tmp_path)
     wire = Wire(server.url)
     wire.greet()
@@ -26,6 +27,8 @@ def test_names_keep_to_prometheus_rules(start_server, tmp_path: Path) -> None:
     assert problems(text) == []
     assert text.count("# TYPE probeless_") >= 20
     assert "_created" not in text
+    if shutil.which("promtool"):
+        subprocess.run(["promtool", "check", "metrics"], input=text.encode(), check=True)
     wire.hang_up()
 
 

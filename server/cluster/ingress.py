@@ -60,9 +60,8 @@ class Ingress:
                 await host.send(route.first)
                 await relay(websocket, host, route.room_id)
         except Refusal as refused:
-            log.info(
-                "client refused", extra={"code": refused.code, "reason": refused.reason, "address": connection.address}
-            )
+            extra = {"address": connection.address, "code": refused.code, "reason": refused.reason}
+            log.info("client refused", extra=extra)
             await connection.refuse(refused)
         finally:
             self.clients -= 1

@@ -12,7 +12,6 @@ from fastapi import WebSocket, WebSocketDisconnect
 from protocol.codec import ProtocolError, decode_client, encode, one_line
 from protocol.limits import SUBPROTOCOL, SUBPROTOCOL_PREFIX
 from protocol.messages import Acknowledged, Bye, ClientMessage, Dropped, Error, Index, ServerMessage
-from server.service.event_log import about
 from server.service.limits import DEFAULT_LIMITS, Limits
 from server.service.rate_limiter import RateLimiter
 
@@ -55,9 +54,9 @@ class Connection:
         self,
         websocket: WebSocket,
         limits: Limits = DEFAULT_LIMITS,
-        on_refusal: Callable[[Refusal], None] = lambda _refusal: None,
+        on_refusal: Callable[[Refusal, str], None] = lambda _refusal, _address: None,
     ) -> None:
-        """`on_refusal` is called before a refused client receives the error."""
+        """`on_refusal` is called with the client's address before a refused client receives the error."""
         self.address = "" if websocket.client is None else websocket.client.host
         self._websocket = websocket
         self._on_refusal = on_refusal
@@ -125,7 +124,7 @@ class Connection:
 
     async def refuse(self, refusal: Refusal) -> None:
         """Close with the reason, both in an error message and in the close frame."""
-        self._note(refusal)
+        self._on_refusal(refusal, self.address)
         with contextlib.suppress(ClientGone, TimeoutError):
             async with asyncio.timeout(CLOSE_PATIENCE_S):
                 await self.send_message(Error(reason=refusal.reason, fatal=True))
@@ -133,12 +132,8 @@ class Connection:
 
     async def turn_away(self, refusal: Refusal) -> None:
         """Close with the reason in the close frame alone, for a client that may not read this protocol's messages."""
-        self._note(refusal)
+        self._on_refusal(refusal, self.address)
         await self.close(refusal.code, refusal.reason)
-
-    def _note(self, refusal: Refusal) -> None:
-        with about(address=self.address):
-            self._on_refusal(refusal)
 
     async def dismiss(self, code: int, reason: str) -> None:
         """Send bye and close; for a client that did nothing wrong."""

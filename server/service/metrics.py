@@ -77,7 +77,7 @@ class Metrics:
             self.stage_s.labels(stage)
         for code in REFUSAL_CODES:
             self.refused.labels(str(code))
-        for reason in ("replaced", "refused", "unreadable", "invalid", "stopping"):
+        for reason in ("replaced", "refused", "unreadable", "invalid"):
             self.dropped.labels(reason)
 
     def _counter(self, name: str, help_text: str, labels: tuple[str, ...] = ()) -> Counter:

@@ -139,7 +139,7 @@ class CaptureSession:
         """Set while the connection is lost; its result is the client's new connection."""
         self._has_ended = False
         self._is_finishing = False
-        """The server is stopping: what has arrived is answered, later frames are not worked on."""
+        """The server is stopping: what has arrived is answered, later frames are not."""
         self.why_ended = ""
         """One line; set when the session has ended."""
         self._done_with: dict[Connection, asyncio.Event] = {}
@@ -185,7 +185,7 @@ class CaptureSession:
         await self._done_with[connection].wait()
 
     async def finish(self) -> None:
-        """Event loop: drop later frames. Returns once what has arrived is answered or the session has ended."""
+        """Event loop: leave out later frames. Returns once what has arrived is answered or the session has ended."""
         self._is_finishing = True
         while not (self._has_ended or self._mailbox.is_idle()):
             await asyncio.sleep(0.01)
@@ -275,7 +275,7 @@ class CaptureSession:
         if isinstance(message, Hello | Watch | Bye):
             raise Refusal(POLICY, f"{type(message).__name__.lower()} was received in a session that captures already")
         if self._is_finishing and isinstance(message, Frame):
-            return await self._drop_late(message)
+            return  # unanswered: its client sends it again where it connects next
         while not self._mailbox.has_room():
             self._mailbox_has_space.clear()
             await self._mailbox_has_space.wait()
@@ -285,11 +285,6 @@ class CaptureSession:
         if receipt.frames_ahead > FAR_TOO_MANY_INFLIGHT and not self._told_of_window:
             self._told_of_window = True
             await self._say_too_many(receipt.frames_ahead)
-        return None
-
-    async def _drop_late(self, frame: Frame) -> None:
-        self._metrics.dropped.labels("stopping").inc()
-        await self._connection.send_message(Dropped(frame=frame.frame, reason="the server is stopping"))
 
     async def _say_replaced(self, frame: Frame) -> None:
         self._metrics.dropped.labels("replaced").inc()

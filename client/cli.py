@@ -304,6 +304,7 @@ def serve(
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free port")] = 8080,
     device: o.DeviceOption = None,
     token: o.ServeToken = None,
+    token_file: o.TokenFile = None,
     insecure: Annotated[
         bool, typer.Option("--insecure", help="with --token none: allow access from other machines")
     ] = False,
@@ -342,12 +343,14 @@ def serve(
         log_format_of,
         objects_folder,
     )
+    from server.service.console import console_of
     from server.service.event_log import log_events
     from server.service.serve import serve as serve_forever
 
     options = ServeOptions(
         host=host,
         token=token,
+        token_file=token_file,
         insecure=insecure,
         allow_origin=tuple(allow_origin or ()),
         tls=tls,
@@ -362,6 +365,7 @@ def serve(
     limits, authenticator, log_format = limits_of(options), authenticator_of(options), log_format_of(log)
     certificate = certificate_of(options)
     log_events(log_format)
+    console = console_of(log_format, is_token_given=(token or token_file) is not None)
     status = serve_forever(
         host,
         port,
@@ -371,6 +375,8 @@ def serve(
         authenticator=authenticator,
         certificate=certificate,
         objects=objects_folder(objects),
+        say=console.say,
+        shows_token=console.shows_token,
     )
     exit_soon(status)
     return status

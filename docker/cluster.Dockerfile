@@ -1,7 +1,7 @@
 # A node of the cluster, head or worker: the server and Ray Serve. KubeRay starts its pods by commands of its own; what a
 # container runs by itself is a cluster of two nodes to try.
 # From the project's folder: docker build -f docker/cluster.Dockerfile -t probeless:cluster .
-FROM debian:bookworm-slim
+FROM debian:bookworm-slim@sha256:96e378d7e6531ac9a15ad505478fcc2e69f371b10f5cdf87857c4b8188404716
 ARG VENDOR=nvidia
 WORKDIR /opt/probeless
 COPY docker/install.sh docker/

@@ -1,5 +1,5 @@
 # The server on a CPU, through PoCL. From the project's folder: docker build -f docker/cpu.Dockerfile -t probeless:cpu .
-FROM debian:bookworm-slim
+FROM debian:bookworm-slim@sha256:96e378d7e6531ac9a15ad505478fcc2e69f371b10f5cdf87857c4b8188404716
 WORKDIR /opt/probeless
 COPY docker/install.sh docker/
 RUN sh docker/install.sh system

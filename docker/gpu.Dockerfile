@@ -1,6 +1,6 @@
 # The server on a GPU, through its vendor's OpenCL; the host needs the NVIDIA container toolkit, or for Intel /dev/dri.
 # From the project's folder: docker build -f docker/gpu.Dockerfile --build-arg VENDOR=nvidia -t probeless:gpu .
-FROM debian:bookworm-slim
+FROM debian:bookworm-slim@sha256:96e378d7e6531ac9a15ad505478fcc2e69f371b10f5cdf87857c4b8188404716
 ARG VENDOR=nvidia
 WORKDIR /opt/probeless
 COPY docker/install.sh docker/

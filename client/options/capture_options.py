@@ -163,6 +163,10 @@ ServeToken = Annotated[
         metavar="TOKEN|none", envvar="PROBELESS_TOKEN", help="required from clients; default: a new one; none: no token"
     ),
 ]
+TokenFile = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", envvar="PROBELESS_TOKEN_FILE", help="file with the token, as a container's secret"),
+]
 AllowOrigin = Annotated[
     list[str] | None,
     typer.Option(metavar="ORIGIN", help="https://host of other pages that may connect; may be repeated"),

@@ -28,7 +28,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     ),
     "Room": ("room", "room_key", "room_from_world", "marker"),
     "Address and access": (
-        *("host", "port", "insecure", "allow_origin", "tls", "tls_cert", "tls_key", "trusted_proxy"),
+        *("host", "port", "token_file", "insecure", "allow_origin", "tls", "tls_cert", "tls_key", "trusted_proxy"),
     ),
     "Limits and data": (
         *("sessions", "sessions_per_address", "volume_memory", "objects", "data", "data_gib", "data_days", "log"),

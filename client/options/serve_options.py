@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import logging
 import os
-import sys
 import tempfile
 import threading
 from dataclasses import dataclass, replace
@@ -14,11 +14,13 @@ from urllib.parse import urlsplit
 from platformdirs import user_data_path
 
 from client.errors import OptionError, RunError
-from server.service.authenticator import MAX_TOKEN_CHARS, Authenticator, is_loopback, is_token, new_token
+from server.service.authenticator import MAX_TOKEN_CHARS, Authenticator, is_loopback, is_token, new_token, token_in
 from server.service.event_log import LogFormat
 from server.service.limits import DEFAULT_LIMITS, GIB, MIB, Limits
 from server.service.saving.retention import DAY_S, RetentionLimits
 from server.service.tls import Certificate, CertificateError, given_certificate, own_certificate
+
+log = logging.getLogger(__name__)
 
 NO_TOKEN = "none"
 NO_DATA = "none"
@@ -32,6 +34,7 @@ class ServeOptions:
 
     host: str
     token: str | None = None
+    token_file: Path | None = None
     insecure: bool = False
     allow_origin: tuple[str, ...] = ()
     tls: bool = False
@@ -48,6 +51,8 @@ class ServeOptions:
 def authenticator_of(options: ServeOptions) -> Authenticator:
     """Raises OptionError."""
     origins = frozenset(_origin(text) for text in options.allow_origin)
+    if options.token_file is not None:
+        return Authenticator(_token_in_file(options), origins)
     if options.token == NO_TOKEN:
         if not (options.insecure or is_loopback(options.host)):
             raise OptionError(
@@ -60,6 +65,18 @@ def authenticator_of(options: ServeOptions) -> Authenticator:
     if options.token is not None and not is_token(options.token):
         raise OptionError(f"--token: expected up to {MAX_TOKEN_CHARS} ASCII characters without spaces, or none")
     return Authenticator(options.token or new_token(), origins)
+
+
+def _token_in_file(options: ServeOptions) -> str:
+    if options.token is not None:
+        raise OptionError("--token (PROBELESS_TOKEN) and --token-file (PROBELESS_TOKEN_FILE) are both given: give one")
+    if options.insecure:
+        raise OptionError("--insecure goes with --token none: leave it out")
+    assert options.token_file is not None
+    try:
+        return token_in(options.token_file)
+    except ValueError as error:
+        raise OptionError(f"--token-file: {error}") from error
 
 
 def certificate_of(options: ServeOptions) -> Certificate | None:
@@ -137,8 +154,7 @@ def exit_soon(status: int) -> None:
     """End this process soon with `status`, even if a thread waits for a device that never answers."""
 
     def stop() -> None:
-        sys.stderr.write("probeless: a session is stuck on the device and was given up\n")
-        sys.stderr.flush()
+        log.error("a session is stuck on the device and was given up")
         os._exit(status)
 
     timer = threading.Timer(EXIT_TIMEOUT_S, stop)

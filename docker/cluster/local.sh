@@ -1,8 +1,9 @@
 #!/bin/sh
 # A cluster of two nodes on this machine, to try it: a socket at port 8000, four places for rooms on each node.
-# Needs PROBELESS_TOKEN (or none) and what `make install-cluster` installs. Ctrl-C or SIGTERM ends all of it.
+# Needs PROBELESS_TOKEN (or none) or PROBELESS_TOKEN_FILE, and what `make install-cluster` installs. Ctrl-C or SIGTERM ends all of it.
 set -eu
 cd "$(dirname "$0")/../.."
+test -z "${PROBELESS_TOKEN_FILE:-}" || PROBELESS_TOKEN=$(cat "$PROBELESS_TOKEN_FILE")
 : "${PROBELESS_TOKEN:?set it to a secret of yours (openssl rand -hex 24), or to none to let everybody in}"
 export PROBELESS_TOKEN RAY_SERVE_ENABLE_HA_PROXY="${RAY_SERVE_ENABLE_HA_PROXY:-1}" RAY_USAGE_STATS_ENABLED=0
 # A node that is silent for about five seconds is dead.

@@ -67,7 +67,7 @@ class RoomHost:
         clients = int(values["probeless_sessions"] + values["probeless_watchers"])
         if clients:
             self._last_client_s = now_s
-        aged = values["probeless_queue_age_ms_sum"] / 1e3, values["probeless_queue_age_ms_count"]
+        aged = values["probeless_queue_age_seconds_sum"], values["probeless_queue_age_seconds_count"]
         age_s, frames = aged[0] - self._aged[0], aged[1] - self._aged[1]
         self._aged = aged
         return HostStatus(clients, now_s - self._last_client_s, age_s / frames if frames else 0.0, self._node)

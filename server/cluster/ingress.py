@@ -7,7 +7,6 @@ import logging
 from pathlib import Path
 
 from fastapi import FastAPI, WebSocket
-from fastapi.responses import JSONResponse
 from fastapi.staticfiles import StaticFiles
 from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import InvalidHandshake
@@ -19,6 +18,7 @@ from server.cluster.routing import Route, route_of
 from server.service.app import PAGE_FOLDER, STREAM_PATH
 from server.service.authenticator import Authenticator
 from server.service.connection import GONE, POLICY, TRY_LATER, BadMessage, Connection, Refusal
+from server.service.health_routes import Health, add_health
 from server.service.limits import DEFAULT_LIMITS, Limits
 from server.service.object_library import ObjectLibrary
 from server.service.object_routes import add_objects
@@ -60,7 +60,8 @@ class Ingress:
                 await host.send(route.first)
                 await relay(websocket, host, route.room_id)
         except Refusal as refused:
-            log.info("client refused", extra={"code": refused.code, "reason": refused.reason})
+            extra = {"address": connection.address, "code": refused.code, "reason": refused.reason}
+            log.info("client refused", extra=extra)
             await connection.refuse(refused)
         finally:
             self.clients -= 1
@@ -98,10 +99,7 @@ def create_ingress_app(ingress: Ingress, page_folder: Path = PAGE_FOLDER) -> Fas
     async def stream(websocket: WebSocket) -> None:
         await ingress.serve(websocket)
 
-    @app.get("/healthz")
-    async def healthz() -> JSONResponse:
-        return JSONResponse({"ready": True, "clients": ingress.clients})
-
+    add_health(app, lambda: Health(True, True, {"clients": ingress.clients}), ingress.authenticator)
     add_objects(app, ObjectLibrary(), ingress.authenticator)
     if (page_folder / "index.html").is_file():
         app.mount("/", StaticFiles(directory=page_folder, html=True))

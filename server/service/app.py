@@ -7,12 +7,13 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 from fastapi import FastAPI, Request, WebSocket
-from fastapi.responses import JSONResponse, PlainTextResponse, Response
+from fastapi.responses import PlainTextResponse, Response
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST
 
 from server.service.authenticator import WHERE_IT_IS, Authenticator
 from server.service.connection import POLICY, Connection, Refusal
+from server.service.health_routes import Health, add_health
 from server.service.object_library import ObjectLibrary
 from server.service.object_routes import add_objects
 from server.service.panorama_routes import add_panorama
@@ -42,7 +43,7 @@ def create_app(
 
     app = FastAPI(lifespan=lifespan, openapi_url=None)
     _add_stream(app, service, authenticator)
-    _add_health(app, service)
+    add_health(app, lambda: _health_of(service), authenticator)
     _add_metrics(app, service, authenticator)
     add_objects(app, library or ObjectLibrary(), authenticator)
     add_panorama(app, service, authenticator)
@@ -66,24 +67,23 @@ def _add_stream(app: FastAPI, service: Service, authenticator: Authenticator) ->
 
     @app.websocket("/{path:path}")
     async def elsewhere(websocket: WebSocket) -> None:
-        connection = Connection(websocket)
+        connection = Connection(websocket, service.limits, service.note_refusal)
         if await connection.accept():
-            await connection.close(POLICY, f"there is no socket at this path; the stream is at {STREAM_PATH}")
+            reason = f"there is no socket at this path; the stream is at {STREAM_PATH}"
+            await connection.turn_away(Refusal(POLICY, reason))
 
 
-def _add_health(app: FastAPI, service: Service) -> None:
-    @app.get("/healthz", responses={503: {"description": "Not ready: what is missing is in the answer"}})
-    async def healthz() -> JSONResponse:
-        state = {"ready": service.ready, "device": service.device_name, "sessions": service.sessions}
-        if service.storage is not None:
-            state["kept_rooms"], state["kept_bytes"] = service.storage.rooms, service.storage.space_bytes
-        if service.shutdown.is_draining:
-            state["draining"] = True
-        if service.failure is not None:
-            state["failure"] = service.failure
-        if service.failed_check is not None:
-            state["failed_check"] = service.failed_check
-        return JSONResponse(state, status_code=200 if service.ready else 503)
+def _health_of(service: Service) -> Health:
+    details: dict[str, object] = {"device": service.device_name, "sessions": service.sessions}
+    if service.storage is not None:
+        details |= {"kept_rooms": service.storage.rooms, "kept_bytes": service.storage.space_bytes}
+    if service.shutdown.is_draining:
+        details["draining"] = True
+    if service.failure is not None:
+        details["failure"] = service.failure
+    if service.failed_check is not None:
+        details["failed_check"] = service.failed_check
+    return Health(service.ready, service.takes_sessions, details)
 
 
 def _add_metrics(app: FastAPI, service: Service, authenticator: Authenticator) -> None:

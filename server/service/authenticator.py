@@ -7,6 +7,7 @@ import ipaddress
 import secrets
 import socket
 from dataclasses import dataclass
+from pathlib import Path
 from urllib.parse import quote, urlsplit
 
 from starlette.requests import HTTPConnection
@@ -25,6 +26,20 @@ def new_token() -> str:
 def is_token(text: str) -> bool:
     """Whether `text` is a valid token: printable ASCII without spaces, so that it fits in a header."""
     return 0 < len(text) <= MAX_TOKEN_CHARS and text.isascii() and text.isprintable() and " " not in text
+
+
+def token_in(path: Path) -> str:
+    """The token in a file, such as a container's secret; white space around it does not count.
+
+    Raises ValueError, one line without the token.
+    """
+    try:
+        text = path.read_text(errors="replace").strip()
+    except OSError as error:
+        raise ValueError(f"the token's file {path} cannot be read ({error.strerror})") from error
+    if not is_token(text):
+        raise ValueError(f"{path}: expected a token, up to {MAX_TOKEN_CHARS} ASCII characters without spaces")
+    return text
 
 
 @dataclass(frozen=True)

@@ -54,9 +54,9 @@ class Connection:
         self,
         websocket: WebSocket,
         limits: Limits = DEFAULT_LIMITS,
-        on_refusal: Callable[[Refusal], None] = lambda _refusal: None,
+        on_refusal: Callable[[Refusal, str], None] = lambda _refusal, _address: None,
     ) -> None:
-        """`on_refusal` is called before a refused client receives the error."""
+        """`on_refusal` is called with the client's address before a refused client receives the error."""
         self.address = "" if websocket.client is None else websocket.client.host
         self._websocket = websocket
         self._on_refusal = on_refusal
@@ -65,6 +65,8 @@ class Connection:
         self._closed = False
         self.is_lost = False
         """Whether the connection broke without a close frame from the client."""
+        self.dismissal = ""
+        """Why the server ended the connection of a client that did nothing wrong."""
 
     async def accept(self) -> bool:
         """Complete the handshake. False for a client of another protocol version, after an error that names ours."""
@@ -74,7 +76,7 @@ class Connection:
             return True
         # A browser shows the close reason only if the server selected one of the offered subprotocols.
         await self._websocket.accept(offered[0] if offered else None)
-        await self.close(PROTOCOL, _wrong_version(offered))
+        await self.turn_away(Refusal(PROTOCOL, _wrong_version(offered)))
         return False
 
     async def receive(self) -> ClientMessage | None:
@@ -122,14 +124,20 @@ class Connection:
 
     async def refuse(self, refusal: Refusal) -> None:
         """Close with the reason, both in an error message and in the close frame."""
-        self._on_refusal(refusal)
+        self._on_refusal(refusal, self.address)
         with contextlib.suppress(ClientGone, TimeoutError):
             async with asyncio.timeout(CLOSE_PATIENCE_S):
                 await self.send_message(Error(reason=refusal.reason, fatal=True))
         await self.close(refusal.code, refusal.reason)
 
+    async def turn_away(self, refusal: Refusal) -> None:
+        """Close with the reason in the close frame alone, for a client that may not read this protocol's messages."""
+        self._on_refusal(refusal, self.address)
+        await self.close(refusal.code, refusal.reason)
+
     async def dismiss(self, code: int, reason: str) -> None:
         """Send bye and close; for a client that did nothing wrong."""
+        self.dismissal = reason
         with contextlib.suppress(ClientGone, TimeoutError):
             async with asyncio.timeout(CLOSE_PATIENCE_S):
                 await self.send_message(Bye(reason=reason))

@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import math
 import sys
+import threading
 import traceback
 from collections.abc import Iterator
 from contextvars import ContextVar
@@ -17,6 +19,9 @@ LogFormat = Literal["text", "json"]
 _about: ContextVar[dict[str, object] | None] = ContextVar("about", default=None)
 _KNOWN = {*vars(logging.makeLogRecord({})), "message", "asctime", "taskName", "color_message"}
 STAGE_NOTE = "in stage "
+TRACEBACK_INDENT = "    "
+
+log = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
@@ -30,12 +35,26 @@ def about(**facts: object) -> Iterator[None]:
 
 
 def log_events(log_format: LogFormat) -> None:
-    """Log to standard error, from level INFO."""
+    """Log to standard error, from level INFO: events, Python's warnings, and errors that end a thread."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines() if log_format == "json" else TextLines())
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(logging.INFO)
+    logging.captureWarnings(True)
+    threading.excepthook = _log_end_of_thread
+    sys.unraisablehook = _log_unraisable
+
+
+def _log_end_of_thread(ended: threading.ExceptHookArgs) -> None:
+    name = "" if ended.thread is None else ended.thread.name
+    if ended.exc_value is not None and not isinstance(ended.exc_value, SystemExit):
+        log.error("a thread failed", exc_info=ended.exc_value, extra={"of": name})
+
+
+def _log_unraisable(failed: sys.UnraisableHookArgs) -> None:
+    if failed.exc_value is not None:
+        log.error("an error could not be raised", exc_info=failed.exc_value, extra={"in": repr(failed.object)})
 
 
 class JsonLines(logging.Formatter):
@@ -46,9 +65,9 @@ class JsonLines(logging.Formatter):
         fields: dict[str, Any] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
-            "event": record.getMessage(),
+            "event": record.getMessage().rstrip(),
             "logger": record.name,
-            **facts_of(record),
+            **{name: _json_value(value) for name, value in facts_of(record).items()},
         }
         error = record.exc_info[1] if record.exc_info else None
         if error is not None:
@@ -59,14 +78,37 @@ class JsonLines(logging.Formatter):
 
 
 class TextLines(logging.Formatter):
-    """Time, level, event and context fields; an error's traceback follows."""
+    """Time, level, event and context fields; an error's traceback follows, indented.
+
+    What clients send can neither begin a line, nor add a field, nor control the terminal.
+    """
 
     def format(self, record: logging.LogRecord) -> str:
         """The line, followed by a traceback if there is one."""
         time = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
-        facts = "".join(f" {name}={value}" for name, value in facts_of(record).items())
-        line = " ".join(f"{time} {record.levelname.lower()}: {record.getMessage()}{facts}".splitlines())
-        return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
+        facts = "".join(f" {name}={_quoted(str(value))}" for name, value in facts_of(record).items())
+        line = f"{time} {record.levelname.lower()}: {escaped(record.getMessage().rstrip())}{facts}"
+        if not record.exc_info:
+            return line
+        rest = self.formatException(record.exc_info).split("\n")
+        return "\n".join([line, *(f"{TRACEBACK_INDENT}{escaped(text)}" for text in rest)])
+
+
+def escaped(text: str) -> str:
+    """`text` with everything that is not printable (control and format characters, line breaks) as Python escapes."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def _quoted(text: str) -> str:
+    """A field's value: in quotes where it could be taken for more than one field."""
+    if text and not any(c in text for c in ' ="\\') and text.isprintable():
+        return text
+    return '"' + escaped(text.replace("\\", "\\\\").replace('"', '\\"')) + '"'
+
+
+def _json_value(value: object) -> object:
+    """JSON has no words for what is not finite."""
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def facts_of(record: logging.LogRecord) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""Graceful shutdown: refuse new clients, notify connected ones, wait for their sessions, save the rooms."""
+"""Graceful shutdown: refuse new clients, answer what has arrived, notify the clients, end sessions, save the rooms."""
 
 from __future__ import annotations
 
@@ -14,6 +14,11 @@ DRAINING = "this server is draining, it takes nobody new: connect again in a whi
 SHARE_OF_SESSIONS = 0.5
 """Share of the time limit in which sessions may end; the rest is for saving."""
 
+ANSWER_PATIENCE_S = 2.0
+"""Time limit for answering the frames that have arrived, at most `SHARE_OF_ANSWERS` of all: most take far less, and
+the rest of the time is for the clients' goodbye and for saving."""
+SHARE_OF_ANSWERS = 0.3
+
 log = logging.getLogger(__name__)
 
 
@@ -26,6 +31,8 @@ class GracefulShutdown:
         """Awaited together after the sessions have ended, to save what must not be lost."""
         self.begin_hooks: list[Callable[[], None]] = []
         """Called first, so that nothing waits for clients that will not return."""
+        self.answer_hooks: list[Callable[[], Awaitable[None]]] = []
+        """Awaited together before the clients are dismissed, until they have been answered."""
         self._connections: set[Connection] = set()
 
     @contextlib.contextmanager
@@ -48,6 +55,7 @@ class GracefulShutdown:
             let_go()
         log.info("draining", extra={"connections": len(self._connections)})
         start_s = asyncio.get_running_loop().time()
+        await self._answer(min(ANSWER_PATIENCE_S, SHARE_OF_ANSWERS * patience_s))
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(SHARE_OF_SESSIONS * patience_s):
                 await asyncio.gather(*(connection.dismiss(RESTART, GOODBYE) for connection in tuple(self._connections)))
@@ -56,6 +64,13 @@ class GracefulShutdown:
         if self._connections:
             log.warning("sessions have not ended in time", extra={"connections": len(self._connections)})
         await self._save(patience_s - (asyncio.get_running_loop().time() - start_s))
+
+    async def _answer(self, patience_s: float) -> None:
+        try:
+            async with asyncio.timeout(patience_s):
+                await asyncio.gather(*(answer() for answer in self.answer_hooks), return_exceptions=True)
+        except TimeoutError:
+            log.warning("frames were given up, they took too long", extra={"limit_s": patience_s})
 
     async def _save(self, patience_s: float) -> None:
         tasks = [asyncio.ensure_future(save()) for save in self.save_hooks]

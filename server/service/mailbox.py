@@ -97,6 +97,7 @@ class Mailbox:
         self._queued_bytes = 0
         self._frames_ahead = 0
         self._closed = False
+        self._is_reader_busy = False
         self._changed = threading.Condition()
 
     def has_room(self) -> bool:
@@ -122,9 +123,11 @@ class Mailbox:
     def take(self) -> QueuedMessage | None:
         """Wait for the oldest message and remove it; None once the mailbox is closed."""
         with self._changed:
+            self._is_reader_busy = False
             self._changed.wait_for(lambda: self._messages or self._closed)
             if self._closed:
                 return None
+            self._is_reader_busy = True
             queued = self._remove(0)
             self._taken_from = queued.connection
             if isinstance(queued.message, Frame):
@@ -145,6 +148,11 @@ class Mailbox:
         if taken and self._on_taken is not None:
             self._on_taken()
         return taken
+
+    def is_idle(self) -> bool:
+        """Whether nothing is unread and the reader has finished the last message: it waits for another one."""
+        with self._changed:
+            return not self._messages and not self._is_reader_busy
 
     def note_answered(self) -> None:
         """Call before answering the last frame taken: the client may then send another."""

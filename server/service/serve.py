@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING
 import uvicorn
 
 from protocol.limits import MAX_MESSAGE_BYTES
-from protocol.local_keys import LocalKey, key_left
+from protocol.local_keys import LocalKey, key_left, key_path
 from server.service.app import create_app
 from server.service.authenticator import Authenticator, is_loopback, new_token
+from server.service.console import print_line
 from server.service.limits import DEFAULT_LIMITS, Limits
 from server.service.lingering_close import LingeringCloseWebSocket
 from server.service.object_library import ObjectLibrary
@@ -56,21 +57,24 @@ def serve(
     certificate: Certificate | None = None,
     data: Path | None = None,
     objects: Path | None = None,
-    say: Callable[[str], None] | None = None,
+    say: Callable[[str], None] = print_line,
+    shows_token: bool = True,
 ) -> int:
     """Serve until interrupted and return the exit status. `say` receives each line for the user (default: stdout).
+
+    `shows_token`: whether the token is in one of these lines.
 
     `authenticator` None: a new token is required. `certificate` None: no TLS. `data`: folder in which rooms are saved.
     `objects`: folder of models that clients may place; None: only the vase.
     A port in use, a missing device or kernels that do not build print one line on standard error and return 1.
     """
-    say = say or _print_line
+    authenticator = authenticator or Authenticator(new_token())
     try:
         listener = listen(host, port)
         with listener:
             service = open_service(device_name, limits=limits, data=data)
             library = ObjectLibrary(objects)
-            return serve_on(listener, service, say, authenticator or Authenticator(new_token()), certificate, library)
+            return serve_on(listener, service, say, authenticator, certificate, library, shows_token=shows_token)
     except ServeError as error:
         sys.stderr.write(f"probeless: {error}\n")
         return 1
@@ -120,6 +124,8 @@ def serve_on(
     authenticator: Authenticator = NO_AUTHENTICATION,
     certificate: Certificate | None = None,
     library: ObjectLibrary | None = None,
+    *,
+    shows_token: bool = True,
 ) -> int:
     """Serve until interrupted and return the exit status. Raises ServeError if the warm-up fails."""
     server = _server(service, authenticator, certificate, library)
@@ -127,7 +133,7 @@ def serve_on(
 
         def on_prepared() -> None:
             if service.failure is None:
-                for line in _ways_in(listener, authenticator, certificate, is_left):
+                for line in _ways_in(listener, authenticator, certificate, is_left, shows_token=shows_token):
                     say(line)
             else:
                 server.should_exit = True
@@ -166,17 +172,26 @@ def _ended_like_interrupted() -> Iterator[None]:
 
 
 def _ways_in(
-    listener: socket.socket, authenticator: Authenticator, certificate: Certificate | None, is_left: bool
+    listener: socket.socket,
+    authenticator: Authenticator,
+    certificate: Certificate | None,
+    is_left: bool,
+    *,
+    shows_token: bool,
 ) -> list[str]:
     """Lines that say how to connect from this and from other machines."""
-    host, url = listener.getsockname()[0], url_of(listener, certificate)
+    (host, port), url = listener.getsockname()[:2], url_of(listener, certificate)
+    query = authenticator.query if shows_token else ""
     pin = "" if certificate is None else f" --tls-fingerprint {certificate.fingerprint}"
     everywhere = host in EVERYWHERE
-    own = url if is_left and (everywhere or is_loopback(host)) else f"{url}{authenticator.query}{pin}"
-    lines = [f"ready: open {url}{authenticator.query} or run: probeless stream SOURCE --server {own}"]
+    own = url if is_left and (everywhere or is_loopback(host)) else f"{url}{query}{pin}"
+    lines = [f"ready: open {url}{query} or run: probeless stream SOURCE --server {own}"]
     if everywhere:
-        there = url_of(listener, certificate, socket.gethostname()) + authenticator.query
-        lines.append(f"on other machines: open {there} or run: probeless stream SOURCE --server {there}{pin}")
+        there = url_of(listener, certificate, socket.gethostname())
+        lines.append(f"on other machines: the same URL with {there} in place of {url}{pin and f', and{pin}'}")
+    if authenticator.token is not None and not shows_token:
+        where = f"is in {key_path(port)}" if is_left else "cannot be shown here: give one with --token-file"
+        lines.append(f"its token {where}")
     if certificate is not None:
         lines.append(f"SHA-256 of its certificate: {certificate.fingerprint}")
     return lines
@@ -288,8 +303,3 @@ def _warm_up(device: Device) -> None:
     from server.service.warm_up import warm_up
 
     warm_up(device)
-
-
-def _print_line(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()

@@ -111,6 +111,7 @@ class Service:
         self._resumable_sessions: dict[str, CaptureSession] = {}
         """Sessions that survive a lost connection, by their keys."""
         self.shutdown.begin_hooks.append(self._stop_waiting_for_clients)
+        self.shutdown.answer_hooks.append(self._finish_frames)
         self._scheduler = Scheduler(concurrent_frames)
         self._factory = pipeline_factory or _real_pipeline()
         self._persistence = RoomPersistence(data, device, self.limits.room_retention) if data is not None else None
@@ -120,7 +121,7 @@ class Service:
             )
         else:
             self.rooms = RoomRegistry(room_factory or _real_room(device))
-        self.metrics.add_room_gauges(lambda: self.rooms.count, self._persistence)
+        self.metrics.add_room_metrics(lambda: self.rooms.count, self._persistence)
         self._worker_context = WorkerContext(
             open_pipeline=self._open_pipeline,
             scheduler=self._scheduler,
@@ -153,6 +154,17 @@ class Service:
     def ready(self) -> bool:
         """True once kernels are compiled and the self-check has passed, until shutdown begins."""
         return self._prepared.is_set() and self.failure is None and not self.shutdown.is_draining
+
+    @property
+    def takes_sessions(self) -> bool:
+        """Whether a new client would be given a session now, as far as the server's own limits go."""
+        if not self.ready or self._sessions >= self.limits.sessions:
+            return False
+        try:
+            self._admit()
+        except Refusal:
+            return False
+        return True
 
     @property
     def sessions(self) -> int:
@@ -196,10 +208,10 @@ class Service:
         self.metrics.parser_deaths.labels(kind).inc()
         log.warning("a parser died", extra={"kind": kind})
 
-    def note_refusal(self, refusal: Refusal) -> None:
+    def note_refusal(self, refusal: Refusal, address: str) -> None:
         """Count and log a refused client."""
         self.metrics.refused.labels(str(refusal.code)).inc()
-        log.info("client refused", extra={"code": refusal.code, "reason": refusal.reason})
+        log.info("client refused", extra={"address": address, "code": refusal.code, "reason": refusal.reason})
 
     async def panorama(
         self, asked: PanoramaOrder, session: str | None = None, room: str | None = None, room_key: str | None = None
@@ -230,7 +242,7 @@ class Service:
         except Refusal as refusal:
             await connection.refuse(refusal)
         except ClientGone:
-            log.info("a client left")
+            log.info("a client left", extra={"address": connection.address})
         except Exception:  # reported to both sides
             log.exception("a connection failed")
             await connection.refuse(Refusal(INTERNAL, "the server failed; its log says why"))
@@ -284,7 +296,7 @@ class Service:
                         await session.run(self._threads)
                 finally:
                     del self._captures[name]
-                log.info("session closed")
+                log.info("session closed", extra={"reason": session.why_ended})
 
     @contextlib.contextmanager
     def _resumable(self, key: str | None, session: CaptureSession) -> Iterator[None]:
@@ -294,6 +306,9 @@ class Service:
             yield
         finally:
             self._resumable_sessions.pop(key or "", None)
+
+    async def _finish_frames(self) -> None:
+        await asyncio.gather(*(session.finish() for session in tuple(self._captures.values())))
 
     def _stop_waiting_for_clients(self) -> None:
         for session in tuple(self._resumable_sessions.values()):

@@ -146,6 +146,10 @@ class CaptureSession:
         self._returned: asyncio.Future[Connection] | None = None
         """Set while the connection is lost; its result is the client's new connection."""
         self._has_ended = False
+        self._is_finishing = False
+        """The server is stopping: what has arrived is answered, later frames are not."""
+        self.why_ended = ""
+        """One line; set when the session has ended."""
         self._done_with: dict[Connection, asyncio.Event] = {}
         """Connections that resumed this session; the event is set when a connection is no longer needed."""
 
@@ -187,6 +191,12 @@ class CaptureSession:
             raise Refusal(GONE, "the session has just ended")
         self._returned.set_result(connection)
         await self._done_with[connection].wait()
+
+    async def finish(self) -> None:
+        """Event loop: leave out later frames. Returns once what has arrived is answered or the session has ended."""
+        self._is_finishing = True
+        while not (self._has_ended or self._mailbox.is_idle()):
+            await asyncio.sleep(0.01)
 
     def take_order(self, order: PanoramaOrder) -> bool:
         """Event loop: queue an order behind what the client has sent. Returns whether there was room."""
@@ -236,14 +246,24 @@ class CaptureSession:
         """Close the socket according to the result of the reader or the worker, whichever ended first."""
         try:
             ended.result()
+            self.why_ended = self._way_of_leaving()
             await self._connection.close()
         except ClientGone:
-            log.info("a client left")
+            self.why_ended = self._connection.dismissal or "the client is gone or does not read"
         except Refusal as refusal:
+            self.why_ended = refusal.reason
             await self._connection.refuse(refusal)
         except Exception as error:  # reported to both sides: a fault of this session must not reach another
             log.exception("a session failed")
+            self.why_ended = f"the server failed: {type(error).__name__}"
             await self._connection.refuse(_told(error))
+
+    def _way_of_leaving(self) -> str:
+        if self._connection.dismissal:
+            return self._connection.dismissal
+        if self._connection.is_lost:
+            return "the connection was lost" + (", the client has not come back" if self._keep_s > 0 else "")
+        return "the client left"
 
     async def _read(self) -> None:
         """Post the client's messages until it leaves. Pauses while too much is unread."""
@@ -263,6 +283,8 @@ class CaptureSession:
     async def _post(self, message: ClientMessage) -> None:
         if isinstance(message, Hello | Watch | Bye):
             raise Refusal(POLICY, f"{type(message).__name__.lower()} was received in a session that captures already")
+        if self._is_finishing and isinstance(message, Frame):
+            return  # unanswered: its client sends it again where it connects next
         while not self._mailbox.has_room():
             self._mailbox_has_space.clear()
             await self._mailbox_has_space.wait()

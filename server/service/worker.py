@@ -150,7 +150,7 @@ class Worker:
         self._outbox.answer_to(queued.connection)
         if isinstance(queued.message, Frame):
             self._arrived_s = queued.arrived_s
-            self._context.metrics.queue_age_ms.observe(queued.age_ms)
+            self._context.metrics.queue_age_s.observe(queued.age_ms / 1e3)
             self._answer_frame(pipeline, queued.message)
         elif isinstance(queued.message, RequestMesh):
             self._send_mesh(pipeline, queued.message.request)
@@ -219,7 +219,7 @@ class Worker:
                 self._adapt_sampling(pipeline)
         except ValueError as error:
             return self._drop(frame, "refused", error)
-        self._context.metrics.turn_ms.observe(turn.waited_s * 1e3)
+        self._context.metrics.turn_s.observe(turn.waited_s)
         self._context.metrics.observe_stages(result.timings)
         self._context.metrics.processed.inc()
         self._deliver(frame, result)
@@ -285,7 +285,7 @@ class Worker:
             exposure=frame.exposure,
             has_depth=frame.depth is not None,
         )
-        self._context.metrics.decode_ms.observe((time.perf_counter() - start_s) * 1e3)
+        self._context.metrics.decode_s.observe(time.perf_counter() - start_s)
         return rgbd
 
     def _drop(self, frame: Frame, cause: str, error: ValueError) -> None:
@@ -332,7 +332,7 @@ class Worker:
         """Build and encode an answer, and record the time."""
         start_s = time.perf_counter()
         data = encode(structs.replace(make(), waited_ms=self._waited_ms))
-        self._context.metrics.encode_ms.observe((time.perf_counter() - start_s) * 1e3)
+        self._context.metrics.encode_s.observe(time.perf_counter() - start_s)
         return data
 
 
@@ -376,8 +376,8 @@ class _Overhead:
 
     def record(self, metrics: Metrics) -> None:
         """Record both times; call when the frame is answered."""
-        metrics.overhead_ms.observe((self._wall_s + time.perf_counter() - self._outbox.waited_s) * 1e3)
-        metrics.overhead_cpu_ms.observe((self._cpu_s + time.thread_time()) * 1e3)
+        metrics.overhead_s.observe(self._wall_s + time.perf_counter() - self._outbox.waited_s)
+        metrics.overhead_cpu_s.observe(self._cpu_s + time.thread_time())
 
 
 def apply_control(

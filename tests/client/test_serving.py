@@ -63,3 +63,24 @@ def test_limits_of_rooms_on_disk() -> None:
     assert (other.space_bytes, other.age_s) == (1 << 29, 2 * 86400)
     none = limits_of(ServeOptions("localhost", data_gib=0, data_days=0)).room_retention
     assert (none.space_bytes, none.age_s) == (None, None)
+
+
+def test_the_token_is_read_from_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "token"
+    file.write_text("from-a-file\n")
+    assert authenticator_of(ServeOptions(host="0.0.0.0", token_file=file)).token == "from-a-file"
+    with pytest.raises(OptionError, match="both given"):
+        authenticator_of(ServeOptions(host="h", token="x", token_file=file))
+    with pytest.raises(OptionError, match="--insecure"):
+        authenticator_of(ServeOptions(host="h", insecure=True, token_file=file))
+
+
+@pytest.mark.parametrize("content", [None, b"", b"\n", b"two words", b"\xff\xfe", b"x" * 257, b"a\nb"])
+def test_a_file_without_a_token_is_named_and_not_shown(content: bytes | None, tmp_path: Path) -> None:
+    file = tmp_path / "token"
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(OptionError, match="--token-file: ") as refused:
+        authenticator_of(ServeOptions(host="h", token_file=file))
+    assert str(file) in str(refused.value)
+    assert "two words" not in str(refused.value)

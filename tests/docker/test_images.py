@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 from server.cluster.settings import read_settings
+from server.service.limits import DEFAULT_LIMITS
 from server.service.serve import STOP_PATIENCE_S
 from tests.docker.dockerfile import ROOT, Image, copies, install_steps, read_image
 
@@ -64,6 +65,12 @@ def test_what_is_copied_exists_and_is_the_whole_program(image) -> None:
 
 
 @each_image
+def test_its_base_is_pinned_and_that_of_the_others(image) -> None:
+    assert re.fullmatch(r"debian:bookworm-slim@sha256:[0-9a-f]{64}", image.last("FROM"))
+    assert image.last("FROM") == IMAGES["cpu"].last("FROM")
+
+
+@each_image
 def test_it_runs_without_rights_and_is_stopped_in_order(image) -> None:
     user = re.search(r"^USER_ID=(\d+)$", (ROOT / "docker/install.sh").read_text(), re.MULTILINE)
     assert user
@@ -104,7 +111,7 @@ def test_start_script_puts_the_server_in_its_place(tmp_path: Path) -> None:
     shutil.copy(ROOT / "docker/start.sh", tmp_path / "docker")
     program = tmp_path / ".venv/bin/probeless"
     program.parent.mkdir(parents=True)
-    program.write_text('#!/bin/sh\necho "$$ $*"\n')
+    program.write_text('#!/bin/sh\necho "$$ $*"\necho an event >&2\n')
     program.chmod(0o755)
     started = subprocess.Popen(
         ["sh", tmp_path / "docker/start.sh", "--sessions", "3"],
@@ -112,7 +119,7 @@ def test_start_script_puts_the_server_in_its_place(tmp_path: Path) -> None:
         env={"PATH": os.environ["PATH"]},
     )
     said, _ = started.communicate()
-    assert said.decode() == f"{started.pid} serve --host 0.0.0.0 --port 8080 --log json --sessions 3\n"
+    assert said.decode() == f"{started.pid} serve --host 0.0.0.0 --port 8080 --log json --sessions 3\nan event\n"
 
 
 @pytest.mark.parametrize(("status", "expected"), [(200, 0), (503, 1), (None, 1)])
@@ -155,13 +162,18 @@ def test_compose_runs_the_images_with_nothing_they_do_not_need(name) -> None:
     volume, _, where = service["volumes"][0].partition(":")
     assert volume in COMPOSE["volumes"]
     assert where == image.last("VOLUME")
-    assert service["environment"]["PROBELESS_TOKEN"].startswith("${PROBELESS_TOKEN:?")
+    assert service["environment"] == {"PROBELESS_TOKEN_FILE": f"/run/secrets/{service['secrets'][0]}"}
+    assert COMPOSE["secrets"][service["secrets"][0]]["file"].startswith("${PROBELESS_TOKEN_PATH:?")
+    assert service["mem_limit"] == service["memswap_limit"]
+    assert service["ulimits"]["nofile"]["soft"] >= 4 * DEFAULT_LIMITS.connections_per_address
+    assert service["ulimits"]["core"] == 0
     assert service["read_only"]
     assert service["cap_drop"] == ["ALL"]
     assert service["ports"][0].endswith(":" + image.last("EXPOSE"))
     assert float(service["stop_grace_period"].rstrip("s")) > STOP_PATIENCE_S
     known = {"build", "cap_drop", "deploy", "environment", "image", "pids_limit", "ports", "profiles", "read_only"}
-    assert set(service) <= known | {"restart", "security_opt", "stop_grace_period", "tmpfs", "volumes"}
+    known |= {"restart", "security_opt", "stop_grace_period", "tmpfs", "volumes"}
+    assert set(service) <= known | {"mem_limit", "memswap_limit", "secrets", "ulimits"}
 
 
 def test_ray_service_says_what_the_application_understands() -> None:

@@ -62,16 +62,16 @@ def test_a_full_disk_and_a_kill_take_nothing_that_was_acknowledged_without_an_er
 
 
 def samples(counts: dict[str, float]) -> dict[tuple[str, ...], float]:
-    return {("probeless_overhead_ms_bucket", bound): count for bound, count in counts.items()}
+    return {("probeless_overhead_seconds_bucket", bound): count for bound, count in counts.items()}
 
 
 def test_percentiles_are_of_what_came_between() -> None:
-    before = samples({"1.0": 5, "5.0": 5, "10.0": 5, "+Inf": 5})
-    after = samples({"1.0": 55, "5.0": 95, "10.0": 105, "+Inf": 105})
-    under, p99 = overhead(before, after, "overhead_ms")
+    before = samples({"0.001": 5, "0.005": 5, "0.01": 5, "+Inf": 5})
+    after = samples({"0.001": 55, "0.005": 95, "0.01": 105, "+Inf": 105})
+    under, p99 = overhead(before, after, "overhead_seconds")
     assert under == pytest.approx(0.9)
     assert 9.4 < p99 < 9.6
-    assert np.isnan(overhead(after, after, "overhead_ms")[1])
+    assert np.isnan(overhead(after, after, "overhead_seconds")[1])
 
 
 def test_growth_is_of_the_halves() -> None:

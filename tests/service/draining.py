@@ -17,6 +17,7 @@ from tests.service.wire import Wire
 def draining(server: BackgroundServer, lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
     """With the client for whose frame it waits."""
     monkeypatch.setattr("server.service.serve.DRAIN_PATIENCE_S", 10 * PATIENCE_S)
+    monkeypatch.setattr("server.service.graceful_shutdown.ANSWER_PATIENCE_S", 0.0)
     lab.hold = True
     wire = Wire(server.url)
     wire.greet()

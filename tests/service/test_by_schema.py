@@ -17,7 +17,16 @@ EXAMPLES = 15
 def test_every_answer_is_described(server) -> None:
     found = requests_by_schema(create_app(Service(FAKE_DEVICE)), server.url, EXAMPLES)
     assert not found.wrong
-    paths = ("/healthz", "/metrics", "/v1/objects", "/v1/objects/{name}", "/v1/panorama.hdr", "/v1/panorama.exr")
+    paths = (
+        "/livez",
+        "/readyz",
+        "/healthz",
+        "/metrics",
+        "/v1/objects",
+        "/v1/objects/{name}",
+        "/v1/panorama.hdr",
+        "/v1/panorama.exr",
+    )
     assert set(found.requests) == {f"GET {path}" for path in paths}
     assert found.requests["GET /v1/objects/{name}"] >= EXAMPLES
 

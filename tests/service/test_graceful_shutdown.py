@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from unittest.mock import MagicMock, patch
 
 import httpx
@@ -14,7 +15,7 @@ import pytest
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
-from protocol.messages import Bye, Composite, Error
+from protocol.messages import Acknowledged, Bye, Composite, Dropped, Error, Quality
 from server.service.graceful_shutdown import DRAINING, GOODBYE, GracefulShutdown
 from server.service.lingering_close import LingeringCloseWebSocket
 from server.service.serve import BackgroundServer
@@ -62,6 +63,7 @@ def test_a_connection_that_is_closing_does_not_keep_the_server_from_leaving(stat
 def test_while_a_session_ends_nobody_new_is_taken_and_health_says_so(start_server, lab, monkeypatch) -> None:
     server = start_server()
     monkeypatch.setattr("server.service.serve.DRAIN_PATIENCE_S", 10 * PATIENCE_S)
+    monkeypatch.setattr("server.service.graceful_shutdown.ANSWER_PATIENCE_S", 0.0)
     lab.hold = True
     wire = Wire(server.url)
     wire.greet()
@@ -80,6 +82,47 @@ def test_while_a_session_ends_nobody_new_is_taken_and_health_says_so(start_serve
     lab.release()
     stopped.join(PATIENCE_S)
     assert lab.closed.is_set()
+
+
+def test_frames_on_the_way_are_answered_before_the_goodbye(start_server, lab, monkeypatch) -> None:
+    monkeypatch.setattr("server.service.serve.DRAIN_PATIENCE_S", 10 * PATIENCE_S)
+    monkeypatch.setattr("server.service.graceful_shutdown.ANSWER_PATIENCE_S", PATIENCE_S)
+    server = start_server()
+    lab.hold = True
+    wire = Wire(server.url)
+    wire.greet()
+    wire.say(frame_message(0), frame_message(1))
+    lab.next_entered()
+    wire.say(Quality(request=1, preset="no such preset"))  # answered by the reader, after it has read the frames
+    assert isinstance(wire.hear(), Acknowledged)
+    stopped = stopping(server)
+    lab.release(2)
+    code, reason, messages = wire.ending()
+    assert [message.frame for message in messages if isinstance(message, Composite)] == [0, 1]
+    assert messages[-1] == Bye(reason=GOODBYE)
+    assert (code, reason) == (1012, GOODBYE)
+    stopped.join(PATIENCE_S)
+
+
+def test_frames_sent_while_it_stops_are_left_to_the_next_server(start_server, lab, monkeypatch) -> None:
+    monkeypatch.setattr("server.service.serve.DRAIN_PATIENCE_S", 10 * PATIENCE_S)
+    monkeypatch.setattr("server.service.graceful_shutdown.ANSWER_PATIENCE_S", PATIENCE_S)
+    server = start_server()
+    lab.hold = True
+    wire = Wire(server.url)
+    wire.greet()
+    wire.say(frame_message(0))
+    lab.next_entered()
+    stopped = stopping(server)
+    while not server.service.shutdown.is_draining:
+        time.sleep(0.01)
+    wire.say(frame_message(1), Quality(request=1, preset="no such preset"))
+    assert isinstance(wire.hear(), Acknowledged)  # the frame before it has been read
+    lab.release(2)
+    _, _, messages = wire.ending()
+    answers = [message for message in messages if isinstance(message, Composite | Dropped)]
+    assert [(type(answer), answer.frame) for answer in answers] == [(Composite, 0)]
+    stopped.join(PATIENCE_S)
 
 
 def test_what_must_not_be_lost_is_saved_after_the_sessions(start_server, lab) -> None:

@@ -1,6 +1,7 @@
 """The mailbox between two threads: latest frame wins, control messages keep their place."""
 
 import threading
+import time
 
 import msgspec
 import pytest
@@ -196,3 +197,19 @@ def test_more_of_a_kind_is_taken_only_as_far_as_it_is_next() -> None:
     assert drain(mailbox, 2) == [quality(3), moves[3]]
     assert mailbox.take_while(MoveObject) == []  # and waits for none
     assert len(taken) == 4
+
+
+def test_it_is_idle_when_the_reader_waits_for_a_message() -> None:
+    mailbox = Mailbox(2)
+    assert mailbox.is_idle()
+    mailbox.post(frame_message(0))
+    assert not mailbox.is_idle()
+    mailbox.take()
+    assert not mailbox.is_idle()  # its answer may not have been sent yet
+    reader = threading.Thread(target=mailbox.take)
+    reader.start()
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not mailbox.is_idle():
+        assert time.monotonic() < deadline_s
+    mailbox.close()
+    reader.join(PATIENCE_S)

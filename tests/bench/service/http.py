@@ -27,6 +27,8 @@ PATHS = (
     "/",
     "/index.html",
     "/healthz",
+    "/livez",
+    "/readyz",
     "/metrics",
     "/v1/stream",
     "/docs",

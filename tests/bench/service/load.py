@@ -3,9 +3,9 @@
 Overhead is the service's time for a frame that is neither the pipeline's nor waiting: from when a session's thread
 takes the frame from its mailbox until the socket has taken the last byte of the answer (decoding, encoding, handing
 over between threads), less the wait for its turn on the device, its turn, and the wait for the socket. Of the processor
-it is what that thread took (`probeless_overhead_cpu_ms`) and, in mean, what event loop and picture readers took for a
-frame, watchers and all. On the clock (`probeless_overhead_ms`) it holds the wait for a processor too, where kernels of
-other sessions' frames have them all.
+it is what that thread took (`probeless_overhead_cpu_seconds`) and, in mean, what event loop and picture readers took
+for a frame, watchers and all. On the clock (`probeless_overhead_seconds`) it holds the wait for a processor too, where
+kernels of other sessions' frames have them all.
 """
 
 from __future__ import annotations
@@ -78,14 +78,14 @@ def load_part(run: Run, out: Path) -> Part:
     part.add(f"{name}: frames/s in all", sum(shares) / load.seconds, "frames/s")
     part.add(f"{name}: most frames of a session over fewest", 100 * (shares[-1] / max(shares[0], 1) - 1), "%", "<= 20")
     beside_ms = 1e3 * load.beside_s / max(sum(shares), 1)
-    _, cpu_ms = overhead(load.before, load.after, "overhead_cpu_ms")
+    _, cpu_ms = overhead(load.before, load.after, "overhead_cpu_seconds")
     part.add(f"{name}: overhead, 99th percentile, of the processor", cpu_ms + beside_ms, "ms", f"<= {GOAL_MS:g}")
-    under, wall_ms = overhead(load.before, load.after, "overhead_ms")
+    under, wall_ms = overhead(load.before, load.after, "overhead_seconds")
     part.add(f"{name}: overhead, 99th percentile, on the clock", wall_ms, "ms", f"<= {GOAL_MS:g}")
     part.add(f"{name}: frames with an overhead below {GOAL_MS:g} ms on the clock", 100 * under, "%")
     part.add(f"{name}: event loop and picture readers, of the processor, a frame", beside_ms, "ms")
-    for metric in ("decode_ms", "encode_ms", "turn_ms", "queue_age_ms"):
-        part.add(f"{name}: mean {metric}", mean_of(load.before, load.after, metric), "ms")
+    for metric in ("decode", "encode", "turn", "queue_age"):
+        part.add(f"{name}: mean {metric}_ms", 1e3 * mean_of(load.before, load.after, f"{metric}_seconds"), "ms")
     part.add(f"{name}: growth of memory, first half to second", growth(load.memory_mb), "%", "<= 1")
     part.add(f"{name}: most memory over least", 100 * (max(load.memory_mb) / min(load.memory_mb) - 1), "%")
     part.add(f"{name}: memory of the server and its parsers at the end", load.memory_mb[-1], "MB")
@@ -286,9 +286,9 @@ Samples = Mapping[tuple[str, ...], float]
 
 
 def overhead(before: Samples, after: Samples, metric: str) -> tuple[float, float]:
-    """Share of the frames below `GOAL_MS`, and the 99th percentile in ms, linear within a bucket."""
+    """Share of the frames below `GOAL_MS`, and the 99th percentile in ms, linear in a bucket. `metric`: in seconds."""
     name = f"probeless_{metric}_bucket"
-    counts = sorted((float(key[1]), n - before.get(key, 0.0)) for key, n in after.items() if key[0] == name)
+    counts = sorted((1e3 * float(key[1]), n - before.get(key, 0.0)) for key, n in after.items() if key[0] == name)
     total = counts[-1][1]
     if not total:
         return 0.0, float("nan")

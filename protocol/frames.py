@@ -155,7 +155,7 @@ def _check_distortion(owner: str, lens: CameraModel | DepthCamera) -> None:
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     u = lens.fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + lens.cx
     v = lens.fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + lens.cy
-    inside = (u >= -0.5) & (u <= lens.width - 0.5) & (v >= -0.5) & (v <= lens.height - 0.5)
+    inside = (radial > 0) & (u >= -0.5) & (u <= lens.width - 0.5) & (v >= -0.5) & (v <= lens.height - 0.5)
     if inside.mean() < LEAST_PICTURE_SHARE:
         raise ValueError(
             f"{owner}.distortion leaves {100 * inside.mean():.0f} % of the picture: it is k1, k2, p1, p2, k3 of OpenCV"

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
 from protocol.limits import MAX_MESSAGE_BYTES, MAX_REASON_CHARS
 from protocol.messages import ClientMessage, ServerMessage
+from protocol.missing_fields import missing_fields
 
 T = TypeVar("T")
 _END_CHARS = 120
@@ -48,19 +49,22 @@ def encode(message: ClientMessage | ServerMessage) -> bytes:
 
 def decode_client(data: bytes | bytearray | memoryview) -> ClientMessage:
     """Decode a client's message. Raises ProtocolError, naming the field as `$.depth.width`."""
-    return _decode(_client_decoder, data)
+    return _decode(_client_decoder, data, ClientMessage)
 
 
 def decode_server(data: bytes | bytearray | memoryview) -> ServerMessage:
     """Decode a server's message. Raises ProtocolError, naming the field as `$.light.sh`."""
-    return _decode(_server_decoder, data)
+    return _decode(_server_decoder, data, ServerMessage)
 
 
-def _decode(decoder: msgspec.msgpack.Decoder[T], data: bytes | bytearray | memoryview) -> T:
+def _decode(decoder: msgspec.msgpack.Decoder[T], data: bytes | bytearray | memoryview, union: Any) -> T:
     _require_size(memoryview(data).nbytes)
     try:
         return decoder.decode(data)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        missing = missing_fields(data, union) if "missing required field" in str(error) else []
+        if len(missing) > 1:
+            raise ProtocolError(f"not a valid message: required fields are missing: {', '.join(missing)}") from error
         raise ProtocolError(f"not a valid message: {error}") from error
     except RecursionError as error:
         raise ProtocolError("not a valid message: lists or maps in it are nested too deeply") from error

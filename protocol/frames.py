@@ -34,6 +34,8 @@ GREATEST_DISTORTION = 100.0
 """Greatest coefficient: those of k3 reach tens where a narrow lens is calibrated."""
 DEPTH_SCALE_M = (1e-6, 1.0)
 """Least and greatest unit of depth: micrometres to metres."""
+LEAST_PICTURE_SHARE = 0.1
+"""Of the rectified picture, that a distortion must leave inside the picture that is sent."""
 _NEAR_ROTATION = 1e-3
 
 
@@ -41,12 +43,19 @@ class DepthCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """Lens of the depth image, if it differs from the colour lens; conventions as in `CameraModel`."""
 
     width: int
+    """Pixels."""
     height: int
+    """Pixels."""
     fx: float
+    """Focal length in pixels: of the width's direction."""
     fy: float
+    """Focal length in pixels: of the height's direction."""
     cx: float
+    """Principal point, pixels; 0 is the centre of the first column."""
     cy: float
+    """Pixels; 0 is the centre of the first row."""
     distortion: Distortion = NO_DISTORTION
+    """OpenCV's k1, k2, p1, p2, k3; all zero for a rectified picture."""
     color_from_depth: Matrix4 = IDENTITY
     """Row-major rigid 4x4, metres: point_in_color_camera = color_from_depth * point_in_depth_camera."""
 
@@ -63,15 +72,23 @@ class CameraModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """
 
     width: int
+    """Pixels."""
     height: int
+    """Pixels."""
     fx: float
+    """Focal length in pixels: of the width's direction."""
     fy: float
+    """Focal length in pixels: of the height's direction."""
     cx: float
+    """Principal point, pixels; 0 is the centre of the first column."""
     cy: float
+    """Pixels; 0 is the centre of the first row."""
     depth_scale_m: float = 0.001
     """Metres per unit of the uint16 depth."""
     distortion: Distortion = NO_DISTORTION
+    """OpenCV's k1, k2, p1, p2, k3; all zero for a rectified picture."""
     color_encoding: ColorEncoding = "srgb8"
+    """What the numbers of every colour picture of the session are."""
     depth: DepthCamera | None = None
     """None: depth is registered to colour, pixel by pixel."""
 
@@ -124,6 +141,25 @@ def check_physical(camera: CameraModel) -> None:
         for number in lens.distortion:
             if abs(number) > GREATEST_DISTORTION:
                 raise ValueError(f"{owner}.distortion has {number:g}, more than {GREATEST_DISTORTION:g}")
+        _check_distortion(owner, lens)
+
+
+def _check_distortion(owner: str, lens: CameraModel | DepthCamera) -> None:
+    """Refuse a lens whose rectified pixels lie nearly all outside of the picture that is sent (OpenCV's model)."""
+    k1, k2, p1, p2, k3 = lens.distortion
+    x, y = np.meshgrid(
+        (np.linspace(0, lens.width - 1, 33) - lens.cx) / lens.fx,
+        (np.linspace(0, lens.height - 1, 33) - lens.cy) / lens.fy,
+    )
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    u = lens.fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + lens.cx
+    v = lens.fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + lens.cy
+    inside = (radial > 0) & (u >= -0.5) & (u <= lens.width - 0.5) & (v >= -0.5) & (v <= lens.height - 0.5)
+    if inside.mean() < LEAST_PICTURE_SHARE:
+        raise ValueError(
+            f"{owner}.distortion leaves {100 * inside.mean():.0f} % of the picture: it is k1, k2, p1, p2, k3 of OpenCV"
+        )
 
 
 def _check_axis(owner: str, axis: str, size: int, focal_px: float, center_px: float) -> None:

@@ -52,6 +52,16 @@ ColorCodec = Literal["jpeg", "png", "raw", "h264"]
 DepthCodec = Literal["raw", "zdelta", "zranks", "zstd-delta", "zstd-ranks"]
 
 
+LEAST_VOLUME_M = 0.01
+"""Side of a volume: a voxel or more."""
+GREATEST_LIGHT = 1e6
+"""Greatest coefficient of a given light; a picture's radiance is at most 1."""
+GREATEST_TURN_DEG = 36_000.0
+"""Hundred turns: beyond, float32 has no tenth of a degree."""
+GREATEST_TIMESTAMP_S = 1e15
+"""Beyond it a float64 has no millisecond."""
+
+
 def _require_auto(where: str, preset: str, *chosen_by: float | None) -> None:
     if preset != "auto" and any(value is not None for value in chosen_by):
         raise ValueError(f"{where}: a budget or a greatest light error chooses the preset: it must be auto")
@@ -65,12 +75,42 @@ def _require_finite(owner: str, **fields: object) -> None:
             raise ValueError(f"{owner}.{name} must be finite")
 
 
+def _require_near(owner: str, **places: tuple[float, ...] | None) -> None:
+    """Raise ValueError naming the field if a coordinate is not finite or is farther than GREATEST_PLACE_M."""
+    _require_finite(owner, **places)
+    for name, place in places.items():
+        farthest_m = max(map(abs, place), default=0.0) if place else 0.0
+        if farthest_m > GREATEST_PLACE_M:
+            raise ValueError(
+                f"{owner}.{name} has {farthest_m:g} m, at most {GREATEST_PLACE_M:g} m: is it in millimetres?"
+            )
+
+
+def _require_direction(name: str, direction: Vector3 | None) -> None:
+    """Raise ValueError if a direction has no usable length in float32."""
+    if direction is None:
+        return
+    if math.hypot(*direction) < 1e-6:
+        raise ValueError(f"{name} must not be zero")
+    if math.hypot(*direction) > 1e6:
+        raise ValueError(f"{name} is {math.hypot(*direction):g} long, must be at most 1e6: give a unit vector")
+
+
+def _require_turn(owner: str, yaw_deg: float) -> None:
+    _require_finite(owner, yaw_deg=yaw_deg)
+    if abs(yaw_deg) > GREATEST_TURN_DEG:
+        raise ValueError(f"{owner}.yaw_deg is {yaw_deg:g}, must be within {GREATEST_TURN_DEG:g} degrees")
+
+
 class Payload(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """An encoded image. The declared size comes first, so that it is checked before the data is decoded."""
 
     width: Side
+    """Pixels."""
     height: Side
+    """Pixels."""
     data: Bytes
+    """The encoded picture, as its codec says."""
 
     def __post_init__(self) -> None:
         if self.width * self.height > MAX_IMAGE_PIXELS:
@@ -84,7 +124,9 @@ class ColorImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True)
     """
 
     codec: ColorCodec
+    """How `data` is encoded."""
     encoding: ColorEncoding = "srgb8"
+    """What the numbers are; that of the session's camera."""
 
 
 class DepthImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
@@ -95,6 +137,7 @@ class DepthImage(Payload, frozen=True, forbid_unknown_fields=True, kw_only=True,
     """
 
     codec: DepthCodec
+    """How `data` is encoded."""
     rounded_per_m: Annotated[float, Meta(gt=0, le=1)] | None = None
     """Rounding by the sender: each depth z (metres) was changed by at most this times z^2; None: no rounding."""
 
@@ -114,6 +157,7 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     max_light_error_deg: LightErrorDeg | None = None
     """With `auto`: choose the fastest point whose error of the dominant direction was measured to be no larger."""
     rays: Annotated[int, Meta(ge=4, le=1024)] = 81
+    """Directions that are traced from a place."""
     stride: Annotated[int, Meta(ge=1, le=16)] | None = None
     """A1: distance between transfer samples in pixels. None here and in the next four fields: the preset's value."""
     interleave: Literal[1, 2, 4, 8] | None = None
@@ -129,8 +173,11 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     ray_length_m: Annotated[float, Meta(ge=0, le=1000)] | None = None
     """None: the whole room."""
     bands: Annotated[int, Meta(ge=2, le=MAX_SH_BANDS)] = 4
+    """SH bands of the estimated light: 4 are 16 coefficients."""
     albedo: Literal["constant", "estimated"] = "estimated"
+    """Of real surfaces: the same everywhere, or estimated from the pictures."""
     indirect: Literal["none", "observed"] = "observed"
+    """Light from one real surface to another: left out, or as photographed."""
     as_thesis: bool = False
     """Plain least squares with rays of 10 cm; one albedo and no indirect light, whatever the fields above say."""
     denoise: Literal["none", "bilateral", "tv_l1"] = "none"
@@ -138,9 +185,11 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     denoise_iterations: Annotated[int, Meta(ge=1, le=1000)] = 20
     """Iterations of TV-L1."""
     poses: Poses = "given"
+    """`given`: those of the frames; `track`: the server finds them; `refine`: it corrects those of the frames."""
     volume_m: tuple[float, float, float, float, float, float] | None = None
     """x0, y0, z0, x1, y1, z1 in world metres; None: the view of the first frame."""
-    voxel_m: Annotated[float, Meta(gt=0, le=1)] | None = None
+    voxel_m: Annotated[float, Meta(ge=1e-4, le=1)] | None = None
+    """Side of a cell of the volume; None: from the size of the volume."""
     up: Vector3 | None = None
     """World direction; None: found from the scan, else the first camera's -y, as the notes of the answers say."""
     light: tuple[Rgb, ...] | None = None
@@ -176,19 +225,24 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Answers use PNG, and every frame is answered in order instead of latest-wins."""
 
     def __post_init__(self) -> None:
-        _require_finite(
-            "wishes", ray_length_m=self.ray_length_m, volume_m=self.volume_m, voxel_m=self.voxel_m, up=self.up
-        )
+        _require_finite("wishes", ray_length_m=self.ray_length_m, voxel_m=self.voxel_m, up=self.up)
+        _require_near("wishes", volume_m=self.volume_m)
         _require_auto("wishes", self.preset, self.budget_ms, self.max_light_error_deg)
-        _require_finite("wishes", light_at=tuple(value for place in self.light_at for value in place))
+        _require_near("wishes", light_at=tuple(value for place in self.light_at for value in place))
         if len(self.light_at) > MAX_LIGHT_PLACES:
             raise ValueError(f"wishes.light_at names {len(self.light_at)} places, at most {MAX_LIGHT_PLACES} are told")
         if self.volume_m is not None and not all(self.volume_m[a] < self.volume_m[a + 3] for a in range(3)):
             raise ValueError("wishes.volume_m must be x0,y0,z0,x1,y1,z1 with each x0 < x1")
-        if self.up is not None and math.hypot(*self.up) < 1e-6:
-            raise ValueError("wishes.up must not be zero")
+        if self.volume_m is not None:
+            side_m = min(self.volume_m[axis + 3] - self.volume_m[axis] for axis in range(3))
+            if side_m < LEAST_VOLUME_M:
+                raise ValueError(f"wishes.volume_m has a side of {side_m:g} m, must be at least {LEAST_VOLUME_M:g} m")
+        _require_direction("wishes.up", self.up)
         if self.light is not None:
             _require_finite("wishes", light=tuple(value for row in self.light for value in row))
+            brightest = max((abs(value) for row in self.light for value in row), default=0.0)
+            if brightest > GREATEST_LIGHT:
+                raise ValueError(f"wishes.light has {brightest:g}, must be at most {GREATEST_LIGHT:g}")
             if len(self.light) not in [bands * bands for bands in range(1, MAX_SH_BANDS + 1)]:
                 raise ValueError(f"wishes.light must have 1, 4, 9 ... {MAX_SH_BANDS**2} coefficients")
 
@@ -204,17 +258,22 @@ class Marker(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A square fiducial marker that the clients of a room may detect."""
 
     id: Annotated[int, Meta(ge=0, le=999)]
+    """Number of the marker in its dictionary."""
     side_m: Annotated[float, Meta(gt=0.005, le=5)]
     """Side of the black square."""
     dictionary: Dictionary = "4x4_50"
+    """OpenCV's name of the set of markers."""
 
 
 class Hello(Message, frozen=True, kw_only=True, omit_defaults=True, tag="hello"):
     """First message of a capturing client."""
 
     client: Name
+    """Name of the program, for the server's log."""
     camera: CameraModel
+    """Lens and size of the pictures that follow."""
     wishes: Wishes = Wishes()
+    """Options of the session."""
     room: Name | None = None
     """Clients of one room share volume, light and objects; None: a room of its own."""
     room_key: Key | None = None
@@ -253,8 +312,11 @@ class Frame(Message, frozen=True, kw_only=True, omit_defaults=True, tag="frame")
     """One RGB-D frame; answered by exactly one of composite or layer (with its light before it), dropped or error."""
 
     frame: Index
+    """Number by which the frame is answered; a client counts upwards."""
     timestamp_s: float
+    """Seconds of the client's clock, increasing."""
     world_from_camera: Matrix4 | None
+    """Pose of the colour camera; None where the server tracks."""
     color: ColorImage | None = None
     """None, with a pose and no depth: the view of a client without a camera, in a room that others scan."""
     depth: DepthImage | None = None
@@ -267,6 +329,10 @@ class Frame(Message, frozen=True, kw_only=True, omit_defaults=True, tag="frame")
 
     def __post_init__(self) -> None:
         _require_finite("frame", timestamp_s=self.timestamp_s)
+        if abs(self.timestamp_s) > GREATEST_TIMESTAMP_S:
+            raise ValueError(
+                f"frame.timestamp_s is {self.timestamp_s:g}, at most {GREATEST_TIMESTAMP_S:g}: give seconds"
+            )
         if self.world_from_camera is not None:
             check_rigid("frame.world_from_camera", self.world_from_camera, GREATEST_PLACE_M)
         if self.color is None and (self.depth is not None or self.world_from_camera is None):
@@ -289,36 +355,43 @@ class Spot(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_d
     """World, of any length."""
 
     def __post_init__(self) -> None:
-        _require_finite("spot", pixel=self.pixel, origin_m=self.origin_m, direction=self.direction)
+        _require_finite("spot", pixel=self.pixel, direction=self.direction)
+        _require_near("spot", origin_m=self.origin_m)
         has_ray = self.origin_m is not None and self.direction is not None
         if (self.pixel is not None) != (self.on == "pixel") or (self.frame is not None and self.on != "pixel"):
             raise ValueError("spot.pixel is needed on a pixel, and it and spot.frame are of no other spot")
         if has_ray != (self.on == "ray") or (self.origin_m is None) != (self.direction is None):
             raise ValueError("spot.origin_m and spot.direction are needed on a ray, and are of no other spot")
-        if self.direction is not None and math.hypot(*self.direction) < 1e-6:
-            raise ValueError("spot.direction must not be zero")
+        _require_direction("spot.direction", self.direction)
 
 
 class PlaceObject(Message, frozen=True, kw_only=True, omit_defaults=True, tag="place_object"):
     """Place a virtual object; acknowledged. With `spot`, the answer to the frame in which it is found tells where."""
 
     request: Index
+    """Number by which the request is answered, used once in a session."""
     object: Name
+    """Its name; an object that has it is replaced."""
     format: ObjectFormat
+    """Of the file."""
     data: Annotated[bytes, Meta(max_length=MAX_MESH_BYTES)]
+    """The bytes of the file."""
     position_m: Vector3 | None = None
     """World position of the bottom centre of the model's box; None, without `spot`: the vertices are world coordinates
     already."""
-    scale: Annotated[float, Meta(gt=0, le=1000)] = 1.0
+    scale: Annotated[float, Meta(ge=1e-6, le=1000)] = 1.0
     """Not used on an `auto` spot."""
     yaw_deg: float = 0.0
+    """Turn about the up axis."""
     spot: Spot | None = None
     """In place of `position_m`."""
-    height_m: Annotated[float, Meta(gt=0, le=1000)] | None = None
+    height_m: Annotated[float, Meta(ge=1e-4, le=1000)] | None = None
     """Height of the placed model, in place of `scale`."""
 
     def __post_init__(self) -> None:
-        _require_finite("place_object", position_m=self.position_m, scale=self.scale, yaw_deg=self.yaw_deg)
+        _require_finite("place_object", scale=self.scale)
+        _require_near("place_object", position_m=self.position_m)
+        _require_turn("place_object", self.yaw_deg)
         _require_finite("place_object", height_m=self.height_m)
         if self.spot is not None and self.position_m is not None:
             raise ValueError("place_object has a position_m and a spot: leave one out")
@@ -330,29 +403,42 @@ class MoveObject(Message, frozen=True, kw_only=True, tag="move_object"):
     """Move an existing object; acknowledged."""
 
     request: Index
+    """Number by which the request is answered, used once in a session."""
     object: Name
+    """Name of the object."""
     position_m: Vector3
-    scale: Annotated[float, Meta(gt=0, le=1000)] = 1.0
+    """World position of the bottom centre of the model's box."""
+    scale: Annotated[float, Meta(ge=1e-6, le=1000)] = 1.0
+    """Factor on the model's size."""
     yaw_deg: float = 0.0
+    """Turn about the up axis."""
 
     def __post_init__(self) -> None:
-        _require_finite("move_object", position_m=self.position_m, scale=self.scale, yaw_deg=self.yaw_deg)
+        _require_finite("move_object", scale=self.scale)
+        _require_near("move_object", position_m=self.position_m)
+        _require_turn("move_object", self.yaw_deg)
 
 
 class RemoveObject(Message, frozen=True, kw_only=True, tag="remove_object"):
     """Remove an object; acknowledged."""
 
     request: Index
+    """Number by which the request is answered, used once in a session."""
     object: Name
+    """Name of the object."""
 
 
 class Quality(Message, frozen=True, kw_only=True, tag="quality"):
     """Change the preset of the running session, or the budget or error limit that chooses it; acknowledged."""
 
     request: Index
+    """Number by which the request is answered, used once in a session."""
     preset: Preset
+    """As in `wishes`."""
     budget_ms: BudgetMs | None = None
+    """As in `wishes`."""
     max_light_error_deg: LightErrorDeg | None = None
+    """As in `wishes`."""
 
     def __post_init__(self) -> None:
         _require_auto("quality", self.preset, self.budget_ms, self.max_light_error_deg)
@@ -362,24 +448,28 @@ class RequestMesh(Message, frozen=True, kw_only=True, tag="request_mesh"):
     """Request the scanned surface as mesh files; answered by mesh parts and then acknowledged."""
 
     request: Index
+    """Number by which the request is answered, used once in a session."""
 
 
 class RequestPanorama(Message, frozen=True, kw_only=True, omit_defaults=True, tag="request_panorama"):
     """Request the light that arrives at a place as a lat-long picture; answered by a panorama and then acknowledged."""
 
     request: Index
+    """Number by which the request is answered, used once in a session."""
     format: PanoramaFormat
+    """Of the file that is sent back."""
     position_m: Vector3 | None = None
     """World. None: the middle of the first virtual object, or of what the last frame sees if there is none."""
 
     def __post_init__(self) -> None:
-        _require_finite("request_panorama", position_m=self.position_m)
+        _require_near("request_panorama", position_m=self.position_m)
 
 
 class Bye(Message, frozen=True, kw_only=True, tag="bye"):
     """Either side is leaving, with the reason."""
 
     reason: Reason = ""
+    """One line for a person; may be empty."""
 
 
 # ---- server to client --------------------------------------------------------------------------------------------
@@ -389,8 +479,11 @@ class Welcome(Message, frozen=True, kw_only=True, omit_defaults=True, tag="welco
     """Answer to hello and watch."""
 
     session: Name
+    """Name of the session; `waiting` for a watcher while nobody streams."""
     server: Name
+    """Name and version of the server."""
     device: str
+    """Name of the device that computes."""
     max_inflight: int
     """Number of frames that the client may have unanswered."""
     key: str | None = None
@@ -399,6 +492,7 @@ class Welcome(Message, frozen=True, kw_only=True, omit_defaults=True, tag="welco
     """True after a resume. What was sent over earlier connections is not answered any more; requests, and in a lossless
     session frames, are answered if they are sent again."""
     room: Name | None = None
+    """The room that the session is in; None: one of its own."""
     codecs: tuple[ColorCodec, ...] = ("jpeg", "png", "raw")
     """Colour codecs that frames may use."""
     depth_codecs: tuple[DepthCodec, ...] = ("raw", "zdelta", "zstd-delta")
@@ -409,8 +503,11 @@ class LeftOut(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """An effect that did not run, the reason, and a bound on the change, in display units (1 is 1/255)."""
 
     effect: str
+    """Its name."""
     reason: str
+    """Why it was not needed, in words."""
     error_bound: float | None
+    """In display units; None: no bound is known."""
 
 
 class OperatingPoint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -419,6 +516,7 @@ class OperatingPoint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     settings: str
     """The settings, written as options of the command line."""
     reason: str
+    """Why these settings, in words."""
     expected_ms: float | None = None
     """Expected time of a frame; like the next field, only for points that the server chose."""
     light_error_deg: float | None = None
@@ -429,7 +527,9 @@ class Plan(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Effects that ran for a frame, in order, those that were left out, and how the frame was sampled."""
 
     run: tuple[str, ...]
+    """Names of the effects, in order."""
     left_out: tuple[LeftOut, ...]
+    """What did not run."""
     point: OperatingPoint | None = None
     """None if tracking is lost: nothing was sampled."""
 
@@ -441,12 +541,19 @@ class Timings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """
 
     input: float = 0.0
+    """Milliseconds: colour to radiance, depth to points and normals."""
     reconstruct: float = 0.0
+    """Milliseconds: tracking and fusion into the volume."""
     surface: float = 0.0
+    """Milliseconds: ray cast of the volume."""
     dynamic_geometry: float = 0.0
+    """Milliseconds: merging the volume with this frame's depth."""
     radiance_transfer: float = 0.0
+    """Milliseconds: visibility and bounced light."""
     light_estimation: float = 0.0
+    """Milliseconds."""
     rendering: float = 0.0
+    """Milliseconds: effects and composite."""
     total: float = 0.0
     """Wall time."""
     host: float = 0.0
@@ -456,6 +563,7 @@ class Timings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     reads: int = 0
     """Times that the host waited for memory of the device."""
     read_bytes: int = 0
+    """Bytes of those reads."""
 
 
 TIMING_ROWS = (
@@ -492,6 +600,7 @@ class Lamp(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Radiant intensity in units of radiance times m^2. At a distance of d metres it adds intensity / (pi d^2) to the
     radiance of a white surface that faces it."""
     intensity_std: Rgb
+    """One standard deviation."""
     share: float
     """Share of the luminance that visible surfaces receive."""
 
@@ -508,11 +617,17 @@ class ArrivingLight(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     sh: tuple[Rgb, ...]
     """This and the fields below as in `light`; 16 x [r, g, b]."""
     sh_std: tuple[RgbOrNull, ...]
+    """16 x [r, g, b]."""
     sh_webxr: tuple[float, ...]
+    """27 floats."""
     dominant_direction: Vector3
+    """World, unit, towards the light."""
     dominant_intensity: float
+    """As in `light`."""
     spread_deg: float | None
+    """As in `light`."""
     valid: bool
+    """As in `light`."""
     seen: float | None = None
     """Share of the directions from here in which photographed surface is met, 0 to 1; null where unknown."""
     object: Name | None = None
@@ -523,7 +638,9 @@ class Light(Message, frozen=True, kw_only=True, tag="light"):
     """The estimate of the room's light after one frame; the fields of a line of `light.jsonl`."""
 
     frame: Index
+    """The frame it belongs to."""
     timestamp_s: float
+    """That of the frame."""
     sh: tuple[Rgb, ...]
     """16 x [r, g, b], zeros for bands not estimated."""
     sh_all: tuple[Rgb, ...] | None = None
@@ -535,6 +652,7 @@ class Light(Message, frozen=True, kw_only=True, tag="light"):
     dominant_direction: Vector3
     """World, unit, towards the light, from l = 1 of Rec. 709 luminance; (0, 0, 0) if there is none."""
     dominant_intensity: float
+    """Luminance of the light from there, as one direction."""
     dominant_lights: tuple[DirectedLight, ...] = ()
     """Directional components, strongest first; empty if the light is uniform."""
     lamps: tuple[Lamp, ...] = ()
@@ -560,11 +678,17 @@ class Drawn(Message, frozen=True, kw_only=True):
     """Fields common to composite and layer."""
 
     frame: Index
+    """The frame it belongs to."""
     timestamp_s: float
+    """That of the frame."""
     world_from_camera: Matrix4
+    """Pose that was used; the last one while tracking is lost."""
     tracking: Tracking
+    """Where the pose is from; `lost`: none was found."""
     timings: Timings
+    """What the frame cost."""
     plan: Plan
+    """Which effects ran."""
     notes: tuple[str, ...] = ()
     """Problems with this frame's input, one line each."""
     waited_ms: float = 0.0
@@ -575,6 +699,7 @@ class Composite(Drawn, frozen=True, kw_only=True, tag="composite"):
     """The composite image of one frame."""
 
     color: ColorImage
+    """sRGB picture of the camera's size."""
 
 
 class LayerPatch(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -583,6 +708,7 @@ class LayerPatch(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     x: Annotated[int, Meta(ge=0, lt=MAX_IMAGE_SIDE_PX)]
     """Column of the camera's image at which the rectangle begins."""
     y: Annotated[int, Meta(ge=0, lt=MAX_IMAGE_SIDE_PX)]
+    """Row of the camera's image at which the rectangle begins."""
     color: ColorImage
     """PNG."""
     depth: DepthImage
@@ -611,7 +737,9 @@ class Dropped(Message, frozen=True, kw_only=True, tag="dropped"):
     """The frame was replaced by a newer one before it was read, or was refused. It gets no other answer."""
 
     frame: Index
+    """Number of the frame."""
     reason: Reason
+    """One line for a person."""
 
 
 class MeshPart(Message, frozen=True, kw_only=True, tag="mesh_part"):
@@ -621,12 +749,15 @@ class MeshPart(Message, frozen=True, kw_only=True, tag="mesh_part"):
     """
 
     request: Index
+    """Number of the request."""
     format: MeshFormat
+    """Of the file."""
     size_bytes: Annotated[int, Meta(ge=1, le=MAX_SCENE_MESH_BYTES)]
     """Size of the whole file."""
     offset: Index
     """Offset of this part in the file."""
     data: Annotated[bytes, Meta(min_length=1, max_length=MAX_MESH_PART_BYTES)]
+    """The bytes of this part."""
 
 
 class Panorama(Message, frozen=True, kw_only=True, tag="panorama"):
@@ -636,7 +767,9 @@ class Panorama(Message, frozen=True, kw_only=True, tag="panorama"):
     """
 
     request: Index
+    """Number of the request."""
     format: PanoramaFormat
+    """Of the file."""
     position_m: Vector3
     """World: where it was made for."""
     data: Annotated[bytes, Meta(min_length=1, max_length=MAX_PANORAMA_BYTES)]
@@ -654,15 +787,20 @@ class Acknowledged(Message, frozen=True, kw_only=True, tag="acknowledged"):
     """
 
     request: Index
+    """Number of the request."""
     error: Reason | None = None
+    """Why the request was refused; None: it was applied."""
     notes: tuple[str, ...] = ()
+    """What a person should know, one line each."""
 
 
 class Error(Message, frozen=True, kw_only=True, tag="error"):
     """The client sent something invalid; `fatal` if the server closes the connection."""
 
     reason: Reason
+    """One line that names the field or rule and what was wrong."""
     fatal: bool
+    """True: the connection is closed next."""
 
 
 ClientMessage = (

@@ -11,6 +11,7 @@ import inspect
 import json
 import sys
 from collections.abc import Iterator
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from textwrap import dedent
@@ -27,8 +28,8 @@ HEADER = "// Generated from protocol/messages.py by `python -m protocol.typescri
 
 def render() -> str:
     """The whole of protocol.ts."""
-    client = _structs(get_args(ClientMessage))
-    server = _structs(get_args(ServerMessage))
+    client = structs_of(get_args(ClientMessage))
+    server = structs_of(get_args(ServerMessage))
     interfaces = [_interface(struct, sent=struct in client) for struct in dict.fromkeys([*client, *server])]
     unions = [_union("ClientMessage", ClientMessage), _union("ServerMessage", ServerMessage)]
     return "\n".join([HEADER, *_constants(), "", *interfaces, *unions])
@@ -40,7 +41,7 @@ def _constants() -> Iterator[str]:
             yield f"export const {name} = {json.dumps(value)};"
 
 
-def _structs(classes: tuple[type, ...]) -> list[type]:
+def structs_of(classes: tuple[type, ...]) -> list[type]:
     """`classes` and all structs used in their fields, each after the structs that it uses."""
     found: dict[type, None] = {}
 
@@ -53,7 +54,7 @@ def _structs(classes: tuple[type, ...]) -> list[type]:
             visit(child)
 
     for cls in classes:
-        visit(_plain(types.type_info(cls)))
+        visit(plain(types.type_info(cls)))
     return list(found)
 
 
@@ -69,9 +70,9 @@ def _children(node: types.Type) -> tuple[types.Type, ...]:
 
 
 def _interface(cls: type, sent: bool) -> str:
-    info = _plain(types.type_info(cls))
+    info = plain(types.type_info(cls))
     assert isinstance(info, types.StructType)
-    docs = _field_docs(cls)
+    docs = field_docs(cls)
     lines = [*_doc(inspect.getdoc(cls), ""), f"export interface {cls.__name__} {{"]
     if info.tag is not None:
         lines.append(f"  {info.tag_field}: {json.dumps(info.tag)};")
@@ -127,7 +128,7 @@ def _doc(text: str | None, indent: str) -> list[str]:
     return [f"{indent}/**", *(f"{indent} * {line}".rstrip() for line in lines), f"{indent} */"]
 
 
-def _field_docs(cls: type) -> dict[str, str]:
+def field_docs(cls: type) -> dict[str, str]:
     """The docstring that follows a field in the class body, by field name; base classes first."""
     docs: dict[str, str] = {}
     for base in reversed([base for base in cls.__mro__ if base.__module__.startswith("protocol.")]):
@@ -139,14 +140,15 @@ def _field_docs(cls: type) -> dict[str, str]:
     return docs
 
 
+@cache
 def _class_body(cls: type) -> list[ast.stmt]:
     definition = ast.parse(dedent(inspect.getsource(cls))).body[0]
     assert isinstance(definition, ast.ClassDef)
     return definition.body
 
 
-def _plain(node: types.Type) -> types.Type:
-    return _plain(node.type) if isinstance(node, types.Metadata) else node
+def plain(node: types.Type) -> types.Type:
+    return plain(node.type) if isinstance(node, types.Metadata) else node
 
 
 def main() -> None:

@@ -226,11 +226,13 @@ class Volume:
 
 def _brick_counts(extent_m: NDArray[np.float64], voxel_m: float) -> tuple[int, int, int]:
     """Bricks along x, y, z. Raises VolumeSizeError."""
-    counts = np.ceil(extent_m / (BRICK * voxel_m) - 1e-6)  # floats: their product does not overflow
-    if (extent_m <= 0).any() or counts.prod() > _GREATEST_BRICKS:
+    size = f"a volume of {' x '.join(f'{side:.2f}' for side in extent_m)} m at {1e3 * voxel_m:.1f} mm a voxel"
+    if not (np.isfinite(extent_m) & (extent_m > 0)).all():
+        raise VolumeSizeError(f"{size} has a side that is not above 0: check the volume's bounds, or pose and depth")
+    counts = np.ceil(extent_m / (BRICK * voxel_m) - 1e-6).clip(1)  # floats: their product does not overflow
+    if counts.prod() > _GREATEST_BRICKS:
         raise VolumeSizeError(
-            f"a volume of {extent_m[0]:.2f} x {extent_m[1]:.2f} x {extent_m[2]:.2f} m at {1e3 * voxel_m:.1f} mm "
-            f"a voxel has {counts.prod():.0f} bricks, at most {_GREATEST_BRICKS}: give a larger --voxel"
+            f"{size} has {counts.prod():.6g} bricks, at most {_GREATEST_BRICKS}: give a larger --voxel"
         )
     x, y, z = counts.astype(np.int64).tolist()
     return x, y, z

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from client.web.build import pack
+from protocol.conformance.play_server import ConformanceServer
 from protocol.messages import Wishes
 from server.opencl.device import Device
 from server.service.authenticator import Authenticator
@@ -88,6 +89,20 @@ def test_a_program_streams_frames_and_gets_the_light(server: BackgroundServer, p
     assert [light["frame"] for light in lights] == [0, 1, 2]
     assert all(len(light["sh"]) == 27 for light in lights)
     assert np.isfinite(lights[-1]["sh"]).all()
+
+
+def test_the_package_keeps_the_rules_of_the_wire_page(program: Path) -> None:
+    kit = ConformanceServer()
+    threading.Thread(target=kit.run, daemon=True).start()
+    try:
+        done = run(program, "stream.mjs", f"http://127.0.0.1:{kit.port}", "12")
+        session = kit.wait_for(0, PATIENCE_S)
+    finally:
+        kit.stop()
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count('"sh"') == 10  # two of twelve frames are dropped, as a busy server does
+    assert session.counts["frame"] == 12
+    assert [str(line) for line in session.lines() if line.failure is not None] == []
 
 
 def test_what_is_refused_is_told_in_one_sentence(server: BackgroundServer, program: Path) -> None:

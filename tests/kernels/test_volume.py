@@ -176,6 +176,11 @@ def test_impossible_volumes_are_refused(engine: Engine, bounds: tuple[float, ...
         Volume(engine, bounds, voxel_m)  # type: ignore[arg-type]
 
 
+def test_a_side_that_is_not_there_is_no_matter_of_voxels(engine: Engine) -> None:
+    with pytest.raises(VolumeSizeError, match="a side that is not above 0"):
+        Volume(engine, (0, 0, 0, 1, 1, -1), 0.01)
+
+
 # ---- tables for rays ---------------------------------------------------------------------------------------------
 
 

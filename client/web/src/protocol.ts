@@ -18,12 +18,19 @@ export const MAX_PANORAMA_BYTES = 8388608;
 
 /** Lens of the depth image, if it differs from the colour lens; conventions as in `CameraModel`. */
 export interface DepthCamera {
+  /** Pixels. */
   width: number;
+  /** Pixels. */
   height: number;
+  /** Focal length in pixels: of the width's direction. */
   fx: number;
+  /** Focal length in pixels: of the height's direction. */
   fy: number;
+  /** Principal point, pixels; 0 is the centre of the first column. */
   cx: number;
+  /** Pixels; 0 is the centre of the first row. */
   cy: number;
+  /** OpenCV's k1, k2, p1, p2, k3; all zero for a rectified picture. */
   distortion?: [number, number, number, number, number];
   /** Row-major rigid 4x4, metres: point_in_color_camera = color_from_depth * point_in_depth_camera. */
   color_from_depth?: Array<number>;
@@ -36,15 +43,23 @@ export interface DepthCamera {
  * `(k1, k2, p1, p2, k3)` on normalised coordinates, all zero for a rectified camera.
  */
 export interface CameraModel {
+  /** Pixels. */
   width: number;
+  /** Pixels. */
   height: number;
+  /** Focal length in pixels: of the width's direction. */
   fx: number;
+  /** Focal length in pixels: of the height's direction. */
   fy: number;
+  /** Principal point, pixels; 0 is the centre of the first column. */
   cx: number;
+  /** Pixels; 0 is the centre of the first row. */
   cy: number;
   /** Metres per unit of the uint16 depth. */
   depth_scale_m?: number;
+  /** OpenCV's k1, k2, p1, p2, k3; all zero for a rectified picture. */
   distortion?: [number, number, number, number, number];
+  /** What the numbers of every colour picture of the session are. */
   color_encoding?: "linear16" | "srgb8";
   /** null: depth is registered to colour, pixel by pixel. */
   depth?: DepthCamera | null;
@@ -61,6 +76,7 @@ export interface Wishes {
   budget_ms?: number | null;
   /** With `auto`: choose the fastest point whose error of the dominant direction was measured to be no larger. */
   max_light_error_deg?: number | null;
+  /** Directions that are traced from a place. */
   rays?: number;
   /** A1: distance between transfer samples in pixels. null here and in the next four fields: the preset's value. */
   stride?: number | null;
@@ -76,8 +92,11 @@ export interface Wishes {
   smooth_depth?: boolean;
   /** null: the whole room. */
   ray_length_m?: number | null;
+  /** SH bands of the estimated light: 4 are 16 coefficients. */
   bands?: number;
+  /** Of real surfaces: the same everywhere, or estimated from the pictures. */
   albedo?: "constant" | "estimated";
+  /** Light from one real surface to another: left out, or as photographed. */
   indirect?: "none" | "observed";
   /** Plain least squares with rays of 10 cm; one albedo and no indirect light, whatever the fields above say. */
   as_thesis?: boolean;
@@ -85,9 +104,11 @@ export interface Wishes {
   denoise?: "bilateral" | "none" | "tv_l1";
   /** Iterations of TV-L1. */
   denoise_iterations?: number;
+  /** `given`: those of the frames; `track`: the server finds them; `refine`: it corrects those of the frames. */
   poses?: "given" | "refine" | "track";
   /** x0, y0, z0, x1, y1, z1 in world metres; null: the view of the first frame. */
   volume_m?: [number, number, number, number, number, number] | null;
+  /** Side of a cell of the volume; null: from the size of the volume. */
   voxel_m?: number | null;
   /** World direction; null: found from the scan, else the first camera's -y, as the notes of the answers say. */
   up?: [number, number, number] | null;
@@ -134,17 +155,22 @@ export interface Wishes {
 
 /** A square fiducial marker that the clients of a room may detect. */
 export interface Marker {
+  /** Number of the marker in its dictionary. */
   id: number;
   /** Side of the black square. */
   side_m: number;
+  /** OpenCV's name of the set of markers. */
   dictionary?: "4x4_50" | "5x5_100" | "6x6_250" | "7x7_1000" | "apriltag_36h11";
 }
 
 /** First message of a capturing client. */
 export interface Hello {
   type: "hello";
+  /** Name of the program, for the server's log. */
   client: string;
+  /** Lens and size of the pictures that follow. */
   camera: CameraModel;
+  /** Options of the session. */
   wishes?: Wishes;
   /** Clients of one room share volume, light and objects; null: a room of its own. */
   room?: string | null;
@@ -181,10 +207,15 @@ export interface Watch {
  * `h264`, in frames only and if listed in `welcome.codecs`: the next picture of the session's video.
  */
 export interface ColorImage {
+  /** Pixels. */
   width: number;
+  /** Pixels. */
   height: number;
+  /** The encoded picture, as its codec says. */
   data: Uint8Array;
+  /** How `data` is encoded. */
   codec: "h264" | "jpeg" | "png" | "raw";
+  /** What the numbers are; that of the session's camera. */
   encoding?: "linear16" | "srgb8";
 }
 
@@ -195,9 +226,13 @@ export interface ColorImage {
  * `zranks` and `zstd-ranks`: the same for the values' ranks, two in a byte.
  */
 export interface DepthImage {
+  /** Pixels. */
   width: number;
+  /** Pixels. */
   height: number;
+  /** The encoded picture, as its codec says. */
   data: Uint8Array;
+  /** How `data` is encoded. */
   codec: "raw" | "zdelta" | "zranks" | "zstd-delta" | "zstd-ranks";
   /** Rounding by the sender: each depth z (metres) was changed by at most this times z^2; null: no rounding. */
   rounded_per_m?: number | null;
@@ -206,8 +241,11 @@ export interface DepthImage {
 /** One RGB-D frame; answered by exactly one of composite or layer (with its light before it), dropped or error. */
 export interface Frame {
   type: "frame";
+  /** Number by which the frame is answered; a client counts upwards. */
   frame: number;
+  /** Seconds of the client's clock, increasing. */
   timestamp_s: number;
+  /** Pose of the colour camera; null where the server tracks. */
   world_from_camera: Array<number> | null;
   /** null, with a pose and no depth: the view of a client without a camera, in a room that others scan. */
   color?: ColorImage | null;
@@ -241,9 +279,13 @@ export interface Spot {
 /** Place a virtual object; acknowledged. With `spot`, the answer to the frame in which it is found tells where. */
 export interface PlaceObject {
   type: "place_object";
+  /** Number by which the request is answered, used once in a session. */
   request: number;
+  /** Its name; an object that has it is replaced. */
   object: string;
+  /** Of the file. */
   format: "glb" | "obj" | "ply" | "stl";
+  /** The bytes of the file. */
   data: Uint8Array;
   /**
    * World position of the bottom centre of the model's box; null, without `spot`: the vertices are world coordinates
@@ -252,6 +294,7 @@ export interface PlaceObject {
   position_m?: [number, number, number] | null;
   /** Not used on an `auto` spot. */
   scale?: number;
+  /** Turn about the up axis. */
   yaw_deg?: number;
   /** In place of `position_m`. */
   spot?: Spot | null;
@@ -262,39 +305,53 @@ export interface PlaceObject {
 /** Move an existing object; acknowledged. */
 export interface MoveObject {
   type: "move_object";
+  /** Number by which the request is answered, used once in a session. */
   request: number;
+  /** Name of the object. */
   object: string;
+  /** World position of the bottom centre of the model's box. */
   position_m: [number, number, number];
+  /** Factor on the model's size. */
   scale?: number;
+  /** Turn about the up axis. */
   yaw_deg?: number;
 }
 
 /** Remove an object; acknowledged. */
 export interface RemoveObject {
   type: "remove_object";
+  /** Number by which the request is answered, used once in a session. */
   request: number;
+  /** Name of the object. */
   object: string;
 }
 
 /** Change the preset of the running session, or the budget or error limit that chooses it; acknowledged. */
 export interface Quality {
   type: "quality";
+  /** Number by which the request is answered, used once in a session. */
   request: number;
+  /** As in `wishes`. */
   preset: "art1" | "art4" | "art8" | "auto" | "gr15" | "gr15fast" | "reg4" | "reg8" | "rm";
+  /** As in `wishes`. */
   budget_ms?: number | null;
+  /** As in `wishes`. */
   max_light_error_deg?: number | null;
 }
 
 /** Request the scanned surface as mesh files; answered by mesh parts and then acknowledged. */
 export interface RequestMesh {
   type: "request_mesh";
+  /** Number by which the request is answered, used once in a session. */
   request: number;
 }
 
 /** Request the light that arrives at a place as a lat-long picture; answered by a panorama and then acknowledged. */
 export interface RequestPanorama {
   type: "request_panorama";
+  /** Number by which the request is answered, used once in a session. */
   request: number;
+  /** Of the file that is sent back. */
   format: "exr" | "hdr";
   /** World. null: the middle of the first virtual object, or of what the last frame sees if there is none. */
   position_m?: [number, number, number] | null;
@@ -303,14 +360,18 @@ export interface RequestPanorama {
 /** Either side is leaving, with the reason. */
 export interface Bye {
   type: "bye";
+  /** One line for a person; may be empty. */
   reason?: string;
 }
 
 /** Answer to hello and watch. */
 export interface Welcome {
   type: "welcome";
+  /** Name of the session; `waiting` for a watcher while nobody streams. */
   session: string;
+  /** Name and version of the server. */
   server: string;
+  /** Name of the device that computes. */
   device: string;
   /** Number of frames that the client may have unanswered. */
   max_inflight: number;
@@ -321,6 +382,7 @@ export interface Welcome {
    * session frames, are answered if they are sent again.
    */
   resumed: boolean;
+  /** The room that the session is in; null: one of its own. */
   room: string | null;
   /** Colour codecs that frames may use. */
   codecs: Array<"h264" | "jpeg" | "png" | "raw">;
@@ -334,12 +396,19 @@ export interface Welcome {
  * While a kernel runs, time counts under the row that launched it, else under the row that the host is at.
  */
 export interface Timings {
+  /** Milliseconds: colour to radiance, depth to points and normals. */
   input: number;
+  /** Milliseconds: tracking and fusion into the volume. */
   reconstruct: number;
+  /** Milliseconds: ray cast of the volume. */
   surface: number;
+  /** Milliseconds: merging the volume with this frame's depth. */
   dynamic_geometry: number;
+  /** Milliseconds: visibility and bounced light. */
   radiance_transfer: number;
+  /** Milliseconds. */
   light_estimation: number;
+  /** Milliseconds: effects and composite. */
   rendering: number;
   /** Wall time. */
   total: number;
@@ -349,13 +418,17 @@ export interface Timings {
   launches: number;
   /** Times that the host waited for memory of the device. */
   reads: number;
+  /** Bytes of those reads. */
   read_bytes: number;
 }
 
 /** An effect that did not run, the reason, and a bound on the change, in display units (1 is 1/255). */
 export interface LeftOut {
+  /** Its name. */
   effect: string;
+  /** Why it was not needed, in words. */
   reason: string;
+  /** In display units; null: no bound is known. */
   error_bound: number | null;
 }
 
@@ -363,6 +436,7 @@ export interface LeftOut {
 export interface OperatingPoint {
   /** The settings, written as options of the command line. */
   settings: string;
+  /** Why these settings, in words. */
   reason: string;
   /** Expected time of a frame; like the next field, only for points that the server chose. */
   expected_ms: number | null;
@@ -372,7 +446,9 @@ export interface OperatingPoint {
 
 /** Effects that ran for a frame, in order, those that were left out, and how the frame was sampled. */
 export interface Plan {
+  /** Names of the effects, in order. */
   run: Array<string>;
+  /** What did not run. */
   left_out: Array<LeftOut>;
   /** null if tracking is lost: nothing was sampled. */
   point: OperatingPoint | null;
@@ -381,16 +457,23 @@ export interface Plan {
 /** The composite image of one frame. */
 export interface Composite {
   type: "composite";
+  /** The frame it belongs to. */
   frame: number;
+  /** That of the frame. */
   timestamp_s: number;
+  /** Pose that was used; the last one while tracking is lost. */
   world_from_camera: Array<number>;
+  /** Where the pose is from; `lost`: none was found. */
   tracking: "given" | "lost" | "tracked";
+  /** What the frame cost. */
   timings: Timings;
+  /** Which effects ran. */
   plan: Plan;
   /** Problems with this frame's input, one line each. */
   notes: Array<string>;
   /** Time from the frame's arrival until its processing began: in the queue, decoding, waiting for the device. */
   waited_ms: number;
+  /** sRGB picture of the camera's size. */
   color: ColorImage;
 }
 
@@ -398,6 +481,7 @@ export interface Composite {
 export interface LayerPatch {
   /** Column of the camera's image at which the rectangle begins. */
   x: number;
+  /** Row of the camera's image at which the rectangle begins. */
   y: number;
   /** PNG. */
   color: ColorImage;
@@ -412,11 +496,17 @@ export interface LayerPatch {
  */
 export interface Layer {
   type: "layer";
+  /** The frame it belongs to. */
   frame: number;
+  /** That of the frame. */
   timestamp_s: number;
+  /** Pose that was used; the last one while tracking is lost. */
   world_from_camera: Array<number>;
+  /** Where the pose is from; `lost`: none was found. */
   tracking: "given" | "lost" | "tracked";
+  /** What the frame cost. */
   timings: Timings;
+  /** Which effects ran. */
   plan: Plan;
   /** Problems with this frame's input, one line each. */
   notes: Array<string>;
@@ -459,6 +549,7 @@ export interface Lamp {
    * radiance of a white surface that faces it.
    */
   intensity: [number, number, number];
+  /** One standard deviation. */
   intensity_std: [number, number, number];
   /** Share of the luminance that visible surfaces receive. */
   share: number;
@@ -474,11 +565,17 @@ export interface ArrivingLight {
   position: [number, number, number];
   /** This and the fields below as in `light`; 16 x [r, g, b]. */
   sh: Array<[number, number, number]>;
+  /** 16 x [r, g, b]. */
   sh_std: Array<[number | null, number | null, number | null]>;
+  /** 27 floats. */
   sh_webxr: Array<number>;
+  /** World, unit, towards the light. */
   dominant_direction: [number, number, number];
+  /** As in `light`. */
   dominant_intensity: number;
+  /** As in `light`. */
   spread_deg: number | null;
+  /** As in `light`. */
   valid: boolean;
   /** Share of the directions from here in which photographed surface is met, 0 to 1; null where unknown. */
   seen: number | null;
@@ -489,7 +586,9 @@ export interface ArrivingLight {
 /** The estimate of the room's light after one frame; the fields of a line of `light.jsonl`. */
 export interface Light {
   type: "light";
+  /** The frame it belongs to. */
   frame: number;
+  /** That of the frame. */
   timestamp_s: number;
   /** 16 x [r, g, b], zeros for bands not estimated. */
   sh: Array<[number, number, number]>;
@@ -501,6 +600,7 @@ export interface Light {
   sh_webxr: Array<number>;
   /** World, unit, towards the light, from l = 1 of Rec. 709 luminance; (0, 0, 0) if there is none. */
   dominant_direction: [number, number, number];
+  /** Luminance of the light from there, as one direction. */
   dominant_intensity: number;
   /** Directional components, strongest first; empty if the light is uniform. */
   dominant_lights: Array<DirectedLight>;
@@ -528,7 +628,9 @@ export interface Light {
 /** The frame was replaced by a newer one before it was read, or was refused. It gets no other answer. */
 export interface Dropped {
   type: "dropped";
+  /** Number of the frame. */
   frame: number;
+  /** One line for a person. */
   reason: string;
 }
 
@@ -539,12 +641,15 @@ export interface Dropped {
  */
 export interface MeshPart {
   type: "mesh_part";
+  /** Number of the request. */
   request: number;
+  /** Of the file. */
   format: "glb" | "ply";
   /** Size of the whole file. */
   size_bytes: number;
   /** Offset of this part in the file. */
   offset: number;
+  /** The bytes of this part. */
   data: Uint8Array;
 }
 
@@ -555,7 +660,9 @@ export interface MeshPart {
  */
 export interface Panorama {
   type: "panorama";
+  /** Number of the request. */
   request: number;
+  /** Of the file. */
   format: "exr" | "hdr";
   /** World: where it was made for. */
   position_m: [number, number, number];
@@ -570,15 +677,20 @@ export interface Panorama {
  */
 export interface Acknowledged {
   type: "acknowledged";
+  /** Number of the request. */
   request: number;
+  /** Why the request was refused; null: it was applied. */
   error: string | null;
+  /** What a person should know, one line each. */
   notes: Array<string>;
 }
 
 /** The client sent something invalid; `fatal` if the server closes the connection. */
 export interface Error {
   type: "error";
+  /** One line that names the field or rule and what was wrong. */
   reason: string;
+  /** True: the connection is closed next. */
   fatal: boolean;
 }
 

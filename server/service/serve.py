@@ -19,8 +19,10 @@ import uvicorn
 
 from protocol.limits import MAX_MESSAGE_BYTES
 from protocol.local_keys import LocalKey, key_left
+from server.service.acceptor import Acceptor, TimedHttp
 from server.service.app import create_app
 from server.service.authenticator import Authenticator, is_loopback, new_token
+from server.service.gate import Gate, Place, max_connections
 from server.service.limits import DEFAULT_LIMITS, Limits
 from server.service.lingering_close import LingeringCloseWebSocket
 from server.service.object_library import ObjectLibrary
@@ -254,15 +256,28 @@ class _Server(uvicorn.Server):
         super().__init__(config)
         self.accepting = threading.Event()
         self._service = service
+        self._acceptors: list[Acceptor] = []
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Drain the service while new clients still get an answer, then close."""
         await self._service.shutdown.drain(DRAIN_PATIENCE_S)
+        for acceptor in self._acceptors:
+            await acceptor.stop()
         await super().shutdown(sockets)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        await super().startup(sockets)
+        """Start without uvicorn's own listening, which accepts without limits."""
+        await super().startup([])
+        limits = self._service.limits
+        most = max_connections(limits)
+        gate = Gate(most, max(1, min(2 * limits.connections_per_address, most // 2)))
+        self._acceptors = [Acceptor(s, gate, self.config, self._open_protocol) for s in sockets or []]
         self.accepting.set()
+
+    def _open_protocol(self, place: Place) -> TimedHttp:
+        protocol = TimedHttp(self.config, self.server_state, self.lifespan.state)
+        protocol.place, protocol.header_s = place, self._service.limits.header_s
+        return protocol
 
 
 def _server(
@@ -274,6 +289,7 @@ def _server(
         ssl_keyfile=None if certificate is None else certificate.key,
         log_level="warning",
         access_log=False,
+        http=TimedHttp,
         ws=LingeringCloseWebSocket,
         ws_per_message_deflate=False,  # costs 10 ms a message; images are compressed already
         ws_max_size=MAX_MESSAGE_BYTES,

@@ -19,6 +19,7 @@ from server.service.event_log import LogFormat
 from server.service.limits import DEFAULT_LIMITS, GIB, MIB, Limits
 from server.service.saving.retention import DAY_S, RetentionLimits
 from server.service.tls import Certificate, CertificateError, given_certificate, own_certificate
+from server.service.trusted_proxies import TrustedProxies
 
 NO_TOKEN = "none"
 NO_DATA = "none"
@@ -34,6 +35,7 @@ class ServeOptions:
     token: str | None = None
     insecure: bool = False
     allow_origin: tuple[str, ...] = ()
+    trusted_proxy: tuple[str, ...] = ()
     tls: bool = False
     tls_cert: Path | None = None
     tls_key: Path | None = None
@@ -48,18 +50,19 @@ class ServeOptions:
 def authenticator_of(options: ServeOptions) -> Authenticator:
     """Raises OptionError."""
     origins = frozenset(_origin(text) for text in options.allow_origin)
+    proxies = _proxies(options.trusted_proxy)
     if options.token == NO_TOKEN:
         if not (options.insecure or is_loopback(options.host)):
             raise OptionError(
                 f"--token none lets in everybody who reaches {options.host}: leave it out, or add --insecure if that "
                 "is meant, say behind a proxy that asks who comes"
             )
-        return Authenticator(None, origins)
+        return Authenticator(None, origins, proxies)
     if options.insecure:
         raise OptionError("--insecure goes with --token none: leave it out")
     if options.token is not None and not is_token(options.token):
         raise OptionError(f"--token: expected up to {MAX_TOKEN_CHARS} ASCII characters without spaces, or none")
-    return Authenticator(options.token or new_token(), origins)
+    return Authenticator(options.token or new_token(), origins, proxies)
 
 
 def certificate_of(options: ServeOptions) -> Certificate | None:
@@ -152,3 +155,13 @@ def _origin(text: str) -> str:
     if parts.scheme not in ("http", "https") or not parts.netloc or parts.path or parts.query:
         raise OptionError(f"--allow-origin {text}: expected https://HOST or https://HOST:PORT, as a browser shows it")
     return f"{parts.scheme}://{parts.netloc}"
+
+
+def _proxies(texts: tuple[str, ...]) -> TrustedProxies:
+    """Raises OptionError."""
+    try:
+        return TrustedProxies(texts)
+    except ValueError as error:
+        raise OptionError(
+            f"--trusted-proxy: {error}; expected ADDRESS or ADDRESS/BITS, such as 10.0.0.5 or 10.0.0.0/24"
+        ) from error

@@ -53,14 +53,15 @@ class Ingress:
             return
         self.clients += 1
         try:
-            if (refusal := self.authenticator.refusal(websocket)) is not None:
+            if (refusal := await self.authenticator.slowed_refusal(websocket)) is not None:
                 raise refusal
             route = route_of(await self._first_message(connection))
             async with await self._host_of(route) as host:
                 await host.send(route.first)
                 await relay(websocket, host, route.room_id)
         except Refusal as refused:
-            log.info("client refused", extra={"code": refused.code, "reason": refused.reason})
+            extra = {"address": connection.address, "code": refused.code, "reason": refused.reason}
+            log.info("client refused", extra=extra)
             await connection.refuse(refused)
         finally:
             self.clients -= 1

@@ -54,9 +54,9 @@ class Connection:
         self,
         websocket: WebSocket,
         limits: Limits = DEFAULT_LIMITS,
-        on_refusal: Callable[[Refusal], None] = lambda _refusal: None,
+        on_refusal: Callable[[Refusal, str], None] = lambda _refusal, _address: None,
     ) -> None:
-        """`on_refusal` is called before a refused client receives the error."""
+        """`on_refusal` is called with the client's address before a refused client receives the error."""
         self.address = "" if websocket.client is None else websocket.client.host
         self._websocket = websocket
         self._on_refusal = on_refusal
@@ -122,7 +122,7 @@ class Connection:
 
     async def refuse(self, refusal: Refusal) -> None:
         """Close with the reason, both in an error message and in the close frame."""
-        self._on_refusal(refusal)
+        self._on_refusal(refusal, self.address)
         with contextlib.suppress(ClientGone, TimeoutError):
             async with asyncio.timeout(CLOSE_PATIENCE_S):
                 await self.send_message(Error(reason=refusal.reason, fatal=True))

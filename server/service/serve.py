@@ -28,6 +28,7 @@ from server.service.lingering_close import LingeringCloseWebSocket
 from server.service.object_library import ObjectLibrary
 from server.service.service import Service
 from server.service.tls import Certificate
+from server.service.trusted_proxies import TrustedProxies
 
 if TYPE_CHECKING:
     from server.opencl.device import Device
@@ -252,10 +253,11 @@ class BackgroundServer:
 class _Server(uvicorn.Server):
     """uvicorn server that signals when it accepts connections and shuts down gracefully."""
 
-    def __init__(self, config: uvicorn.Config, service: Service) -> None:
+    def __init__(self, config: uvicorn.Config, service: Service, proxies: TrustedProxies) -> None:
         super().__init__(config)
         self.accepting = threading.Event()
         self._service = service
+        self._proxies = proxies
         self._acceptors: list[Acceptor] = []
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
@@ -270,7 +272,7 @@ class _Server(uvicorn.Server):
         await super().startup([])
         limits = self._service.limits
         most = max_connections(limits)
-        gate = Gate(most, max(1, min(2 * limits.connections_per_address, most // 2)))
+        gate = Gate(most, max(1, min(2 * limits.connections_per_address, most // 2)), self._proxies.__contains__)
         self._acceptors = [Acceptor(s, gate, self.config, self._open_protocol) for s in sockets or []]
         self.accepting.set()
 
@@ -290,6 +292,8 @@ def _server(
         log_level="warning",
         access_log=False,
         http=TimedHttp,
+        proxy_headers=bool(authenticator.proxies),
+        forwarded_allow_ips=authenticator.proxies.for_uvicorn,
         ws=LingeringCloseWebSocket,
         ws_per_message_deflate=False,  # costs 10 ms a message; images are compressed already
         ws_max_size=MAX_MESSAGE_BYTES,
@@ -297,7 +301,7 @@ def _server(
         log_config=None,
         timeout_graceful_shutdown=STOP_PATIENCE_S - DRAIN_PATIENCE_S,
     )
-    return _Server(config, service)
+    return _Server(config, service, authenticator.proxies)
 
 
 def _warm_up(device: Device) -> None:

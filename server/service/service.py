@@ -196,10 +196,10 @@ class Service:
         self.metrics.parser_deaths.labels(kind).inc()
         log.warning("a parser died", extra={"kind": kind})
 
-    def note_refusal(self, refusal: Refusal) -> None:
+    def note_refusal(self, refusal: Refusal, address: str) -> None:
         """Count and log a refused client."""
         self.metrics.refused.labels(str(refusal.code)).inc()
-        log.info("client refused", extra={"code": refusal.code, "reason": refusal.reason})
+        log.info("client refused", extra={"address": address, "code": refusal.code, "reason": refusal.reason})
 
     async def panorama(
         self, asked: PanoramaOrder, session: str | None = None, room: str | None = None, room_key: str | None = None

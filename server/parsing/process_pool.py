@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from server.parsing.child import ANSWER, DONE, READY, REQUEST
+from server.parsing.turns import Turn
 
 IS_SUPPORTED = hasattr(os, "memfd_create") and hasattr(fcntl, "F_ADD_SEALS")
 """Whether this system supports sealed shared memory."""
@@ -81,10 +82,14 @@ class ChildProcess:
         """Whether the process is running."""
         return self.process.poll() is None
 
-    def ask(self, request: bytes) -> bytearray:
-        """Send a request and wait for the answer. Raises ValueError with the child's line, or ChildDied."""
+    def wait_until_ready(self) -> None:
+        """Wait until a new child has loaded. Raises ChildDied."""
         if not self._is_ready:
             self._is_ready = self._read(len(READY), time.monotonic() + LOADING_TIMEOUT_S) == READY
+
+    def ask(self, request: bytes) -> bytearray:
+        """Send a request and wait for the answer. Raises ValueError with the child's line, or ChildDied."""
+        self.wait_until_ready()
         deadline_s = time.monotonic() + self._spec.timeout_s
         self._write(memoryview(REQUEST.pack(len(request))), deadline_s)
         self._write(memoryview(request), deadline_s)
@@ -198,14 +203,29 @@ class ProcessPool:
             raise ChildDied(STOPPED)
         return new
 
-    def ask(self, request: bytes, read: Callable[[bytearray, mmap.mmap | None], object] | None = None) -> object:
-        """Returns the answer, or `read(answer, shared memory)`. Raises ValueError, ChildDied."""
+    def ask(
+        self,
+        request: bytes,
+        read: Callable[[bytearray, mmap.mmap | None], object] | None = None,
+        turn: Turn | None = None,
+    ) -> object:
+        """Returns the answer, or `read(answer, shared memory)`. Raises ValueError, ChildDied.
+
+        `turn`: the child is killed, and ChildDied raised, when it is interrupted.
+        """
         with self._borrowed() as child:
             try:
+                child.wait_until_ready()
+                if turn is not None:
+                    turn.set_interrupt(child.process.kill)
                 answer = child.ask(request)
             except ChildDied:
-                self._on_death()
+                if turn is None or not turn.is_interrupted:
+                    self._on_death()
                 raise
+            finally:
+                if turn is not None:
+                    turn.set_interrupt(None)
             return answer if read is None else read(answer, child.shared)
 
     def stop(self) -> None:

@@ -51,7 +51,8 @@ class Parsers:
     ) -> None:
         self.on_death: Callable[[str], None] = lambda _kind: None
         """Called in the waiting thread with `mesh`, `picture` or `video` when a child dies during a request."""
-        self.meshes = ProcessPool(mesh_spec, MESH_CHILDREN + SPARE_CHILDREN, lambda: self.on_death("mesh"))
+        on_mesh_death = partial(self._note_death, "mesh")
+        self.meshes = ProcessPool(mesh_spec, MESH_CHILDREN + SPARE_CHILDREN, on_mesh_death, has_spare=True)
         self.mesh_turns = Turns(MESH_CHILDREN)
         self.pictures = ProcessPool(picture_spec, PICTURE_CHILDREN, lambda: self.on_death("picture"))
         self._video_spec = video_spec
@@ -59,6 +60,9 @@ class Parsers:
         """One child per session that sends video."""
         self._changing = threading.Lock()
         self._has_stopped = False
+
+    def _note_death(self, kind: str) -> None:
+        self.on_death(kind)
 
     def start(self) -> None:
         """Start loading one child of each kind in the background."""

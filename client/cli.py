@@ -309,6 +309,10 @@ def serve(
         bool, typer.Option("--insecure", help="with --token none: allow access from other machines")
     ] = False,
     allow_origin: o.AllowOrigin = None,
+    trusted_proxy: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ADDRESS[/BITS]", help="proxy whose X-Forwarded-For is believed; repeatable"),
+    ] = None,
     tls: Annotated[
         bool, typer.Option("--tls", help="https and wss, with a self-signed certificate that is kept")
     ] = False,
@@ -353,6 +357,7 @@ def serve(
         token_file=token_file,
         insecure=insecure,
         allow_origin=tuple(allow_origin or ()),
+        trusted_proxy=tuple(trusted_proxy or ()),
         tls=tls,
         tls_cert=tls_cert,
         tls_key=tls_key,

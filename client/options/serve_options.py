@@ -19,6 +19,7 @@ from server.service.event_log import LogFormat
 from server.service.limits import DEFAULT_LIMITS, GIB, MIB, Limits
 from server.service.saving.retention import DAY_S, RetentionLimits
 from server.service.tls import Certificate, CertificateError, given_certificate, own_certificate
+from server.service.trusted_proxies import TrustedProxies
 
 log = logging.getLogger(__name__)
 
@@ -37,6 +38,7 @@ class ServeOptions:
     token_file: Path | None = None
     insecure: bool = False
     allow_origin: tuple[str, ...] = ()
+    trusted_proxy: tuple[str, ...] = ()
     tls: bool = False
     tls_cert: Path | None = None
     tls_key: Path | None = None
@@ -51,20 +53,21 @@ class ServeOptions:
 def authenticator_of(options: ServeOptions) -> Authenticator:
     """Raises OptionError."""
     origins = frozenset(_origin(text) for text in options.allow_origin)
+    proxies = _proxies(options.trusted_proxy)
     if options.token_file is not None:
-        return Authenticator(_token_in_file(options), origins)
+        return Authenticator(_token_in_file(options), origins, proxies)
     if options.token == NO_TOKEN:
         if not (options.insecure or is_loopback(options.host)):
             raise OptionError(
                 f"--token none lets in everybody who reaches {options.host}: leave it out, or add --insecure if that "
                 "is meant, say behind a proxy that asks who comes"
             )
-        return Authenticator(None, origins)
+        return Authenticator(None, origins, proxies)
     if options.insecure:
         raise OptionError("--insecure goes with --token none: leave it out")
     if options.token is not None and not is_token(options.token):
         raise OptionError(f"--token: expected up to {MAX_TOKEN_CHARS} ASCII characters without spaces, or none")
-    return Authenticator(options.token or new_token(), origins)
+    return Authenticator(options.token or new_token(), origins, proxies)
 
 
 def _token_in_file(options: ServeOptions) -> str:
@@ -168,3 +171,13 @@ def _origin(text: str) -> str:
     if parts.scheme not in ("http", "https") or not parts.netloc or parts.path or parts.query:
         raise OptionError(f"--allow-origin {text}: expected https://HOST or https://HOST:PORT, as a browser shows it")
     return f"{parts.scheme}://{parts.netloc}"
+
+
+def _proxies(texts: tuple[str, ...]) -> TrustedProxies:
+    """Raises OptionError."""
+    try:
+        return TrustedProxies(texts)
+    except ValueError as error:
+        raise OptionError(
+            f"--trusted-proxy: {error}; expected ADDRESS or ADDRESS/BITS, such as 10.0.0.5 or 10.0.0.0/24"
+        ) from error

@@ -53,7 +53,7 @@ class Ingress:
             return
         self.clients += 1
         try:
-            if (refusal := self.authenticator.refusal(websocket)) is not None:
+            if (refusal := await self.authenticator.slowed_refusal(websocket)) is not None:
                 raise refusal
             route = route_of(await self._first_message(connection))
             async with await self._host_of(route) as host:

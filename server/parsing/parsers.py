@@ -7,6 +7,7 @@ import struct
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from protocol.frames import CameraModel
 from protocol.limits import MAX_IMAGE_PIXELS
 from server.parsing.mesh_bytes import MAX_PACKED_BYTES, mesh_from_bytes
 from server.parsing.process_pool import IS_SUPPORTED, ChildDied, JobSpec, ProcessPool
+from server.parsing.turns import MAX_INTERRUPTIONS, Account, Overdrawn, Turns
 from server.scene.limits import MeshError
 from server.scene.mesh import Mesh, load_mesh
 
@@ -32,6 +34,10 @@ VIDEO_JOB = replace(PICTURE_JOB, job="server.parsing.read_video:read_video")
 _SIZE = struct.Struct("<II")
 MESH_CHILDREN, PICTURE_CHILDREN = 2, 2
 """Two each, so that a slow file does not block other sessions."""
+SPARE_CHILDREN = 1
+"""Takes over where a mesh child was killed for another session's turn, while its successor loads."""
+READING_BURST_S, READING_RATE = 120.0, 0.5
+"""Reading time of one session: at once, and per second. Most files take less than 0.1 s."""
 
 
 class Parsers:
@@ -45,13 +51,18 @@ class Parsers:
     ) -> None:
         self.on_death: Callable[[str], None] = lambda _kind: None
         """Called in the waiting thread with `mesh`, `picture` or `video` when a child dies during a request."""
-        self.meshes = ProcessPool(mesh_spec, MESH_CHILDREN, lambda: self.on_death("mesh"))
+        on_mesh_death = partial(self._note_death, "mesh")
+        self.meshes = ProcessPool(mesh_spec, MESH_CHILDREN + SPARE_CHILDREN, on_mesh_death, has_spare=True)
+        self.mesh_turns = Turns(MESH_CHILDREN)
         self.pictures = ProcessPool(picture_spec, PICTURE_CHILDREN, lambda: self.on_death("picture"))
         self._video_spec = video_spec
         self._videos: set[ProcessPool] = set()
         """One child per session that sends video."""
         self._changing = threading.Lock()
         self._has_stopped = False
+
+    def _note_death(self, kind: str) -> None:
+        self.on_death(kind)
 
     def start(self) -> None:
         """Start loading one child of each kind in the background."""
@@ -69,18 +80,39 @@ class Parsers:
         for video in videos:
             video.stop()
 
-    def load_mesh(self, data: bytes, file_format: str) -> Mesh:
-        """As server.scene.mesh.load_mesh. Raises MeshError, also if the child runs out of resources or dies."""
+    def mesh_loader(self) -> Callable[[bytes, str], Mesh]:
+        """`load_mesh` for one session, which has its own reading time."""
+        return partial(self.load_mesh, account=Account(READING_BURST_S, READING_RATE))
+
+    def load_mesh(self, data: bytes, file_format: str, account: Account | None = None) -> Mesh:
+        """As server.scene.mesh.load_mesh. Raises MeshError, also if the child runs out of resources or dies.
+
+        `account`: that of the session; None: a new one. Sessions that have read less go first (`turns.py`).
+        """
         if not IS_SUPPORTED:
             return load_mesh(data, file_format)
         try:
-            answer = self.meshes.ask(file_format.encode() + b"\n" + data)
+            request = file_format.encode() + b"\n" + data
+            answer = self._read_mesh(request, account or Account(READING_BURST_S, READING_RATE))
         except ChildDied as error:
             raise MeshError(f"the reader of the {file_format} file {error}: simplify the mesh or repair it") from error
-        except ValueError as error:
+        except (ValueError, Overdrawn) as error:
             raise MeshError(str(error)) from error
         assert isinstance(answer, bytearray)
         return mesh_from_bytes(answer)
+
+    def _read_mesh(self, request: bytes, account: Account) -> object:
+        """The child's answer. Begins again after an interruption. Raises ValueError, ChildDied, Overdrawn."""
+        for _ in range(1 + MAX_INTERRUPTIONS):
+            with self.mesh_turns.taken(account) as turn:
+                try:
+                    return self.meshes.ask(request, turn=turn)
+                except ChildDied:
+                    if not turn.is_interrupted:
+                        raise
+        raise MeshError(
+            "reading it took so long that other sessions needed the reader: simplify it, or try again later"
+        )
 
     def color_reader(self, camera: CameraModel) -> ColorReader:
         """Colour decoder of one session; must be closed."""

@@ -6,15 +6,16 @@ import contextlib
 import fcntl
 import mmap
 import os
-import queue
 import select
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from server.parsing.child import ANSWER, DONE, READY, REQUEST
+from server.parsing.turns import Turn
 
 IS_SUPPORTED = hasattr(os, "memfd_create") and hasattr(fcntl, "F_ADD_SEALS")
 """Whether this system supports sealed shared memory."""
@@ -77,14 +78,27 @@ class ChildProcess:
             os.close(descriptor)
 
     @property
+    def is_ready(self) -> bool:
+        """Whether it has loaded and is running. Only while it is not in use."""
+        if not self.is_alive:
+            return False
+        said = select.poll()
+        said.register(self._answers, select.POLLIN)
+        return self._is_ready or bool(said.poll(0))
+
+    @property
     def is_alive(self) -> bool:
         """Whether the process is running."""
         return self.process.poll() is None
 
-    def ask(self, request: bytes) -> bytearray:
-        """Send a request and wait for the answer. Raises ValueError with the child's line, or ChildDied."""
+    def wait_until_ready(self) -> None:
+        """Wait until a new child has loaded. Raises ChildDied."""
         if not self._is_ready:
             self._is_ready = self._read(len(READY), time.monotonic() + LOADING_TIMEOUT_S) == READY
+
+    def ask(self, request: bytes) -> bytearray:
+        """Send a request and wait for the answer. Raises ValueError with the child's line, or ChildDied."""
+        self.wait_until_ready()
         deadline_s = time.monotonic() + self._spec.timeout_s
         self._write(memoryview(REQUEST.pack(len(request))), deadline_s)
         self._write(memoryview(request), deadline_s)
@@ -150,17 +164,23 @@ class ChildProcess:
 
 
 class ProcessPool:
-    """Pool of one kind of child. Thread-safe. Last in, first out, so that few processes are started."""
+    """Pool of one kind of child. Thread-safe. Children that have loaded are used first, so that few are started."""
 
-    def __init__(self, spec: JobSpec, most: int, on_death: Callable[[], None] = lambda: None) -> None:
-        """Starts no process yet. `on_death` is called in the requesting thread when a child dies."""
+    def __init__(
+        self, spec: JobSpec, most: int, on_death: Callable[[], None] = lambda: None, *, has_spare: bool = False
+    ) -> None:
+        """Starts no process yet. `on_death` is called in the requesting thread when a child dies.
+
+        `has_spare`: the last child is started as soon as all others are in use: it has loaded when it is needed.
+        """
         self._spec = spec
         self._on_death = on_death
-        self._idle: queue.LifoQueue[ChildProcess | None] = queue.LifoQueue()
+        self._has_spare = has_spare
+        self._idle: list[ChildProcess | None] = [None] * most
+        """A place for each child that is not in use; None: not started."""
+        self._returned = threading.Condition()
         self._all: set[ChildProcess] = set()
         self._stopped = False
-        for _ in range(most):
-            self._idle.put(None)
 
     @property
     def pids(self) -> list[int]:
@@ -174,15 +194,37 @@ class ProcessPool:
 
     @contextlib.contextmanager
     def _borrowed(self) -> Iterator[ChildProcess]:
-        child = self._idle.get()
+        child = self._take()
         try:
             if self._stopped:
                 raise ChildDied(STOPPED)
             if child is None or not child.is_alive:
                 child = self._replaced(child)
+            if self._has_spare:
+                self._start_spare()
             yield child
         finally:
-            self._idle.put(child)
+            with self._returned:
+                self._idle.append(child)
+                self._returned.notify()
+
+    def _take(self) -> ChildProcess | None:
+        """Wait for a place and take it: of a child that is ready, else of the last one that came back."""
+        with self._returned:
+            while not self._idle:
+                self._returned.wait()
+            ready = [k for k, child in enumerate(self._idle) if child is not None and child.is_ready]
+            return self._idle.pop(ready[-1] if ready else -1)
+
+    def _start_spare(self) -> None:
+        """If one child is left that is not in use, start it and let it load; the next request waits less for it."""
+        with self._returned:
+            if len(self._idle) != 1 or self._stopped:
+                return
+            (child,) = self._idle
+            if child is None or not child.is_alive:
+                with contextlib.suppress(ChildDied):
+                    self._idle[0] = self._replaced(child)
 
     def _replaced(self, child: ChildProcess | None) -> ChildProcess:
         if child is not None:
@@ -198,14 +240,29 @@ class ProcessPool:
             raise ChildDied(STOPPED)
         return new
 
-    def ask(self, request: bytes, read: Callable[[bytearray, mmap.mmap | None], object] | None = None) -> object:
-        """Returns the answer, or `read(answer, shared memory)`. Raises ValueError, ChildDied."""
+    def ask(
+        self,
+        request: bytes,
+        read: Callable[[bytearray, mmap.mmap | None], object] | None = None,
+        turn: Turn | None = None,
+    ) -> object:
+        """Returns the answer, or `read(answer, shared memory)`. Raises ValueError, ChildDied.
+
+        `turn`: the child is killed, and ChildDied raised, when it is interrupted.
+        """
         with self._borrowed() as child:
             try:
+                child.wait_until_ready()
+                if turn is not None:
+                    turn.set_interrupt(child.process.kill)
                 answer = child.ask(request)
             except ChildDied:
-                self._on_death()
+                if turn is None or not turn.is_interrupted:
+                    self._on_death()
                 raise
+            finally:
+                if turn is not None:
+                    turn.set_interrupt(None)
             return answer if read is None else read(answer, child.shared)
 
     def stop(self) -> None:
@@ -214,14 +271,11 @@ class ProcessPool:
         for child in tuple(self._all):
             child.process.kill()
             child.process.wait()
-        idle: list[ChildProcess | None] = []
-        with contextlib.suppress(queue.Empty):
-            while True:
-                idle.append(self._idle.get_nowait())
-        for slot in idle:
-            if slot is not None:
-                slot.kill()
-            self._idle.put(None)
+        with self._returned:
+            for slot in self._idle:
+                if slot is not None:
+                    slot.kill()
+            self._idle = [None] * len(self._idle)
 
 
 def _sealed_memory(size: int) -> int:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from server.scene.limits import MAX_CUTOUTS, MeshError
 from server.scene.materials import Beyond, Texture
 from server.scene.mesh_parts import MeshPart
 from server.scene.normals import numbered, unit
@@ -103,9 +104,10 @@ def _inside(index: NDArray[np.int64], side: int, beyond: Beyond) -> NDArray[np.i
 
 
 def cut_out(parts: list[MeshPart]) -> list[MeshPart]:
-    """The parts (with normals) after the cutout; empty parts are removed."""
+    """The parts (with normals) after the cutout; empty parts are removed. Raises MeshError for too many materials."""
     share = MOST_TRIANGLES // max(sum(part.material.cutoff is not None for part in parts), 1)
-    cut = [part if part.material.cutoff is None else _cut(part, share) for part in parts]
+    outlines: dict[tuple[int, float, float], Outline] = {}
+    cut = [part if part.material.cutoff is None else _cut(part, share, outlines) for part in parts]
     return [part for part in cut if len(part.triangles)]
 
 
@@ -117,13 +119,18 @@ def _has_area(corners: Floats) -> NDArray[np.bool_]:
     return good
 
 
-def _cut(part: MeshPart, most: int) -> MeshPart:
+def _cut(part: MeshPart, most: int, outlines: dict[tuple[int, float, float], Outline]) -> MeshPart:
     material = part.material
     assert material.cutoff is not None
     texture = material.color_texture
     if texture is None or texture.alpha is None:
         return part if material.opacity >= material.cutoff else replace(part, triangles=part.triangles[:0])
-    outline = Outline.of(texture, material.opacity, material.cutoff)
+    key = (id(texture), material.opacity, material.cutoff)
+    if key not in outlines:
+        if len(outlines) == MAX_CUTOUTS:
+            raise MeshError(f"more than {MAX_CUTOUTS} materials are cut out by their textures: join them")
+        outlines[key] = Outline.of(texture, material.opacity, material.cutoff)
+    outline = outlines[key]
     assert part.normals is not None
     columns = np.hstack([part.vertices, part.colors, part.normals, part.uv]).astype(np.float64)
     corners = _clipped(outline, *_halved(outline, columns[part.triangles], most))

@@ -120,6 +120,8 @@ def _refuse_unsupported(header: Json) -> None:
 def _refuse_tangled(header: Json) -> None:
     """Refuse a scene graph that is not a tree: a node with two parents, or that is its own ancestor."""
     nodes: list[Any] = header.get("nodes", [])
+    if len(nodes) > MAX_PARTS:
+        raise MeshError(f"the glTF has more than {MAX_PARTS} parts: join them")
     parent: dict[int, int] = {}
     for index, node in enumerate(nodes):
         for child in node.get("children", []):
@@ -146,5 +148,5 @@ def _refuse_oversized(header: Json) -> None:
         raise MeshError(f"more than {MAX_TRIANGLES} triangles: {max(corners, vertices)} vertices; simplify the model")
     if min(accessors, default=0) < 0 or sum(accessors) > 8 * MAX_VERTICES:
         raise MeshError("damaged glTF: its accessors are too large")
-    if len(primitives) > MAX_PARTS or len(header.get("nodes", [])) > MAX_PARTS:
+    if len(primitives) > MAX_PARTS:
         raise MeshError(f"the glTF has more than {MAX_PARTS} parts: join them")

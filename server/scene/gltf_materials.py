@@ -51,7 +51,8 @@ def read_materials(header: Json, binary: bytes | None) -> tuple[list[GltfMateria
     textures: dict[tuple[int, tuple[Beyond, Beyond], bool, bool], Texture] = {}
 
     def texture_of(reference: Json | None, *, is_srgb: bool, with_alpha: bool = False) -> Texture | None:
-        index = _image_of(header, reference)
+        listed = _image_of(header, reference)
+        index = None if listed is None else pictures.same_as(listed)
         image = None if index is None else pictures.image(index, is_srgb=is_srgb)
         if reference is None or index is None or image is None:
             return None

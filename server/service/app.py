@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -11,7 +12,7 @@ from fastapi.responses import PlainTextResponse, Response
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST
 
-from server.service.authenticator import WHERE_IT_IS, Authenticator
+from server.service.authenticator import WHERE_IT_IS, Authenticator, address_of
 from server.service.connection import POLICY, Connection, Refusal
 from server.service.health_routes import Health, add_health
 from server.service.object_library import ObjectLibrary
@@ -21,6 +22,8 @@ from server.service.service import Service
 
 STREAM_PATH = "/v1/stream"
 PAGE_FOLDER = Path(__file__).resolve().parents[2] / "client" / "web" / "dist"
+
+log = logging.getLogger(__name__)
 
 
 def create_app(
@@ -59,7 +62,7 @@ def _add_stream(app: FastAPI, service: Service, authenticator: Authenticator) ->
             return
         try:
             with service.connection_limits.connected(connection.address):
-                if (refusal := authenticator.refusal(websocket)) is not None:
+                if (refusal := await authenticator.slowed_refusal(websocket)) is not None:
                     raise refusal
                 await service.serve(connection)
         except Refusal as refused:
@@ -90,6 +93,8 @@ def _add_metrics(app: FastAPI, service: Service, authenticator: Authenticator) -
     @app.get("/metrics", response_class=PlainTextResponse, responses={401: {"description": "No token"}})
     async def metrics(request: Request) -> Response:
         if not authenticator.shows_metrics_to(request):
+            await authenticator.slow_down(request)
+            log.info("request refused", extra={"address": address_of(request), "path": request.url.path})
             return PlainTextResponse(f"The token is missing or wrong: {WHERE_IT_IS}.\n", status_code=401)
         return Response(service.metrics.render(), media_type=CONTENT_TYPE_LATEST)
 

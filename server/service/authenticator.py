@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import ipaddress
 import secrets
 import socket
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote, urlsplit
 
 from starlette.requests import HTTPConnection
 
 from server.service.connection import FORBIDDEN, UNAUTHORIZED, Refusal
+from server.service.trusted_proxies import TrustedProxies
+from server.service.wrong_tokens import WrongTokens
 
 MAX_TOKEN_CHARS = 256
 WHERE_IT_IS = "use the URL that the server printed at its start, which ends in ?token=..."
@@ -49,6 +52,9 @@ class Authenticator:
     token: str | None = None
     origins: frozenset[str] = frozenset()
     """Origins of other sites whose pages may use this server, as `https://host:port`."""
+    proxies: TrustedProxies = field(default_factory=TrustedProxies, compare=False)
+    """Proxies that say from which address a client comes."""
+    wrong_tokens: WrongTokens = field(default_factory=WrongTokens, compare=False, repr=False)
 
     @property
     def query(self) -> str:
@@ -65,6 +71,18 @@ class Authenticator:
             return None
         return Refusal(UNAUTHORIZED, f"the token is {'missing' if given is None else 'wrong'}: {WHERE_IT_IS}")
 
+    async def slowed_refusal(self, request: HTTPConnection) -> Refusal | None:
+        """As `refusal`, after a delay if the token is wrong."""
+        refusal = self.refusal(request)
+        if refusal is not None and refusal.code == UNAUTHORIZED:
+            await self.slow_down(request)
+        return refusal
+
+    async def slow_down(self, request: HTTPConnection) -> None:
+        """Wait before a refused request is answered, if it holds a wrong token. Others do not wait."""
+        if given_token(request) is not None:
+            await asyncio.sleep(self.wrong_tokens.delay_s(address_of(request)))
+
     def fits(self, given: str | None) -> bool:
         """Whether `given` is the token. Compares in constant time."""
         if self.token is None or given is None:
@@ -73,8 +91,7 @@ class Authenticator:
 
     def shows_metrics_to(self, request: HTTPConnection) -> bool:
         """Metrics are shown to clients with the token and to this machine."""
-        address = "" if request.client is None else request.client.host
-        return self.token is None or is_loopback(address) or self.fits(given_token(request))
+        return self.token is None or is_loopback(address_of(request)) or self.fits(given_token(request))
 
     def _is_ours(self, origin: str, host: str) -> bool:
         """Whether `origin` is this server (reached as `host`) or one of the allowed origins."""
@@ -90,6 +107,11 @@ def given_token(request: HTTPConnection) -> str | None:
     """The token in the request: from the Authorization header or, for a browser's WebSocket, from the URL."""
     scheme, _, token = request.headers.get("authorization", "").partition(" ")
     return token.strip() if scheme.lower() == "bearer" else request.query_params.get("token")
+
+
+def address_of(request: HTTPConnection) -> str:
+    """The client's address; empty if it is not known."""
+    return "" if request.client is None else request.client.host
 
 
 def is_loopback(host: str) -> bool:

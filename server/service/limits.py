@@ -19,9 +19,13 @@ class Limits:
     sessions_per_address: int = 8
     """Capturing sessions from one address (IPv6: one /64 network)."""
     watchers: int = 64
+    connections: int = 1024
+    """Connections of any kind in all; fewer where the limit on open files is low (`gate.max_connections`)."""
     connections_per_address: int = 64
-    """Connections of any kind."""
-    first_message_s: float = 30.0
+    """WebSockets from one address. Twice as many connections are accepted, so that it can still ask for health."""
+    header_s: float = 10.0
+    """Timeout for a TLS handshake, and for a request's header."""
+    first_message_s: float = 10.0
     """Timeout for hello or watch."""
     messages_per_s: float = 500.0
     """Sustained message rate of one connection."""

@@ -12,13 +12,23 @@ from asyncio import TimerHandle
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.protocol import State
 
+from server.service.gate import Place
+
 SILENCE_S = 0.5
 
 
 class LingeringCloseWebSocket(WebSocketsSansIOProtocol):
     """uvicorn's WebSocket with a lingering close after protocol errors."""
 
+    place: Place | None = None
+    """Its place among the connections of the server."""
     _silence: TimerHandle | None = None
+
+    def send_receive_event_to_app(self) -> None:
+        """A message is complete: from the first one on, the connection is in use."""
+        if self.place is not None:
+            self.place.set_silent(False)
+        super().send_receive_event_to_app()
 
     def data_received(self, data: bytes) -> None:
         """Handle received data; discard it once the connection has failed."""
@@ -37,6 +47,8 @@ class LingeringCloseWebSocket(WebSocketsSansIOProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Report code 1006 (connection lost); uvicorn would report 1005. The first event in the queue counts."""
+        if self.place is not None:
+            self.place.leave()
         self.queue.put_nowait({"type": "websocket.disconnect", "code": 1006})
         super().connection_lost(exc)
 

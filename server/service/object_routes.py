@@ -6,6 +6,7 @@ from dataclasses import asdict
 from typing import Any
 
 from fastapi import FastAPI, Request
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, PlainTextResponse, Response
 
 from server.service.access import refused, shared_headers
@@ -26,20 +27,21 @@ FILES: dict[int | str, dict[str, Any]] = {
 
 
 def add_objects(app: FastAPI, library: ObjectLibrary, authenticator: Authenticator) -> None:
-    """Add the routes, with the same access rules as the stream. Handlers are synchronous, so they run in threads."""
+    """Add the routes, with the same access rules as the stream. Files are read in threads."""
 
     @app.get(OBJECTS_PATH, responses=REFUSED)
-    def listing(request: Request) -> Response:
-        return refused(authenticator, request) or JSONResponse(
-            {"objects": [asdict(offered) for offered in library.listing()]}, headers=shared_headers(request)
-        )
+    async def listing(request: Request) -> Response:
+        if (refusal := await refused(authenticator, request)) is not None:
+            return refusal
+        listed = await run_in_threadpool(library.listing)
+        return JSONResponse({"objects": [asdict(offered) for offered in listed]}, headers=shared_headers(request))
 
     @app.get(OBJECTS_PATH + "/{name}", response_class=Response, responses=REFUSED | FILES)
-    def one(request: Request, name: str) -> Response:
-        if (refusal := refused(authenticator, request)) is not None:
+    async def one(request: Request, name: str) -> Response:
+        if (refusal := await refused(authenticator, request)) is not None:
             return refusal
         try:
-            found = library.read(name)
+            found = await run_in_threadpool(library.read, name)
         except NoObject as error:
             return PlainTextResponse(f"{error}\n", status_code=404, headers=shared_headers(request))
         headers = shared_headers(request) | {"etag": found.etag}

@@ -50,7 +50,7 @@ def _add_route(app: FastAPI, service: Service, authenticator: Authenticator, for
         room: str | None = None,
         room_key: str | None = None,
     ) -> Response:
-        if (refusal := refused(authenticator, request)) is not None:
+        if (refusal := await refused(authenticator, request)) is not None:
             return refusal
         headers = shared_headers(request, cached="no-store")
 

@@ -19,14 +19,17 @@ import uvicorn
 
 from protocol.limits import MAX_MESSAGE_BYTES
 from protocol.local_keys import LocalKey, key_left, key_path
+from server.service.acceptor import Acceptor, TimedHttp
 from server.service.app import create_app
 from server.service.authenticator import Authenticator, is_loopback, new_token
 from server.service.console import print_line
+from server.service.gate import Gate, Place, max_connections
 from server.service.limits import DEFAULT_LIMITS, Limits
 from server.service.lingering_close import LingeringCloseWebSocket
 from server.service.object_library import ObjectLibrary
 from server.service.service import Service
 from server.service.tls import Certificate
+from server.service.trusted_proxies import TrustedProxies
 
 if TYPE_CHECKING:
     from server.opencl.device import Device
@@ -265,19 +268,33 @@ class BackgroundServer:
 class _Server(uvicorn.Server):
     """uvicorn server that signals when it accepts connections and shuts down gracefully."""
 
-    def __init__(self, config: uvicorn.Config, service: Service) -> None:
+    def __init__(self, config: uvicorn.Config, service: Service, proxies: TrustedProxies) -> None:
         super().__init__(config)
         self.accepting = threading.Event()
         self._service = service
+        self._proxies = proxies
+        self._acceptors: list[Acceptor] = []
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Drain the service while new clients still get an answer, then close."""
         await self._service.shutdown.drain(DRAIN_PATIENCE_S)
+        for acceptor in self._acceptors:
+            await acceptor.stop()
         await super().shutdown(sockets)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        await super().startup(sockets)
+        """Start without uvicorn's own listening, which accepts without limits."""
+        await super().startup([])
+        limits = self._service.limits
+        most = max_connections(limits)
+        gate = Gate(most, max(1, min(2 * limits.connections_per_address, most // 2)), self._proxies.__contains__)
+        self._acceptors = [Acceptor(s, gate, self.config, self._open_protocol) for s in sockets or []]
         self.accepting.set()
+
+    def _open_protocol(self, place: Place) -> TimedHttp:
+        protocol = TimedHttp(self.config, self.server_state, self.lifespan.state)
+        protocol.place, protocol.header_s = place, self._service.limits.header_s
+        return protocol
 
 
 def _server(
@@ -289,6 +306,9 @@ def _server(
         ssl_keyfile=None if certificate is None else certificate.key,
         log_level="warning",
         access_log=False,
+        http=TimedHttp,
+        proxy_headers=bool(authenticator.proxies),
+        forwarded_allow_ips=authenticator.proxies.for_uvicorn,
         ws=LingeringCloseWebSocket,
         ws_per_message_deflate=False,  # costs 10 ms a message; images are compressed already
         ws_max_size=MAX_MESSAGE_BYTES,
@@ -296,7 +316,7 @@ def _server(
         log_config=None,
         timeout_graceful_shutdown=STOP_PATIENCE_S - DRAIN_PATIENCE_S,
     )
-    return _Server(config, service)
+    return _Server(config, service, authenticator.proxies)
 
 
 def _warm_up(device: Device) -> None:

@@ -126,7 +126,7 @@ class Service:
             open_pipeline=self._open_pipeline,
             scheduler=self._scheduler,
             target_period_s=self.limits.target_period_s,
-            load_mesh=mesh_loader or self._parsers.load_mesh,
+            mesh_loader=self._parsers.mesh_loader if mesh_loader is None else lambda: mesh_loader,
             color_reader=self._parsers.color_reader,
             metrics=self.metrics,
             save_room=self._persistence.save_now if self._persistence else not_saved,

@@ -96,7 +96,8 @@ class WorkerContext:
 
     open_pipeline: Callable[[Hello], AbstractContextManager[ClientSession]]
     """Context with a client's pipeline. Raises ValueError for wishes that cannot be met."""
-    load_mesh: Callable[[bytes, str], Mesh]
+    mesh_loader: Callable[[], Callable[[bytes, str], Mesh]]
+    """Makes the function that reads a session's meshes."""
     metrics: Metrics
     scheduler: Scheduler
     target_period_s: float = 0.25
@@ -117,6 +118,7 @@ class Worker:
         self._mailbox = mailbox
         self._outbox = outbox
         self._share = context.scheduler.join(hello.room)
+        self._load_mesh = context.mesh_loader()
         self._colors = context.color_reader(hello.camera)
         self._arrived_s = self._waited_ms = 0.0
         """Arrival time and waiting time of the newest frame."""
@@ -190,7 +192,7 @@ class Worker:
         """Apply a request and return its acknowledgement. A repeated request is not applied again."""
         done = self._acknowledged.get(message.request)
         if done is None:
-            done = apply_control(pipeline, message, self._context.load_mesh)
+            done = apply_control(pipeline, message, self._load_mesh)
             if isinstance(message, Quality) and done.error is None:
                 self._load_shedding.request(
                     SamplingRequest(message.preset, message.budget_ms, message.max_light_error_deg)

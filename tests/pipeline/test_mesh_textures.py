@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import struct
+from unittest.mock import Mock
 
+import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from server.scene import gltf_pictures
+from server.scene.cutout import Outline
+from server.scene.limits import MAX_CUTOUTS
 from server.scene.materials import Beyond
 from server.scene.mesh import MeshError, load_mesh
 from tests.scenes.gltf_files import QUAD, QUAD_UV, Gltf, assert_well_formed, color_uv, shown_texture
@@ -82,8 +87,11 @@ def test_large_texture_is_scaled_down_with_a_note() -> None:
 def test_many_large_textures_are_scaled_until_they_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gltf_pictures, "MAX_KEPT_PIXELS", 3 * 64 * 64)
     file = Gltf()
-    material = file.texture(np.zeros((128, 128, 3), np.uint8))
-    file.header["images"] = [dict(file.header["images"][0]) for _ in range(6)]
+    images = []
+    for grey in range(6):
+        material = file.texture(np.full((128, 128, 3), grey, np.uint8))
+        images += file.header["images"]
+    file.header["images"] = images
     file.header["textures"] = [{"source": k} for k in range(6)]
     file.quad(material, TEXCOORD_0=QUAD_UV)
     file.header["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": k}}} for k in range(6)]
@@ -102,3 +110,70 @@ def test_texture_bomb_is_refused_before_it_is_decoded() -> None:
     file.quad({"baseColorTexture": {"index": 0}}, TEXCOORD_0=QUAD_UV)
     with pytest.raises(MeshError, match="textures has 60000 x 60000"):
         load_mesh(file.glb(), "glb")
+
+
+def many_materials(count: int, picture: NDArray[np.uint8], **material: object) -> Gltf:
+    """A square for each of `count` materials with an image of its own; the bytes of all images are the same."""
+    file = Gltf()
+    file.quad(file.texture(picture), TEXCOORD_0=QUAD_UV)
+    file.header["images"] = [dict(file.header["images"][0]) for _ in range(count)]
+    file.header["textures"] = [{"source": k} for k in range(count)]
+    file.header["materials"] = [
+        {"pbrMetallicRoughness": {"baseColorTexture": {"index": k}}} | material for k in range(count)
+    ]
+    first = file.header["meshes"][0]["primitives"][0]
+    file.header["meshes"][0]["primitives"] = [
+        first | {"material": k, "attributes": dict(first["attributes"])} for k in range(count)
+    ]
+    return file
+
+
+def test_a_picture_is_decoded_once_for_all_its_materials(monkeypatch: pytest.MonkeyPatch) -> None:
+    decode = Mock(wraps=gltf_pictures._decode)
+    monkeypatch.setattr(gltf_pictures, "_decode", decode)
+    picture = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
+    mesh = load_mesh(many_materials(200, picture).glb(), "glb")
+    assert decode.call_count == 1
+    assert shown_texture(mesh).image.tobytes() == picture.tobytes()
+    assert len({id(m.color_texture) for m in mesh.materials}) == 1
+
+
+def test_a_cutout_is_made_ready_once_for_all_its_materials(monkeypatch: pytest.MonkeyPatch) -> None:
+    outline_of = Mock(wraps=Outline.of)
+    monkeypatch.setattr(Outline, "of", outline_of)
+    picture = np.full((64, 64, 4), 255, np.uint8)
+    picture[:, :40, 3] = 0
+    load_mesh(many_materials(50, picture, alphaMode="MASK").glb(), "glb")
+    assert outline_of.call_count == 1
+
+
+def test_too_many_different_cutouts_are_refused() -> None:
+    picture = np.full((8, 8, 4), 255, np.uint8)
+    picture[:, :5, 3] = 0
+    file = many_materials(MAX_CUTOUTS + 1, picture, alphaMode="MASK")
+    for k, material in enumerate(file.header["materials"]):
+        material["alphaCutoff"] = 0.1 + 0.001 * k
+    with pytest.raises(MeshError, match=f"more than {MAX_CUTOUTS} materials are cut out"):
+        load_mesh(file.glb(), "glb")
+
+
+@pytest.mark.parametrize(
+    ("limit", "most", "told"),
+    [("MAX_DECODED_PIXELS", 2 * 64 * 64, "more than 8192 pixels together"), ("MAX_IMAGE_BYTES", 100, "MiB together")],
+)
+def test_pictures_are_bounded_together_before_one_is_decoded(
+    monkeypatch: pytest.MonkeyPatch, limit: str, most: int, told: str
+) -> None:
+    monkeypatch.setattr(gltf_pictures, limit, most)
+    monkeypatch.setattr(gltf_pictures, "_decode", Mock(side_effect=AssertionError))
+    file = many_materials(3, np.zeros((64, 64, 3), np.uint8))
+    for grey in range(3):
+        file.header["images"][grey] = {"bufferView": file.view(_png(grey)), "mimeType": "image/png"}
+    with pytest.raises(MeshError, match=told):
+        load_mesh(file.glb(), "glb")
+
+
+def _png(grey: int) -> bytes:
+    done, encoded = cv2.imencode(".png", np.full((64, 64, 3), grey, np.uint8))
+    assert done
+    return encoded.tobytes()

@@ -280,7 +280,7 @@ def test_moves_that_wait_behind_a_frame_are_kept_together() -> None:
     pipeline = FakePipeline(lab)
     context = WorkerContext(
         open_pipeline=lambda _hello: contextlib.nullcontext(pipeline),
-        load_mesh=fake_mesh,
+        mesh_loader=lambda: fake_mesh,
         metrics=Metrics(),
         scheduler=Scheduler(),
         save_placements=lambda _name: inbox.kept.append(len(lab.log)),

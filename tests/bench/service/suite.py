@@ -1,9 +1,9 @@
 """`probeless bench service`: what makes it a service a person would run for others.
 
-The way of one client; load; frames of minutes; faults at random moments; bad bytes; two clients that see a plane each;
-replay. Servers are processes of their own, as in the field; clients run here, on the same cores. A run that was stopped
-goes on with the parts that are missing: finished ones lie in out/bench/service/parts, mutated messages in bytes.jsonl,
-logs beside them.
+The way of one client; load; frames of minutes; attacks; faults at random moments; bad bytes; two clients that see a
+plane each; replay. Servers are processes of their own, as in the field; clients run here, on the same cores. A run that
+was stopped goes on with the parts that are missing: finished ones lie in out/bench/service/parts, mutated messages in
+bytes.jsonl, logs beside them.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from server.opencl.device import open_device
 from tests.bench.report.finished import ROOT, Finished, Part
 from tests.bench.report.report import Report
 from tests.bench.report.run import Run
+from tests.bench.service.attacks import large_models_part, silent_sockets_part
 from tests.bench.service.bytes import decoder_part, socket_part
 from tests.bench.service.faults import FAULTS, fault_part, server_killed_part
 from tests.bench.service.full_disk import full_disk_part
@@ -33,6 +34,8 @@ PARTS: dict[str, Callable[..., Part]] = {
     "load": load_part,
     "side by side": side_by_side_part,
     "long frames": long_frames_part,
+    "silent sockets": silent_sockets_part,
+    "large models": large_models_part,
     "server killed": server_killed_part,
     "disk full, then killed": full_disk_part,
     **{name: partial(fault_part, name) for name in FAULTS},

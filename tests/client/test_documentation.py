@@ -23,7 +23,7 @@ from tests.client.documented import GROUP, Command, code_in_sentences, commands,
 from tests.data import ROOT
 
 COMMANDS = commands()
-OTHER_PROGRAMS = {"apt-get", "curl", "docker"}
+OTHER_PROGRAMS = {"apt-get", "curl", "docker", "openssl"}
 """Programs that are not ours; nothing of theirs is checked."""
 SCENE = "?size=160x120&frames=12"
 GENERATED = {f"docs/reference/{name}" for name in ("cli.md", "messages.md", "messages.schema.json")}
@@ -39,7 +39,7 @@ EXTRAS = {"--video": ("av", "PyAV"), "--rerun": ("rerun", "rerun-sdk")}
 OPTIONS = {name for command in GROUP.commands.values() for each in command.params for name in each.opts}
 OPTIONS |= {name for command in GROUP.commands.values() for each in command.params for name in each.secondary_opts}
 OPTIONS |= {"--help", "--help-all", "--debug"}
-OPTIONS_OF_OTHERS = {"--build-arg", "--count", "--from", "--group-add", "--seed"}
+OPTIONS_OF_OTHERS = {"--background", "--build-arg", "--count", "--from", "--group-add", "--python", "--seed", "--serve"}
 """Of other programs, that sentences name."""
 
 

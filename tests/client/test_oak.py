@@ -132,7 +132,7 @@ def test_run_of_a_camera_ends_at_ctrl_c(oak: OakSource, monkeypatch: pytest.Monk
             given.append(frame.index)
             if frame.index == 2:
                 os.kill(os.getpid(), signal.SIGINT)
-            yield SimpleNamespace(notes=(), light=light_of(frame.index), world_from_camera=np.eye(4))
+            yield SimpleNamespace(notes=(), light=light_of(frame.index), world_from_camera=np.eye(4), tracking="given")
 
     monkeypatch.setattr("client.commands.run.process_frames", outputs)
     run = Run.__new__(Run)

@@ -132,11 +132,17 @@ def test_run_of_a_camera_ends_at_ctrl_c(oak: OakSource, monkeypatch: pytest.Monk
             given.append(frame.index)
             if frame.index == 2:
                 os.kill(os.getpid(), signal.SIGINT)
-            yield SimpleNamespace(notes=(), light=light_of(frame.index), world_from_camera=np.eye(4), tracking="given")
+            yield SimpleNamespace(
+                notes=(),
+                light=light_of(frame.index),
+                world_from_camera=np.eye(4),
+                tracking="given",
+                timestamp_s=frame.timestamp_s,
+            )
 
     monkeypatch.setattr("client.commands.run.process_frames", outputs)
     run = Run.__new__(Run)
-    run._capture, run._pipeline = prepare(CaptureOptions("oak")), None
+    run._capture, run._pipeline, run._path = prepare(CaptureOptions("oak")), None, []
     assert len(list(run.outputs())) == 3
     assert given == [0, 1, 2]
 

@@ -49,7 +49,7 @@ PATIENCE_S = 20.0
 MEMORY_GOAL_MB = 3000
 NAMED = re.compile(
     r"`\$|unknown field|required fields? (are|is) missing|truncated|malformed|codec can't decode|Expected `|"
-    r"Invalid (enum )?value|"
+    r"missing required field|Invalid (enum )?value|"
     r"nested too deeply|limit of|color\.|depth\.|frame\.|camera|hello\.|wishes|object\.|quality|place_object|watch"
 )
 """Words of which one is in every refusal that says what was wrong."""

@@ -347,8 +347,8 @@ def serve(
         log_format_of,
         objects_folder,
     )
-    from server.service.console import console_of
-    from server.service.event_log import log_events
+    from server.service.monitoring.console import console_of
+    from server.service.monitoring.event_log import log_events
     from server.service.serve import serve as serve_forever
 
     options = ServeOptions(

@@ -18,7 +18,7 @@ from client.sources.volume import default_volume, default_voxel
 from client.synthetic.scenes import desk
 from protocol.messages import Wishes
 from server.scene.vase import vase_glb
-from server.service.authenticator import Authenticator, new_token
+from server.service.edge.authenticator import Authenticator, new_token
 from server.service.serve import BackgroundServer, open_service
 
 SOURCE = "synthetic:desk?frames="

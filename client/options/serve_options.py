@@ -14,12 +14,12 @@ from urllib.parse import urlsplit
 from platformdirs import user_data_path
 
 from client.errors import OptionError, RunError
-from server.service.authenticator import MAX_TOKEN_CHARS, Authenticator, is_loopback, is_token, new_token, token_in
-from server.service.event_log import LogFormat
+from server.service.edge.authenticator import MAX_TOKEN_CHARS, Authenticator, is_loopback, is_token, new_token, token_in
+from server.service.edge.tls import Certificate, CertificateError, given_certificate, own_certificate
+from server.service.edge.trusted_proxies import TrustedProxies
 from server.service.limits import DEFAULT_LIMITS, GIB, MIB, Limits
+from server.service.monitoring.event_log import LogFormat
 from server.service.saving.retention import DAY_S, RetentionLimits
-from server.service.tls import Certificate, CertificateError, given_certificate, own_certificate
-from server.service.trusted_proxies import TrustedProxies
 
 log = logging.getLogger(__name__)
 

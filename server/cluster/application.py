@@ -15,7 +15,7 @@ from server.cluster.ingress import Ingress, create_ingress_app
 from server.cluster.ray_directory import RayRoomDirectory
 from server.cluster.room_supervisor import RoomSupervisor
 from server.cluster.settings import ClusterSettings, read_settings
-from server.service.authenticator import Authenticator, is_token
+from server.service.edge.authenticator import Authenticator, is_token
 
 TOKEN = "PROBELESS_TOKEN"
 

@@ -16,7 +16,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from server.cluster.node_warm_up import warm_up_node
 from server.cluster.room_directory import Address
 from server.cluster.settings import ClusterSettings
-from server.service.authenticator import Authenticator, new_token
+from server.service.edge.authenticator import Authenticator, new_token
 from server.service.limits import DEFAULT_LIMITS, MIB, Limits
 from server.service.serve import BackgroundServer
 from server.service.service import Service

@@ -16,12 +16,12 @@ from server.cluster.relay import open_host, relay
 from server.cluster.room_directory import RoomDirectory, RoomNotReady, RoomUnavailable
 from server.cluster.routing import Route, route_of
 from server.service.app import PAGE_FOLDER, STREAM_PATH
-from server.service.authenticator import Authenticator
-from server.service.connection import GONE, POLICY, TRY_LATER, BadMessage, Connection, Refusal
-from server.service.health_routes import Health, add_health
+from server.service.edge.authenticator import Authenticator
+from server.service.edge.connection import GONE, POLICY, TRY_LATER, BadMessage, Connection, Refusal
 from server.service.limits import DEFAULT_LIMITS, Limits
-from server.service.object_library import ObjectLibrary
-from server.service.object_routes import add_objects
+from server.service.routes.health_routes import Health, add_health
+from server.service.routes.object_library import ObjectLibrary
+from server.service.routes.object_routes import add_objects
 
 RETRY_S = 0.25
 PATIENCE_S = 20.0

@@ -13,7 +13,7 @@ from ray.exceptions import RayActorError
 from server.cluster.host import HostStatus, open_room_host
 from server.cluster.room_directory import Address, RoomNotReady, RoomUnavailable
 from server.cluster.settings import ClusterSettings
-from server.service.event_log import log_events
+from server.service.monitoring.event_log import log_events
 
 NAMESPACE = "probeless"
 PREFIX = "room-"

@@ -14,7 +14,7 @@ from websockets.typing import Subprotocol
 from protocol.limits import MAX_MESSAGE_BYTES, SUBPROTOCOL
 from server.cluster.room_directory import Address
 from server.cluster.routing import outgoing
-from server.service.connection import GOING_AWAY, INTERNAL, LOST, NO_CODE, NORMAL, RESTART
+from server.service.edge.connection import GOING_AWAY, INTERNAL, LOST, NO_CODE, NORMAL, RESTART
 
 STREAM_PATH = "/v1/stream"
 OPEN_PATIENCE_S = 5.0

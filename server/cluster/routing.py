@@ -16,7 +16,7 @@ from msgspec import structs
 
 from protocol.codec import decode_server, encode
 from protocol.messages import ClientMessage, Hello, Watch, Welcome
-from server.service.connection import GONE, POLICY, Refusal
+from server.service.edge.connection import GONE, POLICY, Refusal
 
 ID_BYTES = 8
 _OWN = re.compile(rf"([0-9a-f]{{{2 * ID_BYTES}}})\.(.+)")

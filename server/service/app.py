@@ -12,12 +12,12 @@ from fastapi.responses import PlainTextResponse, Response
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST
 
-from server.service.authenticator import WHERE_IT_IS, Authenticator, address_of
-from server.service.connection import POLICY, Connection, Refusal
-from server.service.health_routes import Health, add_health
-from server.service.object_library import ObjectLibrary
-from server.service.object_routes import add_objects
-from server.service.panorama_routes import add_panorama
+from server.service.edge.authenticator import WHERE_IT_IS, Authenticator, address_of
+from server.service.edge.connection import POLICY, Connection, Refusal
+from server.service.routes.health_routes import Health, add_health
+from server.service.routes.object_library import ObjectLibrary
+from server.service.routes.object_routes import add_objects
+from server.service.routes.panorama_routes import add_panorama
 from server.service.service import Service
 
 STREAM_PATH = "/v1/stream"

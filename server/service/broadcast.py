@@ -9,7 +9,7 @@ from hmac import compare_digest
 from typing import NamedTuple
 
 from protocol.messages import Bye
-from server.service.connection import POLICY, BadMessage, Connection, Refusal
+from server.service.edge.connection import POLICY, BadMessage, Connection, Refusal
 
 
 class Watcher:

@@ -7,7 +7,7 @@ import contextlib
 import logging
 from collections.abc import Awaitable, Callable, Iterator
 
-from server.service.connection import RESTART, TRY_LATER, Connection, Refusal
+from server.service.edge.connection import RESTART, TRY_LATER, Connection, Refusal
 
 GOODBYE = "the server is stopping: connect again in a while"
 DRAINING = "this server is draining, it takes nobody new: connect again in a while"

@@ -19,17 +19,17 @@ import uvicorn
 
 from protocol.limits import MAX_MESSAGE_BYTES
 from protocol.local_keys import LocalKey, key_left, key_path
-from server.service.acceptor import Acceptor, TimedHttp
 from server.service.app import create_app
-from server.service.authenticator import Authenticator, is_loopback, new_token
-from server.service.console import print_line
-from server.service.gate import Gate, Place, max_connections
+from server.service.edge.acceptor import Acceptor, TimedHttp
+from server.service.edge.authenticator import Authenticator, is_loopback, new_token
+from server.service.edge.gate import Gate, Place, max_connections
+from server.service.edge.lingering_close import LingeringCloseWebSocket
+from server.service.edge.tls import Certificate
+from server.service.edge.trusted_proxies import TrustedProxies
 from server.service.limits import DEFAULT_LIMITS, Limits
-from server.service.lingering_close import LingeringCloseWebSocket
-from server.service.object_library import ObjectLibrary
+from server.service.monitoring.console import print_line
+from server.service.routes.object_library import ObjectLibrary
 from server.service.service import Service
-from server.service.tls import Certificate
-from server.service.trusted_proxies import TrustedProxies
 
 if TYPE_CHECKING:
     from server.opencl.device import Device

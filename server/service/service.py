@@ -22,16 +22,25 @@ from protocol.messages import Bye, Hello, Watch, Welcome, Wishes
 from server.parsing.parsers import Parsers
 from server.scene.mesh import Mesh
 from server.service.broadcast import Broadcast, serve_watcher
-from server.service.connection import GONE, INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
-from server.service.connection_limits import ConnectionLimits
-from server.service.event_log import about
+from server.service.edge.connection import (
+    GONE,
+    INTERNAL,
+    POLICY,
+    TRY_LATER,
+    BadMessage,
+    ClientGone,
+    Connection,
+    Refusal,
+)
+from server.service.edge.connection_limits import ConnectionLimits
 from server.service.graceful_shutdown import GracefulShutdown
 from server.service.limits import DEFAULT_LIMITS, Limits
 from server.service.mailbox import PanoramaOrder
-from server.service.metrics import Metrics
-from server.service.room_persistence import RoomPersistence
+from server.service.monitoring.event_log import about
+from server.service.monitoring.metrics import Metrics
 from server.service.room_registry import RoomFactory, RoomRegistry, key_digest_of
 from server.service.saving.retention import StorageUsage
+from server.service.saving.room_persistence import RoomPersistence
 from server.service.scheduler import Scheduler
 from server.service.session import MAX_INFLIGHT, CaptureSession, EventLoopOutbox
 from server.service.worker import WorkerContext, not_saved

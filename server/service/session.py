@@ -12,7 +12,16 @@ from msgspec import structs
 from protocol.codec import encode
 from protocol.messages import Bye, ClientMessage, Dropped, Error, Frame, Hello, Watch, Welcome
 from server.service.broadcast import Broadcast
-from server.service.connection import GONE, INTERNAL, POLICY, TRY_LATER, BadMessage, ClientGone, Connection, Refusal
+from server.service.edge.connection import (
+    GONE,
+    INTERNAL,
+    POLICY,
+    TRY_LATER,
+    BadMessage,
+    ClientGone,
+    Connection,
+    Refusal,
+)
 from server.service.mailbox import Mailbox, PanoramaOrder
 from server.service.worker import Worker, WorkerContext
 

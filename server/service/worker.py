@@ -37,11 +37,11 @@ from protocol.messages import (
 from server.meshing.files import mesh_files
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement, requested_placement
-from server.service.connection import POLICY, UNAUTHORIZED, ClientGone, Refusal
+from server.service.edge.connection import POLICY, UNAUTHORIZED, ClientGone, Refusal
 from server.service.load_shedding import LoadShedding, SamplingRequest
 from server.service.mailbox import Mailbox, PanoramaOrder, QueuedMessage
 from server.service.mesh_message import mesh_parts
-from server.service.metrics import Metrics
+from server.service.monitoring.metrics import Metrics
 from server.service.result_encoding import composite_message, layer_message
 from server.service.room_registry import WrongRoomKey
 from server.service.scheduler import Scheduler, Turn

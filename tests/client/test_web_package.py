@@ -18,7 +18,7 @@ from client.web.build import pack
 from protocol.conformance.play_server import ConformanceServer
 from protocol.messages import Wishes
 from server.opencl.device import Device
-from server.service.authenticator import Authenticator
+from server.service.edge.authenticator import Authenticator
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.client.web.received import Received

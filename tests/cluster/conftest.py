@@ -12,7 +12,7 @@ import uvicorn
 from server.cluster.host import RoomHost
 from server.cluster.ingress import Ingress, create_ingress_app
 from server.cluster.room_directory import Address, RoomNotReady, RoomUnavailable
-from server.service.authenticator import Authenticator
+from server.service.edge.authenticator import Authenticator
 from server.service.serve import listen, url_of
 from server.service.service import Service
 from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh

@@ -5,7 +5,7 @@ import time
 from protocol.messages import Acknowledged, Composite, Hello, Quality, Watch, Welcome
 from server.cluster.relay import MOVED
 from server.cluster.routing import room_id_of
-from server.service.connection import GONE, RESTART, TRY_LATER, UNAUTHORIZED
+from server.service.edge.connection import GONE, RESTART, TRY_LATER, UNAUTHORIZED
 from tests.cluster.conftest import IMPATIENT_S
 from tests.service.fakes import CAMERA, PATIENCE_S, frame_message
 

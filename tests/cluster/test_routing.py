@@ -6,7 +6,7 @@ from protocol.codec import decode_client, decode_server, encode
 from protocol.limits import MAX_NAME_CHARS
 from protocol.messages import Bye, Dropped, Hello, Watch, Welcome
 from server.cluster.routing import outgoing, room_id_of, route_of
-from server.service.connection import GONE, POLICY, Refusal
+from server.service.edge.connection import GONE, POLICY, Refusal
 from tests.service.fakes import CAMERA
 
 ID = room_id_of("kitchen")

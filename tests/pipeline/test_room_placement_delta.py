@@ -15,8 +15,8 @@ import pytest
 from server.opencl.device import Device
 from server.room.room import Room
 from server.scene.placement import Placement
-from server.service.room_store import RoomStore, RoomStoreError, folder_name
 from server.service.saving.checksummed_files import read_parts, write_parts
+from server.service.saving.room_store import RoomStore, RoomStoreError, folder_name
 from tests.scenes.faulty_disk import FaultyDisk, PowerCut, full
 from tests.scenes.kept_rooms import CUBE, PLACE, client_of, found, print_of, scan
 from tests.scenes.rooms import wishes

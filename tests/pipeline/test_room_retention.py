@@ -13,9 +13,9 @@ import pytest
 from server.opencl.device import Device
 from server.room.room import Room
 from server.room.room_objects import ObjectRecord
-from server.service.room_saver import RoomSaver
-from server.service.room_store import RoomStore, folder_name
 from server.service.saving.retention import DAY_S, RetentionLimits
+from server.service.saving.room_saver import RoomSaver
+from server.service.saving.room_store import RoomStore, folder_name
 from tests.scenes.kept_rooms import CUBE, PLACE
 from tests.scenes.rooms import wishes
 

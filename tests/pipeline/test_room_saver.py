@@ -11,9 +11,9 @@ import pytest
 
 from server.opencl.device import Device
 from server.room.room import Room
-from server.service.room_saver import RoomSaver
-from server.service.room_store import RoomStore
+from server.service.saving.room_saver import RoomSaver
 from server.service.saving.room_saves import Saved
+from server.service.saving.room_store import RoomStore
 from tests.scenes.faulty_disk import FaultyDisk, full
 from tests.scenes.kept_rooms import client_of, print_of, scan
 from tests.scenes.rooms import wishes

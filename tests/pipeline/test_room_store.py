@@ -24,8 +24,8 @@ from server.pipeline import FrameResult
 from server.room.room import Room
 from server.room.room_objects import ObjectRecord
 from server.scene.placement import Placement
-from server.service.room_store import RoomStore, folder_name
 from server.service.saving.brick_files import merged, read_bricks, write_bricks
+from server.service.saving.room_store import RoomStore, folder_name
 from server.volume.raycast import raycast
 from server.volume.volume import Volume
 from tests.scenes import corners

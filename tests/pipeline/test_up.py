@@ -19,7 +19,7 @@ from server.opencl.device import Device
 from server.room.room import Room
 from server.room.up_finder import FRAMES, PAUSE, patch_normals
 from server.scene.placement import Placement
-from server.service.room_store import RoomStore
+from server.service.saving.room_store import RoomStore
 from tests.data import data_folder
 from tests.scenes.analytic import Floats, sphere
 from tests.scenes.kept_rooms import CUBE, client_of, scan

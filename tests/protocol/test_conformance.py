@@ -22,7 +22,7 @@ from protocol.conformance.scene import frame, hello
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.limits import SUBPROTOCOL
 from protocol.wire_page import PAGE
-from server.service.authenticator import Authenticator
+from server.service.edge.authenticator import Authenticator
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.data import ROOT

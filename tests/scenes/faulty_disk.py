@@ -9,7 +9,11 @@ from typing import Any
 
 import pytest
 
-MODULES = ("server.service.saving.checksummed_files", "server.service.saving.save_slot", "server.service.room_store")
+MODULES = (
+    "server.service.saving.checksummed_files",
+    "server.service.saving.save_slot",
+    "server.service.saving.room_store",
+)
 
 
 class PowerCut(BaseException):

@@ -15,9 +15,9 @@ from server.client_session import ClientSession
 from server.opencl.device import Device
 from server.room.room import Room
 from server.scene.placement import Placement
-from server.service.room_store import RoomStore
 from server.service.saving.room_snapshots import snapshot_within
 from server.service.saving.room_state import state_to_bytes
+from server.service.saving.room_store import RoomStore
 from server.service.saving.save_slot import SaveSlot
 from server.volume.volume import Volume
 from tests.scenes.meshes import shape_of

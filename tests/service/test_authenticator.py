@@ -12,7 +12,7 @@ from client.streaming.client import Access
 from protocol.local_keys import LocalKey, find_key, key_left, key_path
 from protocol.messages import Error
 from server.service.app import create_app
-from server.service.authenticator import Authenticator, is_loopback, is_token, new_token
+from server.service.edge.authenticator import Authenticator, is_loopback, is_token, new_token
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.service.admission import TOKEN, connected, not_connected

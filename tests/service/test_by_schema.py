@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import FastAPI, Response
 
 from server.service.app import create_app
-from server.service.authenticator import Authenticator
+from server.service.edge.authenticator import Authenticator
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.service.by_schema import requests_by_schema

@@ -17,9 +17,9 @@ from tests.service.fakes import PATIENCE_S
 TOKEN = "a-token-of-this-test"
 PROGRAM = f"""
 import sys
-from server.service.authenticator import Authenticator
-from server.service.console import console_of
-from server.service.event_log import log_events
+from server.service.edge.authenticator import Authenticator
+from server.service.monitoring.console import console_of
+from server.service.monitoring.event_log import log_events
 from server.service.serve import listen, serve_on
 from server.service.service import Service
 from tests.service.fakes import FAKE_DEVICE, Lab, fake_mesh

@@ -16,8 +16,8 @@ import pytest
 from protocol.messages import Bye, Hello, Wishes
 from server.opencl.device_memory import DeviceMemory
 from server.opencl.profile import Profile
-from server.service.event_log import JsonLines, TextLines, about, facts_of
 from server.service.graceful_shutdown import GOODBYE
+from server.service.monitoring.event_log import JsonLines, TextLines, about, facts_of
 from tests.data import ROOT
 from tests.service.fakes import CAMERA, EXPLODE_MM, PATIENCE_S, frame_message
 from tests.service.http import rows
@@ -101,7 +101,7 @@ def test_numbers_that_json_does_not_have_are_words() -> None:
 LOUD = """
 import logging, threading, uvicorn, warnings
 import numpy as np
-from server.service.event_log import log_events
+from server.service.monitoring.event_log import log_events
 log_events("json")
 config = uvicorn.Config(None, log_config=None, log_level="warning")  # as serve.py
 np.zeros(1) / np.zeros(1)
@@ -124,8 +124,8 @@ def test_json_logs_are_json_whoever_speaks() -> None:
         "py.warnings",
         "py.warnings",
         "uvicorn.error",
-        "server.service.event_log",
-        "server.service.event_log",
+        "server.service.monitoring.event_log",
+        "server.service.monitoring.event_log",
     ]
     assert "RuntimeWarning: invalid value" in said[0]["event"]
     assert said[3]["error"] == "ZeroDivisionError: division by zero"

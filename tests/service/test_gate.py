@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from protocol.messages import Composite
-from server.service.gate import LOG_PERIOD_S, Gate, SparseLog, max_connections
+from server.service.edge.gate import LOG_PERIOD_S, Gate, SparseLog, max_connections
 from server.service.limits import Limits
 from tests.data import ROOT
 from tests.service.fakes import PATIENCE_S, frame_message

@@ -16,8 +16,8 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 
 from protocol.messages import Acknowledged, Bye, Composite, Dropped, Error, Quality
+from server.service.edge.lingering_close import LingeringCloseWebSocket
 from server.service.graceful_shutdown import DRAINING, GOODBYE, GracefulShutdown
-from server.service.lingering_close import LingeringCloseWebSocket
 from server.service.serve import BackgroundServer
 from tests.data import ROOT
 from tests.service.fakes import PATIENCE_S, frame_message

@@ -9,7 +9,7 @@ import httpx
 import pytest
 
 from server.service.app import create_app
-from server.service.authenticator import Authenticator
+from server.service.edge.authenticator import Authenticator
 from server.service.limits import Limits
 from server.service.self_check import CheckFailed
 from server.service.serve import BackgroundServer

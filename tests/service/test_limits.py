@@ -7,9 +7,9 @@ from websockets.exceptions import ConnectionClosed
 
 from protocol.codec import encode
 from protocol.messages import Acknowledged, Composite, Error, Hello, Quality, Welcome
-from server.service.connection_limits import network_of
+from server.service.edge.connection_limits import network_of
+from server.service.edge.rate_limiter import RateLimiter, TokenBucket
 from server.service.limits import Limits
-from server.service.rate_limiter import RateLimiter, TokenBucket
 from tests.service.fakes import CAMERA, frame_message
 from tests.service.wire import Wire
 

@@ -9,8 +9,8 @@ import pytest
 
 from protocol.limits import MAX_MESH_BYTES
 from server.scene.mesh import load_mesh
-from server.service.authenticator import Authenticator
-from server.service.object_library import MAX_OBJECTS, NoObject, ObjectLibrary
+from server.service.edge.authenticator import Authenticator
+from server.service.routes.object_library import MAX_OBJECTS, NoObject, ObjectLibrary
 from tests.service.fakes import PATIENCE_S
 
 TOKEN = "a-token"

@@ -13,7 +13,7 @@ import pytest
 from client.options.light_places import PanoramaOut
 from client.streaming.client import ClientError, StreamClient
 from protocol.messages import Acknowledged, Composite, Hello, Panorama, RequestPanorama, Wishes
-from server.service.authenticator import Authenticator
+from server.service.edge.authenticator import Authenticator
 from server.service.mailbox import Mailbox, PanoramaOrder
 from tests.service.conversation import with_client
 from tests.service.fakes import CAMERA, EXPLODE_MM, PATIENCE_S, frame_message

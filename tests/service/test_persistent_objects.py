@@ -29,8 +29,8 @@ from protocol.messages import (
 from server.opencl.device import Device
 from server.room.room import Room
 from server.service.mailbox import Mailbox
-from server.service.metrics import Metrics
-from server.service.room_store import RoomStore
+from server.service.monitoring.metrics import Metrics
+from server.service.saving.room_store import RoomStore
 from server.service.scheduler import Scheduler
 from server.service.serve import BackgroundServer
 from server.service.service import Service
@@ -75,7 +75,7 @@ def middle_of(folder: Path, device: Device, name: str) -> list[float]:
 @pytest.fixture
 def server(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[BackgroundServer]:
     """One that saves nothing by itself."""
-    monkeypatch.setattr("server.service.room_saver.RoomSaver.start", lambda _self: None)
+    monkeypatch.setattr("server.service.saving.room_saver.RoomSaver.start", lambda _self: None)
     with BackgroundServer(Service(device, data=tmp_path / "rooms")) as server:
         yield server
 

@@ -9,7 +9,7 @@ import pytest
 
 from client.streaming.client import Access, ClientError, RoomPlace, StreamClient
 from protocol.messages import Hello
-from server.service.authenticator import Authenticator
+from server.service.edge.authenticator import Authenticator
 from server.service.graceful_shutdown import DRAINING, GOODBYE
 from tests.service.draining import draining
 from tests.service.fakes import CAMERA, PATIENCE_S
@@ -44,7 +44,7 @@ def test_a_full_server(start_server) -> None:
 
 
 def test_a_server_of_another_version(start_server, monkeypatch) -> None:
-    monkeypatch.setattr("server.service.connection.SUBPROTOCOL", "probeless-v9")
+    monkeypatch.setattr("server.service.edge.connection.SUBPROTOCOL", "probeless-v9")
     assert told(start_server().url) == (
         "this server speaks probeless-v9, you asked for probeless-v1: use the same version on both sides"
     )

@@ -16,10 +16,10 @@ from cryptography import x509
 
 from client.streaming.access import AccessError, connection_parameters, fingerprint_bytes
 from client.streaming.client import Access
-from server.service import tls
-from server.service.authenticator import Authenticator
+from server.service.edge import tls
+from server.service.edge.authenticator import Authenticator
+from server.service.edge.tls import Certificate, CertificateError, given_certificate, own_certificate
 from server.service.serve import BackgroundServer
-from server.service.tls import Certificate, CertificateError, given_certificate, own_certificate
 from tests.service.admission import TOKEN, connected, not_connected
 
 

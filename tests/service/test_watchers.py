@@ -8,7 +8,7 @@ from protocol.frames import CameraModel
 from protocol.images import encode_color, encode_depth
 from protocol.messages import Bye, Composite, Frame, Hello, Light, Quality, Watch, Welcome
 from server.service.broadcast import Broadcast, Watcher
-from server.service.connection import Refusal
+from server.service.edge.connection import Refusal
 from tests.service.fakes import PATIENCE_S, frame_message, rgbd_frame
 from tests.service.wire import Wire
 

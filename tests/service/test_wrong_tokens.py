@@ -9,9 +9,9 @@ import pytest
 
 from client.errors import OptionError
 from client.options.serve_options import ServeOptions, authenticator_of
-from server.service.authenticator import Authenticator
-from server.service.trusted_proxies import TrustedProxies
-from server.service.wrong_tokens import (
+from server.service.edge.authenticator import Authenticator
+from server.service.edge.trusted_proxies import TrustedProxies
+from server.service.edge.wrong_tokens import (
     FIRST_DELAY_S,
     FORGOTTEN_S,
     FREE_ATTEMPTS,

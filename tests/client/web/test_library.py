@@ -9,8 +9,8 @@ import pytest
 from playwright.sync_api import Page
 
 from server.scene.vase import vase_glb
-from server.service.authenticator import Authenticator
-from server.service.object_library import ObjectLibrary
+from server.service.edge.authenticator import Authenticator
+from server.service.routes.object_library import ObjectLibrary
 from server.service.serve import BackgroundServer
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.page import start_capture, wait_until

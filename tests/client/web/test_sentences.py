@@ -10,7 +10,7 @@ from playwright.sync_api import Page
 
 from protocol.limits import SUBPROTOCOL
 from protocol.messages import Hello
-from server.service.authenticator import Authenticator
+from server.service.edge.authenticator import Authenticator
 from server.service.graceful_shutdown import DRAINING, GOODBYE
 from server.service.room_registry import key_digest_of
 from server.service.serve import BackgroundServer
@@ -132,7 +132,7 @@ def test_a_server_that_is_draining(start: StartServer, lab: Lab, open_page: Open
 
 
 def test_a_server_of_another_version(start: StartServer, open_page: OpenPage, monkeypatch) -> None:
-    monkeypatch.setattr("server.service.connection.SUBPROTOCOL", "probeless-v9")
+    monkeypatch.setattr("server.service.edge.connection.SUBPROTOCOL", "probeless-v9")
     page = open_page(start().url)
     wait_for_text(page, "#state", "Refused")
     assert state(page) == (

@@ -7,7 +7,7 @@ import ipaddress
 from collections import Counter
 from collections.abc import Iterator
 
-from server.service.connection import TRY_LATER, Refusal
+from server.service.edge.connection import TRY_LATER, Refusal
 from server.service.limits import Limits
 
 

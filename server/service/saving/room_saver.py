@@ -8,8 +8,8 @@ import time
 from collections.abc import Callable, Iterable
 
 from server.room.room import Room
-from server.service.room_store import RoomStore, RoomStoreError
 from server.service.saving.room_saves import Saved
+from server.service.saving.room_store import RoomStore, RoomStoreError
 
 EVERY_S = 2.0
 """Time between saves. A crash loses at most this time plus the duration of a save."""

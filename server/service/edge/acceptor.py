@@ -13,8 +13,8 @@ from typing import Any
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from server.service.gate import Gate, Place
-from server.service.lingering_close import LingeringCloseWebSocket
+from server.service.edge.gate import Gate, Place
+from server.service.edge.lingering_close import LingeringCloseWebSocket
 
 ACCEPT_PAUSE_S = 0.2
 """Pause after the system could not give a socket, since it would fail again at once."""

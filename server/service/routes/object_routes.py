@@ -9,9 +9,9 @@ from fastapi import FastAPI, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, PlainTextResponse, Response
 
-from server.service.access import refused, shared_headers
-from server.service.authenticator import Authenticator
-from server.service.object_library import MEDIA_TYPES, NoObject, ObjectLibrary
+from server.service.edge.access import refused, shared_headers
+from server.service.edge.authenticator import Authenticator
+from server.service.routes.object_library import MEDIA_TYPES, NoObject, ObjectLibrary
 
 OBJECTS_PATH = "/v1/objects"
 _TEXT: dict[str, Any] = {"content": {"text/plain": {}}}

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from server.opencl.device import Device
     from server.room.room import Room
     from server.service.room_registry import RoomRegistry
-    from server.service.room_saver import RoomSaver
-    from server.service.room_store import RoomStore
+    from server.service.saving.room_saver import RoomSaver
+    from server.service.saving.room_store import RoomStore
 
 log = logging.getLogger(__name__)
 
@@ -36,8 +36,10 @@ class RoomPersistence:
 
     def start(self, rooms: RoomRegistry) -> None:
         """Start to save the open `rooms` every few seconds and to keep the folder within its limits."""
-        from server.service.room_saver import RoomSaver  # loads OpenCL, which a service without rooms does not need
-        from server.service.room_store import RoomStore
+        from server.service.saving.room_saver import (
+            RoomSaver,  # loads OpenCL, which a service without rooms does not need
+        )
+        from server.service.saving.room_store import RoomStore
 
         self._rooms, self._store = rooms, RoomStore(self._folder)
         self._saver = RoomSaver(self._store, rooms.open_rooms, enforce_limits=self.enforce_limits)
@@ -50,7 +52,7 @@ class RoomPersistence:
 
     def key_digest(self, name: str) -> bytes | None:
         """Digest of a saved room's key, read without loading the room. Raises ValueError."""
-        from server.service.room_store import RoomStoreError
+        from server.service.saving.room_store import RoomStoreError
 
         assert self._store is not None
         try:
@@ -61,7 +63,7 @@ class RoomPersistence:
     def open_room(self, wishes: Wishes, name: str) -> Room:
         """Load the saved room, or create a new one. Raises ValueError if the save cannot be read."""
         from server.room.room import Room
-        from server.service.room_store import RoomStoreError
+        from server.service.saving.room_store import RoomStoreError
 
         assert self._store is not None
         try:

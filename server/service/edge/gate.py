@@ -12,7 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 
-from server.service.connection_limits import network_of
+from server.service.edge.connection_limits import network_of
 from server.service.limits import Limits
 
 RESERVED_FILES = 256

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from server.service.event_log import LogFormat
+from server.service.monitoring.event_log import LogFormat
 
 log = logging.getLogger(__name__)
 

@@ -13,9 +13,9 @@ from urllib.parse import quote, urlsplit
 
 from starlette.requests import HTTPConnection
 
-from server.service.connection import FORBIDDEN, UNAUTHORIZED, Refusal
-from server.service.trusted_proxies import TrustedProxies
-from server.service.wrong_tokens import WrongTokens
+from server.service.edge.connection import FORBIDDEN, UNAUTHORIZED, Refusal
+from server.service.edge.trusted_proxies import TrustedProxies
+from server.service.edge.wrong_tokens import WrongTokens
 
 MAX_TOKEN_CHARS = 256
 WHERE_IT_IS = "use the URL that the server printed at its start, which ends in ?token=..."

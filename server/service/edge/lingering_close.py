@@ -12,7 +12,7 @@ from asyncio import TimerHandle
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.protocol import State
 
-from server.service.gate import Place
+from server.service.edge.gate import Place
 
 SILENCE_S = 0.5
 

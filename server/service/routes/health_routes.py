@@ -13,7 +13,7 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, PlainTextResponse, Response
 
-from server.service.authenticator import Authenticator
+from server.service.edge.authenticator import Authenticator
 
 FRESH = {"cache-control": "no-store"}
 

@@ -12,8 +12,8 @@ from fastapi import WebSocket, WebSocketDisconnect
 from protocol.codec import ProtocolError, decode_client, encode, one_line
 from protocol.limits import SUBPROTOCOL, SUBPROTOCOL_PREFIX
 from protocol.messages import Acknowledged, Bye, ClientMessage, Dropped, Error, Index, ServerMessage
+from server.service.edge.rate_limiter import RateLimiter
 from server.service.limits import DEFAULT_LIMITS, Limits
-from server.service.rate_limiter import RateLimiter
 
 NORMAL, PROTOCOL, UNSUPPORTED, INVALID, POLICY, INTERNAL, TRY_LATER = 1000, 1002, 1003, 1007, 1008, 1011, 1013
 RESTART, GOING_AWAY, NO_CODE, LOST = 1012, 1001, 1005, 1006

@@ -10,10 +10,10 @@ from fastapi.responses import PlainTextResponse, Response
 
 from protocol.codec import one_line
 from protocol.messages import PanoramaFormat, Vector3
-from server.service.access import refused, shared_headers
-from server.service.authenticator import Authenticator
+from server.service.edge.access import refused, shared_headers
+from server.service.edge.authenticator import Authenticator
 from server.service.mailbox import PanoramaOrder
-from server.service.object_routes import REFUSED
+from server.service.routes.object_routes import REFUSED
 from server.service.service import NoSession, Service
 
 PANORAMA_PATH = "/v1/panorama"

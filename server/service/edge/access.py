@@ -7,8 +7,8 @@ import logging
 from fastapi import Request
 from fastapi.responses import PlainTextResponse, Response
 
-from server.service.authenticator import Authenticator, address_of
-from server.service.connection import UNAUTHORIZED
+from server.service.edge.authenticator import Authenticator, address_of
+from server.service.edge.connection import UNAUTHORIZED
 
 log = logging.getLogger(__name__)
 

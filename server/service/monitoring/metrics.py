@@ -21,10 +21,10 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from protocol.messages import TIMING_ROWS, Timings
-from server.service import connection
+from server.service.edge import connection
 
 if TYPE_CHECKING:
-    from server.service.room_persistence import RoomPersistence
+    from server.service.saving.room_persistence import RoomPersistence
 
 BUCKETS_S = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15, 0.25, 0.5, 1.0, 2.5, 5.0)
 STAGES = (*TIMING_ROWS, "total", "host")

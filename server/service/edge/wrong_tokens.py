@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from server.service.connection_limits import network_of
+from server.service.edge.connection_limits import network_of
 
 FREE_ATTEMPTS = 5
 """Wrong tokens that are answered at once, for people who mistype."""

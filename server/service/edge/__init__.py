@@ -1,0 +1,1 @@
+"""What a connection meets before its session: limits, timeouts, TLS, the token, proxies."""

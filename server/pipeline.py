@@ -201,7 +201,7 @@ class Pipeline:
             exposure=geometry.exposure,
             sampling=self._transfer.sampling,
             rays=self._transfer.rays,
-            ray_length_m=settings.reach_m,
+            ray_length_m=settings.ray_length_m,
             smooth_edges=settings.edges == "smooth",
             restores_clipped=not settings.as_thesis,
         )

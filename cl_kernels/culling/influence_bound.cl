@@ -84,7 +84,8 @@ static inline int dims(const float4 disc, const float4 ball, const float3 positi
 // discs [discs_count]: see dims. -> most [h][ceil(w / CHUNK)]: the greatest bounds of CHUNK pixels, 0 where no sample changes;
 // w: whether a disc is dimmed.
 kernel void bound_pixels(const int height, global const float4 *positions, global const float4 *normals,
-                         const Grid grid, const int has_bounds, global const float4 *bounds, const float tolerance_m, const int discs_count, global const float4 *discs, const int balls_count,
+                         const Grid grid, const int has_bounds, global const float4 *bounds, const float tolerance_m,
+                         const int discs_count, global const float4 *discs, const int balls_count,
                          global const float4 *balls, global float4 *most) {
     const int chunk = get_global_id(0);
     const int y = get_global_id(1);

@@ -51,7 +51,8 @@ static void gather_clipped(const int row, const int col, const int step, const i
 // then the mean logarithm of radiance over usable pixels (where most are clipped, over those) and the variance of
 // its mean over the channels; then the three of gather_clipped, whatever surface they are of.
 kernel void gather_patches(const int cols, const int rows, const int step, const int width, const float tolerance_m,
-                           const float4 eye, const float4 forward, const float per_pixel, global const float4 *positions, global const float4 *normals, global const uchar *labels,
+                           const float4 eye, const float4 forward, const float per_pixel, global const float4 *positions,
+                           global const float4 *normals, global const uchar *labels,
                            global const float4 *radiance, global float4 *seen_patches) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);

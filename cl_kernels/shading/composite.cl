@@ -20,7 +20,8 @@ static inline void copy_codes(global const uchar *shown, global uchar *picture, 
 
 // shown [h][w][3]: the camera picture as sRGB codes. codes [65536]: sRGB code of linear radiance i / 65535.
 // One item LANES pixels of a row -> picture [h][w][3] sRGB. Pixels without virtual content keep the camera's bytes.
-kernel void composite(const MixtureParameters parameters, MIXTURE_BUFFERS, global const uchar *shown, global const uchar *codes, global uchar *picture) {
+kernel void composite(const MixtureParameters parameters, MIXTURE_BUFFERS, global const uchar *shown, global const uchar *codes,
+                      global uchar *picture) {
     const int first = get_global_id(0) * LANES;
     const int y = get_global_id(1);
     const int width = parameters.real_samples.width;

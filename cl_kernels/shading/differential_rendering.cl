@@ -114,5 +114,6 @@ kernel void light_points(SCENE_PARAMETERS, const int points_count, global const 
     const Arriving arrives = ARRIVING_OF_SCENE;
     const float3 normal = normals[index].xyz;
     const float4 taken = taken_from_virtual(volume, things, arrives, points[index], normal, direction_set(index >> 3, index & 7), 0, 1);
-    radiances[index] = (float4)(albedos[index].xyz * fmax(open_shading(normal, coefficients_of(scene.light, light_table)) - taken.xyz, 0.0f), 1.0f);
+    radiances[index] = (float4)(albedos[index].xyz * fmax(open_shading(normal, coefficients_of(scene.light, light_table)) - taken.xyz,
+    0.0f), 1.0f);
 }

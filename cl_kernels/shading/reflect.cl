@@ -48,7 +48,7 @@ static float3 mean_arriving(const Volume volume, const Objects things, const Arr
         const Rays rays = make_rays(origin / volume.voxel_m, ray);
         floatn begin, end;
         clip_rays(volume, rays, &begin, &end);
-        end = fmin(end, light.reach_m / volume.voxel_m);
+        end = fmin(end, light.ray_length_m / volume.voxel_m);
         float first[LANES], last[LANES];
         STORE_LANES(find_solid_voxels(volume, rays, begin, end), first);
         STORE_LANES(end, last);
@@ -84,7 +84,8 @@ kernel void reflect_surroundings(const ReflectionParameters parameters, SCENE_BU
         // The fit lacks multiple scattering between microfacets; compensated as in Turquin (2019).
         const float3 gloss = clamp((share.x + share.y * head_on) * (1.0f + head_on * (1.0f / (share.x + share.y) - 1.0f)), 0.0f, 1.0f);
         const float turn = GOLDEN * ((y & 3) * 4 + (x & 3));
-        const float3 arriving = mean_arriving(volume, things, arrives, whole_light_of(scene.light, light_table), position.xyz, normal, 2.0f * dot(normal, back) * normal - back,
+        const float3 arriving = mean_arriving(volume, things, arrives, whole_light_of(scene.light, light_table), position.xyz, normal,
+        2.0f * dot(normal, back) * normal - back,
                                               material.x * material.x, turn);
         const float dielectric = clamp(share.x + 0.04f * share.y, 0.0f, 1.0f);
         result = (float4)(gloss * arriving, (1.0f - metal) * (1.0f - dielectric));

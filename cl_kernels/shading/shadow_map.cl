@@ -43,13 +43,13 @@ kernel void halve_maps(const int count, const int level, global float2 *maps) {
     map[level_offset(level) + y * side + x] = (float2)(0.25f * covered, covered > 0.0f ? sum / covered : 0.0f);
 }
 
-#define TRACE_PARAMETERS VOLUME_PARAMETERS, const float reach_m, global const float2 *ray_places
+#define TRACE_PARAMETERS VOLUME_PARAMETERS, const float ray_length_m, global const float2 *ray_places
 
 // Real surface nearer to a near disc than this is the lamp itself.
 #define LAMP_M 0.1f
 
 // Fraction of disc k's light at the surface that real surface does not block, along RAYS rays to places [RAYS] in the unit disc.
-static float real_part(const Volume volume, const float reach_m, const DirectLights lights, const int k,
+static float real_part(const Volume volume, const float ray_length_m, const DirectLights lights, const int k,
                        const float3 position, const float3 normal, const float3 origin, global const float2 *places) {
     global const float4 *axes = lights.rows + 4 * k;
     const float3 right = axes[0].xyz, down = axes[1].xyz, toward = axes[2].xyz;
@@ -69,7 +69,7 @@ static float real_part(const Volume volume, const float reach_m, const DirectLig
         const Rays rays = make_rays(origin / volume.voxel_m, direction);
         floatn begin, end;
         clip_rays(volume, rays, &begin, &end);
-        end = MASK(cosine > 0.0f) ? fmin(end, reach_m / volume.voxel_m) : 0.0f;  // directions below the horizon are not traced
+        end = MASK(cosine > 0.0f) ? fmin(end, ray_length_m / volume.voxel_m) : 0.0f;  // directions below the horizon are not traced
         const floatn lamp_m = 1.0f / (seen.inverse_m * seen.scale * shorten);  // infinite if it is distant
         end = fmin(end, (lamp_m - LAMP_M) / volume.voxel_m);
         const intn open = MASK(find_solid_voxels(volume, rays, begin, end) >= end);
@@ -84,12 +84,12 @@ static float real_part(const Volume volume, const float reach_m, const DirectLig
     return all > 0.0f ? free / all : 1.0f;
 }
 
-static float4 real_parts(const Volume volume, const float reach_m, const DirectLights lights,
+static float4 real_parts(const Volume volume, const float ray_length_m, const DirectLights lights,
                          const float3 position, const float3 normal, const int is_virtual, global const float2 *places) {
     const float3 origin = is_virtual ? clear_origin(volume, position, normal) : position + volume.voxel_m * normal;
     float parts[4] = {1.0f, 1.0f, 1.0f, 1.0f};
     for (int k = 0; k < lights.count; k++)
-        parts[k] = real_part(volume, reach_m, lights, k, position, normal, origin, places);
+        parts[k] = real_part(volume, ray_length_m, lights, k, position, normal, origin, places);
     return vload4(0, parts);
 }
 
@@ -97,7 +97,8 @@ static float4 real_parts(const Volume volume, const float reach_m, const DirectL
 // -> parts [rows][cols]: the fraction of each disc's light that real surface does not block (xyz: discs 0 to 2, w = 1 valid).
 // With has_cells, samples whose cell kept its parts in frame `since` or later get those; the others ask to fill their cell's:
 // cells [rows][cols] (-1 none); claims, kept, frames [cells]: see Cells.
-kernel void trace_discs(const Grid grid, global const float4 *positions, global const float4 *normals, const int is_virtual, DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *parts,
+kernel void trace_discs(const Grid grid, global const float4 *positions, global const float4 *normals, const int is_virtual,
+                        DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *parts,
                         const int has_cells, const int since, global const int *cells, global uint *claims, global const float4 *kept,
                         global const int *frames) {
     const int col = get_global_id(0);
@@ -115,7 +116,7 @@ kernel void trace_discs(const Grid grid, global const float4 *positions, global 
     const DirectLights lights = DIRECT_OF_PARAMETERS;
     float4 result = (float4)(0.0f);
     if (position.w > 0.0f && normal.w > 0.0f)
-        result = real_parts(volume, reach_m, lights, position.xyz, normal.xyz, is_virtual,
+        result = real_parts(volume, ray_length_m, lights, position.xyz, normal.xyz, is_virtual,
                             ray_places + RAYS * ((row & 3) * 4 + (col & 3)));
     parts[sample] = result;
 }
@@ -204,7 +205,8 @@ static inline intn touched_lanes(global const uchar *touched, const int cols, co
 // of the rest of the light, see composite.cl; touched: of change_mask.cl for `ratio`. One item LANES pixels
 // -> mixed [h][w]: R' / R of the whole light (rgb), w = 1 where it may be other than 1, else all 0.
 kernel void light_real(const Grid grid, const int height, global const float4 *positions, global const float4 *normals,
-                       global const float4 *parts, const float tolerance_m, global const float4 *ratio, const int has_refined, global const float4 *refined, global const float4 *rest,
+                       global const float4 *parts, const float tolerance_m, global const float4 *ratio, const int has_refined,
+                       global const float4 *refined, global const float4 *rest,
                        global const uchar *touched, DIRECT_PARAMETERS, global float4 *mixed) {
     const int x = get_global_id(0) * LANES;
     const int y = get_global_id(1);
@@ -269,7 +271,8 @@ kernel void light_real(const Grid grid, const int height, global const float4 *p
 
 // Adds the discs' light to radiances [points_count] of points on virtual objects: points, normals (volume space), albedos
 // [points_count]. One item LANES points.
-kernel void light_points_by_discs(const int points_count, global const float4 *points, global const float4 *normals, global const float4 *albedos,
+kernel void light_points_by_discs(const int points_count, global const float4 *points, global const float4 *normals,
+                                  global const float4 *albedos,
                        DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *radiances) {
     const int first = get_global_id(0) * LANES;
     if (first >= points_count) return;
@@ -278,7 +281,7 @@ kernel void light_points_by_discs(const int points_count, global const float4 *p
     float left[3][LANES];
     for (int lane = 0; lane < LANES; lane++) {
         const int index = min(first + lane, points_count - 1);
-        const float4 parts = real_parts(volume, reach_m, lights, points[index].xyz, normals[index].xyz, 1,
+        const float4 parts = real_parts(volume, ray_length_m, lights, points[index].xyz, normals[index].xyz, 1,
                                         ray_places + RAYS * (index & 15));
         left[0][lane] = parts.x, left[1][lane] = parts.y, left[2][lane] = parts.z;
     }
@@ -296,7 +299,8 @@ kernel void light_points_by_discs(const int points_count, global const float4 *p
 
 // Samples of real surface: positions, normals [h][w]; parts [rows][cols]: of trace_discs. One item LANES samples
 // -> without, with [rows][cols]: light from the discs on white surface without and with objects (rgb).
-kernel void light_samples(const Grid grid, global const float4 *positions, global const float4 *normals, global const float4 *parts, DIRECT_PARAMETERS,
+kernel void light_samples(const Grid grid, global const float4 *positions, global const float4 *normals, global const float4 *parts,
+                          DIRECT_PARAMETERS,
                           global float4 *without, global float4 *with) {
     const int col = get_global_id(0) * LANES;
     const int row = get_global_id(1);

@@ -13,7 +13,8 @@
 // radiance [h][w] (w = 1 usable); transfer [rows][cols][COEFFICIENTS]; hits [rows][cols]: see indirect.cl.
 // -> pairs [pair_rows][pair_cols], 0 where there is no such sample.
 kernel void shade_pairs(const Grid grid, SAMPLE_BUFFERS, global const float4 *radiance, global const float *transfer,
-                        global const float4 *hits, const LightParameters lit, LIGHT_BUFFERS, const int every, const int pair_cols, const int pair_rows,
+                        global const float4 *hits, const LightParameters lit, LIGHT_BUFFERS, const int every, const int pair_cols,
+                        const int pair_rows,
                         global float4 *pairs) {
     const int pair_col = get_global_id(0);
     const int pair_row = get_global_id(1);

@@ -19,7 +19,8 @@ static inline float slope_of(const float pixel, const float per_pixel) {
 // Where the lines of sight of auxiliary views first meet a solid voxel: surface behind it gets no light from the view's direction.
 // One item LANES pixels of a row of views[get_global_id(2)]. axes [views][3]: right, down and forward, unit, volume space; a
 // view's eye is distance_m before center. per_pixel: slope of a pixel. -> depths [view][SIDE][SIDE]: metres along the axis, 0 = none.
-kernel void draw_views(const int count, global const int *views, VOLUME_PARAMETERS, const float4 center, const float distance_m, const float per_pixel,
+kernel void draw_views(const int count, global const int *views, VOLUME_PARAMETERS, const float4 center, const float distance_m,
+                       const float per_pixel,
                        global const float4 *axes, global float *depths) {
     const int x = get_global_id(0) * LANES;
     const int y = get_global_id(1);
@@ -48,7 +49,7 @@ kernel void draw_views(const int count, global const int *views, VOLUME_PARAMETE
 #define LANE_ROWS (LANES / LANE_COLS)
 
 // Whether the auxiliary view along each direction sees the sample: no surface in the sample's pixel of the view is nearer to the
-// view, within reach_m of the sample and above its tangent plane by lift_m.
+// view, within ray_length_m of the sample and above its tangent plane by lift_m.
 //
 // One item LANES samples, `blocks` items a set. positions [h][w], sample_normals [rows][cols] (w = 0 without surface); axes,
 // depths: see draw_views; view_of [sets][count]: the view for a direction.
@@ -100,7 +101,7 @@ kernel void look_into_views(const LookUpParameters p, global const float4 *posit
             const floatn ty = depth * (sx * right.y + sy * down.y + ahead.y) - (distance_m * ahead.y + o.y);
             const floatn tz = depth * (sx * right.z + sy * down.z + ahead.z) - (distance_m * ahead.z + o.z);
             const intn hidden = MASK(depth > 0.0f) & MASK(depth < z) & MASK(tx * n.x + ty * n.y + tz * n.z > p.lift_m) &
-                                MASK(tx * tx + ty * ty + tz * tz < p.reach_m * p.reach_m);
+                                MASK(tx * tx + ty * ty + tz * tz < p.ray_length_m * p.ray_length_m);
             const int arrives = bits_of(above & ~hidden);
             for (int lane = 0; lane < LANES; lane++)
                 bits[lane * MASK_WORDS + (j >> 5)] |= (uint)((arrives >> lane) & 1) << (j & 31);

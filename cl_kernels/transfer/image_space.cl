@@ -46,12 +46,13 @@ static inline Vectors turned(const float16 m, const Vectors v) {
 }
 
 // V' of eq. 6.3 along LANES directions w (view axes) from one point: the least over `steps` samples y at distances r, r ratio,
-// ..., none beyond near_m that surface known to the volume hides, and none beyond reach_m. `surface`, `normal`: the point's tangent plane, view axes. A sample is hidden where the surface s that
+// ..., none beyond near_m that surface known to the volume hides, and none beyond ray_length_m. `surface`, `normal`: the point's tangent
+// plane, view axes. A sample is hidden where the surface s that
 // the view sees on its line of sight is nearer than it by more than bias_m; s must be above the tangent plane by lift_m, or a
 // flat wall would hide itself. V' is 0 where s lies along w and 1 from the threshold on. slack: s may be deeper by up to this
 // fraction of r, the gap between two samples.
 static floatn visibility(const View view, const float3 origin, const float3 surface, const float3 normal, const Vectors w,
-                         floatn r, const float ratio, const int steps, const float near_m, const float reach_m,
+                         floatn r, const float ratio, const int steps, const float near_m, const float ray_length_m,
                          const float bias_m, const float lift_m, const float slack, const float inverse_threshold) {
     const float4 lens = view.intrinsics;
     const float per_x = 1.0f / lens.s0, per_y = 1.0f / lens.s1;
@@ -59,7 +60,7 @@ static floatn visibility(const View view, const float3 origin, const float3 surf
     floatn free = 1.0f;
     for (int k = 0; k < steps; k++) {
         const Vectors y = {origin.x + r * w.x, origin.y + r * w.y, origin.z + r * w.z};
-        const intn ahead = MASK(y.z > 1e-3f) & MASK(r < reach_m);
+        const intn ahead = MASK(y.z > 1e-3f) & MASK(r < ray_length_m);
         const floatn inverse = 1.0f / (ahead ? y.z : 1.0f);
         const floatn u = lens.s0 * y.x * inverse + (lens.s2 + 0.5f), v = lens.s1 * y.y * inverse + (lens.s3 + 0.5f);
         const intn inside = ahead & MASK(u > 0.0f) & MASK(v > 0.0f) & MASK(u < (float)view.width) & MASK(v < (float)view.height);
@@ -84,7 +85,8 @@ static floatn visibility(const View view, const float3 origin, const float3 surf
 // Reduces open[] of directions above the horizon by the occluders in the camera's own picture.
 static void look_near(const View view, const float3 origin, const float3 surface, const float3 normal, const int count,
                       global const float4 *directions, global const float *starts, const float ratio, const int steps,
-                      const float near_m, const float reach_m, const float bias_m, const float lift_m, const float slack, const float inverse_threshold,
+                      const float near_m, const float ray_length_m, const float bias_m, const float lift_m, const float slack,
+                      const float inverse_threshold,
                       float *open) {
     const float3 origin_in_view = transform_point(view.view_from_volume, origin);
     const float3 surface_in_view = transform_point(view.view_from_volume, surface);
@@ -100,7 +102,7 @@ static void look_near(const View view, const float3 origin, const float3 surface
         const Vectors w = {GATHER_FLOATN(components, first), GATHER_FLOATN(components, first + 1), GATHER_FLOATN(components, first + 2)};
         float found[LANES];
         STORE_LANES(visibility(view, origin_in_view, surface_in_view, normal_in_view, turned(view.view_from_volume, w),
-                               GATHER_FLOATN(starts, which), ratio, steps, near_m, reach_m, bias_m, lift_m, slack, inverse_threshold),
+                               GATHER_FLOATN(starts, which), ratio, steps, near_m, ray_length_m, bias_m, lift_m, slack, inverse_threshold),
                     found);
         for (int lane = 0; lane < waiting; lane++) open[chosen[lane]] = fmin(open[chosen[lane]], found[lane]);
         waiting = 0;
@@ -158,7 +160,7 @@ kernel void transfer_from_views(const ViewTransferParameters parameters, global 
         const View camera = {parameters.camera_from_volume, parameters.intrinsics, grid.width, parameters.height, camera_depths};
         look_near(camera, position.xyz + voxel_m * normal.xyz, position.xyz, normal.xyz, count, directions + set,
                   starts + ((row & 1) * 2 + (col & 1)) * count, parameters.ratio, *any_unknown ? parameters.further : parameters.steps,
-                  parameters.near_m, parameters.reach_m, voxel_m, voxel_m, parameters.slack, parameters.inverse_threshold, open);
+                  parameters.near_m, parameters.ray_length_m, voxel_m, voxel_m, parameters.slack, parameters.inverse_threshold, open);
         for (int j = 0; j < count; j++) {
             const float4 direction = directions[set + j];
             const float share = fmax(dot(normal.xyz, direction.xyz), 0.0f) * direction.w * M_1_PI_F;

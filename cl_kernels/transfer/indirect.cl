@@ -13,7 +13,8 @@
 // positions, normals [h][w]; free_mask [rows][cols][MASK_WORDS], sets [rows][cols][INTERLEAVE] (see Transfer); directions
 // [256][count] (unit, sr); colors: of the volume
 // -> hits [rows][cols]: sums of radiance times cosine and of cosine (w) over directions whose surface has a colour; both times
-// `every`; met [rows][cols][most]: the directions that meet surface, and how far away (met.clh). With HAS_CACHE samples that are `found` (transfer_cache.cl) keep their values.
+// `every`; met [rows][cols][most]: the directions that meet surface, and how far away (met.clh). With HAS_CACHE samples that are `found`
+// (transfer_cache.cl) keep their values.
 kernel void gather_hits(const GatherParameters p, global const float4 *positions, global const float4 *normals,
                         global const uint *free_mask, global const uchar *sets, global const int *slots,
                         global const ulong *solid, global const uchar *octets, global const float2 *voxels,
@@ -51,7 +52,7 @@ kernel void gather_hits(const GatherParameters p, global const float4 *positions
             const Rays rays = volume_rays(volume, origin_m, directions, chosen);
             floatn begin, end;
             clip_rays(volume, rays, &begin, &end);
-            end = fmin(end, p.reach_m / volume.voxel_m);
+            end = fmin(end, p.ray_length_m / volume.voxel_m);
             const floatn t = find_solid_voxels(volume, rays, begin, end);
             float distance[LANES];
             STORE_LANES(t < end ? t : -1.0f, distance);

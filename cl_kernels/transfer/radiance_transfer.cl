@@ -18,7 +18,8 @@
 // T(x) = 1/pi * integral of V max(n.w, 0) Y(w) dw. The unoccluded part is exact (A_l Y(n) / pi); only the blocked part
 // is sampled and subtracted, so an open surface has no quadrature error.
 //
-// One item a sample. positions, normals, labels [h][w]: the geometry buffer. directions [sets][count]: unit directions and their solid angle (w, sr), basis [sets][count][COEFFICIENTS]: Y there;
+// One item a sample. positions, normals, labels [h][w]: the geometry buffer. directions [sets][count]: unit directions and their solid
+// angle (w, sr), basis [sets][count][COEFFICIENTS]: Y there;
 // first_set: see direction_sets.clh. radius: of the window of a sample's mean normal, pixels.
 // phase: the subset that this frame traces (visibility_cache.clh); intrinsics, layers, newest, cameras, points and behind them normals,
 // traced, blocked: layers of earlier frames; this frame's layer (newest + 1) is written. state: see visibility_state.clh.
@@ -62,7 +63,8 @@ kernel void transfer_radiance(const TransferParameters parameters, global const 
     const Volume volume = make_volume(parameters.volume, slots, solid, octets, 0);
     const float4 position = positions[pixel];
     const int valid = position.w > 0.0f && normals[pixel].w > 0.0f;
-    const float4 normal = valid ? smooth_normal(width, parameters.height, positions, normals, pixel % width, pixel / width, parameters.radius, volume.voxel_m)
+    const float4 normal = valid ? smooth_normal(width, parameters.height, positions, normals, pixel % width, pixel / width,
+    parameters.radius, volume.voxel_m)
                                 : (float4)(0.0f);
     const int own = parameters.first_set + direction_set(row, col);
 
@@ -78,8 +80,10 @@ kernel void transfer_radiance(const TransferParameters parameters, global const 
     global float4 *cached_normals = (global float4 *)((global uchar *)points + parameters.cached_normals_at);
     const int lasting = valid && labels[pixel] == LABEL_STATIC;
     if (lasting && wanted) {
-        const Layers known = {grid.cols, grid.rows, grid.stride, parameters.intrinsics, parameters.layers, parameters.newest, cameras, points, cached_normals, traced, blocked};
-        wanted = find_cached(known, position.xyz, normal.xyz, volume.voxel_m, ALL_SUBSETS & ~(1u << parameters.phase), stops, set) | 1u << parameters.phase;
+        const Layers known = {grid.cols, grid.rows, grid.stride, parameters.intrinsics, parameters.layers, parameters.newest, cameras,
+        points, cached_normals, traced, blocked};
+        wanted = find_cached(known, position.xyz, normal.xyz, volume.voxel_m, ALL_SUBSETS & ~(1u << parameters.phase), stops,
+        set) | 1u << parameters.phase;
     }
 #endif
     if (wanted) {
@@ -88,7 +92,8 @@ kernel void transfer_radiance(const TransferParameters parameters, global const 
             asked[i] = bits_of_subsets(wanted);
             open[i] = 0;
         }
-        trace_hemisphere(volume, position.xyz + volume.voxel_m * normal.xyz, normal.xyz, directions + own * count, count, parameters.reach_m, asked,
+        trace_hemisphere(volume, position.xyz + volume.voxel_m * normal.xyz, normal.xyz, directions + own * count, count,
+        parameters.ray_length_m, asked,
                          open, stops);  // fig. 7.5
     }
 #if INTERLEAVE > 1

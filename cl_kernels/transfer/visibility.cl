@@ -4,9 +4,10 @@
 
 // One item a sample; samples lie every `stride` pixels from stride / 2. positions, normals [h][w]: the geometry buffer.
 // directions [256][count]: unit directions, see direction_sets.clh. -> free, blocked [rows][cols][MASK_WORDS]: bit j: direction j
-// lies above the surface, and is free for `reach_m` or is not; zeros where there is no surface.
+// lies above the surface, and is free for `ray_length_m` or is not; zeros where there is no surface.
 kernel void trace_visibility(const int cols, const int rows, const int stride, const int width,
-                             global const float4 *positions, global const float4 *normals, VOLUME_PARAMETERS, const int count, global const float4 *directions, const float reach_m,
+                             global const float4 *positions, global const float4 *normals, VOLUME_PARAMETERS, const int count,
+                             global const float4 *directions, const float ray_length_m,
                              global uint *free, global uint *blocked) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
@@ -21,7 +22,7 @@ kernel void trace_visibility(const int cols, const int rows, const int stride, c
     }
     global const float4 *own = directions + direction_set(row, col) * count;
     if (position.w > 0.0f && normal.w > 0.0f)
-        trace_hemisphere(volume, position.xyz + shape.voxel_m * normal.xyz, normal.xyz, own, count, reach_m, asked, is_free, is_blocked);
+        trace_hemisphere(volume, position.xyz + shape.voxel_m * normal.xyz, normal.xyz, own, count, ray_length_m, asked, is_free, is_blocked);
     const int first = (row * cols + col) * MASK_WORDS;
     for (int i = 0; i < MASK_WORDS; i++) {
         free[first + i] = is_free[i];

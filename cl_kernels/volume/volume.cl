@@ -41,11 +41,11 @@ static void mark_frustum(const int4 bricks, const Frustum piece, global uchar *m
     }
 }
 
-// depth_m [h][w], 0 = none -> marked [z][y][x] = 1 for every brick with a voxel within `reach_m` of the measured surface
+// depth_m [h][w], 0 = none -> marked [z][y][x] = 1 for every brick with a voxel within `ray_length_m` of the measured surface
 // along the ray, and a few more. One item a tile of TILE x TILE pixels; depths within half a brick are treated as one piece of
 // surface.
 kernel void mark_bricks(const int width, const int height, const int4 bricks, global const float *depth_m,
-                        const float4 intrinsics, const float16 volume_from_camera, const float voxel_m, const float reach_m,
+                        const float4 intrinsics, const float16 volume_from_camera, const float voxel_m, const float ray_length_m,
                         global uchar *marked) {
     const int x = get_global_id(0) * TILE;
     const int y = get_global_id(1) * TILE;
@@ -70,7 +70,7 @@ kernel void mark_bricks(const int width, const int height, const int4 bricks, gl
     // The tile's own voxels extend half a pixel beyond it; interpolation uses its depth up to one and a half pixels beyond.
     const float2 beside = (0.5f * TILE + 1.0f) / intrinsics.lo;
     const float least_slant = length(fmax(fabs(ray) - (float3)(beside, 0.0f), 0.0f));
-    const float reach_z = reach_m / least_slant;
+    const float reach_z = ray_length_m / least_slant;
     Frustum piece;
     piece.origin = volume_from_camera.s37b / brick_m;
     piece.onward = transform_vector(volume_from_camera, ray) / brick_m;

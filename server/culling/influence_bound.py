@@ -72,7 +72,7 @@ def bound_influence(
     transfer: Transfer,
     volume: Volume,
     rays: Directions,
-    reach_m: float,
+    ray_length_m: float,
     light: DeviceLight,
     indirect: Indirect | None,
     objects: Sequence[Placed],
@@ -85,7 +85,9 @@ def bound_influence(
     balls = balls_around(objects)
 
     def at_samples(every: int, those: NDArray[np.float32]) -> cl_array.Array:
-        return _bound_samples(engine, camera, surface, transfer, rays, reach_m, light, indirect, those, most, every)
+        return _bound_samples(
+            engine, camera, surface, transfer, rays, ray_length_m, light, indirect, those, most, every
+        )
 
     few = _greatest(engine, at_samples(EVERY, balls))
     is_seen = few.change > WINDOW * seen_from
@@ -136,7 +138,7 @@ def _bound_samples(
     surface: Surface,
     transfer: Transfer,
     rays: Directions,
-    reach_m: float,
+    ray_length_m: float,
     light: DeviceLight,
     indirect: Indirect | None,
     balls: NDArray[np.float32],
@@ -154,7 +156,7 @@ def _bound_samples(
         *sample_arguments(engine, surface, transfer),
         transfer.coefficients,
         indirect.hits if indirect else no_hits(engine, transfer),
-        *light_arguments(engine, light, rays, reach_m),
+        *light_arguments(engine, light, rays, ray_length_m),
         len(balls),
         buffers.balls.upload(balls) if len(balls) else engine.unused,
         float4(*most.objects, 0.0),

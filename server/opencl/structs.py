@@ -72,7 +72,7 @@ LIGHT_PARAMETERS = Struct(
     "LightParameters",
     unseen="float4",
     count="int",
-    reach_m="float",
+    ray_length_m="float",
     arriving_at="int",
     coefficients_at="int",
     whole_at="int",
@@ -130,7 +130,7 @@ TRANSFER_PARAMETERS = Struct(
     radius="int",
     count="int",
     first_set="int",
-    reach_m="float",
+    ray_length_m="float",
     phase="int",
     layers="int",
     newest="int",
@@ -155,7 +155,7 @@ LOOK_UP_PARAMETERS = Struct(
     block_rows="int",
     count="int",
     first_set="int",
-    reach_m="float",
+    ray_length_m="float",
     lift_m="float",
 )
 """Parameters of look_into_views in auxiliary_views.cl. center, distance_m, per_pixel: of the views, see draw_views."""
@@ -167,7 +167,7 @@ GATHER_PARAMETERS = Struct(
     count="int",
     every="int",
     most="int",
-    reach_m="float",
+    ray_length_m="float",
     least_cosine="float",
 )
 """Parameters of indirect.cl. count: directions of one set; every: a sample traces every n-th blocked direction, `most`
@@ -186,7 +186,7 @@ VIEW_TRANSFER_PARAMETERS = Struct(
     steps="int",
     further="int",
     near_m="float",
-    reach_m="float",
+    ray_length_m="float",
     slack="float",
     inverse_threshold="float",
 )

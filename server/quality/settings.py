@@ -25,7 +25,7 @@ class Settings:
     """Whether to search for lights inside the room."""
     rays: int
     bands: int
-    reach_m: float
+    ray_length_m: float
     as_thesis: bool
     robustness: frozenset[str]
     """P3: enabled measures, of `openness`, `normals`, `normals_printed`, `memory`, `outliers`."""
@@ -48,13 +48,13 @@ class Settings:
 
 def read_wishes(wishes: Wishes) -> Settings:
     """Settings for `wishes`. Raises ValueError, one line, for unsupported wishes."""
-    reach_m = WHOLE_ROOM_M if wishes.ray_length_m is None else wishes.ray_length_m
+    ray_length_m = WHOLE_ROOM_M if wishes.ray_length_m is None else wishes.ray_length_m
     return Settings(
         sampling=sampling_of(wishes),
         lamps="off" if wishes.as_thesis else wishes.lamps,
         rays=wishes.rays,
         bands=wishes.bands,
-        reach_m=THESIS_REACH_M if wishes.as_thesis else reach_m,
+        ray_length_m=THESIS_REACH_M if wishes.as_thesis else ray_length_m,
         as_thesis=wishes.as_thesis,
         robustness=frozenset(wishes.robustness),
         edges=wishes.edges,

@@ -93,7 +93,7 @@ class ShadowMaps:
 
     volume: Volume
     light: DeviceLight
-    reach_m: float
+    ray_length_m: float
     """Length of rays to real things."""
     rows: cl_array.Array
     """[MOST_LIGHTS, 4] float4: right (w: 1 / distance), down (w: half a side of the map), towards the light (w: tangent
@@ -125,7 +125,7 @@ class ShadowMaps:
     def trace_arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
         """TRACE_PARAMETERS of shadow_map.cl."""
         places = engine.buffers(_Buffers).ray_places.constant(_float2(ray_places()))
-        return (*self.volume.arguments(), np.float32(self.reach_m), places)
+        return (*self.volume.arguments(), np.float32(self.ray_length_m), places)
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class DirectSamples:
 
 
 def draw_shadow_maps(
-    engine: Engine, volume: Volume, light: DeviceLight, objects: Sequence[Placed], reach_m: float
+    engine: Engine, volume: Volume, light: DeviceLight, objects: Sequence[Placed], ray_length_m: float
 ) -> ShadowMaps:
     """Depth maps of `objects`, each with its `volume_from_model`, from every disc of `light`."""
     ball = np.array(ball_around(objects).tolist(), np.float64)
@@ -146,7 +146,7 @@ def draw_shadow_maps(
     rows = _rows(discs, axes, float(ball[3]))
     uploaded = engine.buffers(_Buffers).rows.upload(rows.view(cl_types.float4)[..., 0])
     drawn = _draw_objects(engine, axes, rows, uploaded, ball, objects)
-    return ShadowMaps(volume, light, reach_m, uploaded, ball, rows[:, :3].tobytes(), drawn)
+    return ShadowMaps(volume, light, ray_length_m, uploaded, ball, rows[:, :3].tobytes(), drawn)
 
 
 def most_irradiance(light: DeviceLight, objects: Sequence[Placed]) -> Floats:

@@ -85,7 +85,7 @@ def measure_averages(
     rays: Directions,
     light: DeviceLight,
     indirect: Indirect | None,
-    reach_m: float,
+    ray_length_m: float,
 ) -> Averages:
     """Averages of one frame. radiance: [h, w] float4 as in Measurement; indirect: radiance from surfaces, None: 0."""
     cols, rows = -(-transfer.cols // EVERY), -(-transfer.rows // EVERY)
@@ -101,7 +101,7 @@ def measure_averages(
         radiance,
         transfer.coefficients,
         indirect.hits if indirect else no_hits(engine, transfer),
-        *light_arguments(engine, light, rays, reach_m),
+        *light_arguments(engine, light, rays, ray_length_m),
         EVERY,
         cols,
         rows,

@@ -98,7 +98,7 @@ class TracedScene:
     volume: Volume
     light: DeviceLight
     rays: Directions
-    reach_m: float
+    ray_length_m: float
     """Length of rays."""
     objects: Sequence[Placed]
     table: ObjectTable
@@ -132,7 +132,7 @@ class TracedScene:
         """SceneParameters for a kernel that shades at `samples`, a GRID."""
         return SCENE_PARAMETERS(
             volume=self.volume.shape,
-            light=light_parameters(self.light, self.rays.count, self.reach_m),
+            light=light_parameters(self.light, self.rays.count, self.ray_length_m),
             changed=_changed_parameters(self.changed),
             objects=object_parameters(self.table, self._sent(engine), self.ball),
             samples=samples,
@@ -174,20 +174,22 @@ class TracedScene:
         return self.depth_views.arguments(engine) if self.depth_views else ()
 
 
-def light_parameters(light: DeviceLight, count: int, reach_m: float) -> np.void:
+def light_parameters(light: DeviceLight, count: int, ray_length_m: float) -> np.void:
     """LightParameters of structs.py. count: directions of one set."""
     starts = light.table.starts
     return LIGHT_PARAMETERS(
         unseen=float4(*light.unseen, light.surface_gain),
         count=count,
-        reach_m=reach_m,
+        ray_length_m=ray_length_m,
         **{f"{part}_at": starts[part] for part in ("arriving", "coefficients", "whole")},
     )
 
 
-def light_arguments(engine: Engine, light: DeviceLight, rays: Directions, reach_m: float) -> tuple[KernelArgument, ...]:
+def light_arguments(
+    engine: Engine, light: DeviceLight, rays: Directions, ray_length_m: float
+) -> tuple[KernelArgument, ...]:
     """LightParameters and LIGHT_BUFFERS of include/scene.clh."""
-    return light_parameters(light, rays.count, reach_m), rays.on_device(engine), light.table.memory
+    return light_parameters(light, rays.count, ray_length_m), rays.on_device(engine), light.table.memory
 
 
 def object_parameters(table: ObjectTable, sent: VirtualPointLights, ball: np.generic) -> np.void:
@@ -218,10 +220,10 @@ _CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
 
 
 def trace_scene(
-    engine: Engine, volume: Volume, light: DeviceLight, rays: Directions, reach_m: float, objects: Sequence[Placed]
+    engine: Engine, volume: Volume, light: DeviceLight, rays: Directions, ray_length_m: float, objects: Sequence[Placed]
 ) -> TracedScene:
     """The scene of one frame. Its objects send no light yet."""
-    return TracedScene(volume, light, rays, reach_m, objects, object_table(engine, objects))
+    return TracedScene(volume, light, rays, ray_length_m, objects, object_table(engine, objects))
 
 
 def upload_light(

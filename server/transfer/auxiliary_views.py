@@ -191,7 +191,7 @@ def look_into_views(
     views: AuxiliaryViews,
     view_of: NDArray[np.int32],
     rays: Directions,
-    reach_m: float,
+    ray_length_m: float,
     lift_m: float,
     turn: int,
 ) -> cl_array.Array:
@@ -216,7 +216,7 @@ def look_into_views(
             block_rows=block_rows,
             count=rays.count,
             first_set=first_set(turn),
-            reach_m=reach_m,
+            ray_length_m=ray_length_m,
             lift_m=lift_m,
         ),
         surface.positions,

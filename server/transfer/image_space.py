@@ -93,7 +93,7 @@ class ImageSpaceTransfer:
         volume: Volume,
         surface: Surface,
         stride: int,
-        reach_m: float,
+        ray_length_m: float,
         dominant_direction: Floats | None = None,
         threshold: float | None = None,
         turn: int = 0,
@@ -103,12 +103,12 @@ class ImageSpaceTransfer:
 
         surface: the hybrid geometry buffer. dominant_direction: world, unit, towards the last estimated light, which
         gets a view of its own; None or zeros: not known. threshold: chi of eq. 6.3, None: 1 - cos of half the median
-        angle. Beyond the near part, only the first surface that the light meets counts: if `reach_m` ends inside the
-        scene, a nearer surface behind it may be missed. turn: as in `transfer_radiance`.
+        angle. Beyond the near part, only the first surface that the light meets counts: if `ray_length_m` ends inside
+        the scene, a nearer surface behind it may be missed. turn: as in `transfer_radiance`.
         """
         views = self._around.update(volume, dominant_direction)
         view_of = self._views_for(views)
-        near_m = near_reach_m(views, reach_m)
+        near_m = near_reach_m(views, ray_length_m)
         self.depth_views = RealDepthViews(
             views,
             view_of,
@@ -130,7 +130,7 @@ class ImageSpaceTransfer:
             view_of,
             stride,
             self._rays,
-            reach_m,
+            ray_length_m,
             threshold or self._threshold,
             turn,
         )
@@ -168,9 +168,9 @@ def near_distances(rays: int, voxel_m: float, near_m: float) -> tuple[NDArray[np
     return (begin_m * ratio ** sample_phases(rays)).astype(np.float32), ratio
 
 
-def near_reach_m(views: AuxiliaryViews, reach_m: float) -> float:
+def near_reach_m(views: AuxiliaryViews, ray_length_m: float) -> float:
     """Length of the near part, which looks into the camera's own picture."""
-    return min(NEAR_PIXELS * views.pixel_m, reach_m)
+    return min(NEAR_PIXELS * views.pixel_m, ray_length_m)
 
 
 def depth_room(engine: Engine, camera: CameraModel) -> cl_array.Array:
@@ -210,14 +210,14 @@ def transfer_from_views(
     view_of: NDArray[np.int32],
     stride: int,
     rays: Directions,
-    reach_m: float,
+    ray_length_m: float,
     threshold: float,
     turn: int = 0,
 ) -> Transfer:
     """As ImageSpaceTransfer.transfer, for given views. view_of [SETS, count]: the view for each direction."""
     cols, rows = camera.width // stride, camera.height // stride
     result = room_for_transfer(engine, rows, cols, stride, rays, own_sets(engine, rows, cols, turn))
-    near_m = near_reach_m(views, reach_m)
+    near_m = near_reach_m(views, ray_length_m)
     starts, ratio = near_distances(rays.count, volume.voxel_m, near_m)
     lift_m = LIFT_VOXELS * volume.voxel_m
     defines = {"BANDS": result.bands, "MASK_WORDS": result.free_mask.shape[2], "LANES": engine.lanes}
@@ -238,13 +238,13 @@ def transfer_from_views(
             steps=NEAR_STEPS,
             further=FURTHER_STEPS,
             near_m=near_m,
-            reach_m=reach_m,
+            ray_length_m=ray_length_m,
             slack=SLACK,
             inverse_threshold=1.0 / threshold,
         ),
         surface.positions,
         normals,
-        look_into_views(engine, camera, surface, normals, stride, views, view_of, rays, reach_m, lift_m, turn),
+        look_into_views(engine, camera, surface, normals, stride, views, view_of, rays, ray_length_m, lift_m, turn),
         depths,
         rays.on_device(engine),
         rays.basis_on_device(engine),

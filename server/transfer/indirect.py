@@ -55,7 +55,7 @@ def observe_indirect(
     surface: Surface,
     transfer: Transfer,
     rays: Directions,
-    reach_m: float,
+    ray_length_m: float,
     mean: MeanSent,
     found: cl_array.Array | None = None,
 ) -> Indirect:
@@ -63,7 +63,7 @@ def observe_indirect(
 
     `mean`: of the session. `found`: of transfer_cache.py; samples that were found there keep their values.
     """
-    hits = gather_hits(engine, camera, volume, surface, transfer, rays, reach_m, found=found)
+    hits = gather_hits(engine, camera, volume, surface, transfer, rays, ray_length_m, found=found)
     return Indirect(hits, mean.update(engine, hits), room_for_met(engine, transfer, rays))
 
 
@@ -74,7 +74,7 @@ def gather_hits(
     surface: Surface,
     transfer: Transfer,
     rays: Directions,
-    reach_m: float,
+    ray_length_m: float,
     every: int = EVERY,
     found: cl_array.Array | None = None,
 ) -> cl_array.Array:
@@ -94,7 +94,7 @@ def gather_hits(
             count=rays.count,
             every=every,
             most=met.shape[2],
-            reach_m=reach_m,
+            ray_length_m=ray_length_m,
             least_cosine=LEAST_COSINE,
         ),
         surface.positions,

@@ -156,14 +156,14 @@ def transfer_radiance(
     surface: Surface,
     stride: int,
     rays: Directions,
-    reach_m: float,
+    ray_length_m: float,
     caches: VisibilityCaches | None = None,
     state: VisibilityState | None = None,
     turn: int = 0,
     chosen: NDArray[np.int32] | None = None,
     found: cl_array.Array | None = None,
 ) -> Transfer:
-    """Transfer of the real world without virtual objects at every `stride`-th pixel, by rays of at most `reach_m`.
+    """Transfer of the real world without virtual objects at every `stride`-th pixel, by rays of at most `ray_length_m`.
 
     `caches`: visibility from earlier frames, needed where `rays` are interleaved; this frame's is added.
     `state`: voxels that are known to be open, where no ray is traced. `turn`: selects the direction sets, modulo TURNS.
@@ -193,7 +193,7 @@ def transfer_radiance(
             radius=window_px(camera),
             count=rays.count,
             first_set=first_set(turn),
-            reach_m=reach_m,
+            ray_length_m=ray_length_m,
             chosen_count=0 if chosen is None else len(chosen),
             **(caches.parameters() if caches else NO_CACHES),
         ),

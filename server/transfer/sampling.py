@@ -112,10 +112,10 @@ class TransferSampler:
         surface: Surface,
         volume_from_camera: NDArray[np.float64],
         up: NDArray[np.float64],
-        reach_m: float,
+        ray_length_m: float,
         found: Array | None = None,
     ) -> Transfer:
-        """Transfer of the real world without virtual objects; rays of at most `reach_m`; `up` unit, world axes.
+        """Transfer of the real world without virtual objects; rays of at most `ray_length_m`; `up` unit, world axes.
 
         found: of transfer_cache.py, samples that keep their values; only where `may_be_cached`.
         """
@@ -126,13 +126,13 @@ class TransferSampler:
         )  # subsets of the same set are the most evenly spread
         if self._image_space:
             return self._image_space.transfer(
-                camera, volume_from_camera, volume, surface, sampling.stride, reach_m, turn=turn
+                camera, volume_from_camera, volume, surface, sampling.stride, ray_length_m, turn=turn
             )
         if self._caches:
-            self._caches.begin_frame(camera, volume_from_camera, sampling.stride, self.rays.count, reach_m)
+            self._caches.begin_frame(camera, volume_from_camera, sampling.stride, self.rays.count, ray_length_m)
         if sampling.visibility_state:
             self._state = self._state or VisibilityState(engine, volume, camera, up)
-            self._state.validate(volume_from_camera, reach_m)
+            self._state.validate(volume_from_camera, ray_length_m)
         result = transfer_radiance(
             engine,
             camera,
@@ -140,7 +140,7 @@ class TransferSampler:
             surface,
             sampling.stride,
             self.rays,
-            reach_m,
+            ray_length_m,
             self._caches,
             self._state,
             turn,

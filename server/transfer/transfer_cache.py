@@ -83,7 +83,7 @@ class TransferCache:
         volume_from_camera: NDArray[np.float64],
         stride: int,
         rays: Directions,
-        reach_m: float,
+        ray_length_m: float,
     ) -> cl_array.Array:
         """[rows, cols] int32: at least 0 where a sample was found. Its values are then in the arrays that
         `transfer_radiance` and `gather_hits` return, which leave it out.
@@ -95,7 +95,7 @@ class TransferCache:
         hits, met = room_for_hits(engine, transfer), room_for_met(engine, transfer, rays)
         defines = {"BANDS": transfer.bands, "MASK_WORDS": transfer.free_mask.shape[2], "MOST_MET": met.shape[2]}
         words = _WORDS_BESIDE + defines["MASK_WORDS"] + transfer.bands**2 + defines["MOST_MET"]
-        self._forget_others(camera, volume, stride, rays, reach_m, places, words)
+        self._forget_others(camera, volume, stride, rays, ray_length_m, places, words)
         self._now += 1
         parameters = TRANSFER_CACHE_PARAMETERS(
             grid=sample_grid(camera, transfer),
@@ -170,11 +170,11 @@ class TransferCache:
         volume: Volume,
         stride: int,
         rays: Directions,
-        reach_m: float,
+        ray_length_m: float,
         places: int,
         words: int,
     ) -> None:
-        asked = (camera, stride, rays.count, rays.interleave, rays.basis.shape[2], reach_m)
+        asked = (camera, stride, rays.count, rays.interleave, rays.basis.shape[2], ray_length_m)
         if self._of and self._of[0] is volume and self._of[1:] == asked:
             return
         self._of = (volume, *asked)

@@ -31,9 +31,15 @@ class Visibility:
 
 
 def trace_visibility(
-    engine: Engine, camera: CameraModel, volume: Volume, surface: Surface, stride: int, rays: Directions, reach_m: float
+    engine: Engine,
+    camera: CameraModel,
+    volume: Volume,
+    surface: Surface,
+    stride: int,
+    rays: Directions,
+    ray_length_m: float,
 ) -> Visibility:
-    """From every `stride`-th pixel, one voxel off the surface (fig. 7.5), along rays of at most `reach_m`.
+    """From every `stride`-th pixel, one voxel off the surface (fig. 7.5), along rays of at most `ray_length_m`.
 
     Sample i along an axis lies at pixel stride / 2 + i stride. The arrays are reused by the next call.
     """
@@ -52,7 +58,7 @@ def trace_visibility(
         *volume.arguments(),
         rays.count,
         rays.on_device(engine),
-        reach_m,
+        ray_length_m,
         result.free,
         result.blocked,
     )

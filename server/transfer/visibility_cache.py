@@ -53,13 +53,13 @@ class VisibilityCaches:
         volume_from_camera: NDArray[np.float64],
         stride: int,
         count: int,
-        reach_m: float,
+        ray_length_m: float,
     ) -> None:
         """Open a layer for a frame seen from `volume_from_camera` [4, 4], in place of the oldest layer.
 
         Layers of another camera, stride, number of directions or ray length are forgotten.
         """
-        asked = (camera.width, camera.height, stride, count, reach_m)
+        asked = (camera.width, camera.height, stride, count, ray_length_m)
         known = min(self._known + 1, self._interleave) if asked == self._asked else 1
         self._asked, self._known, self._frame = asked, known, self._frame + 1
         self._shape = (camera.height // stride, camera.width // stride, -(-count // 32))

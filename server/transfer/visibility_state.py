@@ -81,8 +81,8 @@ class VisibilityState:
         """Forget all open voxels."""
         fill_bytes(self._engine.queue, self.bits, 0)
 
-    def validate(self, volume_from_camera: NDArray[np.float64], reach_m: float) -> NDArray[np.bool_]:
-        """Forget what lies within `reach_m` of where the volume has changed since the last call.
+    def validate(self, volume_from_camera: NDArray[np.float64], ray_length_m: float) -> NDArray[np.bool_]:
+        """Forget what lies within `ray_length_m` of where the volume has changed since the last call.
 
         `volume_from_camera`: of the user's camera now. Returns [z, y, x] the bricks that were forgotten.
         """
@@ -92,7 +92,7 @@ class VisibilityState:
             self._compare(watch, changed)
         self._following.volume_from_camera = volume_from_camera
         self._look(self._following)
-        stale = _grown(self._engine.download(changed) > 0, reach_m / (BRICK * self._volume.voxel_m))
+        stale = _grown(self._engine.download(changed) > 0, ray_length_m / (BRICK * self._volume.voxel_m))
         if stale.any():
             x, y, z = self._volume.bricks
             self._engine.launch(

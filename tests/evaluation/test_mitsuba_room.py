@@ -59,14 +59,14 @@ def test_the_true_light_shades_the_objects_as_the_path_tracer(sets: dict[str, Ro
     item = sets["key_white_direct"]
     for index in range(FRAMES):
         assert shading.error(item, index, 3.0 * item.sh) < 0.03
-        assert shading.error(item, index, item.sh, reach_m=0.1) > 0.12
-        assert shading.error(item, index, item.sh, reach_m=0.0) > 0.15
+        assert shading.error(item, index, item.sh, ray_length_m=0.1) > 0.12
+        assert shading.error(item, index, item.sh, ray_length_m=0.0) > 0.15
 
 
 def test_nothing_hides_the_sky_within_no_reach(sets: dict[str, RoomSet], shading: ObjectShading) -> None:
     light, frame = sets["key_white_direct"].sh, shading.frames[0]
     open_sky = frame.albedo * (open_transfer(frame.normals, 4) @ light)
-    np.testing.assert_allclose(shading.radiance(0, light, reach_m=0.0), np.maximum(open_sky, 0), rtol=1e-9)
+    np.testing.assert_allclose(shading.radiance(0, light, ray_length_m=0.0), np.maximum(open_sky, 0), rtol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(frame.normals, axis=1), 1, rtol=1e-6)
 
 

@@ -128,7 +128,7 @@ def test_shadow_lies_away_from_the_light(engine: Engine) -> None:
 
 def test_far_object_leaves_exactly_one(engine: Engine) -> None:
     for solid in (box((3, 5, 3), (3.2, 5.2, 3.2)), box((0.4, 0.3, -40), (0.5, 0.4, -39.9))):
-        shaded = shade_floor(engine, solid, reach_m=2.0)
+        shaded = shade_floor(engine, solid, ray_length_m=2.0)
         np.testing.assert_array_equal(shaded.ratio, 1.0)
 
 

@@ -110,9 +110,9 @@ def test_views_see_the_first_solid_voxel(engine: Engine, name: str) -> None:
 
 
 @pytest.mark.parametrize(("stride", "rays", "bands"), [(4, 81, 4), (3, 33, 2), (8, 169, 6)])
-@pytest.mark.parametrize("reach_m", [ROOM_M, 0.15])
+@pytest.mark.parametrize("ray_length_m", [ROOM_M, 0.15])
 def test_transfer_is_the_twins(
-    device: Device, engine: Engine, stride: int, rays: int, bands: int, reach_m: float
+    device: Device, engine: Engine, stride: int, rays: int, bands: int, ray_length_m: float
 ) -> None:
     scene = SCENES["ball above a floor" if stride == 3 else "room open at the top"]
     looked = look(engine, scene, holes=0.05, hand=scene[1] if stride < 8 else None)
@@ -120,9 +120,20 @@ def test_transfer_is_the_twins(
     threshold = occlusion_threshold(directions.directions[0, :, :3].astype(float))
     views = ViewsAround(engine, 48).update(looked.volume)
     _, view_of = nearest_views(directions, views.toward)
-    arguments: Any = (engine, CAMERA, VIEW, looked.volume, looked.surface, views, view_of, stride, directions, reach_m)
+    arguments: Any = (
+        engine,
+        CAMERA,
+        VIEW,
+        looked.volume,
+        looked.surface,
+        views,
+        view_of,
+        stride,
+        directions,
+        ray_length_m,
+    )
     result = image_space.transfer_from_views(*arguments, threshold)
-    transfer, openness, visible = twin_of(engine, looked, views, view_of, stride, directions, reach_m, threshold)
+    transfer, openness, visible = twin_of(engine, looked, views, view_of, stride, directions, ray_length_m, threshold)
     found = engine.download(result.coefficients)
     # Where a position falls on the brink of a pixel, float32 may take the other one: one direction of a sample differs.
     tolerance = 20 * relative_tolerance(device)
@@ -145,10 +156,10 @@ def twin_of(
     view_of: NDArray[np.int32],
     stride: int,
     rays: Directions,
-    reach_m: float,
+    ray_length_m: float,
     threshold: float,
 ) -> tuple[Floats, Floats, Floats]:
-    near_m = min(image_space.NEAR_PIXELS * views.pixel_m, reach_m)
+    near_m = min(image_space.NEAR_PIXELS * views.pixel_m, ray_length_m)
     starts, ratio = near_distances(rays.count, VOXEL_M, near_m)
     camera_from_volume = inverse_rigid(VIEW)
     in_camera = looked.positions[..., :3] @ camera_from_volume[:3, :3].T + camera_from_volume[:3, 3]
@@ -162,7 +173,7 @@ def twin_of(
         ratio,
         image_space.FURTHER_STEPS if unknown.any() else image_space.NEAR_STEPS,
         near_m,
-        reach_m,
+        ray_length_m,
         image_space.SLACK,
         threshold,
     )
@@ -177,7 +188,7 @@ def twin_of(
         host_views(engine, views),
         view_of,
         near,
-        reach_m,
+        ray_length_m,
         image_space.LIFT_VOXELS * VOXEL_M,
     )
 

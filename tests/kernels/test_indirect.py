@@ -92,12 +92,12 @@ class Case:
         """[rows, 16, rays]."""
         return np.einsum("rcjk,rck->rcj", self.directions, self.normals)
 
-    def both(self, free: Bools, every: int, reach_m: float) -> tuple[Floats, Floats]:
+    def both(self, free: Bools, every: int, ray_length_m: float) -> tuple[Floats, Floats]:
         """[rows, 16, 4] of the kernel and of the twin."""
         engine, rows = self._engine, len(free)
         surface = upload_surface(engine, self.points, self.normals, np.ones((rows, 16), bool))
         transfer, camera = transfer_with(engine, free, self.sets), camera_of(rows, 16)
-        hits = gather_hits(engine, camera, self.volume, surface, transfer, self.rays, reach_m, every)
+        hits = gather_hits(engine, camera, self.volume, surface, transfer, self.rays, ray_length_m, every)
         expected = twin.gather_hits(
             self.points,
             self.normals,
@@ -107,7 +107,7 @@ class Case:
             (np.rint(np.sqrt(self.colors) * MOST) / MOST) ** 2,
             self.has_color,
             VOXEL_M,
-            reach_m,
+            ray_length_m,
             every,
             LEAST_COSINE,
         )
@@ -116,8 +116,8 @@ class Case:
 
 @KINDS
 @pytest.mark.parametrize("name", ["scattered", "room open at the top"])
-@pytest.mark.parametrize("reach_m", [ROOM_M, 0.25])
-def test_each_ray_meets_the_twins_voxel(device: Device, kind: type[Engine], name: str, reach_m: float) -> None:
+@pytest.mark.parametrize("ray_length_m", [ROOM_M, 0.25])
+def test_each_ray_meets_the_twins_voxel(device: Device, kind: type[Engine], name: str, ray_length_m: float) -> None:
     """One hidden direction a sample, above it, so that a sum is one voxel's colour."""
     engine = kind(device)
     case = Case(engine, name, 64, direction_sets(33, 2))
@@ -125,7 +125,7 @@ def test_each_ray_meets_the_twins_voxel(device: Device, kind: type[Engine], name
     free = np.ones(rises.shape, bool)
     one = (np.random.default_rng(1).random(rises.shape) * rises).argmax(axis=-1)[..., None]
     np.put_along_axis(free, one, False, axis=-1)
-    found, expected = case.both(free, 1, reach_m)
+    found, expected = case.both(free, 1, ray_length_m)
     same = (np.abs(found - expected) < 1e-4).all(axis=-1)
     met = expected[..., 3] > 0
     assert met.sum() > 30
@@ -231,8 +231,8 @@ def test_nothing_is_gathered_where_nothing_is_hidden_or_near(device: Device, kin
     camera = camera_of(size, size)
     hidden, open_ = np.zeros((size, size, 81), bool), np.ones((size, size, 81), bool)
     nothing = upload_surface(engine, np.ones((size, size, 3)), np.ones((size, size, 3)), np.zeros((size, size), bool))
-    for of, free, reach_m in ((nothing, hidden, ROOM_M), (surface, open_, ROOM_M), (surface, hidden, 0.25)):
-        hits = gather_hits(engine, camera, volume, of, transfer_with(engine, free), rays, reach_m)
+    for of, free, ray_length_m in ((nothing, hidden, ROOM_M), (surface, open_, ROOM_M), (surface, hidden, 0.25)):
+        hits = gather_hits(engine, camera, volume, of, transfer_with(engine, free), rays, ray_length_m)
         assert not download4(engine, hits).any()
         surface, _ = on_the_floor(engine, 0.3)
     hits = gather_hits(engine, camera, volume, surface, transfer_with(engine, hidden), rays, 0.5)

@@ -113,13 +113,13 @@ def assert_twins(device: Device, traced: Traced, stride: int, rays: int, bands: 
 
 
 @pytest.mark.parametrize("name", SCENES)
-@pytest.mark.parametrize("reach_m", [ROOM_M, 0.1])
-def test_visibility_is_the_twins(engine: Engine, name: str, reach_m: float) -> None:
+@pytest.mark.parametrize("ray_length_m", [ROOM_M, 0.1])
+def test_visibility_is_the_twins(engine: Engine, name: str, ray_length_m: float) -> None:
     scene = SCENES[name]
     volume = fill_volume(engine, scene, VOXEL_M)
-    traced = trace(engine, volume, *points_on(scene, 256, 2), reach_m=reach_m)
+    traced = trace(engine, volume, *points_on(scene, 256, 2), ray_length_m=ray_length_m)
     origins, directions, above = rays_of(traced, 81)
-    exact = trace_volume(solid_voxels(scene, volume), VOXEL_M, origins[above], directions[above], reach_m)
+    exact = trace_volume(solid_voxels(scene, volume), VOXEL_M, origins[above], directions[above], ray_length_m)
     free = traced.free[above]
     # Samples less than a voxel apart miss corners that a ray only clips; what they find, is there.
     missed = (free & ~exact).mean()
@@ -127,7 +127,7 @@ def test_visibility_is_the_twins(engine: Engine, name: str, reach_m: float) -> N
     assert (
         ~free & exact
     ).mean() < 1e-3  # float32 origins within 1e-6 of a voxel's face, and the last sample at `reach`
-    assert reach_m < ROOM_M or (~free).mean() > 0.02
+    assert ray_length_m < ROOM_M or (~free).mean() > 0.02
 
 
 def test_rays_meet_single_voxels(engine: Engine) -> None:
@@ -137,7 +137,7 @@ def test_rays_meet_single_voxels(engine: Engine) -> None:
     solid = random.random([8 * n for n in volume.bricks[::-1]]) < 0.01
     fill(engine, volume, np.where(solid, -0.5, 1.0), np.ones(solid.shape))
     points, normals = random.uniform(0.35, 0.6, (64, 3)), random_directions(64, 16)
-    traced = trace(engine, volume, points, normals, reach_m=0.3)
+    traced = trace(engine, volume, points, normals, ray_length_m=0.3)
     origins, directions, above = rays_of(traced, 81)
     origins, directions, free = origins[above], directions[above], traced.free[above]
     assert not (~free & trace_volume(solid, VOXEL_M, origins, directions, 0.3)).any()
@@ -174,19 +174,19 @@ def test_strides_and_empty_pixels(engine: Engine, stride: int) -> None:
 
 
 @pytest.mark.parametrize("name", SCENES)
-@pytest.mark.parametrize("reach_m", [ROOM_M, 0.1])
-def test_every_ray_away_from_edges(engine: Engine, name: str, reach_m: float) -> None:
+@pytest.mark.parametrize("ray_length_m", [ROOM_M, 0.1])
+def test_every_ray_away_from_edges(engine: Engine, name: str, ray_length_m: float) -> None:
     scene = SCENES[name]
-    traced = trace(engine, fill_volume(engine, scene, VOXEL_M), *points_on(scene, 512, 3), reach_m=reach_m)
+    traced = trace(engine, fill_volume(engine, scene, VOXEL_M), *points_on(scene, 512, 3), ray_length_m=ray_length_m)
     origins, directions, above = rays_of(traced, 81)
     origins, directions, free = origins[above], directions[above], traced.free[above]
     inside = leaves_volume_after(origins, directions)  # what lies outside the volume cannot block
-    must_block = hit(scene, origins, directions, -INNER) < np.minimum(reach_m, inside) - 2 * VOXEL_M
-    must_pass = hit(scene, origins, directions, OUTER) >= reach_m
+    must_block = hit(scene, origins, directions, -INNER) < np.minimum(ray_length_m, inside) - 2 * VOXEL_M
+    must_pass = hit(scene, origins, directions, OUTER) >= ray_length_m
     assert not (must_block & free).any()
     assert not (must_pass & ~free).any()
     assert (must_block | must_pass).mean() > 0.6  # the slit is six voxels wide, three of them beside an edge
-    assert reach_m < ROOM_M or must_block.mean() > 0.1
+    assert ray_length_m < ROOM_M or must_block.mean() > 0.1
 
 
 def leaves_volume_after(origins: Floats, directions: Floats) -> Floats:
@@ -244,7 +244,7 @@ def test_reach_ends_visibility(engine: Engine) -> None:
     volume = fill_volume(engine, (ceiling,), VOXEL_M)
     points = np.tile([0.48, 0.3, 0.48], (64, 1))
     up = np.tile([0.0, 1.0, 0.0], (64, 1))
-    near, far = (trace(engine, volume, points, up, reach_m=reach) for reach in (0.15, 0.3))
+    near, far = (trace(engine, volume, points, up, ray_length_m=reach) for reach in (0.15, 0.3))
     np.testing.assert_array_equal(near.openness, 1.0)  # the ceiling is 19 cm above the rays' origin
     # Within 30 cm lie directions up to 50 degrees off: sin^2 of it of the sky.
     assert far.openness.mean() == pytest.approx((0.19 / 0.3) ** 2, abs=0.06)

@@ -140,13 +140,13 @@ def lit(
     *discs: DirectLight,
     solids: tuple[Box | Ball, ...] = (CRATE,),
     scene: Scene = FLOOR,
-    reach_m: float = FAR_M,
+    ray_length_m: float = FAR_M,
 ) -> Lit:
     rays, volume = direction_sets(81, 4), fill_volume(engine, scene, VOXEL_M)
     light = upload_light(engine, lights.uniform(), rays)
     light = take_discs(engine, light, SplitLight(lights.uniform(), discs), rays)
     objects = [placed(engine, solid) for solid in solids]
-    return Lit(engine, draw_shadow_maps(engine, volume, light, objects, reach_m))
+    return Lit(engine, draw_shadow_maps(engine, volume, light, objects, ray_length_m))
 
 
 def floor_points(count: int = 300, seed: int = 1, around: float = 0.3) -> Floats:
@@ -445,7 +445,7 @@ def test_real_surface_that_a_virtual_one_touches_does_not_hide_the_disc(engine: 
 
 
 def test_rays_are_as_long_as_they_are_said_to_be(engine: Engine) -> None:
-    scene = lit(engine, disc(6.0, (0.9, 0.5, 0.0)), scene=(*FLOOR, WALL), reach_m=0.05)
+    scene = lit(engine, disc(6.0, (0.9, 0.5, 0.0)), scene=(*FLOOR, WALL), ray_length_m=0.05)
     points = floor_points(100, around=0.05) - [0.2, 0, 0]
     np.testing.assert_allclose(scene.floor(points)[0], exact(points[:1], disc(6.0, (0.9, 0.5, 0.0)), ())[0], rtol=3e-4)
 

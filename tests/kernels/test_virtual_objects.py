@@ -25,11 +25,11 @@ SOURCE = """
 #include "virtual_objects.clh"
 kernel void trace(const int rays, const int count, const global float16 *grid_from_volume, const global int4 *dims,
                   const global float *distances, const global float *origins, const global float *directions,
-                  const float reach_m, global float *visibility, global float *cell_m) {
+                  const float ray_length_m, global float *visibility, global float *cell_m) {
     const int ray = get_global_id(0);
     if (ray >= rays) return;
     visibility[ray] = trace_objects(count, grid_from_volume, dims, distances, vload3(ray, origins),
-                                    vload3(ray, directions), reach_m);
+                                    vload3(ray, directions), ray_length_m);
     if (ray < count) cell_m[ray] = cell_size_m(grid_from_volume[ray]);
 }
 """
@@ -44,7 +44,9 @@ def trace(engine: Engine) -> Any:
     options = ["-cl-std=CL1.2", "-Werror", "-I", str(KERNEL_FOLDER / "include")]
     kernel = cl.Kernel(cl.Program(engine.device.context, struct_text() + SOURCE).build(options), "trace")
 
-    def run(table: ObjectTable, origins: Points, directions: Points, reach_m: float = FAR_M) -> NDArray[np.float32]:
+    def run(
+        table: ObjectTable, origins: Points, directions: Points, ray_length_m: float = FAR_M
+    ) -> NDArray[np.float32]:
         space, rays = engine.workspace, len(origins)
         ends = [
             space.upload(f"test_{k}", np.ascontiguousarray(v, np.float32)) for k, v in enumerate((origins, directions))
@@ -52,7 +54,7 @@ def trace(engine: Engine) -> Any:
         visibility = space.array("test_visibility", (rays,), np.float32)
         cell_m = space.array("test_cells", (max(table.count, 1),), np.float32)
         rows = (table.count, table.grid_from_volume, table.dims, table.distances)
-        engine.launch(kernel, (rays,), rays, *rows, *ends, reach_m, visibility, cell_m)
+        engine.launch(kernel, (rays,), rays, *rows, *ends, ray_length_m, visibility, cell_m)
         np.testing.assert_allclose(engine.download(cell_m)[: table.count], table.cell_m, rtol=1e-5)
         result = engine.download(visibility)
         assert set(np.unique(result)) <= {0.0, 1.0}
@@ -193,12 +195,12 @@ def test_many_objects_block_as_each_does(engine: Engine, trace: Any, count: int)
     aims = np.array([place[:3, 3] for place in places])[rng.integers(0, count, 4000)] + rng.normal(size=(4000, 3)) / 4
     directions = unit(aims - origins)
     directions[:60] = np.tile(np.concatenate([np.eye(3), -np.eye(3)]), (10, 1))
-    for reach_m in (3.0, FAR_M):
-        together = trace(object_table(engine, objects), origins, directions, reach_m)
+    for ray_length_m in (3.0, FAR_M):
+        together = trace(object_table(engine, objects), origins, directions, ray_length_m)
         apart = np.ones(len(origins), np.float32)
         for begin in range(0, count, FEW_OBJECTS):
             few = object_table(engine, objects[begin : begin + FEW_OBJECTS])
-            apart = np.minimum(apart, trace(few, origins, directions, reach_m))
+            apart = np.minimum(apart, trace(few, origins, directions, ray_length_m))
         assert 40 < (apart == 0).sum() < 3960
         np.testing.assert_array_equal(together, apart)
 

@@ -112,14 +112,14 @@ def test_boxes_of_released_bricks_are_those_of_cells(device: Device, engine: Eng
 
 
 def visibility_of(
-    engine: Engine, volume: Volume, points: Floats, normals: Floats, rays: int, reach_m: float
+    engine: Engine, volume: Volume, points: Floats, normals: Floats, rays: int, ray_length_m: float
 ) -> tuple[Bools, Bools, Floats, Floats]:
     """Of points, 8 in a row: free and blocked [rows, 8, rays], origins and directions [rows, 8, rays, 3]."""
     points, normals = (a.reshape(-1, 8, 3).astype(np.float32).astype(np.float64) for a in (points, normals))
     camera = CameraModel(width=8, height=len(points), fx=10.0, fy=10.0, cx=0.0, cy=0.0)
     surface = upload_surface(engine, points, normals, np.ones(points.shape[:2], bool))
     sets = direction_sets(rays, 2)
-    found = trace_visibility(engine, camera, volume, surface, 1, sets, reach_m)
+    found = trace_visibility(engine, camera, volume, surface, 1, sets, ray_length_m)
     free, blocked = (
         np.unpackbits(engine.download(a).view(np.uint8), axis=-1, bitorder="little")
         for a in (found.free, found.blocked)
@@ -133,9 +133,9 @@ def visibility_of(
 
 @KINDS
 @pytest.mark.parametrize("name", [*SCENES, "scattered"])
-@pytest.mark.parametrize("reach_m", [ROOM_M, 0.25, 0.1])
+@pytest.mark.parametrize("ray_length_m", [ROOM_M, 0.25, 0.1])
 @pytest.mark.parametrize("rays", [81, 30])
-def test_rays_are_the_twins(device: Device, kind: type[Engine], name: str, reach_m: float, rays: int) -> None:
+def test_rays_are_the_twins(device: Device, kind: type[Engine], name: str, ray_length_m: float, rays: int) -> None:
     engine = kind(device)
     if name == "scattered":
         volume, solid = scattered(engine, 0.0005, VOXEL_M, np.random.default_rng(15))
@@ -144,18 +144,18 @@ def test_rays_are_the_twins(device: Device, kind: type[Engine], name: str, reach
         volume = fill_volume(engine, SCENES[name], VOXEL_M)
         points, normals = points_on(SCENES[name], 256, 2)
         solid = solid_voxels(SCENES[name], volume)
-    free, blocked, origins, directions = visibility_of(engine, volume, points, normals, rays, reach_m)
+    free, blocked, origins, directions = visibility_of(engine, volume, points, normals, rays, ray_length_m)
     assert not (free & blocked).any()
     height = (directions * (origins - points.reshape(-1, 8, 1, 3)) / VOXEL_M).sum(-1)
     assert (free | blocked)[height > 1e-4].all()
     assert not (free | blocked)[height < -1e-4].any()
     traced = free | blocked
-    exact = twin.trace_volume(solid, VOXEL_M, origins[traced], directions[traced], reach_m)
+    exact = twin.trace_volume(solid, VOXEL_M, origins[traced], directions[traced], ray_length_m)
     # Steps go a hundredth of a voxel beyond what is empty and miss clipped corners; what they find, is there.
     assert (free[traced] & ~exact).mean() < 0.001  # seen: 0.0003
     assert name != "scattered" or (free[traced] & ~exact).sum() < 0.04 * (~exact).sum()
-    assert (blocked[traced] & exact).mean() < 1e-3  # origins in float32, and the last sample at `reach_m`
-    assert reach_m == 0.1 or (~exact).mean() > 0.01
+    assert (blocked[traced] & exact).mean() < 1e-3  # origins in float32, and the last sample at `ray_length_m`
+    assert ray_length_m == 0.1 or (~exact).mean() > 0.01
     engine.close()
 
 

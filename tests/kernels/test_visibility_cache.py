@@ -53,16 +53,16 @@ class Watcher:
     def __post_init__(self) -> None:
         self.caches = VisibilityCaches(self.engine, self.interleave)
 
-    def see(self, view: Floats, labels: Any = LABEL_STATIC, reach_m: float = ROOM_M) -> dict[str, Any]:
+    def see(self, view: Floats, labels: Any = LABEL_STATIC, ray_length_m: float = ROOM_M) -> dict[str, Any]:
         """The transfer of one frame, and what its layer holds."""
         self.surface = seen_surface(self.engine, self.volume, CAMERA, view, labels)
-        return self.look_at(self.surface, view, reach_m)
+        return self.look_at(self.surface, view, ray_length_m)
 
-    def look_at(self, surface: Surface, view: Floats, reach_m: float = ROOM_M) -> dict[str, Any]:
-        self.caches.begin_frame(CAMERA, view, self.stride, COUNT, reach_m)
+    def look_at(self, surface: Surface, view: Floats, ray_length_m: float = ROOM_M) -> dict[str, Any]:
+        self.caches.begin_frame(CAMERA, view, self.stride, COUNT, ray_length_m)
         rays = direction_sets(COUNT, 4, self.interleave)
         found = transfer_radiance(
-            self.engine, CAMERA, self.volume, surface, self.stride, rays, reach_m, self.caches, turn=self.turn
+            self.engine, CAMERA, self.volume, surface, self.stride, rays, ray_length_m, self.caches, turn=self.turn
         )
         get = self.engine.download
         assert found.sets is not None
@@ -226,10 +226,10 @@ def test_another_reach_forgets(engine: Engine) -> None:
     watcher = Watcher(engine, fill_volume(engine, SCENES["ball above a floor"], VOXEL_M), 4)
     for _ in range(2):
         watcher.see(pose(0))
-    frame = watcher.see(pose(0), reach_m=0.1)
+    frame = watcher.see(pose(0), ray_length_m=0.1)
     assert frame["traced"][frame["openness"] >= 0].all()
     watcher.caches.forget()
-    frame = watcher.see(pose(0), reach_m=0.1)
+    frame = watcher.see(pose(0), ray_length_m=0.1)
     assert frame["traced"][frame["openness"] >= 0].all()
 
 

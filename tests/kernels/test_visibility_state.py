@@ -93,30 +93,30 @@ def test_nothing_changes_nothing(engine: Engine) -> None:
         assert not stale.any()
 
 
-@pytest.mark.parametrize("reach_m", [0.1, 1000.0])
-def test_a_change_forgets_what_is_in_reach(engine: Engine, reach_m: float) -> None:
+@pytest.mark.parametrize("ray_length_m", [0.1, 1000.0])
+def test_a_change_forgets_what_is_in_reach(engine: Engine, ray_length_m: float) -> None:
     """A ball comes and goes: voxels that a ray connects with it are forgotten, those far away are kept."""
     volume = fill_volume(engine, (floor(0.11),), VOXEL_M)
     state = VisibilityState(engine, volume, CAMERA, UP)
     surface = surface_of(engine, volume)
-    state.validate(VIEW, reach_m)
+    state.validate(VIEW, ray_length_m)
     state.learn(surface, CAMERA, 4, transfer_of(engine, volume, surface, state).openness)
     known = open_voxels(engine, state, volume)
     assert known.sum() > 100
     body = ball((0.5, 0.16, 0.5), 0.06)
     for scene in ((floor(0.11), body), (floor(0.11),)):
         change(engine, volume, scene)
-        stale = state.validate(VIEW, reach_m)
+        stale = state.validate(VIEW, ray_length_m)
         assert stale.any()
         left = open_voxels(engine, state, volume)
         z, y, x = np.nonzero(known)
         points = (np.stack([x, y, z], -1) + 0.5) * VOXEL_M
-        near = body.distance(points) < reach_m - 2 * VOXEL_M
+        near = body.distance(points) < ray_length_m - 2 * VOXEL_M
         assert near.sum() > 10
         assert not left[z, y, x][near].any()
         forgotten = stale.repeat(BRICK, 0).repeat(BRICK, 1).repeat(BRICK, 2)
         np.testing.assert_array_equal(left, known & ~forgotten)
-        assert left.any() == (reach_m < 1)
+        assert left.any() == (ray_length_m < 1)
         state.learn(surface, CAMERA, 4, transfer_of(engine, volume, surface, state).openness)
 
 

@@ -49,9 +49,9 @@ RAYS, REACHES_M = (81, 169, 32), (WHOLE_ROOM_M, THESIS_REACH_M)
 
 def configurations() -> Iterator[tuple[str, int, int, float]]:
     """Preset, rays, bands, length of rays."""
-    for preset, rays, bands, reach_m in product(STRIDES, RAYS, range(2, MAX_SH_BANDS + 1), REACHES_M):
+    for preset, rays, bands, ray_length_m in product(STRIDES, RAYS, range(2, MAX_SH_BANDS + 1), REACHES_M):
         if STRIDES[preset] > 1 or bands in (2, 4, MAX_SH_BANDS):  # every pixel is slow, and bands do not depend on it
-            yield preset, rays, bands, reach_m
+            yield preset, rays, bands, ray_length_m
 
 
 @pytest.mark.parametrize("body", BODIES)
@@ -60,16 +60,16 @@ def test_reconstructed_scene_shades_to_one(engine: Engine, body: str) -> None:
     static = ndimage.minimum_filter(engine.download(surface.labels) == LABEL_STATIC, 3)  # as the estimator wants it
     assert static.mean() > 0.15
     wrong = {}
-    for preset, rays, bands, reach_m in configurations():
+    for preset, rays, bands, ray_length_m in configurations():
         stride = STRIDES[preset]
-        transfer = transfer_radiance(engine, CAMERA, volume, surface, stride, direction_sets(rays, bands), reach_m)
+        transfer = transfer_radiance(engine, CAMERA, volume, surface, stride, direction_sets(rays, bands), ray_length_m)
         shaded = engine.download(transfer.coefficients).astype(float) @ uniform(bands=bands)[:, 0]
         error = np.abs(shaded - 1)[static[stride // 2 :: stride, stride // 2 :: stride]]
         flat = engine.download(transfer.flatness)[static[stride // 2 :: stride, stride // 2 :: stride]]
         assert (flat >= LEAST_FLATNESS).sum() > 25
         # Every sample that the light is estimated from, and of the others (outlines) all but one in a hundred.
         if error[flat >= LEAST_FLATNESS].max() > 0.01 or np.quantile(error, 0.99) > 0.01:
-            wrong[preset, rays, bands, reach_m] = error[flat >= LEAST_FLATNESS].max(), np.quantile(error, 0.99)
+            wrong[preset, rays, bands, ray_length_m] = error[flat >= LEAST_FLATNESS].max(), np.quantile(error, 0.99)
     assert not wrong
 
 
@@ -83,9 +83,11 @@ def test_exact_scene_shades_to_one(engine: Engine) -> None:
         blocks = [np.repeat(np.repeat(a.reshape(24, 24, 3), 4, 0), 4, 1) for a in (points, normals)]
         surface = upload_surface(engine, *blocks, np.ones((96, 96), bool))
         camera = CameraModel(width=96, height=96, fx=90.0, fy=90.0, cx=48.0, cy=48.0)
-        for preset, rays, bands, reach_m in configurations():
+        for preset, rays, bands, ray_length_m in configurations():
             if STRIDES[preset] == 4:
-                transfer = transfer_radiance(engine, camera, volume, surface, 4, direction_sets(rays, bands), reach_m)
+                transfer = transfer_radiance(
+                    engine, camera, volume, surface, 4, direction_sets(rays, bands), ray_length_m
+                )
                 shaded = engine.download(transfer.coefficients).astype(float) @ uniform(bands=bands)[:, 0]
                 np.testing.assert_allclose(shaded, 1.0, rtol=1e-6)
 

@@ -98,7 +98,7 @@ class Picture:
     """[h, w] metres, 0 = none."""
 
     def march(
-        self, origin: Floats, normal: Floats, direction: Floats, first_m: float, ratio: float, reach_m: float,
+        self, origin: Floats, normal: Floats, direction: Floats, first_m: float, ratio: float, ray_length_m: float,
         bias_m: float, most_apart: float,
     ) -> tuple[int, int] | None:  # fmt: skip
         """Row and column of the first surface that a sample lies behind, near the direction and above the plane."""
@@ -106,7 +106,7 @@ class Picture:
         turn = self.camera_from_volume[:3, :3]
         eye = turn @ origin + self.camera_from_volume[:3, 3]
         r = first_m
-        while r < reach_m:
+        while r < ray_length_m:
             x, y, z = eye + r * (turn @ direction)
             col, row = int(np.floor(fx * x / z + cx + 0.5)), int(np.floor(fy * y / z + cy + 0.5))
             if z < 1e-3 or not (0 <= col < self.depths.shape[1] and 0 <= row < self.depths.shape[0]):

@@ -44,7 +44,7 @@ class Views:
         return self.center - self.distance_m * self.axes[view, 2]
 
     def lit(
-        self, view: int, point: Floats, normal: Floats, shift: tuple[float, float], reach_m: float, lift_m: float
+        self, view: int, point: Floats, normal: Floats, shift: tuple[float, float], ray_length_m: float, lift_m: float
     ) -> bool:
         """Whether the view sees a surface point: nothing in its pixel is nearer, within reach and above its plane."""
         side = self.depths.shape[1]
@@ -57,7 +57,7 @@ class Views:
         if depth == 0 or depth >= z:
             return True
         to = self.eye(view) + depth * self.line(view, row, col) - point
-        return bool(to @ normal <= lift_m or to @ to >= reach_m**2)
+        return bool(to @ normal <= lift_m or to @ to >= ray_length_m**2)
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Near:
     ratio: float
     steps: int
     near_m: float
-    reach_m: float
+    ray_length_m: float
     slack: float
     threshold: float
 
@@ -91,7 +91,7 @@ class Near:
         free = 1.0
         for r in start_m * self.ratio ** np.arange(self.steps):
             y = origin + r * w
-            if y[2] <= 1e-3 or r >= self.reach_m:
+            if y[2] <= 1e-3 or r >= self.ray_length_m:
                 continue
             u, v = fx * y[0] / y[2] + cx + 0.5, fy * y[1] / y[2] + cy + 0.5
             if not (0 < u < width and 0 < v < height):
@@ -120,7 +120,7 @@ def transfer_from_views(
     views: Views,
     view_of: NDArray[np.int32],
     near: Near,
-    reach_m: float,
+    ray_length_m: float,
     lift_m: float,
 ) -> tuple[Floats, Floats, Floats]:
     """Transfer [rows, cols, n], openness [rows, cols] (-1: no surface), V' [rows, cols, count] (0 below the horizon).
@@ -143,7 +143,7 @@ def transfer_from_views(
         phase = row % 2 * 2 + col % 2
         for j in np.flatnonzero(share > 0):
             direction = directions[chosen, j, :3]
-            if views.lit(int(view_of[chosen, j]), point, normal, shift, reach_m, lift_m):
+            if views.lit(int(view_of[chosen, j]), point, normal, shift, ray_length_m, lift_m):
                 visible[row, col, j] = near.visibility(
                     point, normal, direction, near.starts[phase, j], voxel_m, voxel_m
                 )

@@ -36,10 +36,10 @@ def first_solid(solid: NDArray[np.bool_], voxel_m: float, origins: Floats, direc
 
 
 def trace_volume(
-    solid: NDArray[np.bool_], voxel_m: float, origins: Floats, directions: Floats, reach_m: float
+    solid: NDArray[np.bool_], voxel_m: float, origins: Floats, directions: Floats, ray_length_m: float
 ) -> NDArray[np.bool_]:
-    """[n] whether unit rays are free of the cubes of `solid` [z, y, x] for `reach_m`."""
-    return first_solid(solid, voxel_m, origins, directions) >= reach_m
+    """[n] whether unit rays are free of the cubes of `solid` [z, y, x] for `ray_length_m`."""
+    return first_solid(solid, voxel_m, origins, directions) >= ray_length_m
 
 
 def find_blockers(

@@ -28,12 +28,12 @@ def mark_bricks(
     depth_m: Floats,
     bricks: tuple[int, int, int],
     voxel_m: float,
-    reach_m: float,
+    ray_length_m: float,
 ) -> Bools:
-    """[z, y, x] bricks with a voxel within `reach_m`, along its ray, of the surface measured at its pixel."""
+    """[z, y, x] bricks with a voxel within `ray_length_m`, along its ray, of the surface measured at its pixel."""
     centers = voxel_centers(tuple(BRICK * count for count in reversed(bricks)), voxel_m)
     points = (centers - volume_from_camera[:3, 3]) @ volume_from_camera[:3, :3]
-    return by_bricks(np.abs(signed_distance(camera, points, depth_m, reach_m)) <= reach_m)
+    return by_bricks(np.abs(signed_distance(camera, points, depth_m, ray_length_m)) <= ray_length_m)
 
 
 def find_solid(tsdf: Floats, weight: Floats) -> tuple[NDArray[np.uint64], NDArray[np.uint8]]:

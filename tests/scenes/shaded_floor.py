@@ -69,7 +69,7 @@ class Shaded:
     light: Floats
     rays: Directions
     cell_m: float
-    reach_m: float
+    ray_length_m: float
 
     def expected(self, solid: Box, grown_m: float) -> Floats:
         """The twin's ratio where objects are exactly `solid`, moved out by `grown_m`."""
@@ -84,7 +84,7 @@ class Shaded:
             self.light,
             directions,
             arriving,
-            lambda o, d: hit([solid], o, d, grown_m) >= self.reach_m,
+            lambda o, d: hit([solid], o, d, grown_m) >= self.ray_length_m,
         )
 
     @cached_property
@@ -102,7 +102,7 @@ def shade_floor(
     *,
     scene: Scene = FLOOR,
     rays: int = 81,
-    reach_m: float = FAR_M,
+    ray_length_m: float = FAR_M,
     points: Floats | None = None,
     roughness: float = 0.0,
 ) -> Shaded:
@@ -115,10 +115,10 @@ def shade_floor(
     camera, directions = camera_of(positions), direction_sets(rays, round(len(light) ** 0.5))
     surface = upload_surface(engine, positions[..., :3], normals[..., :3], positions[..., 3] > 0)
     volume = fill_volume(engine, scene, VOXEL_M)
-    transfer = transfer_radiance(engine, camera, volume, surface, STRIDE, directions, reach_m)
+    transfer = transfer_radiance(engine, camera, volume, surface, STRIDE, directions, ray_length_m)
     objects = [placed(engine, solid)]
     device_light = upload_light(engine, light, directions)
-    traced = trace_scene(engine, volume, device_light, directions, reach_m, objects)
+    traced = trace_scene(engine, volume, device_light, directions, ray_length_m, objects)
     ratio = shadow_real(engine, camera, surface, transfer, traced)
     bits = np.unpackbits(engine.download(transfer.free_mask).view(np.uint8), axis=-1, bitorder="little")[..., :rays]
     return Shaded(
@@ -130,5 +130,5 @@ def shade_floor(
         light,
         directions,
         traced.table.cell_m[0],
-        reach_m,
+        ray_length_m,
     )

@@ -52,12 +52,12 @@ def transfer_of(
     *,
     rays: int = 81,
     bands: int = 4,
-    reach_m: float = ROOM_M,
+    ray_length_m: float = ROOM_M,
 ) -> Traced:
     """Transfer of a geometry buffer [h, w, 4]."""
     surface = upload_surface(engine, positions[..., :3], normals[..., :3], positions[..., 3] > 0)
     camera = camera_of(positions.shape[1], positions.shape[0])
-    result = transfer_radiance(engine, camera, volume, surface, stride, direction_sets(rays, bands), reach_m)
+    result = transfer_radiance(engine, camera, volume, surface, stride, direction_sets(rays, bands), ray_length_m)
     bits = np.unpackbits(engine.download(result.free_mask).view(np.uint8), axis=-1, bitorder="little")
     found = (engine.download(a) for a in (result.coefficients, result.openness, result.flatness))
     return Traced(*found, bits[..., :rays].astype(bool), positions, normals)
@@ -71,11 +71,11 @@ def trace(
     *,
     rays: int = 81,
     bands: int = 4,
-    reach_m: float = ROOM_M,
+    ray_length_m: float = ROOM_M,
 ) -> Traced:
     """Transfer of given points, 8 in a row; each fills a block of pixels, so that no neighbour is mixed in."""
     blocks = [
         np.repeat(np.repeat(np.insert(a.reshape(-1, 8, 3), 3, 1, -1), STRIDE, 0), STRIDE, 1) for a in (points, normals)
     ]
     positions, normals = (block.astype(np.float32).astype(np.float64) for block in blocks)
-    return transfer_of(engine, volume, positions, normals, STRIDE, rays=rays, bands=bands, reach_m=reach_m)
+    return transfer_of(engine, volume, positions, normals, STRIDE, rays=rays, bands=bands, ray_length_m=ray_length_m)

@@ -141,9 +141,9 @@ def _add_shading(
         return
     shading = bench.shading
     pictures = [EXPOSURE * item.picture(i) for i in range(len(shading.frames))]
-    reach_m = THESIS_REACH_M if wishes.as_thesis else np.inf
+    ray_length_m = THESIS_REACH_M if wishes.as_thesis else np.inf
     observed = pictures if wishes.indirect == "observed" else None
-    exact = [shading.error(item, i, light_in(result), reach_m, observed) for i, result in enumerate(found)]
+    exact = [shading.error(item, i, light_in(result), ray_length_m, observed) for i, result in enumerate(found)]
     part.add(f"{row}: objects' radiance, exact geometry, median error", 100 * median(exact), "%", goal)
     shown = [_shown_error(item, shading, i, result) for i, result in enumerate(found)]
     part.add(f"{row}: objects' radiance, composite, median error", 100 * median(shown), "%", goal)

@@ -67,28 +67,30 @@ def visibility_part(run: Run) -> Part:
         scene = Scene(engine, source.camera, volume, seen.model, direction_sets(RAYS, 4))
         part.sizes |= {"triangles": len(mesh.triangles), "threads": threads}
         for place, stride in STRIDES.items():
-            for length, reach_m in REACHES.items():
+            for length, ray_length_m in REACHES.items():
                 run.say(f"rays of {length} at {place}")
-                _add_rows(part, scene, embree, f"rays of {length} at {place}", stride, reach_m, trials)
+                _add_rows(part, scene, embree, f"rays of {length} at {place}", stride, ray_length_m, trials)
     finally:
         engine.close()
     return part
 
 
-def _add_rows(part: Part, scene: Scene, embree: object, name: str, stride: int, reach_m: float, trials: int) -> None:
+def _add_rows(
+    part: Part, scene: Scene, embree: object, name: str, stride: int, ray_length_m: float, trials: int
+) -> None:
     import open3d
 
-    found, above, rays = _rays_of(scene, stride, reach_m)
+    found, above, rays = _rays_of(scene, stride, ray_length_m)
     tensor = open3d.core.Tensor(rays)
     blocked = None
 
     def run_ours() -> None:
-        trace_visibility(scene.engine, scene.camera, scene.volume, scene.surface, stride, scene.sets, reach_m)
+        trace_visibility(scene.engine, scene.camera, scene.volume, scene.surface, stride, scene.sets, ray_length_m)
         scene.engine.queue.finish()
 
     def run_theirs() -> None:
         nonlocal blocked
-        blocked = embree.test_occlusions(tensor, 0.0, reach_m)  # type: ignore[attr-defined]
+        blocked = embree.test_occlusions(tensor, 0.0, ray_length_m)  # type: ignore[attr-defined]
 
     def run_casts() -> None:
         embree.cast_rays(tensor)  # type: ignore[attr-defined]
@@ -105,7 +107,7 @@ def _add_rows(part: Part, scene: Scene, embree: object, name: str, stride: int, 
         if not scene.engine.device.is_gpu:
             part.add(f"{name}: {who}, by processor time", million / cpu_ms * 1e3 * threads, "Mrays/s")
     best_wall, best_cpu = (min(theirs[k], casts[k]) for k in range(2))
-    goal = ">= 2" if reach_m < 1 and stride == 1 else ""
+    goal = ">= 2" if ray_length_m < 1 and stride == 1 else ""
     part.add(f"{name}: rate of probeless / the faster of Open3D's, wall time", best_wall / ours[0], "", goal)
     if not scene.engine.device.is_gpu:
         part.add(f"{name}: the same, processor time", best_cpu / ours[1], "")
@@ -116,9 +118,9 @@ def _add_rows(part: Part, scene: Scene, embree: object, name: str, stride: int, 
     part.add(f"{name}: the same answer", 100 * (our_blocked == blocked.numpy()).mean(), "%")
 
 
-def _rays_of(scene: Scene, stride: int, reach_m: float) -> tuple[Visibility, NDArray[np.bool_], Floats]:
+def _rays_of(scene: Scene, stride: int, ray_length_m: float) -> tuple[Visibility, NDArray[np.bool_], Floats]:
     """What we find, which directions lie above the surface [rows, cols, rays], and those as rays [n, 6]."""
-    found = trace_visibility(scene.engine, scene.camera, scene.volume, scene.surface, stride, scene.sets, reach_m)
+    found = trace_visibility(scene.engine, scene.camera, scene.volume, scene.surface, stride, scene.sets, ray_length_m)
     above = _bits(found.free) | _bits(found.blocked)
     pixels = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     positions, normals = (

@@ -36,9 +36,9 @@ def families_part(run: Run, size: str | None = None, frames: int | None = None) 
     changed = changed_pixels(wanted, shown)
     window = close_up(changed)
     part.details["true"] = save_picture("7.11 true", wanted[window])
-    for row, reach_m in ROWS.items():
+    for row, ray_length_m in ROWS.items():
         run.say(f"fig. 7.11: {row}")
-        asked = msgspec.structs.replace(wishes, ray_length_m=reach_m)
+        asked = msgspec.structs.replace(wishes, ray_length_m=ray_length_m)
         results = last_results(run, bare, {p: at_preset(asked, p) for p in FAMILIES}, frames, full)
         part.details[row] = {}
         for preset, result in results.items():

@@ -62,16 +62,16 @@ class ObjectShading:
         self.frames = [self._trace(index) for index in range(len(poses))]
 
     def radiance(
-        self, index: int, light: Floats, reach_m: float = np.inf, pictures: list[Floats] | None = None
+        self, index: int, light: Floats, ray_length_m: float = np.inf, pictures: list[Floats] | None = None
     ) -> Floats:
         """[n, 3] radiance of the objects' pixels of frame `index` under `light` [bands^2, 3].
 
-        Occluders farther than `reach_m` are not seen. `pictures`: the camera's, [h, w, 3] each in the units of the
+        Occluders farther than `ray_length_m` are not seen. `pictures`: the camera's, [h, w, 3] each in the units of the
         light, for what occluded directions send; None: nothing.
         """
         frame, bands = self.frames[index], bands_of(light)
         weights = np.maximum(frame.normals @ self._directions.T, 0) * (4 / DIRECTIONS)  # cosine * 4 pi / n / pi
-        hidden = (frame.distances_m < reach_m) & (weights > 0)
+        hidden = (frame.distances_m < ray_length_m) & (weights > 0)
         arriving = sh_basis(self._directions, bands) @ light
         shading = lambert_transfer(frame.normals, bands) @ light - (weights * hidden) @ arriving
         if pictures is not None:
@@ -79,11 +79,16 @@ class ObjectShading:
         return frame.albedo * np.maximum(shading, 0)
 
     def error(
-        self, item: RoomSet, index: int, light: Floats, reach_m: float = np.inf, pictures: list[Floats] | None = None
+        self,
+        item: RoomSet,
+        index: int,
+        light: Floats,
+        ray_length_m: float = np.inf,
+        pictures: list[Floats] | None = None,
     ) -> float:
         """Relative RMSE of `radiance` against the composite's pixels, after one scale."""
         true = item.composite(index)[self.frames[index].mask]
-        return relative_rmse(self.radiance(index, light, reach_m, pictures), true)
+        return relative_rmse(self.radiance(index, light, ray_length_m, pictures), true)
 
     def _observed(self, frame: FrameObjects, weights: Floats, shading: Floats, pictures: list[Floats]) -> Floats:
         """[n, 3] irradiance over pi from what is hidden: seen surfaces as pictured, unseen ones as bright as the mean

@@ -59,7 +59,7 @@ def negative_light(trial: Trial) -> Found:
     "an object out of reach", 0, "of the picture", "nothing is taken, so the quotient is of equals: exactly 1."
 )
 def out_of_reach(trial: Trial) -> Found:
-    return Found(shade_floor(trial.engine, box((3, 5, 3), (3.2, 5.2, 3.2)), reach_m=2.0).ratio, 1)
+    return Found(shade_floor(trial.engine, box((3, 5, 3), (3.2, 5.2, 3.2)), ray_length_m=2.0).ratio, 1)
 
 
 @SHADOWS.case(

@@ -34,10 +34,11 @@ class Grouped(Engine):
         size: tuple[int, ...],
         *arguments: KernelArgument,
         local: tuple[int, ...] | None = None,
+        steps: int = 1,
     ) -> None:
         wide = 1 << (self._items.bit_length() // 2)
         shapes = {1: (self._items,), 2: (wide, self._items // wide), 3: (wide, self._items // wide, 1)}
-        super().launch(kernel, size, *arguments, local=local or shapes[len(size)])
+        super().launch(kernel, size, *arguments, local=local or shapes[len(size)], steps=steps)
 
 
 def _chain(engine: Engine) -> Floats:

@@ -6,8 +6,9 @@ Zen 4 for a Zen 3, which has no AVX-512, while PoCL takes the built-in functions
 overrides the name. It is a C string that the device structure points to: it is replaced in place.
 
 Which name matters: PoCL's own library of built-in functions comes compiled for `skylake-avx512` or `haswell`, and LLVM
-inlines a function only into code for a processor that has all of its features. Under the plain x86-64 levels each
-`fmin`, `dot` or `vload8` stays a call, and kernels take up to 1.5 times as long.
+inlines a function only into code for a processor that has all of its features, those too that no compiler uses (CLWB,
+which a Rocket Lake lacks; INVPCID, which a Zen 2 lacks). Else each `fmin`, `dot` or `vload8` stays a call, and kernels
+take up to twice as long. So the name is that of the library, whatever LLVM takes the processor for.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ if TYPE_CHECKING:
     import pyopencl as cl
 
 _UNKNOWN = "generic"
-_WITHOUT_AVX512 = frozenset({"znver1", "znver2", "znver3", "haswell", "broadwell", "skylake", "alderlake"})
 _DEVICE_STRUCT_BYTES = 4096
 _V2 = frozenset({"sse4_1", "sse4_2", "ssse3", "popcnt"})
 _V3 = _V2 | {"avx2", "bmi1", "bmi2", "fma", "f16c", "movbe"}
-_AVX512 = b"skylake-avx512"
+_AVX512, _AVX2 = "skylake-avx512", "haswell"
+"""What PoCL's library is compiled for."""
 _NAMES = (  # with the features that compilers use unasked; what else the name stands for, programs must ask for
-    (_AVX512, _V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
-    (b"haswell", _V3),
+    (_AVX512.encode(), _V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
+    (_AVX2.encode(), _V3),
     (b"x86-64-v2", _V2),
 )
 
@@ -49,14 +50,19 @@ def is_pocl(platform: cl.Platform) -> bool:
 
 
 def name_unknown_cpu(device: cl.Device) -> str | None:
-    """If `device` is PoCL's CPU under a name that is none or too little, give it a better one; that one, else None."""
+    """If `device` is PoCL's CPU under a name that is none or hinders it, give it a better one; that one, else None."""
     known = known_name(device)
     if known is None or platform.machine() != "x86_64" or not Path("/proc/self/mem").exists():
         return None
-    better = processor_name(Path("/proc/cpuinfo").read_text())
-    if known == _UNKNOWN or (known in _WITHOUT_AVX512 and better == _AVX512):
-        return better.decode() if rename(device, known, better) else None
-    return None
+    better = better_name(known, Path("/proc/cpuinfo").read_text())
+    return better if better is not None and rename(device, known, better.encode()) else None
+
+
+def better_name(known: str, cpuinfo: str) -> str | None:
+    """The name to compile for where PoCL compiles for `known`; None: that one."""
+    best = processor_name(cpuinfo).decode()
+    is_better = known == _UNKNOWN or (best in (_AVX512, _AVX2) and best != known)
+    return best if is_better else None
 
 
 def known_name(device: cl.Device) -> str | None:

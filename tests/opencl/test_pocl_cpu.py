@@ -11,7 +11,7 @@ import pyopencl as cl
 import pytest
 
 from server.opencl.device import list_devices
-from server.opencl.pocl_cpu import known_name, processor_name
+from server.opencl.pocl_cpu import better_name, known_name, processor_name
 
 BASE = "fpu vme de pse tsc msr pae mce cx8 apic sse sse2 ht syscall nx lm"
 V2 = f"{BASE} pni ssse3 cx16 sse4_1 sse4_2 popcnt lahf_lm"
@@ -42,6 +42,24 @@ def cpuinfo(flags: str, cores: int = 2) -> str:
 )
 def test_the_best_whose_flags_are_all_there(flags: str, name: bytes) -> None:
     assert processor_name(cpuinfo(flags)) == name
+
+
+@pytest.mark.parametrize(
+    ("known", "flags", "name"),
+    [
+        ("rocketlake", V4, "skylake-avx512"),  # lacks CLWB: the library's functions would stay calls
+        ("znver3", V4, "skylake-avx512"),  # a Zen 4
+        ("znver2", V3, "haswell"),  # lacks INVPCID
+        ("skylake-avx512", V4, None),
+        ("haswell", V3, None),
+        ("generic", V4, "skylake-avx512"),
+        ("generic", BASE, "x86-64"),
+        ("core2", BASE, None),
+        ("nehalem", V2, None),
+    ],
+)
+def test_the_name_of_the_library_is_preferred(known: str, flags: str, name: str | None) -> None:
+    assert better_name(known, cpuinfo(flags)) == name
 
 
 @pytest.mark.parametrize("text", ["", "processor : 0\nFeatures : fp asimd\n", "garbage", "flags"])

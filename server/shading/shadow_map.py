@@ -31,6 +31,7 @@ from server.opencl.program import Define
 from server.opencl.structs import DIRECT_PARAMETERS
 from server.shading.change_mask import mark_changes
 from server.shading.differential_rendering import MOST_POINTS, VIRTUAL_STRIDE, RealShadow
+from server.shading.kept_discs import KeptDiscs
 from server.shading.traced_scene import DeviceLight, ball_around
 from server.shading.virtual_point_lights import PlacedPoints, VirtualPointLights
 from server.transfer.auxiliary_views import view_axes
@@ -100,8 +101,8 @@ class ShadowMaps:
     of half its angle), irradiance (w: _rows); as the light is at the ball's centre."""
     ball: Floats
     """Centre and radius of the ball around all objects, volume metres."""
-    discs: bytes
-    """Of `rows`, but for irradiance: equal where what hides the discs is the same."""
+    discs: tuple[DirectLight, ...]
+    """Those of `light` as they are at the ball's centre."""
     objects: cl_array.Array
     """[MOST_LIGHTS, texels of the pyramid] float2: coverage, mean depth in metres from the ball's centre."""
     traced: list[tuple[Surface, SampleGrid]] = field(default_factory=list)
@@ -146,7 +147,7 @@ def draw_shadow_maps(
     rows = _rows(discs, axes, float(ball[3]))
     uploaded = engine.buffers(_Buffers).rows.upload(rows.view(cl_types.float4)[..., 0])
     drawn = _draw_objects(engine, axes, rows, uploaded, ball, objects)
-    return ShadowMaps(volume, light, ray_length_m, uploaded, ball, rows[:, :3].tobytes(), drawn)
+    return ShadowMaps(volume, light, ray_length_m, uploaded, ball, tuple(discs), drawn)
 
 
 def most_irradiance(light: DeviceLight, objects: Sequence[Placed]) -> Floats:
@@ -203,7 +204,7 @@ def trace_real(
 ) -> SampleGrid:
     """The part of each disc that real surfaces do not block, at the samples of `ratio`: float4, w = 1 valid.
 
-    cells: of these samples; parts are kept there until the discs change.
+    cells: of these samples; parts are kept there until the discs have moved (kept_discs.py).
     """
     for traced, parts in maps.traced:
         if traced is surface and (parts.stride, parts.values.shape) == (ratio.stride, ratio.values.shape):
@@ -353,7 +354,7 @@ def _trace_discs(
     is_virtual: bool,
     cells: Cells | None = None,
 ) -> None:
-    since = engine.state(_KeptDiscs).since(maps.discs, cells.now) if cells else 0
+    since = engine.state(KeptDiscs).since(maps.discs, cells.now) if cells else 0
     kept = (cells.places, cells.claims, cells.disc_parts, cells.disc_frames) if cells else (engine.unused,) * 4
     engine.launch(
         _kernel(engine, "trace_discs"),
@@ -372,20 +373,6 @@ def _trace_discs(
     if cells is not None:
         count = parts.rows * parts.cols
         engine.launch(_kernel(engine, "keep_parts"), (count,), count, cells.now, parts.values, *kept)
-
-
-class _KeptDiscs:
-    """Which discs the parts that cells keep are of."""
-
-    def __init__(self) -> None:
-        self._discs: bytes = b""
-        self._since = 1
-
-    def since(self, discs: bytes, now: int) -> int:
-        """The first frame with these discs, of those that follow one another up to `now`."""
-        if discs != self._discs or now < self._since:
-            self._discs, self._since = discs, now
-        return self._since
 
 
 def _rows(discs: Sequence[DirectLight], axes: Floats, radius_m: float) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""What real surface leaves of the discs of a light is kept by cell of the world, until the discs change."""
+"""What real surface leaves of the discs of a light is kept by cell of the world, until the discs have moved far."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.maths.direct_lights import DirectLight, SplitLight
+from server.maths.direct_lights import DirectLight, SplitLight, lamp_at
 from server.opencl.engine import Engine
+from server.shading.kept_discs import KeptDiscs
 from server.shading.shadow_map import ShadowMaps, draw_shadow_maps, trace_real
 from server.shading.traced_scene import take_discs, upload_light
 from server.transfer.radiance_transfer import Cells, direction_sets
@@ -58,7 +59,7 @@ def floor_under_a_board(engine: Engine) -> tuple[Volume, Surface, CameraModel, S
     return volume, surface, camera, SampleGrid(1, engine.workspace.upload("ones", float4(np.ones((SIDE, SIDE, 3)))))
 
 
-def test_parts_are_kept_until_the_discs_change(engine: Engine) -> None:
+def test_parts_are_kept_until_the_discs_have_moved_far(engine: Engine) -> None:
     volume, surface, camera, samples = floor_under_a_board(engine)
 
     def traced(disc: DirectLight, cells: Cells | None = None) -> Floats:
@@ -86,9 +87,34 @@ def test_parts_are_kept_until_the_discs_change(engine: Engine) -> None:
     np.testing.assert_array_equal(traced(brighter, replace(cells, now=2)), shared(exact))
     assert (frames(cells) == 1).all()
 
+    aside = replace(LIGHT, direction=lights.unit((0.29, 1.0, 0.2)), half_angle_rad=float(np.radians(14.0)))
+    np.testing.assert_array_equal(traced(aside, replace(cells, now=2)), shared(exact))
+
     moved = replace(LIGHT, direction=lights.unit((-0.3, 1.0, 0.2)))
     other = traced(moved).copy()
     assert np.abs(other - exact).max() > 0.3
     np.testing.assert_array_equal(traced(moved, replace(cells, now=3)), other)
     assert (frames(cells) == 3).all()
     np.testing.assert_array_equal(traced(moved, replace(cells, now=4)), shared(other))
+
+
+def test_a_disc_that_moves_slowly_is_followed() -> None:
+    """Turned by 0.09 of its radius in each frame: what was traced two frames ago holds, what is older does not."""
+    kept, angles = KeptDiscs(), np.radians(1.4) * np.arange(12)
+    discs = [replace(LIGHT, direction=np.array([np.sin(a), np.cos(a), 0.0])) for a in angles]
+    assert [kept.since([disc], 10 + i) for i, disc in enumerate(discs)] == [10, 10, 10, *range(11, 20)]
+
+
+def test_discs_that_grow_come_or_are_exchanged_are_others() -> None:
+    lamp = lamp_at(np.array([0.5, 2.0, 0.5]), 0.3, np.ones(3))
+    kept = KeptDiscs()
+    assert kept.since([lamp, LIGHT], 1) == 1
+    assert kept.since([lamp.seen_from(np.zeros(3)), LIGHT], 2) == 1  # the same one, told for another place
+    assert kept.since([replace(lamp, irradiance=5 * lamp.irradiance), LIGHT], 3) == 1
+    assert kept.since([lamp_at(np.array([0.5, 2.0, 0.55]), 0.3, np.ones(3)), LIGHT], 4) == 1
+    assert kept.since([lamp_at(np.array([0.5, 2.0, 0.5]), 0.4, np.ones(3)), LIGHT], 5) == 5
+    assert kept.since([LIGHT, lamp], 6) == 6
+    assert kept.since([LIGHT], 7) == 7
+    assert kept.since([], 8) == 8
+    assert kept.since([], 9) == 8
+    assert kept.since([], 3) == 3  # another sequence of frames

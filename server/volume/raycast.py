@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pyopencl as cl
 import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
@@ -19,6 +20,8 @@ from server.volume.volume import Volume
 LABEL_NONE, LABEL_STATIC, LABEL_DYNAMIC, LABEL_FILLED = 0, 1, 2, 3
 
 _TILE = 8  # as in raycast.cl
+_SPACING = 2
+"""Pixels between rays that are walked through the volume; those between begin at the surface that these have seen."""
 _FARTHEST = int(np.float32(np.inf).view(np.int32))
 
 
@@ -62,9 +65,7 @@ def raycast(
     size, lanes = (camera.height, camera.width), engine.lanes
     positions = buffers.positions.array(size)
     normals = buffers.normals.array(size)
-    engine.launch(
-        engine.kernel("raycast.cl", "raycast", LANES=lanes),
-        (-(-camera.width // lanes), camera.height),
+    arguments = (
         camera.width,
         camera.height,
         *volume.arguments(),
@@ -75,6 +76,9 @@ def raycast(
         positions,
         normals,
     )
+    squares = (-(-camera.width // (_SPACING * lanes)), -(-camera.height // _SPACING))
+    engine.launch(_kernel(engine, "raycast"), squares, *arguments)
+    engine.launch(_kernel(engine, "raycast_between"), (*squares, 3), *arguments, local=(16, 4, 1))
     return Surface(positions, normals, buffers.labels.array(size))
 
 
@@ -89,7 +93,7 @@ def _ray_bounds(
     farthest.fill(np.int32(0))
     if volume.allocated_bricks:
         engine.launch(
-            engine.kernel("raycast.cl", "bound_rays", LANES=engine.lanes),
+            _kernel(engine, "bound_rays"),
             (volume.allocated_bricks,),
             volume.allocated_bricks,
             camera.width,
@@ -104,3 +108,7 @@ def _ray_bounds(
             farthest,
         )
     return nearest, farthest
+
+
+def _kernel(engine: Engine, name: str) -> cl.Kernel:
+    return engine.kernel("raycast.cl", name, LANES=engine.lanes, SPACING=_SPACING)

@@ -14,7 +14,7 @@ from server.volume.volume import Volume
 from tests.reference.integrate import voxel_centers
 from tests.reference.raycast import raycast as twin
 from tests.reference.raycast import trilinear
-from tests.scenes.analytic import Shape, Truth, look, look_at, pixel_rays, plane, quantised
+from tests.scenes.analytic import Shape, Truth, box, look, look_at, pixel_rays, plane, quantised
 from tests.scenes.fused_scenes import (
     BALL,
     BALL_CENTER,
@@ -59,8 +59,8 @@ def degrees_between(a: Floats, b: Floats) -> Floats:
 def compare_with_twin(engine: Engine, volume: Volume, camera: CameraModel, view: Floats, smooth: Bools) -> None:
     """smooth: pixels away from silhouettes.
 
-    The kernel finds the crossing by one Newton and one secant step instead of bisection. Where the field is smooth that
-    is exact to the field's curvature. Beside silhouettes fused views disagree, the field bends within a voxel, and rays
+    The kernel finds the crossing by one or two Newton steps instead of bisection. Where the field is smooth that is
+    exact to the field's curvature. Beside silhouettes fused views disagree, the field bends within a voxel, and rays
     graze solid voxels that the kernel may miss. On the border of what was seen it extrapolates by up to 1.5 voxels.
     """
     hit, depth, normal = cast(engine, volume, camera, view)
@@ -76,7 +76,7 @@ def compare_with_twin(engine: Engine, volume: Volume, camera: CameraModel, view:
     assert np.median(error) < 1e-4  # seen: 2e-6
     assert np.percentile(error, 99) < 0.01  # seen: 0.0016
     turned = degrees_between(normal, normals)[both]
-    assert np.median(turned) < 0.02  # seen: 0.003
+    assert np.median(turned) < 0.04  # seen: 0.027, where rays are two voxels apart
     assert np.percentile(turned, 99) < 0.6  # seen: 0.22
     np.testing.assert_allclose(np.linalg.norm(normal[hit], axis=-1), 1, atol=1e-6)
 
@@ -296,3 +296,19 @@ def test_a_camera_too_far_away_for_float32_ends(engine: Engine) -> None:
     fuse(engine, volume, camera, np.eye(4), np.full((camera.height, camera.width), 8 + side / 2))
     assert volume.allocated_bricks > 0
     assert not cast(engine, volume, camera, np.eye(4))[0].any()
+
+
+def test_what_is_narrow_is_not_missed_between_rays(engine: Engine) -> None:
+    """A post two voxels wide, nearer and nearer: three of four rays begin at what those beside them have seen."""
+    camera = replace(CAMERA, width=96, height=72, cx=47.3, cy=35.6)
+    post = [plane((0, 0, 1.2), (0, 0, -1)), box((-0.05, -1.5, 0.85), (0.05, 1.5, 0.95))]
+    volume = fused(engine, post, [look_at((0.3 * np.sin(a), 0.1, 0.0), (0, 0, 1)) for a in np.linspace(-1, 1, 5)])
+    for distance_m in (-0.2, 0.0, 0.3):
+        view = look_at((0.05, 0.0, distance_m), (0.0, 0.0, 2.0))
+        truth = look(post, camera, view)
+        hit, depth, _ = cast(engine, volume, camera, view)
+        inner = seen_inside(engine, volume, truth)
+        on_post = inner & (truth.points[..., 2] < 1.1)
+        assert on_post.sum() > 50
+        assert hit[inner].all()
+        assert (np.abs(depth - truth.depth_m)[on_post] < 2 * VOXEL_M).all()  # the wall is at least four behind

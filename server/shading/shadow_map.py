@@ -25,6 +25,7 @@ from server.maths.dominant import MOST_LIGHTS
 from server.objects.dirty_region import DirtyRegion, box_around
 from server.objects.pinhole import Pinhole
 from server.objects.rasterize import NEAR_M, Placed, RasterBuffers, VirtualSurface, drawn_depths
+from server.objects.virtual_object import VirtualObject
 from server.opencl.buffers import BufferDescription, BufferGroup, StageBuffers, Workspace
 from server.opencl.engine import Engine, KernelArgument, float4, int4
 from server.opencl.program import Define
@@ -146,7 +147,11 @@ def draw_shadow_maps(
     axes = view_axes(np.stack([disc.direction for disc in discs]))
     rows = _rows(discs, axes, float(ball[3]))
     uploaded = engine.buffers(_Buffers).rows.upload(rows.view(cl_types.float4)[..., 0])
-    drawn = _draw_objects(engine, axes, rows, uploaded, ball, objects)
+    drawn = engine.buffers(_Buffers).maps.array((MOST_LIGHTS, (4 * MAP_SIDE**2 - _COARSEST_SIDE**2) // 3))
+    last, now = engine.state(_LastMaps), _Shown.of(rows, objects)
+    if last.shown != now:
+        _draw_objects(engine, axes, rows, uploaded, ball, objects, drawn)
+        last.shown, last.things = now, [thing for thing, _ in objects]
     return ShadowMaps(volume, light, ray_length_m, uploaded, ball, tuple(discs), drawn)
 
 
@@ -319,10 +324,10 @@ def _draw_objects(
     uploaded: cl_array.Array,
     ball: Floats,
     objects: Sequence[Placed],
-) -> cl_array.Array:
+    maps: cl_array.Array,
+) -> None:
     """The pyramids of all maps. axes: [lights, 3, 3]; rows: of _rows, also on the device."""
-    texels, far_m = (4 * MAP_SIDE**2 - _COARSEST_SIDE**2) // 3, DISTANCE * float(ball[3])
-    maps = engine.buffers(_Buffers).maps.array((MOST_LIGHTS, texels))
+    far_m = DISTANCE * float(ball[3])
     middle, focal_px = (MAP_SIDE - 1) / 2, DISTANCE * MAP_SIDE / 2
     camera = Pinhole(MAP_SIDE, MOST_LIGHTS * MAP_SIDE, focal_px, focal_px, middle, middle)
     drawn: list[Placed] = []
@@ -341,7 +346,30 @@ def _draw_objects(
     for level in range(1, (MAP_SIDE // _COARSEST_SIDE).bit_length()):
         side = MAP_SIDE >> level
         engine.launch(_kernel(engine, "halve_maps"), (side, side, len(axes)), len(axes), level, maps)
-    return maps
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What shadow maps show."""
+
+    discs: bytes
+    things: tuple[int, ...]
+    """Identities of the objects."""
+    places: bytes
+
+    @staticmethod
+    def of(rows: NDArray[np.float32], objects: Sequence[Placed]) -> _Shown:
+        """rows: of _rows; their irradiance does not matter."""
+        places = np.array([matrix for _, matrix in objects]).tobytes()
+        return _Shown(rows[:, :3].tobytes(), tuple(id(thing) for thing, _ in objects), places)
+
+
+class _LastMaps:
+    """What the engine's maps show: they are drawn anew where a disc or an object is another, or has moved."""
+
+    shown: _Shown | None = None
+    things: Sequence[VirtualObject] = ()
+    """Kept alive, so that no other object gets the identity of one of them."""
 
 
 def _trace_discs(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.maths.direct_lights import DirectLight, SplitLight, lamp_at
+from server.objects.rasterize import Placed
 from server.opencl.engine import Engine
 from server.shading.kept_discs import KeptDiscs
 from server.shading.shadow_map import ShadowMaps, draw_shadow_maps, trace_real
@@ -118,3 +119,40 @@ def test_discs_that_grow_come_or_are_exchanged_are_others() -> None:
     assert kept.since([], 8) == 8
     assert kept.since([], 9) == 8
     assert kept.since([], 3) == 3  # another sequence of frames
+
+
+def test_maps_are_drawn_anew_where_an_object_or_a_disc_has_moved(engine: Engine) -> None:
+    volume = fill_volume(engine, (floor(FLOOR_Y),), 0.02)
+    small, large = (
+        placed(engine, box((0.4, 0.2, 0.4), (0.45, 0.3, 0.45))),
+        placed(engine, box((0.4, 0.2, 0.4), (0.5, 0.3, 0.5))),
+    )
+    lamp = lamp_at(np.array([0.5, 2.0, 0.5]), 0.3, np.ones(3))
+
+    def drawn(disc: DirectLight, objects: list[Placed]) -> tuple[int, Floats]:
+        light = take_discs(
+            engine, upload_light(engine, lights.uniform(), RAYS), SplitLight(lights.uniform(), (disc,)), RAYS
+        )
+        engine.profile.begin()
+        maps = draw_shadow_maps(engine, volume, light, objects, 10.0)
+        count = engine.profile.launches
+        return count, engine.download(maps.objects).view(np.float32).copy()
+
+    turned = np.diag([1.0, 1.0, -1.0, 1.0]) @ small[1]
+    brighter = replace(lamp, irradiance=2 * lamp.irradiance)
+    aside = lamp_at(np.array([0.3, 2.0, 0.5]), 0.3, np.ones(3))
+    pictures = []
+    for disc, objects in (
+        (lamp, [small]),
+        (aside, [small]),
+        (lamp, [(small[0], turned)]),
+        (lamp, [large]),
+        (lamp, [small, large]),
+    ):
+        count, picture = drawn(disc, objects)
+        assert count > 0
+        assert all((picture != other).any() for other in pictures)
+        pictures.append(picture)
+        count, again = drawn(brighter if disc is lamp else disc, objects)
+        assert count == 0
+        np.testing.assert_array_equal(again, picture)

@@ -1,8 +1,7 @@
 // Surface prediction (KinectFusion; thesis 4.2.1): the zero crossing of the TSDF along each pixel's ray, and its normal.
-// Provides bound_rays, raycast, raycast_between.
+// Provides bound_rays, raycast, raycast_between, raycast_rest.
 #include "camera.clh"
-#include "field.clh"
-#include "rays.clh"
+#include "ray_surface.clh"
 
 #define TILE 8
 #define LEAST_SLOPE 0.1f  // cosine of a ray and a plane: beyond, a voxel along the ray says little of one across
@@ -74,65 +73,18 @@ kernel void bound_rays(const int count, const int width, const int height, const
     }
 }
 
-// Steps in voxels along rays to where the field falls through zero (Newton); 0 in `falls` where it does not, or is unseen.
-static inline floatn newton_step(const Rays rays, const Field field, const float truncation_voxels, intn *falls) {
-    const floatn slope = field.slope.x * rays.direction.x + field.slope.y * rays.direction.y + field.slope.z * rays.direction.z;
-    *falls = field.seen & MASK(slope * truncation_voxels <= -0.05f);
-    return -field.tsdf / (*falls ? slope : 1.0f);
-}
-
-// Distances in voxels near `t` at which rays cross a surface that faces them, by a Newton step of at most a voxel; 0 for rays outside
-// `asked` and where there is none. -> facing: unit normals of those that do.
-static inline floatn cross_near(const Volume volume, const Rays rays, const floatn t, const intn asked, Vectors *facing) {
-    intn falls;
-    Vectors g;
-    const Field there = sample_surface(volume, point_at(rays, asked ? t : 1.0f), &g);
-    const floatn step = newton_step(rays, there, volume.truncation_m / volume.voxel_m, &falls);
-    const floatn steepness = sqrt(g.x * g.x + g.y * g.y + g.z * g.z);
-    const floatn towards = g.x * rays.direction.x + g.y * rays.direction.y + g.z * rays.direction.z;
-    const intn faces = asked & falls & MASK(fabs(step) < 1.0f) & MASK(t + step > 0.0f) & MASK(steepness > 1e-6f) & MASK(towards < 0.0f);
-    const floatn scale = 1.0f / (faces ? steepness : 1.0f);
-    facing->x = faces ? g.x * scale : facing->x;
-    facing->y = faces ? g.y * scale : facing->y;
-    facing->z = faces ? g.z * scale : facing->z;
-    return faces ? t + step : 0.0f;
-}
-
-// Where rays first cross a surface that faces them, as distance in voxels, 0 if nowhere; beside a silhouette a ray may graze
-// a solid voxel or cross the field where it slopes away, and goes on to what lies behind. From where a ray enters a solid
-// voxel it is two Newton steps to the crossing. -> facing: unit normals.
-static floatn find_surface(const Volume volume, const Rays rays, const floatn begin, const floatn end, Vectors *facing) {
-    floatn found = 0.0f, t = begin;
-    intn looking = MASK(begin < end);
-    while (ANY(looking)) {
-        t = find_solid_voxels(volume, rays, looking ? t : end, end);
-        looking &= MASK(t < end);
-        intn falls;
-        const Field entered = sample_field(volume, point_at(rays, looking ? t : 1.0f));
-        const floatn first = newton_step(rays, entered, volume.truncation_m / volume.voxel_m, &falls);
-        falls &= looking;
-        if (ANY(falls)) {
-            const floatn crossing = cross_near(volume, rays, t + clamp(first, -1.0f, 1.0f), falls, facing);
-            found = MASK(crossing > 0.0f) ? crossing : found;
-            looking &= MASK(found == 0.0f);
-        }
-        t += 0.7f;  // the next solid voxel on the way
-    }
-    return found;
-}
-
-// Rays through the pixels x, x + SPACING, ... of row y, LANES of them, and where on them, in voxels, solid voxels may be.
+// Rays through pixels, and where on them, in voxels, solid voxels may be.
 typedef struct {
     Rays rays;
     floatn begin;
     floatn end;
 } View;
 
-static inline View view_through(const Volume volume, const float4 intrinsics, const float16 volume_from_camera, const int2 size,
-                                const int x, const int y, const float greatest_depth_m, global const int *nearest, global const int *farthest) {
+// Through the pixels (x, y), where solid voxels lie at depths from `near` to `far`, metres.
+static inline View view_through(const Volume volume, const float4 intrinsics, const float16 volume_from_camera, const floatn x,
+                                const floatn y, const floatn near, const floatn far) {
     const float16 m = volume_from_camera;
-    const floatn u = (x + SPACING * LANE_NUMBERS - intrinsics.s2) / intrinsics.s0;
-    const float v = (y - intrinsics.s3) / intrinsics.s1;
+    const floatn u = (x - intrinsics.s2) / intrinsics.s0, v = (y - intrinsics.s3) / intrinsics.s1;
     const floatn length = sqrt(u * u + (v * v + 1.0f));
     const floatn shorten = 1.0f / length;
     const Vectors direction = {(m.s0 * u + (m.s1 * v + m.s2)) * shorten, (m.s4 * u + (m.s5 * v + m.s6)) * shorten,
@@ -140,21 +92,29 @@ static inline View view_through(const Volume volume, const float4 intrinsics, co
     View view;
     view.rays = make_rays(m.s37b / volume.voxel_m, direction);
     clip_rays(volume, view.rays, &view.begin, &view.end);
-    const int row = y / TILE * ((size.x + TILE - 1) / TILE), last = min(x + SPACING * (LANES - 1), size.x - 1) / TILE;
+    const floatn per_depth = length / volume.voxel_m;
+    view.begin = fmax(view.begin, near * per_depth);
+    view.end = fmin(view.end, far * per_depth);
+    return view;
+}
+
+// Through the pixels x, x + SPACING, ... of row y; nearest, farthest: of bound_rays.
+static inline View view_of_row(const Volume volume, const float4 intrinsics, const float16 volume_from_camera, const int width,
+                               const int x, const int y, const float greatest_depth_m, global const int *nearest,
+                               global const int *farthest) {
+    const int row = y / TILE * ((width + TILE - 1) / TILE), last = min(x + SPACING * (LANES - 1), width - 1) / TILE;
     int near = as_int(INFINITY), far = 0;
     for (int column = x / TILE; column <= last; column++) {
         near = min(near, nearest[row + column]);
         far = max(far, farthest[row + column]);
     }
-    const floatn per_depth = length / volume.voxel_m;
-    view.begin = fmax(view.begin, as_float(near) * per_depth);
-    view.end = fmin(view.end, fmin(greatest_depth_m, as_float(far)) * per_depth);
-    return view;
+    return view_through(volume, intrinsics, volume_from_camera, x + SPACING * LANE_NUMBERS, (floatn)((float)y), (floatn)(as_float(near)),
+                        (floatn)(fmin(greatest_depth_m, as_float(far))));
 }
 
-// Writes what these pixels see: distances in voxels (0 where nothing), unit normals.
-static inline void store_surface(const Volume volume, const Rays rays, const floatn t, const Vectors facing, const int width,
-                                 const int x, const int y, global float4 *positions, global float4 *normals) {
+// Writes what `count` pixels see: distances in voxels (0 where nothing), unit normals.
+static inline void store_surface(const Volume volume, const Rays rays, const floatn t, const Vectors facing, const int count,
+                                 const int *pixels, global float4 *positions, global float4 *normals) {
     const Vectors point = point_at(rays, t);
     float hits[LANES], px[LANES], py[LANES], pz[LANES], nx[LANES], ny[LANES], nz[LANES];
     STORE_LANES(t, hits);
@@ -164,11 +124,17 @@ static inline void store_surface(const Volume volume, const Rays rays, const flo
     STORE_LANES(facing.x, nx);
     STORE_LANES(facing.y, ny);
     STORE_LANES(facing.z, nz);
-    for (int lane = 0; lane < LANES && x + SPACING * lane < width; lane++) {
+    for (int lane = 0; lane < count; lane++) {
         const float hit = hits[lane] > 0.0f ? 1.0f : 0.0f;
-        positions[y * width + x + SPACING * lane] = (float4)(hit * volume.voxel_m * (float3)(px[lane], py[lane], pz[lane]), hit);
-        normals[y * width + x + SPACING * lane] = (float4)(hit * (float3)(nx[lane], ny[lane], nz[lane]), hit);
+        positions[pixels[lane]] = (float4)(hit * volume.voxel_m * (float3)(px[lane], py[lane], pz[lane]), hit);
+        normals[pixels[lane]] = (float4)(hit * (float3)(nx[lane], ny[lane], nz[lane]), hit);
     }
+}
+
+// The pixels x, x + SPACING, ... of row y. Returns how many are inside the picture.
+static inline int pixels_of_row(const int width, const int x, const int y, int *pixels) {
+    for (int lane = 0; lane < LANES; lane++) pixels[lane] = y * width + x + SPACING * lane;
+    return min(LANES, (width - x + SPACING - 1) / SPACING);
 }
 
 #define VIEW_PARAMETERS                                                                                                            \
@@ -182,10 +148,12 @@ kernel void raycast(VIEW_PARAMETERS, global float4 *positions, global float4 *no
     const int y = SPACING * get_global_id(1);
     if (x >= width || y >= height) return;
     const Volume volume = VOLUME_OF_PARAMETERS;
-    const View view = view_through(volume, intrinsics, volume_from_camera, (int2)(width, height), x, y, greatest_depth_m, nearest, farthest);
+    const View view = view_of_row(volume, intrinsics, volume_from_camera, width, x, y, greatest_depth_m, nearest, farthest);
     Vectors facing = {0.0f, 0.0f, 0.0f};
     const floatn t = find_surface(volume, view.rays, view.begin, view.end, &facing);
-    store_surface(volume, view.rays, t, facing, width, x, y, positions, normals);
+    int pixels[LANES];
+    const int count = pixels_of_row(width, x, y, pixels);
+    store_surface(volume, view.rays, t, facing, count, pixels, positions, normals);
 }
 
 // What the rays of pixels around say of rays between them; voxels.
@@ -227,21 +195,21 @@ static inline void look_beside(const Rays rays, const float voxel_m, const int2 
 
 // The pixels that `raycast` has left out, with SPACING 2: the third index says which of a square of four. As long as a ray is within a
 // voxel of those beside it, the volume holds nothing that they would miss. So where they have seen nothing, it sees nothing; where it
-// meets the planes that they have seen at one place, a Newton step from there finds the crossing; elsewhere it is walked from shortly before
-// what they have seen.
-kernel void raycast_between(VIEW_PARAMETERS, global float4 *positions, global float4 *normals) {
+// meets the planes that they have seen at one place, a Newton step from there finds the crossing; where at several, as at a silhouette,
+// it is tried at the nearest and at the farthest. -> rest: the number of others, which is 0 before, then of each its pixel and the bits
+// of where its ray begins, in voxels: shortly before what was seen beside it.
+kernel void raycast_between(VIEW_PARAMETERS, global float4 *positions, global float4 *normals, global int *rest) {
     const int dx = get_global_id(2) != 1, dy = get_global_id(2) != 0;
     const int x = SPACING * get_global_id(0) * LANES + dx;
     const int y = SPACING * get_global_id(1) + dy;
     if (x >= width || y >= height || get_global_id(2) > 2) return;
     const Volume volume = VOLUME_OF_PARAMETERS;
-    const int2 size = (int2)(width, height);
-    const View view = view_through(volume, intrinsics, volume_from_camera, size, x, y, greatest_depth_m, nearest, farthest);
+    const View view = view_of_row(volume, intrinsics, volume_from_camera, width, x, y, greatest_depth_m, nearest, farthest);
     const intn all = MASK(view.begin < view.end), none = MASK(view.begin != view.begin);
     Around around = {1e9f, 0.0f, 1e9f, all, none, all};
     for (int i = -dy; i <= dy; i += 2)
         for (int j = -dx; j <= dx; j += 2)
-            look_beside(view.rays, volume.voxel_m, size, x + j, y + i, positions, normals, &around);
+            look_beside(view.rays, volume.voxel_m, (int2)(width, height), x + j, y + i, positions, normals, &around);
     const float focal = fmin(intrinsics.s0, intrinsics.s1);
     const floatn middle = 0.5f * (around.nearest + around.farthest);
     const intn smooth = around.met & MASK(around.farthest - around.nearest < SMOOTH) & MASK(around.farthest < focal);
@@ -250,12 +218,44 @@ kernel void raycast_between(VIEW_PARAMETERS, global float4 *positions, global fl
     floatn t = 0.0f;
     if (ANY(smooth)) t = cross_near(volume, view.rays, middle, smooth, &facing);
     t = MASK(fabs(t - middle) < CLOSE) ? t : 0.0f;
-    const intn walked = all & ~empty & MASK(t == 0.0f);
-    if (ANY(walked)) {
-        const intn bounded = around.inside & MASK(around.first < focal);
-        const floatn begin = bounded ? fmax(view.begin, around.first - BEFORE) : view.begin;
-        const floatn found = find_surface(volume, view.rays, walked ? begin : view.end, view.end, &facing);
-        t = walked ? found : t;
+    const floatn candidates[2] = {around.nearest, around.farthest};
+    for (int i = 0; i < 2; i++) {
+        const intn asked = all & around.inside & around.seen & MASK(t == 0.0f) & MASK(candidates[i] > 0.0f) & MASK(candidates[i] < focal);
+        if (ANY(asked)) t += settle_near(volume, view.rays, candidates[i], asked, &facing);
     }
-    store_surface(volume, view.rays, t, facing, width, x, y, positions, normals);
+    int pixels[LANES], left[LANES];
+    float begin[LANES];
+    const int count = pixels_of_row(width, x, y, pixels);
+    store_surface(volume, view.rays, t, facing, count, pixels, positions, normals);
+    const intn bounded = around.inside & MASK(around.first < focal);
+    STORE_LANES(bounded ? fmax(view.begin, around.first - BEFORE) : view.begin, begin);
+    STORE_LANES(all & ~empty & MASK(t == 0.0f), left);
+    for (int lane = 0; lane < count; lane++) {
+        if (!left[lane]) continue;
+        const int place = atomic_inc(rest);
+        rest[2 * place + 1] = pixels[lane];
+        rest[2 * place + 2] = as_int(begin[lane]);
+    }
+}
+
+// The pixels in `rest`, LANES of them an item: their rays are walked. Which are done together does not matter to any of them.
+kernel void raycast_rest(VIEW_PARAMETERS, global const int *rest, global float4 *positions, global float4 *normals) {
+    const int first = get_global_id(0) * LANES, count = min(rest[0] - first, LANES);
+    if (count <= 0) return;
+    const Volume volume = VOLUME_OF_PARAMETERS;
+    const int columns = (width + TILE - 1) / TILE;
+    int pixels[LANES];
+    float x[LANES], y[LANES], begin[LANES], far[LANES];
+    for (int lane = 0; lane < LANES; lane++) {
+        const int place = first + min(lane, count - 1);
+        const int pixel = rest[2 * place + 1], row = pixel / width, col = pixel % width;
+        pixels[lane] = pixel;
+        x[lane] = col, y[lane] = row;
+        begin[lane] = as_float(rest[2 * place + 2]);
+        far[lane] = fmin(greatest_depth_m, as_float(farthest[row / TILE * columns + col / TILE]));
+    }
+    const View view = view_through(volume, intrinsics, volume_from_camera, LOAD_LANES(x), LOAD_LANES(y), 0.0f, LOAD_LANES(far));
+    Vectors facing = {0.0f, 0.0f, 0.0f};
+    const floatn t = find_surface(volume, view.rays, LOAD_LANES(begin), view.end, &facing);
+    store_surface(volume, view.rays, t, facing, count, pixels, positions, normals);
 }

@@ -38,6 +38,8 @@ class _RayBuffers(StageBuffers):
     """[tile row, tile column] depth at which rays begin, as bits of float metres."""
     farthest = BufferDescription(np.int32)
     """[tile row, tile column] depth at which rays end, in the same form."""
+    rest = BufferDescription(np.int32)
+    """Pixels whose rays are walked last, of raycast_between."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ def raycast(
     size, lanes = (camera.height, camera.width), engine.lanes
     positions = buffers.positions.array(size)
     normals = buffers.normals.array(size)
-    arguments = (
+    view = (
         camera.width,
         camera.height,
         *volume.arguments(),
@@ -73,12 +75,14 @@ def raycast(
         float16(volume_from_camera),
         GREATEST_DEPTH_M,
         *_ray_bounds(engine, camera, volume_from_camera, volume),
-        positions,
-        normals,
     )
+    pixels = camera.width * camera.height
+    rest = engine.buffers(_RayBuffers).rest.array((2 * pixels + 1,))
+    rest[:1].fill(np.int32(0))
     squares = (-(-camera.width // (_SPACING * lanes)), -(-camera.height // _SPACING))
-    engine.launch(_kernel(engine, "raycast"), squares, *arguments)
-    engine.launch(_kernel(engine, "raycast_between"), (*squares, 3), *arguments, local=(16, 4, 1))
+    engine.launch(_kernel(engine, "raycast"), squares, *view, positions, normals)
+    engine.launch(_kernel(engine, "raycast_between"), (*squares, 3), *view, positions, normals, rest, local=(16, 4, 1))
+    engine.launch(_kernel(engine, "raycast_rest"), (-(-pixels // lanes),), *view, rest, positions, normals)
     return Surface(positions, normals, buffers.labels.array(size))
 
 

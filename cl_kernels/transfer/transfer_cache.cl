@@ -32,7 +32,8 @@
 #define OPENNESS 11
 #define FLATNESS 12
 #define HITS 13
-#define MASK_AT 17
+#define LASTS 17   // frames after which it is traced again
+#define MASK_AT 18
 #define TRANSFER (MASK_AT + MASK_WORDS)
 #define MET (TRANSFER + COEFFICIENTS)
 #define WORDS (MET + MOST_MET)
@@ -51,9 +52,9 @@ static inline uint mixed(uint h) {
     return h ^ (h >> 16);
 }
 
-// Sides of cells grow by factors of sqrt(2) with the distance between samples, and are at least as long.
+// Sides of cells grow by factors of sqrt(2) with the distance between samples, and are at least sqrt(2) as long.
 static Cell cell_of(const TransferCacheParameters p, const float3 position, const float3 normal) {
-    const int level = (int)ceil(2.0f * log2(fmax(distance(position, p.eye.xyz) * p.spacing, 1e-4f)));
+    const int level = (int)ceil(2.0f * log2(fmax(distance(position, p.eye.xyz) * p.spacing, 1e-4f))) + 1;
     Cell cell;
     cell.side_m = exp2(0.5f * (float)level);
     const float3 size = fabs(normal);
@@ -78,6 +79,11 @@ static inline float3 vector_in(global const uint *entry, const int at) {
     return (float3)(as_float(entry[at]), as_float(entry[at + 1]), as_float(entry[at + 2]));
 }
 
+// Whether an entry of the cell at this point is of the same surface.
+static inline int is_of(global const uint *entry, const Cell cell, const float3 position, const float3 normal) {
+    return fabs(dot(vector_in(entry, POSITION) - position, normal)) <= cell.side_m && dot(vector_in(entry, NORMAL), normal) >= FACING;
+}
+
 // positions, normals [h][w]: the geometry buffer; entries [places][WORDS]. -> found [rows][cols]: the place of a sample's entry,
 // whose values are then in transfer, openness, flatness, free_mask, sets (see radiance_transfer.cl) hits and met (see indirect.cl); or
 // NOT_STORED, where they are as they were.
@@ -95,8 +101,7 @@ kernel void find_samples(const TransferCacheParameters p, global const float4 *p
     for (int way = 0; way < WAYS; way++) {
         global uint *entry = entries + (size_t)cell.places[way] * WORDS;
         if (!holds(entry, cell.key)) continue;
-        const float off = fabs(dot(vector_in(entry, POSITION) - position.xyz, normal.xyz));
-        if (p.now - (int)entry[TRACED] >= p.period || off > cell.side_m || dot(vector_in(entry, NORMAL), normal.xyz) < FACING) return;
+        if (p.now - (int)entry[TRACED] >= (int)entry[LASTS] || !is_of(entry, cell, position.xyz, normal.xyz)) return;
         entry[USED] = (uint)p.now;
         for (int i = 0; i < COEFFICIENTS; i++) transfer[sample * COEFFICIENTS + i] = as_float(entry[TRANSFER + i]);
         for (int i = 0; i < MASK_WORDS; i++) free_mask[sample * MASK_WORDS + i] = entry[MASK_AT + i];
@@ -132,7 +137,8 @@ kernel void claim_entries(const TransferCacheParameters p, global const float4 *
 }
 
 // Arguments as in find_samples and claim_entries; the arrays of samples now hold values of this frame. The first traced frame of a
-// cell is told earlier by a part of the period, so that cells do not all become too old at once. disc_frames [places]: see
+// cell is told earlier by a part of the period, so that cells do not all become too old at once. An entry of the same surface as before
+// lasts twice as long, up to p.longest frames. disc_frames [places]: see
 // shadow_map.cl; 0 where an entry is new. -> found: the place of the sample's entry, else NOT_STORED.
 kernel void store_samples(const TransferCacheParameters p, global const float4 *positions, global const float4 *normals, global uint *entries,
                           global const float *transfer, global const float *openness, global const float *flatness,
@@ -153,10 +159,12 @@ kernel void store_samples(const TransferCacheParameters p, global const float4 *
     const Cell cell = cell_of(p, position, normal);
     global uint *entry = entries + (size_t)place * WORDS;
     const int is_known = holds(entry, cell.key);
+    const int lasts = is_known && is_of(entry, cell, position, normal) ? min(2 * (int)entry[LASTS], p.longest) : p.period;
     entry[KEY] = cell.key.x;
     entry[KEY + 1] = cell.key.y;
     entry[TRACED] = (uint)(p.now - (is_known ? 0 : (int)(mixed(cell.key.x + cell.key.y) % (uint)p.period)));
     entry[USED] = (uint)p.now;
+    entry[LASTS] = (uint)lasts;
     entry[SET] = sets[sample];
     const float kept[8] = {position.x, position.y, position.z, normal.x, normal.y, normal.z, openness[sample], flatness[sample]};
     for (int i = 0; i < 8; i++) entry[POSITION + i] = as_uint(kept[i]);

@@ -140,7 +140,14 @@ TRANSFER_PARAMETERS = Struct(
 """Parameters of radiance_transfer.cl. cached_normals_at: byte of the cache's surface at which its normals begin."""
 
 TRANSFER_CACHE_PARAMETERS = Struct(
-    "TransferCacheParameters", grid=GRID, eye="float4", spacing="float", now="int", period="int", places="int"
+    "TransferCacheParameters",
+    grid=GRID,
+    eye="float4",
+    spacing="float",
+    now="int",
+    period="int",
+    longest="int",
+    places="int",
 )
 """Parameters of transfer_cache.cl. eye: where the camera is, volume metres; spacing: metres between samples that are a
 metre away."""

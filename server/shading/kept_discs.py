@@ -1,7 +1,7 @@
 """How long what real surface leaves of the discs of the light stays true.
 
 It is kept by place of the surface (trace_discs of shadow_map.cl) and found anew with the place's radiance transfer,
-after 16 frames at most. The light of a room is estimated every few frames, and its discs move by a degree or so each
+after 64 frames at most. The light of a room is estimated every few frames, and its discs move by a degree or so each
 time: a small part of how wide a lamp or window is seen. So it is found anew before that only if discs have moved far.
 """
 
@@ -17,7 +17,7 @@ from server.maths.direct_lights import DirectLight
 FAR = 0.2
 """How far a disc may move and grow, in its radii. Behind a straight edge, the part of a disc that is seen changes by at
 most 2 / pi of this: 13 % of the light of the disc, in the penumbra of real things, with and without virtual ones."""
-_REMEMBERED = 32
+_REMEMBERED = 80
 """Frames: more than a place's radiance transfer is kept for."""
 
 

@@ -1,10 +1,11 @@
 """World-space cache of radiance transfer. Kernel: transfer_cache.cl.
 
 Transfer and the light from surfaces belong to a place of the scanned surface, not to a frame. They are kept by cell of
-the world. A cell is about as large as the distance between samples, so a moving camera finds again what it saw a frame,
-or a turn, ago. A sample that finds nothing is traced and stored. A cell is traced again after PERIOD frames at most,
-because the scan grows. So an entry is off by what the scan has changed in PERIOD frames, and belongs to a point in the
-same cell. Surface that moves is no exception: what a point sees of the scan depends on where it is only.
+the world. A cell is 1.4 to 2 times as long as the distance between samples, so a moving camera finds again what it saw a
+frame, or a turn, ago. A sample that finds nothing is traced and stored. A cell is traced again after PERIOD frames, then
+after twice as many each time, LONGEST at most, because a young scan grows and an old one hardly does. So an entry is off
+by what the scan has changed in as many frames as it was old, LONGEST at most, and belongs to a point in the same cell.
+Surface that moves is no exception: what a point sees of the scan depends on where it is only.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ from server.transfer.radiance_transfer import Cells, Directions, Transfer, sampl
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
 
-PERIOD = 16
-"""Frames after which a cell is traced again: half a second at 30 frames/s."""
+PERIOD, LONGEST = 16, 64
+"""Frames after which a cell is traced again, at first and at most: half a second and two seconds at 30 frames/s."""
 PLACES_A_SAMPLE = 4
 """Size of the table, in samples of a frame, rounded up to a power of two. Views of the last seconds fit, and few cells
 collide."""
 MOST_PLACES = 1 << 20
-"""Of 232 bytes each with the defaults."""
-_WORDS_BESIDE = 17
+"""Of 236 bytes each with the defaults."""
+_WORDS_BESIDE = 18
 """Words of an entry besides mask, coefficients and directions that met surface, as in transfer_cache.cl."""
 _UNCLAIMED = 0xFFFFFFFF
 
@@ -103,6 +104,7 @@ class TransferCache:
             spacing=stride / camera.fx,
             now=self._now,
             period=PERIOD,
+            longest=LONGEST,
             places=places,
         )
         self._frame = _Frame(surface, transfer, hits, met, places, words, parameters, defines)

@@ -37,7 +37,7 @@ class Frames:
     def __init__(self, engine: Engine, places: int, period: int) -> None:
         self.volume: Volume = fill_volume(engine, SCENES["floor under a wall"], 0.05)
         self.cache = TransferCache(engine)
-        self.twin = Table(places, period)
+        self.twin = Table(places, period, transfer_cache.LONGEST)
         self.random = np.random.default_rng(7)
         self._engine = engine
         self._now = 0
@@ -112,18 +112,27 @@ class Frames:
 def test_samples_are_found_and_kept_as_by_the_twin(
     engine: Engine, monkeypatch: pytest.MonkeyPatch, most_places: int, period: int
 ) -> None:
-    """A wide table, one that is too small, and one whose cells soon are too old."""
+    """A wide table, one that is too small, and one whose cells soon are too old, and then last longer."""
     monkeypatch.setattr(transfer_cache, "MOST_PLACES", most_places)
     monkeypatch.setattr(transfer_cache, "PERIOD", period)
+    monkeypatch.setattr(transfer_cache, "LONGEST", 3 * period)
     frames = Frames(engine, places_for(ROWS * COLS), period)
     shares = []
-    for eye in (np.zeros(3), np.zeros(3), np.array([0.02, -0.01, 0.0]), np.array([0.5, 0.5, -0.6]), *[np.zeros(3)] * 4):
+    for eye in (
+        np.zeros(3),
+        np.zeros(3),
+        np.array([0.02, -0.01, 0.0]),
+        np.array([0.5, 0.5, -0.6]),
+        *[np.zeros(3)] * 20,
+    ):
         found, _, cells, after = frames.step(eye)
         np.testing.assert_array_equal(engine.download(cells.places).ravel(), after)
         assert (engine.download(cells.claims) == 0xFFFFFFFF).all()
         shares.append((found >= 0).mean())
     assert shares[0] == 0
     assert shares[1] > (0.3 if most_places > 64 else 0.05)
+    lasting = {entry.lasts for entry in frames.twin.entries.values()}
+    assert lasting >= {period} if period > 3 else lasting == {period, 2 * period, 3 * period}
     assert max(shares) < 0.97  # some are invalid, and some face another way than their cell
 
 

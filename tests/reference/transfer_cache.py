@@ -35,9 +35,10 @@ class Cell:
 
 
 def cell_of(position: Floats, normal: Floats, eye: Floats, spacing: float, places: int) -> Cell:
-    """Sides grow by factors of sqrt(2) with the distance between samples, which is `spacing` at one metre."""
+    """Sides grow by factors of sqrt(2) with the distance between samples, which is `spacing` at one metre, and are
+    sqrt(2) to 2 times as long."""
     size = 2 * np.log2(max(np.linalg.norm(position - eye) * spacing, 1e-4))
-    level = int(np.ceil(size))
+    level = int(np.ceil(size)) + 1
     side_m = 2.0 ** (level / 2)
     axis = int(np.abs(normal).argmax())
     sides = side_m * np.where(np.arange(3) == axis, FLAT, 1.0)
@@ -58,10 +59,17 @@ class Entry:
 
     key: tuple[int, int]
     traced: int
+    lasts: int
     used: int
     position: Floats
     normal: Floats
     value: float
+
+
+def _is_of(entry: Entry, cell: Cell, point: Floats, normal: Floats) -> bool:
+    """Whether it is of the same surface."""
+    off_m = abs((entry.position - point) @ normal)
+    return bool(off_m <= cell.side_m and entry.normal @ normal >= FACING)
 
 
 @dataclass
@@ -70,6 +78,7 @@ class Table:
 
     places: int
     period: int
+    longest: int
     entries: dict[int, Entry] = field(default_factory=dict)
 
     def find(
@@ -83,11 +92,7 @@ class Table:
                 entry = self.entries.get(place)
                 if entry is None or entry.key != cell.key:
                     continue
-                off_m = abs((entry.position - points[i]) @ normals[i])
-                holds = (
-                    now - entry.traced < self.period and off_m <= cell.side_m and entry.normal @ normals[i] >= FACING
-                )
-                if holds:
+                if now - entry.traced < entry.lasts and _is_of(entry, cell, points[i], normals[i]):
                     entry.used, found[i] = now, place
                 break
         return found
@@ -115,7 +120,9 @@ class Table:
         for place, (i, cell) in claims.items():
             entry = self.entries.get(place)
             is_known = entry is not None and entry.key == cell.key
+            is_same = entry is not None and is_known and _is_of(entry, cell, points[i], normals[i])
+            lasts = min(2 * entry.lasts, self.longest) if entry is not None and is_same else self.period
             earlier = 0 if is_known else mixed((cell.key[0] + cell.key[1]) & _MASK) % self.period
-            self.entries[place] = Entry(cell.key, now - earlier, now, points[i], normals[i], float(values[i]))
+            self.entries[place] = Entry(cell.key, now - earlier, lasts, now, points[i], normals[i], float(values[i]))
             places[i] = place
         return places

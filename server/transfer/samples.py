@@ -14,7 +14,7 @@ from server.transfer.indirect import Indirect, MeanSent, observe_indirect
 from server.transfer.radiance_transfer import Directions, Transfer
 from server.transfer.real_depth_views import RealDepthViews
 from server.transfer.sampling import Sampling, TransferSampler
-from server.transfer.transfer_cache import PERIOD, TransferCache
+from server.transfer.transfer_cache import LONGEST, TransferCache
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
 
@@ -80,7 +80,7 @@ class SampledTransfer:
 
     def left_out(self) -> tuple[LeftOut, ...]:
         """What of the last frame's transfer may have been found instead of traced."""
-        reason = f"traced at most {PERIOD} frames ago at the same place of the world"
+        reason = f"traced at most {LONGEST} frames ago at the same place of the world"
         return (LeftOut(effect="transfer_of_known_places", reason=reason, error_bound=None),) if self._has_found else ()
 
     def sample(

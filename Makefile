@@ -43,6 +43,8 @@ WORKERS ?= $(shell expr $$(nproc) + 2)
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest
 PARALLEL := -n $(WORKERS) --dist worksteal
 test test-slow test-second-device slow-list: export PROBELESS_DATA := $(or $(PROBELESS_DATA),$(DATA))
+# Compiled test files are kept: each worker reads all of them, which takes half the time of compiling them.
+test test-slow test-second-device slow-list: export PYTHONDONTWRITEBYTECODE :=
 test test-slow slow-list: export PROBELESS_TEST_DEVICE := $(or $(PROBELESS_TEST_DEVICE),portable computing language)
 
 test: .venv/installed-test

@@ -379,7 +379,7 @@ class Pipeline:
             timings=timings,
             plan=structs.replace(plan, left_out=(*plan.left_out, *others)),
             notes=(*geometry.notes, *notes, *_light_notes(light), *self._place_notes()),
-            is_reused=geometry.is_held,
+            is_reused=geometry.is_reused,
         )
 
     def _timings(self) -> Timings:

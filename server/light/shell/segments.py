@@ -17,10 +17,10 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-def segments(keys: Ints, looks: Floats) -> Ints:
+def segments(keys: Ints, colors: Floats) -> Ints:
     """[n] from 0: which surface each patch is part of.
 
-    keys: [n, 6] cell of a grid and rounded normal, all different; looks: [n, 3] mean logarithm and chroma.
+    keys: [n, 6] cell of a grid and rounded normal, all different; colors: [n, 3] mean logarithm and chroma.
     """
     number = _numbers(keys)
     order = np.argsort(number)
@@ -32,7 +32,7 @@ def segments(keys: Ints, looks: Floats) -> Ints:
         first.append(np.flatnonzero(found))
         second.append(order[place[found]])
     one, other = np.concatenate(first), np.concatenate(second)
-    apart = np.abs(looks[one] - looks[other])
+    apart = np.abs(colors[one] - colors[other])
     is_alike = (apart[:, 0] < LEVEL_EDGE) & (apart[:, 1:].max(axis=1) < CHROMA_EDGE)
     return _components(len(keys), one[is_alike], other[is_alike])
 

@@ -183,7 +183,7 @@ def test_places_at_the_ends_of_the_world(device: Device, far_m: float) -> None:
 
 def test_objects_beyond_the_limit_are_named(device: Device, monkeypatch) -> None:
     monkeypatch.setattr(told_places, "MOST_OBJECTS", 2)
-    monkeypatch.setattr("server.pipeline.MOST_OBJECTS", 2)
+    monkeypatch.setattr("server.room.client_light.MOST_OBJECTS", 2)
     pipeline = session(device)
     for name in "abc":
         place_pole(pipeline, name)

@@ -43,6 +43,8 @@ WORKERS ?= $(shell expr $$(nproc) + 2)
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest
 PARALLEL := -n $(WORKERS) --dist worksteal
 test test-slow test-second-device slow-list: export PROBELESS_DATA := $(or $(PROBELESS_DATA),$(DATA))
+# Compiled test files are kept: each worker reads all of them, which takes half the time of compiling them.
+test test-slow test-second-device slow-list: export PYTHONDONTWRITEBYTECODE :=
 test test-slow slow-list: export PROBELESS_TEST_DEVICE := $(or $(PROBELESS_TEST_DEVICE),portable computing language)
 
 test: .venv/installed-test
@@ -66,9 +68,10 @@ test-slow: .venv/installed-all
 # Kernels and the pipeline; what the others need a device for does not depend on which.
 ON_EVERY_DEVICE := $(addprefix tests/,kernels opencl pipeline hard_cases)
 
-# The loader of OpenCL finds PoCL in any case, and Intel's runtime by this folder.
+# The loader of OpenCL finds PoCL in any case, and Intel's runtime by this folder. The name is the platform's, since PoCL's
+# device holds "Intel" too on a processor of theirs.
 test-second-device: export OCL_ICD_VENDORS := $(CURDIR)/.venv/opencl
-test-second-device: export PROBELESS_TEST_DEVICE := intel
+test-second-device: export PROBELESS_TEST_DEVICE := intel(r) opencl
 test-second-device: .venv/installed-all
 	$(PYTEST) $(PARALLEL) -m device $(ON_EVERY_DEVICE)
 

@@ -182,7 +182,7 @@ class ClientSession:
         """
         with self._room.lock:
             asked = None if position_m is None else np.array(position_m, np.float64)
-            radiance, (x, y, z) = self._pipeline.panorama(asked)
+            radiance, (x, y, z) = self._pipeline.light.panorama(asked)
         return encode_panorama(radiance, format_), (float(x), float(y), float(z))
 
     @property

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pyopencl.cltypes as cl_types
 from msgspec import structs
 from numpy.typing import NDArray
-from pyopencl.array import Array
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import LeftOut, Light, Plan, Timings, Tracking, Wishes
@@ -18,19 +16,14 @@ from server.effects.renderer import Renderer, RenderRequest, RenderResult, Spine
 from server.effects.table import effect_names
 from server.frame_context import FrameContext
 from server.geometry.geometry import Geometry, GeometryFrame, check_size
-from server.input.denoise import denoise_radiance
 from server.input.measure import measure
 from server.light.light_estimation import LightEstimate
-from server.light.light_message import light_message, seen_from
-from server.light.near_light import remove_lamps
-from server.light.panorama_file import lat_long_radiance
-from server.light.told_places import MOST_OBJECTS, ToldPlaces
 from server.objects.rasterize import Placed
-from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.quality.settings import Settings
 from server.reuse.frame_cache import FrameCache
 from server.reuse.temporal_reuse import NO_REUSE, ReuseDecision, SceneVersion, TemporalReuse
+from server.room.client_light import ClientLight
 from server.room.client_objects import ClientObjects
 from server.room.frame_view import frame_view, surface_on_ray
 from server.room.room import Room
@@ -38,7 +31,6 @@ from server.room.spots import SpotView
 from server.shading.composite import shown_picture
 from server.shading.layer import NOTHING, Layer
 from server.tracking.alignment import Alignment
-from server.tracking.exposure import scene_radiance
 from server.transfer.samples import NO_SAMPLES, SampledTransfer, TransferSamples
 from server.volume.volume import Volume
 
@@ -61,11 +53,6 @@ class FrameResult:
     """What is virtual in it; None: the client does not want it apart."""
     is_reused: bool = False
     """Whether the geometry of the frame before was kept."""
-
-
-class _Buffers(StageBuffers):
-    smooth_radiance = BufferDescription(cl_types.float4)
-    """[h, w] denoised, in the first picture's units."""
 
 
 class Pipeline:
@@ -100,9 +87,7 @@ class Pipeline:
         self._cache = FrameCache(engine)
         self._renderer = Renderer(engine, self._cache, settings)
         self._reuse = None if settings.plan == "everything" else TemporalReuse(engine, camera, poses=wishes.poses)
-        self._light_at = np.array(wishes.light_at, np.float64).reshape(-1, 3)
-        self._told = ToldPlaces()
-        self._exposure = 1.0
+        self.light = ClientLight(engine, room, alignment, wishes.light_at)
         self._frames = self._losses = self._samplings = 0
         self.kernel_ms: dict[str, float] = {}
         """Device time of each kernel in the last frame."""
@@ -151,16 +136,16 @@ class Pipeline:
             samples, is_kept = self._sample_transfer(context, reuse, is_shaded, needs_transfer)
         left_out = self._left_out(frame, reuse, is_kept, is_shaded, needs_transfer)
         with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
-            self._begin_light(context, left_out)
+            self.light.begin(context, left_out)
             is_drawn_first = room.light.has_model  # with the light of the frames before
             if not is_drawn_first:
-                light = self._light(context, samples, left_out, is_still=reuse.keeps_geometry)
+                light = self.light.update(context, samples, self._settings, left_out, is_still=reuse.keeps_geometry)
         with stage("rendering"):  # 7.1-7.2, the effects that this frame calls for
             spine = self._spine_outputs(context, frame, objects, samples, left_out)
             rendered = self._renderer.render(context, spine, self._settings, reuse, request)
         if is_drawn_first:
             with stage("light_estimation"):  # while the device draws
-                light = self._light(context, samples, left_out, is_still=reuse.keeps_geometry)
+                light = self.light.update(context, samples, self._settings, left_out, is_still=reuse.keeps_geometry)
         if not room.light.is_given and frame.has_depth:  # B4, for the frames to come
             with stage("light_estimation"):
                 room.lamps.work(self._camera, context.scene_radiance, context.surface, volume)
@@ -245,66 +230,6 @@ class Pipeline:
             has_depth=frame.has_depth,
         )
 
-    def _begin_light(self, context: FrameContext, left_out: dict[str, CullReason]) -> None:
-        """Let the device gather what `_light` needs of the frame."""
-        if "estimate_light" not in left_out:
-            self._room.light.begin(context)
-        self._told.begin(context)
-
-    def _light(
-        self, context: FrameContext, samples: TransferSamples, left_out: dict[str, CullReason], *, is_still: bool
-    ) -> LightEstimate:
-        """The light with this frame, and what arrives at the places of which this client is told."""
-        light = self._estimate_light(context, samples, left_out)
-        self._look_up_places(context, is_still=is_still)
-        return light
-
-    def _estimate_light(
-        self, context: FrameContext, samples: TransferSamples, left_out: dict[str, CullReason]
-    ) -> LightEstimate:
-        """The light with this frame, or as it stands."""
-        engine, light = self._engine, self._room.light
-        if "estimate_light" in left_out:
-            return light.estimate()
-        radiance = self._denoised(context)
-        distant = remove_lamps(engine, radiance, context.surface, context.volume, self._room.lamps.lamps)  # B4
-        return light.update(context, distant, samples, self._room.objects.up)
-
-    def _look_up_places(self, context: FrameContext, *, is_still: bool) -> None:
-        """The light that arrives at the places of which this client is told."""
-        place, room = self._alignment.room_from_client, self._room
-        asked = self._light_at @ place[:3, :3].T + place[:3, 3]
-        self._told.update(context, room.light, asked, room.objects.middles(), is_still=is_still)
-
-    def panorama(self, position: NDArray[np.float64] | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """[h, w, 3] radiance that arrives at a place, in units of the last frame's image, and the place [3].
-
-        Both are of the client's world; position None: the first object's, else the middle of the last view. Rows and
-        columns are those of `panorama_directions` in WebXR's axes. Raises ValueError, one line, before a frame.
-        """
-        room, alignment, volume = self._room, self._alignment, self._room.reconstruction.volume
-        to_webxr, view = alignment.webxr_from_room, self._told.newest.view
-        if volume is None or to_webxr is None or view is None:
-            raise ValueError("there is no light yet: no frame has been placed in the room")
-        if position is None:
-            where = next(iter(room.objects.middles().values()), view)
-        else:
-            where = alignment.room_from_client[:3, :3] @ position + alignment.room_from_client[:3, 3]
-        radiance = lat_long_radiance(
-            lambda directions: room.light.radiance_at(self._engine, volume, where, directions), to_webxr
-        )
-        to_client = alignment.client_from_room
-        return self._exposure * radiance, to_client[:3, :3] @ where + to_client[:3, 3]
-
-    def _denoised(self, context: FrameContext) -> Array:
-        """[h, w] float4: what the light is estimated from, in the first picture's units."""
-        settings = self._settings
-        if settings.denoise == "none":
-            return context.scene_radiance
-        method, iterations = settings.denoise, settings.denoise_iterations
-        smooth = denoise_radiance(self._engine, context.measurement, method, iterations)
-        return scene_radiance(self._engine, smooth, context.exposure, self._engine.buffers(_Buffers).smooth_radiance)
-
     def _spine_outputs(
         self,
         context: FrameContext,
@@ -313,7 +238,7 @@ class Pipeline:
         samples: TransferSamples,
         left_out: dict[str, CullReason],
     ) -> SpineOutputs:
-        sh, split = self._room.light.seen_by_objects(self._place_of_objects(), context.volume.origin_world)
+        sh, split = self._room.light.seen_by_objects(self.light.middle_of_objects(), context.volume.origin_world)
         return SpineOutputs(
             frame=frame,
             objects=objects,
@@ -325,12 +250,6 @@ class Pipeline:
             is_light_given=self._room.light.is_given,
             left_out=left_out,
         )
-
-    def _place_of_objects(self) -> NDArray[np.float64]:
-        """[3] world metres: the middle of all virtual objects, else of what the frame sees."""
-        middles = [*self._room.objects.middles().values()]
-        view = self._told.newest.view
-        return np.mean(middles, axis=0) if middles else np.zeros(3) if view is None else view
 
     def _lost_frame(
         self,
@@ -373,13 +292,13 @@ class Pipeline:
         return FrameResult(
             color=picture,
             layer=rendered.layer,
-            light=self._light_message(frame, geometry, light, volume),
+            light=self.light.message(frame, light, volume, geometry.exposure),
             world_from_camera=self._alignment.in_client(geometry.world_from_camera),
             tracking=geometry.tracking,
             timings=timings,
             plan=structs.replace(plan, left_out=(*plan.left_out, *others)),
-            notes=(*geometry.notes, *notes, *_light_notes(light), *self._place_notes()),
-            is_reused=geometry.is_held,
+            notes=(*geometry.notes, *notes, *self.light.notes(light)),
+            is_reused=geometry.is_reused,
         )
 
     def _timings(self) -> Timings:
@@ -391,24 +310,3 @@ class Pipeline:
         return Timings(
             **times.rows, total=times.total, host=host, launches=launches, reads=reads, read_bytes=read_bytes
         )
-
-    def _light_message(self, frame: RgbdFrame, geometry: GeometryFrame, light: LightEstimate, volume: Volume) -> Light:
-        """The light in the client's world."""
-        lamps, axes = self._room.lamps.lamps_at(volume.origin_world), self._alignment.webxr_from_client
-        assert axes is not None
-        self._exposure, places = geometry.exposure, self._told.newest
-        if not self._alignment.is_identity:
-            light, lamps = seen_from(self._alignment.client_from_room, light, lamps)
-            places = places.seen_from(self._alignment.client_from_room)
-        return light_message(frame.index, frame.timestamp_s, light, axes, lamps, geometry.exposure, places)
-
-    def _place_notes(self) -> tuple[str, ...]:
-        """What is not known of the places that were asked for."""
-        count = len(self._room.objects.middles())
-        if count <= MOST_OBJECTS:
-            return ()
-        return (f"{count} objects: only the first {MOST_OBJECTS} are told a light of their own",)
-
-
-def _light_notes(light: LightEstimate) -> tuple[str, ...]:
-    return ("no usable surface has been seen yet, the light is unknown",) if light.std is None else ()

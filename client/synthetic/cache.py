@@ -8,7 +8,7 @@ import os
 import sys
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -27,15 +27,34 @@ _UNUSABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 def cached(name: str, compute: Callable[[], Tables]) -> Tables:
     """The result of `compute`, from the cache if it is there and intact. An unwritable cache is ignored."""
     path = folder() / f"{name}-{code_version()}.npz"
-    try:
+    with contextlib.suppress(*_UNUSABLE):
         return _load(path)
-    except _UNUSABLE:
+    with _alone(path):
+        with contextlib.suppress(*_UNUSABLE):
+            return _load(path)  # another process has computed it meanwhile
         if sys.stderr.isatty():
             note(f"computing shadows of the synthetic scene {name}, once")
-    tables = compute()
-    with contextlib.suppress(OSError):
-        _store(path, tables)
+        tables = compute()
+        with contextlib.suppress(OSError):
+            _store(path, tables)
     return tables
+
+
+@contextlib.contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """One process at a time computes the file; where files cannot be locked, each does."""
+    try:
+        import fcntl
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.with_suffix(".lock").open("w")
+    except (ImportError, OSError):
+        yield
+        return
+    with file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # released when the file is closed
+        yield
+        path.with_suffix(".lock").unlink(missing_ok=True)
 
 
 def folder() -> Path:

@@ -81,7 +81,7 @@ class FactsFinder:
                 object_sent=float(sent.max()),
                 real_sent=float(real.max()),
             ),
-            reach=self._influence(context, objects, samples, light, MostSent(sent, real)) if is_lit else NOWHERE,
+            influence=self._influence(context, objects, samples, light, MostSent(sent, real)) if is_lit else NOWHERE,
         )
 
     def _influence(

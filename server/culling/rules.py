@@ -105,14 +105,14 @@ def matt(facts: SceneFacts) -> CullReason | None:
     return _if_bounded("what virtual things reflect is hardly seen", codes(facts.gain * facts.reflected * arriving))
 
 
-def out_of_reach(facts: SceneFacts) -> CullReason | None:
+def no_influence(facts: SceneFacts) -> CullReason | None:
     """Real surface: R'/R differs from 1 by b at most, and with bounced light by b (1 + k): see influence_bound.cl. The
     picture there is multiplied by it. Virtual surface gets light off real surface that is multiplied by the same; all
     that it gets is not below 0, so it changes by the same share, and by no more than gain b times what real surface
     sends."""
-    if math.isinf(facts.reach.change):
+    if math.isinf(facts.influence.change):
         return None
-    share = facts.reach.change * (1.0 + (facts.reach.bounced if facts.indirect else 0.0))
+    share = facts.influence.change * (1.0 + (facts.influence.bounced if facts.indirect else 0.0))
     return _if_bounded("virtual things hardly change the light of real surface in view", _codes_of_ratio(facts, share))
 
 
@@ -136,9 +136,9 @@ def faint_sample_share() -> float:
 
 def dark_things(facts: SceneFacts) -> CullReason | None:
     """What objects send: on real surface a share of R, as above; virtual surface gets no more than gain times it."""
-    if math.isinf(facts.reach.sent) and facts.brightness.object_sent > 0:
+    if math.isinf(facts.influence.sent) and facts.brightness.object_sent > 0:
         return None
-    share = facts.reach.sent * (1.0 + facts.reach.bounced) if facts.brightness.object_sent > 0 else 0.0
+    share = facts.influence.sent * (1.0 + facts.influence.bounced) if facts.brightness.object_sent > 0 else 0.0
     on_virtual = codes(facts.gain * facts.brightness.object_sent) if facts.objects_in_view else 0.0
     bound = max(_codes_of_ratio(facts, share), on_virtual)
     return _if_bounded("what virtual things send is hardly seen", bound, ALLOWANCE - ELSEWHERE)
@@ -147,18 +147,18 @@ def dark_things(facts: SceneFacts) -> CullReason | None:
 def nothing_bounces(facts: SceneFacts) -> CullReason | None:
     """Bounced light changes R'/R by k times what it bounces off changes: by b at most, or, as no more than all light
     can be hidden, by 1 and what objects send: k min(b, 1 + b of that)."""
-    reach = facts.reach
-    if math.isinf(reach.bounced):
+    influence = facts.influence
+    if math.isinf(influence.bounced):
         return None
-    change = min(reach.change, 1.0 + reach.sent)
-    share = reach.bounced * change if reach.bounced > 0 else 0.0
+    change = min(influence.change, 1.0 + influence.sent)
+    share = influence.bounced * change if influence.bounced > 0 else 0.0
     bound = _codes_of_ratio(facts, share)
     return _if_bounded("light that bounces off real surface hardly changes", bound, ALLOWANCE - ELSEWHERE)
 
 
 def no_rims(facts: SceneFacts) -> CullReason | None:
     """Means of ratios within b (1 + k) of 1 differ by no more than twice that: none is refined (adaptive.py)."""
-    share = facts.reach.change * (1.0 + facts.reach.bounced) if facts.reach.change < math.inf else math.inf
+    share = facts.influence.change * (1.0 + facts.influence.bounced) if facts.influence.change < math.inf else math.inf
     return CullReason("no shadow has a rim", 0.0) if 2.0 * share < LEAST_CHANGE else None
 
 

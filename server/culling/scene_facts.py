@@ -48,13 +48,13 @@ class SceneFacts:
     gain: float = 1.0
     """Factor on the shading of virtual surface."""
     brightness: Brightness = field(default_factory=Brightness)
-    reach: InfluenceBound = UNKNOWN
+    influence: InfluenceBound = UNKNOWN
     """Bound on the influence of objects on real surface in view."""
 
     @property
     def returned(self) -> float:
         """Bound on the change of the radiance that real surface sends: all of it can be blocked."""
-        change = min(self.reach.change, 1.0 + self.reach.sent)
+        change = min(self.influence.change, 1.0 + self.influence.sent)
         return change * self.brightness.real_sent if self.brightness.real_sent > 0 else 0.0
 
 

@@ -1,7 +1,7 @@
 """Which effects a frame runs: only those that its picture needs and its scene calls for.
 
 An effect is a pure function. It reads the types of its parameters and writes the type that it returns (resources.py). A
-parameter that may be None is an optional read. The plan walks back from the wanted resource. An effect is left out
+parameter that may be None is an optional read. The plan walks back from the target. An effect is left out
 
 - where a required resource is absent, for the reason that this is,
 - where one of its own `disabled_by` rules says so: something was asked for, or there is nothing to do,
@@ -30,7 +30,7 @@ Rule = Callable[[Facts], CullReason | None]
 
 @dataclass(frozen=True)
 class Read:
-    """One parameter of an effect, or one field of what is wanted."""
+    """One parameter of an effect, or one field of the target."""
 
     name: str
     resource: Resource
@@ -79,7 +79,7 @@ class Approximation(Generic[Facts]):
 
 
 class PlanError(LookupError):
-    """The table of effects cannot make what is wanted."""
+    """The table of effects cannot make the target."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class EffectTable(Generic[Facts]):
 class EffectPlan(Generic[T]):
     """The effects of one frame in order, and the values that the plan chose."""
 
-    wanted: type[T]
+    target: type[T]
     order: tuple[Effect[Any], ...]
     chosen: Mapping[Resource, object]
     left_out: tuple[LeftOut, ...]
@@ -117,7 +117,7 @@ class EffectPlan(Generic[T]):
         there |= self.chosen
         for effect in self.order:
             there[effect.writes] = run_effect(effect, _arguments(effect.reads, there))
-        return self.wanted(**_arguments(wanted_reads(self.wanted), there))
+        return self.target(**_arguments(target_reads(self.target), there))
 
 
 def run_effect(effect: Effect[Any], arguments: Mapping[str, Any]) -> object:
@@ -127,20 +127,20 @@ def run_effect(effect: Effect[Any], arguments: Mapping[str, Any]) -> object:
 
 def make_plan(
     table: EffectTable[Facts],
-    wanted: type[T],
+    target: type[T],
     given: Mapping[Resource, object],
     facts: Facts,
     *,
     everything: bool = False,
     stages: Mapping[str, CullReason] | None = None,
 ) -> EffectPlan[T]:
-    """The plan that makes the fields of the dataclass `wanted`.
+    """The plan that makes the fields of the dataclass `target`.
 
     given: values by their resource; a CullReason in place of a value says why it is absent.
     everything: nothing is culled by a bound. stages: what was left out before the effects; the allowance is theirs too.
     Raises PlanError if nothing writes a resource, or effects need each other.
     """
-    return _Planner(table, given, facts, everything, dict(stages or {})).plan(wanted)
+    return _Planner(table, given, facts, everything, dict(stages or {})).plan(target)
 
 
 class _Planner(Generic[Facts]):
@@ -164,8 +164,8 @@ class _Planner(Generic[Facts]):
         self._coarse: dict[Resource, dict[str, CullReason]] = {}
         self._left_out: dict[str, CullReason] = {}
 
-    def plan(self, wanted: type[T]) -> EffectPlan[T]:
-        reads = wanted_reads(wanted)
+    def plan(self, target: type[T]) -> EffectPlan[T]:
+        reads = target_reads(target)
         for read in reads:
             self._judge(read.resource)
         self._collect(reads)
@@ -173,7 +173,7 @@ class _Planner(Generic[Facts]):
             LeftOut(effect=name, reason=why.reason, error_bound=why.error_bound)
             for name, why in (self._stages | self._left_out).items()
         )
-        return EffectPlan(wanted, tuple(self._order), self._chosen, left_out)
+        return EffectPlan(target, tuple(self._order), self._chosen, left_out)
 
     def _judge(self, resource: Resource) -> CullReason | None:
         """Why a resource is absent; None where it will be there."""
@@ -250,10 +250,10 @@ class _Planner(Generic[Facts]):
             self._coarse[choice.resource] = {choice.name: reason}
 
 
-def wanted_reads(wanted: type[Any]) -> tuple[Read, ...]:
+def target_reads(target: type[Any]) -> tuple[Read, ...]:
     """The fields of a dataclass as reads."""
-    hints = get_type_hints(wanted)
-    return _reads({f.name: hints[f.name] for f in fields(wanted)})
+    hints = get_type_hints(target)
+    return _reads({f.name: hints[f.name] for f in fields(target)})
 
 
 def _reads(hints: Mapping[str, Any]) -> tuple[Read, ...]:

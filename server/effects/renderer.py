@@ -305,9 +305,9 @@ def _composed(
 
 def _reused(plan: Plan, left_out: Mapping[str, CullReason], reason: CullReason) -> Plan:
     """The plan of a frame whose effects were made by an earlier one."""
-    held = _left_out(dict.fromkeys((*left_out, *plan.run), reason))
+    reused = _left_out(dict.fromkeys((*left_out, *plan.run), reason))
     others = (left for left in plan.left_out if left.effect not in left_out)
-    return structs.replace(plan, run=(), left_out=(*held, *others))
+    return structs.replace(plan, run=(), left_out=(*reused, *others))
 
 
 def _with_changes(plan: Plan, changes: Changes) -> Plan:

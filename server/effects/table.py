@@ -32,7 +32,7 @@ EFFECTS: EffectTable[SceneFacts] = EffectTable(
         Effect(f.add_objects),
         Effect(f.reflect, culled_by=(rules.unlit, rules.matt)),
         Effect(f.shade_virtual, culled_by=(rules.unlit,)),
-        Effect(f.shadow_real, culled_by=(rules.out_of_reach,)),
+        Effect(f.shadow_real, culled_by=(rules.no_influence,)),
         Effect(f.bounce_real, disabled_by=(rules.no_indirect,), culled_by=(rules.nothing_bounces,)),
         Effect(f.refine_virtual, disabled_by=(rules.not_refined,), culled_by=(rules.unlit,)),
         Effect(f.refine_real, disabled_by=(rules.not_refined,), culled_by=(rules.no_rims,)),

@@ -47,7 +47,7 @@ class GeometryFrame:
     """If it is lost, pose and surfaces are those of the last good frame."""
     notes: tuple[str, ...]
     """Problems with this frame, one line each."""
-    is_held: bool = False
+    is_reused: bool = False
     """Whether pose and surfaces were kept from the frame before, since nothing has changed."""
 
 
@@ -96,7 +96,7 @@ class Geometry:
             scene = self._scene_radiance(measurement, last.exposure)
             self._fuse(volume, last.volume_from_camera, Measurement(scene, measurement.depth_m), last.exposure)
         notes = input_notes(self._camera, frame, volume)
-        return replace(last, measurement=measurement, scene_radiance=scene, notes=notes, is_held=True)
+        return replace(last, measurement=measurement, scene_radiance=scene, notes=notes, is_reused=True)
 
     def update(
         self, frame: RgbdFrame, measurement: Measurement, volume: Volume, unaligned: str | None = None

@@ -79,8 +79,8 @@ class DirectionalFit:
         spreads = (0.0,) if self.sharp else _SPREADS_RAD
         directions, atoms = _candidates(self.bands, spreads)
         atoms = self.root @ atoms
-        held = np.linalg.qr(self.unit_lights(found))[0]  # what the found ones can take over does not count
-        atoms = atoms - held @ (held.T @ atoms)
+        spanned = np.linalg.qr(self.unit_lights(found))[0]  # what the found ones can take over does not count
+        atoms = atoms - spanned @ (spanned.T @ atoms)
         products = -self.linearised(found)[0] @ atoms
         norms = np.maximum(np.sum(atoms**2, axis=0), 1e-300)
         best = int((np.maximum(products, 0.0) ** 2 / norms).argmax())

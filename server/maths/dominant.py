@@ -128,14 +128,14 @@ def _colored(fit: DirectionalFit, found: Floats, targets: Floats) -> tuple[Domin
 
 def _nonnegative(atoms: Floats, target: Floats) -> Floats:
     """Least squares of a few columns whose factors may not be negative: the most negative is left out, in turn."""
-    held = list(range(atoms.shape[1]))
+    free = list(range(atoms.shape[1]))
     factors = np.zeros(atoms.shape[1])
-    while held:
-        solved = np.linalg.lstsq(atoms[:, held], target, rcond=None)[0]
+    while free:
+        solved = np.linalg.lstsq(atoms[:, free], target, rcond=None)[0]
         if solved.min() >= 0:
-            factors[held] = solved
+            factors[free] = solved
             break
-        del held[int(solved.argmin())]
+        del free[int(solved.argmin())]
     return factors
 
 

@@ -35,33 +35,33 @@ def nonnegative_mean(mean: NDArray[np.float64], precision: NDArray[np.float64]) 
         return mean
     scales, axes = np.linalg.eigh(precision)
     roots = np.sqrt(np.maximum(scales, _LEAST_SCALE * scales[-1]))
-    unwhiten = axes / roots  # x = unwhiten (start + reach force), force >= 0
-    start, reach = roots * (axes.T @ mean), (basis @ unwhiten).T
-    result, held, force = mean, np.empty(0, np.int64), np.empty(0)
+    unwhiten = axes / roots  # x = unwhiten (start + responses force), force >= 0
+    start, responses = roots * (axes.T @ mean), (basis @ unwhiten).T
+    result, active, force = mean, np.empty(0, np.int64), np.empty(0)
     for _ in range(_MOST_STEPS):
         values = basis @ result
         worst = int(values.argmin())
-        if values[worst] >= _TOLERANCE * least or worst in held:
+        if values[worst] >= _TOLERANCE * least or worst in active:
             break
-        held, force = _supported(reach, start, np.append(held, worst), np.append(force, 0.0))
-        result = unwhiten @ (start + reach[:, held] @ force)
+        active, force = _supported(responses, start, np.append(active, worst), np.append(force, 0.0))
+        result = unwhiten @ (start + responses[:, active] @ force)
     return np.asarray(result)
 
 
 def _supported(
-    reach: NDArray[np.float64], start: NDArray[np.float64], held: NDArray[np.int64], force: NDArray[np.float64]
+    responses: NDArray[np.float64], start: NDArray[np.float64], active: NDArray[np.int64], force: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The constraints in `held` with a positive multiplier, and their multipliers; `force`: a first guess, >= 0."""
-    while len(held):
-        wanted = np.asarray(np.linalg.lstsq(reach[:, held], -start, rcond=None)[0], np.float64)
-        pulls = wanted <= 0
+    """The constraints in `active` with a positive multiplier, and their multipliers; `force`: a first guess, >= 0."""
+    while len(active):
+        solved = np.asarray(np.linalg.lstsq(responses[:, active], -start, rcond=None)[0], np.float64)
+        pulls = solved <= 0
         if not pulls.any():
-            return held, wanted
-        steps = np.where(pulls, force / np.maximum(force - wanted, 1e-300), np.inf)
-        first = int(steps.argmin())  # on the way to `wanted` its force ends first
-        force = np.delete(force + steps[first] * (wanted - force), first)
-        held = np.delete(held, first)
-    return held, force
+            return active, solved
+        steps = np.where(pulls, force / np.maximum(force - solved, 1e-300), np.inf)
+        first = int(steps.argmin())  # on the way to `solved` its force ends first
+        force = np.delete(force + steps[first] * (solved - force), first)
+        active = np.delete(active, first)
+    return active, force
 
 
 def nonnegative_sum(base: NDArray[np.float64], deviation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -55,10 +55,10 @@ def robust_location(
     middle, width = shortest_part(values, weights, HEAP)
     scale = max(width / HEAP_OF_NORMAL, least_scale)
 
-    def held(place: float) -> float:
+    def weight_near(place: float) -> float:
         return float(weights[np.abs(values - place) < 2 * scale].sum())
 
-    value = near if held(near) >= 0.5 * held(middle) else middle
+    value = near if weight_near(near) >= 0.5 * weight_near(middle) else middle
     for _ in range(_ROUNDS):
         u = (values - value) / (TUKEY * scale)
         kept = weights * np.square(np.clip(1 - u * u, 0, None))
@@ -72,4 +72,4 @@ def robust_location(
     slope = float(np.where(inside, weights * (1 - u * u) * (1 - 5 * u * u), 0).sum())
     scatter = float(np.square(np.bincount(groups, push)).sum())
     std = np.sqrt(scatter) / slope if slope > 0 else np.inf
-    return Location(value, float(std), scale, held(value) / float(weights.sum()))
+    return Location(value, float(std), scale, weight_near(value) / float(weights.sum()))

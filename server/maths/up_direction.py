@@ -114,8 +114,8 @@ def _best_start(normals: Floats, shares: Floats, camera_up: Floats) -> Floats:
     level = np.sqrt(1 - sine**2)
     counted = (cosines > level) + CEILINGS * (cosines < -level) + WALLS * (np.abs(cosines) < sine)
     # Cameras are held about level: a wall that one looks up at is else taken for the floor that another looks down at.
-    held = (starts @ camera_up) ** 2
-    best: Floats = starts[np.argmax((counted @ shares) * held)]
+    levelness = (starts @ camera_up) ** 2
+    best: Floats = starts[np.argmax((counted @ shares) * levelness)]
     return best
 
 

@@ -77,7 +77,7 @@ class SceneObjects:
         """As move(), with world_from_model `matrix` [4, 4]."""
         self._entries[object_id] = replace(self._entries[object_id], world_from_model=matrix, placement=placement)
 
-    def turn(self, up: NDArray[np.float64]) -> None:
+    def set_up(self, up: NDArray[np.float64]) -> None:
         """Set another up direction [3], unit: objects turn about the points they were placed at."""
         self.up = up
         for object_id, entry in self._entries.items():

@@ -1,8 +1,9 @@
-"""The one loader of OpenCL programs: real files, real includes, device structs in front, sorted defines, built once
+"""The one loader of OpenCL programs: real files with their headers, device structs in front, sorted defines, built once
 per device."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from threading import Lock
 
@@ -19,6 +20,7 @@ _PROLOGUE = """#ifdef __clang__
 """
 """Where a processor has no registers for float16, clang warns that other compilers would pass it otherwise: no call
 leaves a program."""
+_INCLUDE = re.compile(r'#include "([^"]+)"')
 
 Define = int | float | str | bool
 
@@ -36,6 +38,24 @@ def define_options(defines: dict[str, Define]) -> tuple[str, ...]:
         text = f"{float(value)!r}f" if isinstance(value, float) else str(int(value) if value is True else value)
         options.append(f"-D{name}={text}")
     return tuple(options)
+
+
+def with_headers(text: str, name: str) -> str:
+    """The source `text` of the file `name`, with each header in place of its #include line.
+
+    So no compiler option holds the path of this installation, which would be part of the key under which PoCL keeps
+    compiled kernels. Compilers name the files all the same. Each header counts once, as with `#pragma once`.
+    """
+    lines = [f'#line 1 "{name}"']
+    for number, line in enumerate(text.splitlines(), 1):
+        if found := _INCLUDE.match(line):
+            header = found[1]
+            guard = f"INCLUDED_{header.replace('.', '_')}"
+            whole = with_headers((KERNEL_FOLDER / "include" / header).read_text(), header)
+            lines += [f"#ifndef {guard}", f"#define {guard}", whole, "#endif", f'#line {number + 1} "{name}"']
+        else:
+            lines.append("" if line == "#pragma once" else line)
+    return "\n".join(lines) + "\n"
 
 
 class ProgramCache:
@@ -65,8 +85,8 @@ class ProgramCache:
 
     def _build(self, file: str, defines: tuple[str, ...]) -> cl.Program:
         path = next(KERNEL_FOLDER.rglob(file))  # names are unique over the folders
-        source = f'{_PROLOGUE}{struct_text()}#line 1 "{file}"\n' + path.read_text()
-        options = [*self._options, "-I", str(KERNEL_FOLDER / "include"), *defines]
+        source = f"{_PROLOGUE}{struct_text()}{with_headers(path.read_text(), file)}"
+        options = [*self._options, *defines]
         try:
             program: cl.Program = cl.Program(self._context, source).build(options)
         except cl.RuntimeError as error:

@@ -146,10 +146,10 @@ class ClientObjects:
         return tuple(notes)
 
     def _find(self, object_id: str, waiting: _Waiting, view: SpotView) -> list[str]:
-        asked, mesh = waiting.placement, waiting.mesh
-        assert isinstance(asked, SpotPlacement)
+        placement, mesh = waiting.placement, waiting.mesh
+        assert isinstance(placement, SpotPlacement)
         try:
-            found = find_spot(view, mesh, asked, self._room.objects.floors(besides=object_id))
+            found = find_spot(view, mesh, placement, self._room.objects.floors(besides=object_id))
         except SpotUnseen as reason:
             return [f"object {object_id!r} waits: {reason}"] if waiting.tries == 0 else []
         except ValueError as error:
@@ -157,7 +157,7 @@ class ClientObjects:
             return [f"object {object_id!r} is not placed: {error}"]
         to_client = self._alignment.client_from_room
         x, y, z = (float(value) for value in to_client[:3, :3] @ found.position + to_client[:3, 3])
-        problems = self._settle(object_id, mesh, asked.at((x, y, z), found.scale))
+        problems = self._settle(object_id, mesh, placement.at((x, y, z), found.scale))
         return problems or [f"object {object_id!r} stands at {x:.3f},{y:.3f},{z:.3f} {found.words}"]
 
     def _settle(self, object_id: str, mesh: Mesh, placement: Placement) -> list[str]:

@@ -106,7 +106,7 @@ class Room:
         elif (up == self.objects.up).all():
             return notes
         else:
-            self.objects.turn(up)
+            self.objects.set_up(up)
         given = static_estimate(self._wishes, bands, webxr_from_world(up, self._first_view))
         if given:
             self.light.give(given)

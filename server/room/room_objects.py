@@ -78,11 +78,11 @@ class RoomObjects:
                 self._objects.place(object_id, mesh, placement)
             self._waiting.clear()
 
-    def turn(self, up: NDArray[np.float64]) -> None:
+    def set_up(self, up: NDArray[np.float64]) -> None:
         """Set another up direction, after `begin`: objects turn about the points they were placed at. up: [3] unit."""
         assert self._objects is not None
         with self._change():
-            self._objects.turn(up)
+            self._objects.set_up(up)
 
     def inventory(self) -> Inventory:
         """Snapshot of all objects. Thread-safe."""

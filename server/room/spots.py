@@ -75,28 +75,28 @@ class SpotView:
         return tables_of(found, floor), floor
 
 
-def find_spot(view: SpotView, mesh: Mesh, asked: SpotPlacement, taken: Floats) -> FoundSpot:
+def find_spot(view: SpotView, mesh: Mesh, placement: SpotPlacement, taken: Floats) -> FoundSpot:
     """The place of an object in this frame. Raises SpotUnseen; ValueError, one line, if no frame can show it.
 
     taken: [k, 4] room metres: of the objects that are there, the middle of the floor and its radius.
     """
-    spot = asked.spot
+    spot = placement.spot
     if spot.on == "pixel":
-        return FoundSpot(_in_pixel(view, spot), asked.scale or 1.0, _on_pixel(spot))
+        return FoundSpot(_in_pixel(view, spot), placement.scale or 1.0, _on_pixel(spot))
     if spot.on == "ray":
-        return FoundSpot(_on_ray(view, spot), asked.scale or 1.0, "on the surface that its ray meets")
+        return FoundSpot(_on_ray(view, spot), placement.scale or 1.0, "on the surface that its ray meets")
     found, ground = view.surfaces
     tables = [_clear_of(taken, table, view.frame.up) for table in found]
     floor = None if ground is None else _clear_of(taken, ground, view.frame.up)
     if spot.on == "auto":
-        return _auto(view.frame, mesh, asked, tables, floor)
+        return _auto(view.frame, mesh, placement, tables, floor)
     if spot.on == "floor":
         if floor is None:
             raise SpotUnseen("no floor is in view yet")
-        return _on_surface(view.frame, mesh, asked.scale or 1.0, floor, "the floor")
+        return _on_surface(view.frame, mesh, placement.scale or 1.0, floor, "the floor")
     if not tables:
         raise SpotUnseen("no table is in view yet, nor other horizontal surface off the floor")
-    return _on_surface(view.frame, mesh, asked.scale or 1.0, tables[0], _table_words(tables[0], floor))
+    return _on_surface(view.frame, mesh, placement.scale or 1.0, tables[0], _table_words(tables[0], floor))
 
 
 def _in_pixel(view: SpotView, spot: Spot) -> Floats:
@@ -163,7 +163,7 @@ def _on_surface(frame: FrameView, mesh: Mesh, scale: float, surface: HorizontalS
 def _auto(
     frame: FrameView,
     mesh: Mesh,
-    asked: SpotPlacement,
+    placement: SpotPlacement,
     tables: list[HorizontalSurface],
     floor: HorizontalSurface | None,
 ) -> FoundSpot:
@@ -171,10 +171,10 @@ def _auto(
     named = [(table, _table_words(table, floor)) for table in tables] + ([(floor, "the floor")] if floor else [])
     if not named:
         raise SpotUnseen("no horizontal surface is in view yet")
-    if asked.scale is not None:
-        places = [(surface, words) for surface, words in named if _fits(frame, mesh, asked.scale, surface)]
+    if placement.scale is not None:
+        places = [(surface, words) for surface, words in named if _fits(frame, mesh, placement.scale, surface)]
         surface, words = (places or named)[0]
-        return _on_surface(frame, mesh, asked.scale, surface, words)
+        return _on_surface(frame, mesh, placement.scale, surface, words)
     unit, own = guessed_unit(mesh)
     size_m = own * max(float(side) for side in np.subtract(*mesh.bounds[::-1]))
     said = "" if unit == "m" else f"; its numbers are taken as {unit}"

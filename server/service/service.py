@@ -223,7 +223,7 @@ class Service:
         log.info("client refused", extra={"address": address, "code": refusal.code, "reason": refusal.reason})
 
     async def panorama(
-        self, asked: PanoramaOrder, session: str | None = None, room: str | None = None, room_key: str | None = None
+        self, order: PanoramaOrder, session: str | None = None, room: str | None = None, room_key: str | None = None
     ) -> bytes:
         """The file that `asked` describes, of a session; default: the newest one (in `room`).
 
@@ -233,13 +233,13 @@ class Service:
         capture = self._captures.get(name or "")
         if capture is None:
             raise NoSession(f"there is no session {session!r} here" if session else "no session is streaming")
-        if not capture.take_order(asked):
+        if not capture.take_order(order):
             raise TimeoutError
         try:
             async with asyncio.timeout(ORDER_PATIENCE_S):
-                return await asyncio.wrap_future(asked.answer)
+                return await asyncio.wrap_future(order.answer)
         except asyncio.CancelledError:
-            if asked.answer.cancelled():
+            if order.answer.cancelled():
                 raise NoSession("the session has just ended") from None
             raise
 

@@ -246,15 +246,15 @@ class Worker:
             self._outbox.send(encode(part))
         return self._outbox.send(encode(Acknowledged(request=request)))
 
-    def _send_panorama(self, pipeline: ClientSession, asked: RequestPanorama) -> None:
+    def _send_panorama(self, pipeline: ClientSession, request: RequestPanorama) -> None:
         try:
             with self._context.scheduler.acquire(self._share):
-                data, position_m = pipeline.panorama(asked.format, asked.position_m)
+                data, position_m = pipeline.panorama(request.format, request.position_m)
         except ValueError as error:
-            return self._outbox.send(encode(Acknowledged(request=asked.request, error=one_line(str(error)))))
-        panorama = Panorama(request=asked.request, format=asked.format, position_m=position_m, data=data)
+            return self._outbox.send(encode(Acknowledged(request=request.request, error=one_line(str(error)))))
+        panorama = Panorama(request=request.request, format=request.format, position_m=position_m, data=data)
         self._outbox.send(encode(panorama))
-        return self._outbox.send(encode(Acknowledged(request=asked.request)))
+        return self._outbox.send(encode(Acknowledged(request=request.request)))
 
     def _fill_order(self, pipeline: ClientSession, order: PanoramaOrder) -> None:
         if not order.answer.set_running_or_notify_cancel():

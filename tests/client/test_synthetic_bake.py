@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -170,6 +172,25 @@ def test_cache_computes_once(cache_folder: Path) -> None:
         np.testing.assert_array_equal(cache.cached("scene", compute)["a"], np.arange(5.0))
     assert len(calls) == 1
     assert len(list(cache_folder.iterdir())) == 1
+
+
+def test_what_several_need_at_once_is_computed_once(cache_folder: Path) -> None:
+    calls: list[int] = []
+    started = threading.Barrier(4)
+
+    def compute() -> dict[str, np.ndarray]:
+        calls.append(1)
+        return {"a": np.arange(5.0)}
+
+    def ask(_: int) -> np.ndarray:
+        started.wait()
+        return cache.cached("scene", compute)["a"]
+
+    with ThreadPoolExecutor(4) as pool:
+        for found in pool.map(ask, range(4)):
+            np.testing.assert_array_equal(found, np.arange(5.0))
+    assert len(calls) == 1
+    assert [path.suffix for path in cache_folder.iterdir()] == [".npz"]
 
 
 @pytest.mark.parametrize("damage", [lambda d: d[:100], lambda d: d[:0], lambda d: d[:200] + b"\x55" * 8 + d[208:]])

@@ -10,7 +10,6 @@ import tomllib
 from pathlib import Path
 
 import cv2
-import pytest
 
 from client.sources.recording import open_recording
 from server.opencl.device import Device
@@ -56,14 +55,13 @@ def test_it_streams_records_and_shows(device: Device, tmp_path: Path) -> None:
     assert len(open_recording(tmp_path / "session.probeless")) == 3
 
 
-@pytest.mark.parametrize(
-    "words",
-    [("run", SCENE, "--out", "out"), ("serve",), ("demo",), ("devices",), ("tune",), ("explain", SCENE)],
-    ids=lambda words: words[0],
-)
-def test_what_it_cannot_do_ends_with_one_line(words: tuple[str, ...], tmp_path: Path) -> None:
-    done = thin(*words, cwd=tmp_path)
-    assert done.returncode == 1
-    assert done.stdout == ""
-    assert done.stderr.count("\n") == 1, done.stderr
-    assert "an installation of the client alone leaves out: make install" in done.stderr
+def test_what_it_cannot_do_ends_with_one_line(tmp_path: Path) -> None:
+    commands = [["run", SCENE, "--out", "out"], ["serve"], ["demo"], ["devices"], ["tune"], ["explain", SCENE]]
+    done = thin("--each", json.dumps(commands), cwd=tmp_path)
+    results = json.loads(done.stdout)
+    assert len(results) == len(commands)
+    for words, (status, out, error) in zip(commands, results, strict=True):
+        assert (status, out) == (1, ""), words
+        assert error.count("\n") == 1, error
+        assert "an installation of the client alone leaves out: make install" in error
+    assert done.stderr == ""

@@ -1,13 +1,19 @@
 """Runs the command line as an installation of the client alone would: `python -m tests.client.thin_client WORDS...`.
 
-Packages that requirements-client.lock does not list cannot be imported. (OpenCV's larger build stands for the smaller.)
+`--each JSON`, a list of lists of words, runs one after the other and prints what each gave: JSON of [status, standard
+output, standard error]. Packages that requirements-client.lock does not list cannot be imported. (OpenCV's larger build
+stands for the smaller.)
 """
 
 from __future__ import annotations
 
+import json
 import re
 import sys
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from importlib.metadata import packages_distributions
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +47,21 @@ class Without:
         return next((spec for spec in found if spec is not None), None)
 
 
+def run_each(run_command: Callable[[list[str]], int], commands: list[list[str]]) -> list[tuple[int, str, str]]:
+    """Status, standard output and standard error of each command."""
+    results = []
+    for words in commands:
+        with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as error:
+            status = run_command(words)
+        results.append((status, out.getvalue(), error.getvalue()))
+    return results
+
+
 if __name__ == "__main__":
     sys.meta_path[:] = [Without(left_out(), list(sys.meta_path))]
     from client.cli import run_command
 
-    sys.exit(run_command(sys.argv[1:]))
+    if sys.argv[1] == "--each":
+        sys.stdout.write(json.dumps(run_each(run_command, json.loads(sys.argv[2]))))
+    else:
+        sys.exit(run_command(sys.argv[1:]))

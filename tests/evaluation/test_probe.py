@@ -32,19 +32,14 @@ Floats = NDArray[np.float64]
 
 def hits(camera: CameraModel, sphere: Sphere) -> tuple[NDArray[np.bool_], Floats, Floats]:
     """Where a sphere is [h, w], its normals and the views there [n, 3], from the quadratic's textbook solution."""
-    seen, normals, views = np.zeros((camera.height, camera.width), bool), [], []
-    for v in range(camera.height):
-        for u in range(camera.width):
-            ray = np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0])
-            a, b = ray @ ray, -2 * ray @ sphere.center_m
-            c = sphere.center_m @ sphere.center_m - sphere.radius_m**2
-            if b * b - 4 * a * c <= 0:
-                continue
-            point = ray * (-b - np.sqrt(b * b - 4 * a * c)) / (2 * a)
-            seen[v, u] = True
-            normals.append((point - sphere.center_m) / sphere.radius_m)
-            views.append(ray / np.linalg.norm(ray))
-    return seen, np.array(normals), np.array(views)
+    v, u = np.mgrid[: camera.height, : camera.width]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1)
+    a, b = (rays**2).sum(-1), -2 * rays @ sphere.center_m
+    c = sphere.center_m @ sphere.center_m - sphere.radius_m**2
+    seen = b * b - 4 * a * c > 0
+    rays, a, b = rays[seen], a[seen], b[seen]
+    points = rays * ((-b - np.sqrt(b * b - 4 * a * c)) / (2 * a))[:, None]
+    return seen, (points - sphere.center_m) / sphere.radius_m, rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
 SEEN, NORMALS, VIEWS = hits(CAMERA, SPHERE)

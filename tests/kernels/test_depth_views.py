@@ -16,7 +16,7 @@ from server.maths.rigid import inverse_rigid
 from server.objects.rasterize import Placed
 from server.objects.virtual_object import VirtualObject
 from server.opencl.engine import Engine
-from server.opencl.program import KERNEL_FOLDER
+from server.opencl.program import with_headers
 from server.opencl.structs import struct_text
 from server.shading import depth_views as stage
 from server.shading.depth_views import DepthViews, ViewShape, draw_depth_views, view_axes
@@ -133,8 +133,10 @@ def scene_of(
 def probe(engine: Engine, scene: TracedScene, points: Floats, normals: Floats, offset_m: float = 0.0) -> Probed:
     """points, normals [n, 3] with n the directions of all sets. offset_m: > 0 asks for points of virtual surface."""
     defines = [f"-D{name}={value}" for name, value in scene.defines(engine).items()]
-    options = ["-cl-std=CL1.2", "-Werror", "-I", str(KERNEL_FOLDER / "include"), *defines]
-    kernel = cl.Kernel(cl.Program(engine.device.context, struct_text() + SOURCE).build(options), "probe")
+    options = ["-cl-std=CL1.2", "-Werror", *defines]
+    kernel = cl.Kernel(
+        cl.Program(engine.device.context, struct_text() + with_headers(SOURCE, "probe.cl")).build(options), "probe"
+    )
     space, count = engine.workspace, len(points)
     found: list[Any] = [space.array(f"test_found_{k}", (count,), t) for k, t in enumerate((np.int32, "f4", "f4"))]
     places = space.upload("test_places", float4(np.zeros((count, 3)), np.ones(count)))

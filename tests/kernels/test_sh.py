@@ -9,7 +9,7 @@ import pytest
 from server.maths import sh
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.opencl.program import KERNEL_FOLDER
+from server.opencl.program import with_headers
 from tests.reference.sh import lambert_bands, sh_basis
 from tests.scenes.lights import random_directions
 from tests.scenes.sh_kernel import AXES, NEAR_POLES, SOURCE
@@ -18,8 +18,8 @@ from tests.scenes.tolerance import relative_tolerance
 
 @pytest.mark.parametrize("bands", range(2, 7))
 def test_basis_and_lambert(device: Device, engine: Engine, bands: int) -> None:
-    options = ["-cl-std=CL1.2", "-Werror", "-I", str(KERNEL_FOLDER / "include"), f"-DBANDS={bands}"]
-    kernel = cl.Kernel(cl.Program(device.context, SOURCE).build(options), "evaluate")
+    options = ["-cl-std=CL1.2", "-Werror", f"-DBANDS={bands}"]
+    kernel = cl.Kernel(cl.Program(device.context, with_headers(SOURCE, "evaluate.cl")).build(options), "evaluate")
     directions = np.concatenate([AXES, NEAR_POLES, random_directions(500, 1)]).astype(np.float32)
     space, count = engine.workspace, len(directions)
     basis = space.array("basis", (count, bands * bands), np.float32)

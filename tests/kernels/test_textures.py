@@ -15,7 +15,7 @@ from protocol.frames import CameraModel
 from server.objects.rasterize import rasterize
 from server.objects.virtual_object import VirtualObject
 from server.opencl.engine import Engine
-from server.opencl.program import KERNEL_FOLDER
+from server.opencl.program import with_headers
 from server.scene.colors import linear_from_srgb
 from server.scene.materials import Beyond, Material, Texture
 from server.scene.mesh import Mesh
@@ -100,8 +100,8 @@ def test_shrunk(width: int, height: int) -> None:
 @pytest.fixture
 def sample(engine: Engine) -> Any:
     """[n, 3] of texture number `texture` of some materials at uv [n, 2], with its changes."""
-    options = ["-cl-std=CL1.2", "-Werror", "-I", str(KERNEL_FOLDER / "include")]
-    kernel = cl.Kernel(cl.Program(engine.device.context, SOURCE).build(options), "sample")
+    options = ["-cl-std=CL1.2", "-Werror"]
+    kernel = cl.Kernel(cl.Program(engine.device.context, with_headers(SOURCE, "sample.cl")).build(options), "sample")
 
     def run(materials: list[Material], texture: int, uv: Floats, du: Floats, dv: Floats, probes: int = 4) -> Floats:
         tables, space = material_tables(materials), engine.workspace

@@ -15,7 +15,7 @@ from server.objects.object_table import ObjectTable, object_table
 from server.objects.object_tree import FEW_OBJECTS, tree_rows
 from server.objects.virtual_object import VirtualObject
 from server.opencl.engine import Engine
-from server.opencl.program import KERNEL_FOLDER
+from server.opencl.program import with_headers
 from server.opencl.structs import struct_text
 from server.scene.mesh import Mesh
 from tests.reference import voxelize as twin
@@ -41,8 +41,10 @@ Points = NDArray[np.float64]
 @pytest.fixture
 def trace(engine: Engine) -> Any:
     """Visibility of rays (origins [n, 3], directions [n, 3], reach) through a table."""
-    options = ["-cl-std=CL1.2", "-Werror", "-I", str(KERNEL_FOLDER / "include")]
-    kernel = cl.Kernel(cl.Program(engine.device.context, struct_text() + SOURCE).build(options), "trace")
+    options = ["-cl-std=CL1.2", "-Werror"]
+    kernel = cl.Kernel(
+        cl.Program(engine.device.context, struct_text() + with_headers(SOURCE, "trace.cl")).build(options), "trace"
+    )
 
     def run(
         table: ObjectTable, origins: Points, directions: Points, ray_length_m: float = FAR_M

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.opencl.program import KERNEL_FOLDER
+from server.opencl.program import with_headers
 from server.opencl.structs import struct_text
 from server.transfer.radiance_transfer import direction_sets
 from server.transfer.visibility import trace_visibility
@@ -51,8 +51,10 @@ def boxes_of(
     device: Device, engine: Engine, volume: Volume, origins: Floats, normals: Floats, reach: float
 ) -> list[tuple[Floats, Floats]]:
     """Lower and upper corners [boxes, 3] of each point's boxes; voxels."""
-    options = ["-cl-std=CL1.2", "-Werror", "-I", str(KERNEL_FOLDER / "include")]
-    kernel = cl.Kernel(cl.Program(device.context, struct_text() + BOXES).build(options), "boxes")
+    options = ["-cl-std=CL1.2", "-Werror"]
+    kernel = cl.Kernel(
+        cl.Program(device.context, struct_text() + with_headers(BOXES, "boxes.cl")).build(options), "boxes"
+    )
     space, count = engine.workspace, len(origins)
     inputs = [space.upload(f"box_{k}", float4(a)) for k, a in enumerate((origins, normals))]
     outputs = [space.upload(f"box_{name}", float4(np.zeros((count, MOST_BOXES, 3)))) for name in ("low", "high")]

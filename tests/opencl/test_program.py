@@ -77,6 +77,34 @@ def test_includes_resolve(engine: Engine, cache: ProgramCache, folder: Path) -> 
     assert run(engine, cache.get("get.cl", {}), "get") == 41
 
 
+def test_a_header_in_a_branch_that_is_not_taken_counts_not(engine: Engine, cache: ProgramCache, folder: Path) -> None:
+    (folder / "include" / "five.clh").write_text("#pragma once\n#define FIVE 5\n")
+    source = '#ifdef NEVER\n#include "five.clh"\n#endif\n#include "five.clh"\n#include "five.clh"\n'
+    (folder / "get.cl").write_text(source + "kernel void get(global float *r) { r[0] = FIVE + __LINE__; }\n")
+    assert run(engine, cache.get("get.cl", {}), "get") == 5 + 6
+
+
+def test_nothing_that_is_compiled_holds_the_path_of_the_kernels(
+    cache: ProgramCache, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """PoCL keeps compiled kernels by source and options: those of one checkout serve every other."""
+    (folder / "include" / "inner.clh").write_text("#pragma once\n#define INNER 20\n")
+    (folder / "get.cl").write_text('#include "inner.clh"\nkernel void get(global float *r) { r[0] = INNER; }\n')
+    compiled: list[str] = []
+
+    class Program:
+        def __init__(self, _context: cl.Context, source: str) -> None:
+            compiled.append(source)
+
+        def build(self, options: list[str]) -> None:
+            compiled.extend(options)
+
+    monkeypatch.setattr(cl, "Program", Program)
+    cache.get("get.cl", {"VALUE": 2})
+    assert "-DVALUE=2" in compiled
+    assert str(folder) not in "".join(compiled)
+
+
 def test_a_build_error_names_file_options_and_line(cache: ProgramCache, folder: Path) -> None:
     (folder / "wrong.cl").write_text("kernel void wrong(global int *x) {\n    x[0] = undeclared_name;\n}\n")
     with pytest.raises(KernelBuildError) as caught:

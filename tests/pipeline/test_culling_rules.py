@@ -20,7 +20,7 @@ from server.shading.composite import srgb_codes
 LEVELS = np.linspace(0.0, 1.0, 1001)
 DARK = Brightness(picture=0.0, arriving=1e-5, shading=1e-5, object_sent=1e-6, real_sent=0.0)
 LIT = Brightness(picture=0.9, arriving=2.0, shading=1.0, object_sent=0.4, real_sent=0.9)
-FACTS = SceneFacts(objects_in_view=1, indirect=True, brightness=LIT, reach=UNKNOWN)
+FACTS = SceneFacts(objects_in_view=1, indirect=True, brightness=LIT, influence=UNKNOWN)
 
 
 def test_codes_are_srgb() -> None:
@@ -55,7 +55,7 @@ def test_gloss_is_bounded_by_its_materials() -> None:
     """A smooth dielectric reflects most at grazing angles; a rough one little; a texture may say anything."""
     smooth, rough = (np.array([[r, 0.0, -1, -1]], np.float32) for r in (0.1, 1.0))
     assert most_reflected(smooth, 0.5) > 0.7
-    assert most_reflected(rough, 0.5) < 0.12
+    assert most_reflected(rough, 0.5) < 0.03  # seen: 0.016
     assert most_reflected(np.array([[1.0, 0.0, -1, 0]], np.float32), 0.5) == 1.0
     both = np.concatenate([rough, smooth, rough])
     assert most_reflected(both, 0.5) == most_reflected(smooth, 0.5)
@@ -65,7 +65,7 @@ def test_gloss_is_bounded_by_its_materials() -> None:
     assert most_reflected(np.array([[0.3, 1.0, -1, -1]], np.float32), 1.0) == 1.0  # metal keeps all diffuse light
 
 
-@pytest.mark.parametrize("rule", [o.unlit, o.matt, o.out_of_reach, o.dark_things, o.nothing_bounces, o.no_rims])
+@pytest.mark.parametrize("rule", [o.unlit, o.matt, o.no_influence, o.dark_things, o.nothing_bounces, o.no_rims])
 def test_what_is_not_known_is_not_left_out(rule: object) -> None:
     facts = SceneFacts(objects_in_view=1, indirect=True, glossy=True)
     assert rule(facts) is None  # type: ignore[operator]
@@ -81,31 +81,31 @@ def test_nothing_is_lit_in_the_dark() -> None:
 
 
 def test_reach_bounds_the_picture() -> None:
-    near = replace(FACTS, reach=InfluenceBound(0.004, 0.001, 0.5))
-    found = o.out_of_reach(near)
+    near = replace(FACTS, influence=InfluenceBound(0.004, 0.001, 0.5))
+    found = o.no_influence(near)
     assert found is not None
     assert found.error_bound == pytest.approx(o.codes_of_share(0.006))
-    assert o.out_of_reach(replace(FACTS, reach=InfluenceBound(0.01, 0.01, 0.5))) is None
-    assert o.out_of_reach(replace(FACTS, reach=NOWHERE)).error_bound == 0.0  # type: ignore[union-attr]
-    black = replace(near, brightness=DARK, reach=InfluenceBound(0.9, 0.9, 0.5))
-    assert o.out_of_reach(black).error_bound == 0.0  # type: ignore[union-attr]
+    assert o.no_influence(replace(FACTS, influence=InfluenceBound(0.01, 0.01, 0.5))) is None
+    assert o.no_influence(replace(FACTS, influence=NOWHERE)).error_bound == 0.0  # type: ignore[union-attr]
+    black = replace(near, brightness=DARK, influence=InfluenceBound(0.9, 0.9, 0.5))
+    assert o.no_influence(black).error_bound == 0.0  # type: ignore[union-attr]
 
 
 def test_bounced_light_is_bounded_by_what_it_bounces_off() -> None:
-    assert o.nothing_bounces(replace(FACTS, reach=InfluenceBound(math.inf, 0.5, 0.1))) is None
-    open_floor = o.nothing_bounces(replace(FACTS, reach=InfluenceBound(math.inf, 0.5, 0.002)))
+    assert o.nothing_bounces(replace(FACTS, influence=InfluenceBound(math.inf, 0.5, 0.1))) is None
+    open_floor = o.nothing_bounces(replace(FACTS, influence=InfluenceBound(math.inf, 0.5, 0.002)))
     assert open_floor is not None
     assert open_floor.error_bound == pytest.approx(o.codes_of_share(0.003))
     much = o.codes_of_share(0.006)
     assert ALLOWANCE - o.ELSEWHERE < much < ALLOWANCE
     assert (
-        o.nothing_bounces(replace(FACTS, reach=InfluenceBound(math.inf, 0.5, 0.004))) is None
+        o.nothing_bounces(replace(FACTS, influence=InfluenceBound(math.inf, 0.5, 0.004))) is None
     )  # parts of the picture come first
 
 
 def test_rims_are_only_where_the_ratio_varies() -> None:
-    assert o.no_rims(replace(FACTS, reach=InfluenceBound(0.05, 0.0, 0.2))) is not None
-    assert o.no_rims(replace(FACTS, reach=InfluenceBound(0.07, 0.0, 0.2))) is None
+    assert o.no_rims(replace(FACTS, influence=InfluenceBound(0.05, 0.0, 0.2))) is not None
+    assert o.no_rims(replace(FACTS, influence=InfluenceBound(0.07, 0.0, 0.2))) is None
 
 
 def test_what_is_spared_elsewhere_is_shared_out() -> None:
@@ -120,8 +120,8 @@ def test_what_is_spared_elsewhere_is_shared_out() -> None:
 
 
 def test_no_more_returns_than_real_surface_sends_and_can_lose_or_gain() -> None:
-    assert replace(FACTS, reach=InfluenceBound(0.1, 0.05, 0.2)).returned == pytest.approx(0.1 * LIT.real_sent)
-    assert replace(FACTS, reach=InfluenceBound(math.inf, 0.5, 0.2)).returned == pytest.approx(1.5 * LIT.real_sent)
+    assert replace(FACTS, influence=InfluenceBound(0.1, 0.05, 0.2)).returned == pytest.approx(0.1 * LIT.real_sent)
+    assert replace(FACTS, influence=InfluenceBound(math.inf, 0.5, 0.2)).returned == pytest.approx(1.5 * LIT.real_sent)
     assert FACTS.returned == math.inf
     assert replace(FACTS, brightness=DARK).returned == 0.0
 
@@ -129,6 +129,6 @@ def test_no_more_returns_than_real_surface_sends_and_can_lose_or_gain() -> None:
 def test_black_things_send_nothing() -> None:
     black = replace(FACTS, brightness=replace(LIT, object_sent=0.0))
     assert o.dark_things(black).error_bound == 0.0  # type: ignore[union-attr]
-    out_of_view = replace(FACTS, objects_in_view=0, reach=InfluenceBound(1.0, 0.001, 0.0))
+    out_of_view = replace(FACTS, objects_in_view=0, influence=InfluenceBound(1.0, 0.001, 0.0))
     assert o.dark_things(out_of_view) is not None
     assert o.dark_things(replace(out_of_view, objects_in_view=1)) is None  # they may be seen by one another

@@ -289,7 +289,7 @@ PLAIN: dict[Any, object] = {SharpLight: SOFT, RealDepthViews: TRACED, Indirect: 
     [
         (
             {**PLAIN, VirtualObjects: NO_OBJECT, Transfer: NO_OBJECT, Averages: OWN_SCALE},
-            SceneFacts(objects_in_view=0, reach=NOWHERE, brightness=BOUNDED),
+            SceneFacts(objects_in_view=0, influence=NOWHERE, brightness=BOUNDED),
             set(),
             {
                 **dict.fromkeys(("rasterize", "cover"), "there is no virtual object"),
@@ -317,7 +317,7 @@ PLAIN: dict[Any, object] = {SharpLight: SOFT, RealDepthViews: TRACED, Indirect: 
         ),
         (
             {},
-            SceneFacts(objects_in_view=0, adaptive=True, indirect=True, reach=NOWHERE, brightness=BOUNDED),
+            SceneFacts(objects_in_view=0, adaptive=True, indirect=True, influence=NOWHERE, brightness=BOUNDED),
             set(),
             dict.fromkeys(("rasterize", "cover", *LIT), "in view")
             | dict.fromkeys(OF_REAL, "hardly change")
@@ -340,7 +340,7 @@ PLAIN: dict[Any, object] = {SharpLight: SOFT, RealDepthViews: TRACED, Indirect: 
         ),
         (
             {RealDepthViews: TRACED},
-            SceneFacts(objects_in_view=1, adaptive=True, indirect=True, brightness=BOUNDED, reach=NOWHERE),
+            SceneFacts(objects_in_view=1, adaptive=True, indirect=True, brightness=BOUNDED, influence=NOWHERE),
             SHADED | {"light_objects", "refine_virtual", "match_average", "shadow_map", "direct_virtual"},
             {**BY_RAYS, "reflect": "glossy"} | dict.fromkeys(OF_REAL, "hardly change") | {"refine_real": ""},
         ),

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 LEVEL_EDGE = 0.7
-"""Difference of the mean logarithms of neighbouring patches from which paint, and not shading, has an edge there: over
-the 15 cm between them, light falls to half only beside a lamp or in the rim of a shadow."""
+"""If the mean logarithms of neighbouring patches differ by more than this, paint has an edge there, and not shading:
+over the 15 cm between them, light falls to half only beside a lamp or in the rim of a shadow."""
 CHROMA_EDGE = 0.2
-"""The same of either coordinate of log chroma."""
+"""The same for each coordinate of log chroma."""
 _OFFSETS = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), -1).reshape(-1, 3)[14:]
 """[13, 3] to one of each two opposite neighbours in a grid."""
 
@@ -17,10 +17,10 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-def segments(keys: Ints, looks: Floats) -> Ints:
+def segments(keys: Ints, colors: Floats) -> Ints:
     """[n] from 0: which surface each patch is part of.
 
-    keys: [n, 6] cell of a grid and rounded normal, all different; looks: [n, 3] mean logarithm and chroma.
+    keys: [n, 6] cell of a grid and rounded normal, all different; colors: [n, 3] mean logarithm and chroma.
     """
     number = _numbers(keys)
     order = np.argsort(number)
@@ -32,7 +32,7 @@ def segments(keys: Ints, looks: Floats) -> Ints:
         first.append(np.flatnonzero(found))
         second.append(order[place[found]])
     one, other = np.concatenate(first), np.concatenate(second)
-    apart = np.abs(looks[one] - looks[other])
+    apart = np.abs(colors[one] - colors[other])
     is_alike = (apart[:, 0] < LEVEL_EDGE) & (apart[:, 1:].max(axis=1) < CHROMA_EDGE)
     return _components(len(keys), one[is_alike], other[is_alike])
 

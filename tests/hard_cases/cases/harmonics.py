@@ -8,7 +8,7 @@ import pyopencl as cl
 from server.maths.nonnegative import faded
 from server.maths.sh import rotate_sh, spherical_fibonacci
 from server.maths.sh import sh_basis as host_basis
-from server.opencl.program import KERNEL_FOLDER
+from server.opencl.program import with_headers
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial
 from tests.reference.composite import srgb_codes
 from tests.reference.sh import open_transfer, sh_basis
@@ -22,8 +22,8 @@ _SUN = unit([0.3, -0.8, -0.5])
 
 def _evaluate(trial: Trial, directions: Floats, bands: int) -> Floats:
     """[n, bands^2] of include/sh.clh."""
-    options = ["-cl-std=CL1.2", "-Werror", "-I", str(KERNEL_FOLDER / "include"), f"-DBANDS={bands}"]
-    kernel = cl.Kernel(cl.Program(trial.device.context, SOURCE).build(options), "evaluate")
+    options = ["-cl-std=CL1.2", "-Werror", f"-DBANDS={bands}"]
+    kernel = cl.Kernel(cl.Program(trial.device.context, with_headers(SOURCE, "evaluate.cl")).build(options), "evaluate")
     space, count = trial.engine.workspace, len(directions)
     basis = space.array("basis", (count, bands * bands), np.float32)
     lambert = space.array("lambert", (bands,), np.float32)

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from server.light.panorama import panorama_directions
 
 BRIGHT = 4.0
-"""Times the mean luminance over the sphere: a lamp or a window is 10 to 1000 times as bright, a lit white wall 2."""
+"""Threshold of bright parts, in mean luminances of the sphere. A lamp or window has 10 to 1000, a lit white wall 2."""
 LEAST_BRIGHT = 1.2
-"""Times the mean luminance: where nothing is as bright, light is the same from everywhere and has no direction."""
+"""If nothing is as bright, in mean luminances, light is the same from everywhere and there is no bright part."""
 MOST_LIGHTS = 8
-"""Engines draw a shadow map for each."""
+"""Most bright parts: engines draw a shadow map for each."""
 LEAST_SHARE = 0.02
-"""Of the irradiance of all bright parts together: weaker ones stay in the picture."""
+"""Least share of the irradiance of all bright parts together: weaker parts stay in the picture."""
 _REC709 = np.array([0.2126, 0.7152, 0.0722])
 
 Floats = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""What a run was, as its page says it."""
+"""Description of a run, for its page."""
 
 from __future__ import annotations
 

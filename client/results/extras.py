@@ -1,4 +1,4 @@
-"""Options that need a package which `make install` does not install: checked before a run begins."""
+"""Options that need a package that `make install` does not install: checked before a run begins."""
 
 from __future__ import annotations
 

@@ -19,19 +19,19 @@ from protocol.frames import CameraModel
 
 Floats = NDArray[np.float64]
 MOST_CELLS = 250_000
-"""Nine bytes each: 3 MB of base64."""
+"""Most cells of the cloud. Each takes nine bytes, together 3 MB of base64."""
 ENLARGED = 2**0.5
-"""By this much at a time: it halves the number of cells on a surface."""
+"""Factor by which cells are enlarged at a time: it halves the number of cells on a surface."""
 FIRST_CELL_M = 0.008
-"""Finer than a pixel of a depth camera at 4 m."""
+"""Size of the first cells: finer than a pixel of a depth camera at 4 m."""
 LARGEST_CELL_M = 0.05
-"""For points that are few; larger ones show no shapes."""
+"""Size of the largest cells, for clouds with few points; still larger ones show no shapes."""
 SAMPLES = 12_000
 """Depth pixels of a frame that are used."""
 DENSE_FRAMES, DENSER = 6, 2
-"""So many frames are sampled at a grid that is so much finer, so that a short run has a scan to be seen."""
+"""The first frames, and the factor by which their grid is finer, so that the scan of a short run can be recognised."""
 GRIDS = 5
-"""Grids of pixels that frames use in turn: those of a still camera differ, and few are kept."""
+"""Number of pixel grids that frames use in turn, so that frames of a still camera differ. Few, since they are kept."""
 _PENDING = 200_000
 """Points that are gathered before they are sorted into cells."""
 FARTHEST_M = 10.0
@@ -39,7 +39,7 @@ FARTHEST_M = 10.0
 _CERTAIN_FRAMES = 5
 """From this many frames on, cells that were met in one frame only are left out: noise, and things that moved."""
 _MOST_LEFT_OUT = 0.3
-"""Share of the cells: if more were met in one frame only, there are too few points for cells of this size."""
+"""If more than this share of the cells was met in one frame only, there are too few points for cells of this size."""
 _HALF = 1 << 20
 """Cells to each side of the world's origin: 21 bits an axis."""
 

@@ -14,11 +14,11 @@ from client.errors import OutputError
 TICKS_PER_S = 90_000
 """Time base of MPEG; every usual frame rate is a whole number of ticks."""
 RATE_FACTOR, PRESET = 18, "veryfast"
-"""Of x264: 18 is hardly told from the picture itself."""
+"""Settings of x264: a video of rate factor 18 is hardly distinguishable from its source."""
 KEY_PICTURE_EVERY = 30
-"""Pictures: so that a player finds each place quickly."""
+"""Number of pictures from one key picture to the next: few enough that a player finds any place quickly."""
 LONGEST_PAUSE_S = 5.0
-"""A longer time between two frames is shown as this."""
+"""A longer time between two frames is shortened to this."""
 
 
 class VideoFile:

@@ -12,14 +12,14 @@ from server.volume.volume import Volume
 
 
 class _Buffers(StageBuffers):
-    """By the number of points, rounded up to a power of two, so that a steady stream allocates nothing."""
+    """Keyed by the number of points, rounded up to a power of two, so that a steady stream allocates nothing."""
 
     points = KeyedBufferDescription(cl_types.float4)
     normals = KeyedBufferDescription(cl_types.float4)
     directions = KeyedBufferDescription(cl_types.float4)
-    """By the number of sets, rounded, and of directions."""
+    """Keyed by the number of sets, rounded, and of directions."""
     arrivals = KeyedBufferDescription(cl_types.float4)
-    """By the number of points, rounded, and of directions."""
+    """Keyed by the number of points, rounded, and of directions."""
 
 
 def trace_arrivals(

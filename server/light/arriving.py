@@ -18,10 +18,11 @@ DIRECTIONS = 1024
 """Directions from a place. Each stands for 0.012 sr, a cone of 3.6 degrees radius; the finest of 16 coefficients turns
 once in 120 degrees. The cost grows with their number; a place may take at most 2 ms."""
 BANDS = 4
-"""Of the light at a place: 16 coefficients, as the wire has."""
+"""SH bands of the light at a place: 16 coefficients, as in the wire format."""
 
 _FAR_M = 1e5
-"""A place farther off is looked up here: from so far the volume, some metres wide, is met by none of the directions."""
+"""Largest distance from the origin at which a place is looked up; farther places are moved here. From so far away no
+direction meets the volume, which is some metres wide."""
 
 Floats = NDArray[np.float64]
 BeyondScan = Callable[[Floats, Floats], Floats]

@@ -27,16 +27,16 @@ from server.volume.raycast import Surface
 from server.volume.volume import Volume
 
 VIEWS, VIEW_SAMPLES = 6, 200
-"""Views that a search looks at, and samples of each: its time goes with their number."""
+"""Number of views in a search, and of samples in each view. The time of a search grows with both."""
 FRAMES_A_VIEW = 8
 FIRST_VIEWS = 3
-"""With which the first search begins."""
+"""Number of views after which the first search begins."""
 MOST_WAITING_FRAMES = 192
-"""Between searches that find the same again: the time doubles up to that, and views are the further apart."""
+"""Longest time between two searches. It doubles while searches find the same lamps; views then are further apart."""
 STEPS_A_FRAME = 6
-"""Of a search; none where a new view is taken, so that no frame is a slow one."""
+"""Steps of a search in one frame. A frame in which a new view is taken has none, so that no frame is slow."""
 CHANGED = 0.25
-"""Misfit of a new view under what was found: beyond this, and three times what the search left, the light changed."""
+"""The light has changed if the misfit of a new view exceeds this, and three times the misfit that the search left."""
 
 
 class LampFinder:
@@ -63,7 +63,7 @@ class LampFinder:
 
     @property
     def found(self) -> Found | None:
-        """By the last complete search; None before, and where the light has changed since."""
+        """Result of the last complete search; None before the first one, and after the light has changed."""
         return self._found
 
     def resume(self, found: Found | None) -> None:
@@ -72,7 +72,7 @@ class LampFinder:
         self._found, self.lamps = found, found.emitters if found else ()
 
     def work(self, camera: CameraModel, radiance: cl_array.Array, surface: Surface, volume: Volume) -> None:
-        """One frame's part of it; `lamps` are then as the last complete search has them, in volume space.
+        """Do one frame's part of a search. `lamps` are then those of the last complete search, in volume space.
 
         radiance: [h, w] float4 as in Measurement, with the lamps' light.
         """
@@ -98,7 +98,7 @@ class LampFinder:
         return tuple(replace(lamp, position=lamp.position + origin_world) for lamp in self.lamps)
 
     def left_out(self) -> tuple[LeftOut, ...]:
-        """What is not yet drawn of them."""
+        """Effects of the lamps that are not rendered yet."""
         reason = "virtual objects are not yet lit by lamps in the room"
         return (LeftOut(effect="lamplight", reason=reason, error_bound=None),) if self.lamps else ()
 
@@ -109,7 +109,7 @@ class LampFinder:
             self._take(end.value)
 
     def _take(self, found: Found) -> None:
-        """The result of a search. Where it is news, look again soon."""
+        """Take the result of a search. If it differs from the last one, the next search begins soon."""
         same = self._found is not None and len(found.emitters) == len(self.lamps)
         self._wait_frames = min(2 * self._wait_frames, MOST_WAITING_FRAMES) if same else VIEWS * FRAMES_A_VIEW
         self._found, self.lamps = found, found.emitters

@@ -33,18 +33,18 @@ LEAST_OPENNESS = 0.05
 LEAST_FLATNESS = 0.95
 """Samples nearer to an edge have a normal and a colour that may belong to two surfaces."""
 LEAST_FLAT_SHARE = 0.1
-"""Of the samples that are used at least, the flattest: one picture's depth, not fused yet, is nowhere flat."""
+"""Least share of the samples that is used, the flattest ones: in depth of one picture, not fused, no sample is flat."""
 FORGETTING = 0.9
-"""What remains of earlier frames' evidence a frame later while the light is steady: a memory of ten frames (5.4), for
-what these frames see."""
+"""Factor by which earlier evidence counts less with each frame while the light is steady: a memory of ten frames (5.4).
+It applies to what the new frames see."""
 CHANGED_FORGETTING = 0.3
-"""The same where the frame contradicts the light so far: a new light has 97 % of the weight after 3 frames."""
+"""The same factor if a frame contradicts the light so far: a new light has 97 % of the weight after 3 frames."""
 CHANGE = 3.0
 """The light has changed if the frame's misfit under it is this many times what the frame's own best fit leaves."""
 _LEAST_MISFIT = 1e-4  # of the frame's energy: below it a ratio of misfits says nothing
 MODEL_DOUBT = 1.3
-"""Of the standard deviation over what the residuals tell of it: so that 95 % intervals hold what they should, by scenes
-of known light (tests/bench/light/honesty.py)."""
+"""Ratio of the stated standard deviation to the one that follows from the residuals. It is chosen on scenes of known
+light, so that 95 % intervals contain the true light in 95 % of cases (tests/bench/light/honesty.py)."""
 THESIS_FORGETTING = 0.9
 COLOR_DEVIATION = 0.2
 """Prior size of a channel's deviation from its multiple of the luminance, relative to the luminance's."""
@@ -259,11 +259,11 @@ class LightEstimator:
         return self.estimate()
 
     def evidence(self) -> Evidence:
-        """All that it knows."""
+        """Everything that the estimate depends on."""
         return Evidence(self._evidence, self._weight, self._dependence)
 
     def resume(self, known: Evidence) -> None:
-        """Go on with the `evidence` of one for as many bands."""
+        """Continue from the `evidence` of an estimator with as many bands."""
         self._evidence, self._weight, self._dependence = known.equations, known.weight, known.dependence
 
     def estimate(self) -> LightEstimate:
@@ -281,7 +281,7 @@ class LightEstimator:
         return LightEstimate(mean / ASSUMED_ALBEDO, std, luminance.condition, valid=bool(fixed))
 
     def _beside(self, frame: NormalEquations, forgetting: float) -> NormalEquations:
-        """What is kept of earlier frames; while the light is steady, all that `frame` says nothing about."""
+        """Earlier evidence that is kept; while the light is steady, all on which `frame` has no bearing."""
         if self._evidence is None:
             return frame.scaled(0.0)
         if forgetting != FORGETTING or self._as_thesis:

@@ -20,16 +20,16 @@ from server.volume.raycast import Surface
 from server.volume.volume import BRICK, Volume
 
 CLEARANCE_M = 0.08
-"""What is nearer to a lamp than this is the lamp: its bulb and shade do not shadow it."""
+"""Surface nearer to a lamp than this belongs to the lamp: its bulb and shade cast no shadow."""
 _GRID_M = 0.25
 _SURROUND_M, _PATCH_M, _PATCH_POINTS = 0.4, 0.8, 3
 
 
 class Emitters:
-    """What samples would see of emitters anywhere in the volume."""
+    """The light that samples would receive from emitters anywhere in the volume."""
 
     def __init__(self, engine: Engine, volume: Volume, samples: PooledSamples, name: str = "near") -> None:
-        """`name`: of the samples on the device; those of another search at the same time need another."""
+        """`name`: of the buffers for the samples. Two searches at the same time need different names."""
         self._engine = engine
         self._volume = volume
         self._count = len(samples)
@@ -63,7 +63,7 @@ class Emitters:
 
 
 _VECTORS_STEP, _SHARES_STEP = 2048, 1 << 20
-"""Arrays grow in such steps, so that searches of about one size take no new memory."""
+"""Arrays grow in these steps, so that searches of similar size allocate no new memory."""
 
 
 def _upload(engine: Engine, name: str, vectors: NDArray[np.float64]) -> cl_array.Array:

@@ -33,15 +33,16 @@ from server.volume.raycast import Surface
 from server.volume.volume import Volume
 
 LOBES = 96
-"""Of the distant light that a lamp has to be told from: so fine that a band-limited sky is well within their reach."""
+"""Number of lobes that represent the distant light, from which a lamp must be distinguished: enough to represent any
+band-limited sky well."""
 LEAST_SHARE = 0.5
-"""Of a pool's samples: fewer have too few directions between them."""
+"""Least share of usable samples in a pool: fewer have too few directions together."""
 _POOL = 4
 _SPARE = 1.25  # pools that are traced for one that is asked for: some turn out to see too little of the sky
 _RAYS, _BANDS = 81, 4
 _SPACING = 1 / 160
-"""Of samples, in picture widths: pools of twice the size smear the light of a lamp half a metre away, which then is
-found 12 instead of 4 cm from its place."""
+"""Spacing of samples in picture widths. Pools of twice the size blur the light of a lamp half a metre away: it is found
+12 cm from its place instead of 4 cm."""
 _LOBE_SHARPNESS = 20.0  # half of the peak at 15 degrees; neighbours are 21 degrees apart
 
 

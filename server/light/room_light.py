@@ -35,7 +35,7 @@ class KnownRoomLight:
     given: LightEstimate | None
     evidence: Evidence | None
     remembered: LightEstimate | None
-    """What was told last."""
+    """The light that clients were told last."""
     room: KnownRoom | None = None
     """None in saves of earlier programs."""
 
@@ -53,7 +53,7 @@ class RoomLight:
         self._model = RoomModel(switches)
         self._given: LightEstimate | None = None
         self._remembered: LightEstimate | None = None
-        """Of earlier frames, until the first new one."""
+        """The light of earlier frames, until the first new frame."""
 
     @property
     def is_given(self) -> bool:

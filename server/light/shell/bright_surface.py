@@ -22,22 +22,23 @@ from server.volume.volume import Volume
 CELL_M = 0.3
 """Side of the grid's cells: half a window pane. From a metre away its light comes from one direction."""
 MOST_EMITTERS = 64
-"""The largest in a room; rays meet the others by chance."""
+"""Only the largest emitters of a room are kept; evenly spread rays meet the others by chance."""
 PRESENCE = 10.0
-"""Frames that whether a cell is clipped is remembered for: a lamp that is switched off is none half a second later."""
+"""Number of frames over which clipping of a cell is averaged. A lamp that is switched off is gone in half a second."""
 LEAST_PRESENCE, MOST_PRESENCE = 0.25, 0.75
-"""Shares of the frames that show it clipped: up to the first a cell is no emitter, from the second it is one."""
+"""Share of the frames that show a cell clipped: up to the first value it is no emitter, from the second on it is
+one."""
 ENOUGH_RAYS = 4.0
-"""Of evenly spread rays that meet an emitter: with more, their count is better than one ray to its middle."""
+"""Number of evenly spread rays that meet an emitter from which on their count is better than one ray to its middle."""
 ROUND, FLAT = 2 / 3, 0.9
 """Length of the mean normal of half a sphere, as a picture shows it, and of a plane with a scan's noise."""
 MOVED_M = 0.05
-"""Distance from which visibility is traced again: a bulb's size."""
+"""An emitter that moved by more than this, the size of a bulb, has its visibility traced again."""
 NEARBY_M = 0.25
-"""Standard deviation of the distance of surface that receives the same light."""
+"""Surface within this distance (standard deviation) is taken to receive the same light."""
 UNLIT, LIT = 0.25, 0.5
-"""Of what a saturated surface sends: where less than the first arrives nearby it is a lamp, where more than the second,
-it may be bright paint in that light."""
+"""Ratio of the light that arrives nearby to the light that a saturated surface sends. Below the first value the surface
+is a lamp; above the second, it may be bright paint in that light."""
 _LEAST_COSINE = 0.2
 
 Floats = NDArray[np.float64]

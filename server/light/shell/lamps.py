@@ -22,12 +22,12 @@ from server.maths.dominant import MOST_LIGHTS
 WINDOW_M = 0.5
 """Standard deviation of the window: a ceiling panel or half a window."""
 WEAK, STRONG = 0.05, 0.15
-"""Shares of the radiance that arrives from the shell: a lamp below the first is none, one above the second is taken out
-whole. Between them it fades in."""
+"""Shares of the radiance that arrives from the shell. Below the first value a mode is no lamp; above the second its
+light becomes a disc completely; between the two, in part."""
 LEAST_RADIUS_M, LEAST_BULB_M = 0.05, 0.02
-"""Of a disc on the shell, and of one of saturated surface: smaller ones have shadows as sharp."""
+"""Least radius of a disc on the shell, and of one of saturated surface: shadows of smaller discs are no sharper."""
 TOUCHING_M = 1.5 * CELL_M
-"""Distance of emitters that are parts of one window."""
+"""Emitters nearer to each other than this are parts of one window."""
 _SHIFTS = 12
 
 Floats = NDArray[np.float64]

@@ -19,17 +19,17 @@ from server.opencl.engine import Engine
 from server.volume.volume import Volume
 
 PATCH_M = 0.15
-"""Side of the grid's cells: shading changes little over it but at contacts, and a room has about 1000 of them."""
+"""Side of the grid's cells. Shading changes little within one, except at contacts; a room has about 1000 patches."""
 REGION_M = 0.4
 """Side of the regions over which a material may differ from what its colour says (objective.py)."""
 MOST_PATCHES = 1536
-"""The patch that was not seen for longest makes way for another. 8 rooms' worth of what one picture shows."""
+"""Beyond this number a new patch replaces the one that was not seen for longest. One picture shows an eighth of it."""
 RAYS = 128
-"""Rays of a patch, evenly spread over its cosine-weighted hemisphere: a lamp of 1 % of it is met by one of them."""
+"""Rays of a patch, evenly spread over its cosine-weighted hemisphere: one of them meets a lamp that fills 1 % of it."""
 TRACED_A_FRAME = 64
-"""Patches whose rays are traced in a frame once all are: the scan behind them goes on growing."""
+"""Patches whose rays are traced again in each frame, once all have been traced: the scan around them keeps growing."""
 MOST_WEIGHT = 30.0
-"""Frames that a patch's mean remembers."""
+"""Number of frames over which a patch is averaged."""
 _FORGOTTEN = 1e-3  # frames: a patch of less weight is none
 _CHANGED_BY_FRAMES = (
     *("weights", "positions", "normals", "logarithms", "variances", "clipped"),

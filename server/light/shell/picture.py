@@ -16,7 +16,7 @@ from server.volume.raycast import Surface
 from server.volume.volume import Volume
 
 LEAST_SHARE = 0.6
-"""Of a block of pixels that must lie on one surface."""
+"""Least share of a block's pixels that must lie on one surface."""
 _BLOCKS_ACROSS = 40  # blocks of pixels along a picture's width
 _TOLERANCE_VOXELS = 1.5
 

@@ -25,19 +25,20 @@ from server.light.shell.solver import LEAST_PATCHES, Solver
 from server.light.shell.switches import Switches
 
 STEADY, CHANGED = 0.2, 0.3
-"""Changes of log radiance, root mean square over the ways that patches face of their median: up to the first (.19 at
-most in the real kitchen, whose exposure varies, .03 in rooms) nothing is forgotten, from the second (a lamp that goes
-45 degrees around a table makes .32) everything is."""
+"""Change of log radiance: the median over patches that face one way, then the root mean square over all ways to face.
+Up to the first value nothing is forgotten (the real kitchen, whose exposure varies, has .19 at most, rooms .03); from
+the second on everything is (a lamp that goes 45 degrees around a table makes .32)."""
 SOLVE_EVERY = 3
-"""Frames that one solution takes in, as long as the light is steady and little of the room is new: what frames show is
-summed in between. The goal is that a change is followed within three."""
+"""Frames between two solutions, as long as the light is steady and little of the room is new: evidence is summed in
+between. The goal is that a change is followed within three frames."""
 NEW_SHARE = 0.1
-"""Share of new patches, or of frames that were not taken in, from which a frame is solved at once."""
+"""If the share of new patches, or of frames that are not in the solution, is at least this, a frame is solved at
+once."""
 STILL = 0.005
-"""Change of the mean log radiance of patches, root mean square, or of what they receive by the last step, up to which
-the solution stays as it is: half a per cent is less than a code of a picture."""
+"""The solution stays as it is while the mean log radiance of patches (root mean square), and what they receive by the
+last step, change by no more than this: half a per cent is less than a code of a picture."""
 LEAST_FACING = 5
-"""Patches that face one way, for a median."""
+"""Least number of patches that face one way, for a median."""
 
 Floats = NDArray[np.float64]
 

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 LEVEL_EDGE = 0.7
-"""Difference of the mean logarithms of neighbouring patches from which paint, and not shading, has an edge there: over
-the 15 cm between them, light falls to half only beside a lamp or in the rim of a shadow."""
+"""If the mean logarithms of neighbouring patches differ by more than this, paint has an edge there, and not shading:
+over the 15 cm between them, light falls to half only beside a lamp or in the rim of a shadow."""
 CHROMA_EDGE = 0.2
-"""The same of either coordinate of log chroma."""
+"""The same for each coordinate of log chroma."""
 _OFFSETS = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), -1).reshape(-1, 3)[14:]
 """[13, 3] to one of each two opposite neighbours in a grid."""
 

@@ -18,7 +18,7 @@ SIDES = 6
 """In the order -x, +x, -y, +y, -z, +z of the shell's axes."""
 CELLS = SIDES * SIDE * SIDE
 CORNERS = 4
-"""Cells that a point of the shell lies between."""
+"""Number of cells between which a point of the shell is interpolated."""
 LEAST_HEIGHT_M = 2.4
 """A ceiling is at least this high above the floor."""
 BEHIND_M = 1.0
@@ -26,9 +26,10 @@ BEHIND_M = 1.0
 CAMERA_M = 0.05
 """A wall that is scanned is at least this far from a camera."""
 WALL_M = 0.3
-"""Depth in which the surface of one wall lies: what hangs on it and bends in the scan included."""
+"""Depth range of the surface of one wall, with the things that hang on it and with bends of the scan."""
 CLOSED_M2 = 0.15
-"""Area of scanned wall from which a side is closed: more than furniture or stray depth shows of one side's normal."""
+"""A side with at least this area of scanned wall is closed: more than furniture or stray depth that faces the same
+way."""
 LAMPS_ABOVE_M = 1.0
 """Height over the floor above which windows and lamps are expected."""
 _NOISE_M = 0.1  # the box moves only where a side does by more

@@ -24,7 +24,8 @@ from server.volume.volume import Volume
 
 BANDS = 4
 DIRECTIONS = 1024
-"""Directions in which the light at a place is looked up: 16 coefficients of a lamp of 10 degrees are good to 3 %."""
+"""Directions in which the light at a place is looked up. The 16 coefficients of a lamp of 10 degrees have errors of 3
+%."""
 
 Floats = NDArray[np.float64]
 
@@ -55,7 +56,7 @@ class _Rays:
 
 @dataclass(frozen=True)
 class Solution:
-    """Of the whole objective at one frame; it never changes. World axes and metres."""
+    """A solution of the whole objective at one frame; it never changes. World axes and metres."""
 
     shell: Shell
     hidden: Mapping[int, int]

@@ -18,12 +18,12 @@ from server.light.shell.switches import Switches
 from server.light.shell.transport import Transport
 
 MOST_STEPS = 16
-"""Gauss-Newton steps of a solution: one, and others while the last one changed what patches receive by more than
-MOVED."""
+"""Most Gauss-Newton steps of a solution. After the first, another follows while the last one changed what patches
+receive by more than MOVED."""
 MOVED, FIRST_MOVED = 0.05, 0.01
-"""Of a logarithm; the second in a first solution, which the others follow."""
+"""Change of a logarithm; the second value holds for a first solution, from which the others start."""
 LEAST_PATCHES = 12
-"""Patches below which nothing is said."""
+"""With fewer patches there is no solution."""
 
 Floats = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""What of the model is on (thesis 5.2, 5.4 and 7.1)."""
+"""Which parts of the model are used (thesis 5.2, 5.4 and 7.1)."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ class Switches:
     albedos: bool = True
     """Surfaces have albedos of their own."""
     indirect: bool = True
-    """Surfaces send light to one another. Only for light from beyond the scan: a room without it is no room."""
+    """Surfaces light one another. Only the light from beyond the scan can be solved without that."""
     normals: NormalWeights = "none"
     """Weights by the distribution of normals (eq. 5.7)."""
     memory: bool = True
-    """Earlier frames count (5.4)."""
+    """Evidence of earlier frames is kept (5.4)."""
     outliers: bool = True
-    """Patches that fit badly count less."""
+    """Patches with large residuals count less."""

@@ -20,13 +20,14 @@ from server.maths.lobes import LOBES, lobes_along
 HIDDEN_M = 0.6
 """Side of the cells of hidden surface: a piece of furniture. Those of saturated surface are smaller (CELL_M)."""
 MOST_HIDDEN = 128
-"""Cells of either kind together; what does not fit shares the last one."""
+"""Most cells of both kinds together; surface beyond that shares the last one."""
 SATURATED, ALL_CHANNELS = 0.97, 0.9
 """Radiance of the strongest channel from which a picture's values are lower bounds, code 252 of 255, and the share of
 it that the weakest has then: where another channel is not clipped, the surface is hardly brighter than it looks."""
 COLUMNS = CELLS + MOST_HIDDEN
 KNOWN, NO_CELL = -1, -2
-"""In place of a cell: photographed surface; hidden or saturated surface that no patch has received light from."""
+"""Values in place of a cell: KNOWN is photographed surface; NO_CELL is hidden or saturated surface from which no patch
+has received light."""
 _MIDDLE = 1 << 19  # half the cells along an axis: 150 km
 _MOST_COUNTED = 1e4  # rays that the mean of a saturated cell remembers
 

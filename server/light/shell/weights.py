@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 MEAN_ALBEDO = 0.6
-"""Reflectance about which materials lie: walls and ceilings are mostly bright. It sets the light's level."""
+"""Mean reflectance of materials: walls and ceilings are mostly bright. It sets the level of the light."""
 ALBEDO_SPREAD = 0.5
 """Standard deviation of the logit of a material's albedo: two thirds lie from .48 to .71, none above 1."""
 MATERIAL_CHROMA = 0.8
@@ -20,9 +20,9 @@ a dark one. On the dark side it has the tail of a Cauchy distribution, since pai
 WHITE = 0.005
 """Deviation of a surface's log albedo above 0: nothing sends back more than it receives."""
 ONE_ALBEDO = 0.01
-"""In place of the three spreads where albedo is constant."""
+"""Replaces the three spreads if albedo is constant."""
 HUBER = 1.5
-"""Deviations of the noise from which a patch counts as an outlier."""
+"""A patch whose residual exceeds so many standard deviations of the noise counts as an outlier."""
 CELL_LOW, CELL_HIGH, CELL_HIDDEN = 0.7, 2.0, 0.7
 """Standard deviations of a cell's log radiance about the mean's: of the shell below the height of windows and lamps and
 above it (a lamp is 50 times the mean), and of surface that was not seen."""
@@ -30,12 +30,13 @@ LOBE, LOBE_SPREAD = -1.0, 2.0
 """Mean and standard deviation of the log radiance of distant lobes, about the mean's: most of a sky is darker than its
 mean, and a sun is 50 times it."""
 LIT_EXCESS, LIT_SPREAD = 0.2, 1.0
-"""Of saturated surface that may be lit paint: radiance beyond what the picture shows, relative to that, and the
+"""For saturated surface that may be lit paint: mean radiance beyond what the picture shows, relative to that, and the
 standard deviation of its log."""
 LAMP_EXCESS, LAMP_SPREAD = 1.0, 2.0
-"""Of lamps and panes: a bulb is 200 times as bright as a picture shows it."""
+"""The same for lamps and windows: a bulb is 200 times as bright as a picture shows it."""
 LAMP_BEGIN = 4.0
-"""Log of a lamp's excess where steps begin: one that begins low brings so little light that the first steps miss it."""
+"""Log of a lamp's excess at the first step: from a low start, a lamp brings so little light that the first steps miss
+it."""
 SMOOTHNESS, EDGE = 1.0, 0.5
 """Weight of the squared difference of neighbouring cells' log radiance, and the difference from which it grows
 linearly: the rims of lamps and windows."""

@@ -15,7 +15,8 @@ import pytest
 import trimesh
 
 from client.cli import run_command
-from server.opencl.device import open_device
+from client.commands import explain, run
+from server.opencl.device import Device, open_device
 from server.scene.vase import vase_glb
 from server.service.serve import BackgroundServer
 from server.service.service import Service
@@ -108,8 +109,14 @@ def test_commands_in_sentences_exist() -> None:
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[BackgroundServer]:
-    with BackgroundServer(Service(open_device())) as server:
+def opened() -> Device:
+    """The device of all commands: each that opened its own would load all programs anew."""
+    return open_device()
+
+
+@pytest.fixture(scope="module")
+def server(opened: Device) -> Iterator[BackgroundServer]:
+    with BackgroundServer(Service(opened)) as server:
         yield server
 
 
@@ -141,11 +148,13 @@ def own_words(command: Command, url: str) -> list[str]:
 
 @pytest.mark.parametrize("command", [c for c in COMMANDS if runs_here(c)], ids=str)
 def test_it_can_be_run(
-    command: Command, server: BackgroundServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: Command, server: BackgroundServer, opened: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for option, (module, package) in EXTRAS.items():
+    for module in (run, explain):
+        monkeypatch.setattr(module, "open_device", lambda _name: opened)
+    for option, (extra, package) in EXTRAS.items():
         if option in command.words:
-            pytest.importorskip(module, reason=f"{package} is an extra: make install-all")
+            pytest.importorskip(extra, reason=f"{package} is an extra: make install-all")
     for name in ("Duck", "lamp", "vase", "sofa"):
         (tmp_path / f"{name}.glb").write_bytes(vase_glb())
     trimesh.creation.cylinder(0.03, 0.1).export(tmp_path / "cup.obj")

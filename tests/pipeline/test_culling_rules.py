@@ -55,7 +55,7 @@ def test_gloss_is_bounded_by_its_materials() -> None:
     """A smooth dielectric reflects most at grazing angles; a rough one little; a texture may say anything."""
     smooth, rough = (np.array([[r, 0.0, -1, -1]], np.float32) for r in (0.1, 1.0))
     assert most_reflected(smooth, 0.5) > 0.7
-    assert most_reflected(rough, 0.5) < 0.12
+    assert most_reflected(rough, 0.5) < 0.03  # seen: 0.016
     assert most_reflected(np.array([[1.0, 0.0, -1, 0]], np.float32), 0.5) == 1.0
     both = np.concatenate([rough, smooth, rough])
     assert most_reflected(both, 0.5) == most_reflected(smooth, 0.5)

@@ -28,8 +28,8 @@ def test_normals_of_exact_depth() -> None:
     ):
         assert known.mean() > 0.6
         angle = np.degrees(np.arccos(np.clip((normals * exact).sum(-1)[known], -1, 1)))
-        assert np.median(angle) < 0.3
-        assert np.percentile(angle, 99) < 5
+        assert np.median(angle) < 0.1  # seen: 0.049
+        assert np.percentile(angle, 99) < 1  # seen: 0.48
 
 
 def test_a_plane_s_normals_are_exact() -> None:
@@ -62,7 +62,7 @@ def test_filters_halve_the_error_of_a_sensor_s_normals(device: Device) -> None:
         for seed in range(2)
     ]
     found = normal_improvement(device, CAMERA, views)
-    assert found.raw.median_deg > 8
+    assert found.raw.median_deg > 30  # seen: 46
     for better in (found.bilateral, found.tv_l1):
         assert better.median_deg < 0.6 * found.raw.median_deg
         assert better.mean_deg < 0.6 * found.raw.mean_deg

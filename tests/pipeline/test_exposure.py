@@ -157,7 +157,7 @@ def object_over_picture(one: Taken, number: int) -> float:
     changed = np.abs(shown - bare) > 1e-6
     center = shown.shape[0] // 2, shown.shape[1] // 2
     pole = changed & (np.hypot(*(np.indices(shown.shape) - np.array(center)[:, None, None])) < 20)
-    assert pole.sum() > 150
+    assert pole.sum() > 400  # seen: 809
     return float(shown[pole].mean() / bare[~changed].mean())
 
 
@@ -226,8 +226,8 @@ def test_a_light_that_turns_is_followed_as_if_no_exposure_were_looked_for(device
             errors[mode].append(degrees_between(light.dominant_direction, source.light(index).direction))
         pipeline.close()
     difference = np.array(errors["auto"]) - errors["constant"]
-    assert np.abs(difference[3:]).max() < 3.0
-    assert abs(difference[3:].mean()) < 1.0
+    assert np.abs(difference[3:]).max() < 2.3  # seen: 1.15
+    assert abs(difference[3:].mean()) < 0.4  # seen: 0.18
 
 
 def test_a_light_that_jumps_is_followed_within_three_frames(device: Device) -> None:
@@ -239,5 +239,5 @@ def test_a_light_that_jumps_is_followed_within_three_frames(device: Device) -> N
         source = before if index < 10 else after
         light = pipeline.process(replace(source[index], exposure=None)).light
     pipeline.close()
-    assert degrees_between(light.dominant_direction, after.light(0).direction) < 10  # seen: 3.3; 70 in the first
-    assert abs(np.log(light.exposure)) < 0.15  # measured 0.04
+    assert degrees_between(light.dominant_direction, after.light(0).direction) < 7  # seen: 3.3; 70 in the first
+    assert abs(np.log(light.exposure)) < 0.08  # measured 0.04

@@ -141,11 +141,11 @@ def test_what_moves_is_where_it_is(passing: tuple[Film, dict[int, Shown]]) -> No
     for index, seen in shown.items():
         truth = film.truth(index)
         wrong = np.abs(seen.hybrid_m - truth.depth_m) > agreement_m(truth.depth_m, VOXEL_M)
-        assert (wrong & truth.is_continuous).sum() <= 12, index
+        assert (wrong & truth.is_continuous).sum() <= 3, index  # seen: 1
         assert wrong.mean() < 0.004, index
         error_m = np.abs(seen.hybrid_m - truth.depth_m)[truth.is_continuous]
-        assert np.median(error_m) < 0.001, index
-        assert np.percentile(error_m, 99) < 0.02, index
+        assert np.median(error_m) < 0.0003, index  # seen: 0.00014
+        assert np.percentile(error_m, 99) < 0.008, index  # seen: 0.0040
 
 
 def test_what_moves_is_dynamic(passing: tuple[Film, dict[int, Shown]]) -> None:
@@ -193,7 +193,7 @@ def check_silhouettes(found: HandReport, worst_plain: float) -> None:
     """Of the hybrid buffer at least 0.95 and nothing afterwards; the volume alone lags."""
     assert min(found.iou["sensor"]) > 0.99  # so that this measures the buffer, not the truth
     assert min(found.iou["hybrid"]) >= 0.95
-    assert max(found.depth_error_m["hybrid"]) < 0.005
+    assert max(found.depth_error_m["hybrid"]) < 0.0015  # seen: 0.0005
     assert found.leftover_px["hybrid"][0] == 0
     assert max(found.leftover_px["hybrid"]) == 0
     assert np.median(found.iou["plain"]) < 0.5
@@ -251,7 +251,7 @@ def test_normals_of_noisy_depth_are_better(device: Device) -> None:
         assert raw.median_deg > 12, name
         assert hybrid.median_deg < share * raw.median_deg, name
         assert hybrid.mean_deg < 0.6 * raw.mean_deg, name
-        assert found[name].missing < 0.01, name
+        assert found[name].missing < 0.001, name  # seen: 0
 
 
 @pytest.mark.data
@@ -268,4 +268,4 @@ def test_normals_of_the_noisy_sequence_are_better(device: Device) -> None:
     assert found.raw.median_deg > 8
     assert found.hybrid.median_deg < 0.3 * found.raw.median_deg
     assert found.hybrid.mean_deg < 0.2 * found.raw.mean_deg
-    assert found.missing < 0.01
+    assert found.missing < 0.001  # seen: 0

@@ -91,7 +91,7 @@ def test_exact_walls_and_balls_shade_to_one(engine: Engine) -> None:
         transfer = ImageSpaceTransfer(engine, RAYS).transfer(camera, pose, volume, surface, 4, ROOM_M)
         used = engine.download(transfer.flatness) >= LEAST_FLATNESS
         shaded = engine.download(transfer.coefficients).astype(float) @ uniform()[:, 0]
-        assert used.sum() > 100
+        assert used.sum() > 200  # seen: 407
         np.testing.assert_allclose(shaded[used], 1.0, rtol=1e-6)
 
 
@@ -107,9 +107,9 @@ def test_reconstructed_open_bodies_shade_to_one(engine: Engine, body: object, st
     flat = engine.download(transfer.flatness) >= LEAST_FLATNESS
     shaded = engine.download(transfer.coefficients).astype(float) @ uniform()[:, 0]
     used = static & flat
-    assert used.sum() > 25
+    assert used.sum() > 200  # seen: 405
     error = np.abs(shaded - 1)[used]
-    assert np.quantile(error, 0.99) <= 0.01
+    assert np.quantile(error, 0.99) <= 1e-5  # seen: 5e-8
     assert error.max() <= 0.05
 
 
@@ -124,11 +124,11 @@ def test_transfer_beside_ray_tracing(table: Scene) -> None:
     expected = downloaded(engine, table.traced(4))
     fine = downloaded(engine, table.traced(4, 810))
     used = (fine.openness >= 0) & (fine.flatness >= LEAST_FLATNESS)
-    assert (fine.openness[used] < 0.9).mean() > 0.1
+    assert (fine.openness[used] < 0.9).mean() > 0.3  # seen: 0.49
     errors = {name: pooled_error(t, fine, used) for name, t in (("image space", found), ("traced", expected))}
     print({name: np.round(e, 4) for name, e in errors.items()})  # noqa: T201
     assert errors["image space"][0] < 0.10
-    assert errors["image space"][1] < 0.06
+    assert errors["image space"][1] < 0.05  # seen: 0.026
     assert abs(errors["image space"][2]) < 0.008  # seen: 0.0026
     agree = (found.bits == expected.bits)[used].mean()
     assert agree > 0.95

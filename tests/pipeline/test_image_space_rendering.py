@@ -160,9 +160,10 @@ def test_virtual_and_real_things_shade_a_virtual_top(engine: Engine) -> None:
     by_real = share_behind(real, middle)
     by_virtual = share_behind(virtual.grown(0.5 * stand(engine, (real,), [top, slab]).scene.table.cell_m[1]), middle)
     assert 0.1 < by_virtual < by_real
-    assert stand(engine, (real,), [top]).virtual(points).mean() == pytest.approx(by_real, abs=0.025)
+    assert stand(engine, (real,), [top]).virtual(points).mean() == pytest.approx(by_real, abs=0.015)  # seen: 0.007
     nothing = (box((0.9, 0.9, 0.9), (0.95, 0.95, 0.95)),)
-    assert stand(engine, nothing, [top, slab]).virtual(points).mean() == pytest.approx(by_virtual, abs=0.025)
+    # Seen: 0.0001.
+    assert stand(engine, nothing, [top, slab]).virtual(points).mean() == pytest.approx(by_virtual, abs=0.005)
     wider = box((0.2, 0.4, 0.1), (0.8, 0.44, 0.9))
     both = stand(engine, (wider,), [top, slab]).virtual(points).mean()
     assert both == pytest.approx(share_behind(wider, middle), abs=0.03)
@@ -177,7 +178,7 @@ def test_real_floor_hides_half_of_the_light_of_a_side(engine: Engine) -> None:
     patch_of_floor = box((0.0, 0.0, 0.0), (0.96, 0.1, 0.96))
     expected = share_behind(patch_of_floor, np.array([0.48, 0.21, 0.66]), np.array([0.0, 0.0, 1.0]))
     assert 0.2 < expected < 0.5
-    assert scene.virtual(side, np.array([0.0, 0.0, 1.0])).mean() == pytest.approx(expected, abs=0.03)
+    assert scene.virtual(side, np.array([0.0, 0.0, 1.0])).mean() == pytest.approx(expected, abs=0.008)  # seen: 0.002
 
 
 def test_object_under_a_real_ceiling_takes_nothing_more(engine: Engine) -> None:
@@ -200,7 +201,7 @@ def test_shadows_move_with_the_object(engine: Engine) -> None:
         aside = pose((0, 0, 0), UP, turn)[:3, :3] @ (0.13, 0.0, 0.02)
         ratios.append(scene.real(around_point(center + aside, 0.003)).mean())
     assert ratios[0] < 0.93
-    assert ratios[1] == pytest.approx(ratios[0], abs=0.008)
+    assert ratios[1] == pytest.approx(ratios[0], abs=0.002)  # seen: 0.0003
 
 
 # ---- in the whole spine ------------------------------------------------------------------------------------------
@@ -236,11 +237,11 @@ def test_both_families_agree(device: Device, indirect: str) -> None:
     assert set(run) - set(other_run) == {"draw_depth_views"}
     without = open_source(source)[0].color.astype(float)
     changed = (np.abs(traced - without) > 1).any(-1)
-    assert changed.mean() > 0.05
+    assert changed.mean() > 0.1  # seen: 0.20
     difference = (looked - traced)[changed]
-    assert np.abs(difference).mean() < 0.7
-    assert abs(difference.mean()) < 0.3
-    assert (np.abs(difference).max(-1) > 16).mean() < 0.01
+    assert np.abs(difference).mean() < 0.6  # seen: 0.28
+    assert abs(difference.mean()) < 0.2  # seen: 0.09
+    assert (np.abs(difference).max(-1) > 16).mean() < 0.001  # seen: 0
     assert np.abs((traced - without)[changed]).mean() > 10 * abs(difference.mean())
 
 
@@ -256,5 +257,5 @@ def test_shadow_of_what_left_the_picture_stays(device: Device, tmp_path: Path) -
         for solids in ([turning.TABLE, turning.SLAB], [turning.TABLE])
     )
     before, after = (turning.shadow_at(turn, with_slab, without, end) for end in (turn.still, len(turn.poses())))
-    assert before.sum() == pytest.approx(turning.exact_shadow(light).sum(), rel=0.1)
+    assert before.sum() == pytest.approx(turning.exact_shadow(light).sum(), rel=0.05)  # seen: 0.023
     assert turning.shadow_change(before, after) < 5

@@ -82,7 +82,7 @@ def test_over_its_own_picture_a_layer_is_the_composite(device: Device, name: str
         is_untouched = (coverage == 0) & ~whole(layer.ratio, source).any(-1)
         np.testing.assert_array_equal(picture[is_untouched], source[0].color[is_untouched])
         assert ((coverage > 0) & (coverage < 1)).any() == (edges == "smooth")
-    assert (result.color != source[0].color).any(-1).mean() > 0.02
+    assert (result.color != source[0].color).any(-1).mean() > 0.04  # seen: 0.063
 
 
 @cache
@@ -113,7 +113,7 @@ def test_a_layer_is_seen_where_the_camera_that_moved_on_sees_it(device: Device, 
         is_covered = np.abs(covered[1] - covered[0]).max(-1) < 100
         overlaps.append((is_covered & of_true).sum() / (is_covered | of_true).sum())
     assert overlaps[0] > 0.95
-    assert overlaps[1] < 0.1
+    assert overlaps[1] < 0.05  # seen: 0.019
 
 
 def test_what_stays_in_view_is_not_torn(device: Device) -> None:
@@ -129,7 +129,7 @@ def test_what_stays_in_view_is_not_torn(device: Device) -> None:
     for shift in (-2, 2):
         inside &= (np.roll(coverage, shift, 0) == 1) & (np.roll(coverage, shift, 1) == 1)
     assert inside.sum() > 500
-    assert np.abs(moved.astype(int) - true)[inside].max() <= 12
+    assert np.abs(moved.astype(int) - true)[inside].max() <= 3  # seen: 1
     is_floor = np.ones(coverage.shape, bool)
     for shift in range(-3, 4):
         is_floor &= (np.roll(coverage, shift, 0) == 0) & (np.roll(coverage, shift, 1) == 0)

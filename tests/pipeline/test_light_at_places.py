@@ -76,7 +76,7 @@ def test_the_view_then_places_then_objects(light: Light) -> None:
     np.testing.assert_allclose(pole.position, np.array(POLE_M) - [0, HEIGHT_M / 2, 0], atol=1e-6)
     # The camera looks at the floor where the pole stands; what it sees ends at 4 m.
     to_view = np.array(view.position) - VIEW[:3, 3]
-    assert degrees_between(to_view, VIEW[:3, 2]) < 15
+    assert degrees_between(to_view, VIEW[:3, 2]) < 10  # seen: 5.1
     assert view.position[1] < POLE_M[1]  # above the floor: y is down
 
 
@@ -177,7 +177,7 @@ def test_places_at_the_ends_of_the_world(device: Device, far_m: float) -> None:
     pipeline = ClientSession(device, CAMERA, asked)
     for at in pipeline.process(frame()).light.at[1:]:
         assert at.seen == 0
-        np.testing.assert_allclose(coefficients(at), LIGHT, atol=2e-3 * LIGHT.max())
+        np.testing.assert_allclose(coefficients(at), LIGHT, atol=2e-4 * LIGHT.max())  # seen: 8e-5
     pipeline.close()
 
 
@@ -213,9 +213,12 @@ def test_a_client_of_another_world_is_told_in_its_own(device: Device) -> None:
         client.close()
     room.close()
     first, second = told
-    np.testing.assert_allclose(second.position, there, atol=1e-3)
+    np.testing.assert_allclose(second.position, there, atol=1e-9)  # exact but for rounding
     np.testing.assert_allclose(
-        np.array(second.sh), rotate_sh(coefficients(first), client_from_room[:3, :3]), atol=0.01 * np.max(first.sh)
+        # Seen: 0.0003.
+        np.array(second.sh),
+        rotate_sh(coefficients(first), client_from_room[:3, :3]),
+        atol=0.001 * np.max(first.sh),
     )
     turned = client_from_room[:3, :3] @ np.array(first.dominant_direction)
-    assert degrees_between(second.dominant_direction, turned) < 0.5
+    assert degrees_between(second.dominant_direction, turned) < 0.05  # seen: 0.02

@@ -79,7 +79,7 @@ def test_textures_that_go_on(wrap: int, discs: int) -> None:
     file.header["samplers"] = [{"wrapS": wrap, "wrapT": wrap}]
     file.header["textures"][0]["sampler"] = 0
     mesh = load_mesh(file.glb(), "glb")
-    assert area(mesh) == pytest.approx(discs * np.pi * (RADIUS / 3) ** 2, rel=0.01)
+    assert area(mesh) == pytest.approx(discs * np.pi * (RADIUS / 3) ** 2, rel=0.002)  # seen: 0.0007
 
 
 @pytest.mark.parametrize("side", [(0, 0), (1, 0), (0, 1)])
@@ -91,7 +91,7 @@ def test_mirrored_textures_are_mirrored(side: tuple[int, int]) -> None:
     file.header["samplers"] = [{"wrapS": 33648, "wrapT": 33648}]
     file.header["textures"][0]["sampler"] = 0
     mesh = load_mesh(file.glb(), "glb")
-    assert area(mesh) == pytest.approx(0.5, abs=0.01)
+    assert area(mesh) == pytest.approx(0.5)
     assert mesh.vertices[:, 0].mean() > 0.5 if side[0] else mesh.vertices[:, 0].mean() < 0.5
 
 

@@ -25,7 +25,7 @@ def test_formats_agree(format: str, up: str) -> None:
     volume = (a * np.cross(b, c)).sum() / 6
     assert volume == pytest.approx(ball.volume, rel=1e-5)  # the triangles still face outwards
     angle = np.degrees(np.arccos(np.clip((mesh.normals * mesh.vertices).sum(axis=1), -1, 1)))
-    assert angle.max() < 1.0
+    assert angle.max() < 0.6  # seen: 0.30
 
 
 def test_gltf_with_embedded_buffer() -> None:
@@ -72,9 +72,9 @@ def test_every_public_mesh() -> None:
 def test_duck_is_yellow_with_an_orange_beak() -> None:
     duck = public_mesh("Duck.glb")
     low, high = duck.bounds
-    assert (high - low)[1] == pytest.approx(1.54, abs=0.01)
+    assert (high - low)[1] == pytest.approx(1.54, abs=0.001)  # seen: 0.0004
     body = np.median(shown_texture(duck).image.reshape(-1, 3), axis=0)
-    np.testing.assert_allclose(body, (255, 216, 0), atol=12)
+    np.testing.assert_allclose(body, (255, 216, 0), atol=1)
     assert duck.uv is not None
     assert duck.uv[:, :2].min() > 0
     assert duck.uv[:, :2].max() < 1

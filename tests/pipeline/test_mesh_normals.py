@@ -23,7 +23,7 @@ def test_round_and_sharp_in_one_mesh() -> None:
     is_cap = np.abs(mesh.normals[:, 2]) > 0.999
     np.testing.assert_allclose(mesh.normals[~is_cap][:, 2], 0, atol=1e-6)
     outward = mesh.vertices[~is_cap] * (1, 1, 0)
-    np.testing.assert_allclose(mesh.normals[~is_cap], outward, atol=1e-3)
+    np.testing.assert_allclose(mesh.normals[~is_cap], outward, atol=1e-6)  # seen: 6e-8
 
 
 def test_normals_of_the_file_are_kept() -> None:
@@ -50,4 +50,5 @@ def test_long_fan_is_smoothed() -> None:
     fan = trimesh.Trimesh(np.vstack([[0, 0, 0], rim]), triangles, process=False)
     mesh = load_mesh(fan.export(file_type="ply"), "ply")
     assert len(mesh.vertices) == 100_001
-    np.testing.assert_allclose(mesh.normals[(mesh.vertices == 0).all(axis=1)], [[0, 0, 1]], atol=1e-3)
+    # Exact but for rounding.
+    np.testing.assert_allclose(mesh.normals[(mesh.vertices == 0).all(axis=1)], [[0, 0, 1]], atol=1e-9)

@@ -41,7 +41,7 @@ def test_far_repeats_are_brought_near() -> None:
     file.quad(file.texture(np.zeros((4, 4, 3), np.uint8)), TEXCOORD_0=QUAD_UV + np.float32([5000, -300]))
     found = color_uv(load_mesh(file.glb(), "glb"))
     for place, at in zip(QUAD.tolist(), QUAD_UV, strict=True):
-        np.testing.assert_allclose(found[tuple(place)], at, atol=1e-3)
+        np.testing.assert_allclose(found[tuple(place)], at, atol=1e-6)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -3e38])

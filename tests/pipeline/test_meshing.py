@@ -79,7 +79,7 @@ def test_a_room_seen_from_inside_faces_inwards() -> None:
     # Only a cell that a corner or an edge goes through is off, by less than half its diagonal.
     off = np.abs(inside(mesh.vertices))
     assert np.percentile(off, 95) < 5e-3
-    assert off.max() < 0.5
+    assert off.max() < 0.3  # seen: 0.20
 
 
 def test_chunk_borders_leave_no_crack_and_no_double_vertex() -> None:
@@ -172,9 +172,9 @@ def test_colours_spread_to_where_there_is_none() -> None:
     mesh = colored_plane(lambda p: p[..., 0] < 12)
     full = with_all_colors(mesh)
     np.testing.assert_array_equal(full.colors[mesh.colored], mesh.colors[mesh.colored])
-    np.testing.assert_allclose(full.colors[~mesh.colored, 0], 11.5 / 24, atol=0.02)
+    np.testing.assert_allclose(full.colors[~mesh.colored, 0], 11.5 / 24, atol=1e-6)
     np.testing.assert_allclose(full.colors[~mesh.colored, 1], 0.5, atol=1e-6)
-    assert np.ptp(full.colors[~mesh.colored, 2]) > 0.3  # along the border each its own
+    assert np.ptp(full.colors[~mesh.colored, 2]) > 0.6  # along the border each its own; seen: 0.93
     none = with_all_colors(colored_plane(lambda p: np.zeros(p.shape[:-1])))
     np.testing.assert_array_equal(none.colors, UNKNOWN_COLOR)
 
@@ -295,7 +295,7 @@ def test_a_rendered_room(engine: Engine) -> None:
     volume = geometry.volume
     mesh = scene_mesh(volume.download_bricks(), volume.voxel_m, volume.origin_world, UPRIGHT)
     errors = np.concatenate([depth_errors(mesh, source[i]) for i in (2, 34, 66, 98)])
-    assert len(errors) > 20_000
+    assert len(errors) > 60_000  # seen: 94 852
     assert np.median(np.abs(errors)) < 0.1 * volume.voxel_m
     assert np.percentile(np.abs(errors), 95) < 0.5 * volume.voxel_m
 

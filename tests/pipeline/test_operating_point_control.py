@@ -87,7 +87,7 @@ def test_the_most_accurate_point_that_fits(budget_ms: float, preset: str) -> Non
     scene = Scene(OperatingPointControl(front(), budget_ms), lambda _: 1.0).run(200)
     assert scene.presets[-1] == preset
     assert within(scene.totals, budget_ms) >= 0.95 or preset == "gr15fast"
-    assert scene.changes <= 4
+    assert scene.changes <= 2  # seen: 1
     assert f"budget of {budget_ms:g} ms" in scene.control.operating_point.reason
 
 
@@ -109,7 +109,7 @@ def test_it_goes_down_at_once_and_climbs_back() -> None:
     assert slow.size
     assert slow.max() <= 104  # what comes after the change is told by two frames
     assert scene.presets[105] == "gr15fast"
-    assert scene.changes <= 12
+    assert scene.changes <= 8  # seen: 5
 
 
 def test_one_slow_frame_changes_nothing() -> None:
@@ -126,7 +126,7 @@ def test_a_cost_at_the_edge_of_the_budget_does_not_pump() -> None:
     """A point that just does not fit is tried less and less often."""
     reg4_ms = front().points[2].total_ms
     scene = Scene(OperatingPointControl(front(), reg4_ms), lambda _: 1.0, noise=0.08).run(1200)
-    assert scene.changes <= 20
+    assert scene.changes <= 12  # seen: 8
     late = Scene(scene.control, lambda _: 1.0, noise=0.08).run(600)
     assert late.changes <= 6
 

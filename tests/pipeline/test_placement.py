@@ -71,7 +71,7 @@ def test_heading_is_nearest_to_the_worlds_x_and_continuous(up: NDArray[np.float6
     assert right[0] > 0
     for nudge in 1e-4 * directions(10):
         moved = place(up + nudge)[:3, :3]
-        assert np.linalg.norm(moved - matrix) < 2e-3
+        assert np.linalg.norm(moved - matrix) < 1e-3  # seen: 3.3e-4
 
 
 @pytest.mark.parametrize("up", [(1, 0, 0), (-1, 0, 0), (1, 1e-5, 0)])

@@ -139,5 +139,5 @@ def test_short_rays_with_the_visibility_state_give_the_same_light(device: Device
     for used in (engine, other):
         used.close()
     changed = np.abs(open_one - open_two)
-    assert np.quantile(changed, 0.95) <= 0.01
+    assert np.quantile(changed, 0.95) <= 0.001  # seen: 0
     assert (open_two == 1).mean() >= (open_one == 1).mean()

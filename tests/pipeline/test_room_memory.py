@@ -273,7 +273,7 @@ def depths_of_both(engine: Engine, views: Sequence[Floats], voxel_m: float) -> t
 def test_dense_and_sparse_are_one_surface(engine: Engine, views: Sequence[Floats], voxel_m: float) -> None:
     """Every pixel: bricks hold all voxels that interpolation reads."""
     sparse, dense = depths_of_both(engine, views, voxel_m)
-    assert np.abs(sparse - dense).max() < 1e-3  # seen: 4e-5
+    assert np.abs(sparse - dense).max() < 1e-4  # seen: 4e-5
 
 
 @pytest.mark.parametrize("voxel_m", [0.02, 0.035])
@@ -284,9 +284,9 @@ def test_dense_and_sparse_all_round(engine: Engine, voxel_m: float) -> None:
     """
     sparse, dense = depths_of_both(engine, AROUND, voxel_m)
     differs = np.abs(sparse - dense)
-    assert np.quantile(differs, 0.99) < 1e-3
-    assert np.quantile(differs, 0.999) < 0.01  # seen: 0.0024
-    assert (differs > 0.1).mean() < 1e-4
+    assert np.quantile(differs, 0.99) < 1e-4  # seen: 0
+    assert np.quantile(differs, 0.999) < 0.005  # seen: 0.0024
+    assert (differs > 0.1).mean() < 5e-5  # seen: 9e-6
 
 
 def test_a_volume_has_what_its_device_gives_one(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -311,7 +311,7 @@ def test_a_room_at_a_centimetre_stays_under_600_mb(device: Device) -> None:
     assert figures["small_full_frames"] == 0
     assert figures["small_most_released_bricks"] > 5000
     assert figures["small_differing_bricks"] == 0
-    assert figures["small_greatest_difference_voxels"] < 0.02
+    assert figures["small_greatest_difference_voxels"] < 0.001  # seen: 0
 
 
 def test_a_table_of_four_million_bricks_works(engine: Engine) -> None:

@@ -162,7 +162,7 @@ def corner(device: Device) -> Iterator[Room]:
     light = show(ClientSession(device, corners.CAMERA, CORNER, room), [FLOOR, WALL] * 6, 0)
     assert light.spread_deg is not None
     assert light.spread_deg < 60  # seen: 49
-    assert degrees_between(light.dominant_direction, TOWARDS) < 8
+    assert degrees_between(light.dominant_direction, TOWARDS) < 6  # seen: 2.8
     yield room
     room.close()
 
@@ -192,7 +192,7 @@ def test_a_light_that_has_changed_is_found_in_a_room_that_came_back(
     again = loaded(store, "corner", device)
     client, turned = ClientSession(device, corners.CAMERA, CORNER, again), (0.98, 0.2, 0.0)
     light = show(client, [FLOOR, WALL] * 8, 12, 0.3 * lobe_and_sky(turned))
-    assert degrees_between(light.dominant_direction, turned) < 20
+    assert degrees_between(light.dominant_direction, turned) < 8  # seen: 3.3
     again.close()
 
 

@@ -113,7 +113,7 @@ def test_cameras_of_several_sizes_add_to_one_light(device: Device) -> None:
     for client in clients:
         client.close()
     room.close()
-    assert degrees_between(result.light.dominant_direction, TOWARDS) < 8
+    assert degrees_between(result.light.dominant_direction, TOWARDS) < 6  # seen: 3.1
 
 
 def test_each_client_is_told_the_light_in_its_own_world(device: Device) -> None:
@@ -134,7 +134,7 @@ def test_each_client_is_told_the_light_in_its_own_world(device: Device) -> None:
     assert ups[0] == pytest.approx(corners.WISHES.up)
     assert ups[1] == pytest.approx(ELSEWHERE[:3, :3] @ ups[0])
     np.testing.assert_allclose(result.world_from_camera, frame.world_from_camera, atol=1e-9)
-    assert degrees_between(result.light.dominant_direction, ELSEWHERE[:3, :3] @ TOWARDS) < 8
+    assert degrees_between(result.light.dominant_direction, ELSEWHERE[:3, :3] @ TOWARDS) < 6  # seen: 2.8
 
 
 def test_what_is_said_of_a_world_is_corrected_by_what_both_see(device: Device, room: Room) -> None:
@@ -144,7 +144,7 @@ def test_what_is_said_of_a_world_is_corrected_by_what_both_see(device: Device, r
     scan(second, range(6, 12), ELSEWHERE)
     found = second._alignment.room_from_client
     assert distance_between(found @ ELSEWHERE @ view_at(8), view_at(8)) < 0.25 * VOXEL_M
-    assert angle_between(found, inverse_rigid(ELSEWHERE)) < np.radians(0.3)
+    assert angle_between(found, inverse_rigid(ELSEWHERE)) < np.radians(0.06)  # seen: 0.024 degrees
 
 
 def test_a_client_that_contradicts_the_room_is_told_so_and_kept_out(device: Device, room: Room) -> None:
@@ -259,8 +259,8 @@ def test_somebody_who_only_looks_sees_the_room_from_where_he_stands(device: Devi
     true = frame_at(view_at(13)).color.astype(int)
     near = np.abs(seen.color.astype(int) - true).max(axis=-1)
     assert seen.tracking == "given"
-    assert np.median(near) < 12
-    assert (near > 60).mean() < 0.2  # the cube, and edges
+    assert np.median(near) < 3  # seen: 1
+    assert (near > 60).mean() < 0.08  # the cube, and edges
     assert "rasterize" in seen.plan.run
     assert {left.effect for left in seen.plan.left_out} >= {"estimate_light"}
     assert room.reconstruction.volume.frames == fused
@@ -278,7 +278,7 @@ def test_a_camera_without_depth_gets_light_and_objects_and_changes_nothing(devic
     result = plain.process(frame)
     assert result.tracking == "given"
     assert result.notes == ()
-    assert (np.abs(result.color.astype(int) - frame.color).max(axis=-1) > 12).mean() > 0.005
+    assert (np.abs(result.color.astype(int) - frame.color).max(axis=-1) > 12).mean() > 0.03  # seen: 0.062
     np.testing.assert_array_equal(room.reconstruction.volume.download_bricks().tsdf, before.tsdf)
 
 
@@ -307,7 +307,7 @@ def test_objects_of_one_client_are_seen_by_the_others_in_their_place(device: Dev
     rows, columns = np.nonzero(changed)
     pixel = inverse_rigid(view_at(6)) @ [-0.9, 0.5, 1.0, 1.0]
     expected = pixel[:2] / pixel[2] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
-    assert np.hypot(np.median(columns) - expected[0], np.median(rows) - expected[1]) < 12
+    assert np.hypot(np.median(columns) - expected[0], np.median(rows) - expected[1]) < 3  # seen: 1.03
     first.remove_object("cube")
     with pytest.raises(KeyError):
         second.remove_object("cube")

@@ -32,10 +32,10 @@ def test_below_saturation_the_order_is_no_matter(device: Device, noise: float) -
         stack = np.stack(found)
         seen = (stack > 0).all(0)
         assert seen.mean() > 0.6  # the volume ends below the ceiling
-        assert ((stack > 0).any(0) & ~seen).mean() < 1e-3
+        assert ((stack > 0).any(0) & ~seen).mean() < 1e-4  # seen: 0
         spread = np.ptp(stack, axis=0)[seen] / VOXEL_M
-        assert np.quantile(spread, 0.99) < 1e-3
-        assert (spread > 0.1).mean() < 1e-3
+        assert np.quantile(spread, 0.99) < 1e-4  # seen: 0
+        assert (spread > 0.1).mean() < 1e-4  # seen: 0
         true = LIVING_ROOM.depth_m(stations()[camera].camera, stations()[camera].world_from_camera)
         assert np.median(np.abs(stack - true)[:, seen]) < (0.2 if noise else 0.02) * VOXEL_M
 
@@ -47,9 +47,9 @@ def test_a_mean_that_forgets_depends_a_little_on_the_order(device: Device) -> No
         seen = (stack > 0).all(0)
         spread = np.ptp(stack, axis=0)[seen] / VOXEL_M
         assert spread.max() > 0
-        assert np.median(spread) < 0.05
-        assert np.quantile(spread, 0.99) < 0.15
-        assert (spread > 1).mean() < 2e-3  # edges, seen past or not
+        assert np.median(spread) < 0.015  # seen: 0.006
+        assert np.quantile(spread, 0.99) < 0.08  # seen: 0.033
+        assert (spread > 1).mean() < 5e-4  # edges, seen past or not
 
 
 def test_a_camera_beside_its_place_does_not_destroy_what_others_see(device: Device) -> None:

@@ -118,7 +118,7 @@ def test_small_light_throws_its_shadow(device: Device, preset: Preset) -> None:
     found, (expected, is_floor) = ratio_of(result), exact_ratio(spread_deg)
     error = (found - expected)[is_floor]
     assert (expected[is_floor] < 0.4).sum() > 100
-    assert np.sqrt(np.mean(error**2)) < 0.05
+    assert np.sqrt(np.mean(error**2)) < 0.04  # seen: 0.020
     assert np.corrcoef(found[is_floor], expected[is_floor])[0, 1] > 0.98
 
 
@@ -167,7 +167,7 @@ def test_surfaces_that_send_light_see_both_parts(device: Device) -> None:
     expected, is_floor = exact_ratio(10.0)
     umbra = is_floor & (expected < expected[is_floor].min() + 0.02)
     assert both[umbra].mean() > direct[umbra].mean()
-    assert np.abs(both - direct)[is_floor].mean() < 0.05
+    assert np.abs(both - direct)[is_floor].mean() < 0.02  # seen: 0.008
     with patch("server.effects.functions.shadow_maps.light_points_by_discs"):
         dim = ratio_of(shown(device, light, indirect=True))
     assert (both >= dim).all()

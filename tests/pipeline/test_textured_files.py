@@ -52,11 +52,11 @@ def test_every_side_shows_its_tile_the_right_way_up(engine: Engine, kind: str, t
         top, left, size = rows.min(), columns.min(), rows.max() - rows.min() + 1
         assert 70 < size < 80
         tile = color[top : top + size, left : left + size, :3]
-        np.testing.assert_allclose(tile[size // 2, size // 2], LINEAR[side], atol=2e-3)
-        np.testing.assert_allclose(tile[-size // 4, -size // 4], LINEAR[side], atol=2e-3)
+        np.testing.assert_allclose(tile[size // 2, size // 2], LINEAR[side], atol=1e-6)
+        np.testing.assert_allclose(tile[-size // 4, -size // 4], LINEAR[side], atol=1e-6)
         mark = 6 * size // 32
-        np.testing.assert_allclose(tile[mark, mark], 0, atol=2e-3)
-        np.testing.assert_allclose(tile[mark, -mark], LINEAR[side], atol=2e-3)
+        np.testing.assert_allclose(tile[mark, mark], 0, atol=1e-6)
+        np.testing.assert_allclose(tile[mark, -mark], LINEAR[side], atol=1e-6)
         np.testing.assert_allclose(material[rows, columns], np.tile((ROUGHNESS, 0, 0, 1), (len(rows), 1)), atol=1e-6)
 
 
@@ -68,7 +68,7 @@ def test_coarse_colors_are_those_of_the_tiles(tmp_path: Path) -> None:
     middles = np.repeat([[0.5, 0.0, 0.5], [0.5, 0.5, 0.0]], 6, axis=0)  # of the diagonal that two triangles share
     side = np.argmax(np.stack([mesh.normals, -mesh.normals], axis=2).reshape(-1, 6)[mesh.triangles[:, 0]], axis=1)
     found = colors_at(mesh, np.arange(12), middles)
-    np.testing.assert_allclose(found, 0.5 * LINEAR[side], atol=0.02)
+    np.testing.assert_allclose(found, 0.5 * LINEAR[side], atol=1e-6)
     corner = colors_at(mesh, np.arange(12), np.tile([0.8, 0.1, 0.1], (12, 1)))
     assert (corner.max(axis=1) < 0.5 * found.max(axis=1)).all()
 

@@ -49,4 +49,4 @@ def test_rods_that_move(device: Device, width_px: float, same_color: bool) -> No
     found = measure_rods(device, rods(width_px, same_color, 0.025), VOXEL_M, first=4)
     assert min(found.kept["hybrid"]) > 0.98
     assert max(found.added["hybrid"]) < 0.01
-    assert max(found.kept["plain"]) < 0.05
+    assert max(found.kept["plain"]) < 0.01  # seen: 0.0014

@@ -36,7 +36,7 @@ def test_the_surface_is_where_the_scene_is(engine: Engine) -> None:
     assert (positions[inner][:, 3] > 0).mean() > 0.97
     off = np.linalg.norm(positions[..., :3] - expected, axis=-1)[inner & (positions[..., 3] > 0)]
     assert np.median(off) < 0.15 * VOXEL_M
-    assert np.percentile(off, 95) < VOXEL_M
+    assert np.percentile(off, 95) < 0.2 * VOXEL_M  # seen: 0.06 voxels
 
 
 def test_the_default_bounds_hold_what_is_seen() -> None:

@@ -51,7 +51,7 @@ def test_an_object_that_waits_is_moved_and_removed(clients: tuple[ClientSession,
     assert second._alignment.is_settled
     found = places(first)
     assert set(found) == {"reference", "moved"}
-    np.testing.assert_allclose(found["moved"], found["reference"], atol=0.02)
+    np.testing.assert_allclose(found["moved"], found["reference"], atol=1e-3)  # seen: equal
 
 
 def test_a_move_that_cannot_be_leaves_what_waits(clients: tuple[ClientSession, ClientSession]) -> None:

@@ -126,5 +126,5 @@ def test_white_scene_tells_the_even_sky(device: Device) -> None:
         result = pipeline.process(replace(frame))
     pipeline.close()
     sh = np.array(result.light.sh)
-    np.testing.assert_allclose(sh[0], uniform()[0] * 0.5029 / 0.5, rtol=0.01)
+    np.testing.assert_allclose(sh[0], uniform()[0] * 0.5029 / 0.5, rtol=0.002)  # seen: 0.0007
     assert np.abs(sh[1:]).max() < 0.02 * sh[0].max()

@@ -42,11 +42,19 @@ class Solver:
         self._shell = shell
 
     def solve(
-        self, patches: Patches, bright: EmittersSeen, traced: NDArray[np.int64], camera: Floats, up: Floats
+        self,
+        patches: Patches,
+        bright: EmittersSeen,
+        traced: NDArray[np.int64],
+        camera: Floats,
+        up: Floats,
+        *,
+        is_other_light: bool = False,
     ) -> Solution | None:
         """The next solution; None where too few patches are known.
 
-        traced: rows of the patches whose rays are new. camera: [3] world metres; up: [3] unit, world.
+        traced: rows of the patches whose rays are new. camera: [3] world metres; up: [3] unit, world. is_other_light:
+        the light is not that of the last solution.
         """
         rows, switches = patches.used, self._switches
         if len(rows) < LEAST_PATCHES:
@@ -58,7 +66,8 @@ class Solver:
         evidence = evidence_of(patches, rows, switches)
         near = near_sources(self._transport, shell, rows)
         distant = distant_sources(self._transport, closed, rows, with_indirect=switches.indirect)
-        settled = MOVED if self._near.known > 0 and switches.memory else FIRST_MOVED
+        is_next = self._near.known > 0 and switches.memory and not is_other_light
+        settled = MOVED if is_next else FIRST_MOVED
         for unknowns, sources in ((self._near, near), (self._distant, distant)):
             for _ in range(MOST_STEPS):
                 step(unknowns, evidence, sources, switches)

@@ -1,8 +1,9 @@
 """Numbers that are legal but odd, and any that float64 has, from one client after the other to a running server.
 
-Hypothesis makes up the sessions (tests/service/odd_numbers.py): cameras, poses, depths, wishes, places, requests. Each is
-sent to a server that computes on its device. It may refuse them by the field's name or answer them; it must not end, and a
-session must not fail inside. All the while another client sends frames, whose times are compared with those before.
+Hypothesis makes up the sessions (tests/service/odd_numbers.py): cameras, poses, depths, wishes, places, requests. Each
+is sent to a server that computes on its device. It may refuse them by the field's name or answer them; it must not end,
+and a session must not fail inside. All the while another client sends frames, whose times are compared with those
+before.
 """
 
 from __future__ import annotations

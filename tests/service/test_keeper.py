@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -13,11 +15,14 @@ from pathlib import Path
 import pytest
 
 from client.options.serve_options import ServeOptions, authenticator_of
+from server.opencl.device import Device
 from server.service import keeper
 from server.service.edge.listening import listen
 from server.service.keeper import CAN_KEEP, KEPT, Keeper, kept
+from tests.bench.service.process import children
 from tests.data import ROOT
 from tests.service.fakes import PATIENCE_S
+from tests.service.wire import Wire
 
 pytestmark = pytest.mark.skipif(not CAN_KEEP, reason="this machine's hardware: Windows hands down no sockets")
 
@@ -132,3 +137,37 @@ def test_without_a_parent_there_is_nothing_kept(monkeypatch) -> None:
 def test_the_kept_token_counts_where_none_was_given() -> None:
     assert authenticator_of(ServeOptions("127.0.0.1", new_token="kept")).token == "kept"
     assert authenticator_of(ServeOptions("127.0.0.1", token="own", new_token="kept")).token == "own"
+
+
+def test_the_program_is_back_at_its_address_after_a_crash(device: Device, tmp_path: Path) -> None:
+    program = [sys.executable, "-c", "from client.cli import main; main()", "serve", "--device", device.name]
+    process = subprocess.Popen(
+        [*program, "--port", "0", "--token", "none", "--data", "none"],
+        cwd=ROOT,
+        env=os.environ | {"PROBELESS_KEYS": str(tmp_path)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        url = ready_url(process)
+        (server,) = children(process.pid)
+        os.kill(server, signal.SIGKILL)
+        wire = Wire(url)  # waits in the parent's socket
+        wire.greet()
+        assert ready_url(process) == url
+        process.send_signal(signal.SIGTERM)
+        assert wire.ending()[0] == 1012
+        _, errors = process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
+    assert process.returncode == 0
+    assert "the server crashed and is started again signal=SIGKILL" in errors
+
+
+def ready_url(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith("ready: open "):
+            return line.split()[2]
+    raise AssertionError("it ended before it was ready")

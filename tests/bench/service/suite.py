@@ -24,6 +24,7 @@ from tests.bench.service.full_disk import full_disk_part
 from tests.bench.service.http import http_part, schema_part
 from tests.bench.service.load import load_part, side_by_side_part
 from tests.bench.service.long_frames import long_frames_part
+from tests.bench.service.odd_numbers import odd_numbers_part
 from tests.bench.service.planes import planes_part
 from tests.bench.service.replay import replay_part
 from tests.bench.service.speed import speed_part
@@ -39,6 +40,7 @@ PARTS: dict[str, Callable[..., Part]] = {
     "server killed": server_killed_part,
     "disk full, then killed": full_disk_part,
     **{name: partial(fault_part, name) for name in FAULTS},
+    "odd numbers": odd_numbers_part,
     "mutated messages": decoder_part,
     "mutated messages over the socket": socket_part,
     "bad requests": http_part,

@@ -20,6 +20,7 @@ from tests.bench.report.run import Run
 from tests.bench.service.attacks import large_models_part, silent_sockets_part
 from tests.bench.service.bytes import decoder_part, socket_part
 from tests.bench.service.faults import FAULTS, fault_part, server_killed_part
+from tests.bench.service.floods import floods_part
 from tests.bench.service.full_disk import full_disk_part
 from tests.bench.service.http import http_part, schema_part
 from tests.bench.service.load import load_part, side_by_side_part
@@ -37,6 +38,7 @@ PARTS: dict[str, Callable[..., Part]] = {
     "long frames": long_frames_part,
     "silent sockets": silent_sockets_part,
     "large models": large_models_part,
+    "floods": floods_part,
     "server killed": server_killed_part,
     "disk full, then killed": full_disk_part,
     **{name: partial(fault_part, name) for name in FAULTS},

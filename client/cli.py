@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from client.display.light_words import light_lines
-from client.errors import OWN_PACKAGES, OptionError
+from client.errors import OWN_PACKAGES, OptionError, RunError
 from client.options import capture_options as o
 from client.options.capture import prepare, refuse_color, refuse_depth_noise
 from client.options.capture_options import CaptureOptions, capturing
@@ -334,6 +334,7 @@ def serve(
     data_days: Annotated[
         float | None, typer.Option(min=0, help="unused saved rooms are removed after this; default 180, 0: never")
     ] = None,
+    restart: Annotated[bool, typer.Option("--restart/--no-restart", help="start it again where it crashes")] = True,
     log: Annotated[str, typer.Option(metavar="text|json", help="format of events on standard error")] = "text",
 ) -> int:
     """Run the server. It requires a token, which is part of the URL that it prints."""
@@ -347,11 +348,14 @@ def serve(
         log_format_of,
         objects_folder,
     )
+    from server.service.edge.listening import ServeError
+    from server.service.keeper import CAN_KEEP, keep, kept
     from server.service.monitoring.console import console_of
     from server.service.monitoring.event_log import log_events
-    from server.service.serve import serve as serve_forever
 
+    keeper = kept()
     options = ServeOptions(
+        new_token=None if keeper is None else keeper.token,
         host=host,
         token=token,
         token_file=token_file,
@@ -370,6 +374,13 @@ def serve(
     limits, authenticator, log_format = limits_of(options), authenticator_of(options), log_format_of(log)
     certificate = certificate_of(options)
     log_events(log_format)
+    if restart and keeper is None and CAN_KEEP:
+        try:
+            keep(host, port, log_format)
+        except ServeError as error:
+            raise RunError(str(error)) from error
+    from server.service.serve import serve as serve_forever
+
     console = console_of(log_format, is_token_given=(token or token_file) is not None)
     status = serve_forever(
         host,
@@ -382,6 +393,7 @@ def serve(
         objects=objects_folder(objects),
         say=console.say,
         shows_token=console.shows_token,
+        keeper=keeper,
     )
     exit_soon(status)
     return status

@@ -31,7 +31,8 @@ GROUPS: dict[str, tuple[str, ...]] = {
         *("host", "port", "token_file", "insecure", "allow_origin", "tls", "tls_cert", "tls_key", "trusted_proxy"),
     ),
     "Limits and data": (
-        *("sessions", "sessions_per_address", "volume_memory", "objects", "data", "data_gib", "data_days", "log"),
+        *("sessions", "sessions_per_address", "volume_memory", "objects", "data", "data_gib", "data_days", "restart"),
+        "log",
     ),
 }
 """Options of all these commands, in the order in which they are shown."""

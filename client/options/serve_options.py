@@ -48,6 +48,8 @@ class ServeOptions:
     sessions_per_address: int | None = None
     data_gib: float | None = None
     data_days: float | None = None
+    new_token: str | None = None
+    """Where none is given: the one that an earlier server made up, which this one takes the place of."""
 
 
 def authenticator_of(options: ServeOptions) -> Authenticator:
@@ -67,7 +69,7 @@ def authenticator_of(options: ServeOptions) -> Authenticator:
         raise OptionError("--insecure goes with --token none: leave it out")
     if options.token is not None and not is_token(options.token):
         raise OptionError(f"--token: expected up to {MAX_TOKEN_CHARS} ASCII characters without spaces, or none")
-    return Authenticator(options.token or new_token(), origins, proxies)
+    return Authenticator(options.token or options.new_token or new_token(), origins, proxies)
 
 
 def _token_in_file(options: ServeOptions) -> str:

@@ -6,6 +6,7 @@ The environment variable PROBELESS_TOKEN must hold the clients' token, or `none`
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from typing import Any
 
 from fastapi import FastAPI
@@ -16,6 +17,7 @@ from server.cluster.ray_directory import RayRoomDirectory
 from server.cluster.room_supervisor import RoomSupervisor
 from server.cluster.settings import ClusterSettings, read_settings
 from server.service.edge.authenticator import Authenticator, is_token
+from server.service.edge.trusted_proxies import TrustedProxies
 
 TOKEN = "PROBELESS_TOKEN"
 
@@ -54,14 +56,14 @@ def build(args: dict[str, Any]) -> Any:
         ray_actor_options={"num_cpus": settings.ingress_cpus},
         graceful_shutdown_timeout_s=10.0,
     )
-    return ingress.bind(settings, authenticator_from_environment(), supervisor.bind(settings))
+    return ingress.bind(settings, authenticator_from_environment(settings.trusted_proxies), supervisor.bind(settings))
 
 
-def authenticator_from_environment() -> Authenticator:
-    """Raises ValueError if the token is missing or invalid."""
-    token = os.environ.get(TOKEN, "")
+def authenticator_from_environment(trusted_proxies: Iterable[str] = ()) -> Authenticator:
+    """Raises ValueError if the token is missing or invalid, or a proxy is no address."""
+    token, proxies = os.environ.get(TOKEN, ""), TrustedProxies(trusted_proxies)
     if token == "none":
-        return Authenticator(None)
+        return Authenticator(None, proxies=proxies)
     if not is_token(token):
         raise ValueError(f"set {TOKEN} to a secret of yours (openssl rand -hex 24), or to none to let everybody in")
-    return Authenticator(token)
+    return Authenticator(token, proxies=proxies)

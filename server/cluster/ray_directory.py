@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import ray
@@ -11,22 +13,25 @@ from ray.actor import exit_actor
 from ray.exceptions import RayActorError
 
 from server.cluster.host import HostStatus, open_room_host
+from server.cluster.quota import Quota
 from server.cluster.room_directory import Address, RoomNotReady, RoomUnavailable
 from server.cluster.settings import ClusterSettings
 from server.service.monitoring.event_log import log_events
 
 NAMESPACE = "probeless"
-PREFIX = "room-"
+PREFIX, QUOTA = "room-", "quota"
 ANSWER_S = 5.0
+LEAVE_S = 20.0
+"""Of a room that is saved and stopped."""
 log = logging.getLogger(__name__)
 
 
 class RoomActor:
     """Ray actor around a `RoomHost`."""
 
-    def __init__(self, settings: ClusterSettings) -> None:
+    def __init__(self, settings: ClusterSettings, is_private: bool) -> None:
         log_events("json")
-        self._host = open_room_host(settings)
+        self._host = open_room_host(settings, is_private=is_private)
 
     def address(self) -> Address:
         """Of `RoomHost`."""
@@ -36,9 +41,9 @@ class RoomActor:
         """Of `RoomHost`."""
         return self._host.status()
 
-    def leave(self) -> bool:
+    def leave(self, even_with_clients: bool = False) -> bool:
         """See `RoomHost`; the actor ends too, which frees its name."""
-        if not self._host.leave():
+        if not self._host.leave(even_with_clients=even_with_clients):
             return False
         exit_actor()
         return True
@@ -50,17 +55,40 @@ class RayRoomDirectory:
     def __init__(self, settings: ClusterSettings) -> None:
         self._settings = settings
 
-    async def find(self, room_id: str, may_open: bool) -> Address:
+    async def find(self, room_id: str, may_open: bool, client: str = "", *, is_private: bool = False) -> Address:
         """The room's host. Raises RoomNotReady, RoomUnavailable."""
         try:
-            actor = await asyncio.to_thread(self._actor, room_id, may_open)
+            actor = await asyncio.to_thread(self._actor, room_id, may_open, client, is_private)
             async with asyncio.timeout(ANSWER_S):
                 address: Address = await actor.address.remote()
         except (RayActorError, TimeoutError) as error:
             raise RoomNotReady(str(error)) from error
         return address
 
-    def _actor(self, room_id: str, may_open: bool) -> Any:
+    async def release(self, room_id: str) -> bool:
+        """Whether the place is free."""
+        try:
+            actor = await asyncio.to_thread(ray.get_actor, PREFIX + room_id, NAMESPACE)
+            async with asyncio.timeout(LEAVE_S):
+                return bool(await actor.leave.remote())
+        except (RayActorError, ValueError):  # ended, or just ending
+            return True
+        except TimeoutError:
+            return False
+
+    async def abandon(self, room_id: str) -> None:
+        """Nothing of it is to be saved."""
+        with contextlib.suppress(RayActorError, ValueError):
+            actor = await asyncio.to_thread(ray.get_actor, PREFIX + room_id, NAMESPACE)
+            await asyncio.to_thread(ray.kill, actor)
+
+    async def has_place(self) -> bool:
+        """Whether the resources of a place are free."""
+        free = await asyncio.to_thread(ray.available_resources)
+        names = await asyncio.to_thread(room_names)
+        return len(names) < self._settings.policy.most and is_enough(free, self._settings.place)
+
+    def _actor(self, room_id: str, may_open: bool, client: str, is_private: bool) -> Any:
         name = PREFIX + room_id
         if not may_open:
             try:
@@ -71,7 +99,28 @@ class RayRoomDirectory:
         names = room_names()
         if name not in names and len(names) >= most:
             raise RoomUnavailable(f"the server is full: {most} rooms are open, which is the most: try again later")
-        return ray.remote(RoomActor).options(**actor_options(name, self._settings.place)).remote(self._settings)
+        if name not in names and not ray.get(_quota(self._settings).claim.remote(room_id, client, _ids(names))):
+            of_one = self._settings.rooms_per_client
+            raise RoomUnavailable(
+                f"your address {client} has {of_one} rooms open, which is the most: close one of them"
+            )
+        options = actor_options(name, self._settings.place)
+        return ray.remote(RoomActor).options(**options).remote(self._settings, is_private)
+
+
+def is_enough(free: Mapping[str, float], place: Mapping[str, float]) -> bool:
+    """Whether a place fits into what is free in all; it may be spread over nodes."""
+    return all(free.get(kind, 0.0) >= share for kind, share in place.items())
+
+
+def _ids(names: Iterable[str]) -> list[str]:
+    return [name.removeprefix(PREFIX) for name in names]
+
+
+def _quota(settings: ClusterSettings) -> Any:
+    """The one quota of the cluster. It forgets who opened which room if its node fails."""
+    options = {"name": QUOTA, "namespace": NAMESPACE, "get_if_exists": True, "lifetime": "detached"}
+    return ray.remote(Quota).options(**options, num_cpus=0, max_restarts=-1).remote(settings.rooms_per_client)
 
 
 def actor_options(name: str, place: dict[str, float]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from typing import Any
 
 from fastapi import WebSocket, WebSocketDisconnect
 from websockets.asyncio.client import ClientConnection, connect
@@ -18,6 +19,8 @@ from server.service.edge.connection import GOING_AWAY, INTERNAL, LOST, NO_CODE, 
 
 STREAM_PATH = "/v1/stream"
 OPEN_PATIENCE_S = 5.0
+READ_AHEAD = 2
+"""Messages, beside those in the socket's own queue."""
 PING_S, PING_PATIENCE_S = 5.0, 10.0
 """A host that does not answer is given up after the sum of both."""
 MOVED = "the machine of this room has failed and the room moves to another one: connect again"
@@ -39,9 +42,36 @@ async def open_host(address: Address) -> ClientConnection:
     )
 
 
-async def relay(client: WebSocket, host: ClientConnection, room_id: str) -> None:
-    """Relay until either side closes, then close the other side."""
-    up = asyncio.create_task(_client_to_host(client, host))
+class ClientEvents:
+    """What a client sends, read ahead a little, so that its leaving is seen while its room is being opened."""
+
+    def __init__(self, client: WebSocket) -> None:
+        self._client = client
+        self._events: asyncio.Queue[Any] = asyncio.Queue(READ_AHEAD)
+        self.has_left = asyncio.Event()
+        self._reading = asyncio.create_task(self._read())
+
+    async def _read(self) -> None:
+        is_open = True
+        while is_open:
+            event = await self._client.receive()
+            is_open = event["type"] != "websocket.disconnect"
+            if not is_open:
+                self.has_left.set()
+            await self._events.put(event)
+
+    async def next(self) -> Any:
+        """The next event of ASGI."""
+        return await self._events.get()
+
+    def close(self) -> None:
+        """Read no more."""
+        self._reading.cancel()
+
+
+async def relay(client: WebSocket, events: ClientEvents, host: ClientConnection, room_id: str) -> None:
+    """Relay until either side closes, then close the other side. `events`: what the client sends."""
+    up = asyncio.create_task(_client_to_host(events, host))
     down = asyncio.create_task(_host_to_client(client, host, room_id))
     try:
         await asyncio.wait((up, down), return_when=asyncio.FIRST_COMPLETED)
@@ -56,9 +86,9 @@ async def relay(client: WebSocket, host: ClientConnection, room_id: str) -> None
             raise error
 
 
-async def _client_to_host(client: WebSocket, host: ClientConnection) -> None:
+async def _client_to_host(events: ClientEvents, host: ClientConnection) -> None:
     while True:
-        event = await client.receive()
+        event = await events.next()
         if event["type"] == "websocket.disconnect":
             code = event.get("code", LOST)
             if code in (NORMAL, GOING_AWAY):  # uvicorn reports NO_CODE for broken connections too

@@ -14,6 +14,7 @@ from ray.exceptions import RayError
 from ray.util.metrics import Gauge
 
 from server.cluster.capacity import Capacity
+from server.cluster.closing import rooms_to_close
 from server.cluster.host import HostStatus
 from server.cluster.ray_directory import NAMESPACE, room_names
 from server.cluster.settings import ClusterSettings
@@ -47,23 +48,27 @@ class RoomSupervisor:
     async def _run(self) -> None:
         while True:
             names = await asyncio.to_thread(room_names)
-            found = await asyncio.gather(*(self._look_after(name) for name in names))
-            ages = [status.queue_age_s for status in found if status is not None and status.queue_age_s > 0]
+            found = dict(zip(names, await asyncio.gather(*map(self._status_of, names)), strict=True))
+            for name in rooms_to_close(found, self._settings.close_after_s):
+                await self._close(name)
+            ages = [status.queue_age_s for status in found.values() if status is not None and status.queue_age_s > 0]
             await self._request_places(len(names), sum(ages) / len(ages) if ages else 0.0)
             await asyncio.sleep(EVERY_S)
 
-    async def _look_after(self, name: str) -> HostStatus | None:
+    async def _status_of(self, name: str) -> HostStatus | None:
         """The room's status; None if it waits for a place, is moving, or was just closed."""
         with contextlib.suppress(RayError, ValueError, TimeoutError):
             async with asyncio.timeout(ANSWER_S):
                 actor: Any = await asyncio.to_thread(ray.get_actor, name, NAMESPACE)
                 status: HostStatus = await actor.status.remote()
-                if status.clients == 0 and status.idle_s > self._settings.close_after_s:
-                    log.info("%s is closed: nobody is in it", name)
-                    actor.leave.remote()
-                    return None
                 return status
         return None
+
+    async def _close(self, name: str) -> None:
+        log.info("%s is closed: nobody is in it", name)
+        with contextlib.suppress(RayError, ValueError):
+            actor: Any = await asyncio.to_thread(ray.get_actor, name, NAMESPACE)
+            actor.leave.remote()
 
     async def _request_places(self, rooms: int, queue_age_s: float) -> None:
         wanted = self._capacity.wanted(time.monotonic(), rooms, queue_age_s)

@@ -32,6 +32,8 @@ class Route:
     first: bytes
     may_open: bool
     """Whether the room may be opened. False for clients that return to a session."""
+    is_private: bool = False
+    """The room of this session alone: it has no name by which another client could enter."""
 
 
 class _Tag(msgspec.Struct):
@@ -50,7 +52,7 @@ def route_of(first: ClientMessage | None) -> Route:
             room_id, own = _split(key, Refusal(GONE, "there is no session with this key: it ended"))
             return Route(room_id, encode(structs.replace(first, resume=own)), may_open=False)
         case Hello(room=None):
-            return Route(secrets.token_hex(ID_BYTES), encode(first), may_open=True)
+            return Route(secrets.token_hex(ID_BYTES), encode(first), may_open=True, is_private=True)
         case Hello(room=str(name)):
             return Route(room_id_of(name), encode(first), may_open=True)
         case Watch(session=str(session)):

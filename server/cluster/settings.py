@@ -32,6 +32,10 @@ class ClusterSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     most_ingress_replicas: Annotated[int, Meta(ge=1)] = 8
     sockets_per_replica: Annotated[int, Meta(ge=1)] = 32
     """Target; a replica accepts up to twice as many while others start."""
+    rooms_per_client: Annotated[int, Meta(ge=1)] = 4
+    """Rooms that clients of one address may have opened; see `quota.client_of`."""
+    trusted_proxies: list[str] = []
+    """ADDRESS or ADDRESS/BITS of the proxies between clients and replicas, whose X-Forwarded-For is believed."""
     ingress_cpus: Annotated[float, Meta(ge=0)] = 0.5
 
 

@@ -101,8 +101,10 @@ def list_devices() -> list[DeviceInfo]:
     ]
 
 
-def open_device(name: str | None = None) -> Device:
+def open_device(name: str | None = None, number: int = 0) -> Device:
     """Open the first usable device whose "platform / device" contains `name` (any case); GPUs are preferred.
+
+    `number`: of several GPUs that are called alike on one platform, which one; they are counted round.
 
     Raises DeviceError with one line that says what is there and what to do.
     """
@@ -117,7 +119,8 @@ def open_device(name: str | None = None) -> Device:
     for device in wanted:
         reason = _why_unusable(device)
         if reason is None:
-            return Device(device)
+            alike = [d for d in wanted if (d.platform, d.name, d.type) == (device.platform, device.name, device.type)]
+            return Device(alike[number % len(alike)])
         reasons.append(f"{device.name.strip()}: {reason}")
     hint = "" if any(linker.CANNOT_LINK in reason for reason in reasons) else f": {_INSTALL}"
     raise DeviceError(f"no usable OpenCL device ({'; '.join(reasons)}){hint}")

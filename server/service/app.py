@@ -7,14 +7,14 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
-from fastapi import FastAPI, Request, WebSocket
-from fastapi.responses import PlainTextResponse, Response
+from fastapi import FastAPI, WebSocket
+from fastapi.responses import PlainTextResponse
 from fastapi.staticfiles import StaticFiles
-from prometheus_client import CONTENT_TYPE_LATEST
 
-from server.service.edge.authenticator import WHERE_IT_IS, Authenticator, address_of
+from server.service.edge.authenticator import Authenticator
 from server.service.edge.connection import POLICY, Connection, Refusal
 from server.service.routes.health_routes import Health, add_health
+from server.service.routes.metrics_route import add_metrics
 from server.service.routes.object_library import ObjectLibrary
 from server.service.routes.object_routes import add_objects
 from server.service.routes.panorama_routes import add_panorama
@@ -47,7 +47,7 @@ def create_app(
     app = FastAPI(lifespan=lifespan, openapi_url=None)
     _add_stream(app, service, authenticator)
     add_health(app, lambda: _health_of(service), authenticator)
-    _add_metrics(app, service, authenticator)
+    add_metrics(app, service.metrics.render, authenticator)
     add_objects(app, library or ObjectLibrary(), authenticator)
     add_panorama(app, service, authenticator)
     _add_page(app, page_folder)
@@ -87,16 +87,6 @@ def _health_of(service: Service) -> Health:
     if service.failed_check is not None:
         details["failed_check"] = service.failed_check
     return Health(service.ready, service.takes_sessions, details)
-
-
-def _add_metrics(app: FastAPI, service: Service, authenticator: Authenticator) -> None:
-    @app.get("/metrics", response_class=PlainTextResponse, responses={401: {"description": "No token"}})
-    async def metrics(request: Request) -> Response:
-        if not authenticator.shows_metrics_to(request):
-            await authenticator.slow_down(request)
-            log.info("request refused", extra={"address": address_of(request), "path": request.url.path})
-            return PlainTextResponse(f"The token is missing or wrong: {WHERE_IT_IS}.\n", status_code=401)
-        return Response(service.metrics.render(), media_type=CONTENT_TYPE_LATEST)
 
 
 def _add_page(app: FastAPI, page_folder: Path) -> None:

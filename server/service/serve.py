@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import logging
 import os
 import signal
@@ -24,6 +23,7 @@ from server.service.edge.acceptor import Acceptor, TimedHttp
 from server.service.edge.authenticator import Authenticator, is_loopback, new_token
 from server.service.edge.gate import Gate, Place, max_connections
 from server.service.edge.lingering_close import LingeringCloseWebSocket
+from server.service.edge.listening import ServeError, listen
 from server.service.edge.tls import Certificate
 from server.service.edge.trusted_proxies import TrustedProxies
 from server.service.limits import DEFAULT_LIMITS, Limits
@@ -33,6 +33,7 @@ from server.service.service import Service
 
 if TYPE_CHECKING:
     from server.opencl.device import Device
+    from server.service.keeper import Kept
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8080
@@ -44,10 +45,6 @@ EVERYWHERE = ("0.0.0.0", "::", "")
 NO_AUTHENTICATION = Authenticator()
 
 log = logging.getLogger(__name__)
-
-
-class ServeError(Exception):
-    """The server cannot start; one line with the reason and a remedy."""
 
 
 def serve(
@@ -62,10 +59,11 @@ def serve(
     objects: Path | None = None,
     say: Callable[[str], None] = print_line,
     shows_token: bool = True,
+    keeper: Kept | None = None,
 ) -> int:
     """Serve until interrupted and return the exit status. `say` receives each line for the user (default: stdout).
 
-    `shows_token`: whether the token is in one of these lines.
+    `shows_token`: whether the token is in one of these lines. `keeper`: whose listening socket is used.
 
     `authenticator` None: a new token is required. `certificate` None: no TLS. `data`: folder in which rooms are saved.
     `objects`: folder of models that clients may place; None: only the vase.
@@ -73,11 +71,14 @@ def serve(
     """
     authenticator = authenticator or Authenticator(new_token())
     try:
-        listener = listen(host, port)
+        listener = listen(host, port) if keeper is None else keeper.listener
         with listener:
             service = open_service(device_name, limits=limits, data=data)
             library = ObjectLibrary(objects)
-            return serve_on(listener, service, say, authenticator, certificate, library, shows_token=shows_token)
+            ready = keeper.tell_ready if keeper is not None else lambda: None
+            return serve_on(
+                listener, service, say, authenticator, certificate, library, shows_token=shows_token, tell_ready=ready
+            )
     except ServeError as error:
         sys.stderr.write(f"probeless: {error}\n")
         return 1
@@ -95,20 +96,6 @@ def open_service(
         raise ServeError(str(error)) from error
     device.volume_bytes = limits.volume_bytes
     return Service(device, warm_up=_warm_up, limits=limits, data=data)
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """A listening socket; port 0 takes a free one. Raises ServeError if the port is in use or the host is not local."""
-    if not 0 <= port <= 65535:
-        raise ServeError(f"there is no port {port}: choose --port from 1 to 65535")
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        return socket.create_server((host, port), family=family)
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            raise ServeError(f"port {port} of {host} is in use: stop what uses it or choose another --port") from error
-        why = error.strerror or str(error)
-        raise ServeError(f"cannot listen on {host} port {port} ({why}): choose another --host or --port") from error
 
 
 def url_of(listener: socket.socket, certificate: Certificate | None = None, everywhere: str = "localhost") -> str:
@@ -129,8 +116,12 @@ def serve_on(
     library: ObjectLibrary | None = None,
     *,
     shows_token: bool = True,
+    tell_ready: Callable[[], None] = lambda: None,
 ) -> int:
-    """Serve until interrupted and return the exit status. Raises ServeError if the warm-up fails."""
+    """Serve until interrupted and return the exit status. Raises ServeError if the warm-up fails.
+
+    `tell_ready` is called when clients are welcome.
+    """
     server = _server(service, authenticator, certificate, library)
     with _key_left(listener, authenticator, certificate) as is_left:
 
@@ -138,6 +129,7 @@ def serve_on(
             if service.failure is None:
                 for line in _ways_in(listener, authenticator, certificate, is_left, shows_token=shows_token):
                     say(line)
+                tell_ready()
             else:
                 server.should_exit = True
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import uvicorn
 
 from server.cluster.host import RoomHost
 from server.cluster.ingress import Ingress, create_ingress_app
+from server.cluster.quota import Quota
 from server.cluster.room_directory import Address, RoomNotReady, RoomUnavailable
 from server.service.edge.authenticator import Authenticator
 from server.service.serve import listen, url_of
@@ -31,21 +34,46 @@ class TownPlaces:
         self.free = places
         self.hosts: dict[str, RoomHost] = {}
         self.moving: set[str] = set()
+        self.private: set[str] = set()
+        self.abandoned: list[str] = []
+        self.quota = Quota(100)
 
-    async def find(self, room_id: str, may_open: bool) -> Address:
+    async def find(self, room_id: str, may_open: bool, client: str = "", *, is_private: bool = False) -> Address:
         if room_id in self.moving:
             raise RoomNotReady(room_id)
         if room_id not in self.hosts:
             if not may_open:
                 raise RoomUnavailable("there is no such session")
+            if not self.quota.claim(room_id, client, self.hosts):
+                raise RoomUnavailable(f"your address {client} has {self.quota.most} rooms open: close one of them")
             if not self.free:
                 raise RoomNotReady("no place is free")
             self.free -= 1
             self.open(room_id)
+            if is_private:
+                self.private.add(room_id)
         return self.hosts[room_id].address()
 
+    async def release(self, room_id: str) -> bool:
+        if not await asyncio.to_thread(self.hosts[room_id].leave):
+            return False
+        del self.hosts[room_id]
+        self.free += 1
+        return True
+
+    async def abandon(self, room_id: str) -> None:
+        self.abandoned.append(room_id)
+
+    async def has_place(self) -> bool:
+        return self.free > 0
+
     def open(self, room_id: str) -> None:
-        service = Service(FAKE_DEVICE, pipeline_factory=self.lab.build, mesh_loader=fake_mesh)  # type: ignore[arg-type]
+        service = Service(
+            FAKE_DEVICE,  # type: ignore[arg-type]
+            pipeline_factory=self.lab.build,
+            room_factory=lambda _wishes, name: SimpleNamespace(name=name, key_digest=None, close=lambda: None),
+            mesh_loader=fake_mesh,
+        )
         self.hosts[room_id] = RoomHost(service, "127.0.0.1")
 
 

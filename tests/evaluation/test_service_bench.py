@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import random
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,10 @@ from tests.bench.service.full_disk import Found, begin, disk_full_then_killed
 from tests.bench.service.guests import CAMERA, FIRST_PX, FULL_S, LAST_PX, WALL_M, Guest, clock_frame, clock_s
 from tests.bench.service.http import bad_request
 from tests.bench.service.load import growth, overhead
+from tests.bench.service.odd_numbers import Outcome, play_sessions
 from tests.bench.service.process import stop
+from tests.servers import fake_server
+from tests.service.fakes import FakePipeline, FakeResult, Lab
 
 
 @pytest.mark.parametrize("shown_s", [0.0, 3.0, 12.0])
@@ -59,6 +63,38 @@ def test_a_full_disk_and_a_kill_take_nothing_that_was_acknowledged_without_an_er
     assert found.missing == []
     assert found.kept >= 5
     assert found.unsaved >= 1
+
+
+def test_a_server_answers_or_refuses_sessions_of_odd_numbers(device: Device) -> None:
+    outcome = Outcome()
+    with BackgroundServer(Service(device)) as server:
+        play_sessions(server.url, 200, outcome)
+    assert outcome.failed == []
+    assert outcome.frames >= 200
+    assert outcome.answers["composite"] >= 40
+    assert outcome.answers["dropped"] >= 10
+    assert all(outcome.reasons)
+
+
+def test_odd_numbers_that_end_the_server_or_a_session_are_found(lab_of_failures: str) -> None:
+    outcome = Outcome()
+    play_sessions(lab_of_failures, 60, outcome)
+    assert any(line.startswith("1011") for line in outcome.failed)
+    with pytest.raises(OSError, match="refused"):
+        play_sessions("http://127.0.0.1:9", 60, outcome)  # the port of "discard": nobody listens
+    assert outcome.failed[-1].startswith("the server is gone")
+
+
+@pytest.fixture
+def lab_of_failures() -> Iterator[str]:
+    """URL of a server whose pipelines fail in every frame."""
+
+    class Failing(FakePipeline):
+        def process(self, *_: object, **__: object) -> FakeResult:
+            raise RuntimeError("secret internals")
+
+    with fake_server(lambda *_: Failing(Lab())) as server:
+        yield server.url
 
 
 def samples(counts: dict[str, float]) -> dict[tuple[str, ...], float]:

@@ -120,3 +120,17 @@ def test_a_device_that_cannot_compile_is_passed_over(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(cl, "Context", compiles)
     assert open_device().name != "Fake Platform / gpu"
     assert module._why_unusable(broken) == "cannot compile: error: unknown target CPU"
+
+
+def test_the_number_chooses_among_gpus_that_are_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fake(platform: str, name: str) -> SimpleNamespace:
+        return SimpleNamespace(platform=SimpleNamespace(name=platform), name=name, type=1)
+
+    vendor = SimpleNamespace(name="vendor")
+    same = [SimpleNamespace(platform=vendor, name="big", type=1, bus=number) for number in range(3)]
+    devices = [same[0], fake("other", "big"), same[1], fake("vendor", "small"), same[2]]
+    monkeypatch.setattr("server.opencl.device._all_devices", lambda: devices)
+    monkeypatch.setattr("server.opencl.device._why_unusable", lambda _device: None)
+    monkeypatch.setattr("server.opencl.device.Device", lambda device: device)
+    assert [open_device(None, number).bus for number in range(5)] == [0, 1, 2, 0, 1]
+    assert open_device("small", 2).name == "small"

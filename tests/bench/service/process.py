@@ -92,7 +92,7 @@ def start(log: Path, *options: str, unusual: Unusual | None = None, port: int = 
     command = [PROGRAM, "serve"]
     if unusual is not None:
         command = [sys.executable, "-m", "tests.bench.service.process", json.dumps(asdict(unusual))]
-    said = (*options, "--log", "json")
+    said = (*options, "--no-restart", "--log", "json")  # its process is looked at, and killed
     with log.open("a") as errors:
         process = subprocess.Popen(
             [*command, "--port", str(port), *said], stdout=subprocess.PIPE, stderr=errors, text=True, cwd=ROOT

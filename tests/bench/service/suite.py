@@ -20,10 +20,12 @@ from tests.bench.report.run import Run
 from tests.bench.service.attacks import large_models_part, silent_sockets_part
 from tests.bench.service.bytes import decoder_part, socket_part
 from tests.bench.service.faults import FAULTS, fault_part, server_killed_part
+from tests.bench.service.floods import floods_part
 from tests.bench.service.full_disk import full_disk_part
 from tests.bench.service.http import http_part, schema_part
 from tests.bench.service.load import load_part, side_by_side_part
 from tests.bench.service.long_frames import long_frames_part
+from tests.bench.service.odd_numbers import odd_numbers_part
 from tests.bench.service.planes import planes_part
 from tests.bench.service.replay import replay_part
 from tests.bench.service.speed import speed_part
@@ -36,9 +38,11 @@ PARTS: dict[str, Callable[..., Part]] = {
     "long frames": long_frames_part,
     "silent sockets": silent_sockets_part,
     "large models": large_models_part,
+    "floods": floods_part,
     "server killed": server_killed_part,
     "disk full, then killed": full_disk_part,
     **{name: partial(fault_part, name) for name in FAULTS},
+    "odd numbers": odd_numbers_part,
     "mutated messages": decoder_part,
     "mutated messages over the socket": socket_part,
     "bad requests": http_part,

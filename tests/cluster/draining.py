@@ -1,0 +1,112 @@
+"""Two nodes of Ray on this machine: clients that leave at once keep no place, and a drained node's rooms move.
+
+    python -m tests.cluster.draining
+
+Prints one JSON object. Needs the extra `cluster`. Both nodes see one folder; the head's node is not drained.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from typing import Any
+
+from tests.cluster.failover import PATIENCE_S, TOKEN, Guest, enter, node_of, until  # first: it sets what Ray reads
+
+import ray  # isort: skip
+from ray import serve  # isort: skip
+from ray.cluster_utils import Cluster  # isort: skip
+
+from client.streaming.client import StreamClient  # isort: skip
+from server.cluster.application import build  # isort: skip
+from server.cluster.ray_directory import room_names  # isort: skip
+from tests.data import ROOT  # isort: skip
+from tests.scenes.rooms import CAMERA, wishes  # isort: skip
+
+PLACES = 2
+"""Of each node."""
+HURRIED = 11
+
+
+def main() -> int:
+    """Run it; 0 if every place came back and no room was lost."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["PROBELESS_KEYS"] = f"{folder}/keys"
+        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "resources": {"room": PLACES}})
+        drained = cluster.add_node(num_cpus=0, resources={"room": PLACES})
+        ray.init(address=cluster.address, log_to_driver="-v" in sys.argv)
+        try:
+            port = int(os.environ.get("PROBELESS_PORT", "18322"))
+            serve.start(http_options={"host": "127.0.0.1", "port": port})
+            serve.run(build({"data": f"{folder}/rooms", "place": {"room": 1.0}, "ingress_cpus": 0.1}), name="probeless")
+            result = asyncio.run(play(f"http://127.0.0.1:{port}/?token={TOKEN}", drained.node_id))
+        finally:
+            serve.shutdown()
+            ray.shutdown()
+            cluster.shutdown()
+    sys.stdout.write(json.dumps(result, indent=1) + "\n")
+    return 0 if result["object_kept"] and result["moved"] and not result["left_open"] else 1
+
+
+async def play(url: str, node: str) -> dict[str, Any]:
+    """What happened."""
+    began_s = time.perf_counter()
+    guests = [await enter(url, f"room {number}") for number in range(PLACES)]  # spread: one on each node
+    opened_s = time.perf_counter() - began_s
+    await asyncio.gather(*(hurry(url) for _ in range(HURRIED)))
+    hurried_s = time.perf_counter()
+    await until(lambda: len(room_names()) == len(guests), PATIENCE_S)
+    returned_s = time.perf_counter() - hurried_s
+    try:
+        await until(lambda: all(len(guest.answered_s) >= 3 for guest in guests), PATIENCE_S)
+        moved = [guest for guest in guests if await node_of(guest.room) == node]
+        began_s = time.perf_counter()
+        status = await asyncio.to_thread(drain, node)
+        await until(lambda: all(guest.back is not None for guest in moved), PATIENCE_S)
+        back_s = max(guest.back or 0.0 for guest in moved) - began_s
+        kept = [(await guest.client.move_object("vase", (-0.8, 0.6, 1.0))).error is None for guest in guests]
+        return {
+            "rooms_opened_s": round(opened_s, 1),
+            "places_back_s": round(returned_s, 1),
+            "left_open": len(room_names()) - len(guests),
+            "drain_status": status,
+            "rooms_of_the_node": len(moved),
+            "moved": [await node_of(guest.room) != node for guest in moved] == [True] * len(moved) and len(moved) > 0,
+            "back_s": round(back_s, 1),
+            "object_kept": all(kept),
+        }
+    finally:
+        await leave(guests)
+
+
+async def hurry(url: str) -> None:
+    """A hello whose client is gone before it is answered."""
+    client = await StreamClient.connect(url)
+    greeting = asyncio.create_task(client.hello(CAMERA, wishes("given")))
+    await asyncio.sleep(0.2)
+    greeting.cancel()
+    await client.close()
+
+
+def drain(node: str) -> int:
+    """Exit status of the command."""
+    command = [sys.executable, "-m", "server.cluster.drain", node]
+    environment = os.environ | {"RAY_ADDRESS": ray.get_runtime_context().gcs_address}
+    return subprocess.run(command, check=False, cwd=ROOT, env=environment).returncode
+
+
+async def leave(guests: list[Guest]) -> None:
+    """All of them."""
+    for guest in guests:
+        for task in guest.tasks:
+            task.cancel()
+        await guest.client.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

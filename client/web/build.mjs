@@ -7,6 +7,9 @@ import { build } from "esbuild";
 
 const argument = process.argv[2] ?? "dist";
 
+/** What needs no building; sample.py makes the sample. */
+const COPIED = ["index.html", "manifest.webmanifest", "icon-192.png", "icon-512.png", "sample.probeless"];
+
 async function buildPage(folder) {
   await rm(folder, { recursive: true, force: true });
   await mkdir(folder, { recursive: true });
@@ -24,7 +27,7 @@ async function buildPage(folder) {
     logLevel: "warning",
     preserveSymlinks: true, // or the names of chunks depend on where a linked node_modules lies
   });
-  await copyFile("src/index.html", join(folder, "index.html"));
+  for (const name of COPIED) await copyFile(join("src", name), join(folder, name));
   await buildResults(join(folder, "results.html"));
   const licences = await Promise.all(["@msgpack/msgpack", "fzstd", "three"].map((name) => readFile(`node_modules/${name}/LICENSE`, "utf8")));
   await writeFile(join(folder, "LICENSES.txt"), licences.join("\n----\n\n"));

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
 from protocol.messages import (
+    Acknowledged,
     Frame,
     MoveObject,
     PanoramaFormat,
@@ -29,6 +30,9 @@ from protocol.messages import (
 )
 
 
+ObjectRequest = PlaceObject | MoveObject | RemoveObject
+
+
 @dataclass(frozen=True)
 class PanoramaOrder:
     """A request for a panorama that did not come over the session's socket (panorama_routes.py)."""
@@ -39,7 +43,18 @@ class PanoramaOrder:
     """The file, or ValueError with one line; cancelled if the session ends first."""
 
 
-Control = PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh | RequestPanorama | PanoramaOrder
+@dataclass(frozen=True)
+class WatcherRequest:
+    """A request of a client that watches, for the objects of the session."""
+
+    message: ObjectRequest
+    answer: Future[Acknowledged] = field(default_factory=Future)
+    """Cancelled if the session ends first."""
+
+
+Order = PanoramaOrder | WatcherRequest
+"""What did not come over the session's socket."""
+Control = ObjectRequest | Quality | RequestMesh | RequestPanorama | Order
 T = TypeVar("T", bound=Control)
 
 MAX_QUEUED_MESSAGES = 64
@@ -66,7 +81,7 @@ class QueuedMessage:
         match self.message:
             case Frame(color=color, depth=depth):
                 return sum(len(picture.data) for picture in (color, depth) if picture is not None)
-            case PlaceObject(data=data):
+            case PlaceObject(data=data) | WatcherRequest(message=PlaceObject(data=data)):
                 return len(data)
         return 0
 
@@ -200,5 +215,5 @@ class Mailbox:
 
 
 def _cancel(message: Frame | Control) -> None:
-    if isinstance(message, PanoramaOrder):
+    if isinstance(message, PanoramaOrder | WatcherRequest):
         message.answer.cancel()

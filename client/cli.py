@@ -314,7 +314,8 @@ def serve(
         typer.Option(metavar="ADDRESS[/BITS]", help="proxy whose X-Forwarded-For is believed; repeatable"),
     ] = None,
     tls: Annotated[
-        bool, typer.Option("--tls", help="https and wss, with a self-signed certificate that is kept")
+        bool,
+        typer.Option("--tls", help="https and wss, with a certificate of its own, which a phone can be told to trust"),
     ] = False,
     tls_cert: Annotated[Path | None, typer.Option(metavar="FILE", help="own certificate, PEM")] = None,
     tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="key of the certificate, PEM")] = None,
@@ -382,6 +383,7 @@ def serve(
         objects=objects_folder(objects),
         say=console.say,
         shows_token=console.shows_token,
+        draws_code=console.draws,
     )
     exit_soon(status)
     return status

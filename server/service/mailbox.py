@@ -29,7 +29,6 @@ from protocol.messages import (
     Vector3,
 )
 
-
 ObjectRequest = PlaceObject | MoveObject | RemoveObject
 
 

@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page
 
+from client.options.source import open_source
 from client.synthetic.scenes import desk
+from client.web.build import FOLDER
 from server.service.serve import BackgroundServer
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.constants import PATIENCE_MS
 from tests.client.web.page import on_screen, picture, wait_until
+from tests.client.web.sequence import of_device
+from tests.client.web.watched import TOUCHED, point_under
 from tests.node import installed_modules
 
 SIZES = {"phone": (390, 844), "tablet": (820, 1180), "desktop": (1440, 900)}
@@ -112,6 +116,20 @@ def test_a_file_that_is_too_large_for_a_room_is_made_to_fit(
     assert asked[1][1].scale == pytest.approx(0.15)
 
 
+def test_two_taps_of_a_phone_with_depth_place_an_object(
+    real_server: BackgroundServer, asked: list, open_page: OpenPage
+) -> None:
+    source = open_source("synthetic:table?light=7&size=160x120&frames=1")
+    page = open_page(real_server.url, of_device(source.camera, [source[0]], loops=True), size=SIZES["phone"])
+    page.locator("#use-camera").tap()
+    wait_for_text(page, "#state", "Live, captured here")
+    wait_for_text(page, "#object-hint", "it is put there")
+    page.touchscreen.tap(*on_screen(page, *TOUCHED))
+    wait_until(lambda: len(asked) == 1, page)
+    place = np.array(asked[0][1].position_m)
+    assert np.abs(place - point_under(source.camera, source[0], *TOUCHED)).max() < 0.01
+
+
 def test_an_iphone_is_told_what_it_can_do(server: BackgroundServer, browser) -> None:
     with browser.new_context(user_agent=IPHONE, viewport={"width": 390, "height": 844}, has_touch=True) as context:
         page = context.new_page()
@@ -119,3 +137,37 @@ def test_an_iphone_is_told_what_it_can_do(server: BackgroundServer, browser) -> 
         wait_for_text(page, "#device-hint", "Browsers on iPhone and iPad measure no depth")
         assert page.locator("#use-camera").is_hidden()
         check(page)
+
+
+@pytest.mark.parametrize("answer", ["picture", "layer"])
+def test_a_recording_fits_a_phone_in_every_mode(
+    real_server: BackgroundServer, open_page: OpenPage, answer: str
+) -> None:
+    page = open_page(real_server.url, size=SIZES["phone"])
+    page.locator("input[name=source][value=recorded]").check()
+    page.locator("[name=answer]").select_option(answer)
+    page.locator("[name=recording]").set_input_files(FOLDER / "src" / "sample.probeless")
+    page.locator("#start").tap()
+    wait_for_text(page, "#state", "Live, captured here")
+    page.wait_for_selector(".has-picture", timeout=PATIENCE_MS)
+    assert is_in_view(page, "#picture-frame")
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert page.locator("#objects option").count() == 1 + 1  # what was placed when it was recorded
+
+
+WAKE = """navigator.__defineGetter__("wakeLock", () => ({ request: () => {
+  window.held = (window.held ?? 0) + 1;
+  return Promise.resolve({ addEventListener() {}, release() { window.held--; return Promise.resolve(); } });
+} }));"""
+
+
+def test_the_screen_stays_on_while_there_is_a_live_picture(real_server: BackgroundServer, open_page: OpenPage) -> None:
+    page = open_page(real_server.url, size=SIZES["phone"])
+    page.evaluate(WAKE)
+    assert page.evaluate("window.held ?? 0") == 0
+    page.locator("#try").tap()
+    wait_for_text(page, "#state", "Live, captured here")
+    page.wait_for_function("window.held === 1")
+    page.locator("#stop").tap()
+    page.wait_for_function("window.held === 0")
+    assert page.locator("#try").is_visible()

@@ -15,8 +15,8 @@ from client.cli import run_command
 from client.options.source import open_source
 from server.opencl.device import Device
 from server.scene.vase import vase_glb
+from tests.client.gltf_scenes import cube_glb
 from tests.client.gltf_validator import validated
-from tests.client.test_gltf_scene import cube_glb
 
 SOURCE = "synthetic:table?size=96x72"
 FRAMES = 3

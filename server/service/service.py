@@ -384,8 +384,8 @@ class Service:
         try:
             return await asyncio.wrap_future(order.answer)
         except asyncio.CancelledError:
-            if not order.answer.cancelled():
-                raise
+            if (task := asyncio.current_task()) is not None and task.cancelling():
+                raise  # the watcher has left
             return Acknowledged(request=message.request, error="the session has just ended")
 
     @contextlib.contextmanager

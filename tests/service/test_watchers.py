@@ -158,6 +158,22 @@ def test_watcher_is_told_that_the_session_ended_before_its_request_was_read(dial
     assert said in ("the session has just ended", "no session is streaming that could have objects")
 
 
+def test_watcher_that_leaves_with_a_request_under_way_disturbs_nobody(dial, lab) -> None:
+    lab.hold = True
+    camera, leaves, stays = dial(), dial(), dial()
+    camera.greet()
+    leaves.watch()
+    stays.watch()
+    camera.say(frame_message(1))
+    lab.next_entered()
+    leaves.say(RemoveObject(request=1, object="of the one that leaves"))
+    leaves.hang_up()
+    stays.say(RemoveObject(request=1, object="of the one that stays"))
+    lab.release()
+    assert stays.hear_until(Acknowledged)[-1].request == 1
+    assert ("remove", "of the one that stays") in lab.log
+
+
 def test_watcher_with_an_invalid_field_is_answered_and_stays(dial) -> None:
     camera, watcher = dial(), dial()
     camera.greet()

@@ -24,7 +24,7 @@ def page(tmp_path: Path, open_page: OpenPage) -> Page:
 def test_a_tap_says_which_pixel_of_which_frame_it_is(page: Page) -> None:
     box = page.locator("#picture").bounding_box()
     page.touchscreen.tap(box["x"] + (80.5 / 160) * box["width"], box["y"] + (90.5 / 120) * box["height"])
-    expected = f"probeless run {SOURCE} --object cup.obj@pixel:80,90:0 --out out/placed"
+    expected = f"probeless run '{SOURCE}' --object cup.obj@pixel:80,90:0 --out out/placed"
     assert page.locator("#command").inner_text() == expected
     depth_m = open_source(SOURCE)[0].depth[88, 80] / 1000
     assert page.locator("#said").inner_text() == f"Pixel 80, 90 of frame 0, {depth_m:.2f} m from the camera."

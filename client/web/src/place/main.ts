@@ -31,6 +31,9 @@ let chosen: { u: number; v: number } | null = null;
 
 const frame = (): Frame => data.frames[Number(slider.value)]!;
 
+/** A word of a shell's command line. */
+const quoted = (word: string): string => (/^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`);
+
 function depthAt({ depth }: Frame, u: number, v: number): number | null {
   if (depth === null) return null;
   const bytes = Uint8Array.from(atob(depth), (character) => character.charCodeAt(0));
@@ -52,7 +55,7 @@ function show(): void {
   const depth_mm = depthAt(frame(), u, v);
   const away = depth_mm === null ? "" : depth_mm === 0 ? "; the sensor saw no depth there: choose a place beside it" : `, ${(depth_mm / 1000).toFixed(2)} m from the camera`;
   setText(byId("said"), `Pixel ${u}, ${v} of frame ${index}${away}.`);
-  setText(byId("command"), `probeless run ${data.source} --object ${data.object}@pixel:${u},${v}:${index} --out out/placed`);
+  setText(byId("command"), `probeless run ${quoted(data.source)} --object ${quoted(`${data.object}@pixel:${u},${v}:${index}`)} --out out/placed`);
 }
 
 function choose(u: number, v: number): void {
@@ -88,6 +91,7 @@ copy.addEventListener("click", () => {
 });
 
 setText(byId("source"), data.source);
+stage.style.width = `min(100%, ${(62 * data.width) / data.height}vh)`; // the command below stays in sight
 slider.max = String(data.frames.length - 1);
 byId("frames").hidden = data.frames.length < 2;
 show();

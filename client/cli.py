@@ -21,7 +21,7 @@ from client.options.help import ALL, GroupedHelp
 from client.options.light_places import parse_panorama_out, write_panorama
 from client.progress import Stopwatch, note, progress_bar, say, track
 from client.results.extras import check_extras
-from client.results.names import PAGE_NAME
+from client.results.names import PAGE_NAME, PLACE_NAME
 from protocol.messages import Light
 
 RUN_EXAMPLES = """\
@@ -34,6 +34,9 @@ probeless stream FOLDER --server URL --object Duck.glb@auto --out out/duck
 probeless stream oak --server URL --view
 probeless stream FOLDER --server URL --realtime --view
 probeless stream FOLDER --server URL --room office --poses track"""
+PLACE_EXAMPLES = """\
+probeless place FOLDER
+probeless place FOLDER --object Duck.glb --frames 0:60 --out out/place"""
 EXPLAIN_EXAMPLES = """\
 probeless explain FOLDER --object Duck.glb@auto
 probeless explain synthetic:room --preset art4 --frame 10"""
@@ -152,6 +155,27 @@ def run(
             write_panorama(panorama.path, pipeline.panorama(panorama.format, panorama.position_m))
     say(f"{watch.summary()}{_written_to(out)}")
     _say_light(light)
+
+
+@app.command(epilog=PLACE_EXAMPLES, cls=GroupedHelp)
+def place(
+    source: o.SourceArgument,
+    object: Annotated[str, typer.Option(metavar="FILE", help="model, for the command that the page shows")] = "FILE",
+    frames: o.Frames = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="output folder")] = Path("out/place"),
+    open_page: Annotated[bool, typer.Option("--open", help="open the page in the browser of this machine")] = False,
+) -> None:
+    """Write a page in which a click on a surface says where an object is to stand."""
+    from client.commands.place import frames_to_show, write_place_page
+    from client.options.capture import parse_frames
+    from client.options.source import open_source
+
+    opened = open_source(source)
+    page = out / PLACE_NAME
+    write_place_page(page, opened, source, frames_to_show(parse_frames(frames, len(opened))), object)
+    say(f"open {page} in a browser and click a surface")
+    if open_page:
+        typer.launch(str(page.resolve()))
 
 
 @app.command(cls=GroupedHelp, epilog=EXPLAIN_EXAMPLES)
@@ -314,7 +338,8 @@ def serve(
         typer.Option(metavar="ADDRESS[/BITS]", help="proxy whose X-Forwarded-For is believed; repeatable"),
     ] = None,
     tls: Annotated[
-        bool, typer.Option("--tls", help="https and wss, with a self-signed certificate that is kept")
+        bool,
+        typer.Option("--tls", help="https and wss, with a certificate of its own, which a phone can be told to trust"),
     ] = False,
     tls_cert: Annotated[Path | None, typer.Option(metavar="FILE", help="own certificate, PEM")] = None,
     tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="key of the certificate, PEM")] = None,
@@ -394,6 +419,7 @@ def serve(
         say=console.say,
         shows_token=console.shows_token,
         keeper=keeper,
+        draws_code=console.draws,
     )
     exit_soon(status)
     return status

@@ -497,6 +497,8 @@ class Welcome(Message, frozen=True, kw_only=True, omit_defaults=True, tag="welco
     """Colour codecs that frames may use."""
     depth_codecs: tuple[DepthCodec, ...] = ("raw", "zdelta", "zstd-delta")
     """Depth codecs that frames may use."""
+    camera: CameraModel | None = None
+    """To a watcher: the lens of the session that it watches, by which it can point at places in the pictures."""
 
 
 class LeftOut(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -674,6 +676,19 @@ class Light(Message, frozen=True, kw_only=True, tag="light"):
     """Light arriving at places: the view, then `wishes.light_at` in their order, then objects in theirs."""
 
 
+class PlacedObject(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Where an object stands whose spot was found; the fields of `place_object` and `move_object`."""
+
+    object: Name
+    """Its name."""
+    position_m: Vector3
+    """World position of the bottom centre of the model's box."""
+    scale: float
+    """Factor on the model's size."""
+    yaw_deg: float
+    """Turn about the up axis."""
+
+
 class Drawn(Message, frozen=True, kw_only=True):
     """Fields common to composite and layer."""
 
@@ -693,6 +708,8 @@ class Drawn(Message, frozen=True, kw_only=True):
     """Problems with this frame's input, one line each."""
     waited_ms: float = 0.0
     """Time from the frame's arrival until its processing began: in the queue, decoding, waiting for the device."""
+    placed: tuple[PlacedObject, ...] = ()
+    """Objects whose spots were found in this frame."""
 
 
 class Composite(Drawn, frozen=True, kw_only=True, tag="composite"):

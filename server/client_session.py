@@ -112,7 +112,8 @@ class ClientSession:
                 point = self._quality.observe(result.timings, is_reused=result.is_reused)
                 self._pipeline.use(self._quality.settings)
                 plan = structs.replace(plan, point=point)
-            return replace(result, plan=plan, notes=(*result.notes, *self._differences, *self._pending_notes()))
+            notes = (*result.notes, *self._differences, *self._pending_notes())
+            return replace(result, plan=plan, notes=notes, placed=self._objects.take_found())
 
     @contextmanager
     def _sharing_device(self, turn: FrameTurn | None) -> Iterator[None]:

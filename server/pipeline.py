@@ -9,7 +9,7 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
-from protocol.messages import LeftOut, Light, Plan, Timings, Tracking, Wishes
+from protocol.messages import LeftOut, Light, PlacedObject, Plan, Timings, Tracking, Wishes
 from server.culling.reason import CullReason
 from server.culling.spine import LOST, spine_left_out
 from server.effects.renderer import Renderer, RenderRequest, RenderResult, SpineOutputs
@@ -53,6 +53,8 @@ class FrameResult:
     """What is virtual in it; None: the client does not want it apart."""
     is_reused: bool = False
     """Whether the geometry of the frame before was kept."""
+    placed: tuple[PlacedObject, ...] = ()
+    """Objects whose spots were found in it."""
 
 
 class Pipeline:

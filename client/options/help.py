@@ -11,7 +11,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Source": ("frames", "poses", "volume", "voxel", "exposure", "up", "smooth_depth"),
     "Output": (
         *("out", "overwrite", "video", "rerun", "scene", "mesh", "panorama_out", "light_at", "record", "view"),
-        *("frame",),
+        *("frame", "open_page"),
     ),
     "Virtual objects": ("object", "edges", "tone_mapping"),
     "Quality and time": (
@@ -38,7 +38,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 """Options of all these commands, in the order in which they are shown."""
 FIRST = {
     *("frames", "poses", "up", "out", "overwrite", "video", "mesh", "object", "preset", "budget_ms", "device"),
-    *("light_at", "panorama_out", "server", "realtime", "lossless", "room", "frame"),
+    *("light_at", "panorama_out", "server", "realtime", "lossless", "room", "frame", "open_page"),
     *("host", "port", "tls", "objects", "data"),
 }
 """Options that `--help` shows; `--help-all` shows the others too."""

@@ -7,6 +7,9 @@ import { build } from "esbuild";
 
 const argument = process.argv[2] ?? "dist";
 
+/** What needs no building; sample.py makes the sample. */
+const COPIED = ["index.html", "manifest.webmanifest", "icon-192.png", "icon-512.png", "sample.probeless"];
+
 async function buildPage(folder) {
   await rm(folder, { recursive: true, force: true });
   await mkdir(folder, { recursive: true });
@@ -24,16 +27,17 @@ async function buildPage(folder) {
     logLevel: "warning",
     preserveSymlinks: true, // or the names of chunks depend on where a linked node_modules lies
   });
-  await copyFile("src/index.html", join(folder, "index.html"));
-  await buildResults(join(folder, "results.html"));
+  for (const name of COPIED) await copyFile(join("src", name), join(folder, name));
+  await buildInOne("results", join(folder, "results.html"), ["three"]);
+  await buildInOne("place", join(folder, "place.html"), []);
   const licences = await Promise.all(["@msgpack/msgpack", "fzstd", "three"].map((name) => readFile(`node_modules/${name}/LICENSE`, "utf8")));
   await writeFile(join(folder, "LICENSES.txt"), licences.join("\n----\n\n"));
 }
 
-/** The page of results in one file: browsers load no modules for a page that comes from disk. */
-async function buildResults(file) {
+/** A page in one file: browsers load no modules for a page that comes from disk. `libraries`: what it contains. */
+async function buildInOne(name, file, libraries) {
   const { outputFiles } = await build({
-    entryPoints: { script: "src/results/main.ts", style: "src/results/style.css" },
+    entryPoints: { script: `src/${name}/main.ts`, style: `src/${name}/style.css` },
     outdir: ".",
     write: false,
     bundle: true,
@@ -44,13 +48,13 @@ async function buildResults(file) {
     legalComments: "none",
     logLevel: "warning",
   });
-  let page = await readFile("src/results/page.html", "utf8");
+  let page = await readFile(`src/${name}/page.html`, "utf8");
   for (const { path, text } of outputFiles) {
-    const name = path.endsWith(".css") ? "style" : "script";
-    page = page.replace(`/*${name}*/`, () => text.replaceAll("</script", "<\\/script").replaceAll("<!--", "<\\!--"));
+    const part = path.endsWith(".css") ? "style" : "script";
+    page = page.replace(`/*${part}*/`, () => text.replaceAll("</script", "<\\/script").replaceAll("<!--", "<\\!--"));
   }
-  const licence = await readFile("node_modules/three/LICENSE", "utf8");
-  await writeFile(file, `${page}<!-- Contains three.js:\n\n${licence.trim()}\n-->\n`);
+  const licences = libraries.map(async (each) => `<!-- Contains ${each}.js:\n\n${(await readFile(`node_modules/${each}/LICENSE`, "utf8")).trim()}\n-->\n`);
+  await writeFile(file, page + (await Promise.all(licences)).join(""));
 }
 
 async function buildLibrary(folder) {

@@ -307,6 +307,23 @@ def _shows_watchers(dial: Dial) -> None:
     _require_answer(watcher, 0)
 
 
+@_rule("a watcher is told the lens, and its requests for objects are acknowledged to it alone", "A session")
+def _takes_requests_of_watchers(dial: Dial) -> None:
+    socket = dial()
+    socket.say(hello())
+    session = socket.hear_a("welcome")["session"]
+    watcher = dial()
+    watcher.say({"type": "watch", "session": session})
+    lens = watcher.hear_a("welcome").get("camera")
+    is_told = lens is not None and lens["width"] == hello()["camera"]["width"]
+    _require(is_told, f"the camera in the watcher's welcome: {lens}")
+    watcher.say({"type": "remove_object", "request": 7, "object": "nothing"})
+    done = watcher.hear_a("acknowledged")
+    _require(done["request"] == 7 and bool(done.get("error")), f"the answer {done}")
+    socket.say(frame(0))
+    _require(socket.hear()["type"] != "acknowledged", "an acknowledgement to the capturing client")
+
+
 @_rule("mesh parts follow on without gaps, then the request is acknowledged", "A session")
 def _sends_mesh(dial: Dial) -> None:
     socket = _greeted(dial)

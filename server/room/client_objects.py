@@ -9,6 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.messages import PlacedObject
 from server.objects.scene_objects import check_room
 from server.room.room import Room
 from server.room.spots import SpotUnseen, SpotView, find_spot
@@ -57,6 +58,8 @@ class ClientObjects:
         self._waiting: dict[str, _Waiting] = {}
         self._unchecked: list[str] = []
         """Placed objects of which nothing was said yet."""
+        self._found: list[PlacedObject] = []
+        """Where objects stand whose spots were found since the last call of take_found()."""
 
     @property
     def waiting(self) -> frozenset[str]:
@@ -145,6 +148,11 @@ class ClientObjects:
         self._unchecked.clear()
         return tuple(notes)
 
+    def take_found(self) -> tuple[PlacedObject, ...]:
+        """Where objects stand whose spots were found since the last call, in the client's world."""
+        found, self._found = tuple(self._found), []
+        return found
+
     def _find(self, object_id: str, waiting: _Waiting, view: SpotView) -> list[str]:
         placement, mesh = waiting.placement, waiting.mesh
         assert isinstance(placement, SpotPlacement)
@@ -158,6 +166,9 @@ class ClientObjects:
         to_client = self._alignment.client_from_room
         x, y, z = (float(value) for value in to_client[:3, :3] @ found.position + to_client[:3, 3])
         problems = self._settle(object_id, mesh, placement.at((x, y, z), found.scale))
+        if not problems:
+            turn = placement.yaw_deg
+            self._found.append(PlacedObject(object=object_id, position_m=(x, y, z), scale=found.scale, yaw_deg=turn))
         return problems or [f"object {object_id!r} stands at {x:.3f},{y:.3f},{z:.3f} {found.words}"]
 
     def _settle(self, object_id: str, mesh: Mesh, placement: Placement) -> list[str]:

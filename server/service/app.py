@@ -8,8 +8,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 from fastapi import FastAPI, WebSocket
-from fastapi.responses import PlainTextResponse
-from fastapi.staticfiles import StaticFiles
+from fastapi.responses import PlainTextResponse, Response
 
 from server.service.edge.authenticator import Authenticator
 from server.service.edge.connection import POLICY, Connection, Refusal
@@ -17,8 +16,10 @@ from server.service.routes.health_routes import Health, add_health
 from server.service.routes.metrics_route import add_metrics
 from server.service.routes.object_library import ObjectLibrary
 from server.service.routes.object_routes import add_objects
+from server.service.routes.page_files import PageFiles
 from server.service.routes.panorama_routes import add_panorama
 from server.service.service import Service
+from server.service.ways_in import AUTHORITY_PATH
 
 STREAM_PATH = "/v1/stream"
 PAGE_FOLDER = Path(__file__).resolve().parents[2] / "client" / "web" / "dist"
@@ -31,10 +32,12 @@ def create_app(
     page_folder: Path = PAGE_FOLDER,
     authenticator: Authenticator | None = None,
     library: ObjectLibrary | None = None,
+    authority: Path | None = None,
 ) -> FastAPI:
     """The ASGI application that starts, serves and stops `service`. `page_folder` holds index.html.
 
     `authenticator`: None lets every client in. `library`: objects that clients may place; None offers the vase only.
+    `authority`: PEM of the certificate authority that devices may trust; None: there is none of the server's own.
     """
     authenticator = authenticator or Authenticator()
 
@@ -50,6 +53,8 @@ def create_app(
     add_metrics(app, service.metrics.render, authenticator)
     add_objects(app, library or ObjectLibrary(), authenticator)
     add_panorama(app, service, authenticator)
+    if authority is not None:
+        _add_authority(app, authority)
     _add_page(app, page_folder)
     return app
 
@@ -89,9 +94,18 @@ def _health_of(service: Service) -> Health:
     return Health(service.ready, service.takes_sessions, details)
 
 
+def _add_authority(app: FastAPI, certificate: Path) -> None:
+    """Public, as every certificate is: a device needs it before it trusts this server."""
+    data = certificate.read_bytes()
+
+    @app.get(AUTHORITY_PATH)
+    async def authority() -> Response:
+        return Response(data, media_type="application/x-x509-ca-cert")
+
+
 def _add_page(app: FastAPI, page_folder: Path) -> None:
     if (page_folder / "index.html").is_file():
-        app.mount("/", StaticFiles(directory=page_folder, html=True))
+        app.mount("/", PageFiles(page_folder))
         return
 
     @app.get("/")

@@ -1,15 +1,23 @@
-"""Sends a capturing session's pictures to its watchers. A slow watcher misses pictures and delays nobody."""
+"""Sends a capturing session's pictures to its watchers, and takes what they ask of its objects.
+
+A slow watcher misses pictures and delays nobody.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from hmac import compare_digest
 from typing import NamedTuple
 
-from protocol.messages import Bye
+from protocol.codec import encode
+from protocol.messages import Acknowledged, Bye, MoveObject, PlaceObject, RemoveObject
 from server.service.edge.connection import POLICY, BadMessage, Connection, Refusal
+from server.service.mailbox import ObjectRequest
+
+AskSession = Callable[[str | None, ObjectRequest], Awaitable[Acknowledged]]
+WATCHERS_SEND = "a watching client sends requests for objects and bye"
 
 
 class Watcher:
@@ -22,12 +30,19 @@ class Watcher:
         self.lock = lock
         self.session = session
         self._news: dict[str, tuple[bytes, ...]] = {}
+        self._answers: list[bytes] = []
+        """To its own requests; one at a time is under way."""
         self._ended = False
         self._changed = asyncio.Event()
 
     def post(self, kind: str, messages: tuple[bytes, ...]) -> None:
         """Queue encoded messages; unread ones of the same kind are replaced."""
         self._news[kind] = messages
+        self._changed.set()
+
+    def answer(self, message: bytes) -> None:
+        """Queue an encoded answer to the watcher's own request."""
+        self._answers.append(message)
         self._changed.set()
 
     def attach(self, session: str | None, welcome: bytes) -> None:
@@ -45,8 +60,9 @@ class Watcher:
         """Wait for unread messages and return them; empty once the watched session has ended."""
         await self._changed.wait()
         self._changed.clear()
-        messages = tuple(message for group in self._news.values() for message in group)
+        messages = (*self._answers, *(message for group in self._news.values() for message in group))
         self._news.clear()
+        self._answers.clear()
         if self._ended:
             self._changed.set()
         return messages
@@ -148,10 +164,13 @@ class Broadcast:
         self._watched = frozenset(watcher.session for watcher in self._watchers)
 
 
-async def serve_watcher(connection: Connection, watcher: Watcher) -> None:
-    """Send messages to a watcher until it leaves or its session ends. Raises Refusal, ClientGone."""
+async def serve_watcher(connection: Connection, watcher: Watcher, ask: AskSession) -> None:
+    """Send messages to a watcher until it leaves or its session ends. Raises Refusal, ClientGone.
+
+    `ask`: has the watched session apply a request.
+    """
     forward = asyncio.create_task(_forward(connection, watcher))
-    listen = asyncio.create_task(_until_it_leaves(connection))
+    listen = asyncio.create_task(_listen(connection, watcher, ask))
     try:
         ended, _ = await asyncio.wait((forward, listen), return_when=asyncio.FIRST_COMPLETED)
         for task in ended:
@@ -169,10 +188,18 @@ async def _forward(connection: Connection, watcher: Watcher) -> None:
     await connection.send_message(Bye(reason="the session is over"))
 
 
-async def _until_it_leaves(connection: Connection) -> None:
-    try:
-        message = await connection.receive()
-    except BadMessage as bad:
-        raise Refusal(POLICY, "a watching client sends nothing but bye") from bad
-    if message is not None and not isinstance(message, Bye):
-        raise Refusal(POLICY, f"a watching client sends nothing but bye, not {type(message).__name__.lower()}")
+async def _listen(connection: Connection, watcher: Watcher, ask: AskSession) -> None:
+    """Take requests one after the other, until the watcher leaves."""
+    while True:
+        try:
+            message = await connection.receive()
+        except BadMessage as bad:
+            if not isinstance(bad.answer, Acknowledged):
+                raise Refusal(POLICY, WATCHERS_SEND) from bad
+            watcher.answer(encode(bad.answer))
+            continue
+        if message is None or isinstance(message, Bye):
+            return
+        if not isinstance(message, PlaceObject | MoveObject | RemoveObject):
+            raise Refusal(POLICY, f"{WATCHERS_SEND}, not {type(message).__name__.lower()}")
+        watcher.answer(encode(await ask(watcher.session, message)))

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
 from protocol.messages import (
+    Acknowledged,
     Frame,
     MoveObject,
     PanoramaFormat,
@@ -27,6 +28,8 @@ from protocol.messages import (
     RequestPanorama,
     Vector3,
 )
+
+ObjectRequest = PlaceObject | MoveObject | RemoveObject
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,18 @@ class PanoramaOrder:
     """The file, or ValueError with one line; cancelled if the session ends first."""
 
 
-Control = PlaceObject | MoveObject | RemoveObject | Quality | RequestMesh | RequestPanorama | PanoramaOrder
+@dataclass(frozen=True)
+class WatcherRequest:
+    """A request of a client that watches, for the objects of the session."""
+
+    message: ObjectRequest
+    answer: Future[Acknowledged] = field(default_factory=Future)
+    """Cancelled if the session ends first."""
+
+
+Order = PanoramaOrder | WatcherRequest
+"""What did not come over the session's socket."""
+Control = ObjectRequest | Quality | RequestMesh | RequestPanorama | Order
 T = TypeVar("T", bound=Control)
 
 MAX_QUEUED_MESSAGES = 64
@@ -66,7 +80,7 @@ class QueuedMessage:
         match self.message:
             case Frame(color=color, depth=depth):
                 return sum(len(picture.data) for picture in (color, depth) if picture is not None)
-            case PlaceObject(data=data):
+            case PlaceObject(data=data) | WatcherRequest(message=PlaceObject(data=data)):
                 return len(data)
         return 0
 
@@ -200,5 +214,5 @@ class Mailbox:
 
 
 def _cancel(message: Frame | Control) -> None:
-    if isinstance(message, PanoramaOrder):
+    if isinstance(message, PanoramaOrder | WatcherRequest):
         message.answer.cancel()

@@ -57,6 +57,7 @@ def _drawn(frame: Frame, result: FrameResult, plan: Plan) -> dict[str, Any]:
         "timings": result.timings,
         "plan": plan,
         "notes": result.notes,
+        "placed": result.placed,
     }
 
 

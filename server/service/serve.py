@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING
 import uvicorn
 
 from protocol.limits import MAX_MESSAGE_BYTES
-from protocol.local_keys import LocalKey, key_left, key_path
+from protocol.local_keys import LocalKey, key_left
 from server.service.app import create_app
 from server.service.edge.acceptor import Acceptor, TimedHttp
-from server.service.edge.authenticator import Authenticator, is_loopback, new_token
+from server.service.edge.authenticator import Authenticator, new_token
 from server.service.edge.gate import Gate, Place, max_connections
 from server.service.edge.lingering_close import LingeringCloseWebSocket
 from server.service.edge.listening import ServeError, listen
@@ -30,6 +30,7 @@ from server.service.limits import DEFAULT_LIMITS, Limits
 from server.service.monitoring.console import print_line
 from server.service.routes.object_library import ObjectLibrary
 from server.service.service import Service
+from server.service.ways_in import WaysIn, url_of
 
 if TYPE_CHECKING:
     from server.opencl.device import Device
@@ -41,7 +42,6 @@ STOP_PATIENCE_S = 10
 """Time limit from the signal to the end of the process."""
 DRAIN_PATIENCE_S = 7
 """Part of it in which sessions end and rooms are saved."""
-EVERYWHERE = ("0.0.0.0", "::", "")
 NO_AUTHENTICATION = Authenticator()
 
 log = logging.getLogger(__name__)
@@ -60,10 +60,12 @@ def serve(
     say: Callable[[str], None] = print_line,
     shows_token: bool = True,
     keeper: Kept | None = None,
+    draws_code: bool = False,
 ) -> int:
     """Serve until interrupted and return the exit status. `say` receives each line for the user (default: stdout).
 
-    `shows_token`: whether the token is in one of these lines. `keeper`: whose listening socket is used.
+    `shows_token`: whether the token is in one of these lines. `keeper`: whose listening socket is used. `draws_code`:
+    whether lines may draw a code for a phone.
 
     `authenticator` None: a new token is required. `certificate` None: no TLS. `data`: folder in which rooms are saved.
     `objects`: folder of models that clients may place; None: only the vase.
@@ -76,9 +78,8 @@ def serve(
             service = open_service(device_name, limits=limits, data=data)
             library = ObjectLibrary(objects)
             ready = keeper.tell_ready if keeper is not None else lambda: None
-            return serve_on(
-                listener, service, say, authenticator, certificate, library, shows_token=shows_token, tell_ready=ready
-            )
+            shown = {"shows_token": shows_token, "draws_code": draws_code}
+            return serve_on(listener, service, say, authenticator, certificate, library, tell_ready=ready, **shown)
     except ServeError as error:
         sys.stderr.write(f"probeless: {error}\n")
         return 1
@@ -98,15 +99,6 @@ def open_service(
     return Service(device, warm_up=_warm_up, limits=limits, data=data)
 
 
-def url_of(listener: socket.socket, certificate: Certificate | None = None, everywhere: str = "localhost") -> str:
-    """URL for a browser on this machine. If the server listens on all addresses, the host is `everywhere`."""
-    host, port = listener.getsockname()[:2]
-    if host in EVERYWHERE:
-        host = everywhere
-    scheme = "http" if certificate is None else "https"
-    return f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"
-
-
 def serve_on(
     listener: socket.socket,
     service: Service,
@@ -117,6 +109,7 @@ def serve_on(
     *,
     shows_token: bool = True,
     tell_ready: Callable[[], None] = lambda: None,
+    draws_code: bool = False,
 ) -> int:
     """Serve until interrupted and return the exit status. Raises ServeError if the warm-up fails.
 
@@ -127,7 +120,8 @@ def serve_on(
 
         def on_prepared() -> None:
             if service.failure is None:
-                for line in _ways_in(listener, authenticator, certificate, is_left, shows_token=shows_token):
+                ways = WaysIn(listener, authenticator, certificate, is_left, shows_token)
+                for line in [*ways.lines(), *(ways.code() if draws_code else ())]:
                     say(line)
                 tell_ready()
             else:
@@ -164,32 +158,6 @@ def _ended_like_interrupted() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _ways_in(
-    listener: socket.socket,
-    authenticator: Authenticator,
-    certificate: Certificate | None,
-    is_left: bool,
-    *,
-    shows_token: bool,
-) -> list[str]:
-    """Lines that say how to connect from this and from other machines."""
-    (host, port), url = listener.getsockname()[:2], url_of(listener, certificate)
-    query = authenticator.query if shows_token else ""
-    pin = "" if certificate is None else f" --tls-fingerprint {certificate.fingerprint}"
-    everywhere = host in EVERYWHERE
-    own = url if is_left and (everywhere or is_loopback(host)) else f"{url}{query}{pin}"
-    lines = [f"ready: open {url}{query} or run: probeless stream SOURCE --server {own}"]
-    if everywhere:
-        there = url_of(listener, certificate, socket.gethostname())
-        lines.append(f"on other machines: the same URL with {there} in place of {url}{pin and f', and{pin}'}")
-    if authenticator.token is not None and not shows_token:
-        where = f"is in {key_path(port)}" if is_left else "cannot be shown here: give one with --token-file"
-        lines.append(f"its token {where}")
-    if certificate is not None:
-        lines.append(f"SHA-256 of its certificate: {certificate.fingerprint}")
-    return lines
 
 
 @contextlib.contextmanager
@@ -293,7 +261,12 @@ def _server(
     service: Service, authenticator: Authenticator, certificate: Certificate | None, library: ObjectLibrary | None
 ) -> _Server:
     config = uvicorn.Config(
-        create_app(service, authenticator=authenticator, library=library),
+        create_app(
+            service,
+            authenticator=authenticator,
+            library=library,
+            authority=None if certificate is None else certificate.authority,
+        ),
         ssl_certfile=None if certificate is None else certificate.certificate,
         ssl_keyfile=None if certificate is None else certificate.key,
         log_level="warning",

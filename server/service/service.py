@@ -18,7 +18,7 @@ from protocol.codec import encode, one_line
 from protocol.colors import readable_codecs
 from protocol.frames import CameraModel
 from protocol.images import DEPTH_CODECS
-from protocol.messages import Bye, Hello, Watch, Welcome, Wishes
+from protocol.messages import Acknowledged, Bye, Hello, Watch, Welcome, Wishes
 from server.parsing.parsers import Parsers
 from server.scene.mesh import Mesh
 from server.service.broadcast import Broadcast, serve_watcher
@@ -35,7 +35,7 @@ from server.service.edge.connection import (
 from server.service.edge.connection_limits import ConnectionLimits
 from server.service.graceful_shutdown import GracefulShutdown
 from server.service.limits import DEFAULT_LIMITS, Limits
-from server.service.mailbox import PanoramaOrder
+from server.service.mailbox import ObjectRequest, PanoramaOrder, WatcherRequest
 from server.service.monitoring.event_log import about
 from server.service.monitoring.metrics import Metrics
 from server.service.room_registry import RoomFactory, RoomRegistry, key_digest_of
@@ -56,6 +56,9 @@ NO_SESSION = "waiting"
 
 ORDER_PATIENCE_S = 60.0
 """Time limit of a panorama: it waits for the frames before it and for the device, which other sessions share."""
+
+FULL_MAILBOX_PAUSE_S = 0.02
+"""Interval at which a watcher's request is offered again to a session that has too much unread."""
 
 log = logging.getLogger(__name__)
 
@@ -293,7 +296,12 @@ class Service:
             )
             key_digest = key_digest_of(hello.room_key)
             outbox = EventLoopOutbox(
-                welcome, connection, self._broadcast, is_resumable=key is not None, key_digest=key_digest
+                welcome,
+                connection,
+                self._broadcast,
+                is_resumable=key is not None,
+                key_digest=key_digest,
+                camera=hello.camera,
             )
             size = f"{hello.camera.width}x{hello.camera.height}"
             with about(session=name, address=connection.address):
@@ -364,7 +372,21 @@ class Service:
                 watch.session, encode(waiting), watch.room, key_digest_of(watch.room_key)
             ) as watcher,
         ):
-            await serve_watcher(connection, watcher)
+            await serve_watcher(connection, watcher, self._ask_session)
+
+    async def _ask_session(self, session: str | None, message: ObjectRequest) -> Acknowledged:
+        """Have the worker of a session apply what one of its watchers asks for."""
+        order = WatcherRequest(message)
+        while (capture := self._captures.get(session or "")) is not None and not capture.take_order(order):
+            await asyncio.sleep(FULL_MAILBOX_PAUSE_S)
+        if capture is None:
+            return Acknowledged(request=message.request, error="no session is streaming that could have objects")
+        try:
+            return await asyncio.wrap_future(order.answer)
+        except asyncio.CancelledError:
+            if (task := asyncio.current_task()) is not None and task.cancelling():
+                raise  # the watcher has left
+            return Acknowledged(request=message.request, error="the session has just ended")
 
     @contextlib.contextmanager
     def _counted_watcher(self) -> Iterator[None]:

@@ -10,6 +10,7 @@ from concurrent.futures import CancelledError, Executor, Future
 from msgspec import structs
 
 from protocol.codec import encode
+from protocol.frames import CameraModel
 from protocol.messages import Bye, ClientMessage, Dropped, Error, Frame, Hello, Watch, Welcome
 from server.service.broadcast import Broadcast
 from server.service.edge.connection import (
@@ -22,7 +23,7 @@ from server.service.edge.connection import (
     Connection,
     Refusal,
 )
-from server.service.mailbox import Mailbox, PanoramaOrder
+from server.service.mailbox import Mailbox, Order
 from server.service.worker import Worker, WorkerContext
 
 MAX_INFLIGHT = 2
@@ -46,12 +47,14 @@ class EventLoopOutbox:
         *,
         is_resumable: bool,
         key_digest: bytes = b"",
+        camera: CameraModel | None = None,
     ) -> None:
         """`welcome`: without the device. `is_resumable`: the session survives a lost connection.
 
-        `key_digest`: of the room's key.
+        `key_digest`: of the room's key. `camera`: of the pictures, for watchers.
         """
         self._key_digest = key_digest
+        self._camera = camera
         self._welcome = welcome
         self._link: tuple[int, Connection | None] = 0, connection
         """Number of the connection, and the connection while it is not lost; replaced together."""
@@ -72,7 +75,8 @@ class EventLoopOutbox:
     def greet(self, device_name: str) -> None:
         """Worker thread: welcome the client and allow watchers. Raises ClientGone."""
         self._welcome = structs.replace(self._welcome, device=device_name)
-        shown = structs.replace(self._welcome, key=None)  # watchers must not be able to resume the session
+        # Watchers must not be able to resume the session.
+        shown = structs.replace(self._welcome, key=None, camera=self._camera)
         self._loop.call_soon_threadsafe(self._open_to_watchers, encode(shown))
         self.send(encode(self._welcome))
 
@@ -207,7 +211,7 @@ class CaptureSession:
         while not (self._has_ended or self._mailbox.is_idle()):
             await asyncio.sleep(0.01)
 
-    def take_order(self, order: PanoramaOrder) -> bool:
+    def take_order(self, order: Order) -> bool:
         """Event loop: queue an order behind what the client has sent. Returns whether there was room."""
         if not self._mailbox.has_room():
             return False

@@ -39,7 +39,7 @@ from server.scene.mesh import Mesh
 from server.scene.placement import Placement, requested_placement
 from server.service.edge.connection import POLICY, UNAUTHORIZED, ClientGone, Refusal
 from server.service.load_shedding import LoadShedding, SamplingRequest
-from server.service.mailbox import Mailbox, PanoramaOrder, QueuedMessage
+from server.service.mailbox import Mailbox, ObjectRequest, PanoramaOrder, QueuedMessage, WatcherRequest
 from server.service.mesh_message import mesh_parts
 from server.service.monitoring.metrics import Metrics
 from server.service.result_encoding import composite_message, layer_message
@@ -54,7 +54,7 @@ MAX_ACKNOWLEDGEMENTS = 256
 MAX_ANSWERS = 4
 """More than the frames a client may have unanswered (session.MAX_INFLIGHT)."""
 
-SceneControl = PlaceObject | MoveObject | RemoveObject | Quality
+SceneControl = ObjectRequest | Quality
 SaveRoom = Callable[[str], str | None]
 """Saves the room of that name and returns why it could not, one line for the client, or None."""
 
@@ -160,13 +160,28 @@ class Worker:
             self._send_panorama(pipeline, queued.message)
         elif isinstance(queued.message, PanoramaOrder):
             self._fill_order(pipeline, queued.message)
+        elif isinstance(queued.message, WatcherRequest):
+            self._answer_watcher(pipeline, queued.message)
         elif isinstance(queued.message, MoveObject):
             self._handle_moves(pipeline, [queued.message, *self._mailbox.take_while(MoveObject)])
         else:
             done = self._applied(pipeline, queued.message)
-            if isinstance(queued.message, PlaceObject | RemoveObject):
+            if not isinstance(queued.message, Quality):
                 (done,) = self._saved([done], self._context.save_room)
             self._outbox.send(encode(done))
+
+    def _answer_watcher(self, pipeline: ClientSession, request: WatcherRequest) -> None:
+        """Apply what a watcher asks for. Its numbers are its own, and it never repeats one."""
+        if not request.answer.set_running_or_notify_cancel():
+            return  # it has left
+        is_move = isinstance(request.message, MoveObject)
+        save = self._context.save_placements if is_move else self._context.save_room
+        try:
+            (done,) = self._saved([apply_control(pipeline, request.message, self._load_mesh)], save)
+        except BaseException as error:
+            request.answer.set_exception(error)
+            raise
+        request.answer.set_result(done)
 
     def _handle_moves(self, pipeline: ClientSession, moves: list[MoveObject]) -> None:
         """Apply consecutive moves, save them together, then acknowledge each."""

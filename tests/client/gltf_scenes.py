@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
@@ -23,3 +26,15 @@ def square(gltf_from_world: NDArray[np.float64] = GLTF_FROM_WORLD) -> SceneMesh:
         colors=np.full((4, 3), 128, np.uint8),
         gltf_from_world=gltf_from_world,
     )
+
+
+def cube_glb(picture: Any = None) -> bytes:
+    """A GLB as trimesh writes it: a cube of one metre around (0, 0.5, 0), half a metre beside."""
+    box = trimesh.creation.box((1, 1, 1))
+    box.apply_translation((0, 0.5, 0))
+    if picture is not None:
+        material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture, roughnessFactor=0.25)
+        box.visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(box.vertices), 2)), material=material)
+    scene = trimesh.Scene()
+    scene.add_geometry(box, transform=trimesh.transformations.translation_matrix((0.5, 0, 0)))
+    return bytes(scene.export(file_type="glb"))

@@ -224,6 +224,12 @@ def test_without_the_extra_one_line_says_what_installs_it(
     assert f"make install-import, or pip install {library}" in error_of(file)
 
 
+def test_a_recording_of_an_azure_kinect_is_told_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "a.mkv").write_bytes(b"\x1aE\xdf\xa3" + bytes(100))
+    with pytest.raises(SourceError, match=r"a\.mkv: Matroska, .* convert it to a plain folder"):
+        open_source(str(tmp_path / "a.mkv"))
+
+
 def test_what_is_in_no_format_is_told_what_was_looked_for(tmp_path: Path) -> None:
     file = tmp_path / "movie.bin"
     file.write_bytes(b"hello, this is nothing")

@@ -21,21 +21,9 @@ from client.objects.object_file import pack_mesh
 from client.results.bright_parts import BrightPart, solid_angles, split
 from client.results.gltf_scene import PlacedObject, scene_glb
 from server.light.panorama import panorama_directions
-from tests.client.gltf_scenes import CAMERA, GLTF_FROM_WORLD, SQUARE, square
+from tests.client.gltf_scenes import CAMERA, GLTF_FROM_WORLD, SQUARE, cube_glb, square
 
 HEIGHT, WIDTH = 128, 256
-
-
-def cube_glb(picture: Any = None) -> bytes:
-    """A GLB as trimesh writes it: a cube of one metre around (0, 0.5, 0), half a metre beside."""
-    box = trimesh.creation.box((1, 1, 1))
-    box.apply_translation((0, 0.5, 0))
-    if picture is not None:
-        material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture, roughnessFactor=0.25)
-        box.visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(box.vertices), 2)), material=material)
-    scene = trimesh.Scene()
-    scene.add_geometry(box, transform=trimesh.transformations.translation_matrix((0.5, 0, 0)))
-    return bytes(scene.export(file_type="glb"))
 
 
 def placed(format_: str, data: bytes, matrix: NDArray[np.float64], name: str = "cube") -> PlacedObject:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import os
 import shutil
@@ -11,9 +13,13 @@ import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+from rich.console import Console
 
+from client.commands.stream import stream
+from client.options.source import open_source
 from client.web.build import pack
 from protocol.conformance.play_server import ConformanceServer
 from protocol.messages import Wishes
@@ -89,6 +95,46 @@ def test_a_program_streams_frames_and_gets_the_light(server: BackgroundServer, p
     assert [light["frame"] for light in lights] == [0, 1, 2]
     assert all(len(light["sh"]) == 27 for light in lights)
     assert np.isfinite(lights[-1]["sh"]).all()
+
+
+BOTH = """
+import { StreamClient } from "probeless";
+import { readFileSync } from "node:fs";
+const bytesOf = (text) => new Uint8Array(Buffer.from(text, "base64"));
+const { camera, wishes, pose, color, depth } = JSON.parse(readFileSync("frame.json", "utf8"));
+const client = await StreamClient.connect(process.argv[1], { client: "test", camera, wishes });
+const answer = await client.send({
+  timestamp_s: 0, world_from_camera: pose, exposure: 1,
+  color: { codec: "raw", width: camera.width, height: camera.height, data: bytesOf(color) },
+  depth: new Uint16Array(bytesOf(depth).buffer),
+});
+console.log(JSON.stringify(answer.light.sh));
+client.close();
+"""
+
+
+def test_it_and_the_python_client_get_the_same_light_of_the_same_server(
+    server: BackgroundServer, program: Path
+) -> None:
+    source = open_source("synthetic:table?size=96x72&frames=1")
+    wishes = Wishes(up=source.up, voxel_m=0.02, lossless=True)
+    frame = source[0]
+    assert frame.exposure == 1
+    given = {
+        "camera": msgspec.to_builtins(source.camera),
+        "wishes": {"up": source.up, "voxel_m": 0.02, "lossless": True},
+        "pose": frame.world_from_camera.ravel().tolist(),
+        "color": base64.b64encode(frame.color.tobytes()).decode(),
+        "depth": base64.b64encode(frame.depth.astype("<u2").tobytes()).decode(),
+    }
+    (program / "frame.json").write_text(json.dumps(given))
+    done = run(program, "--input-type=module", "--eval", BOTH, "--", server.way_in)
+    assert done.returncode == 0, done.stderr
+    quiet = Console(file=io.StringIO())
+    ours = stream(source, server.way_in, (), wishes, lossless=True, realtime=False, console=quiet)
+    assert ours.light is not None
+    assert np.abs(ours.light.sh).max() > 0.01
+    np.testing.assert_allclose(json.loads(done.stdout), ours.light.sh, rtol=1e-6, atol=1e-7)
 
 
 def test_the_package_keeps_the_rules_of_the_wire_page(program: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -47,6 +48,16 @@ def read_exr(data: bytes) -> tuple[dict[str, bytes], NDArray[np.float16]]:
             picture[y - top, :, b"RGB".index(channel)] = values
     assert offset + 8 + size == len(data)
     return attributes, picture
+
+
+def test_ffmpeg_reads_the_same_exr(tmp_path: Path) -> None:
+    radiance = random_radiance()
+    (tmp_path / "a.exr").write_bytes(encode_panorama(radiance, "exr"))
+    with av.open(str(tmp_path / "a.exr")) as container:
+        found = next(container.decode(video=0))
+    assert found.format.name == "gbrpf16le"
+    planes = [np.frombuffer(plane, np.float16).reshape(12, -1)[:, :24] for plane in found.planes]
+    np.testing.assert_array_equal(np.stack([planes[2], planes[0], planes[1]], -1), radiance.astype(np.float16))
 
 
 def test_exr_is_read_back_to_half_precision() -> None:

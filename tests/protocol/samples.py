@@ -29,6 +29,7 @@ from protocol.messages import (
     MoveObject,
     OperatingPoint,
     Panorama,
+    PlacedObject,
     PlaceObject,
     Plan,
     Quality,
@@ -169,6 +170,7 @@ SERVER: dict[str, ServerMessage] = {
             ),
         ),
         notes=("depth is missing in 31 % of the pixels",),
+        placed=(PlacedObject(object="vase", position_m=(0.5, 0.25, -1.0), scale=0.5, yaw_deg=30.0),),
     ),
     "layer": Layer(
         frame=7,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import encode_color, encode_depth
-from protocol.messages import Frame, LeftOut, Light, Plan, Timings, Wishes
+from protocol.messages import Frame, LeftOut, Light, PlacedObject, Plan, Timings, Wishes
 from server.meshing.scene_mesh import SceneMesh
 from server.meshing.surface import MeshingError
 from server.shading.layer import Layer, LayerPart
@@ -44,6 +44,7 @@ class FakeResult:
     plan: Plan
     notes: tuple[str, ...]
     layer: Layer | None = None
+    placed: tuple[PlacedObject, ...] = ()
 
 
 @dataclass

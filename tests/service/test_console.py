@@ -63,10 +63,10 @@ def said(log: str, token: str, keys: Path, *, one_stream: bool, host: str = "127
     return "".join(lines) + rest, err
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
-def test_a_person_sees_it_once(host: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("host", "lines"), [("127.0.0.1", 1), ("0.0.0.0", 3)])
+def test_a_person_sees_it_in_every_line_that_others_need(host: str, lines: int, tmp_path: Path) -> None:
     out, err = said("text", "made up", tmp_path, one_stream=True, host=host)
-    assert out.count(TOKEN) == 1
+    assert sum(TOKEN in line for line in out.splitlines()) == lines
     assert err == ""
 
 

@@ -18,6 +18,7 @@ from client.streaming.access import AccessError, connection_parameters, fingerpr
 from client.streaming.client import Access
 from server.service.edge import tls
 from server.service.edge.authenticator import Authenticator
+from server.service.edge.own_authority import kept_authority, names_of, signed
 from server.service.edge.tls import Certificate, CertificateError, given_certificate, own_certificate
 from server.service.serve import BackgroundServer
 from tests.service.admission import TOKEN, connected, not_connected
@@ -51,6 +52,64 @@ def test_a_certificate_whose_time_is_nearly_over_is_made_again(tmp_path: Path, m
     first = own_certificate(tmp_path)
     monkeypatch.setattr(tls, "RENEWED_BEFORE", tls.LIFETIME + timedelta(days=1))
     assert own_certificate(tmp_path).fingerprint != first.fingerprint
+
+
+def test_a_machine_with_another_address_gets_a_certificate_of_the_same_authority(tmp_path: Path, monkeypatch) -> None:
+    first = own_certificate(tmp_path)
+    assert first.authority is not None
+    trusted = first.authority.read_bytes()
+    monkeypatch.setattr(tls, "local_addresses", lambda: ["127.0.0.1", "192.168.77.5", "::1"])
+    second = own_certificate(tmp_path)
+    found = x509.load_pem_x509_certificate(second.certificate.read_bytes())
+    assert second.fingerprint != first.fingerprint
+    assert "192.168.77.5" in names_of(found)
+    assert second.authority.read_bytes() == trusted
+    found.verify_directly_issued_by(x509.load_pem_x509_certificate(trusted))
+    assert own_certificate(tmp_path) == second
+    monkeypatch.setattr(tls, "local_addresses", lambda: ["127.0.0.1", "203.0.113.9"])  # a public one
+    assert own_certificate(tmp_path).authority.read_bytes() != trusted
+
+
+def test_a_self_signed_certificate_of_earlier_versions_is_replaced(tmp_path: Path) -> None:
+    other = own_certificate(tmp_path / "other")
+    for name, source in (("certificate.pem", other.certificate), ("key.pem", other.key)):
+        (tmp_path / name).write_bytes(source.read_bytes())
+    assert own_certificate(tmp_path).fingerprint != other.fingerprint
+
+
+def openssl_verify(authority: Path, certificate: Path, *options: str) -> subprocess.CompletedProcess:
+    command = ["openssl", "verify", "-x509_strict", *options, "-CAfile", authority, certificate]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_openssl_trusts_the_server_by_its_authority_for_local_names_alone(
+    certificate: Certificate, tmp_path: Path
+) -> None:
+    if shutil.which("openssl") is None:
+        pytest.skip("there is no openssl: apt-get install openssl")
+    done = openssl_verify(certificate.authority, certificate.certificate, "-verify_ip", "127.0.0.1")
+    assert done.returncode == 0, done.stderr
+    folder = certificate.authority.parent
+    signer = kept_authority(certificate.authority, folder / "authority_key.pem", ["localhost"], ["127.0.0.1"])
+    for name, addresses in (("bank.example", []), ("localhost", ["203.0.113.9"])):
+        forged = tmp_path / "forged.pem"
+        forged.write_bytes(signed(signer, [name], addresses, timedelta(days=1))[0])
+        assert "permitted subtree violation" in openssl_verify(certificate.authority, forged).stderr
+
+
+def test_a_device_gets_the_authority_without_a_token_and_trusts_the_server_by_it(secure, tmp_path: Path) -> None:
+    unchecked = httpx.get(f"{secure.url}/ca.crt", verify=False, trust_env=False)
+    assert unchecked.headers["content-type"] == "application/x-x509-ca-cert"
+    (tmp_path / "ca.crt").write_bytes(unchecked.content)
+    context = ssl.create_default_context(cafile=tmp_path / "ca.crt")
+    assert httpx.get(f"{secure.url}/healthz", verify=context, trust_env=False).status_code == 200
+    assert connected(secure.way_in, Access(tls_ca=tmp_path / "ca.crt")) == "a fake device"
+
+
+def test_a_server_with_a_given_certificate_offers_no_authority(start_server, certificate: Certificate) -> None:
+    server = start_server(certificate=given_certificate(certificate.certificate, certificate.key))
+    context = ssl.create_default_context(cafile=certificate.certificate)
+    assert httpx.get(f"{server.url}/ca.crt", verify=context, trust_env=False).status_code == 404
 
 
 def test_the_fingerprint_is_what_openssl_says(certificate: Certificate) -> None:

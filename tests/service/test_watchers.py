@@ -2,14 +2,30 @@
 
 import asyncio
 
+import msgpack
 import pytest
+from msgspec.structs import replace
 
 from protocol.frames import CameraModel
 from protocol.images import encode_color, encode_depth
-from protocol.messages import Bye, Composite, Frame, Hello, Light, Quality, Watch, Welcome
+from protocol.messages import (
+    Acknowledged,
+    Bye,
+    Composite,
+    Frame,
+    Hello,
+    Light,
+    MoveObject,
+    PlaceObject,
+    Quality,
+    RemoveObject,
+    Spot,
+    Watch,
+    Welcome,
+)
 from server.service.broadcast import Broadcast, Watcher
 from server.service.edge.connection import Refusal
-from tests.service.fakes import PATIENCE_S, frame_message, rgbd_frame
+from tests.service.fakes import CAMERA, PATIENCE_S, frame_message, rgbd_frame
 from tests.service.wire import Wire
 
 
@@ -78,13 +94,94 @@ def test_unknown_session_is_refused_with_those_there_are(dial) -> None:
 
 
 @pytest.mark.parametrize("message", [Quality(request=0, preset="rm"), frame_message(0)])
-def test_watcher_may_only_say_bye(dial, message) -> None:
+def test_watcher_may_send_no_frames_and_change_no_quality(dial, message) -> None:
     watcher = dial()
     watcher.watch()
     watcher.say(message)
     code, reason, _ = watcher.ending()
     assert code == 1008
-    assert "nothing but bye" in reason
+    assert "a watching client sends requests for objects and bye, not" in reason
+
+
+def test_watcher_places_moves_and_removes_in_the_session_that_it_sees(dial, lab) -> None:
+    camera, watcher = dial(), dial()
+    camera.greet()
+    assert watcher.watch().camera == CAMERA
+    asked = [
+        PlaceObject(request=5, object="vase", format="glb", data=b"glb", spot=Spot(on="table")),
+        MoveObject(request=6, object="vase", position_m=(1.0, 2.0, 3.0)),
+        RemoveObject(request=7, object="vase"),
+        RemoveObject(request=8, object="vase"),
+    ]
+    for message in asked:
+        watcher.say(message)
+    done = [watcher.hear_until(Acknowledged)[-1] for _ in asked]
+    assert [each.request for each in done] == [5, 6, 7, 8]
+    assert [each.error for each in done[:3]] == [None] * 3
+    assert done[0].notes == ("vase has no texture",)
+    assert "no object 'vase'" in (done[3].error or "")
+    assert [entry[0] for entry in lab.log] == ["place", "move", "remove", "remove"]
+    camera.say(frame_message(1))
+    assert not any(isinstance(message, Acknowledged) for message in camera.hear_until(Composite))
+
+
+def test_numbers_of_a_watcher_are_not_those_of_the_session(dial, lab) -> None:
+    camera, watcher = dial(), dial()
+    camera.greet()
+    watcher.watch()
+    place = PlaceObject(request=0, object="a", format="glb", data=b"glb", position_m=(0.0, 0.0, 0.0))
+    camera.say(place)
+    assert camera.hear_until(Acknowledged)[-1].error is None
+    watcher.say(replace(place, object="b"))
+    assert watcher.hear_until(Acknowledged)[-1].error is None
+    assert [entry[1] for entry in lab.log if entry[0] == "place"] == ["a", "b"]
+
+
+def test_watcher_of_nobody_is_told_that_there_is_no_session(dial) -> None:
+    watcher = dial()
+    watcher.watch()
+    watcher.say(RemoveObject(request=1, object="vase"))
+    assert watcher.hear_until(Acknowledged)[-1].error == "no session is streaming that could have objects"
+
+
+def test_watcher_is_told_that_the_session_ended_before_its_request_was_read(dial, lab) -> None:
+    lab.hold = True
+    camera, watcher = dial(), dial()
+    camera.greet()
+    watcher.watch()
+    camera.say(frame_message(1))
+    lab.next_entered()
+    watcher.say(RemoveObject(request=1, object="vase"))
+    camera.say(Bye())
+    lab.release()
+    said = watcher.hear_until(Acknowledged)[-1].error
+    assert said in ("the session has just ended", "no session is streaming that could have objects")
+
+
+def test_watcher_that_leaves_with_a_request_under_way_disturbs_nobody(dial, lab) -> None:
+    lab.hold = True
+    camera, leaves, stays = dial(), dial(), dial()
+    camera.greet()
+    leaves.watch()
+    stays.watch()
+    camera.say(frame_message(1))
+    lab.next_entered()
+    leaves.say(RemoveObject(request=1, object="of the one that leaves"))
+    leaves.hang_up()
+    stays.say(RemoveObject(request=1, object="of the one that stays"))
+    lab.release()
+    assert stays.hear_until(Acknowledged)[-1].request == 1
+    assert ("remove", "of the one that stays") in lab.log
+
+
+def test_watcher_with_an_invalid_field_is_answered_and_stays(dial) -> None:
+    camera, watcher = dial(), dial()
+    camera.greet()
+    watcher.watch()
+    watcher.socket.send(msgpack.packb({"type": "remove_object", "request": 3, "object": ""}))
+    assert watcher.hear_until(Acknowledged)[-1].request == 3
+    watcher.say(RemoveObject(request=4, object="vase"))
+    assert watcher.hear_until(Acknowledged)[-1].request == 4
 
 
 def test_watcher_that_leaves_disturbs_nobody(dial) -> None:

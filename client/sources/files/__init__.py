@@ -10,6 +10,7 @@ from client.sources.frame_source import Source
 
 _FORMATS = (record3d, scannet, ros_bag)
 _HEAD_BYTES = 64
+_MATROSKA = b"\x1aE\xdf\xa3"
 
 
 def open_file(path: Path) -> Source | None:
@@ -19,6 +20,11 @@ def open_file(path: Path) -> Source | None:
             head = file.read(_HEAD_BYTES)
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror})") from error
+    if head.startswith(_MATROSKA):
+        raise SourceError(
+            f"{path}: Matroska, as an Azure Kinect records, is not read: the SDK that reads it is no longer kept; "
+            "convert it to a plain folder (docs/sources.md)"
+        )
     return next((format_.open_file(path) for format_ in _FORMATS if format_.recognises(path, head)), None)
 
 

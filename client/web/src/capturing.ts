@@ -7,6 +7,7 @@ import { type Captured, type Packed, reasonOf, type Shot, type Sink, type Source
 import { type Draw, startXr } from "./capture/xr_source";
 import { type Choice, setupOf } from "./form";
 import { scaled, type Seen, Y_UP } from "./objects/picking";
+import type { PlaceObject } from "./protocol";
 import type { Remote } from "./remote";
 import type { Vector3 } from "./sh";
 
@@ -52,6 +53,11 @@ export class Capturing implements Sink {
     const up = wishes.up ?? Y_UP;
     this.up = scaled(up, 1 / Math.hypot(...up));
     this.remote.capture(url, { ...setup, wishes }, choice.color === "h264", choice.adapts);
+  }
+
+  /** What the source brings along. */
+  get objects(): readonly PlaceObject[] {
+    return this.source?.objects ?? [];
   }
 
   private open({ source, file, loops, view_deg }: Choice, stage: Element): Promise<Source> {

@@ -78,8 +78,16 @@ export function quality({ preset, budget_ms }: Choice): Pick<Wishes, "preset" | 
   return preset === "auto" ? { preset, budget_ms } : { preset, budget_ms: null };
 }
 
+/** Show the fields of what is chosen. */
+export function noteChoice(form: HTMLFormElement): void {
+  const { source, preset } = read(form);
+  offerLight(form, source !== "recorded");
+  form.dataset["source"] = source;
+  form.dataset["preset"] = preset;
+}
+
 /** Whether objects may be drawn here in the light that is fetched: only over what a WebXR session shows. */
-export function offerLight(form: HTMLFormElement, isOffered: boolean): void {
+function offerLight(form: HTMLFormElement, isOffered: boolean): void {
   const answer = form.elements.namedItem("answer") as HTMLSelectElement;
   const light = answer.querySelector<HTMLOptionElement>('[value="light"]')!;
   light.hidden = light.disabled = !isOffered;

@@ -7,11 +7,20 @@ export function lightOf(light: Light, object: string): ArrivingLight | Light {
   return places(light).find((each) => each.of === "object" && each.object === object) ?? light;
 }
 
+/** The light that a person cares for: at the first object, else in the middle of the view, else the room's; and its name. */
+export function placeShown(light: Light): { light: ArrivingLight | Light; name: string } {
+  const at = places(light);
+  const object = at.find(({ of }) => of === "object");
+  if (object !== undefined) return { light: object, name: "at the virtual object" };
+  const view = at.find(({ of }) => of === "view");
+  return view === undefined ? { light, name: "of the room" } : { light: view, name: "in the middle of the view" };
+}
+
 /** How well the dominant direction is known. */
 export function describeCertainty({ spread_deg, valid }: Pick<Light, "spread_deg" | "valid">): string {
-  if (spread_deg == null) return valid ? "Direction is known to 15° or better" : "Not known yet: the pictures so far do not fix the direction";
+  if (spread_deg == null) return valid ? "Sure to about 15°" : "Not sure yet: the pictures so far do not fix the direction";
   const within = `${Math.round(spread_deg)}°`;
-  return spread_deg <= VALID_SPREAD_DEG ? `Direction is known to ${within}` : `Not known well: the direction may be off by ${within}`;
+  return spread_deg <= VALID_SPREAD_DEG ? `Sure to about ${within}` : `Not sure: it may be off by ${within}`;
 }
 
 /** What is not known of the light at places, a line each. */

@@ -1,22 +1,25 @@
 // The page: watches a session, or captures one of its own, and shows what it produces.
 
 import { reasonOf } from "./capture/source";
-import { findSupport } from "./capture/support";
 import { Capturing } from "./capturing";
 import { type ConnectionState, streamUrl, tokenQuery } from "./connection";
-import { byId, make, setText } from "./dom";
-import { type Choice, fill, missing, offerLight, read } from "./form";
+import { byId, setText } from "./dom";
+import { type Choice, fill, missing, noteChoice, read } from "./form";
 import { clearLatency, noteShown, showAges } from "./latency";
 import { LayerMode } from "./layer_mode";
 import { LightMode } from "./light_mode";
+import { refreshLiveQuality, showLiveQuality } from "./live_quality";
 import { closeParts } from "./local/layer_parts";
 import { ObjectTools } from "./objects/tools";
 import { Panels } from "./panels";
-import { captionPicture, fitPicture, markPicture, showPicture } from "./picture";
-import type { Light, ServerMessage } from "./protocol";
+import { captionPicture, fitPicture, forgetPicture, markPicture, showPicture } from "./picture";
+import type { Light, ServerMessage, Welcome } from "./protocol";
 import { QualityChanges } from "./quality_changes";
 import { Remote } from "./remote";
 import { clearSending, noteSending, showSending } from "./sending";
+import { stayAwake } from "./wake_lock";
+import { WatchedView } from "./watched_view";
+import { offerWaysIn, showCommand } from "./ways_in";
 import type { News } from "./worker_messages";
 
 const QUIET_AFTER_MS = 3000;
@@ -37,8 +40,9 @@ let layerMode: LayerMode | null = null;
 const tools = new ObjectTools((asked) => remote.request(asked));
 const qualityChanges = new QualityChanges(form, (asked) => remote.request(asked), (text) => {
   setText(byId("capture-said"), text);
-  noteChoice();
+  noteChoice(form);
 });
+const watchedView = new WatchedView();
 let capturing: Capturing | null = null;
 let connection: ConnectionState = { kind: "connecting" };
 let retryAt_ms = 0;
@@ -46,6 +50,8 @@ let welcomes = 0;
 let told = "";
 /** What a session must be like to be watched, in words. */
 let watched = "";
+/** Name of the session that is watched. */
+let watchedSession = "";
 
 function receive(message: News): void {
   switch (message.kind) {
@@ -60,7 +66,7 @@ function receive(message: News): void {
     case "picture":
       showPicture(message.composite, message.bitmap);
       if (message.times !== null) noteShown(message.times, message.composite.timings);
-      if (capturing !== null) tools.show(capturing.seenIn(message.composite.frame, message.composite.world_from_camera));
+      tools.show(capturing === null ? watchedView.seenIn(message.composite) : capturing.seenIn(message.composite.frame, message.composite.world_from_camera));
       return;
     case "layer":
       receiveLayer(message);
@@ -86,9 +92,22 @@ function receiveServer(message: ServerMessage): void {
     if (problem !== null) tools.say(problem);
   }
   if (message.type === "welcome" && capturing !== null && ++welcomes > 1 && !message.resumed) beginAgain();
-  if (message.type === "composite" || message.type === "layer") told = "";
-  if (message.type === "light" && message.up) capturing?.noteUp(message.up);
+  if (message.type === "welcome" && capturing === null) beginWatching(message);
+  if (message.type === "composite" || message.type === "layer") {
+    told = "";
+    for (const placed of message.placed ?? []) tools.scene.found(placed);
+  }
+  if (message.type === "light" && message.up) (capturing ?? watchedView).noteUp(message.up);
   if (message.type === "light" && lightMode !== null) receiveLight(message);
+}
+
+/** Another session is watched: what was placed in the last one is not in it. */
+function beginWatching({ session, camera = null }: Welcome): void {
+  watchedView.begin(camera);
+  if (session === watchedSession) return;
+  watchedSession = session;
+  tools.clear();
+  if (camera !== null) tools.begin();
 }
 
 /** The server was started anew, or another camera is used. */
@@ -141,6 +160,8 @@ function refresh(): void {
   setText(byId("state"), text);
   document.documentElement.dataset["state"] = kind;
   markPicture(kind === "good");
+  stayAwake(kind === "good");
+  refreshLiveQuality(form, capturing !== null);
   setText(byId("stage-said"), told !== "" || capturing === null || kind === "good" ? told : text);
   retry.hidden = connection.kind !== "lost";
   reload.hidden = connection.kind !== "refused";
@@ -175,6 +196,7 @@ function watch(): void {
 /** What was shown belongs to a session that is over. */
 function begin(): void {
   welcomes = 0;
+  watchedSession = "";
   panels.clear();
   clearLatency();
   clearSending();
@@ -198,16 +220,18 @@ async function capture(choice: Choice): Promise<void> {
     watch();
     return fail(reasonOf(error));
   }
-  tools.begin();
+  tools.begin(capturing.objects);
   stage.classList.toggle("local", choice.source === "xr" && choice.answer !== "picture");
   stopButton.hidden = false;
   showFull(choice.source !== "recorded");
+  stage.scrollIntoView({ block: "start" });
   refresh();
 }
 
 /** Back to watching. */
 async function leave(reason: string): Promise<void> {
   await endCapture();
+  forgetPicture();
   watch();
   fail(reason);
 }
@@ -237,51 +261,29 @@ async function toggleFull(): Promise<void> {
   else if (document.fullscreenElement !== null) await document.exitFullscreen();
 }
 
-/** The command with which there is something to see; it breaks between words only. */
-function showHint(words: readonly string[]): void {
-  byId("hint").append(...words.flatMap((word) => [make("span", "", word), " "]));
-}
-
-async function showSupport(): Promise<void> {
-  const support = await findSupport();
-  for (const [name, lack] of [["xr", support.xr], ["camera", support.camera]] as const) {
-    const words = byId(`lacks-${name}`);
-    words.hidden = lack === null;
-    setText(words, lack ?? "");
-    const input = form.querySelector<HTMLInputElement>(`input[value="${name}"]`)!;
-    input.disabled = lack !== null;
-    if (lack !== null && input.checked) form.querySelector<HTMLInputElement>('input[value="watch"]')!.checked = true;
-  }
-  noteChoice();
-}
-
-function noteChoice(): void {
-  const choice = read(form);
-  offerLight(form, choice.source !== "recorded");
-  form.dataset["source"] = choice.source;
-  form.dataset["preset"] = choice.preset;
-}
-
 function submit(): void {
   const choice = read(form);
   const lack = missing(choice);
   fail(lack ?? "");
   if (lack !== null) return;
-  if (choice.source === "watch") void endCapture().then(watch);
-  else void capture(choice);
+  if (choice.source === "watch") {
+    stage.scrollIntoView({ block: "start" });
+    void endCapture().then(watch);
+  } else void capture(choice);
 }
 
 function start(): void {
-  showHint(["probeless", "stream", "synthetic:table", "--server", page.origin + tokenQuery(page).replace("?", "/?")]);
+  showCommand(["probeless", "stream", "synthetic:table", "--server", page.origin + tokenQuery(page).replace("?", "/?")]);
   fill(form, page);
-  noteChoice();
-  void showSupport();
+  noteChoice(form);
+  showLiveQuality(form);
+  offerWaysIn((choice) => void capture(choice));
   form.addEventListener("submit", (event) => {
     event.preventDefault();
     submit();
   });
   form.addEventListener("change", (event) => {
-    noteChoice();
+    noteChoice(form);
     const name = (event.target as HTMLInputElement).name;
     if (capturing !== null && (name === "preset" || name === "budget")) qualityChanges.change();
   });

@@ -1,9 +1,10 @@
 // Notes about the input: each line once, with its count and last frame.
 
-import { byId, make } from "./dom";
+import { byId, make, setText } from "./dom";
 
 const MOST = 30;
 const list = byId("notes");
+const NO_NEWS = "time of each stage, plan, notes";
 
 interface Note {
   count: number;
@@ -32,6 +33,7 @@ export function showNotes(): void {
   if (key === shown) return;
   shown = key;
   list.replaceChildren(...[...notes].reverse().map(([text, note]) => describe(text, note)));
+  setText(byId("details-news"), notes.size === 0 ? NO_NEWS : `${notes.size} ${notes.size === 1 ? "note" : "notes"}; ${NO_NEWS}`);
   if (notes.size === 0) list.append(make("li", "quiet", "Nothing was wrong with the input"));
 }
 

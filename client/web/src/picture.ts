@@ -33,6 +33,13 @@ export function drawPicture(picture: ImageBitmap | HTMLCanvasElement): void {
   frame.classList.add("has-picture");
 }
 
+/** Show what there is to begin with instead. */
+export function forgetPicture(): void {
+  frame.classList.remove("has-picture");
+  canvas.setAttribute("aria-label", "No picture yet");
+  setText(caption, "");
+}
+
 /** Say of which frame the virtual things on the screen are. */
 export function captionPicture(answer: Composite | Layer): void {
   const size = `${canvas.width}×${canvas.height}`;

@@ -388,6 +388,8 @@ export interface Welcome {
   codecs: Array<"h264" | "jpeg" | "png" | "raw">;
   /** Depth codecs that frames may use. */
   depth_codecs: Array<"raw" | "zdelta" | "zranks" | "zstd-delta" | "zstd-ranks">;
+  /** To a watcher: the lens of the session that it watches, by which it can point at places in the pictures. */
+  camera: CameraModel | null;
 }
 
 /**
@@ -454,6 +456,18 @@ export interface Plan {
   point: OperatingPoint | null;
 }
 
+/** Where an object stands whose spot was found; the fields of `place_object` and `move_object`. */
+export interface PlacedObject {
+  /** Its name. */
+  object: string;
+  /** World position of the bottom centre of the model's box. */
+  position_m: [number, number, number];
+  /** Factor on the model's size. */
+  scale: number;
+  /** Turn about the up axis. */
+  yaw_deg: number;
+}
+
 /** The composite image of one frame. */
 export interface Composite {
   type: "composite";
@@ -473,6 +487,8 @@ export interface Composite {
   notes: Array<string>;
   /** Time from the frame's arrival until its processing began: in the queue, decoding, waiting for the device. */
   waited_ms: number;
+  /** Objects whose spots were found in this frame. */
+  placed: Array<PlacedObject>;
   /** sRGB picture of the camera's size. */
   color: ColorImage;
 }
@@ -512,6 +528,8 @@ export interface Layer {
   notes: Array<string>;
   /** Time from the frame's arrival until its processing began: in the queue, decoding, waiting for the device. */
   waited_ms: number;
+  /** Objects whose spots were found in this frame. */
+  placed: Array<PlacedObject>;
   /**
    * Four channels: sRGB, not premultiplied, and coverage (255: the whole pixel).
    *

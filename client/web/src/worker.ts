@@ -46,6 +46,7 @@ self.onmessage = ({ data }: MessageEvent<ToWorker>): void => {
       return;
     case "request":
       stream?.request(data.request);
+      watching?.send(data.request);
       return;
     case "retry":
       watching?.open();

@@ -27,11 +27,11 @@ test("one whose place is not told is lit by the room's light", () => {
 });
 
 test("how well the direction is known", () => {
-  assert.equal(describeCertainty({ spread_deg: 12.4, valid: true }), "Direction is known to 12°");
-  assert.equal(describeCertainty({ spread_deg: 25, valid: true }), "Direction is known to 25°");
-  assert.equal(describeCertainty({ spread_deg: 71.6, valid: false }), "Not known well: the direction may be off by 72°");
-  assert.equal(describeCertainty({ spread_deg: null, valid: true }), "Direction is known to 15° or better");
-  assert.match(describeCertainty({ spread_deg: null, valid: false }), /^Not known yet/);
+  assert.equal(describeCertainty({ spread_deg: 12.4, valid: true }), "Sure to about 12°");
+  assert.equal(describeCertainty({ spread_deg: 25, valid: true }), "Sure to about 25°");
+  assert.equal(describeCertainty({ spread_deg: 71.6, valid: false }), "Not sure: it may be off by 72°");
+  assert.equal(describeCertainty({ spread_deg: null, valid: true }), "Sure to about 15°");
+  assert.match(describeCertainty({ spread_deg: null, valid: false }), /^Not sure yet/);
 });
 
 test("what is not known of places", () => {

@@ -2,13 +2,14 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { sizeOfGlb, toGlb } from "../src/objects/glb";
+import { toGlb } from "../src/objects/glb";
+import { sizeOfGlb } from "../src/objects/glb_size";
 import { type Model, Scene } from "../src/objects/scene";
 import { ball, cube, vase } from "../src/objects/shapes";
 import { pixelAt } from "../src/objects/touch";
 import type { Asked } from "../src/session";
 
-const MODEL: Model = { name: "Box", format: "glb", data: new Uint8Array(4), radius_m: 0.1, height_m: 0.1 };
+const MODEL: Model = { name: "Box", format: "glb", data: new Uint8Array(4), radius_m: 0.1, height_m: 0.1, scale: 1 };
 
 function asked(): { scene: Scene; log: Asked[] } {
   const log: Asked[] = [];
@@ -54,6 +55,59 @@ test("a server that has begun anew is given everything again, where it stands no
   const again = log.at(-1)!;
   assert.ok(again.type === "place_object");
   assert.deepEqual([again.position_m, again.yaw_deg], [[1, 2, 3], 30]);
+});
+
+test("undo brings back what stood before, drag by drag, also what was deleted", () => {
+  const { scene, log } = asked();
+  let request = 0;
+  const answer = (): void => {
+    while (request < log.length) scene.acknowledge(request++, null);
+  };
+  scene.remember();
+  const box = scene.place(MODEL, [0, 0, 0]);
+  answer();
+  scene.remember();
+  for (let i = 1; i <= 5; i++) scene.change(box, { position: [i, 0, 0] });
+  answer();
+  scene.remember(); // a touch that moves nothing
+  scene.remember();
+  scene.remove(box);
+  answer();
+  assert.equal(scene.placed.length, 0);
+  assert.ok(scene.undo());
+  answer();
+  const back = log.at(-1)!;
+  assert.ok(back.type === "place_object" && back.object === box.id);
+  assert.deepEqual(back.position_m, [5, 0, 0]);
+  assert.ok(scene.undo());
+  answer();
+  const moved = log.at(-1)!;
+  assert.ok(moved.type === "move_object");
+  assert.deepEqual(moved.position_m, [0, 0, 0]);
+  assert.ok(scene.undo());
+  answer();
+  assert.equal(log.at(-1)!.type, "remove_object");
+  assert.deepEqual([scene.canUndo, scene.undo(), scene.placed.length], [false, false, 0]);
+});
+
+test("an object whose spot the server looks for stands where the server says, and is moved from there", () => {
+  const { scene, log } = asked();
+  const box = scene.place(MODEL, { on: "table" });
+  const asks = log.at(-1)!;
+  assert.ok(asks.type === "place_object" && asks.spot?.on === "table" && asks.position_m === undefined);
+  scene.acknowledge(0, null);
+  scene.change(box, { yaw_deg: 90 }); // nobody knows where it stands
+  assert.equal(log.length, 1);
+  scene.remember();
+  scene.found({ object: "another", position_m: [9, 9, 9], scale: 1, yaw_deg: 0 });
+  scene.found({ object: box.id, position_m: [1, 2, 3], scale: 0.5, yaw_deg: 10 });
+  scene.change(box, { position: [2, 2, 3] });
+  const moved = log.at(-1)!;
+  assert.ok(moved.type === "move_object");
+  assert.deepEqual([moved.position_m, moved.scale, moved.yaw_deg], [[2, 2, 3], 0.5, 10]);
+  scene.acknowledge(1, null);
+  assert.ok(scene.undo());
+  assert.deepEqual(box.position, [1, 2, 3]);
 });
 
 for (const [name, shape, size] of [["vase", vase(), [0.154, 0.24, 0.154]], ["ball", ball(), [0.16, 0.16, 0.16]], ["cube", cube(), [0.15, 0.15, 0.15]]] as const) {

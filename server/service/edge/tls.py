@@ -1,21 +1,23 @@
-"""TLS certificates: a given one, or a self-signed one that is created once and stored."""
+"""TLS certificates: a given one, or one that this user's own authority signs, created once and stored."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import ipaddress
-import os
 import socket
 import ssl
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from platformdirs import user_data_path
 
+if TYPE_CHECKING:
+    from cryptography import x509
+
 LIFETIME = timedelta(days=800)
-"""iOS rejects certificates with a longer lifetime."""
+"""iOS rejects certificates with a lifetime above 825 days."""
 RENEWED_BEFORE = timedelta(days=7)
 NOWHERE = ("192.0.2.1", 9)
 """Documentation address (RFC 5737), used to find the outgoing interface; nothing is sent."""
@@ -32,6 +34,8 @@ class Certificate:
     certificate: Path
     key: Path
     fingerprint: str
+    authority: Path | None = None
+    """Certificate of the own authority that signed it; None: another did."""
 
 
 def given_certificate(certificate: Path, key: Path) -> Certificate:
@@ -47,15 +51,24 @@ def given_certificate(certificate: Path, key: Path) -> Certificate:
 
 
 def own_certificate(folder: Path | None = None) -> Certificate:
-    """The stored self-signed certificate; a new one if there is none or it expires soon. Raises CertificateError."""
+    """The stored certificate for all names and addresses of this machine. Raises CertificateError.
+
+    A new one if there is none, it expires soon, or the machine has another name or address.
+    """
+    from server.service.edge.own_authority import kept_authority, signed, write_privately  # only with TLS
+
     folder = folder or user_data_path("probeless") / "tls"
-    certificate, key = folder / "certificate.pem", folder / "key.pem"
+    certificate, key, authority = (folder / f"{name}.pem" for name in ("certificate", "key", "authority"))
+    names, addresses = host_names(), local_addresses()
     try:
-        if not (key.is_file() and _lasts(certificate)):
-            _make(certificate, key)
+        signer = kept_authority(authority, folder / "authority_key.pem", names, addresses)
+        if not (key.is_file() and _serves(certificate, {*names, *addresses}, signer.certificate)):
+            chain, secret = signed(signer, names, addresses, LIFETIME)
+            write_privately(key, secret)
+            write_privately(certificate, chain)
     except OSError as error:
         raise CertificateError(f"no certificate can be kept in {folder} ({error.strerror}): give --tls-cert") from error
-    return given_certificate(certificate, key)
+    return replace(given_certificate(certificate, key), authority=authority)
 
 
 def fingerprint_of(certificate: Path) -> str:
@@ -65,58 +78,20 @@ def fingerprint_of(certificate: Path) -> str:
     return hashlib.sha256(ssl.PEM_cert_to_DER_cert(first)).digest().hex(":").upper()
 
 
-def _lasts(certificate: Path) -> bool:
+def _serves(certificate: Path, needed: set[str], authority: x509.Certificate) -> bool:
+    """Whether a stored certificate is of this authority, for all that is needed, and not about to expire."""
     from cryptography import x509
+    from cryptography.exceptions import InvalidSignature
+
+    from server.service.edge.own_authority import names_of
 
     try:
         found = x509.load_pem_x509_certificate(certificate.read_bytes())
-    except (FileNotFoundError, ValueError):
+        found.verify_directly_issued_by(authority)
+        is_complete = needed <= names_of(found)
+    except (FileNotFoundError, ValueError, TypeError, InvalidSignature, x509.ExtensionNotFound):
         return False
-    return found.not_valid_after_utc - RENEWED_BEFORE > datetime.now(UTC)
-
-
-def _make(certificate: Path, key: Path) -> None:
-    """Write a key and a self-signed certificate for all names and addresses of this machine."""
-    from cryptography import x509
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import ec
-    from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-
-    private = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"probeless on {socket.gethostname()}"[:64])])
-    names: list[x509.GeneralName] = [x509.DNSName(host) for host in host_names()]
-    names += [x509.IPAddress(ipaddress.ip_address(address)) for address in local_addresses()]
-    uses = dict.fromkeys(
-        ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement", "crl_sign"), False
-    )
-    built = (
-        x509.CertificateBuilder(name, name, private.public_key(), x509.random_serial_number())
-        .not_valid_before(datetime.now(UTC) - timedelta(hours=1))
-        .not_valid_after(datetime.now(UTC) + LIFETIME)
-        .add_extension(x509.SubjectAlternativeName(names), critical=False)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)  # a phone can be told to trust it
-        .add_extension(
-            x509.KeyUsage(digital_signature=True, key_cert_sign=True, encipher_only=False, decipher_only=False, **uses),
-            critical=True,
-        )
-        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(private.public_key()), critical=False)
-        .sign(private, hashes.SHA256())
-    )
-    pem = serialization.Encoding.PEM
-    secret = private.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-    key.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    _write_privately(key, secret)
-    _write_privately(certificate, built.public_bytes(pem))
-
-
-def _write_privately(path: Path, data: bytes) -> None:
-    """Write a file atomically, readable by this user only."""
-    beside = path.with_suffix(f".{os.getpid()}")
-    beside.unlink(missing_ok=True)
-    with open(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-        file.write(data)
-    beside.replace(path)
+    return is_complete and found.not_valid_after_utc - RENEWED_BEFORE > datetime.now(UTC)
 
 
 def host_names() -> list[str]:
@@ -135,6 +110,15 @@ def local_addresses() -> list[str]:
         outward.connect(NOWHERE)  # finds the interface that leads out
         found.add(outward.getsockname()[0])
     return sorted(found)
+
+
+def reachable_host() -> str:
+    """Address by which other machines of the network most likely reach this one; its name where it has none."""
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as outward:
+        outward.connect(NOWHERE)
+        return str(outward.getsockname()[0])
+    others = [address for address in local_addresses() if address not in ("127.0.0.1", "127.0.1.1", "::1")]
+    return others[0] if others else socket.gethostname()
 
 
 def _is_name(name: str) -> bool:

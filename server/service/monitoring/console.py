@@ -21,6 +21,8 @@ class Console:
     """Takes one line."""
     shows_token: bool
     """Whether the token may be part of a line."""
+    draws: bool = False
+    """Whether lines may be a drawing in colours: it is a terminal."""
 
 
 def console_of(log_format: LogFormat, *, is_token_given: bool) -> Console:
@@ -29,7 +31,7 @@ def console_of(log_format: LogFormat, *, is_token_given: bool) -> Console:
     A log of JSON never has the token in it, and nobody needs to be told the token that he gave.
     """
     if log_format == "text":
-        return Console(print_line, shows_token=True)
+        return Console(print_line, shows_token=True, draws=sys.stdout.isatty())
     if _is_one_stream():
         return Console(log.info, shows_token=False)
     return Console(print_line, shows_token=not is_token_given)

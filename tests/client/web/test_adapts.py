@@ -163,6 +163,7 @@ def test_a_narrow_link_gets_smaller_pictures_younger_frames_and_the_best_again_w
         assert (last.width, last.height) == (CAMERA.width // 2, CAMERA.height // 2)
         assert len(last.data) < len(first.data) / 4
         page.locator("#full").click()  # back to the whole page
+        page.locator("#details > summary").click()
         page.locator("#sending").focus()
         assert page.evaluate("document.activeElement.id") == "sending"
         assert page.locator("#sending").get_attribute("aria-live") is None

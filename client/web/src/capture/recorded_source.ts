@@ -1,6 +1,6 @@
 // Plays a recording as a camera: its frames unchanged, in real time, from a local file.
 
-import type { CameraModel, Wishes } from "../protocol";
+import type { CameraModel, PlaceObject, Wishes } from "../protocol";
 import { pictureOf } from "./recorded_picture";
 import { framesOf, type RecordedFrame } from "./recording";
 import { now_ms, type Packed, reasonOf, type Sink, type Source, SourceError } from "./source";
@@ -31,6 +31,7 @@ export async function startRecorded(file: File, loops: boolean, sink: Sink, onSh
 
 export class RecordedSource implements Source {
   readonly wishes: Wishes;
+  readonly objects: readonly PlaceObject[];
   private hasEnded = false;
   private shown: Shown | null = null;
   private isShowing = false;
@@ -45,6 +46,7 @@ export class RecordedSource implements Source {
     private readonly onShown: ((shown: Shown) => void) | null,
   ) {
     this.wishes = wishesOf(first);
+    this.objects = first.objects;
     void this.play(first).catch((error: unknown) => this.end(error instanceof SourceError ? error.message : `The recording cannot be played: ${reasonOf(error)}`));
   }
 

@@ -1,7 +1,7 @@
 // Reads a recording (protocol/README.md): consecutive messages in a file, read in chunks.
 
 import { decodeClient } from "../messages";
-import { type CameraModel, type ClientMessage, type Frame, type Hello, MAX_MESSAGE_BYTES, type Wishes } from "../protocol";
+import { type CameraModel, type ClientMessage, type Frame, type Hello, MAX_MESSAGE_BYTES, type PlaceObject, type Wishes } from "../protocol";
 import { lengthOfValue } from "./message_length";
 import { reasonOf, SourceError } from "./source";
 
@@ -12,6 +12,8 @@ export interface RecordedFrame {
   camera: CameraModel;
   wishes: Wishes;
   frame: Frame;
+  /** Placed before this frame, in this recording; of earlier frames too. */
+  objects: readonly PlaceObject[];
 }
 
 /** Error in a file, in one sentence. */
@@ -21,12 +23,14 @@ const noRecording = (file: File, at: number, why: string): SourceError =>
 /** The frames of a recording in order. Throws SourceError. `onCut` is called if the file ends inside a message. */
 export async function* framesOf(file: File, onCut: (text: string) => void): AsyncGenerator<RecordedFrame> {
   let hello: Hello | null = null;
+  const objects: PlaceObject[] = [];
   for await (const { at, bytes } of messagesOf(file, onCut)) {
     const message = read(file, at, bytes);
     if (message.type === "hello") hello = message;
+    if (message.type === "place_object") objects.push(message);
     if (message.type !== "frame") continue;
     if (hello === null) throw noRecording(file, at, "a frame before any hello");
-    yield { camera: hello.camera, wishes: hello.wishes ?? {}, frame: message };
+    yield { camera: hello.camera, wishes: hello.wishes ?? {}, frame: message, objects };
   }
 }
 

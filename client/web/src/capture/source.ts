@@ -1,6 +1,6 @@
 // Common interface of the page's cameras.
 
-import type { CameraModel, Frame, Wishes } from "../protocol";
+import type { CameraModel, Frame, PlaceObject, Wishes } from "../protocol";
 
 /** Milliseconds on a clock that page and worker share. */
 export const now_ms = (): number => performance.timeOrigin + performance.now();
@@ -41,6 +41,8 @@ export interface Sink {
 export interface Source {
   /** Wishes of the source in addition to the user's. */
   readonly wishes?: Wishes;
+  /** What was placed when it was recorded. */
+  readonly objects?: readonly PlaceObject[];
   stop(): Promise<void>;
 }
 

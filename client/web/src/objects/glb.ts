@@ -61,23 +61,3 @@ function bounds(positions: Float32Array): { min: number[]; max: number[] } {
   const axes = [0, 1, 2].map((axis) => positions.filter((_, i) => i % 3 === axis));
   return { min: axes.map((values) => Math.min(...values)), max: axes.map((values) => Math.max(...values)) };
 }
-
-/** Width, height and depth of the box around a GLB's vertices, as its accessors say; null where they do not. */
-export function sizeOfGlb(data: Uint8Array): [number, number, number] | null {
-  try {
-    const words = new DataView(data.buffer, data.byteOffset, data.byteLength);
-    if (words.getUint32(0, true) !== MAGIC) return null;
-    const text = new TextDecoder().decode(data.subarray(20, 20 + words.getUint32(12, true)));
-    const document = JSON.parse(text) as {
-      meshes: { primitives: { attributes: { POSITION: number } }[] }[];
-      accessors: { min: number[]; max: number[] }[];
-    };
-    const boxes = document.meshes.flatMap((mesh) => mesh.primitives.map((part) => document.accessors[part.attributes.POSITION]!));
-    const size = [0, 1, 2].map(
-      (axis) => Math.max(...boxes.map((box) => box.max[axis]!)) - Math.min(...boxes.map((box) => box.min[axis]!)),
-    );
-    return size.every((side) => Number.isFinite(side)) ? [size[0]!, size[1]!, size[2]!] : null;
-  } catch {
-    return null; // the server says what is wrong with it
-  }
-}

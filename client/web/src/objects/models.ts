@@ -4,9 +4,10 @@ import { reasonOf } from "../capture/source";
 import { tokenQuery } from "../connection";
 import { make } from "../dom";
 import { MAX_MESH_BYTES } from "../protocol";
-import { sizeOfGlb, toGlb } from "./glb";
+import { toGlb } from "./glb";
 import type { Model } from "./scene";
 import { ball, cube, vase } from "./shapes";
+import { fittingScale, sizeOf } from "./size";
 
 /** Of a file whose size is not known here. */
 const UNKNOWN_M = 0.2;
@@ -37,7 +38,7 @@ export class Models {
       ["Ball", ball(), 0.08, 0.16],
       ["Cube", cube(), 0.106, 0.15],
     ] as const) {
-      this.offer(choice, name, () => Promise.resolve({ name, format: "glb", data: toGlb(shape), radius_m, height_m }));
+      this.offer(choice, name, () => Promise.resolve({ name, format: "glb", data: toGlb(shape), radius_m, height_m, scale: 1 }));
     }
     choice.addEventListener("change", () => void this.announce());
   }
@@ -72,7 +73,7 @@ export class Models {
     const model = modelOf(file.name.slice(0, dot) || "Model", format, new Uint8Array(await file.arrayBuffer()));
     this.offer(this.choice, model.name, () => Promise.resolve(model), `file:${model.name}`);
     this.choice.value = `file:${model.name}`;
-    this.say(`${file.name} can be placed now.`);
+    this.say(`${file.name} can be placed now${sizeInWords(model)}.`);
   }
 
   private offer(among: Element, name: string, source: () => Promise<Model>, value = name): void {
@@ -103,9 +104,15 @@ export class Models {
   }
 }
 
-function modelOf(name: string, format: Format, data: Uint8Array): Model {
-  const [width, height, depth] = (format === "glb" ? sizeOfGlb(data) : null) ?? [UNKNOWN_M, UNKNOWN_M, UNKNOWN_M];
-  return { name, format, data, radius_m: Math.hypot(width, depth) / 2, height_m: height };
+export function modelOf(name: string, format: Format, data: Uint8Array<ArrayBuffer>): Model {
+  const size = sizeOf(format, data);
+  const [width, height, depth] = size ?? [UNKNOWN_M, UNKNOWN_M, UNKNOWN_M];
+  return { name, format, data, radius_m: Math.hypot(width, depth) / 2, height_m: height, scale: size === null ? 1 : fittingScale(size, format) };
+}
+
+/** What a person should know of a model that is not shown in the size that its file says. */
+function sizeInWords({ height_m, scale }: Model): string {
+  return scale === 1 ? "" : `, ${Math.max(1, Math.round(100 * height_m * scale))} cm high (${scale.toPrecision(2)} times what the file says)`;
 }
 
 const withoutFormat = (name: string): string => name.slice(0, name.lastIndexOf("."));

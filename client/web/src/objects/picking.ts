@@ -17,8 +17,8 @@ export interface Seen {
   measured_from?: readonly number[];
   /** Unit vector in the world. */
   up: Vector3;
-  /** Compressed until it is needed. */
-  depth: Uint16Array | DepthImage;
+  /** Compressed until it is needed; null: the server alone has it. */
+  depth: Uint16Array | DepthImage | null;
 }
 
 export interface Measured extends Seen {
@@ -29,6 +29,7 @@ export const isMeasured = (seen: Seen): seen is Measured => seen.depth instanceo
 
 /** The frame with its depth decompressed and cached. Throws Error. */
 export async function measured(seen: Seen): Promise<Measured> {
+  if (seen.depth === null) throw new Error("no depth came with this picture");
   if (!isMeasured(seen)) seen.depth = await decodeDepth(seen.depth as DepthImage);
   return seen as Measured;
 }
@@ -138,6 +139,12 @@ export function levelAt({ camera, world_from_camera, up }: Omit<Seen, "depth">, 
   const from = positionOf(world_from_camera);
   const ahead = (height_m - dot(up, from)) / dot(up, ray);
   return Number.isFinite(ahead) && ahead > 0 && ahead <= 20 ? sum(from, scaled(ray, ahead)) : null;
+}
+
+/** The ray of a pixel, in the world. */
+export function rayOf({ camera, world_from_camera }: Pick<Seen, "camera" | "world_from_camera">, pixel: Pixel): { origin_m: [number, number, number]; direction: [number, number, number] } {
+  const [right, down] = slopes(camera, pixel);
+  return { origin_m: [...positionOf(world_from_camera)], direction: [...toWorld(world_from_camera, [right, down, 1])] };
 }
 
 /** Direction of a pixel's ray: x and y for z = 1. */

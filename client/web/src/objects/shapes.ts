@@ -6,10 +6,11 @@ type Rgb = readonly [number, number, number];
 
 const SEGMENTS = 48;
 
-/** Height and radius, in metres, from the middle of the foot up the outside and down the inside. */
+/** Height and radius, in metres, from the middle of the foot up the outside and down the inside; two rings where the colour changes. */
 const VASE: readonly (readonly [number, number])[] = [
-  [0, 0], [0, 0.046], [0.008, 0.05], [0.02, 0.042], [0.045, 0.056], [0.085, 0.074], [0.12, 0.077], [0.15, 0.064],
-  [0.18, 0.036], [0.205, 0.029], [0.225, 0.036], [0.24, 0.048], [0.238, 0.044], [0.215, 0.027], [0.19, 0.024], [0.17, 0],
+  [0, 0], [0, 0.046], [0.008, 0.05], [0.0195, 0.0423], [0.0205, 0.0423], [0.032, 0.0487], [0.045, 0.056], [0.065, 0.0664],
+  [0.085, 0.074], [0.1075, 0.0767], [0.1085, 0.0768], [0.12, 0.077], [0.1315, 0.0744], [0.1325, 0.074], [0.15, 0.064],
+  [0.166, 0.0495], [0.18, 0.036], [0.205, 0.029], [0.225, 0.036], [0.24, 0.048], [0.238, 0.044], [0.215, 0.027], [0.19, 0.024], [0.17, 0],
 ];
 const BALL_RADIUS_M = 0.08;
 const BALL_RINGS = 24;

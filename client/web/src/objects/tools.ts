@@ -5,8 +5,10 @@ import { byId, setText } from "../dom";
 import type { Asked } from "../session";
 import { toWorld, type Vector3 } from "../sh";
 import { drawGuide } from "./guide";
-import { Models } from "./models";
-import { cross, floorOf, isMeasured, levelAt, levelled, type Measured, measured, type Pixel, project, scaled, type Seen, seenFrom, sum, surfaceAt } from "./picking";
+import { handlingHint, placingHint } from "./hints";
+import { Models, modelOf } from "./models";
+import { cross, dot, floorOf, isMeasured, levelAt, levelled, type Measured, measured, type Pixel, project, rayOf, scaled, type Seen, seenFrom, sum, surfaceAt } from "./picking";
+import type { PlaceObject, Spot } from "../protocol";
 import { type Placed, Scene } from "./scene";
 import { GROWTH, handleTouch, TURN_DEG } from "./touch";
 
@@ -21,12 +23,15 @@ export class ObjectTools {
   private readonly list = byId<HTMLSelectElement>("objects");
   private readonly placeButton = byId<HTMLButtonElement>("place");
   private readonly said = byId("object-said");
+  private readonly hint = byId("object-hint");
+  private readonly undoButton = byId<HTMLButtonElement>("undo");
   /** Of the picture on the screen; null where nothing can be placed. */
   private seen: Seen | null = null;
   /** From where, if that is another picture than the one that was measured. */
   private from: readonly number[] | null = null;
   private floor_m: number | null = null;
   private isPlacing = false;
+  private isFetching = false;
   private drags = 0;
   private lastDrag = 0;
 
@@ -52,9 +57,17 @@ export class ObjectTools {
     if (this.scene.selected !== null) this.draw();
   }
 
-  /** A session begins: what can be placed in it. */
-  begin(): void {
+  /** A session begins: what can be placed in it, and what its source brings along. */
+  begin(brought: readonly PlaceObject[] = []): void {
     void this.models.refresh();
+    for (const { object, format, data, position_m, spot, yaw_deg = 0, scale = 1, height_m } of brought) {
+      const where = spot ?? position_m;
+      if (!where) continue; // its vertices are places of the world, which cannot be handled here
+      const model = modelOf(object.charAt(0).toUpperCase() + object.slice(1), format, new Uint8Array(data));
+      const placed = this.scene.place({ ...model, scale: height_m && model.height_m > 0 ? height_m / model.height_m : scale }, where);
+      if (yaw_deg !== 0) this.scene.change(placed, { yaw_deg });
+    }
+    this.scene.select(null);
   }
 
   /** A session ends: its floor and what was placed are not those of the next. */
@@ -77,9 +90,11 @@ export class ObjectTools {
       step: (right, away) => this.step(right, away),
       scale: (by) => this.scale(by),
       remove: () => this.remove(),
+      remember: () => this.scene.remember(),
+      undo: () => this.undo(),
     });
     this.placeButton.addEventListener("click", (event) => this.pressPlace(event.detail === 0));
-    this.list.addEventListener("change", () => this.scene.select(this.scene.placed[this.list.selectedIndex] ?? null));
+    this.list.addEventListener("change", () => this.scene.select(this.scene.placed[this.list.selectedIndex - 1] ?? null));
     const buttons: [string, () => void][] = [
       ["move-left", () => this.step(-1, 0)],
       ["move-right", () => this.step(1, 0)],
@@ -91,7 +106,13 @@ export class ObjectTools {
       ["larger", () => this.scale(GROWTH)],
       ["remove", () => this.remove()],
     ];
-    for (const [id, act] of buttons) byId(id).addEventListener("click", act);
+    for (const [id, act] of buttons) {
+      byId(id).addEventListener("click", () => {
+        this.scene.remember();
+        act();
+      });
+    }
+    this.undoButton.addEventListener("click", () => this.undo());
     const file = byId<HTMLInputElement>("model-file");
     file.addEventListener("change", () => void this.models.read(file.files?.[0]));
     for (const target of [this.frame, byId("object-tools")]) {
@@ -107,8 +128,8 @@ export class ObjectTools {
   private pressPlace(isKey: boolean): void {
     if (!isKey) {
       this.isPlacing = !this.isPlacing;
-      this.refresh();
-      return this.say(this.isPlacing ? "Tap where it shall stand." : "");
+      this.say("");
+      return this.refresh();
     }
     const size = byId<HTMLCanvasElement>("picture");
     void this.placeAt({ x: (size.width - 1) / 2, y: (size.height - 1) / 2 });
@@ -117,33 +138,44 @@ export class ObjectTools {
 
   private touch(pixel: Pixel): boolean {
     if (this.seen === null) return false;
-    if (this.isPlacing) {
+    if (this.isPlacing || this.scene.placed.length === 0) {
       this.scene.select(null); // what is dragged from now on is what is placed
       void this.placeAt(pixel);
       return true;
     }
     this.scene.select(this.nearest(pixel));
+    this.scene.remember(); // of a drag that may follow
     return this.scene.selected !== null;
   }
 
   private async placeAt(pixel: Pixel): Promise<void> {
     const { seen } = this;
     if (seen === null) return;
-    this.isPlacing = false; // a second tap while a model is fetched places no second one
+    if (this.isFetching) return; // a second tap while a model is fetched places no second one
+    this.isPlacing = false;
+    this.isFetching = true;
     try {
       const [model, place] = await Promise.all([this.models.chosen(), this.placeUnder(seen, pixel)]);
       if (this.seen === null) return; // the session is over
       if (place === null) throw new Error("No surface was measured there: tap somewhere else, or move closer.");
+      this.scene.remember();
       this.scene.place(model, place);
-      this.say(`${model.name} placed. Drag it, or move it with the arrow keys; [ and ] turn it, Delete removes it.`);
+      this.say(`${model.name} placed.`);
     } catch (error) {
       this.isPlacing = true;
       this.refresh();
       this.say(reasonOf(error));
+    } finally {
+      this.isFetching = false;
     }
   }
 
-  private async placeUnder(seen: Seen, pixel: Pixel): Promise<Vector3 | null> {
+  /** Where there is no depth here, the server looks for the surface in its scan. */
+  private async placeUnder(seen: Seen, pixel: Pixel): Promise<Vector3 | Spot | null> {
+    return seen.depth === null ? { on: "ray", ...rayOf(seen, pixel) } : this.surfaceUnder(seen, pixel);
+  }
+
+  private async surfaceUnder(seen: Seen, pixel: Pixel): Promise<Vector3 | null> {
     const known = await measured(seen);
     this.noteFloor(known);
     return surfaceAt(known, pixel) ?? (this.floor_m === null ? null : levelAt(known, pixel, this.floor_m));
@@ -160,7 +192,7 @@ export class ObjectTools {
     if (seen === null) return null;
     const canvas = this.guide;
     const pixels = canvas.width / Math.max(1, canvas.getBoundingClientRect().width);
-    const distances = this.scene.placed.map((placed) => {
+    const distances = this.scene.placed.filter(({ spot }) => spot === null).map((placed) => {
       const half_m = (placed.model.height_m * placed.scale) / 2;
       const middle = project(seen.camera, seen.world_from_camera, sum(placed.position, scaled(seen.up, half_m)));
       const side = project(seen.camera, seen.world_from_camera, placed.position);
@@ -177,10 +209,14 @@ export class ObjectTools {
     const { selected } = scene;
     if (seen === null || selected === null) return;
     const drag = ++this.drags;
-    const place = await this.placeUnder(seen, pixel).catch(() => null); // of depth that cannot be read: it stays where it is
+    const place = await this.draggedTo(seen, selected, pixel).catch(() => null); // of depth that cannot be read: it stays where it is
     if (place === null || drag < this.lastDrag || scene.selected !== selected) return;
     this.lastDrag = drag;
     scene.change(selected, { position: place });
+  }
+
+  private async draggedTo(seen: Seen, { position }: Placed, pixel: Pixel): Promise<Vector3 | null> {
+    return seen.depth === null ? levelAt(seen, pixel, dot(seen.up, position)) : this.surfaceUnder(seen, pixel);
   }
 
   /** On its level, to the picture's right and away from the camera. */
@@ -205,8 +241,9 @@ export class ObjectTools {
   private scale(by: number): void {
     const { selected } = this.scene;
     if (selected === null) return;
-    this.scene.change(selected, { scale: Math.min(100, Math.max(0.01, selected.scale * by)) });
-    this.say(`${selected.model.name} at ${Math.round(100 * selected.scale)} % of its size.`);
+    const [least, most] = [0.01 * selected.model.scale, 100 * selected.model.scale];
+    this.scene.change(selected, { scale: Math.min(most, Math.max(least, selected.scale * by)) });
+    this.say(`${selected.model.name} at ${Math.round((100 * selected.scale) / selected.model.scale)} % of its size.`);
   }
 
   private remove(): void {
@@ -216,20 +253,27 @@ export class ObjectTools {
     this.say(`${selected.model.name} removed.`);
   }
 
+  private undo(): void {
+    this.say(this.scene.undo() ? "Undone." : "There is nothing to undo.");
+  }
+
   private refresh(): void {
     const { placed, selected } = this.scene;
-    this.list.replaceChildren(...placed.map((each) => new Option(each.id.replace(/-.*-/, " "), each.id, false, each === selected)));
-    if (selected === null) this.list.selectedIndex = -1;
+    const count = new Option(`${placed.length} ${placed.length === 1 ? "object" : "objects"}`, "");
+    this.list.replaceChildren(count, ...placed.map((each) => new Option(each.id.replace(/-.*-/, " "), each.id, false, each === selected)));
     this.list.disabled = placed.length === 0;
     byId("selected-tools").hidden = selected === null;
+    this.undoButton.disabled = !this.scene.canUndo;
+    const isPlacing = this.isPlacing || placed.length === 0;
+    setText(this.hint, isPlacing ? placingHint() : selected !== null ? handlingHint() : "");
     this.placeButton.setAttribute("aria-pressed", String(this.isPlacing));
-    this.frame.classList.toggle("handling", this.isPlacing || selected !== null);
+    this.frame.classList.toggle("handling", isPlacing || selected !== null);
     this.draw();
   }
 
   private draw(): void {
     const { selected } = this.scene;
-    if (this.seen === null || selected === null) return drawGuide(this.guide, NO_LENS, NO_POSE, null);
+    if (this.seen === null || selected === null || selected.spot !== null) return drawGuide(this.guide, NO_LENS, NO_POSE, null);
     const { position, yaw_deg, scale, model } = selected;
     const standing = { position, up: this.seen.up, yaw_deg, radius_m: model.radius_m * scale, height_m: model.height_m * scale };
     drawGuide(this.guide, this.seen.camera, this.seen.world_from_camera, standing);

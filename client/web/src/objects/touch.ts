@@ -12,6 +12,9 @@ export interface Handling {
   step(right: number, away: number): void;
   scale(by: number): void;
   remove(): void;
+  /** What stands now is what undo() brings back. */
+  remember(): void;
+  undo(): void;
 }
 
 /** Where a point of the page is in a picture that keeps its shape within its element; null beside it. */
@@ -45,7 +48,10 @@ export function handleTouch(frame: HTMLElement, canvas: HTMLCanvasElement, handl
   frame.addEventListener("pointermove", (event) => {
     const known = fingers.get(event.pointerId);
     if (known === undefined) return;
-    if (fingers.size === 2 && dragged !== null) handling.turn(-turnOf(fingers, event));
+    if (fingers.size === 2 && dragged !== null) {
+      handling.turn(-turnOf(fingers, event));
+      handling.scale(growthOf(fingers, event));
+    }
     fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
     const pixel = pixelOf(event);
     if (event.pointerId === dragged && fingers.size === 1 && pixel !== null) handling.drag(pixel);
@@ -57,7 +63,9 @@ export function handleTouch(frame: HTMLElement, canvas: HTMLCanvasElement, handl
   frame.addEventListener("pointerup", lift);
   frame.addEventListener("pointercancel", lift);
   frame.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.altKey || event.metaKey || !press(event, handling)) return;
+    const isUndo = (event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z";
+    if (isUndo) handling.undo();
+    else if (event.ctrlKey || event.altKey || event.metaKey || !press(event, handling)) return;
     event.preventDefault();
   });
 }
@@ -72,7 +80,22 @@ function turnOf(fingers: ReadonlyMap<number, { x: number; y: number }>, event: P
   return turned > 180 ? turned - 360 : turned < -180 ? turned + 360 : turned;
 }
 
+/** By which factor the distance of two fingers grows when one of them moves. */
+function growthOf(fingers: ReadonlyMap<number, { x: number; y: number }>, event: PointerEvent): number {
+  const other = [...fingers].find(([id]) => id !== event.pointerId)![1];
+  const was = fingers.get(event.pointerId)!;
+  const [before, after] = [was, { x: event.clientX, y: event.clientY }].map(({ x, y }) => Math.max(LEAST_APART_PX, Math.hypot(x - other.x, y - other.y)));
+  return after! / before!;
+}
+
+/** Nearer than this two fingers say nothing of a size. */
+const LEAST_APART_PX = 20;
+
+const KEYS = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "[", "]", "+", "-", "Delete", "Backspace"];
+
 function press(event: KeyboardEvent, handling: Handling): boolean {
+  if (!KEYS.includes(event.key)) return false;
+  handling.remember();
   const far = event.shiftKey ? COARSE : FINE;
   switch (event.key) {
     case "ArrowLeft":

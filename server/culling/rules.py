@@ -17,7 +17,6 @@ import math
 
 from server.culling.reason import ALLOWANCE, CullReason
 from server.culling.scene_facts import SceneFacts
-from server.shading.adaptive import LEAST_CHANGE
 
 SHOWN = 255.0
 """Bound of an effect that a setting switches off: any change."""
@@ -154,12 +153,6 @@ def nothing_bounces(facts: SceneFacts) -> CullReason | None:
     share = influence.bounced * change if influence.bounced > 0 else 0.0
     bound = _codes_of_ratio(facts, share)
     return _if_bounded("light that bounces off real surface hardly changes", bound, ALLOWANCE - ELSEWHERE)
-
-
-def no_rims(facts: SceneFacts) -> CullReason | None:
-    """Means of ratios within b (1 + k) of 1 differ by no more than twice that: none is refined (adaptive.py)."""
-    share = facts.influence.change * (1.0 + facts.influence.bounced) if facts.influence.change < math.inf else math.inf
-    return CullReason("no shadow has a rim", 0.0) if 2.0 * share < LEAST_CHANGE else None
 
 
 def _codes_of_ratio(facts: SceneFacts, share: float) -> float:

@@ -35,7 +35,7 @@ EFFECTS: EffectTable[SceneFacts] = EffectTable(
         Effect(f.shadow_real, culled_by=(rules.no_influence,)),
         Effect(f.bounce_real, disabled_by=(rules.no_indirect,), culled_by=(rules.nothing_bounces,)),
         Effect(f.refine_virtual, disabled_by=(rules.not_refined,), culled_by=(rules.unlit,)),
-        Effect(f.refine_real, disabled_by=(rules.not_refined,), culled_by=(rules.no_rims,)),
+        Effect(f.refine_real, disabled_by=(rules.not_refined,)),
         Effect(f.mark_changes),
         Effect(f.direct_virtual, culled_by=(rules.unlit,)),
         Effect(f.direct_real),

@@ -65,7 +65,7 @@ def test_gloss_is_bounded_by_its_materials() -> None:
     assert most_reflected(np.array([[0.3, 1.0, -1, -1]], np.float32), 1.0) == 1.0  # metal keeps all diffuse light
 
 
-@pytest.mark.parametrize("rule", [o.unlit, o.matt, o.no_influence, o.dark_things, o.nothing_bounces, o.no_rims])
+@pytest.mark.parametrize("rule", [o.unlit, o.matt, o.no_influence, o.dark_things, o.nothing_bounces])
 def test_what_is_not_known_is_not_left_out(rule: object) -> None:
     facts = SceneFacts(objects_in_view=1, indirect=True, glossy=True)
     assert rule(facts) is None  # type: ignore[operator]
@@ -101,11 +101,6 @@ def test_bounced_light_is_bounded_by_what_it_bounces_off() -> None:
     assert (
         o.nothing_bounces(replace(FACTS, influence=InfluenceBound(math.inf, 0.5, 0.004))) is None
     )  # parts of the picture come first
-
-
-def test_rims_are_only_where_the_ratio_varies() -> None:
-    assert o.no_rims(replace(FACTS, influence=InfluenceBound(0.05, 0.0, 0.2))) is not None
-    assert o.no_rims(replace(FACTS, influence=InfluenceBound(0.07, 0.0, 0.2))) is None
 
 
 def test_what_is_spared_elsewhere_is_shared_out() -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import ray
 from ray.actor import exit_actor
 from ray.exceptions import RayActorError
 
+from server.cluster.closing import is_enough
 from server.cluster.host import HostStatus, open_room_host
 from server.cluster.quota import Quota
 from server.cluster.room_directory import Address, RoomNotReady, RoomUnavailable
@@ -106,11 +107,6 @@ class RayRoomDirectory:
             )
         options = actor_options(name, self._settings.place)
         return ray.remote(RoomActor).options(**options).remote(self._settings, is_private)
-
-
-def is_enough(free: Mapping[str, float], place: Mapping[str, float]) -> bool:
-    """Whether a place fits into what is free in all; it may be spread over nodes."""
-    return all(free.get(kind, 0.0) >= share for kind, share in place.items())
 
 
 def _ids(names: Iterable[str]) -> list[str]:

@@ -14,7 +14,7 @@ from ray.exceptions import RayError
 from ray.util.metrics import Gauge
 
 from server.cluster.capacity import Capacity
-from server.cluster.closing import rooms_to_close
+from server.cluster.closing import is_enough, rooms_to_close
 from server.cluster.host import HostStatus
 from server.cluster.ray_directory import NAMESPACE, room_names
 from server.cluster.settings import ClusterSettings
@@ -49,7 +49,9 @@ class RoomSupervisor:
         while True:
             names = await asyncio.to_thread(room_names)
             found = dict(zip(names, await asyncio.gather(*map(self._status_of, names)), strict=True))
-            for name in rooms_to_close(found, self._settings.close_after_s):
+            free = await asyncio.to_thread(ray.available_resources)
+            is_full = not is_enough(free, self._settings.place)
+            for name in rooms_to_close(found, self._settings.close_after_s, is_full=is_full):
                 await self._close(name)
             ages = [status.queue_age_s for status in found.values() if status is not None and status.queue_age_s > 0]
             await self._request_places(len(names), sum(ages) / len(ages) if ages else 0.0)

@@ -59,7 +59,8 @@ class WaysIn:
 
     def _certificate_lines(self) -> list[str]:
         if self.certificate is None:
-            return []
+            is_open = self.listener.getsockname()[0] in EVERYWHERE
+            return ["browsers of other machines give no camera to a page without https: add --tls"] if is_open else []
         lines = [f"SHA-256 of its certificate: {self.certificate.fingerprint}"]
         if self.certificate.authority is not None:
             lines.append(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from server.cluster.closing import FIRST_CLIENT_S, rooms_to_close
+from server.cluster.closing import FIRST_CLIENT_S, is_enough, rooms_to_close
 from server.cluster.host import HostStatus, gpu_number
 from server.cluster.quota import SETTLING_S, Quota, client_of
 from server.service.edge.trusted_proxies import TrustedProxies
@@ -66,15 +66,24 @@ def test_empty_rooms_are_closed_in_their_time() -> None:
         "private, new": status(0, FIRST_CLIENT_S - 1, is_private=True, is_new=True),
         "private, never used": status(0, FIRST_CLIENT_S + 1, is_private=True, is_new=True),
     }
-    assert rooms_to_close(rooms, AFTER_S) == ["long empty", "private", "private, never used"]
+    assert rooms_to_close(rooms, AFTER_S, is_full=True) == ["long empty", "private", "private, never used"]
 
 
 def test_rooms_that_wait_get_the_places_of_the_longest_empty_ones() -> None:
     rooms = {"a": status(0, 5.0), "b": status(0, 9.0), "c": status(1), "new": status(0, 20.0, is_new=True)}
-    assert rooms_to_close(rooms, AFTER_S) == []
-    assert rooms_to_close(rooms | {"waits": None}, AFTER_S) == ["b"]
-    assert rooms_to_close(rooms | {"waits": None, "too": None, "and": None}, AFTER_S) == ["b", "a"]
-    assert rooms_to_close(rooms | {"d": status(0, AFTER_S + 1), "waits": None}, AFTER_S) == ["d"]
+    waits, more = {"waits": None}, {"too": None, "and": None}
+    assert rooms_to_close(rooms, AFTER_S, is_full=True) == []
+    assert rooms_to_close(rooms | waits, AFTER_S, is_full=False) == [], "it only starts: there are places"
+    assert rooms_to_close(rooms | waits, AFTER_S, is_full=True) == ["b"]
+    assert rooms_to_close(rooms | waits | more, AFTER_S, is_full=True) == ["b", "a"]
+    assert rooms_to_close(rooms | {"d": status(0, AFTER_S + 1)} | waits, AFTER_S, is_full=True) == ["d"]
+
+
+def test_a_place_is_free_where_all_it_takes_is() -> None:
+    place = {"CPU": 0.5, "room": 1.0}
+    assert is_enough({"CPU": 1.0, "room": 1.0, "GPU": 0.0}, place)
+    assert not is_enough({"CPU": 1.0}, place)
+    assert not is_enough({"CPU": 0.25, "room": 3.0}, place)
 
 
 @pytest.mark.parametrize(("ids", "number"), [([], 0), (["0"], 0), (["3"], 3), (["3", "1"], 3), (["GPU-8932"], 0)])

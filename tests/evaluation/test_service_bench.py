@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import random
+import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,14 +19,16 @@ from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.bench.service.bytes import Fed, _Kept, feed
 from tests.bench.service.faults import Tally, part_of
+from tests.bench.service.floods import Held
+from tests.bench.service.floods import _round as flood_round
 from tests.bench.service.full_disk import Found, begin, disk_full_then_killed
 from tests.bench.service.guests import CAMERA, FIRST_PX, FULL_S, LAST_PX, WALL_M, Guest, clock_frame, clock_s
 from tests.bench.service.http import bad_request
 from tests.bench.service.load import growth, overhead
 from tests.bench.service.odd_numbers import Outcome, play_sessions
-from tests.bench.service.process import stop
+from tests.bench.service.process import Served, stop
 from tests.servers import fake_server
-from tests.service.fakes import FakePipeline, FakeResult, Lab
+from tests.service.fakes import PATIENCE_S, FakePipeline, FakeResult, Lab
 
 
 @pytest.mark.parametrize("shown_s", [0.0, 3.0, 12.0])
@@ -138,6 +142,27 @@ def test_chunks_of_mutations_are_kept(tmp_path: Path) -> None:
     both.add(fed)
     both.add(fed)
     assert both.messages == 400
+
+
+def test_floods_leave_no_session_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the round itself; what a real server keeps is the benchmark's question."""
+    monkeypatch.setattr("tests.bench.service.floods.FLOODS", 1)
+    rooms = {"room_factory": lambda _wishes, name: SimpleNamespace(name=name, key_digest=None, close=lambda: None)}
+    with fake_server(Lab().build, **rooms) as server:
+        flood_round(Served(None, server.url, Path("no log"), ()), 3, 4, 3)  # type: ignore[arg-type]
+        end_s = time.monotonic() + PATIENCE_S
+        while server.service.sessions and time.monotonic() < end_s:
+            time.sleep(0.01)
+        assert server.service.sessions == 0
+        dropped = server.service.metrics.dropped.labels("replaced")._value.get()
+    assert dropped > 0  # of those that never read, which do not keep to the window
+
+
+def test_growth_is_told_by_kind() -> None:
+    before = Held(100.0, 20, 8, 1.0)
+    assert Held(120.0, 22, 12, 1.0).growth_from(before) == {
+        "memory_mb": pytest.approx(20.0), "files": 0.0, "threads": pytest.approx(25.0), "disk_kb": 0.0
+    }  # fmt: skip
 
 
 def test_bad_requests_are_the_same_for_the_same_seed() -> None:

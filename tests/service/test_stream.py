@@ -37,6 +37,7 @@ def run_in_process(source: FakeSource, frames: range, folder: Path) -> None:
             frame = source[i]
             result = {**vars(fake_result(frame))}
             assert result.pop("layer") is None  # not wished for
+            assert result.pop("placed") == ()  # files have it as a note
             result["captured"] = captured_of(frame, source.camera)
             writer.write(FrameOutput(frame=frame.index, timestamp_s=frame.timestamp_s, **result))
 

@@ -63,6 +63,13 @@ def test_no_code_and_no_other_address_where_no_other_machine_reaches_it() -> Non
         assert ways.code() == []
 
 
+def test_without_tls_it_is_said_that_cameras_of_others_need_it(listener: socket.socket) -> None:
+    lines = WaysIn(listener, Authenticator("a-token"), None, is_key_left=True, shows_token=True).lines()
+    assert lines[1].startswith(f"from other machines: open http://{THERE}:")
+    assert lines[-1].endswith("add --tls")
+    assert not any("SHA-256" in line for line in lines)
+
+
 def test_a_token_that_is_not_shown_is_in_no_line_and_no_code(listener: socket.socket) -> None:
     ways = WaysIn(listener, Authenticator("a-token"), None, is_key_left=True, shows_token=False)
     assert not any("a-token" in line for line in ways.lines())

@@ -7,6 +7,7 @@ the surface that was seen, not the number of frames. Kernel: arrivals.cl.
 from __future__ import annotations
 
 from copy import copy
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from server.light.arrivals import trace_arrivals
 from server.light.shell.known_room import KnownPatches
 from server.light.shell.picture import Seen
-from server.maths.sh import GOLDEN_TURN
+from server.maths.sh import spherical_fibonacci
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
 
@@ -24,9 +25,10 @@ REGION_M = 0.4
 """Side of the regions over which a material may differ from what its colour says (objective.py)."""
 MOST_PATCHES = 1536
 """The patch that was not seen for longest makes way for another. 8 rooms' worth of what one picture shows."""
-RAYS = 128
-"""Rays of a patch, evenly spread over its cosine-weighted hemisphere: a lamp of 1 % of it is met by one of them."""
-TRACED_A_FRAME = 64
+RAYS = 1024
+"""Directions, evenly spread and the same for all patches, of which half are above the plane of each. With a quarter of
+them, what a window sends to a patch is a tenth off, and the light turns by as much as with another room."""
+TRACED_A_FRAME = 16
 """Patches whose rays are traced in a frame once all are: the scan behind them goes on growing."""
 MOST_WEIGHT = 30.0
 """Frames that a patch's mean remembers."""
@@ -57,9 +59,10 @@ class Patches:
         """Which region each lies in: equal numbers, the same one."""
         self.seen_in, self.traced_in = np.full(n, -1), np.full(n, -1)
         """Number of the last frame that showed it, or in which its rays were traced; -1: none."""
-        self.directions = np.zeros((n, RAYS, 3), np.float32)
         self.arrivals = np.zeros((n, RAYS, 4), np.float32)
-        """As of trace_arrivals."""
+        """What the rays along `ray_directions` met, as of trace_arrivals; of no meaning below the plane."""
+        self.traced_normals = np.zeros((n, 3))
+        """Above whose planes rays were traced."""
         self._frame = 0
 
     @property
@@ -115,10 +118,9 @@ class Patches:
         rows = order[: max(fresh, frames * TRACED_A_FRAME)]
         if len(rows) == 0:
             return rows
-        self.directions[rows] = hemisphere_rays(self.normals[rows], rows)
-        origins = self.positions[rows] + volume.voxel_m * self.normals[rows] - volume.origin_world
-        directions = self.directions[rows].astype(np.float64)
-        self.arrivals[rows] = trace_arrivals(engine, volume, origins, None, directions)
+        self.traced_normals[rows] = normals = self.normals[rows]
+        origins = self.positions[rows] - volume.origin_world
+        self.arrivals[rows] = trace_arrivals(engine, volume, origins, normals, ray_directions()[None])
         self.traced_in[rows] = self._frame
         return rows
 
@@ -196,19 +198,13 @@ class _Means:
         return np.asarray(np.stack(columns, axis=1) / self._counts[:, None])
 
 
-def hemisphere_rays(normals: Floats, numbers: Ints) -> NDArray[np.float32]:
-    """[n, RAYS, 3] unit directions, spread as the cosine to `normals` [n, 3]; `numbers` [n] choose their turn."""
-    index = np.arange(RAYS) + 0.5
-    radius, height = np.sqrt(index / RAYS), np.sqrt(1 - index / RAYS)
-    turns = 2 * np.pi * ((numbers * GOLDEN_TURN) % 1.0)[:, None]
-    angle = 2 * np.pi * GOLDEN_TURN * np.arange(RAYS)[None, :] + turns
-    across = np.eye(3)[np.abs(normals).argmin(axis=1)]
-    first = np.cross(normals, across)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(normals, first)
-    parts = (
-        (radius * np.cos(angle))[..., None] * first[:, None],
-        (radius * np.sin(angle))[..., None] * second[:, None],
-        np.broadcast_to(height[:, None], (*angle.shape, 1)) * normals[:, None],
-    )
-    return np.asarray(sum(parts), np.float32)
+@cache
+def ray_directions() -> Floats:
+    """[RAYS, 3] unit, world axes."""
+    return spherical_fibonacci(RAYS)
+
+
+def hemisphere_weights(normals: Floats) -> Floats:
+    """[n, RAYS] how far rays count at surface with unit `normals` [n, 3]: as their cosine, with sum 1."""
+    cosines = np.maximum(normals @ ray_directions().T, 0.0)
+    return np.asarray(cosines / np.maximum(cosines.sum(axis=1, keepdims=True), 1e-9))

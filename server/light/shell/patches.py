@@ -30,6 +30,8 @@ RAYS = 1024
 them, what a window sends to a patch is a tenth off, and the light turns by as much as with another room."""
 TRACED_A_FRAME = 16
 """Patches whose rays are traced in a frame once all are: the scan behind them goes on growing."""
+OUTDATED_LEFT = 0.5
+"""Share of what is outdated that still is a frame later: colours of the scan follow another light within a few."""
 MOST_WEIGHT = 30.0
 """Frames that a patch's mean remembers."""
 _FORGOTTEN = 1e-3  # frames: a patch of less weight is none
@@ -63,6 +65,8 @@ class Patches:
         """What the rays along `ray_directions` met, as of trace_arrivals; of no meaning below the plane."""
         self.traced_normals = np.zeros((n, 3))
         """Above whose planes rays were traced."""
+        self.outdated = 0.0
+        """Share of the patches whose rays met surface under another light; what is solved is far from the new one."""
         self._frame = 0
 
     @property
@@ -86,6 +90,7 @@ class Patches:
         """Take `share` of their weight from all patches: the light has changed."""
         self.weights *= 1.0 - share
         self.weights[self.weights < _FORGOTTEN] = 0.0
+        self.outdated = max(OUTDATED_LEFT * self.outdated, share)
 
     def add(self, seen: Seen) -> None:
         """Fold a picture in."""
@@ -111,11 +116,11 @@ class Patches:
 
     def trace(self, engine: Engine, volume: Volume, frames: int = 1) -> Ints:
         """Trace the rays of patches that have none yet, and of those traced longest ago, TRACED_A_FRAME for each of
-        `frames`. Returns their rows."""
+        `frames`, or more where the light is another. Returns their rows."""
         alive = np.flatnonzero(self.weights > 0)
         order = alive[np.argsort(self.traced_in[alive], kind="stable")]
         fresh = int((self.traced_in[order] < 0).sum())
-        rows = order[: max(fresh, frames * TRACED_A_FRAME)]
+        rows = order[: max(fresh, frames * TRACED_A_FRAME, round(self.outdated * len(order)))]
         if len(rows) == 0:
             return rows
         self.traced_normals[rows] = normals = self.normals[rows]

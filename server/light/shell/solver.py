@@ -21,7 +21,7 @@ MOST_STEPS = 16
 """Gauss-Newton steps of a solution: one, and others while the last one changed what patches receive by more than
 MOVED."""
 MOVED, FIRST_MOVED = 0.05, 0.01
-"""Of a logarithm; the second in a first solution, which the others follow."""
+"""Of a logarithm; the second in a first solution, which the others follow, and where the light is another."""
 LEAST_PATCHES = 12
 """Patches below which nothing is said."""
 
@@ -58,7 +58,8 @@ class Solver:
         evidence = evidence_of(patches, rows, switches)
         near = near_sources(self._transport, shell, rows)
         distant = distant_sources(self._transport, closed, rows, with_indirect=switches.indirect)
-        settled = MOVED if self._near.known > 0 and switches.memory else FIRST_MOVED
+        first = patches.outdated if self._near.known > 0 and switches.memory else 1.0
+        settled = MOVED ** (1 - first) * FIRST_MOVED**first
         for unknowns, sources in ((self._near, near), (self._distant, distant)):
             for _ in range(MOST_STEPS):
                 step(unknowns, evidence, sources, switches)

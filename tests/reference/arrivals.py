@@ -25,7 +25,8 @@ def trace_arrivals(
 ) -> tuple[Floats, Floats]:
     """Arrivals [n, m, 4] as of the kernel, and how clearly each surface faces [n, m]: the cosine to its outward normal.
 
-    points [n, 3], normals [n, 3] of the surface that they lie on, or None, directions [n, m, 3]; tsdf, weight, has_color [z, y, x], colors [z, y, x, 3].
+    points [n, 3], normals [n, 3] of the surface that they lie on, or None, directions [n, m, 3]; tsdf, weight,
+    has_color [z, y, x], colors [z, y, x, 3].
     """
     shape = directions.shape[:2]
     if normals is not None:

@@ -160,7 +160,8 @@ class Transport:
 def _summed(rows: Ints, columns: Ints, shares: Floats, count: int) -> Floats:
     """[count, COLUMNS] sums over rays of `shares` of `columns`, [m, CORNERS] each; rows [m]: whose they are."""
     place = COLUMNS * rows[:, None] + columns
-    return np.bincount(place.ravel(), shares.ravel(), count * COLUMNS).reshape(-1, COLUMNS)
+    sums = np.bincount(place.ravel(), shares.ravel(), count * COLUMNS)
+    return np.asarray(sums.reshape(-1, COLUMNS), np.float64)
 
 
 def bright_keys(points: Floats) -> Ints:

@@ -10,8 +10,17 @@ static inline int is_back(const Volume volume, const float3 at, const float3 dir
     return surface_near(volume, at * volume.voxel_m, &distance_m, &outwards) && dot(outwards, direction) > 0.0f;
 }
 
-// One item LANES directions of a point. points [count]: volume metres, w unused; normals [count]: directions below the plane
-// are skipped, w = 0: none is. directions [sets][per_set] unit; point i takes set i % sets.
+// Where the rays of a point of scanned surface begin: as for a virtual surface (clear_origin.clh), but however deep its mean place lies.
+static float3 clear_of_surface(const Volume volume, const float3 point, const float3 normal) {
+    const float3 origin = point + volume.voxel_m * normal;
+    float distance_m;
+    float3 outwards;
+    if (!surface_near(volume, origin, &distance_m, &outwards) || distance_m >= volume.voxel_m) return origin;
+    return origin + (volume.voxel_m - distance_m) * outwards;
+}
+
+// One item LANES directions of a point. points [count]: volume metres, w unused; normals [count]: of the surface that it lies on,
+// rays begin clear of it and directions below its plane are skipped; w = 0: it lies on none. directions [sets][per_set] unit; point i takes set i % sets.
 // -> arrivals [count][per_set]: radiance (rgb) of the surface that is met, and its distance in metres (w): positive, surface
 // that was photographed; negative, a back or surface without a colour; 0, nothing is met, or the direction is skipped.
 kernel void trace_arrivals(const VolumeShape shape, global const int *slots, global const ulong *solid,
@@ -29,7 +38,8 @@ kernel void trace_arrivals(const VolumeShape shape, global const int *slots, glo
         chosen[lane] = set + min(first + lane, per_set - 1);
         skipped |= (normal.w > 0.0f && dot(normal.xyz, directions[chosen[lane]].xyz) <= 0.0f) << lane;
     }
-    const Rays rays = volume_rays(volume, points[point].xyz, directions, chosen);
+    const float3 origin = normal.w > 0.0f ? clear_of_surface(volume, points[point].xyz, normal.xyz) : points[point].xyz;
+    const Rays rays = volume_rays(volume, origin, directions, chosen);
     floatn begin, end;
     clip_rays(volume, rays, &begin, &end);
     end = mask_of(skipped) ? begin : end;
@@ -40,7 +50,7 @@ kernel void trace_arrivals(const VolumeShape shape, global const int *slots, glo
         float4 arrival = (float4)(0.0f);
         if (met[lane] > 0.0f) {
             const float3 direction = directions[chosen[lane]].xyz;
-            const float3 at = points[point].xyz / volume.voxel_m + met[lane] * direction;
+            const float3 at = origin / volume.voxel_m + met[lane] * direction;
             float4 color = color_at(volume, colors, at);
             if (color.w <= 0.0f) color = color_at(volume, colors, at - direction);  // colours reach 1.5 voxels deep (integrate.cl)
             const int is_known = color.w > 0.0f && !is_back(volume, at, direction);

@@ -32,8 +32,9 @@ def trace_arrivals(
     """[n, m, 4] what is first met from `points` [n, 3] (volume metres): radiance (RGB) and distance in metres.
 
     The distance is positive for photographed surface, negative for a surface's back or one without a colour, and 0
-    where nothing is met. directions: [sets, m, 3] unit, world axes; point i takes set i modulo sets. normals: [n, 3],
-    directions below their plane are skipped (0); None: of none.
+    where nothing is met. directions: [sets, m, 3] unit, world axes; point i takes set i modulo sets. normals: [n, 3]
+    unit, of the surface that the points lie on: rays begin clear of it, those below its plane are skipped (0); None:
+    they lie on none.
     """
     buffers, (sets, per_set, _), count = engine.buffers(_Buffers), directions.shape, len(points)
     room, room_of_sets = _rounded(count), _rounded(sets)

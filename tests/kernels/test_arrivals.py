@@ -44,7 +44,7 @@ def test_matches_twin(device, kind) -> None:  # type: ignore[no-untyped-def]
         tsdf, weight, _ = dense_voxels(engine, volume)
         expected, facing = twin(
             points, normals, sets[np.arange(COUNT) % SETS], tsdf.astype(np.float64), weight.astype(np.float64),
-            colors, has_color, volume.voxel_m,
+            colors, has_color, volume.voxel_m, volume.truncation_m,
         )  # fmt: skip
         apart = np.abs(np.abs(found[..., 3]) - np.abs(expected[..., 3])) > 0.02 * volume.voxel_m
         assert apart.mean() < 0.002, name  # rays along the edge of a voxel; seen: 0
@@ -79,3 +79,14 @@ def test_directions_below_the_plane_are_skipped(engine: Engine) -> None:
     point, down = np.array([[SIDE_M / 2, 0.4, SIDE_M / 2]]), np.array([[[0.0, -1.0, 0.0]]])
     assert trace_arrivals(engine, volume, point, np.array([[0.0, 1.0, 0.0]]), down)[0, 0, 3] == 0.0
     assert trace_arrivals(engine, volume, point, np.array([[0.0, -1.0, 0.0]]), down)[0, 0, 3] > 0.0
+
+
+def test_rays_of_buried_surface_begin_clear_of_it(engine: Engine) -> None:
+    """The mean place of bent surface lies behind it: its rays leave it, and do not meet it from its back."""
+    volume = fill_volume(engine, (floor(),), VOXEL_M)
+    paint(engine, volume, np.full((*voxels_of(volume), 3), 0.5))
+    middle, up = SIDE_M / 2, np.array([[0.0, 1.0, 0.0]])
+    directions = spherical_fibonacci(RAYS)[None]
+    for depth in (0.0, 1.0, 2.0):
+        point = np.array([[middle, 0.1 - depth * VOXEL_M, middle]])
+        np.testing.assert_array_equal(trace_arrivals(engine, volume, point, up, directions)[..., 3], 0.0)

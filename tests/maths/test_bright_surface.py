@@ -7,7 +7,7 @@ import pytest
 
 from server.light.shell.bright_surface import CELL_M, MOST_EMITTERS, BrightSurface, Emitters, EmittersSeen
 from server.light.shell.objective import Unknowns, step
-from server.light.shell.patches import MOST_PATCHES, PATCH_M, RAYS, Patches
+from server.light.shell.patches import MOST_PATCHES, PATCH_M, Patches
 from server.light.shell.picture import Seen, SeenBright
 from server.light.shell.sources import near_sources
 from server.light.shell.transport import bright_keys, columns_of
@@ -118,7 +118,7 @@ def test_near_ones_are_left_to_evenly_spread_rays() -> None:
     emitters = found(pane(0.0))
     near, far = MIDDLE + 0.05 * emitters.facing, MIDDLE + 2.0 * emitters.facing
     points, normals = np.concatenate([near, far]), np.tile(-emitters.facing, (2, 1))
-    weights = emitters.weights(emitters.shares(points, normals), RAYS)
+    weights = emitters.weights(emitters.shares(points, normals), 128)
     assert weights[0] < 0.1
     assert weights[1] > 0.9
     ends = np.stack([MIDDLE, MIDDLE, MIDDLE + np.array([0.0, CELL_M, 0.0])])

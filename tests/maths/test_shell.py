@@ -11,7 +11,7 @@ from server.light.shell import weights
 from server.light.shell.distant import distant_light
 from server.light.shell.evidence import DARKEST, log_chroma, materials_of
 from server.light.shell.objective import LOGIT, Unknowns, step
-from server.light.shell.patches import PATCH_M, RAYS, Patches
+from server.light.shell.patches import PATCH_M, RAYS, Patches, hemisphere_weights
 from server.light.shell.shell import (
     BEHIND_M,
     CAMERA_M,
@@ -285,13 +285,10 @@ def test_scanned_walls_close_their_sides() -> None:
 def test_what_rays_meet() -> None:
     transport, shell = Transport(), Shell(np.eye(3), np.zeros(3), np.full(3, 4.0), 0.0, np.zeros((2, 3)))
     directions = np.array([[[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0, 0, -1.0]]])
-    arrivals = np.array([[[0.2, 0.3, 0.4, 1.0], [0, 0, 0, -1.0], [1, SATURATED, 0.95, 1.5], [0, 0, 0, 0]]])
+    arrivals = np.array([[[0.2, 0.3, 0.4, 1e-3], [0, 0, 0, -1e-3], [1, SATURATED, 0.95, 1e-3], [0, 0, 0, 0]]])
     patches, middle = Patches(), np.array([[2.0, 2.0, 2.0]])
     patches.positions[:1], patches.weights[0], patches.traced_in[0] = middle, 1.0, 1
-    patches.directions[0], patches.arrivals[0] = (
-        np.tile(directions[0], (RAYS // 4, 1)),
-        np.tile(arrivals[0], (RAYS // 4, 1)),
-    )
+    patches.traced_normals[0], patches.arrivals[0] = [0.6, 0.0, 0.8], np.tile(arrivals[0], (RAYS // 4, 1))
     transport.update(patches, NO_EMITTERS, np.array([0]), shell)
     met = meet(shell, transport.hidden, middle, directions, arrivals)
     (known, back, bright, free), shares = met.columns[0], met.shares[0]
@@ -308,6 +305,10 @@ def test_what_rays_meet() -> None:
     cells, _ = shell.exits(np.array([2.0, 2.0, 2.0]), np.array([0.0, 0, -1.0]))
     np.testing.assert_array_equal(free, cells)
     assert transport.columns == CELLS + 2
+    of_each = hemisphere_weights(patches.traced_normals[:1])[0].reshape(-1, 4).sum(axis=0)
+    shares = transport.shares[0]
+    np.testing.assert_allclose([shares[back], shares[bright], shares[:CELLS].sum()], of_each[1:], rtol=1e-5)
+    np.testing.assert_allclose(transport.known[0], of_each[[0, 2]] @ arrivals[0, [0, 2], :3], rtol=1e-5)
 
 
 # ---- light from far away ---------------------------------------------------------------------------------------

@@ -21,12 +21,16 @@ def trace_arrivals(
     colors: Floats,
     has_color: Bools,
     voxel_m: float,
+    truncation_m: float,
 ) -> tuple[Floats, Floats]:
     """Arrivals [n, m, 4] as of the kernel, and how clearly each surface faces [n, m]: the cosine to its outward normal.
 
-    points [n, 3], normals [n, 3], directions [n, m, 3]; tsdf, weight, has_color [z, y, x], colors [z, y, x, 3].
+    points [n, 3], normals [n, 3] of the surface that they lie on, or None, directions [n, m, 3]; tsdf, weight,
+    has_color [z, y, x], colors [z, y, x, 3].
     """
     shape = directions.shape[:2]
+    if normals is not None:
+        points = _clear_of_surface(points, normals, tsdf, weight, voxel_m, truncation_m)
     origins, along = np.repeat(points, shape[1], axis=0), directions.reshape(-1, 3)
     solid = (weight > 0) & (tsdf < 0)
     distance = first_solid(solid, voxel_m, origins, along)
@@ -45,6 +49,19 @@ def trace_arrivals(
     result[is_known, :3] = color[is_known]
     result[:, 3] = np.where(met, np.where(is_known, 1.0, -1.0) * np.maximum(distance, 0.01 * voxel_m), 0.0)
     return result.reshape(*shape, 4), facing.reshape(shape)
+
+
+def _clear_of_surface(
+    points: Floats, normals: Floats, tsdf: Floats, weight: Floats, voxel_m: float, truncation_m: float
+) -> Floats:
+    """One voxel off the surface, by the normal and then by the field, where all of it is known."""
+    origins = points + voxel_m * normals
+    distance, is_seen = trilinear(tsdf, weight, origins / voxel_m)
+    slope, _ = _slope(tsdf, weight, origins / voxel_m)
+    steepness = np.linalg.norm(slope, axis=-1)
+    missing = np.maximum(voxel_m - truncation_m * distance, 0.0)
+    missing = np.where(is_seen & (steepness > 1e-6), missing, 0.0)
+    return np.asarray(origins + (missing / np.maximum(steepness, 1e-12))[:, None] * slope)
 
 
 def _color(colors: Floats, has_color: Bools, at: Floats) -> tuple[Floats, Bools]:

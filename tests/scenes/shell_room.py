@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from server.light.shell.bright_surface import BrightSurface
 from server.light.shell.evidence import Evidence, evidence_of
 from server.light.shell.objective import Unknowns, step
-from server.light.shell.patches import PATCH_M, Patches, hemisphere_rays
+from server.light.shell.patches import PATCH_M, RAYS, Patches, hemisphere_weights, ray_directions
 from server.light.shell.picture import Seen
 from server.light.shell.shell import Shell, closed_sides, shell_around
 from server.light.shell.sources import Sources, distant_sources, near_sources
@@ -117,14 +117,14 @@ def make_room(
     at, facing, albedo = np.concatenate(points), np.concatenate(normals), np.concatenate(colors)
     patches = Patches()
     rows: NDArray[np.int64] = np.arange(len(at))
-    directions = hemisphere_rays(facing, rows).astype(np.float64)
+    directions = np.broadcast_to(ray_directions(), (len(at), RAYS, 3))
     from_beyond = ambient(directions) if callable(ambient) else np.array(ambient)
     radiance, arrivals = sent(at, directions, lamp, from_beyond, known)
-    shown = np.log(albedo * radiance.mean(axis=1))
+    shown = np.log(albedo * np.einsum("nm,nmr->nr", hemisphere_weights(facing), radiance))
     patches.add(Seen(at + 1e-4, facing, shown, np.zeros(len(at)), np.zeros(len(at))))
     # `add` sorts the patches: bring the rays into its order.
     order = np.array([np.abs(at + 1e-4 - position).sum(1).argmin() for position in patches.positions[rows]])
-    patches.directions[rows], patches.arrivals[rows] = directions[order], arrivals[order]
+    patches.traced_normals[rows], patches.arrivals[rows] = patches.normals[rows], arrivals[order]
     patches.traced_in[rows] = 1
     shell = shell_around(at, facing, np.stack([CAMERA, SIZE_M - 1.0]), UP, PATCH_M, None)
     transport = Transport()

@@ -7,6 +7,7 @@ the surface that was seen, not the number of frames. Kernel: arrivals.cl.
 from __future__ import annotations
 
 from copy import copy
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from server.light.arrivals import trace_arrivals
 from server.light.shell.known_room import KnownPatches
 from server.light.shell.picture import Seen
-from server.maths.sh import GOLDEN_TURN
+from server.maths.sh import spherical_fibonacci
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
 
@@ -24,10 +25,13 @@ REGION_M = 0.4
 """Side of the regions over which a material may differ from what its colour says (objective.py)."""
 MOST_PATCHES = 1536
 """Beyond this number a new patch replaces the one that was not seen for longest. One picture shows an eighth of it."""
-RAYS = 128
-"""Rays of a patch, evenly spread over its cosine-weighted hemisphere: one of them meets a lamp that fills 1 % of it."""
-TRACED_A_FRAME = 64
+RAYS = 1024
+"""Directions, evenly spread and the same for all patches, of which half are above the plane of each. With a quarter of
+them, what a window sends to a patch is a tenth off, and the light turns by as much as with another room."""
+TRACED_A_FRAME = 16
 """Patches whose rays are traced again in each frame, once all have been traced: the scan around them keeps growing."""
+OUTDATED_LEFT = 0.5
+"""Share of what is outdated that still is a frame later: colours of the scan follow another light within a few."""
 MOST_WEIGHT = 30.0
 """Number of frames over which a patch is averaged."""
 _FORGOTTEN = 1e-3  # frames: a patch of less weight is none
@@ -57,9 +61,12 @@ class Patches:
         """Which region each lies in: equal numbers, the same one."""
         self.seen_in, self.traced_in = np.full(n, -1), np.full(n, -1)
         """Number of the last frame that showed it, or in which its rays were traced; -1: none."""
-        self.directions = np.zeros((n, RAYS, 3), np.float32)
         self.arrivals = np.zeros((n, RAYS, 4), np.float32)
-        """As of trace_arrivals."""
+        """What the rays along `ray_directions` met, as of trace_arrivals; of no meaning below the plane."""
+        self.traced_normals = np.zeros((n, 3))
+        """Above whose planes rays were traced."""
+        self.outdated = 0.0
+        """Share of the patches whose rays met surface under another light; what is solved is far from the new one."""
         self._frame = 0
 
     @property
@@ -83,6 +90,7 @@ class Patches:
         """Take `share` of their weight from all patches: the light has changed."""
         self.weights *= 1.0 - share
         self.weights[self.weights < _FORGOTTEN] = 0.0
+        self.outdated = max(OUTDATED_LEFT * self.outdated, share)
 
     def add(self, seen: Seen) -> None:
         """Fold a picture in."""
@@ -108,17 +116,16 @@ class Patches:
 
     def trace(self, engine: Engine, volume: Volume, frames: int = 1) -> Ints:
         """Trace the rays of patches that have none yet, and of those traced longest ago, TRACED_A_FRAME for each of
-        `frames`. Returns their rows."""
+        `frames`, or more where the light is another. Returns their rows."""
         alive = np.flatnonzero(self.weights > 0)
         order = alive[np.argsort(self.traced_in[alive], kind="stable")]
         fresh = int((self.traced_in[order] < 0).sum())
-        rows = order[: max(fresh, frames * TRACED_A_FRAME)]
+        rows = order[: max(fresh, frames * TRACED_A_FRAME, round(self.outdated * len(order)))]
         if len(rows) == 0:
             return rows
-        self.directions[rows] = hemisphere_rays(self.normals[rows], rows)
-        origins = self.positions[rows] + volume.voxel_m * self.normals[rows] - volume.origin_world
-        directions = self.directions[rows].astype(np.float64)
-        self.arrivals[rows] = trace_arrivals(engine, volume, origins, None, directions)
+        self.traced_normals[rows] = normals = self.normals[rows]
+        origins = self.positions[rows] - volume.origin_world
+        self.arrivals[rows] = trace_arrivals(engine, volume, origins, normals, ray_directions()[None])
         self.traced_in[rows] = self._frame
         return rows
 
@@ -196,19 +203,13 @@ class _Means:
         return np.asarray(np.stack(columns, axis=1) / self._counts[:, None])
 
 
-def hemisphere_rays(normals: Floats, numbers: Ints) -> NDArray[np.float32]:
-    """[n, RAYS, 3] unit directions, spread as the cosine to `normals` [n, 3]; `numbers` [n] choose their turn."""
-    index = np.arange(RAYS) + 0.5
-    radius, height = np.sqrt(index / RAYS), np.sqrt(1 - index / RAYS)
-    turns = 2 * np.pi * ((numbers * GOLDEN_TURN) % 1.0)[:, None]
-    angle = 2 * np.pi * GOLDEN_TURN * np.arange(RAYS)[None, :] + turns
-    across = np.eye(3)[np.abs(normals).argmin(axis=1)]
-    first = np.cross(normals, across)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(normals, first)
-    parts = (
-        (radius * np.cos(angle))[..., None] * first[:, None],
-        (radius * np.sin(angle))[..., None] * second[:, None],
-        np.broadcast_to(height[:, None], (*angle.shape, 1)) * normals[:, None],
-    )
-    return np.asarray(sum(parts), np.float32)
+@cache
+def ray_directions() -> Floats:
+    """[RAYS, 3] unit, world axes."""
+    return spherical_fibonacci(RAYS)
+
+
+def hemisphere_weights(normals: Floats) -> Floats:
+    """[n, RAYS] how far rays count at surface with unit `normals` [n, 3]: as their cosine, with sum 1."""
+    cosines = np.maximum(normals @ ray_directions().T, 0.0)
+    return np.asarray(cosines / np.maximum(cosines.sum(axis=1, keepdims=True), 1e-9))

@@ -96,13 +96,13 @@ class RoomModel:
         self._bright.trace(engine, volume, self._patches, traced)
         self._waiting = 0
         camera = context.volume_from_camera[:3, 3] + volume.origin_world
-        self._begin_solution(traced, camera, up, is_other_light=change > 0.0)
+        self._begin_solution(traced, camera, up)
         if must_follow or is_young:
             self._take_over()
 
-    def _begin_solution(self, traced: NDArray[np.int64], camera: Floats, up: Floats, *, is_other_light: bool) -> None:
-        patches, bright, solve = self._patches.copy(), self._bright.seen_by(), self._solver.solve
-        self._next = Beside(lambda: solve(patches, bright, traced, camera, up, is_other_light=is_other_light))
+    def _begin_solution(self, traced: NDArray[np.int64], camera: Floats, up: Floats) -> None:
+        patches, bright = self._patches.copy(), self._bright.seen_by()
+        self._next = Beside(lambda: self._solver.solve(patches, bright, traced, camera, up))
 
     def _take_over(self) -> None:
         """The solution that was begun last, waited for."""

@@ -21,7 +21,8 @@ MOST_STEPS = 16
 """Most Gauss-Newton steps of a solution. After the first, another follows while the last one changed what patches
 receive by more than MOVED."""
 MOVED, FIRST_MOVED = 0.05, 0.01
-"""Change of a logarithm; the second value holds for a first solution, from which the others start."""
+"""Change of a logarithm; the second value holds for a first solution, from which the others start, and where the light
+is another."""
 LEAST_PATCHES = 12
 """With fewer patches there is no solution."""
 
@@ -42,19 +43,11 @@ class Solver:
         self._shell = shell
 
     def solve(
-        self,
-        patches: Patches,
-        bright: EmittersSeen,
-        traced: NDArray[np.int64],
-        camera: Floats,
-        up: Floats,
-        *,
-        is_other_light: bool = False,
+        self, patches: Patches, bright: EmittersSeen, traced: NDArray[np.int64], camera: Floats, up: Floats
     ) -> Solution | None:
         """The next solution; None where too few patches are known.
 
-        traced: rows of the patches whose rays are new. camera: [3] world metres; up: [3] unit, world. is_other_light:
-        the light is not that of the last solution.
+        traced: rows of the patches whose rays are new. camera: [3] world metres; up: [3] unit, world.
         """
         rows, switches = patches.used, self._switches
         if len(rows) < LEAST_PATCHES:
@@ -66,8 +59,8 @@ class Solver:
         evidence = evidence_of(patches, rows, switches)
         near = near_sources(self._transport, shell, rows)
         distant = distant_sources(self._transport, closed, rows, with_indirect=switches.indirect)
-        is_next = self._near.known > 0 and switches.memory and not is_other_light
-        settled = MOVED if is_next else FIRST_MOVED
+        first = patches.outdated if self._near.known > 0 and switches.memory else 1.0
+        settled = MOVED ** (1 - first) * FIRST_MOVED**first
         for unknowns, sources in ((self._near, near), (self._distant, distant)):
             for _ in range(MOST_STEPS):
                 step(unknowns, evidence, sources, switches)

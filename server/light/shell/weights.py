@@ -9,8 +9,9 @@ ALBEDO_SPREAD = 0.5
 MATERIAL_CHROMA = 0.8
 """Spacing of the grid of materials over log chroma: orange wood and white paint are a node apart. On a finer one, the
 light's colour and the materials' go on exchanging."""
-PATCH_NOISE = 0.1
-"""Standard deviation of a patch's log radiance: transfer by 128 rays, normals, what is not diffuse."""
+PATCH_NOISE = 0.15
+"""Standard deviation of a patch's log radiance: transfer by rays, normals, what is not diffuse. With less, a clipped
+speck beside the paint of a few patches is found to be a lamp."""
 REGION_SPREAD = 0.05
 """Standard deviation of a region's log albedo about its surface's: stains, texture. More would take the gradients that
 tell where light comes from for texture."""

@@ -22,6 +22,7 @@ from server.service.monitoring.event_log import log_events
 NAMESPACE = "probeless"
 PREFIX, QUOTA = "room-", "quota"
 ANSWER_S = 5.0
+ABANDON_TRIES, ABANDON_PAUSE_S = 5, 1.0
 LEAVE_S = 20.0
 """Of a room that is saved and stopped."""
 log = logging.getLogger(__name__)
@@ -55,11 +56,13 @@ class RayRoomDirectory:
 
     def __init__(self, settings: ClusterSettings) -> None:
         self._settings = settings
+        self._starting: dict[str, asyncio.Task[Any]] = {}
+        """Calls by which rooms are being opened; they go on where the client leaves."""
 
     async def find(self, room_id: str, may_open: bool, client: str = "", *, is_private: bool = False) -> Address:
         """The room's host. Raises RoomNotReady, RoomUnavailable."""
         try:
-            actor = await asyncio.to_thread(self._actor, room_id, may_open, client, is_private)
+            actor = await asyncio.shield(self._start(room_id, may_open, client, is_private))
             async with asyncio.timeout(ANSWER_S):
                 address: Address = await actor.address.remote()
         except (RayActorError, TimeoutError) as error:
@@ -77,11 +80,28 @@ class RayRoomDirectory:
         except TimeoutError:
             return False
 
+    def _start(self, room_id: str, may_open: bool, client: str, is_private: bool) -> asyncio.Task[Any]:
+        task = asyncio.create_task(asyncio.to_thread(self._actor, room_id, may_open, client, is_private))
+        self._starting[room_id] = task
+
+        def forget(done: asyncio.Task[Any]) -> None:
+            if self._starting.get(room_id) is done:
+                del self._starting[room_id]
+            if not done.cancelled():
+                done.exception()  # of one that nobody awaits any more
+
+        task.add_done_callback(forget)
+        return task
+
     async def abandon(self, room_id: str) -> None:
         """Nothing of it is to be saved."""
-        with contextlib.suppress(RayActorError, ValueError):
-            actor = await asyncio.to_thread(ray.get_actor, PREFIX + room_id, NAMESPACE)
-            await asyncio.to_thread(ray.kill, actor)
+        if (starting := self._starting.get(room_id)) is not None:
+            await asyncio.wait((starting,))
+        for _ in range(ABANDON_TRIES):  # an actor that is just being registered is not found at once
+            with contextlib.suppress(RayActorError, ValueError):
+                actor = await asyncio.to_thread(ray.get_actor, PREFIX + room_id, NAMESPACE)
+                await asyncio.to_thread(ray.kill, actor)
+            await asyncio.sleep(ABANDON_PAUSE_S)
 
     async def has_place(self) -> bool:
         """Whether the resources of a place are free."""

@@ -29,7 +29,7 @@ AMBIENT = (0.3, 0.3, 0.3)
 TOWARDS = unit([0.6, 0.5, 0.6])
 _LINEAR = [3, 1, 2]
 _MODEL = (
-    "the lobes' 35 degrees, 128 rays a patch and the priors of what three walls do not tell leave up to 14 degrees in "
+    "the lobes' 35 degrees, 512 rays a patch and the priors of what three walls do not tell leave up to 14 degrees in "
     "closed form (tests/maths/test_shell.py)"
 )
 

@@ -1,4 +1,4 @@
-"""With Ray: a node is killed or drained, and its rooms come back; clients that leave at once keep no place."""
+"""With Ray: a node is killed or drained, and its rooms come back."""
 
 import importlib.util
 import json
@@ -31,7 +31,7 @@ def played(module: str) -> dict[str, Any]:
     return result
 
 
-def test_rooms_of_a_node_that_is_drained_move_and_places_come_back() -> None:
+def test_rooms_of_a_node_that_is_drained_move() -> None:
     result = played("tests.cluster.draining")
     assert result["left_open"] == 0
     assert result["drain_status"] == 0

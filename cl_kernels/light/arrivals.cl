@@ -20,7 +20,8 @@ static float3 clear_of_surface(const Volume volume, const float3 point, const fl
 }
 
 // One item LANES directions of a point. points [count]: volume metres, w unused; normals [count]: of the surface that it lies on,
-// rays begin clear of it and directions below its plane are skipped; w = 0: it lies on none. directions [sets][per_set] unit; point i takes set i % sets.
+// rays begin clear of it and directions below its plane are skipped; w = 0: it lies on none. directions [sets][per_set] unit; point i
+// takes set i % sets.
 // -> arrivals [count][per_set]: radiance (rgb) of the surface that is met, and its distance in metres (w): positive, surface
 // that was photographed; negative, a back or surface without a colour; 0, nothing is met, or the direction is skipped.
 kernel void trace_arrivals(const VolumeShape shape, global const int *slots, global const ulong *solid,

@@ -196,8 +196,9 @@ static inline void look_beside(const Rays rays, const float voxel_m, const int2 
 // The pixels that `raycast` has left out, with SPACING 2: the third index says which of a square of four. As long as a ray is within a
 // voxel of those beside it, the volume holds nothing that they would miss. So where they have seen nothing, it sees nothing; where it
 // meets the planes that they have seen at one place, a Newton step from there finds the crossing; where at several, as at a silhouette,
-// it is tried at the nearest and at the farthest. -> rest: the number of others, which is 0 before, then of each its pixel and the bits
-// of where its ray begins, in voxels: shortly before what was seen beside it.
+// it is tried at the nearest of them, at the distance of the nearest point that was seen, and at the farthest of them. -> rest: the
+// number of others, which is 0 before, then of each its pixel and the bits of where its ray begins, in voxels: shortly before what was
+// seen beside it.
 kernel void raycast_between(VIEW_PARAMETERS, global float4 *positions, global float4 *normals, global int *rest) {
     const int dx = get_global_id(2) != 1, dy = get_global_id(2) != 0;
     const int x = SPACING * get_global_id(0) * LANES + dx;
@@ -218,8 +219,8 @@ kernel void raycast_between(VIEW_PARAMETERS, global float4 *positions, global fl
     floatn t = 0.0f;
     if (ANY(smooth)) t = cross_near(volume, view.rays, middle, smooth, &facing);
     t = MASK(fabs(t - middle) < CLOSE) ? t : 0.0f;
-    const floatn candidates[2] = {around.nearest, around.farthest};
-    for (int i = 0; i < 2; i++) {
+    const floatn candidates[3] = {around.nearest, around.first, around.farthest};
+    for (int i = 0; i < 3; i++) {
         const intn asked = all & around.inside & around.seen & MASK(t == 0.0f) & MASK(candidates[i] > 0.0f) & MASK(candidates[i] < focal);
         if (ANY(asked)) t += settle_near(volume, view.rays, candidates[i], asked, &facing);
     }

@@ -71,6 +71,7 @@ def run_in_process(device: Device, scene: Scene, folder: Path) -> None:
             result = {**vars(pipeline.process(frame))}
             assert result.pop("layer") is None  # not wished for
             result.pop("is_reused")  # of the server alone
+            result.pop("placed")  # files have it as a note
             result["captured"] = captured_of(frame, CAMERA)
             writer.write(FrameOutput(frame=frame.index, timestamp_s=frame.timestamp_s, **result))
         writer.write_mesh(mesh_files(pipeline.scene_mesh()))

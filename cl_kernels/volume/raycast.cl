@@ -4,14 +4,12 @@
 #include "ray_surface.clh"
 
 #define TILE 8
+#define SPACING 2         // pixels between rays that are walked from where solid voxels may be
 #define LEAST_SLOPE 0.1f  // cosine of a ray and a plane: beyond, a voxel along the ray says little of one across
 #define SMOOTH 0.3f      // voxels between the planes that are taken for one surface,
 #define CLOSE 0.1f       // and from these to its crossing: the error of a Newton step that long is a hundredth of a voxel
 #define BEFORE 4.0f       // voxels: what two rays that are two voxels apart have seen may slope towards the camera between them
 
-#ifndef SPACING
-#error SPACING must be defined: pixels between rays that are walked from where solid voxels may be, 1 or 2
-#endif
 
 // First and last of four layers of cells that contain one of `cells`; layer i is `first_layer` shifted by i steps.
 static inline float2 layers(const ulong cells, const ulong first_layer, const int step) {
@@ -193,7 +191,7 @@ static inline void look_beside(const Rays rays, const float voxel_m, const int2 
     around->inside &= LOAD_LANES(inside);
 }
 
-// The pixels that `raycast` has left out, with SPACING 2: the third index says which of a square of four. As long as a ray is within a
+// The pixels that `raycast` has left out: the third index says which of a square of four. As long as a ray is within a
 // voxel of those beside it, the volume holds nothing that they would miss. So where they have seen nothing, it sees nothing; where it
 // meets the planes that they have seen at one place, a Newton step from there finds the crossing; where at several, as at a silhouette,
 // it is tried at the nearest of them, at the distance of the nearest point that was seen, and at the farthest of them. -> rest: the

@@ -2,20 +2,9 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version
+from prometheus_client import Counter, Gauge, Histogram, generate_latest
 
-from prometheus_client import (
-    CollectorRegistry,
-    Counter,
-    Gauge,
-    Histogram,
-    Info,
-    PlatformCollector,
-    ProcessCollector,
-    generate_latest,
-)
-
-from server.service.monitoring.metrics import REFUSAL_CODES
+from server.service.monitoring.metrics import REFUSAL_CODES, process_registry
 
 WAIT_BUCKETS_S = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 20.0)
 
@@ -24,10 +13,7 @@ class IngressMetrics:
     """All metrics of `/metrics` of a replica. Ray's own are scraped beside them."""
 
     def __init__(self) -> None:
-        registry = self._registry = CollectorRegistry()
-        ProcessCollector(registry=registry)
-        PlatformCollector(registry=registry)
-        Info("probeless_build", "Version of the server", registry=registry).info({"version": version("probeless")})
+        registry = self._registry = process_registry()
         self.clients = Gauge("probeless_ingress_clients", "Sockets of clients at this replica", registry=registry)
         self.has_place = Gauge(
             "probeless_ingress_has_place",

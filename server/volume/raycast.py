@@ -20,8 +20,7 @@ from server.volume.volume import Volume
 LABEL_NONE, LABEL_STATIC, LABEL_DYNAMIC, LABEL_FILLED = 0, 1, 2, 3
 
 _TILE = 8  # as in raycast.cl
-_SPACING = 2
-"""Pixels between rays that are walked through the volume; those between begin at the surface that these have seen."""
+_SPACING = 2  # as in raycast.cl
 _FARTHEST = int(np.float32(np.inf).view(np.int32))
 
 
@@ -116,4 +115,4 @@ def _ray_bounds(
 
 
 def _kernel(engine: Engine, name: str) -> cl.Kernel:
-    return engine.kernel("raycast.cl", name, LANES=engine.lanes, SPACING=_SPACING)
+    return engine.kernel("raycast.cl", name, LANES=engine.lanes)

@@ -14,18 +14,14 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from typing import Any
 
-from tests.cluster.failover import PATIENCE_S, TOKEN, Guest, enter, node_of, until  # first: it sets what Ray reads
+from tests.cluster.failover import PATIENCE_S, Guest, enter, node_of, two_nodes, until  # first: it sets what Ray reads
 
 import ray  # isort: skip
-from ray import serve  # isort: skip
-from ray.cluster_utils import Cluster  # isort: skip
 
 from client.streaming.client import StreamClient  # isort: skip
-from server.cluster.application import build  # isort: skip
 from server.cluster.ray_directory import room_names  # isort: skip
 from tests.data import ROOT  # isort: skip
 from tests.scenes.rooms import CAMERA, wishes  # isort: skip
@@ -37,21 +33,8 @@ HURRIED = 11
 
 def main() -> int:
     """Run it; 0 if every place came back and no room was lost."""
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["PROBELESS_KEYS"] = f"{folder}/keys"
-        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "resources": {"room": PLACES}})
-        drained = cluster.add_node(num_cpus=0, resources={"room": PLACES})
-        ray.init(address=cluster.address, log_to_driver="-v" in sys.argv)
-        try:
-            port = int(os.environ.get("PROBELESS_PORT", "18322"))
-            serve.start(http_options={"host": "127.0.0.1", "port": port})
-            serve.run(build({"data": f"{folder}/rooms", "place": {"room": 1.0}, "ingress_cpus": 0.1}), name="probeless")
-            hurried = HURRIED if "--hurried" in sys.argv else 0
-            result = asyncio.run(play(f"http://127.0.0.1:{port}/?token={TOKEN}", drained.node_id, hurried))
-        finally:
-            serve.shutdown()
-            ray.shutdown()
-            cluster.shutdown()
+    with two_nodes(PLACES, 18322) as (url, _, drained):
+        result = asyncio.run(play(url, drained.node_id, HURRIED if "--hurried" in sys.argv else 0))
     sys.stdout.write(json.dumps(result, indent=1) + "\n")
     return 0 if result["object_kept"] and result["moved"] and not result["left_open"] else 1
 

@@ -16,6 +16,7 @@ import signal
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -86,23 +87,29 @@ class Guest:
                     self.back = self.answered_s[-1]
 
 
-def main() -> int:
-    """Run it; 0 if every room came back."""
+@contextlib.contextmanager
+def two_nodes(places: int, port: int) -> Iterator[tuple[str, Cluster, Any]]:
+    """The address of a service on two nodes with so many places each, the cluster, and its node besides the head."""
     with tempfile.TemporaryDirectory() as folder:
         os.environ["PROBELESS_KEYS"] = f"{folder}/keys"
-        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "resources": {"room": ROOMS}})
-        doomed = cluster.add_node(num_cpus=0, resources={"room": ROOMS})
+        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "resources": {"room": places}})
+        other = cluster.add_node(num_cpus=0, resources={"room": places})
         ray.init(address=cluster.address, log_to_driver="-v" in sys.argv)
         try:
-            port = int(os.environ.get("PROBELESS_PORT", "18321"))
+            port = int(os.environ.get("PROBELESS_PORT", str(port)))
             serve.start(http_options={"host": "127.0.0.1", "port": port})
-            args = {"data": f"{folder}/rooms", "place": {"room": 1.0}, "ingress_cpus": 0.1}
-            serve.run(build(args), name="probeless")
-            result = asyncio.run(play(f"http://127.0.0.1:{port}/?token={TOKEN}", cluster, doomed))
+            serve.run(build({"data": f"{folder}/rooms", "place": {"room": 1.0}, "ingress_cpus": 0.1}), name="probeless")
+            yield f"http://127.0.0.1:{port}/?token={TOKEN}", cluster, other
         finally:
             serve.shutdown()
             ray.shutdown()
             cluster.shutdown()
+
+
+def main() -> int:
+    """Run it; 0 if every room came back."""
+    with two_nodes(ROOMS, 18321) as (url, cluster, doomed):
+        result = asyncio.run(play(url, cluster, doomed))
     sys.stdout.write(json.dumps(result, indent=1) + "\n")
     return 0 if all(room["object_kept"] and room["longest_pause_s"] is not None for room in result["rooms"]) else 1
 

@@ -38,16 +38,20 @@ REFUSAL_CODES = (
 disable_created_metrics()  # type: ignore[no-untyped-call]
 
 
+def process_registry() -> CollectorRegistry:
+    """A registry with what every process of the server tells: memory, descriptors, Python and the version."""
+    registry = CollectorRegistry()
+    ProcessCollector(registry=registry)
+    PlatformCollector(registry=registry)
+    Info("probeless_build", "Version of the server", registry=registry).info({"version": version("probeless")})
+    return registry
+
+
 class Metrics:
     """All metrics of `/metrics`. Prometheus types are thread-safe, so workers update them directly."""
 
     def __init__(self) -> None:
-        self._registry = CollectorRegistry()
-        ProcessCollector(registry=self._registry)
-        PlatformCollector(registry=self._registry)
-        Info("probeless_build", "Version of the server", registry=self._registry).info(
-            {"version": version("probeless")}
-        )
+        self._registry = process_registry()
         self.stage_s = self._histogram("stage_seconds", "Time of each stage of the pipeline", ("stage",))
         self.decode_s = self._histogram("decode_seconds", "Time to decode a frame's colour and depth")
         self.encode_s = self._histogram("encode_seconds", "Time to encode a composite")

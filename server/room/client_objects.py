@@ -167,8 +167,8 @@ class ClientObjects:
         x, y, z = (float(value) for value in to_client[:3, :3] @ found.position + to_client[:3, 3])
         problems = self._settle(object_id, mesh, placement.at((x, y, z), found.scale))
         if not problems:
-            turn = placement.yaw_deg
-            self._found.append(PlacedObject(object=object_id, position_m=(x, y, z), scale=found.scale, yaw_deg=turn))
+            placed = PlacedObject(object=object_id, position_m=(x, y, z), scale=found.scale, yaw_deg=placement.yaw_deg)
+            self._found.append(placed)
         return problems or [f"object {object_id!r} stands at {x:.3f},{y:.3f},{z:.3f} {found.words}"]
 
     def _settle(self, object_id: str, mesh: Mesh, placement: Placement) -> list[str]:

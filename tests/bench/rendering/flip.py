@@ -1,7 +1,7 @@
 """FLIP: how different two pictures look to someone who flips between them (thesis E6's place for HDR-VDP-2).
 
 The metric is NVIDIA's own implementation of Andersson et al., "FLIP: A Difference Evaluator for Alternating Images"
-(2020), which the bench dependencies bring (`flip_evaluator`).
+(2020), `flip_evaluator`, which the tests install.
 """
 
 from __future__ import annotations

@@ -357,7 +357,7 @@ def test_before_a_solve_there_is_no_distant_light() -> None:
 def test_a_closed_box_says_nothing_of_what_is_beyond() -> None:
     room = make_room(LAMP, AMBIENT)
     unknowns, evidence = Unknowns(), room.evidence
-    closed = distant_sources(room.transport, np.ones(SIDES), room.patches.used, with_indirect=True)
+    closed = distant_sources(room.transport, np.ones(SIDES), evidence.rows, with_indirect=True)
     for _ in range(25):
         step(unknowns, evidence, closed)
     light = distant_light(unknowns, 4)

@@ -56,13 +56,13 @@ class ShellRoom:
     @property
     def near(self) -> Sources:
         """The shell's cells."""
-        return near_sources(self.transport, self.shell, self.patches.used)
+        return near_sources(self.transport, self.shell, self.evidence.rows)
 
     def distant(self, *, with_indirect: bool = True) -> Sources:
         """Lobes, and the cells of sides that were scanned."""
         rows = self.patches.used
         closed = closed_sides(self.patches.positions[rows], self.patches.normals[rows], self.shell.axes, PATCH_M)
-        return distant_sources(self.transport, closed, rows, with_indirect=with_indirect)
+        return distant_sources(self.transport, closed, self.evidence.rows, with_indirect=with_indirect)
 
     def solve(self, steps: int) -> None:
         """Take steps towards the light of the shell."""

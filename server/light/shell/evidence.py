@@ -36,9 +36,9 @@ class Evidence:
     """[n] 1 / S_p^2 of y."""
     is_clipped: NDArray[np.bool_]
     rows: Ints
-    """[n] of the patches."""
+    """[n] of the patches, region by region."""
     regions: Ints
-    """[n] from 0; region by region of surface 0, then 1 and so on."""
+    """[n] from 0, ascending; those of surface 0, then of 1 and so on."""
     surfaces: Ints
     """[n] from 0."""
 
@@ -50,9 +50,12 @@ class Evidence:
 
 
 def evidence_of(patches: Patches, rows: Ints, switches: Switches) -> Evidence:
-    """What the patches in `rows` [n] show."""
+    """What the patches in `rows` [n] show; in another order."""
+    surfaces = segments(patches.keys[rows], log_chroma(patches.logarithms[rows]))
+    regions = _nested(patches.regions[rows], surfaces)
+    order = np.argsort(regions, kind="stable")
+    rows, regions, surfaces = rows[order], regions[order], surfaces[order]
     logs = log_chroma(patches.logarithms[rows])
-    surfaces = segments(patches.keys[rows], logs)
     age = patches.weights[rows]
     noise = PATCH_NOISE**2 + patches.variances[rows] / np.maximum(np.minimum(age, MOST_WEIGHT), 1.0)
     precision = np.minimum(age, 1.0) / noise
@@ -62,7 +65,7 @@ def evidence_of(patches: Patches, rows: Ints, switches: Switches) -> Evidence:
         precision=precision * normal_weights(patches.normals[rows], precision, switches.normals),
         is_clipped=patches.clipped[rows] > 0.5,
         rows=rows,
-        regions=_nested(patches.regions[rows], surfaces),
+        regions=regions,
         surfaces=surfaces,
     )
 

@@ -21,12 +21,13 @@ over neighbouring sources (k,l). tau is quadratic, but log(1 + (o / s_o)^2) belo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lu_factor, lu_solve
+from scipy.sparse import csr_matrix
 
 from server.light.shell import weights
 from server.light.shell.evidence import DARKEST, LOG_CHROMA, NODES, Evidence, log_chroma, materials_of
@@ -35,10 +36,10 @@ from server.light.shell.sources import Sources
 from server.light.shell.switches import Switches
 
 LOGIT = float(np.log(weights.MEAN_ALBEDO / (1 - weights.MEAN_ALBEDO)))
-RELAXATION, LEAST_RELAXATION = 0.5, 0.05
-"""Share of a Gauss-Newton step that is taken: whole ones turn back and forth where few patches share the light of two
-cells. It falls while steps turn back, and rises again, by TURNING_BACK and GOING_ON: the albedo that makes a surface
-white and the chroma that tells its material follow the light, and are not in the step's derivatives."""
+LEAST_RELAXATION = 0.05
+"""Least share of a Gauss-Newton step that is taken. It falls from 1 while steps turn back, and rises again, by
+TURNING_BACK and GOING_ON: the albedo that makes a surface white and the chroma that tells its material follow the
+light, and are not in the step's derivatives."""
 TURNING_BACK, GOING_ON = 0.7, 1.1
 MOST_STEP = 3.0
 """Greatest change of an unknown logarithm in a whole step."""
@@ -46,6 +47,7 @@ _COLUMNS = 8  # of an inverse, to tell its norm
 _FROM_CHROMA = np.linalg.inv(LOG_CHROMA)
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 
@@ -69,16 +71,16 @@ class Unknowns:
     """Log of the mean radiance of light, about which sources lie."""
     radiance: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     """[k, 3] RGB of the sources."""
-    curvature: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    curvature: Singles = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     """[k + albedos] squared: half the second derivative of the objective at the last step, sources first."""
-    factors: tuple[NDArray[np.float32], NDArray[np.int32]] = field(
+    factors: tuple[Singles, NDArray[np.int32]] = field(
         default_factory=lambda: (np.zeros((0, 0), np.float32), np.zeros(0, np.int32))
     )
     """Of the curvature (LU), and their order."""
     step: float = float("inf")
     """By how much the last step changed the logarithm of what patches receive, root mean square."""
 
-    relaxation: float = RELAXATION
+    relaxation: float = 1.0
     """Share of the last step that was taken."""
     last: Floats = field(default_factory=_empty)
     """[k] the last whole step of z."""
@@ -92,13 +94,13 @@ class Unknowns:
         """The share of the step `change` [k] of z to take."""
         turns_back = float(change[: len(self.last)] @ self.last) < 0
         factor = TURNING_BACK if turns_back else GOING_ON
-        self.relaxation = float(np.clip(self.relaxation * factor, LEAST_RELAXATION, RELAXATION))
+        self.relaxation = float(np.clip(self.relaxation * factor, LEAST_RELAXATION, 1.0))
         self.last = change.copy()
         return self.relaxation
 
-    def solve(self, curvature: Floats, right: Floats) -> Floats:
+    def solve(self, curvature: Singles, right: Floats) -> Floats:
         """[k + albedos] the whole Gauss-Newton step; keeps the curvature."""
-        self.curvature = curvature.astype(np.float32)
+        self.curvature = curvature
         self.factors = lu_factor(self.curvature, check_finite=False)
         return lu_solve(self.factors, right.astype(np.float32), check_finite=False).astype(np.float64)  # type: ignore[no-any-return]
 
@@ -118,20 +120,26 @@ class Unknowns:
 
 
 def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Switches | None = None) -> None:
-    """One Gauss-Newton step, in place. Sources that are new begin at their prior."""
+    """One Gauss-Newton step, in place. Sources that are new begin at their prior.
+
+    Products of matrices are float32: terms are good to a percent, and nothing cancels.
+    """
     switches, count = switches or Switches(), sources.count
     unknowns.mean = float(np.log(evidence.mean / weights.MEAN_ALBEDO))
     prior = np.where(sources.is_saturated, 0.0, unknowns.mean) + sources.offset
     z = np.concatenate([unknowns.z, (prior + sources.begin)[unknowns.known :]])
     cell_chroma = np.concatenate([unknowns.chroma, np.zeros((count - unknowns.known, 2))])
 
-    level = _levels(z, sources)
+    level = _levels(z, sources).astype(np.float32)
     known_logs = log_chroma(np.log(np.maximum(sources.known, DARKEST)))
     known = np.where(sources.known.max(axis=1) > 0, np.exp(known_logs[:, 0]), 0.0)
     arriving = np.maximum(sources.shares @ level + known, DARKEST)
-    parts = sources.shares * (level / arriving[:, None])  # T
+    parts = sources.shares * level
+    parts /= arriving.astype(np.float32)[:, None]  # T
+    sent_chroma = parts @ cell_chroma.astype(np.float32)
     known_part = (known / arriving)[:, None] * known_logs[:, 1:]
-    nodes, materials = materials_of(evidence.chroma - parts @ cell_chroma - known_part)
+    is_clipped = evidence.is_clipped[:, None]
+    nodes, materials = materials_of(np.where(is_clipped, 0.0, evidence.chroma - sent_chroma - known_part))
     albedo = 1 / (1 + np.exp(-(materials @ unknowns.materials[nodes])))
     residual = evidence.level - np.log(arriving) - np.log(albedo)
     offsets = _means(unknowns.offsets[evidence.rows], evidence.surfaces)
@@ -140,15 +148,14 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     counts[evidence.is_clipped & (error < 0)] = 0.0
     counts[(known == 0) & (sources.shares.sum(axis=1) <= sources.least_share)] = 0.0
 
-    design = np.concatenate([parts, (1 - albedo)[:, None] * materials], axis=1)
-    gram = _gram(design, counts)
+    design = np.concatenate([parts, ((1 - albedo)[:, None] * materials).astype(np.float32)], axis=1)
     spreads = _albedo_spreads(switches)
-    regions = _regions(design, counts, evidence)
+    regions = _Regions.of(design, counts, evidence)
     whitest = -_means(np.log(albedo), evidence.surfaces)
     surfaces = _Surfaces.of(offsets, whitest, regions, spreads)
     residual = residual - surfaces.center[evidence.surfaces]
-    matrix, vector = _without_regions(gram, design, counts, residual[:, None], regions, spreads.region, surfaces)
-    right = vector[:, 0]
+    matrix, vector = _without_regions(design, residual[:, None], regions, spreads.region, surfaces)
+    right = vector[:, 0].astype(np.float64)
     differences = z[sources.pairs[:, 0]] - z[sources.pairs[:, 1]]
     strength = weights.SMOOTHNESS / np.sqrt(1 + (differences / weights.EDGE) ** 2)
     _add_smoothness(matrix, sources.pairs, strength)
@@ -162,10 +169,10 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     unknowns.step = float(np.sqrt(np.mean((parts @ change[:count]) ** 2)))
     unknowns.z = z + change[:count]
     unknowns.materials[nodes] += change[count:]
-    offsets = surfaces.offsets(residual - design @ change, counts)
+    offsets = surfaces.offsets(residual - design @ change)
     unknowns.offsets[evidence.rows] = offsets[evidence.surfaces]
-    seen = np.where(evidence.is_clipped[:, None], parts @ cell_chroma, evidence.chroma - known_part)
-    unknowns.chroma = _solve_chroma(parts, gram[:count, :count], counts, seen, regions, spreads.chroma, sources.pairs)
+    seen = np.where(is_clipped, sent_chroma, evidence.chroma - known_part)
+    unknowns.chroma = _solve_chroma(parts, seen, regions.columns(count), spreads.chroma, sources.pairs)
     logs = np.concatenate([np.log(_levels(unknowns.z, sources))[:, None], unknowns.chroma], axis=1)
     unknowns.radiance = np.exp(logs @ _FROM_CHROMA.T)
 
@@ -192,42 +199,49 @@ def _huber(ratio: Floats) -> Floats:
     return np.asarray(np.minimum(1.0, weights.HUBER / np.maximum(np.abs(ratio), 1e-9)))
 
 
-def _gram(design: Floats, counts: Floats) -> Floats:
-    """Weighted sums of products of columns; float32, since terms are good to a percent and nothing cancels."""
-    root = (design * np.sqrt(counts)[:, None]).astype(np.float32)
-    return (root.T @ root).astype(np.float64)
-
-
 def _means(values: Floats, groups: Ints) -> Floats:
     """[groups] of values [n]."""
     return np.asarray(np.bincount(groups, values) / np.bincount(groups))
 
 
+def _members(shares: Floats, starts: Ints) -> csr_matrix:
+    """[groups, n] `shares` [n] of the members of groups that stand one after the other; starts: [groups + 1]."""
+    return csr_matrix((shares.astype(np.float32), np.arange(len(shares)), starts), (len(starts) - 1, len(shares)))
+
+
 @dataclass(frozen=True)
 class _Regions:
-    """Weighted sums over the patches of each region."""
+    """Weighted sums of the design's columns over the patches, all of them and those of each region."""
 
-    order: Ints
-    """[n] patches, region by region."""
-    starts: Ints
+    counts: Floats
+    """[n] weights of the patches."""
+    members: csr_matrix
+    """[regions, n] the weights of each one's patches."""
     totals: Floats
     """[regions] of weights."""
-    sums: NDArray[np.float32]
-    """[regions, c] of the design's columns."""
+    gram: Singles
+    """[c, c] sums of products of two columns."""
+    sums: Singles
+    """[regions, c] of columns."""
     surfaces: Ints
     """[regions] which surface each is part of."""
 
+    @staticmethod
+    def of(design: Singles, counts: Floats, evidence: Evidence) -> _Regions:
+        """Of the columns of `design` [n, c] with weights `counts` [n]."""
+        starts = np.searchsorted(evidence.regions, np.arange(evidence.regions[-1] + 2))
+        members = _members(counts, starts)
+        rooted = design * np.sqrt(counts).astype(np.float32)[:, None]
+        totals = np.bincount(evidence.regions, counts).astype(np.float64)
+        return _Regions(counts, members, totals, rooted.T @ rooted, members @ design, evidence.surfaces[starts[:-1]])
+
+    def columns(self, count: int) -> _Regions:
+        """The same for the first `count` columns."""
+        return replace(self, gram=self.gram[:count, :count], sums=self.sums[:, :count])
+
     def sums_of(self, values: Floats) -> Floats:
-        """[regions, ...] of values [n, ...]."""
-        return np.add.reduceat(values[self.order], self.starts)
-
-
-def _regions(design: Floats, counts: Floats, evidence: Evidence) -> _Regions:
-    order = np.argsort(evidence.regions, kind="stable")
-    starts = np.searchsorted(evidence.regions[order], np.arange(evidence.regions.max() + 1))
-    weighted = (design[order] * counts[order, None]).astype(np.float32)
-    totals, sums = np.add.reduceat(counts[order], starts), np.add.reduceat(weighted, starts, axis=0)
-    return _Regions(order, starts, totals, sums, evidence.surfaces[order[starts]])
+        """[regions, ...] weighted sums of values [n, ...]."""
+        return np.asarray(self.members @ values)
 
 
 @dataclass(frozen=True)
@@ -258,46 +272,41 @@ class _Surfaces:
 
     def sums(self, by_region: NDArray[Any]) -> NDArray[Any]:
         """[surfaces, ...] of sums over regions [regions, ...]."""
-        kept = by_region * self.keeps.reshape(-1, *[1] * (by_region.ndim - 1)).astype(by_region.dtype)
-        return np.add.reduceat(kept, np.searchsorted(self.regions.surfaces, np.arange(len(self.factor))))
+        starts = np.searchsorted(self.regions.surfaces, np.arange(len(self.factor) + 1))
+        return np.asarray(_members(self.keeps, starts) @ by_region)
 
-    def offsets(self, residual: Floats, counts: Floats) -> Floats:
+    def offsets(self, residual: Floats) -> Floats:
         """[surfaces] the best, for residuals [n] from which `center` was taken."""
-        return np.asarray(self.center + self.factor * self.sums(self.regions.sums_of(counts * residual)))
+        return np.asarray(self.center + self.factor * self.sums(self.regions.sums_of(residual)))
 
 
 def _without_regions(
-    gram: Floats,
-    design: Floats,
-    counts: Floats,
-    residuals: Floats,
-    regions: _Regions,
-    spread: float,
-    surfaces: _Surfaces | None = None,
-) -> tuple[Floats, Floats]:
-    """Normal matrix and vector [c, m] of the columns of `gram` without the offsets of regions and of surfaces.
+    design: Singles, residuals: Floats, regions: _Regions, spread: float, surfaces: _Surfaces | None = None
+) -> tuple[Singles, Singles]:
+    """Normal matrix and vector [c, m] of `design` [n, c], without the offsets of regions and of surfaces.
 
-    spread: deviation of a region's offset.
+    residuals: [n, m]. spread: deviation of a region's offset.
     """
-    sums, weighted = regions.sums[:, : len(gram)], counts[:, None] * residuals
-    factor, differences = spread**2 / (1 + spread**2 * regions.totals), regions.sums_of(weighted)
-    root = sums * np.sqrt(factor).astype(np.float32)[:, None]
-    matrix = gram - (root.T @ root).astype(np.float64)
-    vector = design.T @ weighted - sums.T @ (factor[:, None] * differences)
+    factor, differences = spread**2 / (1 + spread**2 * regions.totals), regions.sums_of(residuals)
+    weighted = (regions.counts[:, None] * residuals).astype(np.float32)
+    root = regions.sums * np.sqrt(factor).astype(np.float32)[:, None]
+    matrix = regions.gram - root.T @ root
+    vector = design.T @ weighted - regions.sums.T @ (factor[:, None] * differences).astype(np.float32)
     if surfaces is not None:
-        of_surfaces = surfaces.sums(sums)
+        of_surfaces = surfaces.sums(regions.sums)
         root = of_surfaces * np.sqrt(surfaces.factor).astype(np.float32)[:, None]
-        matrix -= (root.T @ root).astype(np.float64)
-        vector -= of_surfaces.T @ (surfaces.factor[:, None] * surfaces.sums(differences))
+        matrix -= root.T @ root
+        of_differences = surfaces.factor[:, None] * surfaces.sums(differences)
+        vector -= of_surfaces.T @ of_differences.astype(np.float32)
     return matrix, vector
 
 
-def _add_smoothness(matrix: Floats, pairs: Ints, strength: Floats | float) -> None:
+def _add_smoothness(matrix: Singles, pairs: Ints, strength: Floats | float) -> None:
     first, second = pairs.T
     np.add.at(matrix, (first, first), strength)
     np.add.at(matrix, (second, second), strength)
-    np.add.at(matrix, (first, second), -np.asarray(strength))
-    np.add.at(matrix, (second, first), -np.asarray(strength))
+    np.subtract.at(matrix, (first, second), strength)
+    np.subtract.at(matrix, (second, first), strength)
 
 
 def _smoothness_gradient(pairs: Ints, pull: Floats, count: int) -> Floats:
@@ -305,16 +314,14 @@ def _smoothness_gradient(pairs: Ints, pull: Floats, count: int) -> Floats:
     return np.asarray(up - down)
 
 
-def _solve_chroma(
-    parts: Floats, gram: Floats, counts: Floats, seen: Floats, regions: _Regions, spread: float, pairs: Ints
-) -> Floats:
+def _solve_chroma(parts: Singles, seen: Floats, regions: _Regions, spread: float, pairs: Ints) -> Floats:
     """[k, 2] chroma of the sources: equation (2) is linear in it and the light's; `seen` [n, 2]."""
     ratio = (weights.PATCH_NOISE / weights.CHROMA_NOISE) ** 2  # of the weights of chroma to those of level
-    matrix, vector = _without_regions(gram, parts, counts, seen, regions, spread * np.sqrt(ratio))
-    matrix, vector = ratio * matrix, ratio * vector
+    matrix, vector = _without_regions(parts, seen, regions, spread * np.sqrt(ratio))
+    matrix, vector = np.float32(ratio) * matrix, np.float32(ratio) * vector
     _add_smoothness(matrix, pairs, weights.CHROMA_SMOOTHNESS)
     matrix[np.diag_indices_from(matrix)] += 1 / weights.CELL_CHROMA**2
     # The light's own chroma t is eliminated: u about t, t about 0.
     pull = 1 / weights.CELL_CHROMA**2
-    matrix -= pull**2 / (parts.shape[1] * pull + 1 / weights.TINT**2)
-    return np.linalg.solve(matrix.astype(np.float32), vector.astype(np.float32)).astype(np.float64)
+    matrix -= np.float32(pull**2 / (parts.shape[1] * pull + 1 / weights.TINT**2))
+    return lu_solve(lu_factor(matrix, check_finite=False), vector, check_finite=False).astype(np.float64)  # type: ignore[no-any-return]

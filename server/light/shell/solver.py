@@ -20,7 +20,7 @@ from server.light.shell.transport import Transport
 MOST_STEPS = 16
 """Most Gauss-Newton steps of a solution. After the first, another follows while the last one changed what patches
 receive by more than MOVED."""
-MOVED, FIRST_MOVED = 0.05, 0.01
+MOVED, FIRST_MOVED = 0.01, 0.01
 """Change of a logarithm; the second value holds for a first solution, from which the others start, and where the light
 is another."""
 LEAST_PATCHES = 12
@@ -57,8 +57,8 @@ class Solver:
         self._transport.update(patches, bright, traced, shell)
         closed = closed_sides(positions, normals, shell.axes, PATCH_M)
         evidence = evidence_of(patches, rows, switches)
-        near = near_sources(self._transport, shell, rows)
-        distant = distant_sources(self._transport, closed, rows, with_indirect=switches.indirect)
+        near = near_sources(self._transport, shell, evidence.rows)
+        distant = distant_sources(self._transport, closed, evidence.rows, with_indirect=switches.indirect)
         first = patches.outdated if self._near.known > 0 and switches.memory else 1.0
         settled = MOVED ** (1 - first) * FIRST_MOVED**first
         for unknowns, sources in ((self._near, near), (self._distant, distant)):

@@ -23,7 +23,7 @@ _PAIRS = neighbours()
 class Sources:
     """Sources of one radiance each, and what is known of them beforehand. [n] patches, [k] sources."""
 
-    shares: Floats
+    shares: NDArray[np.float32]
     """[n, k] of a patch's cosine-weighted hemisphere."""
     known: Floats
     """[n, 3] radiance that photographed surface brings."""
@@ -53,7 +53,7 @@ def near_sources(transport: Transport, shell: Shell, rows: Ints) -> Sources:
     offset, deviation, begin = _priors(transport)
     deviation[:CELLS] = np.where(shell.is_low, weights.CELL_LOW, weights.CELL_HIGH)
     return Sources(
-        shares=transport.shares[rows, :count].astype(np.float64),
+        shares=transport.shares[rows, :count],
         known=transport.known[rows],
         clipped=transport.clipped[:count],
         is_saturated=transport.is_saturated[:count],
@@ -84,9 +84,10 @@ def distant_sources(transport: Transport, closed: Floats, rows: Ints, *, with_in
     closed: [6] from 0, open, to 1. The first LOBES sources are the lobes. with_indirect: surfaces send light.
     """
     count = transport.columns
-    beyond = np.einsum("nfl,f->nl", transport.beyond[rows], 1.0 - closed)
-    near = transport.shares[rows, :count].astype(np.float64)
-    near[:, :CELLS] *= np.repeat(closed, SIDE * SIDE)
+    is_closed = closed.astype(np.float32)
+    beyond = np.einsum("nfl,f->nl", transport.beyond[rows], 1 - is_closed)
+    near = transport.shares[rows, :count]
+    near[:, :CELLS] *= np.repeat(is_closed, SIDE * SIDE)
     known = transport.known[rows]
     if not with_indirect:
         near[:, CELLS:], known = 0.0, np.zeros_like(known)

@@ -53,7 +53,8 @@ def corner(change: Callable[[ShellRoom], None] | None = None) -> ShellRoom:
 
 def solved(room: ShellRoom, closed: Floats | None = None) -> Unknowns:
     """The light from beyond the scan; closed: of its sides, where it is not as was scanned."""
-    rows, unknowns, evidence = room.patches.used, Unknowns(), room.evidence
+    unknowns, evidence = Unknowns(), room.evidence
+    rows = evidence.rows
     sources = room.distant() if closed is None else distant_sources(room.transport, closed, rows, with_indirect=True)
     for _ in range(STEPS):
         step(unknowns, evidence, sources)

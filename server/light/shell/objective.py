@@ -43,6 +43,9 @@ light, and are not in the step's derivatives."""
 TURNING_BACK, GOING_ON = 0.7, 1.1
 MOST_STEP = 3.0
 """Greatest change of an unknown logarithm in a whole step."""
+BEGIN_EXCESS = np.arange(9.0)
+"""Logarithms of excess, over its prior mean, of which new saturated sources begin at the best. A bulb is e^5 times as
+bright as a picture shows it."""
 _COLUMNS = 8  # of an inverse, to tell its norm
 _FROM_CHROMA = np.linalg.inv(LOG_CHROMA)
 
@@ -120,19 +123,21 @@ class Unknowns:
 
 
 def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Switches | None = None) -> None:
-    """One Gauss-Newton step, in place. Sources that are new begin at their prior.
+    """One Gauss-Newton step, in place. Sources that are new begin at their prior, or as of `_begin`.
 
     Products of matrices are float32: terms are good to a percent, and nothing cancels.
     """
     switches, count = switches or Switches(), sources.count
     unknowns.mean = float(np.log(evidence.mean / weights.MEAN_ALBEDO))
     prior = np.where(sources.is_saturated, 0.0, unknowns.mean) + sources.offset
-    z = np.concatenate([unknowns.z, (prior + sources.begin)[unknowns.known :]])
+    known_logs = log_chroma(np.log(np.maximum(sources.known, DARKEST)))
+    known = np.where(sources.known.max(axis=1) > 0, np.exp(known_logs[:, 0]), 0.0)
+    offsets = _means(unknowns.offsets[evidence.rows], evidence.surfaces)
+    z = np.concatenate([unknowns.z, prior[unknowns.known :]])
+    z += _begin(z, unknowns.known, evidence, sources, known, offsets)
     cell_chroma = np.concatenate([unknowns.chroma, np.zeros((count - unknowns.known, 2))])
 
     level = _levels(z, sources).astype(np.float32)
-    known_logs = log_chroma(np.log(np.maximum(sources.known, DARKEST)))
-    known = np.where(sources.known.max(axis=1) > 0, np.exp(known_logs[:, 0]), 0.0)
     arriving = np.maximum(sources.shares @ level + known, DARKEST)
     parts = sources.shares * level
     parts /= arriving.astype(np.float32)[:, None]  # T
@@ -142,7 +147,6 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     nodes, materials = materials_of(np.where(is_clipped, 0.0, evidence.chroma - sent_chroma - known_part))
     albedo = 1 / (1 + np.exp(-(materials @ unknowns.materials[nodes])))
     residual = evidence.level - np.log(arriving) - np.log(albedo)
-    offsets = _means(unknowns.offsets[evidence.rows], evidence.surfaces)
     error = residual - offsets[evidence.surfaces]
     counts = evidence.precision * (_huber(error * np.sqrt(evidence.precision)) if switches.outliers else 1.0)
     counts[evidence.is_clipped & (error < 0)] = 0.0
@@ -156,10 +160,7 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     residual = residual - surfaces.center[evidence.surfaces]
     matrix, vector = _without_regions(design, residual[:, None], regions, spreads.region, surfaces)
     right = vector[:, 0].astype(np.float64)
-    differences = z[sources.pairs[:, 0]] - z[sources.pairs[:, 1]]
-    strength = weights.SMOOTHNESS / np.sqrt(1 + (differences / weights.EDGE) ** 2)
-    _add_smoothness(matrix, sources.pairs, strength)
-    right[:count] -= _smoothness_gradient(sources.pairs, strength * differences, count)
+    right[:count] -= _smoothen(matrix, z, sources.pairs)
     diagonal = np.concatenate([1 / sources.deviation**2, np.full(len(nodes), 1 / spreads.material**2)])
     matrix[np.diag_indices_from(matrix)] += diagonal
     target = np.concatenate([prior - z, LOGIT - unknowns.materials[nodes]])
@@ -175,6 +176,25 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     unknowns.chroma = _solve_chroma(parts, seen, regions.columns(count), spreads.chroma, sources.pairs)
     logs = np.concatenate([np.log(_levels(unknowns.z, sources))[:, None], unknowns.chroma], axis=1)
     unknowns.radiance = np.exp(logs @ _FROM_CHROMA.T)
+
+
+def _begin(z: Floats, count: int, evidence: Evidence, sources: Sources, known: Floats, offsets: Floats) -> Floats:
+    """[k] by how much sources from `count` on begin above `z`: saturated ones, all alike, at what fits the level best.
+
+    From too little light the first steps do not find a lamp; from too much they take all surface for black.
+    known: [n] radiance of photographed surface; offsets: [surfaces].
+    """
+    is_new = sources.is_saturated.copy()
+    is_new[:count] = False
+    if not is_new.any():
+        return np.zeros_like(z)
+    level = _levels(z, sources)
+    brought = sources.shares[:, is_new] @ level[is_new]
+    others = sources.shares[:, ~is_new] @ level[~is_new] + known
+    target = evidence.level - np.log(weights.MEAN_ALBEDO) - offsets[evidence.surfaces]
+    arriving = np.log(np.maximum(others + np.exp(BEGIN_EXCESS)[:, None] * brought, DARKEST))
+    errors = np.abs(target - arriving)[:, ~evidence.is_clipped].sum(axis=1)
+    return np.where(is_new, BEGIN_EXCESS[errors.argmin()], 0.0)
 
 
 @dataclass(frozen=True)
@@ -309,8 +329,12 @@ def _add_smoothness(matrix: Singles, pairs: Ints, strength: Floats | float) -> N
     np.subtract.at(matrix, (second, first), strength)
 
 
-def _smoothness_gradient(pairs: Ints, pull: Floats, count: int) -> Floats:
-    up, down = (np.bincount(side, pull, count) for side in pairs.T)
+def _smoothen(matrix: Singles, z: Floats, pairs: Ints) -> Floats:
+    """[k] half the gradient of the sum of rho at z [k]; its curvature is added to `matrix`."""
+    differences = z[pairs[:, 0]] - z[pairs[:, 1]]
+    strength = weights.SMOOTHNESS / np.sqrt(1 + (differences / weights.EDGE) ** 2)
+    _add_smoothness(matrix, pairs, strength)
+    up, down = (np.bincount(side, strength * differences, len(z)) for side in pairs.T)
     return np.asarray(up - down)
 
 

@@ -34,8 +34,6 @@ class Sources:
     """[k] prior mean of the log radiance, over that of the mean light; of saturated ones, of their relative excess."""
     deviation: Floats
     """[k] standard deviation of it."""
-    begin: Floats
-    """[k] where steps begin, over the prior mean."""
     pairs: Ints
     """[m, 2] neighbours."""
     least_share: float = 0.0
@@ -50,7 +48,7 @@ class Sources:
 def near_sources(transport: Transport, shell: Shell, rows: Ints) -> Sources:
     """All that is not scanned lies on the shell, for the patches in `rows` [n]."""
     count = transport.columns
-    offset, deviation, begin = _priors(transport)
+    offset, deviation = _priors(transport)
     deviation[:CELLS] = np.where(shell.is_low, weights.CELL_LOW, weights.CELL_HIGH)
     return Sources(
         shares=transport.shares[rows, :count],
@@ -59,23 +57,17 @@ def near_sources(transport: Transport, shell: Shell, rows: Ints) -> Sources:
         is_saturated=transport.is_saturated[:count],
         offset=offset,
         deviation=deviation,
-        begin=begin,
         pairs=_PAIRS,
     )
 
 
-def _priors(transport: Transport) -> tuple[Floats, Floats, Floats]:
-    """[k] offset, deviation and begin of Sources; those of hidden surface for the shell's cells."""
+def _priors(transport: Transport) -> tuple[Floats, Floats]:
+    """[k] offset and deviation of Sources; those of hidden surface for the shell's cells."""
     count = transport.columns
     is_saturated, lit = transport.is_saturated[:count], transport.lit[:count]
     offset = lit * np.log(weights.LIT_EXCESS) + (1 - lit) * np.log(weights.LAMP_EXCESS)
     spread = lit * weights.LIT_SPREAD + (1 - lit) * weights.LAMP_SPREAD
-    begin = (1 - lit) * (weights.LAMP_BEGIN - np.log(weights.LAMP_EXCESS))
-    return (
-        np.where(is_saturated, offset, 0.0),
-        np.where(is_saturated, spread, weights.CELL_HIDDEN),
-        np.where(is_saturated, begin, 0.0),
-    )
+    return np.where(is_saturated, offset, 0.0), np.where(is_saturated, spread, weights.CELL_HIDDEN)
 
 
 def distant_sources(transport: Transport, closed: Floats, rows: Ints, *, with_indirect: bool) -> Sources:
@@ -91,7 +83,7 @@ def distant_sources(transport: Transport, closed: Floats, rows: Ints, *, with_in
     known = transport.known[rows]
     if not with_indirect:
         near[:, CELLS:], known = 0.0, np.zeros_like(known)
-    offset, deviation, begin = _priors(transport)
+    offset, deviation = _priors(transport)
     deviation[:CELLS] = weights.CELL_LOW
     return Sources(
         shares=np.concatenate([beyond, near], axis=1),
@@ -100,7 +92,6 @@ def distant_sources(transport: Transport, closed: Floats, rows: Ints, *, with_in
         is_saturated=np.concatenate([np.zeros(LOBES, bool), transport.is_saturated[:count]]),
         offset=np.concatenate([np.full(LOBES, weights.LOBE), offset]),
         deviation=np.concatenate([np.full(LOBES, weights.LOBE_SPREAD), deviation]),
-        begin=np.concatenate([np.zeros(LOBES), begin]),
         pairs=_PAIRS + LOBES,
         least_share=0.0 if with_indirect else LEAST_OPENNESS,
     )

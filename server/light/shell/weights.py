@@ -35,9 +35,6 @@ LIT_EXCESS, LIT_SPREAD = 0.2, 1.0
 standard deviation of its log."""
 LAMP_EXCESS, LAMP_SPREAD = 1.0, 2.0
 """The same for lamps and windows: a bulb is 200 times as bright as a picture shows it."""
-LAMP_BEGIN = 4.0
-"""Log of a lamp's excess at the first step: from a low start, a lamp brings so little light that the first steps miss
-it."""
 SMOOTHNESS, EDGE = 1.0, 0.5
 """Weight of the squared difference of neighbouring cells' log radiance, and the difference from which it grows
 linearly: the rims of lamps and windows."""

@@ -45,5 +45,7 @@ def level_objective(
         total += constants.SMOOTHNESS * constants.EDGE**2 * (np.sqrt(1 + ratio**2) - 1)
     total += (((materials - LOGIT) / constants.ALBEDO_SPREAD) ** 2).sum() / 2
     ratio = offsets / constants.SURFACE_SPREAD
-    total += np.where(ratio > 0, ratio**2, np.log1p(ratio**2)).sum() / 2
+    edge = constants.DARK_EDGE
+    dark = 2 * (edge / constants.SURFACE_SPREAD) ** 2 * (np.sqrt(1 + (offsets / edge) ** 2) - 1)
+    total += np.where(ratio > 0, ratio**2, dark).sum() / 2
     return float(total)

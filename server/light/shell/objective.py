@@ -15,8 +15,9 @@ has besides, d_r and c_r what region r of it has; they are eliminated exactly. M
     + sum_g ((m_g - m) / s_m)^2 + sum_f tau(o_f) + sum_r (d_r / s_d)^2
     + sum_p |e'_p / S'_p|^2 + sum_k |(u_k - t) / s_u|^2 + sum_(k,l) c |u_k - u_l|^2 + |t / s_t|^2 + sum_r |c_r / s_c|^2
 
-over neighbouring sources (k,l). tau is quadratic, but log(1 + (o / s_o)^2) below 0, and steep where the albedo exceeds
-1. The weights stand in weights.py. A patch that is clipped only counts where (1) is below what it shows.
+over neighbouring sources (k,l). tau is (o / s_o)^2, but 2 (d / s_o)^2 (sqrt(1 + (o / d)^2) - 1) below 0, which becomes
+linear, and steep where the albedo exceeds 1. The weights stand in weights.py. A patch that is clipped only counts where
+(1) is below what it shows; its material is the mean one.
 """
 
 from __future__ import annotations
@@ -280,10 +281,10 @@ class _Surfaces:
     def of(offsets: Floats, whitest: Floats, regions: _Regions, spreads: _AlbedoSpreads) -> _Surfaces:
         """By the last `offsets` [surfaces] and the greatest, `whitest`, with which an albedo is 1.
 
-        The prior grows ever more slowly for dark ones, since paint may be black, and sharply from `whitest` on.
+        The prior grows slowly for dark ones, since paint may be black, and sharply from `whitest` on.
         """
         is_white = offsets >= whitest
-        variance = spreads.surface**2 * (1 + np.minimum(offsets / spreads.surface, 0.0) ** 2)
+        variance = spreads.surface**2 * np.sqrt(1 + (np.minimum(offsets, 0.0) / weights.DARK_EDGE) ** 2)
         beyond = np.where(is_white, 1 / weights.WHITE**2, 0.0)  # precision of a second prior, about `whitest`
         variance = variance / (1 + variance * beyond)
         keeps = 1 / (1 + spreads.region**2 * regions.totals)

@@ -17,7 +17,10 @@ REGION_SPREAD = 0.05
 tell where light comes from for texture."""
 SURFACE_SPREAD = 0.1
 """Standard deviation of a surface's log albedo about its material's (segments.py): more would take a wall in shade for
-a dark one. On the dark side it has the tail of a Cauchy distribution, since paint may be black."""
+a dark one."""
+DARK_EDGE = 0.05
+"""Log albedo below its material's from which the prior of a surface's grows linearly: paint may be black. With the tail
+of a Cauchy distribution there are more minima, between which the light jumps."""
 WHITE = 0.005
 """Deviation of a surface's log albedo above 0: nothing sends back more than it receives."""
 ONE_ALBEDO = 0.01

@@ -38,9 +38,9 @@ from server.light.shell.switches import Switches
 
 LOGIT = float(np.log(weights.MEAN_ALBEDO / (1 - weights.MEAN_ALBEDO)))
 LEAST_RELAXATION = 0.05
-"""Least share of a Gauss-Newton step that is taken. It falls from 1 while steps turn back, and rises again, by
-TURNING_BACK and GOING_ON: the albedo that makes a surface white and the chroma that tells its material follow the
-light, and are not in the step's derivatives."""
+"""Least share of a Gauss-Newton step that is taken. It falls while steps turn back, and rises again, by TURNING_BACK
+and GOING_ON: the albedo that makes a surface white and the chroma that tells its material follow the light, and are
+not in the step's derivatives."""
 TURNING_BACK, GOING_ON = 0.7, 1.1
 MOST_STEP = 3.0
 """Greatest change of an unknown logarithm in a whole step."""
@@ -84,8 +84,10 @@ class Unknowns:
     step: float = float("inf")
     """By how much the last step changed the logarithm of what patches receive, root mean square."""
 
+    most_relaxation: float = 1.0
+    """Greatest share of a step to take."""
     relaxation: float = 1.0
-    """Share of the last step that was taken."""
+    """Share of the last step that was taken, of those that are at most `most_relaxation`."""
     last: Floats = field(default_factory=_empty)
     """[k] the last whole step of z."""
 
@@ -98,7 +100,7 @@ class Unknowns:
         """The share of the step `change` [k] of z to take."""
         turns_back = float(change[: len(self.last)] @ self.last) < 0
         factor = TURNING_BACK if turns_back else GOING_ON
-        self.relaxation = float(np.clip(self.relaxation * factor, LEAST_RELAXATION, 1.0))
+        self.relaxation = float(np.clip(self.relaxation * factor, LEAST_RELAXATION, self.most_relaxation))
         self.last = change.copy()
         return self.relaxation
 

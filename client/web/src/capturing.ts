@@ -5,6 +5,7 @@ import { startCamera } from "./capture/camera_source";
 import { type Shown, startRecorded } from "./capture/recorded_source";
 import { type Captured, type Packed, reasonOf, type Shot, type Sink, type Source, SourceError } from "./capture/source";
 import { type Draw, startXr } from "./capture/xr_source";
+import { byId } from "./dom";
 import { type Choice, setupOf } from "./form";
 import { scaled, type Seen, Y_UP } from "./objects/picking";
 import type { PlaceObject } from "./protocol";
@@ -62,7 +63,7 @@ export class Capturing implements Sink {
 
   private open({ source, file, loops, view_deg }: Choice, stage: Element): Promise<Source> {
     const { hooks, screen } = this;
-    if (source === "camera") return startCamera(view_deg, this);
+    if (source === "camera") return startCamera(view_deg, byId<HTMLVideoElement>("viewfinder"), this);
     if (source === "xr") {
       const draw: Draw = (view, ...others) => {
         hooks.look(worldFromCamera(view.transform.matrix));

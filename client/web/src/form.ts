@@ -73,6 +73,11 @@ export function missing(choice: Choice): string | null {
   return null;
 }
 
+/** What a person is to do until the server knows where the camera is; null: nothing. */
+export function aimOf({ source, room, marker }: Choice): string | null {
+  return source === "camera" ? `Point the camera at marker ${marker}. A camera with depth in room “${room}” must have seen it, too.` : null;
+}
+
 /** How the light is sampled. */
 export function quality({ preset, budget_ms }: Choice): Pick<Wishes, "preset" | "budget_ms"> {
   return preset === "auto" ? { preset, budget_ms } : { preset, budget_ms: null };

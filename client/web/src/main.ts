@@ -4,7 +4,7 @@ import { reasonOf } from "./capture/source";
 import { Capturing } from "./capturing";
 import { type ConnectionState, streamUrl, tokenQuery } from "./connection";
 import { byId, setText } from "./dom";
-import { type Choice, fill, missing, noteChoice, read } from "./form";
+import { aimOf, type Choice, fill, missing, noteChoice, read } from "./form";
 import { clearLatency, noteShown, showAges } from "./latency";
 import { LayerMode } from "./layer_mode";
 import { LightMode } from "./light_mode";
@@ -48,6 +48,8 @@ let connection: ConnectionState = { kind: "connecting" };
 let retryAt_ms = 0;
 let welcomes = 0;
 let told = "";
+/** What brings a picture of what is captured. */
+let aim: string | null = null;
 /** What a session must be like to be watched, in words. */
 let watched = "";
 /** Name of the session that is watched. */
@@ -162,7 +164,8 @@ function refresh(): void {
   markPicture(kind === "good");
   stayAwake(kind === "good");
   refreshLiveQuality(form, capturing !== null);
-  setText(byId("stage-said"), told !== "" || capturing === null || kind === "good" ? told : text);
+  const waiting = connection.kind === "open" ? (aim ?? text) : text;
+  setText(byId("stage-said"), told !== "" || capturing === null || kind === "good" ? told : waiting);
   retry.hidden = connection.kind !== "lost";
   reload.hidden = connection.kind !== "refused";
   const left_s = connection.kind === "lost" ? Math.max(0, Math.ceil((retryAt_ms - now_ms) / 1000)) : null;
@@ -220,6 +223,8 @@ async function capture(choice: Choice): Promise<void> {
     watch();
     return fail(reasonOf(error));
   }
+  aim = aimOf(choice);
+  stage.dataset["source"] = choice.source;
   tools.begin(capturing.objects);
   stage.classList.toggle("local", choice.source === "xr" && choice.answer !== "picture");
   stopButton.hidden = false;
@@ -241,6 +246,7 @@ async function endCapture(): Promise<void> {
   layerMode?.stop();
   capturing = lightMode = layerMode = null;
   stage.classList.remove("local");
+  delete stage.dataset["source"];
   stopButton.hidden = true;
   showFull(false);
   await ended?.stop();

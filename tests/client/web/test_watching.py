@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
-from dataclasses import replace
-from itertools import count
 
 import numpy as np
 import pytest
 
 from client.options.source import open_source
-from client.streaming.coding import frame_message
-from protocol.messages import Composite, Hello, Wishes
+from protocol.messages import Composite
 from server.scene.placement import Placement, SpotPlacement
 from server.service.serve import BackgroundServer
 from tests.client.web.conftest import OpenPage, wait_for_text
 from tests.client.web.page import on_screen, wait_until
-from tests.client.web.watched import SIZE, TOUCHED, point_under, wait_for
-from tests.service.wire import Wire
+from tests.client.web.watched import SIZE, TOUCHED, point_under, standing_camera, wait_for
 
 SOURCE = "synthetic:table?light=7&size=160x120&frames=1"
 
@@ -26,23 +21,8 @@ SOURCE = "synthetic:table?light=7&size=160x120&frames=1"
 @pytest.fixture
 def captured(real_server: BackgroundServer) -> Iterator[list[Composite]]:
     """The answers to a camera that stands still, until the end of the test."""
-    source, answers, ended = open_source(SOURCE), list[Composite](), threading.Event()
-    wire = Wire(real_server.url)
-    wire.say(Hello(client="test", camera=source.camera, wishes=Wishes(up=source.up, voxel_m=0.01)))
-
-    def capture() -> None:
-        for index in count():
-            if ended.is_set():
-                return
-            wire.say(frame_message(replace(source[0], index=index), source.camera))
-            answers.append(wire.hear_until(Composite)[-1])
-
-    thread = threading.Thread(target=capture)
-    thread.start()
-    yield answers
-    ended.set()
-    thread.join()
-    wire.hang_up()
+    with standing_camera(real_server.url, open_source(SOURCE)) as answers:
+        yield answers
 
 
 def test_a_watcher_places_drags_and_removes(

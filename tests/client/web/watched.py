@@ -1,14 +1,20 @@
-"""A real service that tells what objects it was asked for."""
+"""A real service that tells what objects it was asked for, and a camera that others can watch."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
 
+from client.options.source import Source
+from client.streaming.coding import frame_message
 from protocol.frames import CameraModel, RgbdFrame
+from protocol.messages import Composite, Hello, Wishes
 from server.client_session import ClientSession
 from server.opencl.device import Device
 from server.scene.mesh import Mesh
@@ -16,6 +22,7 @@ from server.scene.placement import Placement
 from server.service.serve import BackgroundServer
 from server.service.service import Service
 from tests.client.web.page import wait_until
+from tests.service.wire import Wire
 
 SIZE = (600, 800)
 TOUCHED = (112.0, 69.0)
@@ -64,3 +71,26 @@ def watched_server(device: Device) -> Iterator[tuple[BackgroundServer, list]]:
 
     with BackgroundServer(Service(device, pipeline_factory=build)) as server:
         yield server, asked
+
+
+@contextmanager
+def standing_camera(url: str, source: Source) -> Iterator[list[Composite]]:
+    """The answers to a camera that shows the source's first frame again and again, as they come."""
+    answers, ended, wire = list[Composite](), threading.Event(), Wire(url)
+    wire.say(Hello(client="test", camera=source.camera, wishes=Wishes(up=source.up, voxel_m=0.01)))
+
+    def capture() -> None:
+        for index in count():
+            if ended.is_set():
+                return
+            wire.say(frame_message(replace(source[0], index=index), source.camera))
+            answers.append(wire.hear_until(Composite)[-1])
+
+    thread = threading.Thread(target=capture)
+    thread.start()
+    try:
+        yield answers
+    finally:
+        ended.set()
+        thread.join()
+        wire.hang_up()

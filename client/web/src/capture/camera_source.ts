@@ -6,8 +6,8 @@ import { now_ms, reasonOf, type Sink, type Source, SourceError } from "./source"
 
 const LONGEST_PX = 640;
 
-/** Start the rear camera. `view_deg`: field of view along the longer side. Throws SourceError. */
-export async function startCamera(view_deg: number, sink: Sink): Promise<Source> {
+/** Start the rear camera; `video` plays what it sees. `view_deg`: field of view along the longer side. Throws SourceError. */
+export async function startCamera(view_deg: number, video: HTMLVideoElement, sink: Sink): Promise<Source> {
   let stream: MediaStream;
   try {
     stream = await navigator.mediaDevices.getUserMedia({
@@ -17,9 +17,6 @@ export async function startCamera(view_deg: number, sink: Sink): Promise<Source>
   } catch (error) {
     throw new SourceError(refusal(error));
   }
-  const video = document.createElement("video");
-  video.muted = true;
-  video.playsInline = true;
   video.srcObject = stream;
   await video.play();
   return new CameraSource(stream, video, view_deg, sink);

@@ -17,10 +17,11 @@ export interface Standing {
   yaw_deg: number;
 }
 
-/** Draw the guide of `standing` on a canvas of the picture's size; null clears it. */
+/** Draw the guide of `standing` on a canvas of the picture's size; null clears and hides it. */
 export function drawGuide(canvas: HTMLCanvasElement, camera: Lens, worldFromCamera: readonly number[], standing: Standing | null): void {
   const context = context2d(canvas);
   context.clearRect(0, 0, canvas.width, canvas.height);
+  canvas.toggleAttribute("hidden", standing === null); // Chromium sometimes goes on showing what was cleared last
   if (standing === null) return;
   const { position, radius_m, height_m, yaw_deg } = standing;
   const [right, up, front] = uprightAxes(standing.up);

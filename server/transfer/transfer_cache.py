@@ -76,6 +76,10 @@ class TransferCache:
         self._now = 0
         self._frame: _Frame | None = None
 
+    def forget(self) -> None:
+        """Begin anew with the next frame: transfer is found in another way."""
+        self._of = ()
+
     def find(
         self,
         camera: CameraModel,

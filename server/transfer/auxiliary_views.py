@@ -42,8 +42,8 @@ GROWTH = 0.03
 A camera that enters a room sees most of it within a second; light would leak through outdated views."""
 YOUNG_FRAMES = 16
 """A view of a volume of fewer frames is redrawn when the number of frames has doubled: few noisy frames leave holes."""
-MOST_PER_FRAME = 96
-"""Most views that one frame redraws."""
+MOST_PER_FRAME = 24
+"""Most views that one frame redraws: all of them in 43 frames while the volume grows."""
 
 
 @dataclass(frozen=True)

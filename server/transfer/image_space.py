@@ -40,8 +40,9 @@ from server.volume.volume import Volume
 
 Floats = NDArray[np.float64]
 
-VIEWS_PER_FRAME = 32
-"""Auxiliary views redrawn in each frame: all of them in 32 frames."""
+VIEWS_PER_FRAME = 16
+"""Auxiliary views redrawn in each frame: all of them in 64 frames, as long as places of the world keep their transfer
+at most (transfer_cache.py). In the real kitchen 8 to 96 a frame make pictures that differ by FLIP .0003."""
 NEAR_STEPS = 4
 """Samples along a direction in the camera's picture."""
 NEAR_PIXELS = 4.0

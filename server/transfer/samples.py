@@ -40,7 +40,8 @@ class SampledTransfer:
     def __init__(
         self, engine: Engine, camera: CameraModel, sampling: Sampling, rays: int, bands: int, *, is_cached: bool = False
     ) -> None:
-        """`is_cached`: transfer of earlier frames is used at the places where it was found (transfer_cache.py)."""
+        """`is_cached`: transfer of earlier frames is used at the places where it was found (transfer_cache.py), but where
+        there is a visibility state."""
         self._engine = engine
         self._camera = camera
         self._bands = bands

@@ -69,7 +69,8 @@ PRESETS = {
 }
 """Thesis 6.1.3.1 and 6.2.3; RM is its GR12, ART4 its GR14. The number is the spacing in pixels. ART traces a fourth of
 its directions in each frame. In the thesis a frame traces a fourth of RM's; here it traces as many as RM, so a sample
-has four times as many: still several times faster, with a light nearer to RM's."""
+has four times as many: still several times faster, with a light nearer to RM's. Where transfer is kept at places of the
+world, a sample has as many directions, traced at once."""
 
 
 class TransferSampler:

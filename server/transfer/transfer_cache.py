@@ -6,6 +6,9 @@ saw a frame, or a turn, ago. A sample that finds nothing is traced and stored. A
 frames, then after twice as many each time, LONGEST at most, because a young scan grows and an old one hardly does. So
 an entry is off by what the scan has changed in as many frames as it was old, LONGEST at most, and belongs to a point
 in the same cell. Surface that moves is no exception: what a point sees of the scan depends on where it is only.
+
+Transfer that is looked up in depth views (image_space.py) is kept likewise, with what the camera's picture adds near a
+point when it is looked up. What of the picture is not in the scan belongs to no place and is left out.
 """
 
 from __future__ import annotations
@@ -32,7 +35,7 @@ PLACES_A_SAMPLE = 4
 """Size of the table, in samples of a frame, rounded up to a power of two. Views of the last seconds fit, and few cells
 collide."""
 MOST_PLACES = 1 << 20
-"""Of 236 bytes each with the defaults."""
+"""Of 236 bytes each with the defaults, of 520 with ART4's 324 directions."""
 _WORDS_BESIDE = 18
 """Words of an entry besides mask, coefficients and directions that met surface, as in transfer_cache.cl."""
 _UNCLAIMED = 0xFFFFFFFF

@@ -40,7 +40,7 @@ class SampledTransfer:
     def __init__(
         self, engine: Engine, camera: CameraModel, sampling: Sampling, rays: int, bands: int, *, is_cached: bool = False
     ) -> None:
-        """`is_cached`: transfer of earlier frames is used at the places where it was found (transfer_cache.py), but where
+        """`is_cached`: transfer of earlier frames is used at the places where it was found (transfer_cache.py), unless
         there is a visibility state."""
         self._engine = engine
         self._camera = camera

@@ -45,7 +45,7 @@ kernel void draw_views(const int count, global const int *views, VOLUME_PARAMETE
 // Samples of the same direction set: every 8th sample along both axes has the same set (direction_sets.clh), so all of them look into
 // the same view for one direction. An item looks for a block of those, LANES at a time.
 #define SET_STEP 8
-#define BLOCK_SIDE (LANES == 8 ? 8 : 1)
+#define BLOCK_SIDE (LANES == 8 ? 16 : 1)
 
 // The bits of LANES samples at o (from the views' centre) with normals n: bit j of `bits` [LANES][MASK_WORDS], 0 before, is set where
 // direction j of the set that begins at `set` lies above the surface and its light arrives. shift: of a sample within its pixel.

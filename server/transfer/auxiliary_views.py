@@ -33,7 +33,7 @@ VIEWS = 1024
 DISTANCE = 50.0
 """From a view's eye to the volume's centre, in half diagonals: lines of sight are parallel to 1.2 degrees."""
 _SET_STEP = 8  # samples so far apart along an axis have the same directions
-_BLOCK_SIDE = 8  # of the samples of one set that a work-item of several lanes looks for; as in auxiliary_views.cl
+_BLOCK_SIDE = 16  # of the samples of one set that a work-item of several lanes looks for; as in auxiliary_views.cl
 LEAST_TURN = float(np.cos(np.deg2rad(3.0)))
 """The view from the dominant light is drawn anew once the light has turned by 3 degrees."""
 GROWTH = 0.03
@@ -228,7 +228,7 @@ def look_into_views(
         views.axes,
         views.depths,
         lit,
-        local=(16,),
+        local=(8,),
     )
     return lit
 

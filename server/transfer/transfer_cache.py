@@ -34,8 +34,8 @@ PERIOD, LONGEST = 16, 64
 PLACES_A_SAMPLE = 4
 """Size of the table, in samples of a frame, rounded up to a power of two. Views of the last seconds fit, and few cells
 collide."""
-MOST_PLACES = 1 << 20
-"""Of 236 bytes each with the defaults, of 520 with ART4's 324 directions."""
+MOST_BYTES = 1 << 28
+"""Of the table. A place takes 232 bytes with the defaults, 504 with ART4's 324 directions."""
 _WORDS_BESIDE = 18
 """Words of an entry besides mask, coefficients and directions that met surface, as in transfer_cache.cl."""
 _UNCLAIMED = 0xFFFFFFFF
@@ -99,10 +99,10 @@ class TransferCache:
         What was found by other rays, in another volume or by another camera model is forgotten.
         """
         engine, transfer = self._engine, traced_transfer(self._engine, camera, stride, rays)
-        places = places_for(transfer.rows * transfer.cols)
         hits, met = room_for_hits(engine, transfer), room_for_met(engine, transfer, rays)
         defines = {"BANDS": transfer.bands, "MASK_WORDS": transfer.free_mask.shape[2], "MOST_MET": met.shape[2]}
         words = _WORDS_BESIDE + defines["MASK_WORDS"] + transfer.bands**2 + defines["MOST_MET"]
+        places = places_for(transfer.rows * transfer.cols, words)
         self._forget_others(camera, volume, stride, rays, ray_length_m, places, words)
         self._now += 1
         parameters = TRANSFER_CACHE_PARAMETERS(
@@ -193,6 +193,7 @@ class TransferCache:
         self._buffers.disc_frames.upload(np.zeros(places, np.int32))
 
 
-def places_for(samples: int) -> int:
-    """Places of the table for so many samples of a frame: a power of two."""
-    return min(1 << (PLACES_A_SAMPLE * max(samples, 1) - 1).bit_length(), MOST_PLACES)
+def places_for(samples: int, words: int) -> int:
+    """Places of the table for so many samples of a frame, of `words` 32-bit words each: a power of two."""
+    most = max(MOST_BYTES // (4 * words), 1)
+    return 1 << min((PLACES_A_SAMPLE * max(samples, 1) - 1).bit_length(), most.bit_length() - 1)

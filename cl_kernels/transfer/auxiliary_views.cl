@@ -42,74 +42,79 @@ kernel void draw_views(const int count, global const int *views, VOLUME_PARAMETE
     for (int lane = 0; lane < min(LANES, SIDE - x); lane++) depths[(view * SIDE + y) * SIDE + x + lane] = found[lane];
 }
 
-// LANES samples of the same direction set: every 8th sample along both axes has the same set (direction_sets.clh), so all of them
-// look into the same view for one direction.
+// Samples of the same direction set: every 8th sample along both axes has the same set (direction_sets.clh), so all of them look into
+// the same view for one direction. An item looks for a block of those, LANES at a time.
 #define SET_STEP 8
-#define LANE_COLS (LANES == 8 ? 4 : 1)
-#define LANE_ROWS (LANES / LANE_COLS)
+#define BLOCK_SIDE (LANES == 8 ? 16 : 1)
+
+// The bits of LANES samples at o (from the views' centre) with normals n: bit j of `bits` [LANES][MASK_WORDS], 0 before, is set where
+// direction j of the set that begins at `set` lies above the surface and its light arrives. shift: of a sample within its pixel.
+static void look(const LookUpParameters p, const Vectors o, const Vectors n, const int set, const float shift_x, const float shift_y,
+                 global const float4 *directions, global const int *view_of, global const float4 *axes, global const float *depths,
+                 uint *bits) {
+    const float distance_m = p.distance_m, per_pixel = p.per_pixel;
+    for (int j = 0; j < p.count; j++) {
+        const float4 w = directions[set + j];
+        const intn above = MASK(n.x * w.x + n.y * w.y + n.z * w.z > 0.0f);
+        if (!ANY(above)) continue;
+        const int view = view_of[set + j];
+        const float4 right = axes[3 * view], down = axes[3 * view + 1], ahead = axes[3 * view + 2];
+        const floatn z = ahead.x * o.x + ahead.y * o.y + ahead.z * o.z + distance_m;
+        const floatn pixels = 1.0f / (z * per_pixel);
+        const floatn x = (right.x * o.x + right.y * o.y + right.z * o.z) * pixels + shift_x;
+        const floatn y = (down.x * o.x + down.y * o.y + down.z * o.z) * pixels + shift_y;
+        const intn col = clamp(CONVERT_INTN(x), 0, SIDE - 1), row = clamp(CONVERT_INTN(y), 0, SIDE - 1);
+        const floatn depth = GATHER_FLOATN(depths, ((view * SIDE + row) * SIDE + col) & above);
+        const floatn sx = (CONVERT_FLOATN(col) - 0.5f * (SIDE - 1)) * per_pixel, sy = (CONVERT_FLOATN(row) - 0.5f * (SIDE - 1)) * per_pixel;
+        const floatn tx = depth * (sx * right.x + sy * down.x + ahead.x) - (distance_m * ahead.x + o.x);
+        const floatn ty = depth * (sx * right.y + sy * down.y + ahead.y) - (distance_m * ahead.y + o.y);
+        const floatn tz = depth * (sx * right.z + sy * down.z + ahead.z) - (distance_m * ahead.z + o.z);
+        const intn hidden = MASK(depth > 0.0f) & MASK(depth < z) & MASK(tx * n.x + ty * n.y + tz * n.z > p.lift_m) &
+                            MASK(tx * tx + ty * ty + tz * tz < p.ray_length_m * p.ray_length_m);
+        const int arrives = bits_of(above & ~hidden);
+        for (int lane = 0; lane < LANES; lane++)
+            bits[lane * MASK_WORDS + (j >> 5)] |= (uint)((arrives >> lane) & 1) << (j & 31);
+    }
+}
 
 // Whether the auxiliary view along each direction sees the sample: no surface in the sample's pixel of the view is nearer to the
 // view, within ray_length_m of the sample and above its tangent plane by lift_m.
 //
-// One item LANES samples, `blocks` items a set. positions [h][w], sample_normals [rows][cols] (w = 0 without surface); axes,
-// depths: see draw_views; view_of [sets][count]: the view for a direction.
+// One item a block of BLOCK_SIDE x BLOCK_SIDE samples of one set; there are block_cols x block_rows blocks of each set. positions
+// [h][w], sample_normals [rows][cols]: nothing is looked up and `lit` is not written where w = 0; axes, depths: see draw_views;
+// view_of [sets][count]: the view for a direction.
 // -> lit [rows][cols][MASK_WORDS]: bit j = direction j lies above the surface and its light arrives.
 kernel void look_into_views(const LookUpParameters p, global const float4 *positions, global const float4 *sample_normals,
                             global const float4 *directions, global const int *view_of, global const float4 *axes,
                             global const float *depths, global uint *lit) {
     const int item = get_global_id(0);
-    const int cols = p.grid.cols, rows = p.grid.rows, count = p.count, block_cols = p.block_cols, block_rows = p.block_rows;
-    const float distance_m = p.distance_m, per_pixel = p.per_pixel;
-    const int blocks = block_cols * block_rows;
+    const int cols = p.grid.cols, rows = p.grid.rows, blocks = p.block_cols * p.block_rows;
     if (item >= SET_STEP * SET_STEP * blocks) return;
     const int place = item / blocks, block = item % blocks;
-    const int first_col = place % SET_STEP + block % block_cols * (SET_STEP * LANE_COLS);
-    const int first_row = place / SET_STEP + block / block_cols * (SET_STEP * LANE_ROWS);
+    const int first_col = place % SET_STEP + block % p.block_cols * (SET_STEP * BLOCK_SIDE);
+    const int first_row = place / SET_STEP + block / p.block_cols * (SET_STEP * BLOCK_SIDE);
+    const float shift_x = 0.5f * SIDE + (first_col & 1) * 0.5f - 0.25f, shift_y = 0.5f * SIDE + (first_row & 1) * 0.5f - 0.25f;
+    const int set = (p.first_set + direction_set(first_row, first_col)) * p.count;
     float px[LANES], py[LANES], pz[LANES], nx[LANES], ny[LANES], nz[LANES];
-    int covered = 0;
-    for (int lane = 0; lane < LANES; lane++) {
-        const int col = first_col + lane % LANE_COLS * SET_STEP, row = first_row + lane / LANE_COLS * SET_STEP;
-        float4 position = (float4)(0.0f), normal = (float4)(0.0f);
-        if (col < cols && row < rows) {
-            position = positions[sample_pixel(p.grid, row, col)] - p.center;
-            normal = sample_normals[row * cols + col];
+    int sample[LANES];
+    int waiting = 0;
+    for (int i = 0; i < BLOCK_SIDE * BLOCK_SIDE; i++) {
+        const int col = first_col + i % BLOCK_SIDE * SET_STEP, row = first_row + i / BLOCK_SIDE * SET_STEP;
+        if (col < cols && row < rows && sample_normals[row * cols + col].w > 0.0f) {
+            const float4 position = positions[sample_pixel(p.grid, row, col)] - p.center, normal = sample_normals[row * cols + col];
+            px[waiting] = position.x, py[waiting] = position.y, pz[waiting] = position.z;
+            nx[waiting] = normal.x, ny[waiting] = normal.y, nz[waiting] = normal.z;
+            sample[waiting++] = row * cols + col;
         }
-        covered |= normal.w > 0.0f;
-        px[lane] = position.x, py[lane] = position.y, pz[lane] = position.z;
-        nx[lane] = normal.x, ny[lane] = normal.y, nz[lane] = normal.z;
-    }
-    uint bits[LANES * MASK_WORDS];
-    for (int i = 0; i < LANES * MASK_WORDS; i++) bits[i] = 0;
-    if (covered) {
+        if (waiting == 0 || (waiting < LANES && i < BLOCK_SIDE * BLOCK_SIDE - 1)) continue;
+        for (int lane = waiting; lane < LANES; lane++)
+            px[lane] = px[0], py[lane] = py[0], pz[lane] = pz[0], nx[lane] = nx[0], ny[lane] = ny[0], nz[lane] = nz[0];
         const Vectors o = {LOAD_LANES(px), LOAD_LANES(py), LOAD_LANES(pz)}, n = {LOAD_LANES(nx), LOAD_LANES(ny), LOAD_LANES(nz)};
-        const float shift_x = 0.5f * SIDE + (first_col & 1) * 0.5f - 0.25f, shift_y = 0.5f * SIDE + (first_row & 1) * 0.5f - 0.25f;
-        const int set = (p.first_set + direction_set(first_row, first_col)) * count;
-        for (int j = 0; j < count; j++) {
-            const float4 w = directions[set + j];
-            const intn above = MASK(n.x * w.x + n.y * w.y + n.z * w.z > 0.0f);
-            if (!ANY(above)) continue;
-            const int view = view_of[set + j];
-            const float4 right = axes[3 * view], down = axes[3 * view + 1], ahead = axes[3 * view + 2];
-            const floatn z = ahead.x * o.x + ahead.y * o.y + ahead.z * o.z + distance_m;
-            const floatn pixels = 1.0f / (z * per_pixel);
-            const floatn x = (right.x * o.x + right.y * o.y + right.z * o.z) * pixels + shift_x;
-            const floatn y = (down.x * o.x + down.y * o.y + down.z * o.z) * pixels + shift_y;
-            const intn col = clamp(CONVERT_INTN(x), 0, SIDE - 1), row = clamp(CONVERT_INTN(y), 0, SIDE - 1);
-            const floatn depth = GATHER_FLOATN(depths, ((view * SIDE + row) * SIDE + col) & above);
-            const floatn sx = (CONVERT_FLOATN(col) - 0.5f * (SIDE - 1)) * per_pixel, sy = (CONVERT_FLOATN(row) - 0.5f * (SIDE - 1)) * per_pixel;
-            const floatn tx = depth * (sx * right.x + sy * down.x + ahead.x) - (distance_m * ahead.x + o.x);
-            const floatn ty = depth * (sx * right.y + sy * down.y + ahead.y) - (distance_m * ahead.y + o.y);
-            const floatn tz = depth * (sx * right.z + sy * down.z + ahead.z) - (distance_m * ahead.z + o.z);
-            const intn hidden = MASK(depth > 0.0f) & MASK(depth < z) & MASK(tx * n.x + ty * n.y + tz * n.z > p.lift_m) &
-                                MASK(tx * tx + ty * ty + tz * tz < p.ray_length_m * p.ray_length_m);
-            const int arrives = bits_of(above & ~hidden);
-            for (int lane = 0; lane < LANES; lane++)
-                bits[lane * MASK_WORDS + (j >> 5)] |= (uint)((arrives >> lane) & 1) << (j & 31);
-        }
-    }
-    for (int lane = 0; lane < LANES; lane++) {
-        const int col = first_col + lane % LANE_COLS * SET_STEP, row = first_row + lane / LANE_COLS * SET_STEP;
-        if (col >= cols || row >= rows) continue;
-        for (int i = 0; i < MASK_WORDS; i++) lit[(row * cols + col) * MASK_WORDS + i] = bits[lane * MASK_WORDS + i];
+        uint bits[LANES * MASK_WORDS];
+        for (int k = 0; k < LANES * MASK_WORDS; k++) bits[k] = 0;
+        look(p, o, n, set, shift_x, shift_y, directions, view_of, axes, depths, bits);
+        for (int lane = 0; lane < waiting; lane++)
+            for (int k = 0; k < MASK_WORDS; k++) lit[sample[lane] * MASK_WORDS + k] = bits[lane * MASK_WORDS + k];
+        waiting = 0;
     }
 }

@@ -46,13 +46,13 @@ static inline Vectors turned(const float16 m, const Vectors v) {
 }
 
 // V' of eq. 6.3 along LANES directions w (view axes) from one point: the least over `steps` samples y at distances r, r ratio,
-// ..., none beyond near_m that surface known to the volume hides, and none beyond ray_length_m. `surface`, `normal`: the point's tangent
-// plane, view axes. A sample is hidden where the surface s that
+// ..., none beyond near_m that surface known to the volume hides, none beyond ray_length_m, and none that other surface hides
+// unless has_unknown. `surface`, `normal`: the point's tangent plane, view axes. A sample is hidden where the surface s that
 // the view sees on its line of sight is nearer than it by more than bias_m; s must be above the tangent plane by lift_m, or a
 // flat wall would hide itself. V' is 0 where s lies along w and 1 from the threshold on. slack: s may be deeper by up to this
 // fraction of r, the gap between two samples.
 static floatn visibility(const View view, const float3 origin, const float3 surface, const float3 normal, const Vectors w,
-                         floatn r, const float ratio, const int steps, const float near_m, const float ray_length_m,
+                         floatn r, const float ratio, const int steps, const int has_unknown, const float near_m, const float ray_length_m,
                          const float bias_m, const float lift_m, const float slack, const float inverse_threshold) {
     const float4 lens = view.intrinsics;
     const float per_x = 1.0f / lens.s0, per_y = 1.0f / lens.s1;
@@ -66,7 +66,7 @@ static floatn visibility(const View view, const float3 origin, const float3 surf
         const intn inside = ahead & MASK(u > 0.0f) & MASK(v > 0.0f) & MASK(u < (float)view.width) & MASK(v < (float)view.height);
         const intn col = CONVERT_INTN(inside ? u : 0.0f), row = CONVERT_INTN(inside ? v : 0.0f);
         const floatn kept = GATHER_FLOATN(view.depths, row * view.width + col), depth = fabs(kept);
-        const intn counts = MASK(kept < 0.0f) | (MASK(kept > 0.0f) & MASK(r < near_m));
+        const intn counts = (MASK(kept < 0.0f) & -has_unknown) | (MASK(kept > 0.0f) & MASK(r < near_m));
         const intn hidden = inside & counts & MASK(y.z - depth > bias_m);
         if (ANY(hidden)) {
             const floatn center_x = (CONVERT_FLOATN(col) - lens.s2) * per_x, center_y = (CONVERT_FLOATN(row) - lens.s3) * per_y;
@@ -85,7 +85,7 @@ static floatn visibility(const View view, const float3 origin, const float3 surf
 // Reduces open[] of directions above the horizon by the occluders in the camera's own picture.
 static void look_near(const View view, const float3 origin, const float3 surface, const float3 normal, const int count,
                       global const float4 *directions, global const float *starts, const float ratio, const int steps,
-                      const float near_m, const float ray_length_m, const float bias_m, const float lift_m, const float slack,
+                      const int has_unknown, const float near_m, const float ray_length_m, const float bias_m, const float lift_m, const float slack,
                       const float inverse_threshold,
                       float *open) {
     const float3 origin_in_view = transform_point(view.view_from_volume, origin);
@@ -102,22 +102,30 @@ static void look_near(const View view, const float3 origin, const float3 surface
         const Vectors w = {GATHER_FLOATN(components, first), GATHER_FLOATN(components, first + 1), GATHER_FLOATN(components, first + 2)};
         float found[LANES];
         STORE_LANES(visibility(view, origin_in_view, surface_in_view, normal_in_view, turned(view.view_from_volume, w),
-                               GATHER_FLOATN(starts, which), ratio, steps, near_m, ray_length_m, bias_m, lift_m, slack, inverse_threshold),
+                               GATHER_FLOATN(starts, which), ratio, steps, has_unknown, near_m, ray_length_m, bias_m, lift_m, slack, inverse_threshold),
                     found);
         for (int lane = 0; lane < waiting; lane++) open[chosen[lane]] = fmin(open[chosen[lane]], found[lane]);
         waiting = 0;
     }
 }
 
-// Mean normals around samples: see smooth_normal.clh -> [rows][cols], w: flatness, 0 where there is no surface.
+// Mean normals around samples: see smooth_normal.clh -> [rows][cols], w: flatness, 0 where there is no surface. With HAS_CACHE also
+// 0 where a sample is `found` (transfer_cache.cl): nothing is looked up for it.
 kernel void smooth_normals(const int cols, const int rows, const int stride, const int width, const int height, const int radius,
                            global const float4 *positions, global const float4 *normals, const float voxel_m,
-                           global float4 *sample_normals) {
+                           global float4 *sample_normals
+#ifdef HAS_CACHE
+                           , global const int *found
+#endif
+) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= cols || row >= rows) return;
     const int x = stride / 2 + col * stride, y = stride / 2 + row * stride;
-    const int valid = positions[y * width + x].w > 0.0f && normals[y * width + x].w > 0.0f;
+    int valid = positions[y * width + x].w > 0.0f && normals[y * width + x].w > 0.0f;
+#ifdef HAS_CACHE
+    valid = valid && found[row * cols + col] < 0;
+#endif
     sample_normals[row * cols + col] = valid ? smooth_normal(width, height, positions, normals, x, y, radius, voxel_m) : (float4)(0.0f);
 }
 
@@ -125,14 +133,19 @@ kernel void smooth_normals(const int cols, const int rows, const int stride, con
 // The unoccluded part is exact, as in radiance_transfer.cl, whose arguments and results the first and last ones are.
 //
 // sample_normals: see smooth_normals. lit [rows][cols][MASK_WORDS]: of look_into_views. camera_depths [height][width],
-// camera_from_volume, intrinsics: the camera's picture, looked into at `steps` distances, which lie within near_m, and at `further`
-// ones where there is something that the volume does not know. starts [4][count]: distance of a direction's first sample in metres,
-// for the 2 x 2 pattern of jitter. inverse_threshold: 1 / chi.
+// camera_from_volume, intrinsics: the camera's picture, looked into at `steps` distances, which lie within near_m, and, unless it is 0,
+// at `further` ones where there is something that the volume does not know. starts [4][count]: distance of a direction's first sample in metres,
+// for the 2 x 2 pattern of jitter. inverse_threshold: 1 / chi. With HAS_CACHE samples that are `found` (transfer_cache.cl) keep their
+// values.
 kernel void transfer_from_views(const ViewTransferParameters parameters, global const float4 *positions,
                                 global const float4 *sample_normals, global const uint *lit, global const float *camera_depths,
                                 global const float4 *directions, global const float *basis, global const float *starts,
                                 global const int *any_unknown, global float *transfer, global float *openness,
-                                global float *flatness, global uint *free_mask) {
+                                global float *flatness, global uint *free_mask, global uchar *sets
+#ifdef HAS_CACHE
+                                , global const int *found
+#endif
+) {
     const Grid grid = parameters.grid;
     const int count = parameters.count;
     const float voxel_m = parameters.voxel_m;
@@ -140,9 +153,13 @@ kernel void transfer_from_views(const ViewTransferParameters parameters, global 
     const int row = get_global_id(1);
     if (col >= grid.cols || row >= grid.rows) return;
     const int sample = row * grid.cols + col;
+#ifdef HAS_CACHE
+    if (found[sample] >= 0) return;
+#endif
     const float4 position = positions[sample_pixel(grid, row, col)];
     const float4 normal = sample_normals[sample];
     const int valid = normal.w > 0.0f;
+    const int own = parameters.first_set + direction_set(row, col);
 
     float t[COEFFICIENTS];
     for (int i = 0; i < COEFFICIENTS; i++) t[i] = 0.0f;
@@ -154,13 +171,14 @@ kernel void transfer_from_views(const ViewTransferParameters parameters, global 
         sh_basis(normal.xyz, t);
         for (int l = 0; l < BANDS; l++)
             for (int i = l * l; i < (l + 1) * (l + 1); i++) t[i] *= lambert_band(l);
-        const int set = (parameters.first_set + direction_set(row, col)) * count;
+        const int set = own * count;
         float open[DIRECTIONS];
         for (int j = 0; j < count; j++) open[j] = (lit[sample * MASK_WORDS + (j >> 5)] >> (j & 31)) & 1;
+        const int has_unknown = parameters.further > 0 && *any_unknown;
         const View camera = {parameters.camera_from_volume, parameters.intrinsics, grid.width, parameters.height, camera_depths};
         look_near(camera, position.xyz + voxel_m * normal.xyz, position.xyz, normal.xyz, count, directions + set,
-                  starts + ((row & 1) * 2 + (col & 1)) * count, parameters.ratio, *any_unknown ? parameters.further : parameters.steps,
-                  parameters.near_m, parameters.ray_length_m, voxel_m, voxel_m, parameters.slack, parameters.inverse_threshold, open);
+                  starts + ((row & 1) * 2 + (col & 1)) * count, parameters.ratio, has_unknown ? parameters.further : parameters.steps,
+                  has_unknown, parameters.near_m, parameters.ray_length_m, voxel_m, voxel_m, parameters.slack, parameters.inverse_threshold, open);
         for (int j = 0; j < count; j++) {
             const float4 direction = directions[set + j];
             const float share = fmax(dot(normal.xyz, direction.xyz), 0.0f) * direction.w * M_1_PI_F;
@@ -175,6 +193,7 @@ kernel void transfer_from_views(const ViewTransferParameters parameters, global 
     }
     for (int i = 0; i < COEFFICIENTS; i++) transfer[sample * COEFFICIENTS + i] = t[i];
     for (int i = 0; i < MASK_WORDS; i++) free_mask[sample * MASK_WORDS + i] = mask[i];
+    sets[sample] = (uchar)own;
     flatness[sample] = normal.w;
     openness[sample] = valid && sky > 0.0f ? 1.0f - blocked_sky / sky : -1.0f;
 }

@@ -33,6 +33,7 @@ VIEWS = 1024
 DISTANCE = 50.0
 """From a view's eye to the volume's centre, in half diagonals: lines of sight are parallel to 1.2 degrees."""
 _SET_STEP = 8  # samples so far apart along an axis have the same directions
+_BLOCK_SIDE = 16  # of the samples of one set that a work-item of several lanes looks for; as in auxiliary_views.cl
 LEAST_TURN = float(np.cos(np.deg2rad(3.0)))
 """The view from the dominant light is drawn anew once the light has turned by 3 degrees."""
 GROWTH = 0.03
@@ -41,8 +42,8 @@ GROWTH = 0.03
 A camera that enters a room sees most of it within a second; light would leak through outdated views."""
 YOUNG_FRAMES = 16
 """A view of a volume of fewer frames is redrawn when the number of frames has doubled: few noisy frames leave holes."""
-MOST_PER_FRAME = 96
-"""Most views that one frame redraws."""
+MOST_PER_FRAME = 24
+"""Most views that one frame redraws: all of them in 43 frames while the volume grows."""
 
 
 @dataclass(frozen=True)
@@ -197,13 +198,14 @@ def look_into_views(
 ) -> cl_array.Array:
     """[rows, cols, words] uint32: bit j set where direction j is above the surface of a sample and its view sees it.
 
-    normals: [rows, cols] float4 of the samples, w = 0 without surface. view_of: [SETS, count].
+    normals: [rows, cols] float4 of the samples, w = 0 where nothing is wanted and the result undefined. view_of:
+    [SETS, count].
     """
     rows, cols = normals.shape
     words = -(-rays.count // 32)
     lit = engine.buffers(_Buffers).lit.array((rows, cols, words))
-    lane_cols = 4 if engine.lanes == 8 else 1
-    block_cols, block_rows = -(-cols // (_SET_STEP * lane_cols)), -(-rows // (_SET_STEP * engine.lanes // lane_cols))
+    side = _BLOCK_SIDE if engine.lanes == 8 else 1
+    block_cols, block_rows = -(-cols // (_SET_STEP * side)), -(-rows // (_SET_STEP * side))
     engine.launch(
         _kernel(engine, "look_into_views", views, words),
         (_SET_STEP**2 * block_cols * block_rows,),
@@ -226,6 +228,7 @@ def look_into_views(
         views.axes,
         views.depths,
         lit,
+        local=(8,),
     )
     return lit
 

@@ -23,16 +23,15 @@ from server.maths.rigid import inverse_rigid
 from server.maths.self_occlusion import occlusion_threshold
 from server.maths.sh import GOLDEN_TURN
 from server.opencl.buffers import BufferDescription, StageBuffers
-from server.opencl.engine import Engine, float16
+from server.opencl.engine import Engine, KernelArgument, float16
 from server.opencl.structs import VIEW_TRANSFER_PARAMETERS
 from server.transfer.auxiliary_views import VIEWS, AuxiliaryViews, ViewsAround, look_into_views
 from server.transfer.radiance_transfer import (
     Directions,
     Transfer,
     first_set,
-    own_sets,
-    room_for_transfer,
     sample_grid,
+    traced_transfer,
     window_arguments,
 )
 from server.transfer.real_depth_views import RealDepthViews
@@ -41,8 +40,9 @@ from server.volume.volume import Volume
 
 Floats = NDArray[np.float64]
 
-VIEWS_PER_FRAME = 32
-"""Auxiliary views redrawn in each frame: all of them in 32 frames."""
+VIEWS_PER_FRAME = 16
+"""Auxiliary views redrawn in each frame: all of them in 64 frames, as long as places of the world keep their transfer
+at most (transfer_cache.py). In the real kitchen 8 to 96 a frame make pictures that differ by FLIP .0003."""
 NEAR_STEPS = 4
 """Samples along a direction in the camera's picture."""
 NEAR_PIXELS = 4.0
@@ -97,6 +97,7 @@ class ImageSpaceTransfer:
         dominant_direction: Floats | None = None,
         threshold: float | None = None,
         turn: int = 0,
+        found: cl_array.Array | None = None,
     ) -> Transfer:
         """Transfer of the real world without virtual objects at every `stride`-th pixel, in arrays as
         `transfer_radiance` has.
@@ -104,7 +105,8 @@ class ImageSpaceTransfer:
         surface: the hybrid geometry buffer. dominant_direction: world, unit, towards the last estimated light, which
         gets a view of its own; None or zeros: not known. threshold: chi of eq. 6.3, None: 1 - cos of half the median
         angle. Beyond the near part, only the first surface that the light meets counts: if `ray_length_m` ends inside
-        the scene, a nearer surface behind it may be missed. turn: as in `transfer_radiance`.
+        the scene, a nearer surface behind it may be missed. turn, found: as in `transfer_radiance`; what is found at
+        places of the world is of the scan, so with `found` surface that only the sensor knows (a hand) blocks nothing.
         """
         views = self._around.update(volume, dominant_direction)
         view_of = self._views_for(views)
@@ -133,6 +135,7 @@ class ImageSpaceTransfer:
             ray_length_m,
             threshold or self._threshold,
             turn,
+            found,
         )
 
     def _views_for(self, views: AuxiliaryViews) -> NDArray[np.int32]:
@@ -213,19 +216,23 @@ def transfer_from_views(
     ray_length_m: float,
     threshold: float,
     turn: int = 0,
+    found: cl_array.Array | None = None,
 ) -> Transfer:
     """As ImageSpaceTransfer.transfer, for given views. view_of [SETS, count]: the view for each direction."""
-    cols, rows = camera.width // stride, camera.height // stride
-    result = room_for_transfer(engine, rows, cols, stride, rays, own_sets(engine, rows, cols, turn))
+    result = traced_transfer(engine, camera, stride, rays)
     near_m = near_reach_m(views, ray_length_m)
     starts, ratio = near_distances(rays.count, volume.voxel_m, near_m)
     lift_m = LIFT_VOXELS * volume.voxel_m
     defines = {"BANDS": result.bands, "MASK_WORDS": result.free_mask.shape[2], "LANES": engine.lanes}
     depths, any_unknown = camera_depths(engine, camera, volume_from_camera, surface, defines)
-    normals = smooth_normals(engine, camera, surface, stride, volume.voxel_m, defines)
+    only: tuple[KernelArgument, ...] = ()
+    if found is not None:
+        defines["HAS_CACHE"] = 1
+        only = (found,)
+    normals = smooth_normals(engine, camera, surface, stride, volume.voxel_m, defines, only)
     engine.launch(
         engine.kernel("image_space.cl", "transfer_from_views", **defines),
-        (cols, rows),
+        (result.cols, result.rows),
         VIEW_TRANSFER_PARAMETERS(
             grid=sample_grid(camera, result),
             camera_from_volume=float16(inverse_rigid(volume_from_camera)),
@@ -236,7 +243,7 @@ def transfer_from_views(
             first_set=first_set(turn),
             ratio=ratio,
             steps=NEAR_STEPS,
-            further=FURTHER_STEPS,
+            further=FURTHER_STEPS if found is None else 0,
             near_m=near_m,
             ray_length_m=ray_length_m,
             slack=SLACK,
@@ -254,14 +261,25 @@ def transfer_from_views(
         result.openness,
         result.flatness,
         result.free_mask,
+        result.sets,
+        *only,
     )
     return result
 
 
 def smooth_normals(
-    engine: Engine, camera: CameraModel, surface: Surface, stride: int, voxel_m: float, defines: dict[str, int]
+    engine: Engine,
+    camera: CameraModel,
+    surface: Surface,
+    stride: int,
+    voxel_m: float,
+    defines: dict[str, int],
+    only: tuple[KernelArgument, ...] = (),
 ) -> cl_array.Array:
-    """[rows, cols] float4: mean normals around the samples, volume space, w: flatness; 0 without surface."""
+    """[rows, cols] float4: mean normals around the samples, volume space, w: flatness; 0 without surface.
+
+    `only`: of transfer_cache.py, with HAS_CACHE; samples that were found there have 0 too.
+    """
     cols, rows = camera.width // stride, camera.height // stride
     normals = engine.buffers(_Buffers).normals.array((rows, cols))
     engine.launch(
@@ -270,5 +288,6 @@ def smooth_normals(
         *window_arguments(camera, surface, stride),
         voxel_m,
         normals,
+        *only,
     )
     return normals

@@ -165,15 +165,17 @@ def transfer_radiance(
 ) -> Transfer:
     """Transfer of the real world without virtual objects at every `stride`-th pixel, by rays of at most `ray_length_m`.
 
-    `caches`: visibility from earlier frames, needed where `rays` are interleaved; this frame's is added.
+    `caches`: visibility from earlier frames, of the subsets of `rays` that this frame does not trace; this frame's is
+    added. Without them all subsets are traced.
     `state`: voxels that are known to be open, where no ray is traced. `turn`: selects the direction sets, modulo TURNS.
     `chosen` [k]: only these samples (row * cols + col) are traced; the others keep their values.
     `found`: of transfer_cache.py; samples that were found there keep their values.
     """
     cols, rows = camera.width // stride, camera.height // stride
-    buffers, result = engine.buffers(TransferBuffers), traced_transfer(engine, camera, stride, rays)
+    subsets = rays.interleave if caches else 1
+    buffers, result = engine.buffers(TransferBuffers), traced_transfer(engine, camera, stride, rays, subsets)
     words = result.free_mask.shape[2]
-    defines = {"BANDS": result.bands, "MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": rays.interleave}
+    defines = {"BANDS": result.bands, "MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": subsets}
     if state is not None:
         defines["HAS_STATE"] = 1
     only: tuple[KernelArgument, ...] = (state.bits,) if state else ()
@@ -215,10 +217,10 @@ def transfer_radiance(
     return result
 
 
-def traced_transfer(engine: Engine, camera: CameraModel, stride: int, rays: Directions) -> Transfer:
-    """What `transfer_radiance` returns, before it has run."""
+def traced_transfer(engine: Engine, camera: CameraModel, stride: int, rays: Directions, subsets: int = 1) -> Transfer:
+    """What `transfer_radiance` returns, before it has run. `subsets`: that each have a direction set of their own."""
     cols, rows = camera.width // stride, camera.height // stride
-    sets = engine.buffers(TransferBuffers).sets[rows, cols].array((rows, cols, rays.interleave))
+    sets = engine.buffers(TransferBuffers).sets[rows, cols].array((rows, cols, subsets))
     return room_for_transfer(engine, rows, cols, stride, rays, sets)
 
 

@@ -40,18 +40,25 @@ class SampledTransfer:
     def __init__(
         self, engine: Engine, camera: CameraModel, sampling: Sampling, rays: int, bands: int, *, is_cached: bool = False
     ) -> None:
-        """`is_cached`: transfer of earlier frames is used at the places where it was found (transfer_cache.py)."""
+        """`is_cached`: transfer of earlier frames is used at the places where it was found (transfer_cache.py), unless
+        there is a visibility state."""
         self._engine = engine
         self._camera = camera
         self._bands = bands
-        self._sampler = TransferSampler(engine, camera, sampling, rays, bands)
         self._cache = TransferCache(engine) if is_cached else None
+        self._sampler = self._sampler_for(sampling, rays)
         self._mean_sent = MeanSent()
         self._has_found = False
 
     def use(self, sampling: Sampling, rays: int) -> None:
         """Change the sampling. Visibility of earlier frames is forgotten."""
-        self._sampler = TransferSampler(self._engine, self._camera, sampling, rays, self._bands)
+        self._sampler = self._sampler_for(sampling, rays)
+        if self._cache:
+            self._cache.forget()
+
+    def _sampler_for(self, sampling: Sampling, rays: int) -> TransferSampler:
+        has_places = self._cache is not None
+        return TransferSampler(self._engine, self._camera, sampling, rays, self._bands, has_places=has_places)
 
     @property
     def sampling(self) -> Sampling:
@@ -95,7 +102,7 @@ class SampledTransfer:
     ) -> TransferSamples:
         """Transfer of the real world without virtual objects (eq. 5.2). up: [3] unit, world axes."""
         engine, camera, rays = self._engine, self._camera, self._sampler.rays
-        cache, found = self._cache if self._sampler.may_be_cached else None, None
+        cache, found = self._cache if self._sampler.is_kept else None, None
         self._has_found = cache is not None
         if cache:
             stride = self._sampler.sampling.stride

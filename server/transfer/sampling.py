@@ -69,19 +69,35 @@ PRESETS = {
 }
 """Thesis 6.1.3.1 and 6.2.3; RM is its GR12, ART4 its GR14. The number is the spacing in pixels. ART traces a fourth of
 its directions in each frame. In the thesis a frame traces a fourth of RM's; here it traces as many as RM, so a sample
-has four times as many: still several times faster, with a light nearer to RM's."""
+has four times as many: still several times faster, with a light nearer to RM's. Where transfer is kept at places of the
+world, a sample has as many directions, traced at once."""
 
 
 class TransferSampler:
     """Radiance transfer of one session, with its caches from earlier frames."""
 
-    def __init__(self, engine: Engine, camera: CameraModel, sampling: Sampling, rays: int, bands: int) -> None:
-        """`rays`: directions of a sample in all subsets, or in one, see `Sampling.rays_per_frame`."""
+    def __init__(
+        self,
+        engine: Engine,
+        camera: CameraModel,
+        sampling: Sampling,
+        rays: int,
+        bands: int,
+        *,
+        has_places: bool = False,
+    ) -> None:
+        """`rays`: directions of a sample in all subsets, or in one, see `Sampling.rays_per_frame`.
+
+        `has_places`: transfer is kept at places of the world (transfer_cache.py), unless there is a visibility state. A
+        place is traced rarely, and then along all its directions: nothing is left to interleave.
+        """
         self._engine = engine
         self._camera = camera
         self.sampling = sampling
+        self.is_kept = has_places and not sampling.visibility_state
+        """Whether samples of earlier frames are told to `transfer`."""
         self.rays: Directions = direction_sets(sampling.directions(rays), bands, sampling.interleave)
-        self._caches = VisibilityCaches(engine, sampling.interleave) if sampling.interleave > 1 else None
+        self._caches = VisibilityCaches(engine, sampling.interleave) if self._interleave > 1 else None
         self._state: VisibilityState | None = None
         self._frame = -1
         self._image_space = ImageSpaceTransfer(engine, self.rays, sampling.views) if sampling.image_space else None
@@ -92,15 +108,14 @@ class TransferSampler:
         return self._image_space.depth_views if self._image_space else None
 
     @property
-    def may_be_cached(self) -> bool:
-        """Whether every frame traces all directions of a sample by rays: else earlier frames are used in other ways."""
-        sampling = self.sampling
-        return sampling.interleave == 1 and not sampling.image_space and not sampling.visibility_state
+    def _interleave(self) -> int:
+        """Frames that trace the directions of a sample between them."""
+        return 1 if self.is_kept else self.sampling.interleave
 
     @property
     def period(self) -> int:
         """Number of frames after which a still view gets the same samples again."""
-        return (TURNS if self.sampling.turning else 1) * self.sampling.interleave
+        return (TURNS if self.sampling.turning else 1) * self._interleave
 
     def pass_frame(self) -> None:
         """Advance the sequence of direction sets for a frame without transfer."""
@@ -117,16 +132,16 @@ class TransferSampler:
     ) -> Transfer:
         """Transfer of the real world without virtual objects; rays of at most `ray_length_m`; `up` unit, world axes.
 
-        found: of transfer_cache.py, samples that keep their values; only where `may_be_cached`.
+        found: of transfer_cache.py, samples that keep their values; if and only if `is_kept`.
         """
         engine, camera, sampling = self._engine, self._camera, self.sampling
         self._frame += 1
         turn = (
-            self._frame // sampling.interleave if sampling.turning else 0
+            self._frame // self._interleave if sampling.turning else 0
         )  # subsets of the same set are the most evenly spread
         if self._image_space:
             return self._image_space.transfer(
-                camera, volume_from_camera, volume, surface, sampling.stride, ray_length_m, turn=turn
+                camera, volume_from_camera, volume, surface, sampling.stride, ray_length_m, turn=turn, found=found
             )
         if self._caches:
             self._caches.begin_frame(camera, volume_from_camera, sampling.stride, self.rays.count, ray_length_m)

@@ -6,6 +6,9 @@ saw a frame, or a turn, ago. A sample that finds nothing is traced and stored. A
 frames, then after twice as many each time, LONGEST at most, because a young scan grows and an old one hardly does. So
 an entry is off by what the scan has changed in as many frames as it was old, LONGEST at most, and belongs to a point
 in the same cell. Surface that moves is no exception: what a point sees of the scan depends on where it is only.
+
+Transfer that is looked up in depth views (image_space.py) is kept likewise, with what the camera's picture adds near a
+point when it is looked up. What of the picture is not in the scan belongs to no place and is left out.
 """
 
 from __future__ import annotations
@@ -31,8 +34,8 @@ PERIOD, LONGEST = 16, 64
 PLACES_A_SAMPLE = 4
 """Size of the table, in samples of a frame, rounded up to a power of two. Views of the last seconds fit, and few cells
 collide."""
-MOST_PLACES = 1 << 20
-"""Of 236 bytes each with the defaults."""
+MOST_BYTES = 1 << 28
+"""Of the table. A place takes 232 bytes with the defaults, 504 with ART4's 324 directions."""
 _WORDS_BESIDE = 18
 """Words of an entry besides mask, coefficients and directions that met surface, as in transfer_cache.cl."""
 _UNCLAIMED = 0xFFFFFFFF
@@ -76,6 +79,10 @@ class TransferCache:
         self._now = 0
         self._frame: _Frame | None = None
 
+    def forget(self) -> None:
+        """Begin anew with the next frame: transfer is found in another way."""
+        self._of = ()
+
     def find(
         self,
         camera: CameraModel,
@@ -92,10 +99,10 @@ class TransferCache:
         What was found by other rays, in another volume or by another camera model is forgotten.
         """
         engine, transfer = self._engine, traced_transfer(self._engine, camera, stride, rays)
-        places = places_for(transfer.rows * transfer.cols)
         hits, met = room_for_hits(engine, transfer), room_for_met(engine, transfer, rays)
         defines = {"BANDS": transfer.bands, "MASK_WORDS": transfer.free_mask.shape[2], "MOST_MET": met.shape[2]}
         words = _WORDS_BESIDE + defines["MASK_WORDS"] + transfer.bands**2 + defines["MOST_MET"]
+        places = places_for(transfer.rows * transfer.cols, words)
         self._forget_others(camera, volume, stride, rays, ray_length_m, places, words)
         self._now += 1
         parameters = TRANSFER_CACHE_PARAMETERS(
@@ -186,6 +193,7 @@ class TransferCache:
         self._buffers.disc_frames.upload(np.zeros(places, np.int32))
 
 
-def places_for(samples: int) -> int:
-    """Places of the table for so many samples of a frame: a power of two."""
-    return min(1 << (PLACES_A_SAMPLE * max(samples, 1) - 1).bit_length(), MOST_PLACES)
+def places_for(samples: int, words: int) -> int:
+    """Places of the table for so many samples of a frame, of `words` 32-bit words each: a power of two."""
+    most = max(MOST_BYTES // (4 * words), 1)
+    return 1 << min((PLACES_A_SAMPLE * max(samples, 1) - 1).bit_length(), most.bit_length() - 1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,10 +23,11 @@ from server.opencl.engine import Engine
 from server.transfer import auxiliary_views, image_space
 from server.transfer.auxiliary_views import AuxiliaryViews, ViewsAround
 from server.transfer.image_space import ImageSpaceTransfer, near_distances, nearest_views, sample_phases
-from server.transfer.radiance_transfer import Directions, Transfer, direction_sets
+from server.transfer.radiance_transfer import Directions, Transfer, direction_sets, first_set, traced_transfer
 from server.volume.raycast import LABEL_DYNAMIC, LABEL_FILLED, LABEL_NONE, LABEL_STATIC, Surface
 from server.volume.volume import Volume
 from tests.reference import image_space as twin
+from tests.reference.radiance_transfer import direction_set
 from tests.reference.visibility import first_solid
 from tests.scenes.analytic import look_at, pixel_rays
 from tests.scenes.depth_view_scene import host_views
@@ -149,6 +150,42 @@ def test_transfer_is_the_twins(
     assert stride == 8 or ((visible > 0.01) & (visible < 0.99)).any()  # eq. 6.3 took part
 
 
+@pytest.mark.parametrize("share", [0.0, 0.85, 1.0])
+def test_samples_that_were_found_keep_their_values(device: Device, engine: Engine, share: float) -> None:
+    """Of transfer_cache.py. The others are the twin's, for which surface that the sensor alone knows blocks nothing."""
+    scene, stride, turn = SCENES["ball above a floor"], 2, 3
+    looked = look(engine, scene, holes=0.05, hand=scene[1])
+    rays = direction_sets(33, 2)
+    threshold = occlusion_threshold(rays.directions[0, :, :3].astype(float))
+    views = ViewsAround(engine, 48).update(looked.volume)
+    _, view_of = nearest_views(rays, views.toward)
+    room = traced_transfer(engine, CAMERA, stride, rays)
+    assert room.sets is not None
+    arrays = (room.coefficients, room.openness, room.flatness, room.free_mask, room.sets)
+    for array in arrays:
+        array.fill(array.dtype.type(7))
+    found = np.random.default_rng(5).random((room.rows, room.cols)) < share
+    places = engine.workspace.upload("test_found", np.where(found, 3, -1).astype(np.int32))
+    image_space.transfer_from_views(
+        *(engine, CAMERA, VIEW, looked.volume, looked.surface, views, view_of, stride, rays, ROOM_M, threshold),
+        turn,
+        places,
+    )
+    transfer, openness, flatness, mask, sets = (engine.download(array) for array in arrays)
+    for array in (transfer, openness, flatness, mask, sets):
+        assert (array[found] == 7).all()
+    later = replace(
+        rays, directions=np.roll(rays.directions, -first_set(turn), 0), basis=np.roll(rays.basis, -first_set(turn), 0)
+    )
+    turned = np.roll(view_of, -first_set(turn), 0)
+    expected, sky, _ = twin_of(engine, looked, views, turned, stride, later, ROOM_M, threshold, has_unknown=False)
+    agree = (np.abs(transfer - expected) < 20 * relative_tolerance(device)).all(-1)[~found]
+    assert share == 1 or agree.mean() > 0.99  # seen: all
+    np.testing.assert_allclose(openness[~found][agree], sky[~found][agree], atol=20 * relative_tolerance(device))
+    row, col = np.nonzero(~found)
+    np.testing.assert_array_equal(sets[~found][..., 0], first_set(turn) + np.asarray(direction_set(row, col)))
+
+
 def twin_of(
     engine: Engine,
     looked: Looked,
@@ -158,14 +195,18 @@ def twin_of(
     rays: Directions,
     ray_length_m: float,
     threshold: float,
+    *,
+    has_unknown: bool = True,
 ) -> tuple[Floats, Floats, Floats]:
+    """has_unknown: whether surface that the sensor alone knows blocks anything."""
     near_m = min(image_space.NEAR_PIXELS * views.pixel_m, ray_length_m)
     starts, ratio = near_distances(rays.count, VOXEL_M, near_m)
     camera_from_volume = inverse_rigid(VIEW)
     in_camera = looked.positions[..., :3] @ camera_from_volume[:3, :3].T + camera_from_volume[:3, 3]
-    unknown = looked.labels == LABEL_DYNAMIC
+    unknown = (looked.labels == LABEL_DYNAMIC) & has_unknown
+    blocking = unknown | (looked.labels == LABEL_STATIC)
     near = twin.Near(
-        np.where((looked.labels == LABEL_NONE) | (looked.labels == LABEL_FILLED), 0, in_camera[..., 2]),
+        np.where(blocking, in_camera[..., 2], 0),
         unknown,
         camera_from_volume,
         (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy),

@@ -25,6 +25,8 @@ ROWS, COLS, STRIDE = 13, 19, 1
 CAMERA = CameraModel(width=COLS, height=ROWS, fx=40.0, fy=40.0, cx=9.0, cy=6.0)
 SPACING = STRIDE / CAMERA.fx
 RAYS = direction_sets(33, 2)
+WORDS = 18 + 2 + 4 + 9
+"""Of an entry: with 33 directions in the mask, 2 x 2 coefficients, every fourth direction's surface."""
 REACH_M = 10.0
 CLEAR = 1e-3
 """Margin of samples from borders of cells, over which float32 cannot carry them."""
@@ -113,10 +115,10 @@ def test_samples_are_found_and_kept_as_by_the_twin(
     engine: Engine, monkeypatch: pytest.MonkeyPatch, most_places: int, period: int
 ) -> None:
     """A wide table, one that is too small, and one whose cells soon are too old, and then last longer."""
-    monkeypatch.setattr(transfer_cache, "MOST_PLACES", most_places)
+    monkeypatch.setattr(transfer_cache, "MOST_BYTES", most_places * 4 * WORDS)
     monkeypatch.setattr(transfer_cache, "PERIOD", period)
     monkeypatch.setattr(transfer_cache, "LONGEST", 3 * period)
-    frames = Frames(engine, places_for(ROWS * COLS), period)
+    frames = Frames(engine, places_for(ROWS * COLS, WORDS), period)
     shares = []
     for eye in (
         np.zeros(3),
@@ -137,7 +139,7 @@ def test_samples_are_found_and_kept_as_by_the_twin(
 
 
 def test_another_way_of_sampling_begins_anew(engine: Engine) -> None:
-    frames = Frames(engine, places_for(ROWS * COLS), transfer_cache.PERIOD)
+    frames = Frames(engine, places_for(ROWS * COLS, WORDS), transfer_cache.PERIOD)
     frames.step(np.zeros(3))
     found, _, _, _ = frames.step(np.zeros(3))
     assert (found >= 0).any()
@@ -150,7 +152,9 @@ def test_another_way_of_sampling_begins_anew(engine: Engine) -> None:
 
 
 def test_the_table_has_four_places_a_sample_up_to_its_bound() -> None:
-    assert places_for(19200) == 1 << 17
-    assert places_for(1 << 17) == 1 << 19
-    assert places_for(640 * 480) == 1 << 20
-    assert places_for(1) == 4
+    assert places_for(19200, 58) == 1 << 17
+    assert places_for(1 << 17, 58) == 1 << 19
+    assert places_for(640 * 480, 58) == 1 << 20
+    assert places_for(640 * 480, 64) == 1 << 20  # 256 MB
+    assert places_for(640 * 480, 65) == 1 << 19
+    assert places_for(1, 58) == 4

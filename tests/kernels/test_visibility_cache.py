@@ -122,8 +122,10 @@ def test_all_at_once_is_what_is_traced_without_subsets(engine: Engine) -> None:
     rays = direction_sets(COUNT, 4, 4)
     alone = VisibilityCaches(engine, 4)
     alone.begin_frame(CAMERA, pose(0), STRIDE, COUNT, ROOM_M)
-    whole = transfer_radiance(engine, CAMERA, volume, watcher.surface, STRIDE, rays, ROOM_M, alone)
-    np.testing.assert_array_equal(frames[-1]["transfer"], engine.download(whole.coefficients))
+    for caches in (alone, None):  # without caches, as where transfer is kept at places of the world
+        whole = transfer_radiance(engine, CAMERA, volume, watcher.surface, STRIDE, rays, ROOM_M, caches)
+        np.testing.assert_array_equal(frames[-1]["transfer"], engine.download(whole.coefficients))
+        assert whole.interleave == (4 if caches else 1)
 
 
 @pytest.mark.parametrize("stride", [1, 4])

@@ -12,13 +12,15 @@ from client.gallery.play import play, wishes_of
 from client.gallery.source import GallerySource
 from client.options.source import open_source
 from client.sources.volume import default_volume, default_voxel
-from protocol.messages import Wishes
+from protocol.messages import Preset, Wishes
 from server.client_session import ClientSession
 from server.culling.spine import NOT_SHADED
 from server.opencl.device import Device
 from server.pipeline import FrameResult
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
+from server.transfer import transfer_cache
+from server.transfer.sampling import PRESETS
 from server.transfer.transfer_cache import TransferCache
 from tests.bench.rendering.flip import flip_map
 from tests.data import data_folder
@@ -46,12 +48,28 @@ def pictures_of(results: list[FrameResult]) -> Pictures:
     return [result.color for result in results if result.color is not None]
 
 
-@pytest.mark.parametrize("name", ["closed-room", "red-wall", "sharp-sun"])
-def test_a_moving_camera_shows_what_it_would_without(device: Device, shares: list[float], name: str) -> None:
-    """Bit for bit in the first frame, and but for some codes in a few pixels in the others; again the same."""
+@pytest.mark.parametrize(
+    ("name", "preset"),
+    [
+        ("closed-room", "reg4"),
+        ("red-wall", "reg4"),
+        ("sharp-sun", "reg4"),
+        ("closed-room", "gr15fast"),
+        ("sharp-sun", "gr15fast"),
+        ("red-wall", "art4"),
+        ("closed-room", "gr15"),
+    ],
+)
+def test_a_moving_camera_shows_what_it_would_without(
+    device: Device, shares: list[float], name: str, preset: Preset
+) -> None:
+    """Nearly bit for bit in the first frame, and but for some codes in a few pixels in the others; again the same.
+
+    Surface that only the sensor knows is nowhere in what is kept; in image space it counts without: one code.
+    """
     source = GallerySource(name, width=160)
     on, again, off = (
-        pictures_of([result for _, result in play(device, source, wishes_of(source, cache=cache))])
+        pictures_of([result for _, result in play(device, source, wishes_of(source, cache=cache, preset=preset))])
         for cache in ("on", "on", "off")
     )
     assert len(shares) == 2 * len(source)
@@ -63,13 +81,58 @@ def test_a_moving_camera_shows_what_it_would_without(device: Device, shares: lis
         assert apart.max() <= 12  # seen: 6, with samples 2.5 cm apart
         assert (apart > 1).mean() < 0.03  # seen: 0.016
         assert flip_map(cached, exact).mean() < 0.006  # seen: 0.0038
-    np.testing.assert_array_equal(on[0], off[0])
+    assert np.abs(on[0].astype(int) - off[0]).max() <= (1 if PRESETS[preset].image_space else 0)
 
 
-def test_a_real_kitchen_is_lit_the_same_and_shown_nearly_so(device: Device, shares: list[float]) -> None:
+@pytest.mark.parametrize("preset", ["reg4", "art4", "gr15fast"])
+def test_a_thing_that_comes_in_shades_nearly_as_without(device: Device, preset: Preset) -> None:
+    """A real ball: cells keep, until they are traced again, what they saw of the scan before it came."""
+    source = GallerySource("hand", width=160)
+    on, off = (
+        pictures_of([result for _, result in play(device, source, wishes_of(source, cache=cache, preset=preset))])
+        for cache in ("on", "off")
+    )
+    for cached, exact in zip(on, off, strict=True):
+        apart = np.abs(cached.astype(int) - exact).max(axis=-1)
+        assert apart.max() <= 18  # seen: 10
+        assert (apart > 1).mean() < 0.02  # seen: 0.013
+        assert flip_map(cached, exact).mean() < 0.009  # seen: 0.0048
+
+
+@pytest.mark.parametrize(("preset", "codes"), [("reg4", 0), ("art4", 8), ("gr15fast", 6)])  # seen: 0, 4, 3
+def test_cells_that_are_traced_again_show_what_has_changed(
+    device: Device, monkeypatch: pytest.MonkeyPatch, shares: list[float], preset: Preset, codes: int
+) -> None:
+    """With cells that last one frame, all is as without, but for what ART takes from the frames before there, and but
+    for surface that only the sensor knows in image space."""
+    monkeypatch.setattr(transfer_cache, "PERIOD", 1)
+    monkeypatch.setattr(transfer_cache, "LONGEST", 1)
+    source = GallerySource("hand", width=160)
+    on, off = (
+        pictures_of([result for _, result in play(device, source, wishes_of(source, cache=cache, preset=preset))])
+        for cache in ("on", "off")
+    )
+    assert max(shares) == 0
+    for cached, exact in zip(on, off, strict=True):
+        assert np.abs(cached.astype(int) - exact).max() <= codes
+
+
+def test_another_preset_finds_nothing_of_the_last(device: Device, shares: list[float]) -> None:
+    """Though it has the same samples and directions."""
+    source = GallerySource("closed-room", width=160)
+    for index, (session, _) in enumerate(play(device, source, wishes_of(source, preset="reg4"))):
+        if index == 2:
+            session.set_quality("gr15fast")
+    assert [share == 0 for share in shares] == [True, False, False, True, False, False]
+
+
+@pytest.mark.parametrize("preset", ["reg4", "gr15fast", "art4"])
+def test_a_real_kitchen_is_lit_the_same_and_shown_nearly_so(
+    device: Device, shares: list[float], preset: Preset
+) -> None:
     source = open_source(str(data_folder("rgbd_7scenes_redkitchen")))
     volume_m = default_volume(source, range(60))
-    wishes = Wishes(volume_m=volume_m, voxel_m=default_voxel(volume_m), up=source.up)
+    wishes = Wishes(volume_m=volume_m, voxel_m=default_voxel(volume_m), up=source.up, preset=preset)
     found: dict[str, list[FrameResult]] = {}
     for cache in ("on", "off"):
         session = ClientSession(device, source.camera, structs.replace(wishes, cache=cache))
@@ -82,7 +145,7 @@ def test_a_real_kitchen_is_lit_the_same_and_shown_nearly_so(device: Device, shar
         assert cached.light.sh == exact.light.sh
         assert [at.sh for at in cached.light.at] == [at.sh for at in exact.light.at]
     for some, others in zip(*(pictures_of(found[cache]) for cache in ("on", "off")), strict=True):
-        assert flip_map(some, others).mean() < 0.003  # seen: 0.0018; the goal is 0.01
+        assert flip_map(some, others).mean() < 0.0045  # seen: 0.0024; the goal is 0.01
 
 
 def test_nothing_is_traced_where_nothing_virtual_is_drawn(device: Device, shares: list[float]) -> None:

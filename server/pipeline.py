@@ -308,7 +308,6 @@ class Pipeline:
         launches, reads, read_bytes = profile.launches, profile.reads, profile.read_bytes
         times = profile.collect()
         self.kernel_ms = times.kernels
-        host = max(times.total - sum(times.kernels.values()), 0.0)
         return Timings(
-            **times.rows, total=times.total, host=host, launches=launches, reads=reads, read_bytes=read_bytes
+            **times.rows, total=times.total, host=times.idle, launches=launches, reads=reads, read_bytes=read_bytes
         )

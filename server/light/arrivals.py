@@ -34,8 +34,10 @@ def trace_arrivals(
     The distance is positive for photographed surface, negative for a surface's back or one without a colour, and 0
     where nothing is met. directions: [sets, m, 3] unit, world axes; point i takes set i modulo sets. normals: [n, 3]
     unit, of the surface that the points lie on: rays begin clear of it, those below its plane are skipped (0); None:
-    they lie on none.
+    they lie on none. Waits for the volume, but not for what else `engine` is at work on.
     """
+    engine = engine.aside
+    engine.wait_for(volume.written)
     buffers, (sets, per_set, _), count = engine.buffers(_Buffers), directions.shape, len(points)
     room, room_of_sets = _rounded(count), _rounded(sets)
     planes = np.zeros((count, 4)) if normals is None else np.pad(normals, ((0, 0), (0, 1)), constant_values=1.0)

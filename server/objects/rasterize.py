@@ -24,6 +24,7 @@ from server.objects.raster_tables import CHUNK, TILE, Picture, TableBuffers, tab
 from server.objects.virtual_object import VirtualObject
 from server.opencl.buffers import BufferDescription, BufferGroup, StageBuffers, Workspace
 from server.opencl.engine import Engine, int2, int4
+from server.opencl.pending_read import PendingRead
 from server.opencl.structs import SURFACE_PARAMETERS
 
 __all__ = [
@@ -47,6 +48,12 @@ _LEAST_ENTRIES = 1 << 16
 _LEAST_ROOM = 1 << 10
 _PIECES_PER_PIXEL = 4
 """Initial capacity, limited by the number of triangles; grows when needed."""
+_LIST_ITEMS = 1 << 14
+"""Work-items that go through a list whose length only the device knows."""
+_MORE_TILES = 1.5
+"""A picture that covers this many times as many tiles as the last one may have far more entries."""
+_MORE_ENTRIES = 4
+"""Room for so many times the entries of the last picture, or its triangles."""
 _FRAGMENTS_PER_PIXEL = 2
 """Capacity; if there are more, the triangles are processed a second time."""
 _FRAGMENTS_PER_TRIANGLE = 40
@@ -83,6 +90,8 @@ class RasterBuffers(StageBuffers):
         super().__init__(workspace)
         self.drawn: DirtyRegion = DirtyRegion()
         """The region of `nearest`."""
+        self.listed: _Listed | None = None
+        """What the last picture listed."""
 
 
 class VirtualSurfaceBuffers(StageBuffers):
@@ -124,18 +133,34 @@ class VirtualSurface:
 
 
 @dataclass(frozen=True)
+class _Listed:
+    """How much one picture listed."""
+
+    covered: int
+    """Tiles of its region."""
+    triangles: int
+    ends: PendingRead
+    """Entries, pieces and fragments."""
+
+    def suffices(self, picture: Picture) -> bool:
+        """Whether it says how many entries `picture` has at most. If it has more all the same, that only takes time."""
+        return picture.covered <= _MORE_TILES * self.covered and picture.triangles <= self.triangles
+
+
+@dataclass(frozen=True)
 class _Lists:
     """Device lists of one picture's triangles: large ones as pieces, sorted into tiles; small ones as fragments."""
 
     projected: cl_array.Array
     corners: cl_array.Array
     inverse_depths: cl_array.Array
+    counts: cl_array.Array
     starts: cl_array.Array
     entries: cl_array.Array
     nearest: cl_array.Array
     fragments: cl_array.Array
-    fragment_count: int
-    """Includes fragments beyond the capacity."""
+    may_overflow: bool
+    """There may be more fragments than room for them."""
 
 
 def rasterize(
@@ -148,7 +173,7 @@ def rasterize(
     """Draw `objects`, each with its `volume_from_model`, as a pinhole camera sees them (its distortion is ignored).
 
     `camera_from_volume` [4, 4] float64, rigid: camera axes x right, y down, z forward. buffers: of the result;
-    None: the engine's. Waits for the device once.
+    None: the engine's. Waits for the device where there is much more to draw than the last time, or something to clip.
     """
     boxes = boxes_in_view(camera, camera_from_volume, objects)
     lists = engine.buffers(_Buffers).lists
@@ -234,10 +259,29 @@ def _make_lists(
         _setup(engine, picture, projected, counts, corners, inverse_depths, nearest, fragments)
         scan = _kernel(engine, "scan_tiles")
         engine.launch(scan, (_SCAN_ITEMS,), tiles, _MOST_ENTRIES // tiles, counts, starts, local=(_SCAN_ITEMS,))
-        total, pieces, fragment_count = (int(value) for value in engine.download(starts[tiles:]))
-    entries = buffers.entries.array((_power_of_two(max(total, _LEAST_ENTRIES)),))
-    engine.launch(_kernel(engine, "fill_tiles"), (pieces,), pieces, picture.size, corners, starts, counts, entries)
-    return _Lists(projected, corners, inverse_depths, starts, entries, nearest, fragments, fragment_count)
+        if not (picture.is_whole and picture.triangles <= room):  # else a triangle has one piece at most
+            pieces = int(engine.download(starts[tiles:])[1])
+    last, buffers.listed = (
+        buffers.listed,
+        _Listed(picture.covered, picture.triangles, engine.begin_download(starts[tiles:])),
+    )
+    latest = last if last is not None and last.suffices(picture) else buffers.listed
+    most = max(int(latest.ends.result()[0]), picture.triangles)
+    entries = buffers.entries.array((_power_of_two(max(_MORE_ENTRIES * most, _LEAST_ENTRIES)),))
+    engine.launch(
+        _kernel(engine, "fill_tiles"),
+        (min(room, _LIST_ITEMS),),
+        min(room, _LIST_ITEMS),
+        tiles,
+        len(entries),
+        picture.size,
+        corners,
+        starts,
+        counts,
+        entries,
+    )
+    may_overflow = _FRAGMENTS_PER_TRIANGLE * picture.triangles > len(fragments)
+    return _Lists(projected, corners, inverse_depths, counts, starts, entries, nearest, fragments, may_overflow)
 
 
 def _project(engine: Engine, picture: Picture, buffers: RasterBuffers) -> cl_array.Array:
@@ -305,6 +349,8 @@ def _raster(engine: Engine, picture: Picture, lists: _Lists, buffers: RasterBuff
         ((x1 - x0) * (y1 - y0) * TILE * TILE,),
         picture.size,
         int4(*picture.region),
+        picture.tiles,
+        len(lists.entries),
         lists.corners,
         lists.inverse_depths,
         lists.starts,
@@ -313,14 +359,17 @@ def _raster(engine: Engine, picture: Picture, lists: _Lists, buffers: RasterBuff
         visible,
         local=(TILE * TILE,),
     )
-    count = lists.fragment_count
-    if count <= len(lists.fragments):
-        engine.launch(_kernel(engine, "settle_fragments"), (count,), count, lists.fragments, lists.nearest, visible)
-    else:
+    room = len(lists.fragments)
+    items = min(room, _LIST_ITEMS)
+    settle = _kernel(engine, "settle_fragments")
+    engine.launch(settle, (items,), items, room, lists.counts, lists.fragments, lists.nearest, visible)
+    if lists.may_overflow:
         engine.launch(
             _kernel(engine, "settle_triangles"),
             (len(picture.triangle_chunks) * CHUNK,),
             picture.size,
+            room,
+            lists.counts,
             picture.triangle_chunks,
             picture.objects,
             picture.arena.triangles,

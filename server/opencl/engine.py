@@ -30,11 +30,12 @@ class _UnusedBuffers(StageBuffers):
 class Engine:
     """One command queue with everything that belongs to it. Owned by one thread at a time."""
 
-    def __init__(self, device: Device, beside: Engine | None = None) -> None:
+    def __init__(self, device: Device, beside: Engine | None = None, *, is_apart: bool = False) -> None:
         """`beside`: another engine, whose queue, kernels and times this one shares; its memory is its own. What either
-        does, it does after all that both were asked for before."""
+        does, it does after all that both were asked for before; `is_apart`: it has a queue of its own, which waits for
+        the other where `wait_for` says so."""
         self.device = device
-        self.queue: cl.CommandQueue = beside.queue if beside else _make_queue(device)
+        self.queue: cl.CommandQueue = beside.queue if beside and not is_apart else _make_queue(device)
         self.workspace = Workspace(self.queue)
         device.memory.add(self.workspace)
         self.profile: Profile = beside.profile if beside else Profile()
@@ -44,6 +45,30 @@ class Engine:
         self._launched: set[tuple[object, ...]] = beside._launched if beside else set()
         self._states: dict[type[Any], Any] = {}
         self._buffers: dict[type[StageBuffers], StageBuffers] = {}
+        self._aside: Engine | None = None
+
+    @property
+    def aside(self) -> Engine:
+        """For work that need not wait for what this engine was asked for: it runs while this one's goes on."""
+        if self._aside is None:
+            self._aside = Engine(self.device, beside=self, is_apart=True)
+        return self._aside
+
+    def mark(self) -> cl.Event:
+        """An event that completes with all that was asked for so far; another queue can wait for it."""
+        event = cl.enqueue_marker(self.queue)
+        self.queue.flush()
+        return event
+
+    def wait_for(self, event: cl.Event) -> None:
+        """What is asked for from now on begins after `event`. The host does not wait."""
+        if event.command_execution_status != cl.command_execution_status.COMPLETE:
+            cl.enqueue_barrier(self.queue, [event])
+
+    @property
+    def bytes_held(self) -> int:
+        """Device memory of all buffers."""
+        return self.workspace.bytes_held + (self._aside.bytes_held if self._aside else 0)
 
     @property
     def lanes(self) -> int:
@@ -120,6 +145,9 @@ class Engine:
 
     def close(self) -> None:
         """Wait for the device and give its memory back."""
+        if self._aside is not None:
+            self._aside.close()
+            self._aside = None
         self.queue.finish()
         self.workspace.release()
         self._states.clear()

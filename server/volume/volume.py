@@ -70,7 +70,7 @@ class Volume:
         budget_bytes = engine.device.volume_bytes if budget_bytes is None else budget_bytes
         host_bytes = 4 * budget_bytes if host_budget_bytes is None else host_budget_bytes
         self._residency = Residency(engine, self._tables, self.voxel_m, budget_bytes, host_bytes)
-        self._tables.update()
+        self.update_tables()
 
     @property
     def voxels(self) -> cl_array.Array:
@@ -157,7 +157,7 @@ class Volume:
         for places, voxels, colors in batches:
             self._residency.fill(places, voxels, colors)
         self.frames = frames
-        self._tables.update()
+        self.update_tables()
 
     def volume_from_world(self) -> NDArray[np.float64]:
         """[4, 4] translation to the volume's origin."""
@@ -185,14 +185,18 @@ class Volume:
         bricks = self._bricks_near(camera, volume_from_camera, depth_m)
         self._residency.begin_frame(bricks)
         self.is_full = not self._residency.provide(camera, volume_from_camera, bricks)
+        self.written = self._engine.mark()
 
     def bring_back(self, camera: CameraModel, volume_from_camera: NDArray[np.float64]) -> None:
         """Restore released bricks in view. Needed before ray casting from a pose without a measurement."""
         self._residency.provide(camera, volume_from_camera, np.empty(0, np.int32))
+        self.written = self._engine.mark()
 
     def update_tables(self) -> None:
         """Renew the tables for empty-space skipping, after integration has changed the solid cells."""
         self._tables.update()
+        self.written = self._engine.mark()
+        """Event after which its memory is what it was asked to become; for other queues."""
 
     def download_batches(self) -> Iterator[Bricks]:
         """All bricks with voxels in batches, including released ones."""

@@ -1,7 +1,7 @@
 """Bounds of the change that virtual objects make to real surface in view, without tracing. Kernels: influence_bound.cl.
 
 Each object is replaced by the ball around its box. A few samples are tested first: most often they already show that
-the change is visible, and the rest is skipped. While the last frame's few samples showed that, a frame does not wait for
+the change is visible, and the rest is skipped. While the last frame's few samples showed it, a frame does not wait for
 its own, which the next one reads: where the change fades, one more frame is drawn with all of it, and none with less.
 """
 

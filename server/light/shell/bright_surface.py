@@ -114,8 +114,13 @@ class Emitters:
 
     def visible(self, engine: Engine, volume: Volume, points: Floats) -> NDArray[np.bool_]:
         """[n, k] whether nothing stands between `points` [n, 3] and an emitter."""
-        directions, distances, areas = self.seen_from(points)
+        directions = self.seen_from(points)[0]
         arrivals = trace_arrivals(engine, volume, points - volume.origin_world, None, directions)
+        return self.unblocked(volume, points, arrivals)
+
+    def unblocked(self, volume: Volume, points: Floats, arrivals: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """The same. arrivals: [n, k, 4] what rays towards the emitters met, as of trace_arrivals."""
+        _, distances, areas = self.seen_from(points)
         met = np.abs(arrivals[..., 3])
         own = np.sqrt(areas) + 2 * volume.voxel_m  # what is as near to its middle is the emitter itself
         return np.asarray((met == 0) | (met >= distances - own))

@@ -173,7 +173,7 @@ def _bound_samples(
         indirect.hits if indirect else no_hits(engine, transfer),
         *light_arguments(engine, light, rays, ray_length_m),
         len(balls),
-        buffers.balls.upload(balls) if len(balls) else engine.unused,
+        buffers.balls.refresh(balls) if len(balls) else engine.unused,
         float4(*most.objects, 0.0),
         float4(*most.real, 0.0),
         every,
@@ -216,9 +216,9 @@ def _bound_pixels(
         bounds,
         volume.voxel_m,
         len(light.discs),
-        buffers.discs.upload(table.view(cl_types.float4)[:, 0]),
+        buffers.discs.refresh(table.view(cl_types.float4)[:, 0]),
         len(balls),
-        buffers.balls.upload(balls),
+        buffers.balls.refresh(balls),
         most,
     )
     return np.asarray(engine.download(most).view(np.float32).reshape(-1, 4).max(axis=0, initial=0.0))

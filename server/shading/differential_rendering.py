@@ -148,8 +148,10 @@ def light_points(engine: Engine, scene: TracedScene, placed: PlacedPoints | None
     placed: of place_points for the scene's objects; None: they are placed here.
     """
     placed = placed or place_points(engine, scene.objects)
-    radiances = engine.buffers(_Buffers).point_radiances.upload(placed.under_even_light(scene.light.mean))
     lit, traced = min(placed.count, MOST_POINTS), replace(scene, point_lights=placed.point_lights)
+    buffer = engine.buffers(_Buffers).point_radiances
+    is_rest_even = lit < placed.count
+    radiances = buffer.upload(placed.under_even_light(scene.light.mean)) if is_rest_even else buffer.array((lit,))
     engine.launch(
         engine.kernel("differential_rendering.cl", "light_points", **scene.defines(engine)),
         (lit,),

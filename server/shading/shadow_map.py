@@ -146,7 +146,7 @@ def draw_shadow_maps(
     discs = [_seen_from(disc, ball) for disc in light.discs]
     axes = view_axes(np.stack([disc.direction for disc in discs]))
     rows = _rows(discs, axes, float(ball[3]))
-    uploaded = engine.buffers(_Buffers).rows.upload(rows.view(cl_types.float4)[..., 0])
+    uploaded = engine.buffers(_Buffers).rows.refresh(rows.view(cl_types.float4)[..., 0])
     drawn = engine.buffers(_Buffers).maps.array((MOST_LIGHTS, (4 * MAP_SIDE**2 - _COARSEST_SIDE**2) // 3))
     last, now = engine.state(_LastMaps), _Shown.of(rows, objects)
     if last.shown != now:

@@ -17,7 +17,7 @@ from server.opencl.device import Device
 from server.opencl.pacing import Pacer
 from server.opencl.pending_read import PendingRead
 from server.opencl.profile import Profile
-from server.opencl.program import Define, define_options
+from server.opencl.program import Define
 
 State = TypeVar("State")
 KernelArgument = cl_array.Array | np.generic | int | float | None
@@ -41,7 +41,7 @@ class Engine:
         self.profile: Profile = beside.profile if beside else Profile()
         self.pacer: Pacer = beside.pacer if beside else Pacer()
         self._kernels: dict[tuple[object, ...], cl.Kernel] = beside._kernels if beside else {}
-        self._typed: dict[int, cl.Kernel] = beside._typed if beside else {}
+        self._typed: dict[int, tuple[cl.Kernel, str]] = beside._typed if beside else {}
         self._launched: set[tuple[object, ...]] = beside._launched if beside else set()
         self._states: dict[type[Any], Any] = {}
         self._buffers: dict[type[StageBuffers], StageBuffers] = {}
@@ -77,7 +77,8 @@ class Engine:
 
     def kernel(self, file: str, name: str, **defines: Define) -> cl.Kernel:
         """Kernel `name` of the kernel file `file`; retrieved once, because a kernel object carries its arguments."""
-        key = (file, name, define_options(defines))  # as text: 1, 1.0 and True are equal in Python
+        values = tuple(defines.values())
+        key = (file, name, *defines, *values, *map(type, values))  # 1, 1.0 and True are equal in Python
         if key not in self._kernels:
             with nullcontext() if self.device.programs.has(file, defines) else self.pacer.aside():
                 program = self.device.programs.get(file, defines)
@@ -103,9 +104,9 @@ class Engine:
         rounded = tuple(-(-count // group) * group for count, group in zip(size, local, strict=True))
         if id(kernel) not in self._typed:  # without types each number takes pyopencl as long as a launch
             kernel.set_arg_types([_type_of(value) for value in arguments])
-            self._typed[id(kernel)] = kernel
+            self._typed[id(kernel)] = kernel, kernel.function_name
         passed: list[Any] = [a.data if isinstance(a, cl_array.Array) else a for a in arguments]
-        name = kernel.function_name
+        _, name = self._typed[id(kernel)]
         for offset, part in self.pacer.slices(name, rounded, local, steps):
             shift = offset if any(offset) else None
             variant = (id(kernel), local, shift is None)

@@ -137,7 +137,7 @@ def shadow_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface,
         virtual.normal,
         virtual.object_index,
         occluded.values,
-        steps=scene.rays.count,
+        steps=-(-scene.rays.count // scene.rays.interleave),
     )
     return occluded
 

@@ -171,7 +171,7 @@ class BrightSurface:
         """Of a cell that shows as clipped, or where surface is in view that does not."""
         for key, row in self._rows.items():
             center, radius_m = self._centers[row] / max(self._squares[row], 1e-12), np.sqrt(self._area(row) / np.pi)
-            nearest = np.linalg.norm(positions - center, axis=1).min(initial=np.inf)
+            nearest = np.sqrt(np.square(positions - center).sum(axis=1).min(initial=np.inf))
             if key in shown or nearest <= radius_m:
                 self._frames[row] = min(self._frames[row] + 1, PRESENCE)
                 self._presence[row] += (float(key in shown) - self._presence[row]) / self._frames[row]

@@ -125,7 +125,7 @@ class RoomModel:
 
     def estimate(self, bands: int) -> LightEstimate:
         """The light from beyond the scan."""
-        return distant_light(self._solution.distant if self._solution else Unknowns(), bands)
+        return self._solution.estimate(bands) if self._solution else distant_light(Unknowns(), bands)
 
     def known(self) -> KnownRoom:
         """What it is solved from."""

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.light.arrivals import PendingArrivals, begin_arrivals, trace_arrivals
+from server.light.light_estimation import LightEstimate
 from server.light.place_light import VALID_SPREAD_DEG, PlaceLight
 from server.light.shell.bright_surface import Emitters
+from server.light.shell.distant import distant_light
 from server.light.shell.lamps import ShellLamp, emitting_lamps, find_lamps
 from server.light.shell.objective import Unknowns
 from server.light.shell.shell import CORNERS, Shell
@@ -72,6 +74,8 @@ class Solution:
     """[n, 3] mean log radiance of these patches."""
     _beyond: dict[tuple[bytes, int], tuple[Floats, Floats, list[ShellLamp]]] = field(default_factory=dict)
     """What `beyond` found last."""
+    _estimates: dict[int, LightEstimate] = field(default_factory=dict)
+    """Of `estimate`, by the number of bands."""
 
     def radiance_at(self, engine: Engine, volume: Volume, position: Floats, directions: Floats) -> Floats:
         """[m, 3] radiance that arrives at `position` [3] (world) against `directions` [m, 3]."""
@@ -103,6 +107,12 @@ class Solution:
             self._beyond.clear()
             self._beyond[asked] = self._seen_beyond(position, bands)
         return self._beyond[asked]
+
+    def estimate(self, bands: int) -> LightEstimate:
+        """The light from beyond the scan, the same for all places."""
+        if bands not in self._estimates:
+            self._estimates[bands] = distant_light(self.distant, bands)
+        return self._estimates[bands]
 
     def _seen_beyond(self, position: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
         directions = look_up_directions()[0]

@@ -1,7 +1,7 @@
 // Draws triangle meshes into the virtual geometry buffer (the rasterised buffer of section 7.2, fig. 7.5).
 //
-// clear_picture -> project_vertices -> setup_triangles -> scan_tiles -> fill_tiles -> raster_tiles -> settle_fragments
-// -> shade_surface, each once for all objects. Screen positions are snapped to 1/256 pixel and edges evaluated in exact
+// begin_picture -> setup_triangles -> scan_tiles -> fill_tiles -> raster_tiles -> settle_fragments -> shade_surface, each
+// once for all objects. Screen positions are snapped to 1/256 pixel and edges evaluated in exact
 // integers, so that triangles sharing an edge cover each pixel centre once (top-left rule). Pixel centres lie at
 // integers. Triangles that cover only a few pixels are drawn directly, as fragments, all others through lists per tile.
 // First the nearest depth of each pixel is found, then the lowest triangle index with that depth: the result does not
@@ -49,9 +49,8 @@ static void write_piece(const int8 piece, const float4 depths, const int slot, c
 
 // Clears the counters and the depths of the tiles of `region` (x0 y0 x1 y1, half-open).
 // One item a row of pixels of a tile.
-kernel void clear_picture(const int2 size, const int4 region, const int count, global int *counts,
+static void clear_picture(const int index, const int2 size, const int4 region, const int count, global int *counts,
                           global uint *nearest) {
-    const int index = get_global_id(0);
     if (index < count) counts[index] = 0;
     const int columns = region.z - region.x;
     if (columns <= 0 || index >= columns * (region.w - region.y) * TILE) return;
@@ -61,10 +60,14 @@ kernel void clear_picture(const int2 size, const int4 region, const int count, g
     else for (int i = x; i < size.x; i++) nearest[y * size.x + i] = 0;
 }
 
-// Every vertex of the objects in view on the screen.
+// Clears the picture, and finds every vertex of the objects in view on the screen. The work-groups are at least those
+// of the `chunk_count` chunks.
 kernel __attribute__((reqd_work_group_size(CHUNK, 1, 1)))
-void project_vertices(const global int2 *chunks, const global int8 *objects, const global float16 *matrices,
-                      const float near_m, const global float *vertices, global int4 *projected) {
+void begin_picture(const int2 size, const int4 region, const int count, const int chunk_count, const global int2 *chunks,
+                   const global int8 *objects, const global float16 *matrices, const float near_m,
+                   const global float *vertices, global int *counts, global uint *nearest, global int4 *projected) {
+    clear_picture(get_global_id(0), size, region, count, counts, nearest);
+    if (group_number() >= chunk_count) return;
     const int2 chunk = chunks[group_number()];
     const int8 object = objects[chunk.x];
     const int vertex = chunk.y + get_local_id(0);

@@ -244,7 +244,7 @@ def _make_lists(
 ) -> _Lists:
     """Project, clip and sort the triangles. Buffers grow until everything fits. cleared: tiles of `nearest`."""
     tiles, shape = picture.tiles, (picture.camera.height, picture.camera.width)
-    projected = _project(engine, picture, buffers)
+    projected = buffers.projected.array((_power_of_two(max(picture.vertices, _LEAST_ROOM)),))
     starts = buffers.starts.array((tiles + 3,))
     counts = buffers.counts.array((2 + tiles,))
     pixels = shape[0] * shape[1]
@@ -255,7 +255,7 @@ def _make_lists(
         room = _power_of_two(pieces)
         corners = buffers.corners.array((room,))
         inverse_depths = buffers.inverse_depths.array((room,))
-        _clear(engine, picture, counts, nearest, cleared)
+        _begin(engine, picture, counts, nearest, cleared, projected)
         _setup(engine, picture, projected, counts, corners, inverse_depths, nearest, fragments)
         scan = _kernel(engine, "scan_tiles")
         engine.launch(scan, (_SCAN_ITEMS,), tiles, _MOST_ENTRIES // tiles, counts, starts, local=(_SCAN_ITEMS,))
@@ -284,28 +284,34 @@ def _make_lists(
     return _Lists(projected, corners, inverse_depths, counts, starts, entries, nearest, fragments, may_overflow)
 
 
-def _project(engine: Engine, picture: Picture, buffers: RasterBuffers) -> cl_array.Array:
-    """The vertices of the objects in view on the screen, [vertices] int4."""
-    room = _power_of_two(max(picture.vertices, _LEAST_ROOM))
-    projected = buffers.projected.array((room,))
+def _begin(
+    engine: Engine,
+    picture: Picture,
+    counts: cl_array.Array,
+    nearest: cl_array.Array,
+    tiles: PixelBox,
+    projected: cl_array.Array,
+) -> None:
+    """Clear counts and these tiles of `nearest`; find the vertices of the objects in view on the screen."""
+    rows = 0 if is_empty(tiles) else (tiles[2] - tiles[0]) * (tiles[3] - tiles[1]) * TILE
+    chunks = len(picture.vertex_chunks) if picture.vertices else 0
     engine.launch(
-        _kernel(engine, "project_vertices"),
-        (len(picture.vertex_chunks) * CHUNK if picture.vertices else 0,),
+        _kernel(engine, "begin_picture"),
+        (max(counts.size, rows, chunks * CHUNK),),
+        picture.size,
+        int4(*tiles),
+        counts.size,
+        chunks,
         picture.vertex_chunks,
         picture.objects,
         picture.matrices,
         NEAR_M,
         picture.arena.vertices,
+        counts,
+        nearest,
         projected,
         local=(CHUNK,),
     )
-    return projected
-
-
-def _clear(engine: Engine, picture: Picture, counts: cl_array.Array, nearest: cl_array.Array, tiles: PixelBox) -> None:
-    rows = 0 if is_empty(tiles) else (tiles[2] - tiles[0]) * (tiles[3] - tiles[1]) * TILE
-    kernel = _kernel(engine, "clear_picture")
-    engine.launch(kernel, (max(counts.size, rows),), picture.size, int4(*tiles), counts.size, counts, nearest)
 
 
 def _setup(

@@ -51,6 +51,7 @@ NEAREST = 1.25
 LEAST_SHADING = 0.02
 """The least shading that counts, as in include/shadows.clh."""
 _COARSEST_SIDE = 8
+_MAP_ITEMS = 64
 
 Floats = NDArray[np.float64]
 
@@ -341,11 +342,8 @@ def _draw_objects(
         camera_from_volume[1] += light * MAP_SIDE / focal_px * camera_from_volume[2]
         drawn += [(thing, camera_from_volume @ volume_from_model) for thing, volume_from_model in objects]
     nearest = drawn_depths(engine, camera, np.eye(4), drawn, engine.buffers(_Buffers).objects)
-    size = (MAP_SIDE, len(axes) * MAP_SIDE)
-    engine.launch(_kernel(engine, "begin_maps"), size, len(axes), far_m, uploaded, nearest, maps)
-    for level in range(1, (MAP_SIDE // _COARSEST_SIDE).bit_length()):
-        side = MAP_SIDE >> level
-        engine.launch(_kernel(engine, "halve_maps"), (side, side, len(axes)), len(axes), level, maps)
+    items = (_MAP_ITEMS * _COARSEST_SIDE**2 * len(axes),)
+    engine.launch(_kernel(engine, "build_maps"), items, far_m, uploaded, nearest, maps, local=(_MAP_ITEMS,))
 
 
 @dataclass(frozen=True)

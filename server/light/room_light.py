@@ -111,8 +111,13 @@ class RoomLight:
         return whole, SplitLight(rest, discs)
 
     def look_up(self, engine: Engine, volume: Volume, positions: NDArray[np.float64]) -> LookUp | None:
-        """Begin to trace what `arriving_at` needs, as long as the solution stays; None where there is no solution."""
-        return self._solution.look_up(engine, volume, positions) if self._solution else None
+        """Begin to trace what `arriving_at` needs; None where there is no solution, or this frame takes another."""
+        solution = None if self._model.is_due else self._solution
+        return solution.look_up(engine, volume, positions) if solution else None
+
+    def finish(self) -> None:
+        """Begin what is worked out beside the frames. The last of a frame."""
+        self._model.finish()
 
     def arriving_at(
         self, engine: Engine, volume: Volume, positions: NDArray[np.float64], begun: LookUp | None = None

@@ -77,6 +77,7 @@ class ClientLight:
             distant = remove_lamps(self._engine, radiance, context.surface, context.volume, lamps)  # B4
             light = self._room.light.update(context, distant, samples, self._room.objects.up)
         self._places.update(context, self._room.light, is_still=is_still)
+        self._room.light.finish()
         return light
 
     def _denoised(self, context: FrameContext, settings: Settings) -> Array:

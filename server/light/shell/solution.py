@@ -93,7 +93,7 @@ class Solution:
         """The light at each position of a look-up of this solution."""
         positions, arrivals = look_up.positions, look_up.rays.result()
         met = self._met(positions, look_up_directions()[0], arrivals[:, :DIRECTIONS])
-        visible = self.emitters.unblocked(look_up.volume, positions, arrivals[:, DIRECTIONS:])
+        visible = self.emitters.visible(look_up.volume, positions, arrivals[:, DIRECTIONS:])
         rays = self._with_emitters(positions, met, visible)
         return [self._arriving(position, of_place) for position, of_place in zip(positions, rays, strict=True)]
 

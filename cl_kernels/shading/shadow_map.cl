@@ -110,17 +110,17 @@ static float4 real_parts(const Volume volume, const float ray_length_m, const Di
     return vload4(0, parts);
 }
 
-// Samples of a surface: positions, normals [h][w] (w = 0 without surface). ray_places [RAY_SETS][RAYS].
+// Samples `around` (x0 y0 x1 y1, half-open) of a surface: positions, normals [h][w] (w = 0 without surface). ray_places [RAY_SETS][RAYS].
 // -> parts [rows][cols]: the fraction of each disc's light that real surface does not block (xyz: discs 0 to 2, w = 1 valid).
 // With has_cells, samples whose cell kept its parts in frame `since` or later get those; the others ask to fill their cell's:
 // cells [rows][cols] (-1 none); claims, kept, frames [cells]: see Cells.
-kernel void trace_discs(const Grid grid, global const float4 *positions, global const float4 *normals, const int is_virtual,
+kernel void trace_discs(const Grid grid, const int4 around, global const float4 *positions, global const float4 *normals, const int is_virtual,
                         DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *parts,
                         const int has_cells, const int since, global const int *cells, global uint *claims, global const float4 *kept,
                         global const int *frames) {
-    const int col = get_global_id(0);
-    const int row = get_global_id(1);
-    if (col >= grid.cols || row >= grid.rows) return;
+    const int col = around.x + get_global_id(0);
+    const int row = around.y + get_global_id(1);
+    if (col >= around.z || row >= around.w) return;
     const int pixel = sample_pixel(grid, row, col);
     const float4 position = positions[pixel], normal = normals[pixel];
     const int sample = row * grid.cols + col, place = has_cells ? cells[sample] : -1;

@@ -24,6 +24,7 @@ from server.maths.disc_places import disc_places, ray_places, search_places
 from server.maths.dominant import MOST_LIGHTS
 from server.objects.dirty_region import DirtyRegion, box_around
 from server.objects.pinhole import Pinhole
+from server.objects.pixel_boxes import PixelBox
 from server.objects.rasterize import NEAR_M, Placed, RasterBuffers, VirtualSurface, drawn_depths
 from server.objects.virtual_object import VirtualObject
 from server.opencl.buffers import BufferDescription, BufferGroup, StageBuffers, Workspace
@@ -88,6 +89,8 @@ class _Buffers(StageBuffers):
         super().__init__(workspace)
         self.drawn: DirtyRegion = DirtyRegion()
         """Of `virtual`."""
+        self.traced: DirtyRegion = DirtyRegion()
+        """Of `virtual_parts`, in samples."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +186,9 @@ def light_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, 
     direct = buffers.virtual.array((camera.height, camera.width))
     shape = (camera.height // VIRTUAL_STRIDE, camera.width // VIRTUAL_STRIDE)
     parts = SampleGrid(VIRTUAL_STRIDE, buffers.virtual_parts.array(shape))
-    _trace_discs(engine, camera, virtual.position, virtual.normal, parts, maps, is_virtual=True)
+    covered = parts.inside(box_around(virtual.boxes))
+    with buffers.traced.redraw(parts.values, covered, parts.all) as around:
+        _trace_discs(engine, camera, virtual.position, virtual.normal, parts, around, maps, is_virtual=True)
     with buffers.drawn.redraw(direct, box_around(virtual.boxes), (0, 0, *size)) as (x0, y0, x1, y1):
         engine.launch(
             _kernel(engine, "light_virtual"),
@@ -216,7 +221,9 @@ def trace_real(
         if traced is surface and (parts.stride, parts.values.shape) == (ratio.stride, ratio.values.shape):
             return parts
     parts = SampleGrid(ratio.stride, engine.buffers(_Buffers).real_parts.array(ratio.values.shape))
-    _trace_discs(engine, camera, surface.positions, surface.normals, parts, maps, is_virtual=False, cells=cells)
+    _trace_discs(
+        engine, camera, surface.positions, surface.normals, parts, parts.all, maps, is_virtual=False, cells=cells
+    )
     maps.traced[:] = [(surface, parts)]  # the next call writes the same array
     return parts
 
@@ -376,6 +383,7 @@ def _trace_discs(
     positions: cl_array.Array,
     normals: cl_array.Array,
     parts: SampleGrid,
+    around: PixelBox,
     maps: ShadowMaps,
     is_virtual: bool,
     cells: Cells | None = None,
@@ -384,8 +392,9 @@ def _trace_discs(
     kept = (cells.places, cells.claims, cells.disc_parts, cells.disc_frames) if cells else (engine.unused,) * 4
     engine.launch(
         _kernel(engine, "trace_discs"),
-        (parts.cols, parts.rows),
+        (around[2] - around[0], around[3] - around[1]),
         grid_of(parts, camera),
+        int4(*around),
         positions,
         normals,
         is_virtual,

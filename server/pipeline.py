@@ -293,7 +293,7 @@ class Pipeline:
     ) -> FrameResult:
         """The answer, once the device is done."""
         picture, plan = rendered.picture(), rendered.told_plan()
-        self._engine.queue.finish()
+        self._engine.finish()
         timings = self._timings()
         self._frames += 1
         self._room.changes += 1

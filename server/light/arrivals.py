@@ -60,7 +60,7 @@ def begin_arrivals(
     directions: NDArray[np.float64],
 ) -> PendingArrivals:
     """The same without waiting."""
-    engine = engine.aside
+    engine = engine.concurrent
     engine.wait_for(volume.written)
     buffers, (sets, per_set, _), count = engine.buffers(_Buffers), directions.shape, len(points)
     table = np.zeros((_rounded(2 * count + sets * per_set), 4), np.float32)

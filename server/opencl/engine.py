@@ -30,12 +30,12 @@ class _UnusedBuffers(StageBuffers):
 class Engine:
     """One command queue with everything that belongs to it. Owned by one thread at a time."""
 
-    def __init__(self, device: Device, beside: Engine | None = None, *, is_apart: bool = False) -> None:
+    def __init__(self, device: Device, beside: Engine | None = None, *, has_own_queue: bool = False) -> None:
         """`beside`: another engine, whose queue, kernels and times this one shares; its memory is its own. What either
-        does, it does after all that both were asked for before; `is_apart`: it has a queue of its own, which waits for
-        the other where `wait_for` says so."""
+        does, it does after all that both were asked for before; `has_own_queue`: it waits for the other only where
+        `wait_for` says so."""
         self.device = device
-        self.queue: cl.CommandQueue = beside.queue if beside and not is_apart else _make_queue(device)
+        self.queue: cl.CommandQueue = beside.queue if beside and not has_own_queue else _make_queue(device)
         self.workspace = Workspace(self.queue)
         device.memory.add(self.workspace)
         self.profile: Profile = beside.profile if beside else Profile()
@@ -45,14 +45,20 @@ class Engine:
         self._launched: set[tuple[object, ...]] = beside._launched if beside else set()
         self._states: dict[type[Any], Any] = {}
         self._buffers: dict[type[StageBuffers], StageBuffers] = {}
-        self._aside: Engine | None = None
+        self._concurrent: Engine | None = None
+
+    def finish(self) -> None:
+        """Wait until all that was asked for is done."""
+        self.queue.finish()
+        if self._concurrent is not None:
+            self._concurrent.finish()
 
     @property
-    def aside(self) -> Engine:
+    def concurrent(self) -> Engine:
         """For work that need not wait for what this engine was asked for: it runs while this one's goes on."""
-        if self._aside is None:
-            self._aside = Engine(self.device, beside=self, is_apart=True)
-        return self._aside
+        if self._concurrent is None:
+            self._concurrent = type(self)(self.device, beside=self, has_own_queue=True)
+        return self._concurrent
 
     def mark(self) -> cl.Event:
         """An event that completes with all that was asked for so far; another queue can wait for it."""
@@ -68,7 +74,7 @@ class Engine:
     @property
     def bytes_held(self) -> int:
         """Device memory of all buffers."""
-        return self.workspace.bytes_held + (self._aside.bytes_held if self._aside else 0)
+        return self.workspace.bytes_held + (self._concurrent.bytes_held if self._concurrent else 0)
 
     @property
     def lanes(self) -> int:
@@ -146,10 +152,10 @@ class Engine:
 
     def close(self) -> None:
         """Wait for the device and give its memory back."""
-        if self._aside is not None:
-            self._aside.close()
-            self._aside = None
-        self.queue.finish()
+        self.finish()
+        if self._concurrent is not None:
+            self._concurrent.close()
+            self._concurrent = None
         self.workspace.release()
         self._states.clear()
         self._buffers.clear()

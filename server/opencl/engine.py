@@ -83,8 +83,8 @@ class Engine:
 
     def kernel(self, file: str, name: str, **defines: Define) -> cl.Kernel:
         """Kernel `name` of the kernel file `file`; retrieved once, because a kernel object carries its arguments."""
-        values = tuple(defines.values())
-        key = (file, name, *defines, *values, *map(type, values))  # 1, 1.0 and True are equal in Python
+        named = sorted(defines.items())
+        key = (file, name, *named, *(type(value) for _, value in named))  # 1, 1.0 and True are equal in Python
         if key not in self._kernels:
             with nullcontext() if self.device.programs.has(file, defines) else self.pacer.aside():
                 program = self.device.programs.get(file, defines)
@@ -143,7 +143,7 @@ class Engine:
     def download(self, array: cl_array.Array) -> NDArray[Any]:
         """Copy to the host; waits for everything queued before."""
         self.profile.count_read(array.nbytes)
-        result: NDArray[Any] = array.get()
+        result: NDArray[Any] = array.get(self.queue)
         return result
 
     def begin_download(self, array: cl_array.Array) -> PendingRead:

@@ -317,14 +317,16 @@ def test_more_triangles_in_a_tile_than_are_looked_at_at_once(engine: Engine) -> 
         assert (draw(engine, (soup, EYE)).triangle != visible).mean() < FLIPS
 
 
-@pytest.mark.parametrize("setting", ["_PIECES_PER_PIXEL", "_FRAGMENTS_PER_PIXEL"])
+@pytest.mark.parametrize("setting", ["_PIECES_PER_PIXEL", "_FRAGMENTS_PER_PIXEL", "_MORE_ENTRIES"])
 def test_lists_without_room(engine: Engine, monkeypatch: pytest.MonkeyPatch, setting: str) -> None:
-    """Pieces get more, of fragments the triangles are gone through again; the picture is the same."""
+    """Pieces get more, of fragments the triangles are gone through again, of entries all pieces; the picture is the
+    same."""
     soup = random_soup(3, 2000, 0.05, (0.0, 0.0, 1.0), 0.6)
     twice = soup_of(np.concatenate([soup.vertices, soup.vertices]).reshape(-1, 3, 3))
     expected = draw(engine, (twice, EYE))
     monkeypatch.setattr(rasterize_module, setting, 0)
     monkeypatch.setattr(rasterize_module, "_LEAST_ROOM", 1)
+    monkeypatch.setattr(rasterize_module, "_LEAST_ENTRIES", 1)
     other = Engine(engine.device)
     found = draw(other, (twice, EYE))
     other.close()

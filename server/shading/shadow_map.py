@@ -25,7 +25,8 @@ from server.maths.dominant import MOST_LIGHTS
 from server.objects.dirty_region import DirtyRegion, box_around
 from server.objects.pinhole import Pinhole
 from server.objects.pixel_boxes import PixelBox
-from server.objects.rasterize import NEAR_M, Placed, RasterBuffers, VirtualSurface, drawn_depths
+from server.objects.raster_lists import RasterBuffers
+from server.objects.rasterize import NEAR_M, Placed, VirtualSurface, drawn_depths
 from server.objects.virtual_object import VirtualObject
 from server.opencl.buffers import BufferDescription, BufferGroup, StageBuffers, Workspace
 from server.opencl.engine import Engine, KernelArgument, float4, int4

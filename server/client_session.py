@@ -194,7 +194,7 @@ class ClientSession:
     @property
     def device_bytes(self) -> int:
         """Device memory of this session and its room: arrays and volume; what all sessions share is not counted."""
-        return self._engine.workspace.bytes_held + self._room.device_bytes
+        return self._engine.bytes_held + self._room.device_bytes
 
     def close(self) -> None:
         """Give the device's memory back, and the room's where it is this session's alone."""

@@ -133,14 +133,16 @@ class Pipeline:
         context = self._context(geometry, volume)
         objects = room.objects.placed(volume.volume_from_world())
         is_shaded = bool(objects) and request.is_drawn
+        is_learning = self._settings.plan == "everything" or not room.light.is_given
+        with stage("light_estimation"):  # 5.1.3
+            self.light.begin(context, is_learnt=is_learning and frame.has_depth and reuse.reason is None)
         with stage("radiance_transfer"):  # 5.1.2, eq. 5.2; 7.3.3
             needs_transfer = is_shaded or room.light.needs_transfer or self._settings.plan == "everything"
             samples, is_kept = self._sample_transfer(context, reuse, is_shaded, needs_transfer)
-        left_out = self._left_out(frame, reuse, is_kept, is_shaded, needs_transfer)
-        with stage("light_estimation"):  # 5.1.3, eq. 5.5-5.6
-            self.light.begin(context, left_out)
-            is_drawn_first = room.light.has_model  # with the light of the frames before
-            if not is_drawn_first:
+        left_out = self._left_out(frame, reuse, is_kept, is_shaded, needs_transfer, is_learning)
+        is_drawn_first = room.light.has_model  # with the light of the frames before
+        if not is_drawn_first:
+            with stage("light_estimation"):  # eq. 5.5-5.6
                 light = self.light.update(context, samples, self._settings, left_out, is_still=reuse.keeps_geometry)
         with stage("rendering"):  # 7.1-7.2, the effects that this frame calls for
             spine = self._spine_outputs(context, frame, objects, samples, left_out)
@@ -218,9 +220,14 @@ class Pipeline:
         return samples, False
 
     def _left_out(
-        self, frame: RgbdFrame, reuse: ReuseDecision, is_kept: bool, is_shaded: bool, needs_transfer: bool
+        self,
+        frame: RgbdFrame,
+        reuse: ReuseDecision,
+        is_kept: bool,
+        is_shaded: bool,
+        needs_transfer: bool,
+        is_learning: bool,
     ) -> dict[str, CullReason]:
-        is_learning = self._settings.plan == "everything" or not self._room.light.is_given
         return spine_left_out(
             reuse.reason,
             reuse.echo if is_shaded else None,
@@ -286,7 +293,7 @@ class Pipeline:
     ) -> FrameResult:
         """The answer, once the device is done."""
         picture, plan = rendered.picture(), rendered.told_plan()
-        self._engine.queue.finish()
+        self._engine.finish()
         timings = self._timings()
         self._frames += 1
         self._room.changes += 1
@@ -308,7 +315,6 @@ class Pipeline:
         launches, reads, read_bytes = profile.launches, profile.reads, profile.read_bytes
         times = profile.collect()
         self.kernel_ms = times.kernels
-        host = max(times.total - sum(times.kernels.values()), 0.0)
         return Timings(
-            **times.rows, total=times.total, host=host, launches=launches, reads=reads, read_bytes=read_bytes
+            **times.rows, total=times.total, host=times.idle, launches=launches, reads=reads, read_bytes=read_bytes
         )

@@ -19,27 +19,28 @@ static float3 clear_of_surface(const Volume volume, const float3 point, const fl
     return origin + (volume.voxel_m - distance_m) * outwards;
 }
 
-// One item LANES directions of a point. points [count]: volume metres, w unused; normals [count]: of the surface that it lies on,
-// rays begin clear of it and directions below its plane are skipped; w = 0: it lies on none. directions [sets][per_set] unit; point i
-// takes set i % sets.
+// One item LANES directions of a point. `table`, one after the other: points [count], volume metres, w unused; normals [count] of
+// the surface that a point lies on: rays begin clear of it and directions below its plane are skipped; w = 0: it lies on none;
+// directions [sets][per_set] unit. Point i takes set i % sets.
 // -> arrivals [count][per_set]: radiance (rgb) of the surface that is met, and its distance in metres (w): positive, surface
 // that was photographed; negative, a back or surface without a colour; 0, nothing is met, or the direction is skipped.
 kernel void trace_arrivals(const VolumeShape shape, global const int *slots, global const ulong *solid,
                            global const uchar *octets, global const float2 *voxels, global const uint *colors,
-                           const int count, const int per_set, const int sets, global const float4 *points,
-                           global const float4 *normals, global const float4 *directions, global float4 *arrivals) {
+                           const int count, const int per_set, const int sets, global const float4 *table,
+                           global float4 *arrivals) {
     const int first = get_global_id(0) * LANES;
     const int point = get_global_id(1);
     if (first >= per_set || point >= count) return;
     const Volume volume = make_volume(shape, slots, solid, octets, voxels);
-    const float4 normal = normals[point];
+    global const float4 *directions = table + 2 * count;
+    const float4 place = table[point], normal = table[count + point];
     const int set = (point % sets) * per_set;
     int chosen[LANES], skipped = 0;
     for (int lane = 0; lane < LANES; lane++) {
         chosen[lane] = set + min(first + lane, per_set - 1);
         skipped |= (normal.w > 0.0f && dot(normal.xyz, directions[chosen[lane]].xyz) <= 0.0f) << lane;
     }
-    const float3 origin = normal.w > 0.0f ? clear_of_surface(volume, points[point].xyz, normal.xyz) : points[point].xyz;
+    const float3 origin = normal.w > 0.0f ? clear_of_surface(volume, place.xyz, normal.xyz) : place.xyz;
     const Rays rays = volume_rays(volume, origin, directions, chosen);
     floatn begin, end;
     clip_rays(volume, rays, &begin, &end);

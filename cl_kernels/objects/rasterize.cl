@@ -1,7 +1,7 @@
 // Draws triangle meshes into the virtual geometry buffer (the rasterised buffer of section 7.2, fig. 7.5).
 //
-// clear_picture -> project_vertices -> setup_triangles -> scan_tiles -> fill_tiles -> raster_tiles -> settle_fragments
-// -> shade_surface, each once for all objects. Screen positions are snapped to 1/256 pixel and edges evaluated in exact
+// begin_picture -> setup_triangles -> scan_tiles -> fill_tiles -> raster_tiles -> settle_fragments -> shade_surface, each
+// once for all objects. Screen positions are snapped to 1/256 pixel and edges evaluated in exact
 // integers, so that triangles sharing an edge cover each pixel centre once (top-left rule). Pixel centres lie at
 // integers. Triangles that cover only a few pixels are drawn directly, as fragments, all others through lists per tile.
 // First the nearest depth of each pixel is found, then the lowest triangle index with that depth: the result does not
@@ -49,9 +49,8 @@ static void write_piece(const int8 piece, const float4 depths, const int slot, c
 
 // Clears the counters and the depths of the tiles of `region` (x0 y0 x1 y1, half-open).
 // One item a row of pixels of a tile.
-kernel void clear_picture(const int2 size, const int4 region, const int count, global int *counts,
+static void clear_picture(const int index, const int2 size, const int4 region, const int count, global int *counts,
                           global uint *nearest) {
-    const int index = get_global_id(0);
     if (index < count) counts[index] = 0;
     const int columns = region.z - region.x;
     if (columns <= 0 || index >= columns * (region.w - region.y) * TILE) return;
@@ -61,10 +60,14 @@ kernel void clear_picture(const int2 size, const int4 region, const int count, g
     else for (int i = x; i < size.x; i++) nearest[y * size.x + i] = 0;
 }
 
-// Every vertex of the objects in view on the screen.
+// Clears the picture, and finds every vertex of the objects in view on the screen. The work-groups are at least those
+// of the `chunk_count` chunks.
 kernel __attribute__((reqd_work_group_size(CHUNK, 1, 1)))
-void project_vertices(const global int2 *chunks, const global int8 *objects, const global float16 *matrices,
-                      const float near_m, const global float *vertices, global int4 *projected) {
+void begin_picture(const int2 size, const int4 region, const int count, const int chunk_count, const global int2 *chunks,
+                   const global int8 *objects, const global float16 *matrices, const float near_m,
+                   const global float *vertices, global int *counts, global uint *nearest, global int4 *projected) {
+    clear_picture(get_global_id(0), size, region, count, counts, nearest);
+    if (group_number() >= chunk_count) return;
     const int2 chunk = chunks[group_number()];
     const int8 object = objects[chunk.x];
     const int vertex = chunk.y + get_local_id(0);
@@ -176,15 +179,15 @@ void setup_triangles(const int2 size, const int2 room, const global int2 *chunks
     if (shown) write_fragments(shown, piece, size, depths, first[1] + place, room.y, fragments);
 }
 
-// As settle_fragments, from the triangles themselves, if there were more fragments than capacity.
+// As settle_fragments, from the triangles themselves, if there were more fragments than `room`.
 kernel __attribute__((reqd_work_group_size(CHUNK, 1, 1)))
-void settle_triangles(const int2 size, const global int2 *chunks, const global int8 *objects,
-                      const global int *triangles, const global int4 *projected, const global uint *nearest,
-                      global int *visible) {
+void settle_triangles(const int2 size, const int room, const global int *counts, const global int2 *chunks,
+                      const global int8 *objects, const global int *triangles, const global int4 *projected,
+                      const global uint *nearest, global int *visible) {
     const int2 chunk = chunks[group_number()];
     const int8 object = objects[chunk.x];
     const int triangle = chunk.y + get_local_id(0);
-    if (triangle >= object.s4) return;
+    if (counts[1] <= room || triangle >= object.s4) return;
     bool whole, behind;
     float4 depths = (float4)(0.0f);
     const int8 piece = piece_of(object, triangle, size, triangles, projected, &depths, &whole, &behind);
@@ -226,12 +229,9 @@ void scan_tiles(const int tiles, const int most, const global int *counts, globa
     }
 }
 
-// Lists each piece in the tiles it touches. Counts the tiles down to 0; the order within a tile does not matter.
-kernel void fill_tiles(const int pieces, const int2 size, const global int8 *corners, const global int *starts,
-                       global int *counts, global int *entries) {
-    const int index = get_global_id(0);
-    if (index >= pieces) return;
-    const int8 piece = corners[index];
+// Lists a piece in the tiles it touches.
+static void list_piece(const int index, const int8 piece, const int2 size, const global int *starts, global int *counts,
+                       global int *entries) {
     const int4 tiles = pixel_bounds(piece, size) / TILE;
     for (int y = tiles.y; y <= tiles.w; y++)
         for (int x = tiles.x; x <= tiles.z; x++) {
@@ -241,15 +241,25 @@ kernel void fill_tiles(const int pieces, const int2 size, const global int8 *cor
         }
 }
 
+// Lists all pieces, each of `items` work-items every items-th, unless the entries are more than `room`. Counts the tiles
+// down to 0; the order within a tile does not matter.
+kernel void fill_tiles(const int items, const int tiles, const int room, const int2 size, const global int8 *corners,
+                       const global int *starts, global int *counts, global int *entries) {
+    const int pieces = starts[tiles] <= room ? starts[tiles + 1] : 0;
+    for (int index = get_global_id(0); index < pieces; index += items)
+        list_piece(index, corners[index], size, starts, counts, entries);
+}
+
 static inline int2 pixel_of(const int bit) { return (int2)(bit % TILE, bit / TILE); }
 
 // One work-group a tile of `region`. It processes up to 64 entries at a time: if there are few, each pixel tests
 // those that cover it; if there are many, they are mostly small, and each entry visits the pixels it covers:
-// first the nearest depth of each pixel is found, then the lowest triangle that has it.
+// first the nearest depth of each pixel is found, then the lowest triangle that has it. Where the entries were more than
+// `room`, nothing is listed, and all pieces are processed.
 // -> visible: the triangle of each pixel, the lower index of two equally near ones; NOBODY where a fragment is
 // nearer or there is none. nearest: of fragments and pieces.
 kernel __attribute__((reqd_work_group_size(TILE * TILE, 1, 1)))
-void raster_tiles(const int2 size, const int4 region, const global int8 *corners,
+void raster_tiles(const int2 size, const int4 region, const int tiles, const int room, const global int8 *corners,
                   const global float4 *inverse_depths, const global int *starts,
                   const global int *entries, global uint *nearest, global int *visible) {
     local ulong masks[TILE * TILE];
@@ -267,10 +277,12 @@ void raster_tiles(const int2 size, const int4 region, const global int8 *corners
     const int index = pixel.y * size.x + pixel.x;
     best[item] = inside ? nearest[index] : 0;
     winners[item] = NOBODY;
-    for (int begin = starts[tile]; begin < starts[tile + 1]; begin += TILE * TILE) {
-        const int count = min(starts[tile + 1] - begin, TILE * TILE);
+    const bool is_listed = starts[tiles] <= room;
+    const int first = is_listed ? starts[tile] : 0, end = is_listed ? starts[tile + 1] : starts[tiles + 1];
+    for (int begin = first; begin < end; begin += TILE * TILE) {
+        const int count = min(end - begin, TILE * TILE);
         if (item < count) {
-            const int entry = entries[begin + item];
+            const int entry = is_listed ? entries[begin + item] : begin + item;
             const int8 piece = corners[entry];
             masks[item] = coverage(piece, origin, size);
             edges[item] = edges_of(piece, origin);
@@ -310,13 +322,15 @@ void raster_tiles(const int2 size, const int4 region, const global int8 *corners
     }
 }
 
-// Writes the triangles of the nearest fragments; of several at one pixel, the lowest index.
-kernel void settle_fragments(const int count, const global int4 *fragments, const global uint *nearest,
-                             global int *visible) {
-    const int index = get_global_id(0);
-    if (index >= count) return;
-    const int4 fragment = fragments[index];
-    if ((uint)fragment.y == nearest[fragment.x]) atomic_min(&visible[fragment.x], fragment.z);
+// Writes the triangles of the nearest fragments; of several at one pixel, the lowest index. Each of `items` work-items
+// takes every items-th fragment, none if there were more than `room`.
+kernel void settle_fragments(const int items, const int room, const global int *counts, const global int4 *fragments,
+                             const global uint *nearest, global int *visible) {
+    const int count = counts[1] <= room ? counts[1] : 0;
+    for (int index = get_global_id(0); index < count; index += items) {
+        const int4 fragment = fragments[index];
+        if ((uint)fragment.y == nearest[fragment.x]) atomic_min(&visible[fragment.x], fragment.z);
+    }
 }
 
 static float3 textured(const Textures textures, const int texture, const float2 a, const float2 ab, const float2 ac,

@@ -88,13 +88,14 @@ kernel void bounce_real(SURROUNDINGS_PARAMETERS, SAMPLE_BUFFERS, const int most,
 
 // Virtual surface: the radiance that real and virtual occluders take from it, at the samples that it covers.
 // positions, normals [h][w] (w = 1 where covered), shown [h][w] (which object, -1 none): the virtual geometry buffer.
-// scene.every: a sample traces every n-th direction of its set; its neighbours trace others. -> occluded [rows][cols] (rgb, w = 1 valid).
-kernel void shadow_virtual(SCENE_PARAMETERS, global const float4 *positions, global const float4 *normals, global const int *shown,
+// scene.every: a sample traces every n-th direction of its set; its neighbours trace others. -> occluded [rows][cols] (rgb, w = 1 valid)
+// at the samples `around` (x0 y0 x1 y1, half-open).
+kernel void shadow_virtual(SCENE_PARAMETERS, const int4 around, global const float4 *positions, global const float4 *normals, global const int *shown,
                            global float4 *occluded) {
-    const int col = get_global_id(0);
-    const int row = get_global_id(1);
+    const int col = around.x + get_global_id(0);
+    const int row = around.y + get_global_id(1);
     const Grid grid = scene.samples;
-    if (col >= grid.cols || row >= grid.rows) return;
+    if (col >= around.z || row >= around.w) return;
     const int pixel = sample_pixel(grid, row, col);
     const Volume volume = VOLUME_OF_SCENE;
     const Objects things = OBJECTS_OF_SCENE(own_offset_m(scene.objects.count, grids_of(object_table), shown[pixel]));

@@ -1,11 +1,12 @@
 // Shadow maps along the sharp lights of a room, and shading with them (thesis 7.2.3, fig. 7.7).
-// Provides begin_maps, halve_maps, trace_discs, keep_parts, light_virtual, light_real, light_points_by_discs, light_samples, mix_direct,
+// Provides build_maps, trace_discs, keep_parts, light_virtual, light_real, light_points_by_discs, light_samples, mix_direct,
 // unmix_direct.
 #include "arriving.clh"
 #include "camera.clh"
 #include "clear_origin.clh"
 #include "direct_lights.clh"
 #include "direct_mix.clh"
+#include "groups.clh"
 #include "rays.clh"
 #include "samples.clh"
 #include "sampled_value.clh"
@@ -14,25 +15,21 @@
 #define RAYS 8  // of a sample to a disc; neighbours have others
 #define RAY_SETS 16
 
-// nearest [count MAP_SIDE][MAP_SIDE]: for each light, bits of 1 / depth of objects drawn from its distance, or if it is distant from
-// distance_m, before the ball's centre, 0 without any; rows: of DirectLights -> level 0 of its map, depths mapped.
-kernel void begin_maps(const int count, const float distance_m, global const float4 *rows, global const uint *nearest, global float2 *maps) {
-    const int x = get_global_id(0);
-    const int y = get_global_id(1);
-    if (x >= MAP_SIDE || y >= count * MAP_SIDE) return;
-    const float inverse = as_float(nearest[y * MAP_SIDE + x]);
-    const float inverse_m = rows[4 * (y / MAP_SIDE)].w;
+#define MAP_ITEMS 64
+#define COARSEST (1 << LEVELS_END)
+#define BLOCK (MAP_SIDE / COARSEST)  // texels of level 0 along a side of one of the coarsest
+
+// A texel of level 0: bits of 1 / depth of what was drawn there, 0 for nothing, seen from 1 / inverse_m, or if that is 0 from
+// distance_m, before the ball's centre.
+static inline float2 drawn_texel(const uint bits, const float inverse_m, const float distance_m) {
+    const float inverse = as_float(bits);
     const float depth = inverse_m > 0.0f ? (1.0f - inverse / inverse_m) / inverse_m : 1.0f / inverse - distance_m;
-    maps[y / MAP_SIDE * MAP_TEXELS + y % MAP_SIDE * MAP_SIDE + x] = inverse > 0.0f ? (float2)(1.0f, depth) : (float2)(0.0f);
+    return inverse > 0.0f ? (float2)(1.0f, depth) : (float2)(0.0f);
 }
 
-// `level` of all maps from the one before.
-kernel void halve_maps(const int count, const int level, global float2 *maps) {
-    const int x = get_global_id(0);
-    const int y = get_global_id(1);
+// A texel at (x, y) of `level` from the level before.
+static inline void halve_texel(global float2 *map, const int level, const int x, const int y) {
     const int side = MAP_SIDE >> level;
-    if (x >= side || y >= side || (int)get_global_id(2) >= count) return;
-    global float2 *map = maps + get_global_id(2) * MAP_TEXELS;
     global const float2 *finer = map + level_offset(level - 1);
     float covered = 0.0f, sum = 0.0f;
     for (int i = 0; i < 4; i++) {
@@ -41,6 +38,26 @@ kernel void halve_maps(const int count, const int level, global float2 *maps) {
         sum += texel.x * texel.y;
     }
     map[level_offset(level) + y * side + x] = (float2)(0.25f * covered, covered > 0.0f ? sum / covered : 0.0f);
+}
+
+// nearest [lights MAP_SIDE][MAP_SIDE]: for each light, bits of 1 / depth of objects, see drawn_texel; rows: of DirectLights
+// -> maps [lights][MAP_TEXELS], depths mapped. One work-group a texel of the coarsest level, with all that lies below it.
+kernel __attribute__((reqd_work_group_size(MAP_ITEMS, 1, 1)))
+void build_maps(const float distance_m, global const float4 *rows, global const uint *nearest, global float2 *maps) {
+    const int item = get_local_id(0), light = group_number() / (COARSEST * COARSEST), block = group_number() % (COARSEST * COARSEST);
+    const int2 corner = BLOCK * (int2)(block % COARSEST, block / COARSEST);
+    const float inverse_m = rows[4 * light].w;
+    global float2 *map = maps + light * MAP_TEXELS;
+    for (int i = item; i < BLOCK * BLOCK; i += MAP_ITEMS) {
+        const int texel = (corner.y + i / BLOCK) * MAP_SIDE + corner.x + i % BLOCK;
+        map[texel] = drawn_texel(nearest[light * MAP_SIDE * MAP_SIDE + texel], inverse_m, distance_m);
+    }
+    for (int level = 1; BLOCK >> level > 0; level++) {
+        barrier(CLK_GLOBAL_MEM_FENCE);
+        const int side = BLOCK >> level;
+        for (int i = item; i < side * side; i += MAP_ITEMS)
+            halve_texel(map, level, (corner.x >> level) + i % side, (corner.y >> level) + i / side);
+    }
 }
 
 #define TRACE_PARAMETERS VOLUME_PARAMETERS, const float ray_length_m, global const float2 *ray_places
@@ -93,17 +110,17 @@ static float4 real_parts(const Volume volume, const float ray_length_m, const Di
     return vload4(0, parts);
 }
 
-// Samples of a surface: positions, normals [h][w] (w = 0 without surface). ray_places [RAY_SETS][RAYS].
+// Samples `around` (x0 y0 x1 y1, half-open) of a surface: positions, normals [h][w] (w = 0 without surface). ray_places [RAY_SETS][RAYS].
 // -> parts [rows][cols]: the fraction of each disc's light that real surface does not block (xyz: discs 0 to 2, w = 1 valid).
 // With has_cells, samples whose cell kept its parts in frame `since` or later get those; the others ask to fill their cell's:
 // cells [rows][cols] (-1 none); claims, kept, frames [cells]: see Cells.
-kernel void trace_discs(const Grid grid, global const float4 *positions, global const float4 *normals, const int is_virtual,
+kernel void trace_discs(const Grid grid, const int4 around, global const float4 *positions, global const float4 *normals, const int is_virtual,
                         DIRECT_PARAMETERS, TRACE_PARAMETERS, global float4 *parts,
                         const int has_cells, const int since, global const int *cells, global uint *claims, global const float4 *kept,
                         global const int *frames) {
-    const int col = get_global_id(0);
-    const int row = get_global_id(1);
-    if (col >= grid.cols || row >= grid.rows) return;
+    const int col = around.x + get_global_id(0);
+    const int row = around.y + get_global_id(1);
+    if (col >= around.z || row >= around.w) return;
     const int pixel = sample_pixel(grid, row, col);
     const float4 position = positions[pixel], normal = normals[pixel];
     const int sample = row * grid.cols + col, place = has_cells ? cells[sample] : -1;

@@ -1,24 +1,20 @@
 // The pool of bricks: clearing, placing and copying. Slot 0 represents all bricks on the host, see server/volume/brick_pool.py.
-// Provides claim_bricks, place_bricks, copy_bricks.
+// Provides place_bricks, copy_bricks.
 #include "volume.clh"
 
-// slots [count] -> their voxels are never seen and without colour. One item a row of 8 voxels.
-kernel void claim_bricks(const int count, global const int *slots, global float2 *voxels, global uint *colors) {
+// listed: the bricks [count] from `first` on, and their new slots [count] behind them -> table [z][y][x]; a brick with NO_SLOT is
+// not solid; if `clears`, the slots' voxels are never seen and without colour. One item a row of 8 voxels.
+kernel void place_bricks(const int count, const int clears, const int first, global const int *listed, global int *table,
+                         global ulong *solid, global float2 *voxels, global uint *colors) {
     const int item = get_global_id(0);
     if (item >= count * BRICK * BRICK) return;
-    const int row = slots[item / (BRICK * BRICK)] * BRICK * BRICK + item % (BRICK * BRICK);
-    vstore16((float16)(0.0f), row, (global float *)voxels);
-    vstore8((uint8)(0), row, colors);
-}
-
-// bricks [count] and their new slots [count] -> table [z][y][x]; a brick with NO_SLOT is not solid.
-kernel void place_bricks(const int count, global const int *bricks, global const int *slots, global int *table,
-                         global ulong *solid) {
-    const int item = get_global_id(0);
-    if (item >= count) return;
-    const int brick = bricks[item];
-    table[brick] = slots[item];
-    if (slots[item] == NO_SLOT) solid[brick] = 0;
+    const int row = item % (BRICK * BRICK), number = first + item / (BRICK * BRICK);
+    const int brick = listed[number], slot = listed[number + count];
+    if (row == 0) table[brick] = slot;
+    if (row == 0 && slot == NO_SLOT) solid[brick] = 0;
+    if (!clears) return;
+    vstore16((float16)(0.0f), slot * BRICK * BRICK + row, (global float *)voxels);
+    vstore8((uint8)(0), slot * BRICK * BRICK + row, colors);
 }
 
 // Rows `from` [count] of one pool -> rows `to` [count] of another. One item a row of 8 voxels.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from server.culling.influence_bound import NOWHERE, UNKNOWN, InfluenceBound, MostSent, bound_influence
+from server.culling.influence_bound import NOWHERE, UNKNOWN, FewSamples, InfluenceBound, MostSent, bound_influence
 from server.culling.reason import ALLOWANCE
 from server.culling.rules import share_of_codes
 from server.culling.scene_facts import SPREAD, Brightness, SceneFacts, most_albedo, most_radiance, most_shading
@@ -28,12 +28,13 @@ ROUNDING = 1.01
 
 
 class FactsFinder:
-    """Remembers the brightest picture of a session."""
+    """Remembers the brightest picture of a session, and whether the influence of its objects was visible."""
 
     def __init__(self, *, everything: bool) -> None:
         """`everything`: nothing is culled by a bound, so no bounds are computed."""
         self._everything = everything
         self._brightest = 0.0  # of the pictures so far, in units of the first
+        self._few_samples = FewSamples()
 
     def find(
         self,
@@ -109,6 +110,7 @@ class FactsFinder:
             most,
             share_of_codes(ALLOWANCE),
             context.sampling.upsampling,
+            self._few_samples,
         )
 
 

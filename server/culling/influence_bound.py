@@ -1,7 +1,8 @@
 """Bounds of the change that virtual objects make to real surface in view, without tracing. Kernels: influence_bound.cl.
 
 Each object is replaced by the ball around its box. A few samples are tested first: most often they already show that
-the change is visible, and the rest is skipped.
+the change is visible, and the rest is skipped. While the last frame's few samples showed it, a frame does not wait for
+its own, which the next one reads: where the change fades, one more frame is drawn with all of it, and none with less.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from protocol.frames import CameraModel
 from server.objects.rasterize import Placed
 from server.opencl.buffers import BufferDescription, KeyedBufferDescription, StageBuffers
 from server.opencl.engine import Engine, float4
+from server.opencl.pending_read import PendingRead
 from server.shading.traced_scene import DeviceLight, ball_around, light_arguments
 from server.transfer.indirect import Indirect, no_hits
 from server.transfer.radiance_transfer import Directions, Transfer, sample_arguments, sample_grid
@@ -57,6 +59,14 @@ NOWHERE = InfluenceBound(0.0, 0.0, 0.0)
 UNKNOWN = InfluenceBound(np.inf, np.inf, np.inf)
 
 
+@dataclass
+class FewSamples:
+    """A session's."""
+
+    last: PendingRead | None = None
+    """Bounds at those of the last frame."""
+
+
 @dataclass(frozen=True)
 class MostSent:
     """Bounds on the radiance that leaves surfaces, [3] each, in the picture's units."""
@@ -79,9 +89,11 @@ def bound_influence(
     most: MostSent,
     seen_from: float,
     upsampling: Upsampling = "bilateral",
+    few_samples: FewSamples | None = None,
 ) -> InfluenceBound:
     """Bounds for `objects`, of which there is at least one. seen_from: larger changes are visible anyway and are
-    returned as infinite. Waits for the device."""
+    returned as infinite. Waits for the device, unless all of the change was visible at the last frame's `few_samples`.
+    """
     balls = balls_around(objects)
 
     def at_samples(every: int, those: NDArray[np.float32]) -> cl_array.Array:
@@ -89,14 +101,17 @@ def bound_influence(
             engine, camera, surface, transfer, rays, ray_length_m, light, indirect, those, most, every
         )
 
-    few = _greatest(engine, at_samples(EVERY, balls))
-    is_seen = few.change > WINDOW * seen_from
-    if is_seen and few.bounced > seen_from:
-        return UNKNOWN
+    few_samples = few_samples or FewSamples()
+    last, few_samples.last = few_samples.last, engine.begin_download(at_samples(EVERY, balls))
+    for read in filter(None, (last, few_samples.last)):  # the second waits for the device
+        few = _greatest(read.result())
+        is_seen = few.change > WINDOW * seen_from
+        if is_seen and few.bounced > seen_from:
+            return UNKNOWN
     if is_seen:  # the rest needs no directions
-        return replace(_greatest(engine, at_samples(1, balls[:0])), change=np.inf)
+        return replace(_greatest(engine.download(at_samples(1, balls[:0]))), change=np.inf)
     bounds = at_samples(1, balls)
-    found = _greatest(engine, bounds)
+    found = _greatest(engine.download(bounds))
     is_between = seen_from < found.change <= WINDOW * seen_from
     if not (is_between or light.discs):
         return found
@@ -127,8 +142,8 @@ def balls_around(objects: Sequence[Placed]) -> NDArray[np.float32]:
     return balls.view(cl_types.float4)[:, 0]
 
 
-def _greatest(engine: Engine, bounds: cl_array.Array) -> InfluenceBound:
-    most = engine.download(bounds).view(np.float32).reshape(-1, 4).max(axis=0, initial=0.0)
+def _greatest(bounds: NDArray[np.void]) -> InfluenceBound:
+    most = bounds.view(np.float32).reshape(-1, 4).max(axis=0, initial=0.0)
     return InfluenceBound(*(float(value) for value in most[:3]))
 
 
@@ -158,7 +173,7 @@ def _bound_samples(
         indirect.hits if indirect else no_hits(engine, transfer),
         *light_arguments(engine, light, rays, ray_length_m),
         len(balls),
-        buffers.balls.upload(balls) if len(balls) else engine.unused,
+        buffers.balls.refresh(balls) if len(balls) else engine.unused,
         float4(*most.objects, 0.0),
         float4(*most.real, 0.0),
         every,
@@ -201,9 +216,9 @@ def _bound_pixels(
         bounds,
         volume.voxel_m,
         len(light.discs),
-        buffers.discs.upload(table.view(cl_types.float4)[:, 0]),
+        buffers.discs.refresh(table.view(cl_types.float4)[:, 0]),
         len(balls),
-        buffers.balls.upload(balls),
+        buffers.balls.refresh(balls),
         most,
     )
     return np.asarray(engine.download(most).view(np.float32).reshape(-1, 4).max(axis=0, initial=0.0))

@@ -250,10 +250,15 @@ class _Planner(Generic[Facts]):
             self._coarse[choice.resource] = {choice.name: reason}
 
 
+_READS_OF: dict[type[Any], tuple[Read, ...]] = {}
+
+
 def target_reads(target: type[Any]) -> tuple[Read, ...]:
-    """The fields of a dataclass as reads."""
-    hints = get_type_hints(target)
-    return _reads({f.name: hints[f.name] for f in fields(target)})
+    """The fields of a dataclass as reads; found once, because hints are text that has to be compiled."""
+    if target not in _READS_OF:
+        hints = get_type_hints(target)
+        _READS_OF[target] = _reads({f.name: hints[f.name] for f in fields(target)})
+    return _READS_OF[target]
 
 
 def _reads(hints: Mapping[str, Any]) -> tuple[Read, ...]:

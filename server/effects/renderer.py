@@ -263,6 +263,7 @@ def composite_inputs(context: FrameContext, parts: PictureParts) -> CompositeInp
         camera=context.camera,
         volume_from_camera=context.volume_from_camera,
         radiance=context.measurement.radiance,
+        codes=context.measurement.codes,
         surface=context.surface,
         tolerance_m=context.volume.voxel_m,
         light=parts.light,

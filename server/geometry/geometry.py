@@ -15,6 +15,7 @@ from server.geometry.merge import merge_depth
 from server.input.measure import GREATEST_DEPTH_M, Measurement, measure
 from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
+from server.opencl.pending_read import PendingRead
 from server.tracking.camera_tracking import CameraTracking, PoseEstimate
 from server.tracking.exposure import ExposureTracking, scene_radiance
 from server.tracking.reconstruction import Reconstruction
@@ -107,14 +108,17 @@ class Geometry:
             located = self._locate(frame, measurement, volume, unaligned)
             volume_from_camera = volume.volume_from_world() @ located.world_from_camera
             place = volume_from_camera if located.fuse else None
+            marked = None  # found before the exposure, so that the host waits once for both
+            if located.fuse and frame.has_depth:
+                marked = volume.mark_near(camera, volume_from_camera, measurement.depth_m)
             exposure, doubts = self._exposure.update(frame, measurement, volume, place)  # B3
             scene = self._scene_radiance(measurement, exposure)
             notes = (*located.notes, *doubts, *input_notes(camera, frame, volume))
             if self._last is not None and not located.fuse:
                 lost = replace(self._last, measurement=measurement, exposure=exposure, scene_radiance=scene)
                 return replace(lost, tracking=located.tracking, notes=notes)
-            if located.fuse and frame.has_depth:
-                self._fuse(volume, volume_from_camera, Measurement(scene, measurement.depth_m), exposure)
+            if marked is not None:
+                self._fuse(volume, volume_from_camera, Measurement(scene, measurement.depth_m), exposure, marked)
         with stage("surface"):  # 4.2.1
             model = raycast(engine, camera, volume_from_camera, volume)
             if located.fuse:
@@ -147,9 +151,14 @@ class Geometry:
         return scene_radiance(self._engine, measurement.radiance, exposure, self._buffers.scene_radiance)
 
     def _fuse(
-        self, volume: Volume, volume_from_camera: NDArray[np.float64], measured: Measurement, exposure: float
+        self,
+        volume: Volume,
+        volume_from_camera: NDArray[np.float64],
+        measured: Measurement,
+        exposure: float,
+        marked: PendingRead | None = None,
     ) -> None:
-        volume.allocate(self._camera, volume_from_camera, measured.depth_m)
+        volume.allocate(self._camera, volume_from_camera, measured.depth_m, marked)
         integrate(self._engine, volume, self._camera, volume_from_camera, measured)
         self._reconstruction.count_exposure(exposure)
 

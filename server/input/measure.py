@@ -43,6 +43,8 @@ class Measurement:
     """[h, w] float4: linear RGB, w = 1 usable, 0 black or clipped, -1 outside the picture."""
     depth_m: cl_array.Array
     """[h, w] float32 metres along the optical axis, 0 = none."""
+    codes: cl_array.Array | None = None
+    """[h, w, 3] uint8: the picture as it is shown; None where that is not what was received."""
 
 
 @cache
@@ -61,32 +63,34 @@ def intrinsics(lens: CameraModel | DepthCamera) -> np.generic:
 
 def measure(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> Measurement:
     """Upload `frame` and rectify it. Its pictures must have the sizes of the camera's lenses."""
-    radiance = _measure_color(engine, camera, frame)
+    radiance, codes = _measure_color(engine, camera, frame)
     units = engine.buffers(_Buffers).depth_units.upload(frame.depth)
     if camera.depth is None:
         depth_m = _measure_depth(engine, camera, units)
     else:
         depth_m = register_depth(engine, camera, units, GREATEST_DEPTH_M)
-    return Measurement(radiance, depth_m)
+    is_shown = camera.color_encoding == "srgb8" and not camera.is_distorted
+    return Measurement(radiance, depth_m, codes if is_shown else None)
 
 
-def _measure_color(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> cl_array.Array:
+def _measure_color(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> tuple[cl_array.Array, cl_array.Array]:
+    """The radiance, and the codes that it was made from."""
     buffers = engine.buffers(_Buffers)
     radiance = buffers.radiance.array((camera.height, camera.width))
     is_linear = camera.color_encoding == "linear16"
-    codes = buffers.linear16_codes if is_linear else buffers.srgb8_codes
+    codes = (buffers.linear16_codes if is_linear else buffers.srgb8_codes).upload(frame.color)
     engine.launch(
         engine.kernel("measure.cl", "measure_color", LINEAR16=is_linear, DISTORTED=camera.is_distorted),
         (camera.width, camera.height),
         camera.width,
         camera.height,
-        codes.upload(frame.color),
+        codes,
         buffers.linear_values.constant(linear_values(camera.color_encoding)),
         intrinsics(camera),
         _distortion(camera),
         radiance,
     )
-    return radiance
+    return radiance, codes
 
 
 def _measure_depth(engine: Engine, camera: CameraModel, units: cl_array.Array) -> cl_array.Array:

@@ -2,24 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from server.opencl.buffers import KeyedBufferDescription, StageBuffers
 from server.opencl.engine import Engine
+from server.opencl.pending_read import PendingRead
 from server.volume.volume import Volume
 
 
 class _Buffers(StageBuffers):
-    """Keyed by the number of points, rounded up to a power of two, so that a steady stream allocates nothing."""
+    """Keyed by their length, a power of two, so that a steady stream allocates nothing."""
 
-    points = KeyedBufferDescription(cl_types.float4)
-    normals = KeyedBufferDescription(cl_types.float4)
-    directions = KeyedBufferDescription(cl_types.float4)
-    """Keyed by the number of sets, rounded, and of directions."""
+    tables = KeyedBufferDescription(cl_types.float4)
+    """Points, normals and directions."""
     arrivals = KeyedBufferDescription(cl_types.float4)
-    """Keyed by the number of points, rounded, and of directions."""
+
+
+@dataclass(frozen=True)
+class PendingArrivals:
+    """Rays on their way."""
+
+    read: PendingRead
+    shape: tuple[int, int]
+    """Points, directions of each."""
+
+    def result(self) -> NDArray[np.float32]:
+        """[n, m, 4] as of trace_arrivals, waited for."""
+        return np.asarray(self.read.result().view(np.float32).reshape(*self.shape, 4))
 
 
 def trace_arrivals(
@@ -34,12 +47,29 @@ def trace_arrivals(
     The distance is positive for photographed surface, negative for a surface's back or one without a colour, and 0
     where nothing is met. directions: [sets, m, 3] unit, world axes; point i takes set i modulo sets. normals: [n, 3]
     unit, of the surface that the points lie on: rays begin clear of it, those below its plane are skipped (0); None:
-    they lie on none.
+    they lie on none. Waits for the volume, but not for what else `engine` is at work on.
     """
+    return begin_arrivals(engine, volume, points, normals, directions).result()
+
+
+def begin_arrivals(
+    engine: Engine,
+    volume: Volume,
+    points: NDArray[np.float64],
+    normals: NDArray[np.float64] | None,
+    directions: NDArray[np.float64],
+) -> PendingArrivals:
+    """The same without waiting."""
+    engine = engine.concurrent
+    engine.wait_for(volume.written)
     buffers, (sets, per_set, _), count = engine.buffers(_Buffers), directions.shape, len(points)
-    room, room_of_sets = _rounded(count), _rounded(sets)
-    planes = np.zeros((count, 4)) if normals is None else np.pad(normals, ((0, 0), (0, 1)), constant_values=1.0)
-    arrivals = buffers.arrivals[room, per_set].array((room, per_set))
+    table = np.zeros((_rounded(2 * count + sets * per_set), 4), np.float32)
+    table[:count, :3] = points
+    if normals is not None:
+        table[count : 2 * count] = np.pad(normals, ((0, 0), (0, 1)), constant_values=1.0)
+    table[2 * count : 2 * count + sets * per_set, :3] = directions.reshape(-1, 3)
+    size = _rounded(count * per_set)
+    arrivals = buffers.arrivals[size].array((size,))
     engine.launch(
         engine.kernel("arrivals.cl", "trace_arrivals", LANES=engine.lanes),
         (-(-per_set // engine.lanes), count),
@@ -48,20 +78,11 @@ def trace_arrivals(
         count,
         per_set,
         sets,
-        buffers.points[room].upload(_float4(points, room)),
-        buffers.normals[room].upload(_float4(planes, room)),
-        buffers.directions[room_of_sets, per_set].upload(_float4(directions, room_of_sets)),
+        buffers.tables[len(table)].upload(table.view(cl_types.float4)[:, 0]),
         arrivals,
     )
-    return np.asarray(engine.download(arrivals).view(np.float32).reshape(room, per_set, 4)[:count])
+    return PendingArrivals(engine.begin_download(arrivals[: count * per_set]), (count, per_set))
 
 
 def _rounded(count: int) -> int:
     return 1 << max(count - 1, 0).bit_length()
-
-
-def _float4(vectors: NDArray[np.float64], room: int) -> NDArray[np.void]:
-    """[room, ...] float4 of [n, ..., 3 or 4], the rest zeros."""
-    padded: NDArray[np.float32] = np.zeros((room, *vectors.shape[1:-1], 4), np.float32)
-    padded[: len(vectors), ..., : vectors.shape[-1]] = vectors
-    return padded.view(cl_types.float4)[..., 0]

@@ -18,7 +18,7 @@ from server.light.light_estimation import LEAST_OPENNESS, Evidence, LightEstimat
 from server.light.place_light import PlaceLight
 from server.light.shell.known_room import KnownRoom
 from server.light.shell.room_model import RoomModel
-from server.light.shell.solution import Solution
+from server.light.shell.solution import LookUp, Solution
 from server.light.shell.switches import Switches
 from server.maths.direct_lights import SplitLight, split_light
 from server.maths.sh import LUMINANCE
@@ -110,10 +110,24 @@ class RoomLight:
         discs = tuple(lamp.as_direct_light(origin_world) for lamp in lamps)
         return whole, SplitLight(rest, discs)
 
-    def arriving_at(self, engine: Engine, volume: Volume, positions: NDArray[np.float64]) -> tuple[PlaceLight, ...]:
-        """The light that arrives at each of `positions` [n, 3] (world metres), in units of the first picture."""
+    def look_up(self, engine: Engine, volume: Volume, positions: NDArray[np.float64]) -> LookUp | None:
+        """Begin to trace what `arriving_at` needs; None where there is no solution, or this frame takes another."""
+        solution = None if self._model.is_due else self._solution
+        return solution.look_up(engine, volume, positions) if solution else None
+
+    def finish(self) -> None:
+        """Begin what is worked out beside the frames. The last of a frame."""
+        self._model.finish()
+
+    def arriving_at(
+        self, engine: Engine, volume: Volume, positions: NDArray[np.float64], begun: LookUp | None = None
+    ) -> tuple[PlaceLight, ...]:
+        """The light that arrives at each of `positions` [n, 3] (world metres), in units of the first picture.
+
+        begun: of look_up, used if it is of the same places and solution."""
         if solution := self._solution:
-            found = solution.arriving_at(engine, volume, positions)
+            is_begun = begun and begun.solution is solution and np.array_equal(begun.positions, positions)
+            found = solution.arriving(begun if begun and is_begun else solution.look_up(engine, volume, positions))
             if self._settings.light_color == "white":
                 found = [replace(light, sh=_whitened(light.sh)) for light in found]
             return tuple(found)

@@ -12,6 +12,7 @@ from server.light.light_message import LightPlaces
 from server.light.place_light import LitPlace, Place, PlaceLight
 from server.light.room_light import RoomLight
 from server.light.shell.room_model import SOLVE_EVERY
+from server.light.shell.solution import LookUp
 from server.light.view_middle import ViewMiddle
 
 MOST_OBJECTS = 64
@@ -29,38 +30,40 @@ class ToldPlaces:
         self.newest = LightPlaces()
         """World axes of the room, metres; where the camera is lost, those of the last frame that was placed."""
         self._middle: ViewMiddle | None = None
+        self._view: Floats = np.zeros(3)
+        self._places: list[Place] = []
+        self._begun: LookUp | None = None
         self._sh: Floats = np.zeros(0)
         self._frames = 0
 
     def begin(self, context: FrameContext) -> None:
-        """Let the device find the middle of a frame's view; `update` needs it."""
+        """Let the device find the middle of a frame's view."""
         self._middle = ViewMiddle(context.engine, context.surface)
 
-    def update(
-        self,
-        context: FrameContext,
-        light: RoomLight,
-        asked: Floats,
-        objects: Mapping[str, Floats],
-        *,
-        is_still: bool,
-    ) -> None:
-        """Look up the light at all places. asked: [n, 3] world; objects: the middle of each by name.
+    def look_up(self, context: FrameContext, light: RoomLight, asked: Floats, objects: Mapping[str, Floats]) -> None:
+        """Find the places, wait for the middle of the view, and begin to trace what is met from new ones.
 
-        `is_still`: the geometry is that of the frame before.
+        asked: [n, 3] world; objects: the middle of each by name.
         """
         origin = context.volume.origin_world
         eye = context.volume_from_camera[:3, 3]
         middle = self._middle.seen_from(eye) if self._middle else None
-        view = (eye if middle is None else middle) + origin
-        places = _places(view, asked, objects)
+        self._view = (eye if middle is None else middle) + origin
+        self._places = _places(self._view, asked, objects)
+        told = {_key(lit.place) for lit in self.newest.lit}
+        new = [place.position for place in self._places if _key(place) not in told]
+        self._begun = light.look_up(context.engine, context.volume, np.array(new)) if new else None
+
+    def update(self, context: FrameContext, light: RoomLight, *, is_still: bool) -> None:
+        """Look up the light at all places. `is_still`: the geometry is that of the frame before."""
         kept = self._kept(light, is_still=is_still)
-        new = [place for place in places if _key(place) not in kept]
+        new = [place for place in self._places if _key(place) not in kept]
         if new:
             positions = np.array([place.position for place in new])
-            found = light.arriving_at(context.engine, context.volume, positions)
+            found = light.arriving_at(context.engine, context.volume, positions, self._begun)
             kept |= {_key(place): one for place, one in zip(new, found, strict=True)}
-        self.newest = LightPlaces(view, [LitPlace(place, kept[_key(place)]) for place in places])
+        self._begun = None
+        self.newest = LightPlaces(self._view, [LitPlace(place, kept[_key(place)]) for place in self._places])
 
     def _kept(self, light: RoomLight, *, is_still: bool) -> dict[Key, PlaceLight]:
         """What was found under the same light and still holds: in a still view, and between solutions of the model."""

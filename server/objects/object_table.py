@@ -69,7 +69,7 @@ def object_table(engine: Engine, objects: Sequence[tuple[VirtualObject, Matrix]]
     table = np.concatenate(rows if count else [np.zeros((1, 16))]).astype(np.float32)
     return ObjectTable(
         count=count,
-        rows=engine.buffers(_Buffers).rows.upload_parts(
+        rows=engine.buffers(_Buffers).rows.refresh_parts(
             {"grid_from_volume": table.view(cl_types.float16)[:, 0], "dims": dims.view(cl_types.int4)[:, 0]},
         ),
         distances=pool,

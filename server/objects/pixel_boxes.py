@@ -12,6 +12,8 @@ from server.objects.pinhole import Pinhole
 
 NEAR_M = 0.05
 """Distance of the near plane."""
+GUARD_PX = 1e6
+"""Nothing that far out needs clipping; less than the bound in clip.clh, for rounding."""
 
 Floats = NDArray[np.float64]
 PixelBox = tuple[int, int, int, int]
@@ -30,9 +32,7 @@ def pixel_boxes(
     """
     if not len(low):
         return ()
-    corners = low[:, None] + _CORNERS * (high - low)[:, None]
-    corners = corners @ camera_from_model[:, :3, :3].transpose(0, 2, 1) + camera_from_model[:, None, :3, 3]
-    points, in_front = _in_front(corners)
+    points, in_front = _in_front(_corners_in_camera(camera_from_model, low, high))
     depth = np.where(in_front, points[..., 2], 1.0)
     u, v = (points[..., k] / depth * f + c for k, f, c in ((0, camera.fx, camera.cx), (1, camera.fy, camera.cy)))
     x0, x1 = _span(u, in_front, camera.width)
@@ -40,6 +40,21 @@ def pixel_boxes(
     seen = (x0 < x1) & (y0 < y1)
     rows = np.stack([x0, y0, x1, y1], axis=1).tolist()
     return tuple((a, b, c, d) if good else None for (a, b, c, d), good in zip(rows, seen.tolist(), strict=True))
+
+
+def are_whole(camera: CameraModel | Pinhole, camera_from_model: Floats, low: Floats, high: Floats) -> bool:
+    """Whether no triangle inside these boxes needs clipping (clip.clh). Arguments as of pixel_boxes."""
+    if not len(low):
+        return True
+    x, y, depth = np.moveaxis(_corners_in_camera(camera_from_model, low, high), -1, 0)
+    most = depth * GUARD_PX
+    in_guard = (np.abs(x * camera.fx + depth * camera.cx) < most) & (np.abs(y * camera.fy + depth * camera.cy) < most)
+    return bool((in_guard & (depth > 1.01 * NEAR_M)).all())
+
+
+def _corners_in_camera(camera_from_model: Floats, low: Floats, high: Floats) -> Floats:
+    corners = low[:, None] + _CORNERS * (high - low)[:, None]
+    return corners @ camera_from_model[:, :3, :3].transpose(0, 2, 1) + camera_from_model[:, None, :3, 3]
 
 
 def _span(places: Floats, valid: NDArray[np.bool_], size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

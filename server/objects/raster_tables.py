@@ -14,7 +14,7 @@ from protocol.frames import CameraModel
 from server.objects.arena import Arena, gather
 from server.objects.dirty_region import box_around
 from server.objects.pinhole import Pinhole
-from server.objects.pixel_boxes import PixelBox
+from server.objects.pixel_boxes import PixelBox, are_whole
 from server.objects.virtual_object import VirtualObject
 from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, int2
@@ -49,11 +49,19 @@ class Picture:
     triangles: int
     region: PixelBox
     """Tiles that the objects can cover: x0, y0, x1, y1, half-open; EMPTY where there are none."""
+    is_whole: bool
+    """No triangle has to be clipped."""
 
     @property
     def all_tiles(self) -> PixelBox:
         """As `region`, of the whole picture."""
         return 0, 0, -(-self.camera.width // TILE), -(-self.camera.height // TILE)
+
+    @property
+    def covered(self) -> int:
+        """Number of tiles of `region`."""
+        x0, y0, x1, y1 = self.region
+        return (x1 - x0) * (y1 - y0)
 
     @property
     def size(self) -> np.generic:
@@ -83,20 +91,22 @@ def tabulate(
     in_view = np.array([box is not None for box in boxes], bool)
     sizes = np.array([(len(t.vertices), len(t.triangles)) for t in things], np.int64).reshape(-1, 2) * in_view[:, None]
     before = np.cumsum(sizes, axis=0) - sizes
+    low, high = (np.array([thing.bounds[k] for thing in things], np.float64).reshape(-1, 3) for k in (0, 1))
     if things:
         rows[:, :3] = arena.firsts[[slot[id(thing)] for thing in things]]
         rows[:, 3:5], rows[:, 5], rows[:, 6] = sizes, before[:, 1], before[:, 0]
     return Picture(
         camera,
         arena,
-        buffers.objects.upload(rows.view(cl_types.int8)[:, 0]),
-        buffers.matrices.upload(_matrices(camera, camera_from_volume, volume_from_model)),
-        buffers.vertex_chunks.upload(_chunks(sizes[:, 0])),
-        buffers.triangle_chunks.upload(_chunks(sizes[:, 1])),
+        buffers.objects.refresh(rows.view(cl_types.int8)[:, 0]),
+        buffers.matrices.refresh(_matrices(camera, camera_from_volume, volume_from_model)),
+        buffers.vertex_chunks.refresh(_chunks(sizes[:, 0])),
+        buffers.triangle_chunks.refresh(_chunks(sizes[:, 1])),
         len(things),
         int(sizes[:, 0].sum()),
         int(sizes[:, 1].sum()),
         _tiles_of(box_around(boxes)),
+        are_whole(camera, (camera_from_volume @ volume_from_model)[in_view], low[in_view], high[in_view]),
     )
 
 

@@ -17,13 +17,14 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.objects.dirty_region import DirtyRegion, is_empty
+from server.objects.dirty_region import DirtyRegion
 from server.objects.pinhole import Pinhole, finer
 from server.objects.pixel_boxes import NEAR_M, PixelBox, pixel_boxes
-from server.objects.raster_tables import CHUNK, TILE, Picture, TableBuffers, tabulate
+from server.objects.raster_lists import LIST_ITEMS, Lists, RasterBuffers, make_lists
+from server.objects.raster_tables import CHUNK, TILE, Picture, tabulate
 from server.objects.virtual_object import VirtualObject
 from server.opencl.buffers import BufferDescription, BufferGroup, StageBuffers, Workspace
-from server.opencl.engine import Engine, int2, int4
+from server.opencl.engine import Engine, int4
 from server.opencl.structs import SURFACE_PARAMETERS
 
 __all__ = [
@@ -42,47 +43,9 @@ FINE_SUBPIXELS, COARSE_SUBPIXELS = 4, 2
 has one shade more than that, and with three shades furniture has visible steps."""
 FINE_PIXELS = 640 * 480
 """Pictures up to this size have fine subpixels. In larger ones steps are smaller, and the cost grows by the area."""
-_SCAN_ITEMS = 256
-_LEAST_ENTRIES = 1 << 16
-_LEAST_ROOM = 1 << 10
-_PIECES_PER_PIXEL = 4
-"""Initial capacity, limited by the number of triangles; grows when needed."""
-_FRAGMENTS_PER_PIXEL = 2
-"""Capacity; if there are more, the triangles are processed a second time."""
-_FRAGMENTS_PER_TRIANGLE = 40
-"""More fragments than a triangle in a square of 8 pixels can have."""
-_MOST_ENTRIES = 1 << 27
-"""Most entries of all tiles together: 512 MiB."""
 
 Matrix = NDArray[np.float64]
 Placed = tuple[VirtualObject, Matrix]
-
-
-class RasterBuffers(StageBuffers):
-    """Device buffers of one picture's tables and lists."""
-
-    tables = BufferGroup(TableBuffers)
-    projected = BufferDescription(cl_types.int4)
-    """[vertices] on the screen."""
-    starts = BufferDescription(np.int32)
-    counts = BufferDescription(np.int32)
-    """[tiles and a few] where each tile's entries begin, and how many it has."""
-    corners = BufferDescription(cl_types.int8)
-    inverse_depths = BufferDescription(cl_types.float4)
-    """[pieces] of triangles."""
-    entries = BufferDescription(np.int32)
-    """[entries] pieces sorted by tile."""
-    fragments = BufferDescription(cl_types.int4)
-    """[fragments] of triangles smaller than a few pixels."""
-    nearest = BufferDescription(np.uint32)
-    """[h, w] bits of the nearest 1 / depth (1/metre)."""
-    visible = BufferDescription(np.int32)
-    """[h, w] index of the triangle that is seen."""
-
-    def __init__(self, workspace: Workspace) -> None:
-        super().__init__(workspace)
-        self.drawn: DirtyRegion = DirtyRegion()
-        """The region of `nearest`."""
 
 
 class VirtualSurfaceBuffers(StageBuffers):
@@ -123,21 +86,6 @@ class VirtualSurface:
     """[h, w] float4: perceptual roughness, metalness, 0, w = 1; 0 where there is none; rasterize() always has it."""
 
 
-@dataclass(frozen=True)
-class _Lists:
-    """Device lists of one picture's triangles: large ones as pieces, sorted into tiles; small ones as fragments."""
-
-    projected: cl_array.Array
-    corners: cl_array.Array
-    inverse_depths: cl_array.Array
-    starts: cl_array.Array
-    entries: cl_array.Array
-    nearest: cl_array.Array
-    fragments: cl_array.Array
-    fragment_count: int
-    """Includes fragments beyond the capacity."""
-
-
 def rasterize(
     engine: Engine,
     camera: CameraModel,
@@ -148,7 +96,7 @@ def rasterize(
     """Draw `objects`, each with its `volume_from_model`, as a pinhole camera sees them (its distortion is ignored).
 
     `camera_from_volume` [4, 4] float64, rigid: camera axes x right, y down, z forward. buffers: of the result;
-    None: the engine's. Waits for the device once.
+    None: the engine's. Waits for the device where there is much more to draw than the last time, or something to clip.
     """
     boxes = boxes_in_view(camera, camera_from_volume, objects)
     lists = engine.buffers(_Buffers).lists
@@ -202,101 +150,15 @@ def _kernel(engine: Engine, name: str) -> cl.Kernel:
     return engine.kernel("rasterize.cl", name)
 
 
-def _power_of_two(count: int) -> int:
-    return 1 << max(count - 1, 0).bit_length()
-
-
 def _draw(engine: Engine, picture: Picture, buffers: RasterBuffers) -> tuple[cl_array.Array, cl_array.Array]:
     """[h, w] bits of the nearest 1 / depth; [h, w] the triangle that has it, in the tiles of `picture.region` only."""
     nearest = buffers.nearest.array((picture.camera.height, picture.camera.width))
     with buffers.drawn.redraw(nearest, picture.region, picture.all_tiles) as tiles:
-        lists = _make_lists(engine, picture, buffers, nearest, tiles)
+        lists = make_lists(engine, picture, buffers, nearest, tiles)
         return nearest, _raster(engine, picture, lists, buffers)
 
 
-def _make_lists(
-    engine: Engine, picture: Picture, buffers: RasterBuffers, nearest: cl_array.Array, cleared: PixelBox
-) -> _Lists:
-    """Project, clip and sort the triangles. Buffers grow until everything fits. cleared: tiles of `nearest`."""
-    tiles, shape = picture.tiles, (picture.camera.height, picture.camera.width)
-    projected = _project(engine, picture, buffers)
-    starts = buffers.starts.array((tiles + 3,))
-    counts = buffers.counts.array((2 + tiles,))
-    pixels = shape[0] * shape[1]
-    fragment_room = min(_FRAGMENTS_PER_TRIANGLE * picture.triangles, _FRAGMENTS_PER_PIXEL * pixels)
-    fragments = buffers.fragments.array((_power_of_two(max(fragment_room, 1)),))
-    room, pieces = 0, min(picture.triangles, _PIECES_PER_PIXEL * pixels) + _LEAST_ROOM
-    while pieces > room:
-        room = _power_of_two(pieces)
-        corners = buffers.corners.array((room,))
-        inverse_depths = buffers.inverse_depths.array((room,))
-        _clear(engine, picture, counts, nearest, cleared)
-        _setup(engine, picture, projected, counts, corners, inverse_depths, nearest, fragments)
-        scan = _kernel(engine, "scan_tiles")
-        engine.launch(scan, (_SCAN_ITEMS,), tiles, _MOST_ENTRIES // tiles, counts, starts, local=(_SCAN_ITEMS,))
-        total, pieces, fragment_count = (int(value) for value in engine.download(starts[tiles:]))
-    entries = buffers.entries.array((_power_of_two(max(total, _LEAST_ENTRIES)),))
-    engine.launch(_kernel(engine, "fill_tiles"), (pieces,), pieces, picture.size, corners, starts, counts, entries)
-    return _Lists(projected, corners, inverse_depths, starts, entries, nearest, fragments, fragment_count)
-
-
-def _project(engine: Engine, picture: Picture, buffers: RasterBuffers) -> cl_array.Array:
-    """The vertices of the objects in view on the screen, [vertices] int4."""
-    room = _power_of_two(max(picture.vertices, _LEAST_ROOM))
-    projected = buffers.projected.array((room,))
-    engine.launch(
-        _kernel(engine, "project_vertices"),
-        (len(picture.vertex_chunks) * CHUNK if picture.vertices else 0,),
-        picture.vertex_chunks,
-        picture.objects,
-        picture.matrices,
-        NEAR_M,
-        picture.arena.vertices,
-        projected,
-        local=(CHUNK,),
-    )
-    return projected
-
-
-def _clear(engine: Engine, picture: Picture, counts: cl_array.Array, nearest: cl_array.Array, tiles: PixelBox) -> None:
-    rows = 0 if is_empty(tiles) else (tiles[2] - tiles[0]) * (tiles[3] - tiles[1]) * TILE
-    kernel = _kernel(engine, "clear_picture")
-    engine.launch(kernel, (max(counts.size, rows),), picture.size, int4(*tiles), counts.size, counts, nearest)
-
-
-def _setup(
-    engine: Engine,
-    picture: Picture,
-    projected: cl_array.Array,
-    counts: cl_array.Array,
-    corners: cl_array.Array,
-    inverse_depths: cl_array.Array,
-    nearest: cl_array.Array,
-    fragments: cl_array.Array,
-) -> None:
-    """Fill the lists of pieces and fragments up to their capacity, and count all."""
-    engine.launch(
-        _kernel(engine, "setup_triangles"),
-        (len(picture.triangle_chunks) * CHUNK if picture.triangles else 0,),
-        picture.size,
-        int2(len(corners), len(fragments)),
-        picture.triangle_chunks,
-        picture.objects,
-        picture.matrices,
-        NEAR_M,
-        picture.arena.vertices,
-        picture.arena.triangles,
-        projected,
-        counts,
-        corners,
-        inverse_depths,
-        nearest,
-        fragments,
-        local=(CHUNK,),
-    )
-
-
-def _raster(engine: Engine, picture: Picture, lists: _Lists, buffers: RasterBuffers) -> cl_array.Array:
+def _raster(engine: Engine, picture: Picture, lists: Lists, buffers: RasterBuffers) -> cl_array.Array:
     """Index of the triangle that each pixel shows, [h, w] int32, 2^31 - 1 without one; only in `region`."""
     x0, y0, x1, y1 = picture.region
     visible = buffers.visible.array(lists.nearest.shape)
@@ -305,6 +167,8 @@ def _raster(engine: Engine, picture: Picture, lists: _Lists, buffers: RasterBuff
         ((x1 - x0) * (y1 - y0) * TILE * TILE,),
         picture.size,
         int4(*picture.region),
+        picture.tiles,
+        len(lists.entries),
         lists.corners,
         lists.inverse_depths,
         lists.starts,
@@ -313,14 +177,17 @@ def _raster(engine: Engine, picture: Picture, lists: _Lists, buffers: RasterBuff
         visible,
         local=(TILE * TILE,),
     )
-    count = lists.fragment_count
-    if count <= len(lists.fragments):
-        engine.launch(_kernel(engine, "settle_fragments"), (count,), count, lists.fragments, lists.nearest, visible)
-    else:
+    room = len(lists.fragments)
+    items = min(room, LIST_ITEMS)
+    settle = _kernel(engine, "settle_fragments")
+    engine.launch(settle, (items,), items, room, lists.counts, lists.fragments, lists.nearest, visible)
+    if lists.may_overflow:
         engine.launch(
             _kernel(engine, "settle_triangles"),
             (len(picture.triangle_chunks) * CHUNK,),
             picture.size,
+            room,
+            lists.counts,
             picture.triangle_chunks,
             picture.objects,
             picture.arena.triangles,

@@ -30,6 +30,8 @@ class DeviceBuffer:
         self._dtype: np.dtype[Any] = np.dtype(dtype)
         self.current: cl_array.Array | None = None
         """The array as it is; None before its first use."""
+        self._refreshed: bytes | None = None
+        """Content of the array, of `refresh`."""
         workspace.add(self)
 
     def array(self, shape: tuple[int, ...]) -> cl_array.Array:
@@ -49,6 +51,15 @@ class DeviceBuffer:
         self._workspace.copy(array, values)
         return array
 
+    def refresh(self, values: NDArray[Any]) -> cl_array.Array:
+        """As `upload`, but nothing is copied if the array has these values from the last time: no kernel writes it."""
+        before, content = self.current, values.tobytes()
+        array = self.array(values.shape)
+        if array is not before or content != self._refreshed:
+            self.upload(values)
+            self._refreshed = content
+        return array
+
     def constant(self, values: NDArray[Any]) -> cl_array.Array:
         """The array, copied from `values` only the first time and when the shape changes. `values` must not change."""
         if self.current is not None and self.current.shape == values.shape:
@@ -60,12 +71,12 @@ class DeviceBuffer:
         starts, size = place(shapes, part_alignment_bytes(self._workspace.queue.device))
         return Parts(self.array((size,)), starts, shapes)
 
-    def upload_parts(self, arrays: Mapping[str, NDArray[Any]], *, is_constant: bool = False) -> Parts:
-        """Copy `arrays` into this buffer, which must be of uint8. is_constant: only the first time, as `constant`."""
+    def refresh_parts(self, arrays: Mapping[str, NDArray[Any]]) -> Parts:
+        """Copy `arrays` into this buffer, which must be of uint8, as `refresh` does."""
         shapes = {part: (values.shape, values.dtype) for part, values in arrays.items()}
         starts, size = place(shapes, part_alignment_bytes(self._workspace.queue.device))
         packed = pack(arrays, starts, size)
-        return Parts(self.constant(packed) if is_constant else self.upload(packed), starts, shapes)
+        return Parts(self.refresh(packed), starts, shapes)
 
 
 class BufferDescription:
@@ -142,8 +153,8 @@ class Workspace:
         self._buffers = [*(held for held in self._buffers if held() is not None), ref(buffer)]
 
     def copy(self, array: cl_array.Array, values: NDArray[Any]) -> None:
-        """Copy `values` into an array of their size. Waits for nothing: a copy of `values` is kept until it is done."""
-        if array.nbytes:
+        """Copy `values` over the beginning of an array. Waits for nothing: a copy of them is kept until it is done."""
+        if values.nbytes:
             memory, copied = cast(Any, array.data), np.array(values, order="C")
             self._copying.append((cl.enqueue_copy(self.queue, memory, copied, is_blocking=False), copied))
         while self._copying and self._copying[0][0].command_execution_status == cl.command_execution_status.COMPLETE:

@@ -17,7 +17,7 @@ from server.opencl.device import Device
 from server.opencl.pacing import Pacer
 from server.opencl.pending_read import PendingRead
 from server.opencl.profile import Profile
-from server.opencl.program import Define, define_options
+from server.opencl.program import Define
 
 State = TypeVar("State")
 KernelArgument = cl_array.Array | np.generic | int | float | None
@@ -30,20 +30,51 @@ class _UnusedBuffers(StageBuffers):
 class Engine:
     """One command queue with everything that belongs to it. Owned by one thread at a time."""
 
-    def __init__(self, device: Device, beside: Engine | None = None) -> None:
+    def __init__(self, device: Device, beside: Engine | None = None, *, has_own_queue: bool = False) -> None:
         """`beside`: another engine, whose queue, kernels and times this one shares; its memory is its own. What either
-        does, it does after all that both were asked for before."""
+        does, it does after all that both were asked for before; `has_own_queue`: it waits for the other only where
+        `wait_for` says so."""
         self.device = device
-        self.queue: cl.CommandQueue = beside.queue if beside else _make_queue(device)
+        self.queue: cl.CommandQueue = beside.queue if beside and not has_own_queue else _make_queue(device)
         self.workspace = Workspace(self.queue)
         device.memory.add(self.workspace)
         self.profile: Profile = beside.profile if beside else Profile()
         self.pacer: Pacer = beside.pacer if beside else Pacer()
         self._kernels: dict[tuple[object, ...], cl.Kernel] = beside._kernels if beside else {}
-        self._typed: dict[int, cl.Kernel] = beside._typed if beside else {}
+        self._typed: dict[int, tuple[cl.Kernel, str]] = beside._typed if beside else {}
         self._launched: set[tuple[object, ...]] = beside._launched if beside else set()
         self._states: dict[type[Any], Any] = {}
         self._buffers: dict[type[StageBuffers], StageBuffers] = {}
+        self._concurrent: Engine | None = None
+
+    def finish(self) -> None:
+        """Wait until all that was asked for is done."""
+        self.queue.finish()
+        if self._concurrent is not None:
+            self._concurrent.finish()
+
+    @property
+    def concurrent(self) -> Engine:
+        """For work that need not wait for what this engine was asked for: it runs while this one's goes on."""
+        if self._concurrent is None:
+            self._concurrent = type(self)(self.device, beside=self, has_own_queue=True)
+        return self._concurrent
+
+    def mark(self) -> cl.Event:
+        """An event that completes with all that was asked for so far; another queue can wait for it."""
+        event = cl.enqueue_marker(self.queue)
+        self.queue.flush()
+        return event
+
+    def wait_for(self, event: cl.Event) -> None:
+        """What is asked for from now on begins after `event`. The host does not wait."""
+        if event.command_execution_status != cl.command_execution_status.COMPLETE:
+            cl.enqueue_barrier(self.queue, [event])
+
+    @property
+    def bytes_held(self) -> int:
+        """Device memory of all buffers."""
+        return self.workspace.bytes_held + (self._concurrent.bytes_held if self._concurrent else 0)
 
     @property
     def lanes(self) -> int:
@@ -52,7 +83,8 @@ class Engine:
 
     def kernel(self, file: str, name: str, **defines: Define) -> cl.Kernel:
         """Kernel `name` of the kernel file `file`; retrieved once, because a kernel object carries its arguments."""
-        key = (file, name, define_options(defines))  # as text: 1, 1.0 and True are equal in Python
+        named = sorted(defines.items())
+        key = (file, name, *named, *(type(value) for _, value in named))  # 1, 1.0 and True are equal in Python
         if key not in self._kernels:
             with nullcontext() if self.device.programs.has(file, defines) else self.pacer.aside():
                 program = self.device.programs.get(file, defines)
@@ -78,9 +110,9 @@ class Engine:
         rounded = tuple(-(-count // group) * group for count, group in zip(size, local, strict=True))
         if id(kernel) not in self._typed:  # without types each number takes pyopencl as long as a launch
             kernel.set_arg_types([_type_of(value) for value in arguments])
-            self._typed[id(kernel)] = kernel
+            self._typed[id(kernel)] = kernel, kernel.function_name
         passed: list[Any] = [a.data if isinstance(a, cl_array.Array) else a for a in arguments]
-        name = kernel.function_name
+        _, name = self._typed[id(kernel)]
         for offset, part in self.pacer.slices(name, rounded, local, steps):
             shift = offset if any(offset) else None
             variant = (id(kernel), local, shift is None)
@@ -111,7 +143,7 @@ class Engine:
     def download(self, array: cl_array.Array) -> NDArray[Any]:
         """Copy to the host; waits for everything queued before."""
         self.profile.count_read(array.nbytes)
-        result: NDArray[Any] = array.get()
+        result: NDArray[Any] = array.get(self.queue)
         return result
 
     def begin_download(self, array: cl_array.Array) -> PendingRead:
@@ -120,7 +152,10 @@ class Engine:
 
     def close(self) -> None:
         """Wait for the device and give its memory back."""
-        self.queue.finish()
+        self.finish()
+        if self._concurrent is not None:
+            self._concurrent.close()
+            self._concurrent = None
         self.workspace.release()
         self._states.clear()
         self._buffers.clear()

@@ -17,6 +17,8 @@ from typing import Protocol
 
 import pyopencl as cl
 
+from server.opencl.profile import clock_s
+
 Size = tuple[int, ...]
 
 SLICE_S = 0.05
@@ -69,6 +71,8 @@ class Pacer:
         self._slice_s, self._ahead_s, self._step_s = slice_s, ahead_s, step_s
         self._times: dict[str, _StepTime] = {}
         self._ahead: deque[_Enqueued] = deque()
+        self._expected_s = 0.0
+        """Of all that is ahead."""
         self.yielding: Yielding | None = None
         """None: the frame has the device for itself."""
 
@@ -88,7 +92,9 @@ class Pacer:
         """A slice of so many work-items was enqueued."""
         time = self._times.get(kernel)
         usual_s = time.usual_s if time else self._step_s
-        self._ahead.append(_Enqueued(kernel, items * steps, items * steps * usual_s, event))
+        one = _Enqueued(kernel, items * steps, items * steps * usual_s, event)
+        self._ahead.append(one)
+        self._expected_s += one.expected_s
 
     @contextmanager
     def aside(self) -> Iterator[None]:
@@ -102,21 +108,28 @@ class Pacer:
 
     def _make_room(self) -> None:
         while self._ahead and self._ahead[0].event.command_execution_status == cl.command_execution_status.COMPLETE:
-            self._learn(self._ahead.popleft())
+            self._learn(self._next())
         if self.yielding is not None and self.yielding.is_due():
             self._drain(0.0)
             self.yielding.give_way()
         self._drain(self._ahead_s)
 
     def _drain(self, ahead_s: float) -> None:
-        """Wait until no more than so much is on the device."""
-        while sum(one.expected_s for one in self._ahead) > ahead_s:
-            one = self._ahead.popleft()
+        """Wait until no more than so much is on the device; 0: nothing."""
+        while self._ahead and (ahead_s == 0.0 or self._expected_s > ahead_s):
+            one = self._next()
             one.event.wait()
             self._learn(one)
 
+    def _next(self) -> _Enqueued:
+        """What the device does next, which no longer counts as ahead."""
+        one = self._ahead.popleft()
+        self._expected_s = self._expected_s - one.expected_s if self._ahead else 0.0
+        return one
+
     def _learn(self, one: _Enqueued) -> None:
-        step_s = (one.event.profile.end - one.event.profile.start) * 1e-9 / one.steps
+        started_s, ended_s = (clock_s(one.event, which) for which in (cl.profiling_info.START, cl.profiling_info.END))
+        step_s = (ended_s - started_s) / one.steps
         known = self._times.get(one.kernel)
         if known is None:
             self._times[one.kernel] = _StepTime(step_s, step_s)

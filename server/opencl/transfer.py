@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 
 
 def fill_bytes(queue: cl.CommandQueue, array: cl_array.Array, value: int) -> None:
@@ -16,12 +16,9 @@ def fill_bytes(queue: cl.CommandQueue, array: cl_array.Array, value: int) -> Non
         cl.enqueue_fill_buffer(queue, _memory(array), np.array([value], np.uint8), 0, array.nbytes)
 
 
-def copy_beginning(queue: cl.CommandQueue, array: cl_array.Array, values: cl_array.Array | NDArray[Any]) -> None:
-    """Copy `values`, of the array's type, over its beginning; host memory is read before this returns."""
-    if isinstance(values, cl_array.Array):
-        cl.enqueue_copy(queue, _memory(array), _memory(values), byte_count=values.nbytes)
-    elif values.nbytes:
-        cl.enqueue_copy(queue, _memory(array), np.ascontiguousarray(values), is_blocking=True)
+def copy_beginning(queue: cl.CommandQueue, array: cl_array.Array, values: cl_array.Array) -> None:
+    """Copy `values`, of the array's type, over its beginning."""
+    cl.enqueue_copy(queue, _memory(array), _memory(values), byte_count=values.nbytes)
 
 
 def copy_into(queue: cl.CommandQueue, whole: cl_array.Array, start: int, part: cl_array.Array) -> None:

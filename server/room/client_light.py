@@ -48,9 +48,9 @@ class ClientLight:
         self._places = ToldPlaces()
         self._exposure = 1.0
 
-    def begin(self, context: FrameContext, left_out: Mapping[str, CullReason]) -> None:
-        """Let the device gather what `update` needs of a frame. `left_out`: steps that the frame does not need."""
-        if "estimate_light" not in left_out:
+    def begin(self, context: FrameContext, *, is_learnt: bool) -> None:
+        """Let the device gather what `update` needs of a frame. `is_learnt`: the frame adds to the light."""
+        if is_learnt:
             self._room.light.begin(context)
         self._places.begin(context)
 
@@ -67,15 +67,17 @@ class ClientLight:
 
         `is_still`: the geometry is that of the frame before.
         """
+        place = self._alignment.room_from_client
+        asked = self._light_at @ place[:3, :3].T + place[:3, 3]
+        self._places.look_up(context, self._room.light, asked, self._room.objects.middles())
         if "estimate_light" in left_out:
             light = self._room.light.estimate()
         else:
             radiance, lamps = self._denoised(context, settings), self._room.lamps.lamps
             distant = remove_lamps(self._engine, radiance, context.surface, context.volume, lamps)  # B4
             light = self._room.light.update(context, distant, samples, self._room.objects.up)
-        place = self._alignment.room_from_client
-        asked = self._light_at @ place[:3, :3].T + place[:3, 3]
-        self._places.update(context, self._room.light, asked, self._room.objects.middles(), is_still=is_still)
+        self._places.update(context, self._room.light, is_still=is_still)
+        self._room.light.finish()
         return light
 
     def _denoised(self, context: FrameContext, settings: Settings) -> Array:

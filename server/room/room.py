@@ -137,7 +137,7 @@ class Room:
     @property
     def device_bytes(self) -> int:
         """Device memory of the shared state, in bytes."""
-        return self.engine.workspace.bytes_held
+        return self.engine.bytes_held
 
     def close(self) -> None:
         """Free the device memory."""

@@ -93,6 +93,8 @@ class CompositeInputs:
     """Stands for `ratio` and `refined_ratio` where the light has discs (shadow_map.py)."""
     reached: cl_array.Array | None = None
     """Of mark_changes: the cells in which `ratio` counts; None: wherever it is not 1."""
+    codes: cl_array.Array | None = None
+    """[h, w, 3] uint8 as of Measurement."""
     restores_clipped: bool = False
     """Whether a shadow falls on the radiance that clipped channels are likely to have (restored.clh): what the picture
     shows of it is a lower bound."""
@@ -189,6 +191,7 @@ def composite_on_device(engine: Engine, shown: NDArray[np.uint8], mixture: Compo
     """The same where something is virtual, not read yet; valid until the next call."""
     buffers, camera = engine.buffers(_Buffers), mixture.camera
     picture = buffers.picture.array((camera.height, camera.width, 3))
-    others = (buffers.shown.upload(shown), srgb_table(engine), picture)
+    codes = buffers.shown.upload(shown) if mixture.codes is None else mixture.codes
+    others = (codes, srgb_table(engine), picture)
     launch_mixture(engine, "composite.cl", "composite", mixture, mixture_parameters(mixture), *others)
     return picture

@@ -14,9 +14,10 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
+from server.objects.dirty_region import DirtyRegion, box_around
 from server.objects.rasterize import VirtualSurface
-from server.opencl.buffers import BufferDescription, StageBuffers
-from server.opencl.engine import Engine
+from server.opencl.buffers import BufferDescription, StageBuffers, Workspace
+from server.opencl.engine import Engine, int4
 from server.shading.traced_scene import Changed, TracedScene
 from server.shading.virtual_point_lights import PlacedPoints, VirtualPointLights, place_points
 from server.transfer.indirect import Indirect, no_hits
@@ -41,6 +42,11 @@ class _Buffers(StageBuffers):
     """[rows, cols] radiance that occluders take from virtual surface."""
     point_radiances = BufferDescription(cl_types.float4)
     """[points] what points on objects send."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace)
+        self.drawn: DirtyRegion = DirtyRegion()
+        """Of `occluded`, in samples."""
 
 
 @dataclass(frozen=True)
@@ -127,18 +133,22 @@ def _sample_defines(engine: Engine, transfer: Transfer, scene: TracedScene) -> d
 def shadow_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, scene: TracedScene) -> SampleGrid:
     """Radiance that real and virtual occluders take from the virtual surface, at every VIRTUAL_STRIDE-th pixel."""
     shape = (camera.height // VIRTUAL_STRIDE, camera.width // VIRTUAL_STRIDE)
-    occluded = SampleGrid(VIRTUAL_STRIDE, engine.buffers(_Buffers).occluded.array(shape))
-    engine.launch(
-        engine.kernel("differential_rendering.cl", "shadow_virtual", **scene.defines(engine)),
-        (occluded.cols, occluded.rows),
-        scene.parameters(engine, grid_of(occluded, camera), scene.rays.interleave),
-        *scene.arguments(engine),
-        virtual.position,
-        virtual.normal,
-        virtual.object_index,
-        occluded.values,
-        steps=scene.rays.count,
-    )
+    buffers = engine.buffers(_Buffers)
+    occluded = SampleGrid(VIRTUAL_STRIDE, buffers.occluded.array(shape))
+    covered = occluded.inside(box_around(virtual.boxes))
+    with buffers.drawn.redraw(occluded.values, covered, occluded.all) as (x0, y0, x1, y1):
+        engine.launch(
+            engine.kernel("differential_rendering.cl", "shadow_virtual", **scene.defines(engine)),
+            (x1 - x0, y1 - y0),
+            scene.parameters(engine, grid_of(occluded, camera), scene.rays.interleave),
+            *scene.arguments(engine),
+            int4(x0, y0, x1, y1),
+            virtual.position,
+            virtual.normal,
+            virtual.object_index,
+            occluded.values,
+            steps=-(-scene.rays.count // scene.rays.interleave),
+        )
     return occluded
 
 
@@ -148,8 +158,10 @@ def light_points(engine: Engine, scene: TracedScene, placed: PlacedPoints | None
     placed: of place_points for the scene's objects; None: they are placed here.
     """
     placed = placed or place_points(engine, scene.objects)
-    radiances = engine.buffers(_Buffers).point_radiances.upload(placed.under_even_light(scene.light.mean))
     lit, traced = min(placed.count, MOST_POINTS), replace(scene, point_lights=placed.point_lights)
+    buffer = engine.buffers(_Buffers).point_radiances
+    is_rest_even = lit < placed.count
+    radiances = buffer.upload(placed.under_even_light(scene.light.mean)) if is_rest_even else buffer.array((lit,))
     engine.launch(
         engine.kernel("differential_rendering.cl", "light_points", **scene.defines(engine)),
         (lit,),

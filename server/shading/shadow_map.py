@@ -24,7 +24,9 @@ from server.maths.disc_places import disc_places, ray_places, search_places
 from server.maths.dominant import MOST_LIGHTS
 from server.objects.dirty_region import DirtyRegion, box_around
 from server.objects.pinhole import Pinhole
-from server.objects.rasterize import NEAR_M, Placed, RasterBuffers, VirtualSurface, drawn_depths
+from server.objects.pixel_boxes import PixelBox
+from server.objects.raster_lists import RasterBuffers
+from server.objects.rasterize import NEAR_M, Placed, VirtualSurface, drawn_depths
 from server.objects.virtual_object import VirtualObject
 from server.opencl.buffers import BufferDescription, BufferGroup, StageBuffers, Workspace
 from server.opencl.engine import Engine, KernelArgument, float4, int4
@@ -51,6 +53,7 @@ NEAREST = 1.25
 LEAST_SHADING = 0.02
 """The least shading that counts, as in include/shadows.clh."""
 _COARSEST_SIDE = 8
+_MAP_ITEMS = 64
 
 Floats = NDArray[np.float64]
 
@@ -87,6 +90,8 @@ class _Buffers(StageBuffers):
         super().__init__(workspace)
         self.drawn: DirtyRegion = DirtyRegion()
         """Of `virtual`."""
+        self.traced: DirtyRegion = DirtyRegion()
+        """Of `virtual_parts`, in samples."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +151,7 @@ def draw_shadow_maps(
     discs = [_seen_from(disc, ball) for disc in light.discs]
     axes = view_axes(np.stack([disc.direction for disc in discs]))
     rows = _rows(discs, axes, float(ball[3]))
-    uploaded = engine.buffers(_Buffers).rows.upload(rows.view(cl_types.float4)[..., 0])
+    uploaded = engine.buffers(_Buffers).rows.refresh(rows.view(cl_types.float4)[..., 0])
     drawn = engine.buffers(_Buffers).maps.array((MOST_LIGHTS, (4 * MAP_SIDE**2 - _COARSEST_SIDE**2) // 3))
     last, now = engine.state(_LastMaps), _Shown.of(rows, objects)
     if last.shown != now:
@@ -182,7 +187,9 @@ def light_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, 
     direct = buffers.virtual.array((camera.height, camera.width))
     shape = (camera.height // VIRTUAL_STRIDE, camera.width // VIRTUAL_STRIDE)
     parts = SampleGrid(VIRTUAL_STRIDE, buffers.virtual_parts.array(shape))
-    _trace_discs(engine, camera, virtual.position, virtual.normal, parts, maps, is_virtual=True)
+    covered = parts.inside(box_around(virtual.boxes))
+    with buffers.traced.redraw(parts.values, covered, parts.all) as around:
+        _trace_discs(engine, camera, virtual.position, virtual.normal, parts, around, maps, is_virtual=True)
     with buffers.drawn.redraw(direct, box_around(virtual.boxes), (0, 0, *size)) as (x0, y0, x1, y1):
         engine.launch(
             _kernel(engine, "light_virtual"),
@@ -215,7 +222,9 @@ def trace_real(
         if traced is surface and (parts.stride, parts.values.shape) == (ratio.stride, ratio.values.shape):
             return parts
     parts = SampleGrid(ratio.stride, engine.buffers(_Buffers).real_parts.array(ratio.values.shape))
-    _trace_discs(engine, camera, surface.positions, surface.normals, parts, maps, is_virtual=False, cells=cells)
+    _trace_discs(
+        engine, camera, surface.positions, surface.normals, parts, parts.all, maps, is_virtual=False, cells=cells
+    )
     maps.traced[:] = [(surface, parts)]  # the next call writes the same array
     return parts
 
@@ -341,11 +350,8 @@ def _draw_objects(
         camera_from_volume[1] += light * MAP_SIDE / focal_px * camera_from_volume[2]
         drawn += [(thing, camera_from_volume @ volume_from_model) for thing, volume_from_model in objects]
     nearest = drawn_depths(engine, camera, np.eye(4), drawn, engine.buffers(_Buffers).objects)
-    size = (MAP_SIDE, len(axes) * MAP_SIDE)
-    engine.launch(_kernel(engine, "begin_maps"), size, len(axes), far_m, uploaded, nearest, maps)
-    for level in range(1, (MAP_SIDE // _COARSEST_SIDE).bit_length()):
-        side = MAP_SIDE >> level
-        engine.launch(_kernel(engine, "halve_maps"), (side, side, len(axes)), len(axes), level, maps)
+    items = (_MAP_ITEMS * _COARSEST_SIDE**2 * len(axes),)
+    engine.launch(_kernel(engine, "build_maps"), items, far_m, uploaded, nearest, maps, local=(_MAP_ITEMS,))
 
 
 @dataclass(frozen=True)
@@ -378,6 +384,7 @@ def _trace_discs(
     positions: cl_array.Array,
     normals: cl_array.Array,
     parts: SampleGrid,
+    around: PixelBox,
     maps: ShadowMaps,
     is_virtual: bool,
     cells: Cells | None = None,
@@ -386,8 +393,9 @@ def _trace_discs(
     kept = (cells.places, cells.claims, cells.disc_parts, cells.disc_frames) if cells else (engine.unused,) * 4
     engine.launch(
         _kernel(engine, "trace_discs"),
-        (parts.cols, parts.rows),
+        (around[2] - around[0], around[3] - around[1]),
         grid_of(parts, camera),
+        int4(*around),
         positions,
         normals,
         is_virtual,

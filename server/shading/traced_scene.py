@@ -239,7 +239,7 @@ def upload_light(
     """
     sh, buffers = exposure * sh, engine.buffers(_Buffers)
     return DeviceLight(
-        buffers.coefficients.upload(_float4(sh)),
+        buffers.coefficients.refresh(_float4(sh)),
         np.maximum(0.5 / np.sqrt(np.pi) * sh[0], 0.0),
         _upload_table(buffers.table, rays, sh, sh),
         sh,
@@ -257,7 +257,7 @@ def take_discs(
     rest, buffers = exposure * split.rest, engine.buffers(_Buffers)
     return replace(
         light,
-        coefficients=buffers.rest_coefficients.upload(_float4(rest)),
+        coefficients=buffers.rest_coefficients.refresh(_float4(rest)),
         table=_upload_table(buffers.rest_table, rays, rest, light.sh),
         discs=tuple(replace(disc, irradiance=exposure * disc.irradiance) for disc in split.discs),
         with_discs=light.coefficients,
@@ -271,7 +271,7 @@ def _upload_table(
     whole: NDArray[np.float64],
 ) -> Parts:
     """The light's table, laid out as in include/arriving.clh."""
-    return buffer.upload_parts({"coefficients": _float4(sh), "whole": _float4(whole), "arriving": _arriving(rays, sh)})
+    return buffer.refresh_parts({"coefficients": _float4(sh), "whole": _float4(whole), "arriving": _arriving(rays, sh)})
 
 
 def _arriving(rays: Directions, sh: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -76,9 +76,8 @@ def no_point_lights(engine: Engine, objects: int = 1) -> VirtualPointLights:
     empty = np.zeros(1, cl_types.float4)
     cells, nearest = np.zeros(count, cl_types.int4), np.full(SIDES, -1, np.int32)
     return VirtualPointLights(
-        buffers.empty_tables[count].upload_parts(
+        buffers.empty_tables[count].refresh_parts(
             {"points": empty, "normals": empty, "cells": cells, "nearest": nearest},
-            is_constant=True,
         ),
         buffers.nothing_sent.constant(empty),
     )
@@ -137,13 +136,13 @@ def place_points(engine: Engine, objects: Sequence[Placed]) -> PlacedPoints:
     cells_m = np.linalg.norm(volume_from_grid[:, :3, 0], axis=1)
     return PlacedPoints(
         len(points),
-        buffers.points.upload(float4_rows(points, 1.0)),
-        buffers.normals.upload(float4_rows(normals)),
+        buffers.points.refresh(float4_rows(points, 1.0)),
+        buffers.normals.refresh(float4_rows(normals)),
         every.albedos,
-        buffers.albedos.upload(float4_rows(every.albedos)),
-        buffers.offsets_m.upload(cells_m[every.owners].astype(np.float32)),
+        buffers.albedos.refresh(float4_rows(every.albedos)),
+        buffers.offsets_m.refresh(cells_m[every.owners].astype(np.float32)),
         VirtualPointLights(
-            buffers.table.upload_parts(
+            buffers.table.refresh_parts(
                 {
                     "points": float4_rows(every.points),
                     "normals": float4_rows(every.normals),
@@ -151,7 +150,7 @@ def place_points(engine: Engine, objects: Sequence[Placed]) -> PlacedPoints:
                     "nearest": every.nearest,
                 },
             ),
-            buffers.unlit.upload(np.zeros(len(points), cl_types.float4)),
+            buffers.unlit.constant(np.zeros(len(points), cl_types.float4)),
         ),
     )
 

@@ -8,6 +8,7 @@ import numpy as np
 import pyopencl.array as cl_array
 
 from protocol.frames import CameraModel
+from server.objects.pixel_boxes import PixelBox
 from server.opencl.structs import GRID
 
 NO_GRID = GRID(cols=0, rows=0, stride=1, width=0)
@@ -30,6 +31,21 @@ class SampleGrid:
     def cols(self) -> int:
         """Samples across."""
         return int(self.values.shape[1])
+
+    @property
+    def all(self) -> PixelBox:
+        """All samples: x0, y0, x1, y1, half-open."""
+        return 0, 0, self.cols, self.rows
+
+    def inside(self, box: PixelBox) -> PixelBox:
+        """The samples at the pixels of `box`, and some beside it, as `all`."""
+        x0, y0, x1, y1 = box
+        return (
+            x0 // self.stride,
+            y0 // self.stride,
+            min(-(-x1 // self.stride), self.cols),
+            min(-(-y1 // self.stride), self.rows),
+        )
 
 
 def grid_of(samples: SampleGrid, camera: CameraModel) -> np.void:

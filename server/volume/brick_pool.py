@@ -30,8 +30,6 @@ class _Buffers(StageBuffers):
     """[slots, 512] packed as in bricks.py."""
     octets = BufferDescription(np.uint8)
     """[slots, 64] see include/volume.clh."""
-    claimed_slots = BufferDescription(np.int32)
-    """[n or more]"""
     copied_slots = BufferDescription(np.int32)
     """[n or more]"""
     staged_voxels = BufferDescription(cl_types.float2)
@@ -67,11 +65,6 @@ class BrickPool:
         self.colors = self._grown(self._buffers.colors, self.colors)
         self.octets = self._grown(self._buffers.octets, self.octets)
 
-    def clear(self, slots: NDArray[np.int32]) -> None:
-        """Reset the voxels of slots: never seen, without colour."""
-        claimed = upload_list(self._engine, self._buffers.claimed_slots, slots)
-        self._over_rows("claim_bricks", len(slots), claimed, self.voxels, self.colors)
-
     def download(self, slots: NDArray[np.int32]) -> Iterator[tuple[slice, NDArray[Any], NDArray[np.uint32]]]:
         """Batches: slice of `slots`, voxels [k, 512] float2, colours [k, 512]."""
         for batch in _batches(len(slots)):
@@ -85,8 +78,8 @@ class BrickPool:
         """Fill slots with voxels [n, 512] float2 and colours [n, 512]."""
         for batch in _batches(len(slots)):
             staged_voxels, staged_colors, rows = self._staging(batch)
-            copy_beginning(self._engine.queue, staged_voxels, voxels[batch])
-            copy_beginning(self._engine.queue, staged_colors, colors[batch])
+            self._engine.workspace.copy(staged_voxels, voxels[batch])
+            self._engine.workspace.copy(staged_colors, colors[batch])
             chosen = upload_list(self._engine, self._buffers.copied_slots, slots[batch])
             self._over_rows(
                 "copy_bricks", len(slots[batch]), rows, staged_voxels, staged_colors, chosen, self.voxels, self.colors
@@ -118,7 +111,7 @@ class BrickPool:
 def upload_list(engine: Engine, buffer: DeviceBuffer, values: NDArray[np.int32]) -> cl_array.Array:
     """Copy `values` into the first elements of an int32 buffer, whose length rarely changes."""
     array = buffer.array((rounded(len(values)),))
-    copy_beginning(engine.queue, array, values)
+    engine.workspace.copy(array, values)
     return array
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
-from server.volume.brick_pool import BRICK_BYTES, BRICK_VOXELS, BrickPool, upload_list
+from server.volume.brick_pool import BRICK_BYTES, BRICK_CELLS, BRICK_VOXELS, BrickPool, upload_list
 from server.volume.brick_store import BrickStore
 from server.volume.brick_table import AWAY_SLOT, NO_SLOT, BrickTable, Indices, in_view
 from server.volume.ray_tables import RayTables
@@ -30,14 +30,10 @@ _SPARE_SHARE = 1 / 16
 class _Buffers(StageBuffers):
     slots = BufferDescription(np.int32)
     """[z, y, x] slot of each brick, AWAY_SLOT, or NO_SLOT."""
-    resident_bricks = BufferDescription(np.int32)
-    """[n or more] in the order of their slots."""
+    listed_bricks = BufferDescription(np.int32)
+    """[n or more] resident ones in the order of their slots, then those that got another slot last, and these slots."""
     restored_bricks = BufferDescription(np.int32)
     """[n or more]"""
-    placed_bricks = BufferDescription(np.int32)
-    """[n or more] bricks that get another slot."""
-    placed_slots = BufferDescription(np.int32)
-    """[n or more] their slots."""
 
 
 class Residency:
@@ -54,7 +50,7 @@ class Residency:
         self.pool = BrickPool(engine)
         self.store = BrickStore(host_bytes // (_VOXEL_BYTES * BRICK_VOXELS))
         self.slots_device = self._buffers.slots.upload(self._table.slots)
-        self.resident_device = upload_list(engine, self._buffers.resident_bricks, self._table.resident())
+        self.resident_device = upload_list(engine, self._buffers.listed_bricks, self._table.resident())
         self.resident_count = 0
         self.changes = 0
         """Number of changes of voxels so far."""
@@ -175,9 +171,9 @@ class Residency:
             self._table.grow(capacity)
 
     def _claim(self, bricks: Indices) -> None:
-        self.pool.clear(self._table.take(bricks))
+        self._table.take(bricks)
         self._note_change(bricks)
-        self._place(bricks)
+        self._place(bricks, clears=True)
 
     def _restore(self, bricks: Indices) -> None:
         if not bricks.size:
@@ -204,14 +200,23 @@ class Residency:
         self._table.leave(empty, NO_SLOT)
         self._place(empty)
 
-    def _place(self, bricks: Indices) -> None:
-        """Copy the new slots of bricks to the device."""
+    def _place(self, bricks: Indices, *, clears: bool = False) -> None:
+        """Copy the new slots of bricks to the device; `clears`: their voxels are never seen."""
         if not bricks.size:
             return
-        slots = upload_list(self._engine, self._buffers.placed_slots, self._table.slots_of(bricks))
-        placed = upload_list(self._engine, self._buffers.placed_bricks, bricks)
-        kernel = self._engine.kernel("brick_pool.cl", "place_bricks")
-        self._engine.launch(kernel, (len(bricks),), len(bricks), placed, slots, self.slots_device, self._tables.solid)
-        resident = self._table.resident()
-        self.resident_count = len(resident)
-        self.resident_device = upload_list(self._engine, self._buffers.resident_bricks, resident)
+        resident, pool = self._table.resident(), self.pool
+        lists = np.concatenate([resident, bricks, self._table.slots_of(bricks)])
+        listed = upload_list(self._engine, self._buffers.listed_bricks, lists)
+        self._engine.launch(
+            self._engine.kernel("brick_pool.cl", "place_bricks"),
+            (BRICK_CELLS * len(bricks),),
+            len(bricks),
+            clears,
+            len(resident),
+            listed,
+            self.slots_device,
+            self._tables.solid,
+            pool.voxels,
+            pool.colors,
+        )
+        self.resident_device, self.resident_count = listed, len(resident)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from server.opencl.buffers import BufferDescription, KeyedBufferDescription, StageBuffers
 from server.opencl.engine import Engine, int4
 from server.opencl.parts import part_alignment_bytes
-from server.opencl.transfer import copy_beginning, fill_bytes, part_of
+from server.opencl.transfer import fill_bytes, part_of
 from server.volume.brick_pool import BrickPool, rounded, upload_list
 
 GREATEST_GAP = 15
@@ -82,7 +82,7 @@ class RayTables:
     def update(self) -> None:
         """Recompute the gaps around bricks that have become solid or empty."""
         engine, (x, y, z), bricks = self._engine, self.bricks, int4(*self.bricks, 0)
-        copy_beginning(engine.queue, self._changed, _UNCHANGED)
+        engine.workspace.copy(self._changed, _UNCHANGED)
         engine.launch(
             engine.kernel("volume.cl", "gaps_along_x"),
             (y, z),

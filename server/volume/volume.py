@@ -19,6 +19,7 @@ from server.input.measure import intrinsics
 from server.maths.rigid import translation
 from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, KernelArgument, float16, int4
+from server.opencl.pending_read import PendingRead
 from server.opencl.structs import VOLUME_SHAPE
 from server.opencl.transfer import fill_bytes
 from server.volume.brick_pool import BRICK_VOXELS
@@ -70,7 +71,7 @@ class Volume:
         budget_bytes = engine.device.volume_bytes if budget_bytes is None else budget_bytes
         host_bytes = 4 * budget_bytes if host_budget_bytes is None else host_budget_bytes
         self._residency = Residency(engine, self._tables, self.voxel_m, budget_bytes, host_bytes)
-        self._tables.update()
+        self.update_tables()
 
     @property
     def voxels(self) -> cl_array.Array:
@@ -157,7 +158,7 @@ class Volume:
         for places, voxels, colors in batches:
             self._residency.fill(places, voxels, colors)
         self.frames = frames
-        self._tables.update()
+        self.update_tables()
 
     def volume_from_world(self) -> NDArray[np.float64]:
         """[4, 4] translation to the volume's origin."""
@@ -177,22 +178,34 @@ class Volume:
             gaps_at=self._tables.gaps_at,
         )
 
-    def allocate(self, camera: CameraModel, volume_from_camera: NDArray[np.float64], depth_m: cl_array.Array) -> None:
+    def allocate(
+        self,
+        camera: CameraModel,
+        volume_from_camera: NDArray[np.float64],
+        depth_m: cl_array.Array,
+        marked: PendingRead | None = None,
+    ) -> None:
         """Give a slot to every brick near the measured surface, and restore released bricks in view.
 
         If the budget has no room for all of them, the ones nearest to the camera get a slot and `is_full` is set.
+        marked: of `mark_near` for the same arguments; None: they are marked here.
         """
-        bricks = self._bricks_near(camera, volume_from_camera, depth_m)
+        marked = marked or self.mark_near(camera, volume_from_camera, depth_m)
+        bricks = np.flatnonzero(marked.result().view(np.bool_)).astype(np.int32)
         self._residency.begin_frame(bricks)
         self.is_full = not self._residency.provide(camera, volume_from_camera, bricks)
+        self.written = self._engine.mark()
 
     def bring_back(self, camera: CameraModel, volume_from_camera: NDArray[np.float64]) -> None:
         """Restore released bricks in view. Needed before ray casting from a pose without a measurement."""
         self._residency.provide(camera, volume_from_camera, np.empty(0, np.int32))
+        self.written = self._engine.mark()
 
     def update_tables(self) -> None:
         """Renew the tables for empty-space skipping, after integration has changed the solid cells."""
         self._tables.update()
+        self.written = self._engine.mark()
+        """Event after which its memory is what it was asked to become; for other queues."""
 
     def download_batches(self) -> Iterator[Bricks]:
         """All bricks with voxels in batches, including released ones."""
@@ -203,9 +216,10 @@ class Volume:
         """All bricks with voxels, including released ones."""
         return Bricks.joined(list(self.download_batches()))
 
-    def _bricks_near(
+    def mark_near(
         self, camera: CameraModel, volume_from_camera: NDArray[np.float64], depth_m: cl_array.Array
-    ) -> Indices:
+    ) -> PendingRead:
+        """[bricks] uint8, on its way: 1 for those near the measured surface."""
         marked = self._buffers.near_surface.array((self.solid.size,))
         fill_bytes(self._engine.queue, marked, 0)
         self._engine.launch(
@@ -221,7 +235,7 @@ class Volume:
             self.truncation_m + self.voxel_m,
             marked,
         )
-        return np.flatnonzero(self._engine.download(marked).view(np.bool_)).astype(np.int32)
+        return self._engine.begin_download(marked)
 
 
 def _brick_counts(extent_m: NDArray[np.float64], voxel_m: float) -> tuple[int, int, int]:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
 import pytest
 from numpy.typing import NDArray
 
-from server.opencl.engine import Engine
+from server.opencl.engine import Engine, KernelArgument
 from server.volume.brick_pool import BRICK_VOXELS, BrickPool
 from server.volume.brick_table import AWAY_SLOT, NO_SLOT
 from tests.reference import brick_pool as twin
@@ -29,7 +28,7 @@ def as_pairs(voxels: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(voxels).view(cl_types.float2)[..., 0]
 
 
-def launch(engine: Engine, name: str, items: int, count: int, *arguments: cl_array.Array) -> None:
+def launch(engine: Engine, name: str, items: int, count: int, *arguments: KernelArgument) -> None:
     engine.launch(engine.kernel("brick_pool.cl", name), (items * count,), count, *arguments)
 
 
@@ -50,22 +49,26 @@ def test_kernels_match_their_twins(engine: Engine, count: int) -> None:
     )
     np.testing.assert_array_equal(engine.download(target[1]), twin.copy_bricks(colors, slots, other_colors, places))
 
-    launch(engine, "claim_bricks", 64, count, *source)
-    voxels, colors = twin.claim_bricks(slots, voxels, colors)
-    np.testing.assert_array_equal(vectors(engine.download(device["voxels"])), voxels)
-    np.testing.assert_array_equal(engine.download(device["colors"]), colors)
 
-
-def test_placing_matches_its_twin(engine: Engine) -> None:
+@pytest.mark.parametrize("clears", [False, True])
+def test_placing_matches_its_twin(engine: Engine, clears: bool) -> None:
     rng, upload = np.random.default_rng(1), engine.workspace.upload
     table, solid = rng.integers(-1, 50, 300).astype(np.int32), rng.integers(0, 2**63, 300, np.uint64)
+    voxels, colors = random_pool(rng)
     bricks = rng.permutation(300)[:130].astype(np.int32)
-    slots = rng.integers(NO_SLOT, AWAY_SLOT + 3, 130).astype(np.int32)
-    device = upload("table", table), upload("solid", solid)
-    launch(engine, "place_bricks", 1, 130, upload("bricks", bricks), upload("slots", slots), *device)
-    expected = twin.place_bricks(bricks, slots, table, solid)
-    for found, wanted in zip(device, expected, strict=True):
+    least = AWAY_SLOT + 1 if clears else NO_SLOT
+    slots = rng.choice(np.arange(least, least + SLOTS), 130).astype(np.int32) % SLOTS
+    if not clears:
+        slots[::3] = NO_SLOT
+    listed = upload("listed", np.concatenate([np.full(7, -9, np.int32), bricks, slots]))
+    device = upload("table", table), upload("solid", solid), upload("v", as_pairs(voxels)), upload("c", colors)
+    launch(engine, "place_bricks", 64, 130, clears, 7, listed, *device)
+    if clears:
+        voxels, colors = twin.clear_slots(slots, voxels, colors)
+    for found, wanted in zip(device[:2], twin.place_bricks(bricks, slots, table, solid), strict=True):
         np.testing.assert_array_equal(engine.download(found), wanted)
+    np.testing.assert_array_equal(vectors(engine.download(device[2])), voxels)
+    np.testing.assert_array_equal(engine.download(device[3]), colors)
 
 
 def test_bricks_survive_growth_and_the_way_to_the_host_and_back(engine: Engine) -> None:

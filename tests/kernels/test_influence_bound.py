@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -10,7 +12,16 @@ import pyopencl.cltypes as cl_types
 import pytest
 
 from protocol.frames import CameraModel
-from server.culling.influence_bound import MostSent, _bound_pixels, _bound_samples, _greatest
+from server.culling import influence_bound
+from server.culling.influence_bound import (
+    UNKNOWN,
+    FewSamples,
+    MostSent,
+    _bound_pixels,
+    _bound_samples,
+    _greatest,
+    bound_influence,
+)
 from server.maths.direct_lights import DirectLight
 from server.opencl.device import Device
 from server.opencl.engine import Engine
@@ -156,7 +167,7 @@ def test_few_samples_are_some_of_all(engine: Engine) -> None:
 
 def test_what_is_below_the_horizon_is_out_of_reach(engine: Engine) -> None:
     case = Case(engine, BALLS[2:])
-    found = _greatest(engine, case.bounds())
+    found = _greatest(engine.download(case.bounds()))
     assert (found.change, found.sent) == (0.0, 0.0)
     assert found.bounced > 0
 
@@ -237,3 +248,35 @@ def test_discs_reach_where_balls_stand_in_their_light(
     some = [twin.dims(towards, 0.1, case.balls[0], point, UP) for point in points[::3]]
     assert any(some) == reaches
     assert found == reaches
+
+
+def test_while_all_is_visible_the_last_frame_decides(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the change fades one more frame is drawn whole; where it appears the frame itself says so."""
+    now, launched = {"change": 0.0}, list[int]()
+
+    def bound_samples(*arguments: Any) -> cl_array.Array:
+        launched.append(arguments[-1])
+        return engine.workspace.upload("bounds", np.array([[now["change"], 0.0, now["change"], 1.0]], np.float32))
+
+    monkeypatch.setattr(influence_bound, "_bound_samples", bound_samples)
+    monkeypatch.setattr(influence_bound, "balls_around", lambda _: np.zeros(1, cl_types.float4))
+    few, given = FewSamples(), dict.fromkeys(("camera", "surface", "transfer", "volume", "rays", "indirect"))
+    found = []
+    for change in (1.0, 1e-4, 1e-4, 1.0, 1e-4):
+        now["change"] = change
+        found.append(
+            bound_influence(
+                engine,
+                **given,  # type: ignore[arg-type]
+                ray_length_m=1.0,
+                light=SimpleNamespace(discs=()),  # type: ignore[arg-type]
+                objects=(),
+                most=MOST,
+                seen_from=0.01,
+                few_samples=few,
+            )
+        )
+    faint = found[2]
+    assert faint.change == pytest.approx(1e-4)
+    assert found == [UNKNOWN, UNKNOWN, faint, UNKNOWN, UNKNOWN]
+    assert launched == [4, 4, 4, 1, 4, 4]

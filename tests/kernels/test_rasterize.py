@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.objects import rasterize as rasterize_module
+from server.objects import raster_lists
 from server.objects.rasterize import NEAR_M, VirtualSurfaceBuffers, nearest_depths, rasterize
 from server.objects.virtual_object import VirtualObject
 from server.opencl.device import Device
@@ -317,14 +317,16 @@ def test_more_triangles_in_a_tile_than_are_looked_at_at_once(engine: Engine) -> 
         assert (draw(engine, (soup, EYE)).triangle != visible).mean() < FLIPS
 
 
-@pytest.mark.parametrize("setting", ["_PIECES_PER_PIXEL", "_FRAGMENTS_PER_PIXEL"])
+@pytest.mark.parametrize("setting", ["_PIECES_PER_PIXEL", "_FRAGMENTS_PER_PIXEL", "_MORE_ENTRIES"])
 def test_lists_without_room(engine: Engine, monkeypatch: pytest.MonkeyPatch, setting: str) -> None:
-    """Pieces get more, of fragments the triangles are gone through again; the picture is the same."""
+    """Pieces get more, of fragments the triangles are gone through again, of entries all pieces; the picture is the
+    same."""
     soup = random_soup(3, 2000, 0.05, (0.0, 0.0, 1.0), 0.6)
     twice = soup_of(np.concatenate([soup.vertices, soup.vertices]).reshape(-1, 3, 3))
     expected = draw(engine, (twice, EYE))
-    monkeypatch.setattr(rasterize_module, setting, 0)
-    monkeypatch.setattr(rasterize_module, "_LEAST_ROOM", 1)
+    monkeypatch.setattr(raster_lists, setting, 0)
+    monkeypatch.setattr(raster_lists, "_LEAST_ROOM", 1)
+    monkeypatch.setattr(raster_lists, "_LEAST_ENTRIES", 1)
     other = Engine(engine.device)
     found = draw(other, (twice, EYE))
     other.close()
@@ -334,8 +336,8 @@ def test_lists_without_room(engine: Engine, monkeypatch: pytest.MonkeyPatch, set
 
 def test_tiles_with_more_than_they_may_list(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     """Some is not drawn, what is drawn is right, and nothing is written beyond the lists."""
-    monkeypatch.setattr(rasterize_module, "_MOST_ENTRIES", 5 * 20 * 13)
-    monkeypatch.setattr(rasterize_module, "_LEAST_ENTRIES", 1)
+    monkeypatch.setattr(raster_lists, "_MOST_ENTRIES", 5 * 20 * 13)
+    monkeypatch.setattr(raster_lists, "_LEAST_ENTRIES", 1)
     pixels = np.array([60.0, 40.0]) + np.random.default_rng(7).normal(size=(200, 3, 2)) * 30
     soup = soup_of(at_pixels(CAMERA, pixels) * np.linspace(0.5, 4, 200)[:, None, None])
     picture = draw(engine, (soup, EYE))

@@ -204,6 +204,7 @@ def taken_from_top(
             "position": space.upload("virtual_positions", float4(positions[..., :3], covered)),
             "normal": space.upload("virtual_normals", float4(normals[..., :3], covered)),
             "object_index": space.upload("virtual_index", np.zeros(covered.shape, np.int32)),
+            "boxes": ((0, 0, *covered.shape[::-1]),),
         }
     )
     rays, camera = direction_sets(81, 4), camera_of(positions)

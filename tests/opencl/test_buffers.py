@@ -66,6 +66,26 @@ def test_copy_into(engine: Engine) -> None:
     np.testing.assert_array_equal(engine.download(whole), [0, 1, 2, 70, 80, 5, 6, 7, 8, 9])
 
 
+def test_the_same_values_are_copied_once(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    copied: list[int] = []
+    copy = Workspace.copy
+    monkeypatch.setattr(Workspace, "copy", lambda *given: (copied.append(given[2].size), copy(*given)))
+    sums = engine.buffers(_Stage).sums
+    steps = [
+        np.zeros(4),
+        np.zeros(4),
+        np.arange(4),
+        np.arange(4),
+        np.arange(6),
+        np.arange(4),
+        np.arange(6),
+        np.zeros(6),
+    ]
+    for values in steps:
+        np.testing.assert_array_equal(engine.download(sums.refresh(values.astype(np.float32))), values)
+    assert copied == [4, 4, 6, 4, 6, 6]
+
+
 @pytest.mark.parametrize("shape", [(5, 3), (3, 6), (15,)])
 def test_another_shape_replaces_it(engine: Engine, shape: tuple[int, ...]) -> None:
     sums = engine.buffers(_Stage).sums

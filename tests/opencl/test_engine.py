@@ -9,6 +9,7 @@ import pyopencl.cltypes as cl_types
 import pytest
 
 from server.opencl import program
+from server.opencl.device import Device
 from server.opencl.engine import Engine, float4, float16, int4
 from tests.scenes.volumes import vectors
 
@@ -47,6 +48,24 @@ def test_nothing_to_do_is_not_launched(engine: Engine) -> None:
     visits = engine.workspace.upload("visits", np.zeros(1, np.int32))
     engine.launch(engine.kernel("engine_test.cl", "count_visits"), (0, 5), 0, 5, 1, visits)
     assert engine.profile.collect().kernels == {}
+
+
+def test_the_second_queue_waits_where_it_is_told_to_and_is_closed_with_the_first(device: Device) -> None:
+    engine = Engine(device)
+    other, visits = engine.concurrent, engine.workspace.array("visits", (1 << 20,), np.int32)
+    assert engine.concurrent is other
+    for number in range(1, 4):
+        engine.workspace.copy(visits, np.full(len(visits), number, np.int32))
+        other.wait_for(engine.mark())
+        other.launch(other.kernel("engine_test.cl", "count_visits"), (len(visits),), len(visits), 1, 1, visits)
+        assert (other.download(visits) == number + 1).all()
+    held = engine.bytes_held
+    other.workspace.array("own", (100,), np.int32)
+    assert engine.bytes_held == held + 400
+    assert engine.profile.launches == 3
+    engine.finish()
+    engine.close()
+    assert other.workspace.bytes_held == 0
 
 
 def test_arguments_arrive(engine: Engine) -> None:

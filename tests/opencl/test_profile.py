@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 from server.opencl.engine import Engine
@@ -23,9 +24,9 @@ class FakeEvent:
     start: int
     end: int
 
-    @property
-    def profile(self) -> FakeEvent:
-        return self
+    def get_profiling_info(self, which: int) -> int:
+        times = cl.profiling_info
+        return {times.QUEUED: self.queued, times.START: self.start, times.END: self.end}[which]
 
 
 class Clock:
@@ -102,6 +103,20 @@ def test_host_time_counts_under_its_row_where_no_kernel_runs(clock: Clock) -> No
     times = profile.collect()
     assert times.rows == pytest.approx({"input": 1.0, "surface": 12.0, "light_estimation": 27.25, "rendering": 0.5})
     assert times.total == pytest.approx(sum(times.rows.values()))
+
+
+def test_of_two_kernels_at_once_the_second_counts_from_the_end_of_the_first(clock: Clock) -> None:
+    profile = Profile()
+    clock.launch(profile, "raycast", 10.0)
+    with profile.stage("light_estimation"):
+        start = round((clock.now_s + 0.004 - SKEW_S) * 1e9)
+        queued = round((clock.now_s - SKEW_S) * 1e9)
+        profile.add_event("arrivals", FakeEvent(queued, start, start + 8_000_000))  # type: ignore[arg-type]
+    clock.wait(15.0)
+    times = profile.collect()
+    assert times.rows == pytest.approx({"input": 10.0, "light_estimation": 5.0})
+    assert times.kernels == pytest.approx({"raycast": 10.0, "arrivals": 8.0})
+    assert (times.idle, times.total) == pytest.approx((3.0, 15.0))
 
 
 def test_launched_kernels_are_counted(engine: Engine) -> None:

@@ -7,13 +7,6 @@ from typing import Any
 from numpy.typing import NDArray
 
 
-def claim_bricks(slots: NDArray[Any], voxels: NDArray[Any], colors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Voxels and colours after the bricks in `slots` were cleared."""
-    voxels, colors = voxels.copy(), colors.copy()
-    voxels[slots], colors[slots] = 0, 0
-    return voxels, colors
-
-
 def place_bricks(
     bricks: NDArray[Any], slots: NDArray[Any], table: NDArray[Any], solid: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -22,6 +15,13 @@ def place_bricks(
     table[bricks] = slots
     solid[bricks[slots == -1]] = 0
     return table, solid
+
+
+def clear_slots(slots: NDArray[Any], voxels: NDArray[Any], colors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Voxels and colours after the bricks in `slots` were cleared."""
+    voxels, colors = voxels.copy(), colors.copy()
+    voxels[slots], colors[slots] = 0, 0
+    return voxels, colors
 
 
 def copy_bricks(source: NDArray[Any], chosen: NDArray[Any], target: NDArray[Any], places: NDArray[Any]) -> NDArray[Any]:

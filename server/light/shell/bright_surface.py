@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from server.light.arrivals import trace_arrivals
+from server.light.arrivals import PendingArrivals, begin_arrivals
 from server.light.shell.patches import MOST_PATCHES, MOST_WEIGHT, Patches
 from server.light.shell.picture import SeenBright
 from server.light.shell.weights import MEAN_ALBEDO
@@ -112,10 +112,10 @@ class Emitters:
         result[own] -= weights[rows[own], number[own]]
         return result
 
-    def visible(self, engine: Engine, volume: Volume, points: Floats) -> NDArray[np.bool_]:
-        """[n, k] whether nothing stands between `points` [n, 3] and an emitter."""
-        directions, distances, areas = self.seen_from(points)
-        arrivals = trace_arrivals(engine, volume, points - volume.origin_world, None, directions)
+    def visible(self, volume: Volume, points: Floats, arrivals: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """[n, k] whether nothing stands between `points` [n, 3] and an emitter. arrivals: [n, k, 4] what rays towards
+        the emitters met, as of trace_arrivals."""
+        _, distances, areas = self.seen_from(points)
         met = np.abs(arrivals[..., 3])
         own = np.sqrt(areas) + 2 * volume.voxel_m  # what is as near to its middle is the emitter itself
         return np.asarray((met == 0) | (met >= distances - own))
@@ -128,6 +128,21 @@ class EmittersSeen:
     emitters: Emitters
     visible: Floats
     """[MOST_PATCHES, k] 1 or 0."""
+
+
+@dataclass(frozen=True)
+class TracedEmitters:
+    """Rays from patches towards emitters on their way."""
+
+    emitters: Emitters
+    rows: Ints
+    """[k] of the emitters."""
+    volume: Volume
+    patches: Ints
+    """[n] rows."""
+    origins: Floats
+    """[n, 3] of the rays, world metres."""
+    arrivals: PendingArrivals
 
 
 class BrightSurface:
@@ -166,7 +181,7 @@ class BrightSurface:
         """Of a cell that shows as clipped, or where surface is in view that does not."""
         for key, row in self._rows.items():
             center, radius_m = self._centers[row] / max(self._squares[row], 1e-12), np.sqrt(self._area(row) / np.pi)
-            nearest = np.linalg.norm(positions - center, axis=1).min(initial=np.inf)
+            nearest = np.sqrt(np.square(positions - center).sum(axis=1).min(initial=np.inf))
             if key in shown or nearest <= radius_m:
                 self._frames[row] = min(self._frames[row] + 1, PRESENCE)
                 self._presence[row] += (float(key in shown) - self._presence[row]) / self._frames[row]
@@ -235,20 +250,29 @@ class BrightSurface:
         emitters, rows = self.emitters()
         return EmittersSeen(emitters, (self.visibility[:, rows] > 0).astype(np.float64))
 
-    def trace(self, engine: Engine, volume: Volume, patches: Patches, traced: Ints) -> None:
+    def begin_trace(self, engine: Engine, volume: Volume, patches: Patches, traced: Ints) -> TracedEmitters | None:
         """Trace which patches see which emitters: those in `traced` anew, of the others what is not known."""
         emitters, rows = self.emitters()
         if not emitters.count:
-            return
+            return None
         moved = np.linalg.norm(emitters.centers - self._traced_at[rows], axis=1) > MOVED_M
         self._traced_at[rows[moved]] = emitters.centers[moved]
         self.visibility[:, rows[moved]] = -1
         self.visibility[traced] = -1
         used = patches.used
         unknown = used[(self.visibility[np.ix_(used, rows)] < 0).any(axis=1)]
-        if len(unknown):
-            origins = patches.positions[unknown] + volume.voxel_m * patches.normals[unknown]
-            self.visibility[np.ix_(unknown, rows)] = emitters.visible(engine, volume, origins)
+        if not len(unknown):
+            return None
+        origins = patches.positions[unknown] + volume.voxel_m * patches.normals[unknown]
+        directions = emitters.seen_from(origins)[0]
+        arrivals = begin_arrivals(engine, volume, origins - volume.origin_world, None, directions)
+        return TracedEmitters(emitters, rows, volume, unknown, origins, arrivals)
+
+    def end_trace(self, traced: TracedEmitters | None) -> None:
+        """Take over which emitters are visible, waited for."""
+        if traced is not None:
+            visible = traced.emitters.visible(traced.volume, traced.origins, traced.arrivals.result())
+            self.visibility[np.ix_(traced.patches, traced.rows)] = visible
 
 
 def _keys(points: Floats) -> Ints:

@@ -7,12 +7,13 @@ the surface that was seen, not the number of frames. Kernel: arrivals.cl.
 from __future__ import annotations
 
 from copy import copy
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from server.light.arrivals import trace_arrivals
+from server.light.arrivals import PendingArrivals, begin_arrivals
 from server.light.shell.known_room import KnownPatches
 from server.light.shell.picture import Seen
 from server.maths.sh import spherical_fibonacci
@@ -43,6 +44,15 @@ _FACINGS = 1.2  # normals are rounded to multiples of 1 / 1.2: 26 ways to face
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class TracedPatches:
+    """Patches whose rays are on their way."""
+
+    rows: Ints
+    arrivals: PendingArrivals | None
+    """None where there are no rows."""
 
 
 class Patches:
@@ -114,20 +124,24 @@ class Patches:
         """Number of patches whose rays were not traced yet."""
         return int(((self.weights > 0) & (self.traced_in < 0)).sum())
 
-    def trace(self, engine: Engine, volume: Volume, frames: int = 1) -> Ints:
+    def begin_trace(self, engine: Engine, volume: Volume, frames: int = 1) -> TracedPatches:
         """Trace the rays of patches that have none yet, and of those traced longest ago, TRACED_A_FRAME for each of
-        `frames`, or more where the light is another. Returns their rows."""
+        `frames`, or more where the light is another. Until `end_trace`, their arrivals are the last ones."""
         alive = np.flatnonzero(self.weights > 0)
         order = alive[np.argsort(self.traced_in[alive], kind="stable")]
         fresh = int((self.traced_in[order] < 0).sum())
         rows = order[: max(fresh, frames * TRACED_A_FRAME, round(self.outdated * len(order)))]
         if len(rows) == 0:
-            return rows
+            return TracedPatches(rows, None)
         self.traced_normals[rows] = normals = self.normals[rows]
         origins = self.positions[rows] - volume.origin_world
-        self.arrivals[rows] = trace_arrivals(engine, volume, origins, normals, ray_directions()[None])
         self.traced_in[rows] = self._frame
-        return rows
+        return TracedPatches(rows, begin_arrivals(engine, volume, origins, normals, ray_directions()[None]))
+
+    def end_trace(self, traced: TracedPatches) -> None:
+        """Take over what the rays met, waited for."""
+        if traced.arrivals is not None:
+            self.arrivals[traced.rows] = traced.arrivals.result()
 
     def copy(self) -> Patches:
         """What frames add does not reach it. Rays, which `trace` alone changes, are shared."""

@@ -7,17 +7,19 @@ part of the room that is new and a light that changes are solved within the fram
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from server.frame_context import FrameContext
 from server.light.light_estimation import LightEstimate
 from server.light.shell.beside import Beside
-from server.light.shell.bright_surface import BrightSurface
+from server.light.shell.bright_surface import BrightSurface, TracedEmitters
 from server.light.shell.distant import distant_light
 from server.light.shell.known_room import KnownRoom
 from server.light.shell.objective import Unknowns
-from server.light.shell.patches import Patches
+from server.light.shell.patches import Patches, TracedPatches
 from server.light.shell.picture import PatchesInPicture, Seen
 from server.light.shell.shell import Shell
 from server.light.shell.solution import Solution
@@ -43,6 +45,18 @@ LEAST_FACING = 5
 Floats = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class _Tracing:
+    """What a solution waits for, and is solved for."""
+
+    patches: TracedPatches
+    emitters: TracedEmitters | None
+    camera: Floats
+    """[3] world metres."""
+    up: Floats
+    """[3] unit, world."""
+
+
 class RoomModel:
     """Radiance of all that is not scanned surface, with the evidence for it. World axes and metres."""
 
@@ -53,6 +67,7 @@ class RoomModel:
         self._solution: Solution | None = None
         self._next: Beside[Solution | None] | None = None
         self._picture: PatchesInPicture | None = None
+        self._tracing: _Tracing | None = None
         self._begun_with: Shell | None = None
         self._waiting = self._frames = 0
 
@@ -72,10 +87,19 @@ class RoomModel:
             context.volume_from_camera,
         )
 
+    @property
+    def is_due(self) -> bool:
+        """Whether the next update takes a solution over, as far as can be told before."""
+        return self._waiting + 1 >= SOLVE_EVERY or self._waiting + 1 > NEW_SHARE * (self._frames + 1)
+
     def update(self, context: FrameContext, up: Floats) -> None:
-        """Fold in the frame that was begun; take a solution over, or begin the next. up: [3] unit, world."""
+        """Fold in the frame that was begun; take a solution over, and trace what the next needs, which `finish` begins.
+
+        up: [3] unit, world.
+        """
         engine, volume, switches = context.engine, context.volume, self._switches
         assert self._picture is not None
+        self.finish()  # what a frame that failed has left
         seen, self._picture = self._picture.seen(), None
         if not seen.count:
             return
@@ -92,17 +116,24 @@ class RoomModel:
         self._take_over()
         if not must_follow and self._is_still():
             return
-        traced = self._patches.trace(engine, volume, self._waiting)
-        self._bright.trace(engine, volume, self._patches, traced)
+        traced = self._patches.begin_trace(engine, volume, self._waiting)
+        emitters = self._bright.begin_trace(engine, volume, self._patches, traced.rows)
         self._waiting = 0
         camera = context.volume_from_camera[:3, 3] + volume.origin_world
-        self._begin_solution(traced, camera, up)
+        self._tracing = _Tracing(traced, emitters, camera, up)
         if must_follow or is_young:
+            self.finish()
             self._take_over()
 
-    def _begin_solution(self, traced: NDArray[np.int64], camera: Floats, up: Floats) -> None:
-        patches, bright = self._patches.copy(), self._bright.seen_by()
-        self._next = Beside(lambda: self._solver.solve(patches, bright, traced, camera, up))
+    def finish(self) -> None:
+        """Begin the solution whose rays are on their way, if there is one."""
+        if self._tracing is None:
+            return
+        tracing, self._tracing = self._tracing, None
+        self._patches.end_trace(tracing.patches)
+        self._bright.end_trace(tracing.emitters)
+        patches, bright, traced = self._patches.copy(), self._bright.seen_by(), tracing.patches.rows
+        self._next = Beside(lambda: self._solver.solve(patches, bright, traced, tracing.camera, tracing.up))
 
     def _take_over(self) -> None:
         """The solution that was begun last, waited for."""
@@ -125,7 +156,7 @@ class RoomModel:
 
     def estimate(self, bands: int) -> LightEstimate:
         """The light from beyond the scan."""
-        return distant_light(self._solution.distant if self._solution else Unknowns(), bands)
+        return self._solution.estimate(bands) if self._solution else distant_light(Unknowns(), bands)
 
     def known(self) -> KnownRoom:
         """What it is solved from."""

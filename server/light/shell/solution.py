@@ -9,9 +9,11 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from server.light.arrivals import trace_arrivals
+from server.light.arrivals import PendingArrivals, begin_arrivals, trace_arrivals
+from server.light.light_estimation import LightEstimate
 from server.light.place_light import VALID_SPREAD_DEG, PlaceLight
 from server.light.shell.bright_surface import Emitters
+from server.light.shell.distant import distant_light
 from server.light.shell.lamps import ShellLamp, emitting_lamps, find_lamps
 from server.light.shell.objective import Unknowns
 from server.light.shell.shell import CORNERS, Shell
@@ -72,15 +74,27 @@ class Solution:
     """[n, 3] mean log radiance of these patches."""
     _beyond: dict[tuple[bytes, int], tuple[Floats, Floats, list[ShellLamp]]] = field(default_factory=dict)
     """What `beyond` found last."""
+    _estimates: dict[int, LightEstimate] = field(default_factory=dict)
+    """Of `estimate`, by the number of bands."""
 
     def radiance_at(self, engine: Engine, volume: Volume, position: Floats, directions: Floats) -> Floats:
         """[m, 3] radiance that arrives at `position` [3] (world) against `directions` [m, 3]."""
-        return np.asarray(self._radiance_of(self._looked_up(engine, volume, position[None], directions[None]))[0])
+        arrivals = trace_arrivals(engine, volume, position[None] - volume.origin_world, None, directions[None])
+        return np.asarray(self._radiance_of(self._met(position[None], directions, arrivals))[0])
 
-    def arriving_at(self, engine: Engine, volume: Volume, positions: Floats) -> list[PlaceLight]:
-        """The light at each of `positions` [n, 3] (world)."""
-        met = self._looked_up(engine, volume, positions, look_up_directions())
-        rays = self._with_emitters(engine, volume, positions, met)
+    def look_up(self, engine: Engine, volume: Volume, positions: Floats) -> LookUp:
+        """Begin to trace what `arriving` needs for each of `positions` [n, 3] (world)."""
+        evenly = np.broadcast_to(look_up_directions(), (len(positions), DIRECTIONS, 3))
+        directions = np.concatenate([evenly, self.emitters.seen_from(positions)[0]], axis=1)
+        rays = begin_arrivals(engine, volume, positions - volume.origin_world, None, directions)
+        return LookUp(self, volume, positions, rays)
+
+    def arriving(self, look_up: LookUp) -> list[PlaceLight]:
+        """The light at each position of a look-up of this solution."""
+        positions, arrivals = look_up.positions, look_up.rays.result()
+        met = self._met(positions, look_up_directions()[0], arrivals[:, :DIRECTIONS])
+        visible = self.emitters.visible(look_up.volume, positions, arrivals[:, DIRECTIONS:])
+        rays = self._with_emitters(positions, met, visible)
         return [self._arriving(position, of_place) for position, of_place in zip(positions, rays, strict=True)]
 
     def beyond(self, position: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
@@ -93,6 +107,12 @@ class Solution:
             self._beyond.clear()
             self._beyond[asked] = self._seen_beyond(position, bands)
         return self._beyond[asked]
+
+    def estimate(self, bands: int) -> LightEstimate:
+        """The light from beyond the scan, the same for all places."""
+        if bands not in self._estimates:
+            self._estimates[bands] = distant_light(self.distant, bands)
+        return self._estimates[bands]
 
     def _seen_beyond(self, position: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
         directions = look_up_directions()[0]
@@ -118,17 +138,17 @@ class Solution:
         is_known = (columns >= 0) & (columns < self.near.known)
         return np.where(is_known[:, None], self.near.radiance[np.where(is_known, columns, 0)], 0.0)
 
-    def _looked_up(self, engine: Engine, volume: Volume, positions: Floats, directions: Floats) -> Met:
-        """What rays [n, m] meet; cells that the solution does not have are NO_CELL."""
-        arrivals = trace_arrivals(engine, volume, positions - volume.origin_world, None, directions)
-        turned = np.broadcast_to(directions[0], (len(positions), *directions[0].shape))
+    def _met(self, positions: Floats, directions: Floats, arrivals: NDArray[np.float32]) -> Met:
+        """What rays from `positions` [n, 3] along `directions` [m, 3] met; cells that the solution does not have are
+        NO_CELL. arrivals: [n, m, 4] as of trace_arrivals."""
+        turned = np.broadcast_to(directions, (len(positions), *directions.shape))
         met = meet(self.shell, self.hidden, positions, turned, arrivals.astype(np.float64))
         is_known = met.columns < self.near.known
         columns, shares = np.where(is_known, met.columns, NO_CELL), np.where(is_known, met.shares, 0.0)
         return replace(met, columns=columns, shares=shares)
 
-    def _with_emitters(self, engine: Engine, volume: Volume, positions: Floats, met: Met) -> list[_Rays]:
-        """What evenly spread rays from `positions` [n, 3] met, and a ray to each emitter."""
+    def _with_emitters(self, positions: Floats, met: Met, visible: NDArray[np.bool_]) -> list[_Rays]:
+        """What evenly spread rays from `positions` [n, 3] met, and a ray to each emitter, `visible` [n, k] or not."""
         emitters = self.emitters
         solid_angles = emitters.solid_angles(positions)
         weights = emitters.weights(solid_angles / (4 * np.pi), DIRECTIONS)
@@ -138,7 +158,7 @@ class Solution:
         shares[place, ray] *= emitters.left_to_others(weights, place, ends)[:, None]
         columns = columns_of(self.hidden, bright_keys(emitters.centers))
         columns = np.where(columns < self.near.known, columns, NO_CELL)
-        brought = weights * solid_angles * emitters.visible(engine, volume, positions) * (columns >= 0)
+        brought = weights * solid_angles * visible * (columns >= 0)
         towards = sh_basis(emitters.seen_from(positions)[0].reshape(-1, 3), BANDS)
         towards = towards.reshape(*brought.shape, BANDS * BANDS)
         return [
@@ -185,3 +205,15 @@ class Solution:
         place = cells * bands + np.arange(bands)[:, None]
         sums = np.bincount(place.ravel(), (rays.basis[:, ray] * sent).ravel(), self.near.known * bands)
         return np.asarray(sums.reshape(-1, bands).T)
+
+
+@dataclass(frozen=True)
+class LookUp:
+    """Rays from places on their way, for Solution.arriving."""
+
+    solution: Solution
+    volume: Volume
+    positions: Floats
+    """[n, 3] world."""
+    rays: PendingArrivals
+    """Along look_up_directions, then towards the solution's emitters."""

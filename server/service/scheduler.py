@@ -25,6 +25,8 @@ QUANTUM_S = 0.2
 NEXT_QUANTUM_S = 0.1
 """The same for a frame that was interrupted before. With it, and with what is enqueued already (pacing.py), another
 session waits for 0.2 s, and for twice as long where the processor has other work too."""
+REQUEST_QUANTUM_S = 0.02
+"""The same for what is no frame and has time, such as a panorama (0.1 to 0.2 s of a processor)."""
 _RATE = 0.2  # weight of a new frame in the running mean of costs
 
 
@@ -46,15 +48,21 @@ class SessionShare:
 class Turn:
     """A session's use of the device for one frame; made by Scheduler.acquire."""
 
-    def __init__(self, scheduler: Scheduler, share: SessionShare) -> None:
+    def __init__(self, scheduler: Scheduler, share: SessionShare, quantum_s: float = QUANTUM_S) -> None:
         self._scheduler = scheduler
         self._share = share
+        self._quantum_s = quantum_s
         self.waited_s = 0.0
         """Time before the frame could begin."""
         self.spent_s = 0.0
         """Device time of the frame before it was last resumed."""
         self.resumed_s = 0.0
         """When it was begun or last resumed, by the scheduler's clock."""
+
+    @property
+    def quantum_s(self) -> float:
+        """Time that it has from when it was begun or resumed until it lets others go first."""
+        return self._quantum_s if self.spent_s == 0.0 else min(self._quantum_s, NEXT_QUANTUM_S)
 
     def is_due(self) -> bool:
         """Whether the frame is to let another session go first."""
@@ -98,9 +106,9 @@ class Scheduler:
             self._shares.remove(share)
 
     @contextmanager
-    def acquire(self, share: SessionShare) -> Iterator[Turn]:
-        """Context in which the session may use the device."""
-        turn, began_s = Turn(self, share), self._clock()
+    def acquire(self, share: SessionShare, quantum_s: float = QUANTUM_S) -> Iterator[Turn]:
+        """Context in which the session may use the device. quantum_s: time before it lets others go first."""
+        turn, began_s = Turn(self, share, quantum_s), self._clock()
         with self._changed:
             share.used_s = max(share.used_s, self._least_used_s(share, share.used_s) - CREDIT_S)
             self._wait(turn, share)
@@ -115,7 +123,7 @@ class Scheduler:
     def is_due(self, turn: Turn, share: SessionShare) -> bool:
         """Whether the session that has the turn is to let another go first."""
         spent_s = self._clock() - turn.resumed_s
-        if spent_s < (QUANTUM_S if turn.spent_s == 0.0 else NEXT_QUANTUM_S):
+        if spent_s < turn.quantum_s:
             return False
         with self._changed:
             return any(other.used_s < share.used_s + spent_s for other in self._able())

@@ -7,6 +7,8 @@ part of the room that is new and a light that changes are solved within the fram
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +25,7 @@ from server.light.shell.shell import Shell
 from server.light.shell.solution import Solution
 from server.light.shell.solver import LEAST_PATCHES, Solver
 from server.light.shell.switches import Switches
+from server.opencl.pacing import Pacer
 
 STEADY, CHANGED = 0.2, 0.3
 """Change of log radiance: the median over patches that face one way, then the root mean square over all ways to face.
@@ -89,7 +92,7 @@ class RoomModel:
         is_young = self._waiting > NEW_SHARE * self._frames
         if not must_follow and not is_young and self._waiting < SOLVE_EVERY:
             return
-        self._take_over()
+        self._take_over(engine.pacer)
         if not must_follow and self._is_still():
             return
         traced = self._patches.trace(engine, volume, self._waiting)
@@ -98,16 +101,17 @@ class RoomModel:
         camera = context.volume_from_camera[:3, 3] + volume.origin_world
         self._begin_solution(traced, camera, up)
         if must_follow or is_young:
-            self._take_over()
+            self._take_over(engine.pacer)
 
     def _begin_solution(self, traced: NDArray[np.int64], camera: Floats, up: Floats) -> None:
         patches, bright = self._patches.copy(), self._bright.seen_by()
         self._next = Beside(lambda: self._solver.solve(patches, bright, traced, camera, up))
 
-    def _take_over(self) -> None:
-        """The solution that was begun last, waited for."""
+    def _take_over(self, pacer: Pacer) -> None:
+        """The solution that was begun last, waited for: others may use the device meanwhile."""
         if self._next is not None:
-            self._solution = self._next.result() or self._solution
+            with nullcontext() if self._next.is_done else pacer.aside():
+                self._solution = self._next.result() or self._solution
             self._next = None
 
     def _must_follow(self, change: float) -> bool:

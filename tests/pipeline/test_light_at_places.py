@@ -131,7 +131,7 @@ class Turn:
     def is_due(self) -> bool:
         return True
 
-    def give_way(self, *, may_end: bool) -> None:
+    def give_way(self, *, may_end: bool) -> None:  # noqa: ARG002 (of the protocol)
         self.given += 1
 
     def released(self) -> AbstractContextManager[None]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -40,6 +40,10 @@ class FrameTurn(Protocol):
 
     def released(self) -> AbstractContextManager[None]:
         """Context in which others use the device."""
+
+
+_WITH_NOBODY: AbstractContextManager[FrameTurn | None] = nullcontext()
+"""The use of a device that is not shared."""
 
 
 @dataclass(frozen=True)
@@ -175,13 +179,21 @@ class ClientSession:
             standing = [(each.object_id, each.place) for each in self._room.objects.kept()]
         return {name: client_from_room @ place for name, place in standing if isinstance(place, np.ndarray)}
 
-    def panorama(self, format_: PanoramaFormat, position_m: Vector3 | None = None) -> tuple[bytes, Vector3]:
+    def panorama(
+        self,
+        format_: PanoramaFormat,
+        position_m: Vector3 | None = None,
+        device: AbstractContextManager[FrameTurn | None] = _WITH_NOBODY,
+    ) -> tuple[bytes, Vector3]:
         """The light that arrives at a place as a lat-long file, and that place, both in the client's world.
 
         position_m: None for the first virtual object, else the middle of what the last frame saw. Radiance is in units
-        of the last frame's image. Raises ValueError, one line, before the first frame.
+        of the last frame's image. device: context in which the device is used; the file is made after it.
+
+        Raises ValueError, one line, before the first frame, and what the turn raises, after which only `close` may be
+        called.
         """
-        with self._room.lock:
+        with device as turn, self._room.lock, self._sharing_device(turn):
             asked = None if position_m is None else np.array(position_m, np.float64)
             radiance, (x, y, z) = self._pipeline.light.panorama(asked)
         return encode_panorama(radiance, format_), (float(x), float(y), float(z))

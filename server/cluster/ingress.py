@@ -84,19 +84,12 @@ class Ingress:
         events = ClientEvents(websocket)
         is_connected = False
         try:
-            opening = asyncio.create_task(
-                self._host_of(route, client_of(connection.address, self.authenticator.proxies))
-            )
-            leaving = asyncio.create_task(events.has_left.wait())
-            await asyncio.wait((opening, leaving), return_when=asyncio.FIRST_COMPLETED)
-            leaving.cancel()
-            if not opening.done():
-                opening.cancel()
-                return
-            async with await opening as host:
+            client = client_of(connection.address, self.authenticator.proxies)
+            if (host := await _unless_left(self._host_of(route, client), events)) is not None:
                 is_connected = True
-                await host.send(route.first)
-                await relay(websocket, events, host, route.room_id)
+                async with host:
+                    await host.send(route.first)
+                    await relay(websocket, events, host, route.room_id)
         finally:
             events.close()
             if route.is_private:
@@ -159,6 +152,20 @@ class Ingress:
             raise Refusal(TRY_LATER, "no machine has a place for this room yet: try again in a minute") from late
         except RoomUnavailable as none:
             raise Refusal(TRY_LATER if route.may_open else GONE, str(none)) from none
+
+
+async def _unless_left(opening: Coroutine[Any, Any, ClientConnection], events: ClientEvents) -> ClientConnection | None:
+    """The connection to a host; None where the client leaves before. Raises what `opening` does.
+
+    Where it ends otherwise, as where Serve cancels it because its client has left, nothing is opened any more either.
+    """
+    opened, left = asyncio.create_task(opening), asyncio.create_task(events.has_left.wait())
+    try:
+        await asyncio.wait((opened, left), return_when=asyncio.FIRST_COMPLETED)
+        return await opened if opened.done() else None
+    finally:
+        left.cancel()
+        opened.cancel()
 
 
 def create_ingress_app(ingress: Ingress, page_folder: Path = PAGE_FOLDER) -> FastAPI:

@@ -58,6 +58,8 @@ class RayRoomDirectory:
         self._settings = settings
         self._starting: dict[str, asyncio.Task[Any]] = {}
         """Calls by which rooms are being opened; they go on where the client leaves."""
+        self._given_up: set[str] = set()
+        """Rooms that are being abandoned: such a call opens them no more."""
 
     async def find(self, room_id: str, may_open: bool, client: str = "", *, is_private: bool = False) -> Address:
         """The room's host. Raises RoomNotReady, RoomUnavailable."""
@@ -95,8 +97,10 @@ class RayRoomDirectory:
 
     async def abandon(self, room_id: str) -> None:
         """Nothing of it is to be saved."""
+        self._given_up.add(room_id)
         if (starting := self._starting.get(room_id)) is not None:
             await asyncio.wait((starting,))
+        self._given_up.discard(room_id)
         for _ in range(ABANDON_TRIES):  # an actor that is just being registered is not found at once
             with contextlib.suppress(RayActorError, ValueError):
                 actor = await asyncio.to_thread(ray.get_actor, PREFIX + room_id, NAMESPACE)
@@ -126,6 +130,8 @@ class RayRoomDirectory:
                 f"your address {client} has {of_one} rooms open, which is the most: close one of them"
             )
         options = actor_options(name, self._settings.place)
+        if room_id in self._given_up:
+            raise RoomUnavailable("its client has left")
         return ray.remote(RoomActor).options(**options).remote(self._settings, is_private)
 
 

@@ -9,8 +9,9 @@ results are the same to the bit.
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import Protocol
@@ -23,8 +24,9 @@ Size = tuple[int, ...]
 
 SLICE_S = 0.05
 """Longest slice. A launch of a usual frame is shorter and is not cut."""
-AHEAD_S = 0.1
-"""What may be enqueued ahead of the device, by expected time: enough for it never to wait for the host."""
+AHEAD_S = 0.05
+"""What may be enqueued ahead of the device, by expected time: enough for it never to wait for the host. One slice more
+may be there, and all of it runs before another session has the device."""
 STEP_S = 20e-9
 """Time of one step of one work-item on two cores of a processor, before a kernel's own is known, and at least this
 even where it was faster: a kernel that found nothing to do in one frame may find it in the next. Measured: 10 to 90 ns
@@ -81,12 +83,15 @@ class Pacer:
 
         `steps`: inner steps of a work-item, such as rays. Waits before each slice while too much is enqueued already.
         """
+        return cut(size, local, lambda: self._most_items(kernel, steps))
+
+    def _most_items(self, kernel: str, steps: int) -> int:
+        """Work-items of the next slice, once there is room for one. What earlier slices took counts at once: a launch
+        may last minutes, in which others begin to use the processor."""
+        self._make_room()
         time = self._times.get(kernel)
         longest_s = max(time.longest_s, self._step_s) if time else self._step_s
-        most_items = max(int(self._slice_s / (longest_s * steps)), 1)
-        for offset, part in cut(size, local, most_items):
-            self._make_room()
-            yield offset, part
+        return max(int(self._slice_s / (longest_s * steps)), 1)
 
     def enqueued(self, kernel: str, items: int, steps: int, event: cl.Event) -> None:
         """A slice of so many work-items was enqueued."""
@@ -138,28 +143,27 @@ class Pacer:
             known.usual_s += 0.25 * (step_s - known.usual_s)
 
 
-def cut(size: Size, local: Size, most_items: int) -> Iterator[tuple[Size, Size]]:
-    """Offset and size of parts of a launch with at most `most_items` work-items each, where a work-group has no more.
+def cut(size: Size, local: Size, most_items: Callable[[], int]) -> Iterator[tuple[Size, Size]]:
+    """Offset and size of parts of a launch with at most `most_items()` work-items each, where a work-group has no more.
 
-    A part is whole in the fastest dimensions as far as that is possible.
+    It is asked for each part anew. A part is whole in the fastest dimensions as far as that is possible.
     """
+    at = [0] * len(size)
+    while at[-1] < size[-1]:
+        part = _next_part(size, local, at, most_items())
+        yield tuple(at), part
+        for axis, extent in enumerate(part):
+            at[axis] += extent
+            if at[axis] < size[axis] or axis == len(size) - 1:
+                break
+            at[axis] = 0
+
+
+def _next_part(size: Size, local: Size, at: list[int], most_items: int) -> Size:
     part = list(local)
-    for axis in range(len(size)):
-        others = 1
-        for other, extent in enumerate(part):
-            others *= extent if other != axis else 1
-        groups = max(most_items // (others * local[axis]), 1)
-        part[axis] = min(groups * local[axis], size[axis])
+    for axis, group in enumerate(local):
+        groups = max(most_items // math.prod(part), 1)
+        part[axis] = min(groups * group, size[axis] - at[axis])
         if part[axis] < size[axis]:
             break
-    yield from _tiles(size, tuple(part))
-
-
-def _tiles(size: Size, part: Size) -> Iterator[tuple[Size, Size]]:
-    if not size:
-        yield (), ()
-        return
-    for slowest in range(0, size[-1], part[-1]):
-        extent = min(part[-1], size[-1] - slowest)
-        for offset, inner in _tiles(size[:-1], part[:-1]):
-            yield (*offset, slowest), (*inner, extent)
+    return tuple(part)

@@ -17,7 +17,8 @@ from protocol.colors import ColorReader
 from protocol.frames import CameraModel
 from protocol.limits import MAX_IMAGE_PIXELS
 from server.parsing.mesh_bytes import MAX_PACKED_BYTES, mesh_from_bytes
-from server.parsing.process_pool import IS_SUPPORTED, ChildDied, JobSpec, ProcessPool
+from server.parsing.nursery import ChildDied, JobSpec, Nursery
+from server.parsing.process_pool import IS_SUPPORTED, ProcessPool
 from server.parsing.turns import MAX_INTERRUPTIONS, Account, Overdrawn, Turns
 from server.scene.limits import MeshError
 from server.scene.mesh import Mesh, load_mesh
@@ -34,8 +35,6 @@ VIDEO_JOB = replace(PICTURE_JOB, job="server.parsing.read_video:read_video")
 _SIZE = struct.Struct("<II")
 MESH_CHILDREN, PICTURE_CHILDREN = 2, 2
 """Two each, so that a slow file does not block other sessions."""
-SPARE_CHILDREN = 1
-"""Takes over where a mesh child was killed for another session's turn, while its successor loads."""
 READING_BURST_S, READING_RATE = 120.0, 0.5
 """Reading time of one session: at once, and per second. Most files take less than 0.1 s."""
 
@@ -52,10 +51,10 @@ class Parsers:
         self.on_death: Callable[[str], None] = lambda _kind: None
         """Called in the waiting thread with `mesh`, `picture` or `video` when a child dies during a request."""
         on_mesh_death = partial(self._note_death, "mesh")
-        self.meshes = ProcessPool(mesh_spec, MESH_CHILDREN + SPARE_CHILDREN, on_mesh_death, has_spare=True)
+        self.meshes = ProcessPool(mesh_spec, MESH_CHILDREN, on_mesh_death)
         self.mesh_turns = Turns(MESH_CHILDREN)
         self.pictures = ProcessPool(picture_spec, PICTURE_CHILDREN, lambda: self.on_death("picture"))
-        self._video_spec = video_spec
+        self._video_spec, self._video_nursery = video_spec, Nursery(video_spec)
         self._videos: set[ProcessPool] = set()
         """One child per session that sends video."""
         self._changing = threading.Lock()
@@ -65,10 +64,10 @@ class Parsers:
         self.on_death(kind)
 
     def start(self) -> None:
-        """Start loading one child of each kind in the background."""
+        """Load what readers of meshes and pictures need in the background."""
         if IS_SUPPORTED:
-            self.meshes.start_one()
-            self.pictures.start_one()
+            self.meshes.load()
+            self.pictures.load()
 
     def stop(self) -> None:
         """End all children."""
@@ -79,6 +78,7 @@ class Parsers:
             videos = tuple(self._videos)
         for video in videos:
             video.stop()
+        self._video_nursery.stop()
 
     def mesh_loader(self) -> Callable[[bytes, str], Mesh]:
         """`load_mesh` for one session, which has its own reading time."""
@@ -122,7 +122,7 @@ class Parsers:
         return _picture_of(self.pictures, data)
 
     def _open_video(self) -> _Video:
-        children = ProcessPool(self._video_spec, 1, lambda: self.on_death("video"))
+        children = ProcessPool(self._video_spec, 1, lambda: self.on_death("video"), self._video_nursery)
         with self._changing:
             self._videos.add(children)
             if self._has_stopped:

@@ -7,98 +7,65 @@ import fcntl
 import mmap
 import os
 import select
-import subprocess
-import sys
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
-from server.parsing.child import ANSWER, DONE, READY, REQUEST
+from server.parsing.child import ANSWER, DONE, REQUEST
+from server.parsing.nursery import ChildDied, JobSpec, Nursery
 from server.parsing.turns import Turn
 
 IS_SUPPORTED = hasattr(os, "memfd_create") and hasattr(fcntl, "F_ADD_SEALS")
 """Whether this system supports sealed shared memory."""
 PIPE_BYTES = 1 << 20
-LOADING_TIMEOUT_S = 60.0
 STOPPED = "was stopped: the server ends"
 
 
-class ChildDied(Exception):
-    """The child died or was killed during a request. The message completes a sentence such as "the reader ..."."""
-
-
-@dataclass(frozen=True)
-class JobSpec:
-    """Job and resource limits of one kind of child."""
-
-    job: str
-    """`module:function`, see server.parsing.child."""
-    memory_mib: int
-    """Address space limit."""
-    timeout_s: float
-    """Time limit for one request."""
-    max_answer_bytes: int
-    """Largest answer in bytes."""
-    shared_bytes: int = 0
-    """Size of the memory that the child writes and the server reads."""
-
-
 class ChildProcess:
-    """One process. Not thread-safe."""
+    """One process. Used by one thread; others may end it."""
 
-    def __init__(self, spec: JobSpec) -> None:
-        self._spec = spec
-        arguments = [sys.executable, "-P", "-m", "server.parsing.child", spec.job]
-        arguments += [str(spec.memory_mib), str(spec.timeout_s)]
+    def __init__(self, nursery: Nursery, spec: JobSpec) -> None:
+        """Raises ChildDied if it cannot be started."""
+        self._nursery, self._spec = nursery, spec
+        self._ending = threading.Lock()
+        self._has_ended = False
+        self._status: int | None = None
+        """Exit status once it is reaped, if that is known."""
         self.shared: mmap.mmap | None = None
-        self._is_ready = False
-        descriptors: list[int] = []
+        theirs: list[int] = []
+        requests, self._requests = os.pipe()
+        self._answers, answers = os.pipe()
+        theirs += (requests, answers)
         if spec.shared_bytes:
-            descriptors.append(_sealed_memory(spec.shared_bytes))
-            self.shared = mmap.mmap(descriptors[0], spec.shared_bytes, prot=mmap.PROT_READ)
-            arguments.append(str(descriptors[0]))
-        self.process = subprocess.Popen(
-            arguments,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            bufsize=0,
-            pass_fds=descriptors,
-            env=_environment(),
-            start_new_session=True,  # Ctrl-C must reach only the server
-        )
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self._requests, self._answers = self.process.stdin.fileno(), self.process.stdout.fileno()
+            theirs.append(_sealed_memory(spec.shared_bytes))
+            self.shared = mmap.mmap(theirs[-1], spec.shared_bytes, prot=mmap.PROT_READ)
         for pipe in (self._requests, self._answers):
             os.set_blocking(pipe, False)
             with contextlib.suppress(OSError):  # the per-user limit on pipe memory may be reached
                 fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-        for descriptor in descriptors:
-            os.close(descriptor)
-
-    @property
-    def is_ready(self) -> bool:
-        """Whether it has loaded and is running. Only while it is not in use."""
-        if not self.is_alive:
-            return False
-        said = select.poll()
-        said.register(self._answers, select.POLLIN)
-        return self._is_ready or bool(said.poll(0))
+        try:
+            self.pid = nursery.fork(*theirs)
+        except ChildDied:
+            self._has_ended = True
+            self._close()
+            raise
+        finally:
+            for descriptor in theirs:
+                os.close(descriptor)
 
     @property
     def is_alive(self) -> bool:
         """Whether the process is running."""
-        return self.process.poll() is None
-
-    def wait_until_ready(self) -> None:
-        """Wait until a new child has loaded. Raises ChildDied."""
-        if not self._is_ready:
-            self._is_ready = self._read(len(READY), time.monotonic() + LOADING_TIMEOUT_S) == READY
+        with self._ending:
+            if self._has_ended:
+                return False
+            told = select.poll()
+            told.register(self._answers, 0)  # the end of its pipe, which comes with its own
+            return not told.poll(0)
 
     def ask(self, request: bytes) -> bytearray:
         """Send a request and wait for the answer. Raises ValueError with the child's line, or ChildDied."""
-        self.wait_until_ready()
         deadline_s = time.monotonic() + self._spec.timeout_s
         self._write(memoryview(REQUEST.pack(len(request))), deadline_s)
         self._write(memoryview(request), deadline_s)
@@ -111,14 +78,26 @@ class ChildProcess:
             raise ValueError(body[:2000].decode(errors="replace"))
         return body
 
+    def end(self) -> None:
+        """End the process; whoever waits for its answer is told. From any thread."""
+        with self._ending:
+            if self._has_ended:
+                return
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.pid, signal.SIGKILL)
+            self._status = self._nursery.reap(self.pid)
+            self._has_ended = True
+
     def kill(self) -> None:
-        """Kill the process and free its memory and pipes."""
-        self.process.kill()
-        self.process.wait()
-        for pipe in (self.process.stdin, self.process.stdout):
-            with contextlib.suppress(OSError):
-                if pipe is not None:
-                    pipe.close()
+        """End the process and free its memory and pipes."""
+        self.end()
+        self._close()
+
+    def _close(self) -> None:
+        for pipe in (self._requests, self._answers):
+            if pipe >= 0:
+                os.close(pipe)
+        self._requests = self._answers = -1
         if self.shared is not None:
             self.shared.close()
 
@@ -156,26 +135,29 @@ class ChildProcess:
 
     def _raise_died(self) -> None:
         """Raise ChildDied with the exit status."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(1.0)
-        code = self.process.returncode
         self.kill()
+        code = self._status
         raise ChildDied("died on it" if code is None or code >= 0 else f"died on it (signal {-code})")
 
 
 class ProcessPool:
-    """Pool of one kind of child. Thread-safe. Children that have loaded are used first, so that few are started."""
+    """Pool of one kind of child. Thread-safe. Few are started: those that live are used first."""
 
     def __init__(
-        self, spec: JobSpec, most: int, on_death: Callable[[], None] = lambda: None, *, has_spare: bool = False
+        self,
+        spec: JobSpec,
+        most: int,
+        on_death: Callable[[], None] = lambda: None,
+        nursery: Nursery | None = None,
     ) -> None:
         """Starts no process yet. `on_death` is called in the requesting thread when a child dies.
 
-        `has_spare`: the last child is started as soon as all others are in use: it has loaded when it is needed.
+        `nursery`: that of pools which have the same job; None: one of its own.
         """
         self._spec = spec
         self._on_death = on_death
-        self._has_spare = has_spare
+        self._owns_nursery = nursery is None
+        self._nursery = nursery or Nursery(spec)
         self._idle: list[ChildProcess | None] = [None] * most
         """A place for each child that is not in use; None: not started."""
         self._returned = threading.Condition()
@@ -185,12 +167,11 @@ class ProcessPool:
     @property
     def pids(self) -> list[int]:
         """Process ids of running children."""
-        return [child.process.pid for child in tuple(self._all) if child.is_alive]
+        return [child.pid for child in tuple(self._all) if child.is_alive]
 
-    def start_one(self) -> None:
-        """Start a child, so that the first request does not wait for it to load."""
-        with self._borrowed():
-            pass
+    def load(self) -> None:
+        """Load what the children need in the background, so that the first request does not wait for it."""
+        self._nursery.load()
 
     @contextlib.contextmanager
     def _borrowed(self) -> Iterator[ChildProcess]:
@@ -200,8 +181,6 @@ class ProcessPool:
                 raise ChildDied(STOPPED)
             if child is None or not child.is_alive:
                 child = self._replaced(child)
-            if self._has_spare:
-                self._start_spare()
             yield child
         finally:
             with self._returned:
@@ -209,31 +188,18 @@ class ProcessPool:
                 self._returned.notify()
 
     def _take(self) -> ChildProcess | None:
-        """Wait for a place and take it: of a child that is ready, else of the last one that came back."""
+        """Wait for a place and take it: of a child that lives, else of the last one that came back."""
         with self._returned:
             while not self._idle:
                 self._returned.wait()
-            ready = [k for k, child in enumerate(self._idle) if child is not None and child.is_ready]
-            return self._idle.pop(ready[-1] if ready else -1)
-
-    def _start_spare(self) -> None:
-        """If one child is left that is not in use, start it and let it load; the next request waits less for it."""
-        with self._returned:
-            if len(self._idle) != 1 or self._stopped:
-                return
-            (child,) = self._idle
-            if child is None or not child.is_alive:
-                with contextlib.suppress(ChildDied):
-                    self._idle[0] = self._replaced(child)
+            alive = [k for k, child in enumerate(self._idle) if child is not None and child.is_alive]
+            return self._idle.pop(alive[-1] if alive else -1)
 
     def _replaced(self, child: ChildProcess | None) -> ChildProcess:
         if child is not None:
             self._all.discard(child)
             child.kill()
-        try:
-            new = ChildProcess(self._spec)
-        except OSError as error:
-            raise ChildDied(f"could not be started ({error.strerror})") from error
+        new = ChildProcess(self._nursery, self._spec)
         self._all.add(new)
         if self._stopped:  # meanwhile
             new.kill()
@@ -252,9 +218,8 @@ class ProcessPool:
         """
         with self._borrowed() as child:
             try:
-                child.wait_until_ready()
                 if turn is not None:
-                    turn.set_interrupt(child.process.kill)
+                    turn.set_interrupt(child.end)
                 answer = child.ask(request)
             except ChildDied:
                 if turn is None or not turn.is_interrupted:
@@ -269,13 +234,14 @@ class ProcessPool:
         """Kill all children. Requests in progress raise ChildDied."""
         self._stopped = True
         for child in tuple(self._all):
-            child.process.kill()
-            child.process.wait()
+            child.end()
         with self._returned:
             for slot in self._idle:
                 if slot is not None:
                     slot.kill()
             self._idle = [None] * len(self._idle)
+        if self._owns_nursery:
+            self._nursery.stop()
 
 
 def _sealed_memory(size: int) -> int:
@@ -284,12 +250,3 @@ def _sealed_memory(size: int) -> int:
     os.ftruncate(descriptor, size)
     fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
     return descriptor
-
-
-def _environment() -> dict[str, str]:
-    """Minimal environment for the child, without secrets such as the token."""
-    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH", "LANG", "TMPDIR") if name in os.environ}
-    threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
-    # Keep freed image memory in the process: allocating it again from the system takes as long as decoding.
-    memory = {"MALLOC_MMAP_THRESHOLD_": str(64 << 20), "MALLOC_TRIM_THRESHOLD_": str(128 << 20)}
-    return {**kept, **threads, **memory, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}

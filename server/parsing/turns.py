@@ -11,8 +11,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
-SLICE_S = 0.3
-"""Time that a turn lasts at least: most files take less than 0.1 s, and the child that takes over loads for 0.4 s."""
+SLICE_S = 0.2
+"""Time that a turn lasts at least: most files take less than 0.1 s."""
 MAX_INTERRUPTIONS = 3
 
 

@@ -4,8 +4,8 @@ Start-time fair queuing (Goyal, Vin and Cheng 1996) with measured costs: the ses
 A session with expensive frames therefore gets fewer of them and slows only itself. A session that was idle continues
 from the others' least device time minus a small credit, so idle time cannot be saved up.
 
-A frame that takes long is interrupted: after QUANTUM_S it lets sessions with less device time go first, as often as it
-takes. Other clients of its room wait until it has ended, since it may have changed the room by half.
+A frame that takes long is interrupted: after QUANTUM_S it lets sessions with less device time go first, and then after
+each NEXT_QUANTUM_S. Other clients of its room wait until it has ended, since it may have changed the room by half.
 """
 
 from __future__ import annotations
@@ -22,6 +22,11 @@ AWAY_S = 5.0
 """A session that is idle for longer is not counted as sharing the device."""
 QUANTUM_S = 0.2
 """Time that a frame has before it lets others go first: a usual frame is not interrupted."""
+NEXT_QUANTUM_S = 0.1
+"""The same for a frame that was interrupted before. With it, and with what is enqueued already (pacing.py), another
+session waits for 0.2 s, and for twice as long where the processor has other work too."""
+REQUEST_QUANTUM_S = 0.02
+"""The same for what is no frame and has time, such as a panorama (0.1 to 0.2 s of a processor)."""
 _RATE = 0.2  # weight of a new frame in the running mean of costs
 
 
@@ -43,15 +48,21 @@ class SessionShare:
 class Turn:
     """A session's use of the device for one frame; made by Scheduler.acquire."""
 
-    def __init__(self, scheduler: Scheduler, share: SessionShare) -> None:
+    def __init__(self, scheduler: Scheduler, share: SessionShare, quantum_s: float = QUANTUM_S) -> None:
         self._scheduler = scheduler
         self._share = share
+        self._quantum_s = quantum_s
         self.waited_s = 0.0
         """Time before the frame could begin."""
         self.spent_s = 0.0
         """Device time of the frame before it was last resumed."""
         self.resumed_s = 0.0
         """When it was begun or last resumed, by the scheduler's clock."""
+
+    @property
+    def quantum_s(self) -> float:
+        """Time that it has from when it was begun or resumed until it lets others go first."""
+        return self._quantum_s if self.spent_s == 0.0 else min(self._quantum_s, NEXT_QUANTUM_S)
 
     def is_due(self) -> bool:
         """Whether the frame is to let another session go first."""
@@ -95,9 +106,9 @@ class Scheduler:
             self._shares.remove(share)
 
     @contextmanager
-    def acquire(self, share: SessionShare) -> Iterator[Turn]:
-        """Context in which the session may use the device."""
-        turn, began_s = Turn(self, share), self._clock()
+    def acquire(self, share: SessionShare, quantum_s: float = QUANTUM_S) -> Iterator[Turn]:
+        """Context in which the session may use the device. quantum_s: time before it lets others go first."""
+        turn, began_s = Turn(self, share, quantum_s), self._clock()
         with self._changed:
             share.used_s = max(share.used_s, self._least_used_s(share, share.used_s) - CREDIT_S)
             self._wait(turn, share)
@@ -112,7 +123,7 @@ class Scheduler:
     def is_due(self, turn: Turn, share: SessionShare) -> bool:
         """Whether the session that has the turn is to let another go first."""
         spent_s = self._clock() - turn.resumed_s
-        if spent_s < QUANTUM_S:
+        if spent_s < turn.quantum_s:
             return False
         with self._changed:
             return any(other.used_s < share.used_s + spent_s for other in self._able())

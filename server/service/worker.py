@@ -44,7 +44,7 @@ from server.service.mesh_message import mesh_parts
 from server.service.monitoring.metrics import Metrics
 from server.service.result_encoding import composite_message, layer_message
 from server.service.room_registry import WrongRoomKey
-from server.service.scheduler import Scheduler, Turn
+from server.service.scheduler import REQUEST_QUANTUM_S, Scheduler, Turn
 
 if TYPE_CHECKING:
     from server.client_session import ClientSession
@@ -261,10 +261,15 @@ class Worker:
             self._outbox.send(encode(part))
         return self._outbox.send(encode(Acknowledged(request=request)))
 
+    @contextlib.contextmanager
+    def _short_turn(self) -> Iterator[_FrameTurn]:
+        """Context of a request's use of the device, which lets others' frames go first."""
+        with self._context.scheduler.acquire(self._share, REQUEST_QUANTUM_S) as turn:
+            yield _FrameTurn(turn, self._outbox)
+
     def _send_panorama(self, pipeline: ClientSession, request: RequestPanorama) -> None:
         try:
-            with self._context.scheduler.acquire(self._share):
-                data, position_m = pipeline.panorama(request.format, request.position_m)
+            data, position_m = pipeline.panorama(request.format, request.position_m, self._short_turn())
         except ValueError as error:
             return self._outbox.send(encode(Acknowledged(request=request.request, error=one_line(str(error)))))
         panorama = Panorama(request=request.request, format=request.format, position_m=position_m, data=data)
@@ -275,8 +280,7 @@ class Worker:
         if not order.answer.set_running_or_notify_cancel():
             return  # nobody waits any more
         try:
-            with self._context.scheduler.acquire(self._share):
-                data, _ = pipeline.panorama(order.format, order.position_m)
+            data, _ = pipeline.panorama(order.format, order.position_m, self._short_turn())
         except ValueError as error:
             order.answer.set_exception(error)
         except BaseException as error:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import uvicorn
@@ -36,9 +38,11 @@ class TownPlaces:
         self.moving: set[str] = set()
         self.private: set[str] = set()
         self.abandoned: list[str] = []
+        self.asked = 0
         self.quota = Quota(100)
 
     async def find(self, room_id: str, may_open: bool, client: str = "", *, is_private: bool = False) -> Address:
+        self.asked += 1
         if room_id in self.moving:
             raise RoomNotReady(room_id)
         if room_id not in self.hosts:
@@ -105,10 +109,28 @@ def ingress(town: TownPlaces) -> Ingress:
     return Ingress(town, Authenticator(TOKEN))
 
 
-@pytest.fixture
-def ingress_url(ingress: Ingress) -> Iterator[str]:
-    """Of the ingress."""
-    app = create_ingress_app(ingress)
+class AsServe:
+    """An app whose request is cancelled when its client leaves, as Serve does; it may not hear of that before."""
+
+    def __init__(self, app: Any) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        async def hear() -> Any:
+            event = await receive()
+            if event["type"] == "websocket.disconnect":
+                running.cancel()
+                await asyncio.Event().wait()
+            return event
+
+        running = asyncio.create_task(self._app(scope, hear, send))
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
+
+
+@contextlib.contextmanager
+def served(app: Any) -> Iterator[str]:
+    """The address of an app."""
     config = uvicorn.Config(app, log_config=None, ws_per_message_deflate=False, ws_max_size=32 << 20)
     server = uvicorn.Server(config)
     with listen("127.0.0.1", 0) as listener:
@@ -118,6 +140,13 @@ def ingress_url(ingress: Ingress) -> Iterator[str]:
         server.should_exit = True
         server.force_exit = True
         thread.join()
+
+
+@pytest.fixture
+def ingress_url(ingress: Ingress) -> Iterator[str]:
+    """Of the ingress."""
+    with served(create_ingress_app(ingress)) as url:
+        yield url
 
 
 @pytest.fixture

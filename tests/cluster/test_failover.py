@@ -1,4 +1,4 @@
-"""With Ray: a node is killed or drained, and its rooms come back."""
+"""With Ray: a node is killed or drained, and its rooms come back; clients that have left get none."""
 
 import importlib.util
 import json
@@ -31,8 +31,9 @@ def played(module: str) -> dict[str, Any]:
     return result
 
 
-def test_rooms_of_a_node_that_is_drained_move() -> None:
+def test_clients_that_leave_at_once_keep_no_place_and_rooms_of_a_drained_node_move() -> None:
     result = played("tests.cluster.draining")
+    assert result["opened_for_nobody"] == 0
     assert result["left_open"] == 0
     assert result["drain_status"] == 0
     assert result["rooms_of_the_node"] == 1

@@ -5,13 +5,15 @@ import time
 import httpx
 
 from protocol.messages import Acknowledged, Composite, Hello, Quality, Watch, Welcome, Wishes
+from server.cluster.ingress import create_ingress_app
 from server.cluster.quota import Quota
 from server.cluster.relay import MOVED
 from server.cluster.routing import room_id_of
 from server.service.edge.connection import GONE, RESTART, TRY_LATER, UNAUTHORIZED
-from tests.cluster.conftest import IMPATIENT_S
+from tests.cluster.conftest import IMPATIENT_S, TOKEN, AsServe, served
 from tests.service.fakes import CAMERA, PATIENCE_S, frame_message
 from tests.service.promlint import problems
+from tests.service.wire import Wire
 
 
 def greeted(wire, **said) -> Welcome:
@@ -199,6 +201,22 @@ def test_who_leaves_before_the_room_is_ready_gives_up_its_place(town, dial, ingr
     assert eventually(lambda: ingress.clients == 0)
     assert not town.hosts
     assert b"probeless_ingress_abandoned_total 11.0" in ingress.metrics.render()
+
+
+def test_whose_request_is_cancelled_before_the_room_is_ready_opens_none(town, ingress, monkeypatch) -> None:
+    monkeypatch.setattr("server.cluster.ingress.RETRY_S", 0.01)
+    town.free = 0
+    with served(AsServe(create_ingress_app(ingress))) as url:
+        for _ in range(5):
+            wire = Wire(url, Authorization=f"Bearer {TOKEN}")
+            wire.say(Hello(client="test", camera=CAMERA))
+            wire.hang_up()
+        assert eventually(lambda: len(town.abandoned) == 5)
+        assert eventually(lambda: ingress.clients == 0)
+        asked, town.free = town.asked, 3
+        time.sleep(0.5)
+        assert town.asked == asked
+    assert not town.hosts
 
 
 def test_what_was_sent_before_the_room_was_ready_arrives_in_order(town, dial) -> None:

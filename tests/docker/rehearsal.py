@@ -3,9 +3,10 @@
     python -m tests.docker.rehearsal docker/cpu.Dockerfile FOLDER
 
 As root, with debootstrap and the network. FOLDER becomes the root, and stays. What a container would do then is done by
-chroot: the server is started as the image's user, must become healthy by the image's own health check, answers the
-frames of a client, and ends with status 0 when it is told to. What is not tried is what only an engine has: layers,
-namespaces, limits.
+unshare and chroot: the image's command is the first process of its namespace, as the image's user, in a root that is
+read-only but for /data, /tmp and /dev/shm. It must become healthy by the image's own health check, answer the frames of
+a client, be healthy again after its server was killed, leave no process unreaped, and end with status 0 when its first
+process is told to. What is not tried is what only an engine has: layers, a network of its own, limits.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import contextlib
 import os
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -22,6 +24,7 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
+from tests.bench.service.process import children, descendants
 from tests.docker.dockerfile import ROOT, Image, assigned, copies, read_image
 
 MIRROR = "http://deb.debian.org/debian"
@@ -62,35 +65,69 @@ def build(image: Image, root: Path) -> None:
 
 
 def use(image: Image, root: Path) -> None:
-    """Start what the image starts, as its user; healthy, frames answered, stopped in order."""
+    """Start what the image starts, as its user; healthy, frames answered, started again, stopped in order."""
     given = {"PATH": "/usr/bin:/bin", "PROBELESS_TOKEN": TOKEN, "PROBELESS_PORT": str(free_port())}
     environment = given | image.environment
     port = int(environment["PROBELESS_PORT"])
-    environment["TINI_SUBREAPER"] = "1"  # here it is not the first process, as it is in a container
     folder = image.last("WORKDIR")
     as_user = ["chroot", f"--userspec={image.last('USER')}", str(root), "env", "-i", *pairs(environment)]
 
     def command(words: list[str]) -> list[str]:
         return [*as_user, "sh", "-c", f'cd {folder} && exec "$@"', "sh", *words]
 
-    began = time.perf_counter()
-    server = subprocess.Popen(command(image.command), start_new_session=True)
-    try:
+    def wait_until_healthy() -> None:
+        began = time.perf_counter()
         while subprocess.run(command(image.health_command), check=False, capture_output=True).returncode != 0:
-            if server.poll() is not None or time.perf_counter() - began > HEALTHY_WITHIN_S:
+            if engine.poll() is not None or time.perf_counter() - began > HEALTHY_WITHIN_S:
                 raise RuntimeError("the server did not become healthy")
             time.sleep(0.5)
-        health = urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz").read().decode()
-        say(f"healthy after {time.perf_counter() - began:.1f} s: {health}")
-        say(f"runs as {owner(server.pid)}, may write: {writable(as_user, folder)}")
+        say(f"healthy after {time.perf_counter() - began:.1f} s")
+
+    engine = subprocess.Popen(contained(root, command(image.command)), start_new_session=True)
+    try:
+        wait_until_healthy()
+        (first,) = children(engine.pid)
+        say(urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz").read().decode())
+        say(f"its first process runs as {owner(first)}, may write: {writable(first)}")
         stream(port)
-    finally:
-        server.terminate()
+        (keeper,) = children(first)
+        (server,) = children(keeper)
+        os.kill(server, signal.SIGKILL)
+        say("its server was killed")
+        while children(keeper) in ([], [server]):
+            time.sleep(0.1)
+        wait_until_healthy()
+        stream(port)
+        while unreaped := [one for one in descendants(first) if state(one) == "Z"]:
+            say(f"unreaped: {unreaped}")
+            time.sleep(1.0)
+        os.kill(first, signal.SIGTERM)
         began = time.perf_counter()
-        status = server.wait(STOPPED_WITHIN_S)
+        status = engine.wait(STOPPED_WITHIN_S)
+    finally:
+        engine.kill()
     say(f"SIGTERM: exit status {status} after {time.perf_counter() - began:.1f} s")
     if status != 0:
         raise RuntimeError(f"the server ended with status {status}")
+
+
+def contained(root: Path, command: list[str]) -> list[str]:
+    """The command as the first process of its namespace, in a read-only root, without a way to more rights."""
+    mounts = (
+        f"mount --rbind {root} {root}",
+        f"mount --bind {root}/data {root}/data",
+        f"mount -t proc proc {root}/proc",
+        f"mount -o remount,bind,ro {root}",
+    )
+    script = " && ".join((*mounts, 'exec setpriv --no-new-privs "$@"'))
+    return ["unshare", "--mount", "--pid", "--fork", "--kill-child", "sh", "-c", script, "sh", *command]
+
+
+def state(pid: int) -> str:
+    """Of a process, as in /proc; empty where there is none any more."""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    return ""
 
 
 def stream(port: int) -> None:
@@ -114,7 +151,7 @@ def stream(port: int) -> None:
 def mounted(root: Path, image: Image) -> Iterator[None]:
     """A minimal root of the release that the image is made from, with what a container too finds in it."""
     if not (root / "bin/sh").exists():
-        release = image.last("FROM").partition(":")[2].removesuffix("-slim")
+        release = image.last("FROM").partition("@")[0].partition(":")[2].removesuffix("-slim")
         subprocess.run(["debootstrap", "--variant=minbase", release, root, MIRROR], check=True)
     for name in ("resolv.conf", "hosts"):
         shutil.copy(f"/etc/{name}", root / "etc" / name)
@@ -168,11 +205,14 @@ def owner(pid: int) -> str:
     return f"{found.st_uid}:{found.st_gid}"
 
 
-def writable(as_user: list[str], folder: str) -> str:
-    """Folders of `folder` and /data that the image's user may write to."""
-    words = ["find", folder, "/data", "-maxdepth", "1", "-type", "d", "-writable"]
-    out = subprocess.run([*as_user, *words], check=False, capture_output=True, text=True)
-    return " ".join(out.stdout.split()) or "nothing"
+def writable(pid: int) -> str:
+    """Folders of the process's working folder and root that it may write to."""
+    found = Path(f"/proc/{pid}/root")
+    user = found.parent.stat().st_uid
+    words = ["nsenter", "--mount", f"--target={pid}", f"--setuid={user}", f"--setgid={user}", f"--root={found}"]
+    look = ["find", "/", "/dev", "/opt/probeless", "-maxdepth", "1", "-type", "d", "-writable"]
+    out = subprocess.run([*words, *look], check=False, capture_output=True, text=True)
+    return " ".join(sorted(set(out.stdout.split()))) or "nothing"
 
 
 def free_port() -> int:

@@ -79,7 +79,7 @@ class Other:
 )
 def test_parts_cover_a_launch_once(size: tuple[int, ...], local: tuple[int, ...], most: int) -> None:
     covered = Counter[tuple[int, ...]]()
-    for offset, part in cut(size, local, most):
+    for offset, part in cut(size, local, lambda: most):
         assert all(extent % group == 0 for extent, group in zip(part, local, strict=True))
         assert np.prod(part) <= max(most, np.prod(local))
         covered.update(product(*(range(o, o + e, g) for o, e, g in zip(offset, part, local, strict=True))))
@@ -87,7 +87,7 @@ def test_parts_cover_a_launch_once(size: tuple[int, ...], local: tuple[int, ...]
 
 
 def test_a_launch_that_is_short_enough_is_whole() -> None:
-    assert list(cut((1920, 1200), (16, 4), 1920 * 1200)) == [((0, 0), (1920, 1200))]
+    assert list(cut((1920, 1200), (16, 4), lambda: 1920 * 1200)) == [((0, 0), (1920, 1200))]
 
 
 @pytest.mark.parametrize("size", [(65,), (1000,), (17, 5), (97, 71), (9, 8, 3)])
@@ -143,11 +143,12 @@ class _Event:
 
     command_execution_status = 1
 
-    def __init__(self, log: list[int], number: int) -> None:
+    def __init__(self, log: list[int], number: int, took_ns: int = 1_000_000) -> None:
         self.log, self.number = log, number
+        self.took_ns = took_ns
 
     def get_profiling_info(self, which: int) -> int:
-        return {cl.profiling_info.START: 0, cl.profiling_info.END: 1_000_000}[which]
+        return {cl.profiling_info.START: 0, cl.profiling_info.END: self.took_ns}[which]
 
     def wait(self) -> None:
         self.log.append(self.number)
@@ -160,6 +161,16 @@ def test_no_more_is_enqueued_ahead_than_a_device_needs() -> None:
             pacer.enqueued("kernel", 1, 1, _Event(waited, number))
         assert number + 1 - len(waited) <= 4
     assert waited == list(range(6))
+
+
+def test_slices_of_a_launch_become_smaller_while_the_device_becomes_slower() -> None:
+    pacer, sizes = Pacer(slice_s=0.1, ahead_s=0.0, step_s=0.001), list[int]()
+    for number, (_, (items,)) in enumerate(pacer.slices("kernel", (1000,), (1,), 1)):
+        sizes.append(items)
+        step_ns = 1_000_000 if number < 3 else 10_000_000
+        pacer.enqueued("kernel", items, 1, _Event([], number, items * step_ns))
+    assert sizes[:4] == [100, 100, 100, 100]
+    assert max(sizes[5:]) < 15, "a tenth of the items in the same time, and slowly more as that is forgotten"
 
 
 def test_the_profile_counts_slices_of_one_kernel_together(engine: Engine) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -119,6 +120,30 @@ def test_the_light_at_a_place_is_its_panorama(device: Device, tmp_path: Path) ->
         expected = np.array(at.sh_webxr).reshape(9, 3)
         # Measured 0.0040 of the largest coefficient: the floor's edge between 1024 directions.
         np.testing.assert_allclose(found, expected, atol=0.008 * np.abs(expected).max())
+    pipeline.close()
+
+
+class Turn:
+    """Of a session that always has to let another one go first."""
+
+    given = 0
+
+    def is_due(self) -> bool:
+        return True
+
+    def give_way(self, *, may_end: bool) -> None:  # noqa: ARG002 (of the protocol)
+        self.given += 1
+
+    def released(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+
+def test_a_panorama_lets_others_go_first_and_is_the_same(device: Device) -> None:
+    pipeline = session(device)
+    pipeline.process(frame())
+    turn = Turn()
+    assert pipeline.panorama("hdr", PLACES[0]) == pipeline.panorama("hdr", PLACES[0], nullcontext(turn))
+    assert turn.given > 1
     pipeline.close()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, NamedTuple
@@ -122,9 +123,13 @@ class FakePipeline:
         return self.lab.mesh
 
     def panorama(
-        self, format_: str, position_m: tuple[float, float, float] | None = None
+        self,
+        format_: str,
+        position_m: tuple[float, float, float] | None = None,
+        device: AbstractContextManager[object] = nullcontext(),  # noqa: B008 (it has no state)
     ) -> tuple[bytes, tuple[float, float, float]]:
-        self.lab.log.append(("panorama", format_, position_m))
+        with device:
+            self.lab.log.append(("panorama", format_, position_m))
         if self.lab.panorama is None:
             raise ValueError("there is no light yet: no frame has been placed in the room")
         return self.lab.panorama, position_m or (1.0, 2.0, 3.0)

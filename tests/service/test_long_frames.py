@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from protocol.messages import Composite, Hello, Welcome
-from server.service.scheduler import QUANTUM_S, Scheduler, SessionShare, Turn
+from server.service.scheduler import NEXT_QUANTUM_S, QUANTUM_S, REQUEST_QUANTUM_S, Scheduler, SessionShare, Turn
 from server.service.serve import BackgroundServer
 from tests.service.fakes import CAMERA, PATIENCE_S, Lab, frame_message
 from tests.service.wire import Wire
@@ -91,6 +91,31 @@ def test_a_long_frame_lets_others_go_first(scheduler: Scheduler, long_turn: Turn
     assert order == ["other"]
     assert not long_turn.is_due()
     assert long_turn.spent_s == QUANTUM_S
+
+
+def test_once_interrupted_it_lets_others_go_first_sooner(scheduler: Scheduler, clock: Clock, long_turn: Turn) -> None:
+    for _ in range(3):
+        other = Frame(scheduler, scheduler.join(), "other", [])
+        threading.Timer(0.05, other.end).start()
+        long_turn.give_way()
+        later = Frame(scheduler, scheduler.join(), "later", [])
+        clock.now_s += 0.9 * NEXT_QUANTUM_S
+        assert not long_turn.is_due()
+        clock.now_s += 0.2 * NEXT_QUANTUM_S
+        assert long_turn.is_due()
+        threading.Timer(0.05, later.end).start()
+        long_turn.give_way()
+
+
+def test_a_request_lets_frames_go_first_at_once(scheduler: Scheduler, clock: Clock) -> None:
+    with scheduler.acquire(scheduler.join(), REQUEST_QUANTUM_S) as turn:
+        other = Frame(scheduler, scheduler.join(), "other", [])
+        assert not turn.is_due()
+        clock.now_s += 1.1 * REQUEST_QUANTUM_S
+        assert turn.is_due()
+        threading.Timer(0.05, other.end).start()
+        turn.give_way()
+        assert turn.quantum_s == REQUEST_QUANTUM_S
 
 
 def test_it_goes_on_before_those_that_have_used_more(scheduler: Scheduler, clock: Clock, long_turn: Turn) -> None:

@@ -26,8 +26,9 @@ from protocol.images import decode_color, encode_color
 from protocol.messages import Acknowledged, Composite, Dropped, PlaceObject
 from server.objects.scene_objects import mesh_digest
 from server.parsing.mesh_bytes import mesh_from_bytes, mesh_to_bytes
+from server.parsing.nursery import ChildDied
 from server.parsing.parsers import MESH_JOB, PICTURE_JOB, Parsers
-from server.parsing.process_pool import ChildDied, ProcessPool
+from server.parsing.process_pool import ProcessPool
 from server.scene.limits import MeshError
 from server.scene.materials import Beyond, Material, Texture
 from server.scene.mesh import Mesh, load_mesh
@@ -252,6 +253,29 @@ def test_a_reader_killed_while_idle_costs_nobody_a_mesh(stubborn: Parsers) -> No
     assert is_served(stubborn)
 
 
+def test_readers_come_also_where_what_forks_them_was_killed(stubborn: Parsers) -> None:
+    assert is_served(stubborn)
+    for pid in (stubborn.meshes._nursery._process.pid, *stubborn.meshes.pids):
+        os.kill(pid, signal.SIGKILL)
+    while stubborn.meshes.pids:
+        time.sleep(0.01)
+    assert is_served(stubborn)
+
+
+def test_a_reader_that_is_replaced_leaves_nothing_behind(stubborn: Parsers) -> None:
+    assert is_served(stubborn)
+    (pid,) = stubborn.meshes.pids
+    open_files = len(os.listdir("/proc/self/fd"))
+    for _ in range(5):
+        told(stubborn, b"crash")
+        assert is_served(stubborn)
+    assert not Path(f"/proc/{pid}").exists()
+    nursery = stubborn.meshes._nursery._process.pid
+    assert Path(f"/proc/{nursery}/task/{nursery}/children").read_text().split() == [str(stubborn.meshes.pids[0])]
+    assert len(os.listdir("/proc/self/fd")) == open_files
+    assert len(os.listdir(f"/proc/{nursery}/fd")) == 4  # its socket, output twice, and this list's own
+
+
 def test_a_reader_that_lies_is_not_believed(stubborn: Parsers) -> None:
     assert "is not a valid mesh" in told(stubborn, b"lie")
     talkative = Parsers(replace(STUBBORN_MESHES, max_answer_bytes=100_000))
@@ -278,6 +302,8 @@ def test_one_that_hangs_keeps_no_other_waiting(stubborn: Parsers) -> None:
         os.kill(pid, signal.SIGKILL)
     hanging.join(PATIENCE_S)
     assert not hanging.is_alive()
+    while stubborn.meshes.pids:
+        time.sleep(0.01)
     assert is_served(stubborn)
 
 

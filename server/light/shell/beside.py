@@ -21,6 +21,11 @@ class Beside(Generic[Result]):
         self._future: Future[Result] = Future()
         threading.Thread(target=self._run, args=(work,), name="beside").start()
 
+    @property
+    def is_done(self) -> bool:
+        """Whether `result` does not wait."""
+        return self._future.done()
+
     def result(self) -> Result:
         """Wait for it. Raises what the work raised."""
         return self._future.result()

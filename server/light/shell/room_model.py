@@ -7,6 +7,7 @@ part of the room that is new and a light that changes are solved within the fram
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,7 @@ from server.light.shell.shell import Shell
 from server.light.shell.solution import Solution
 from server.light.shell.solver import LEAST_PATCHES, Solver
 from server.light.shell.switches import Switches
+from server.opencl.pacing import Pacer
 
 STEADY, CHANGED = 0.2, 0.3
 """Change of log radiance: the median over patches that face one way, then the root mean square over all ways to face.
@@ -113,7 +115,7 @@ class RoomModel:
         is_young = self._waiting > NEW_SHARE * self._frames
         if not must_follow and not is_young and self._waiting < SOLVE_EVERY:
             return
-        self._take_over()
+        self._take_over(engine.pacer)
         if not must_follow and self._is_still():
             return
         traced = self._patches.begin_trace(engine, volume, self._waiting)
@@ -123,7 +125,7 @@ class RoomModel:
         self._tracing = _Tracing(traced, emitters, camera, up)
         if must_follow or is_young:
             self.finish()
-            self._take_over()
+            self._take_over(engine.pacer)
 
     def finish(self) -> None:
         """Begin the solution whose rays are on their way, if there is one."""
@@ -135,10 +137,11 @@ class RoomModel:
         patches, bright, traced = self._patches.copy(), self._bright.seen_by(), tracing.patches.rows
         self._next = Beside(lambda: self._solver.solve(patches, bright, traced, tracing.camera, tracing.up))
 
-    def _take_over(self) -> None:
-        """The solution that was begun last, waited for."""
+    def _take_over(self, pacer: Pacer) -> None:
+        """The solution that was begun last, waited for: others may use the device meanwhile."""
         if self._next is not None:
-            self._solution = self._next.result() or self._solution
+            with nullcontext() if self._next.is_done else pacer.aside():
+                self._solution = self._next.result() or self._solution
             self._next = None
 
     def _must_follow(self, change: float) -> bool:

@@ -25,7 +25,7 @@ from client.streaming.client import ClientError
 from tests.bench.report.finished import ROOT, Part
 from tests.bench.report.run import Run
 from tests.bench.service.guests import Guest
-from tests.bench.service.process import BEGIN, END, Served, Unusual, children, serving, start, stop
+from tests.bench.service.process import BEGIN, END, Served, Unusual, descendants, serving, start, stop
 from tests.service.proxy import Proxy
 
 TRIALS, QUICK_TRIALS = 20, 3
@@ -133,7 +133,7 @@ async def _reader_killed(
 ) -> None:
     placing = asyncio.create_task(victim.place("large", LARGE))
     await asyncio.sleep(chance.uniform(0.0, 0.3))
-    for child in children(served.process.pid, "read_mesh"):
+    for child in descendants(served.process.pid, "read_mesh"):
         os.kill(child, signal.SIGKILL)
     await asyncio.wait_for(placing, LIMIT_S)
     await victim.place("after it")

@@ -28,7 +28,7 @@ from protocol.conformance.scene import CAMERA, frame, hello, place
 from protocol.limits import SUBPROTOCOL
 from tests.bench.report.finished import Part
 from tests.bench.report.run import Run
-from tests.bench.service.process import Served, children, resident_mb, serving
+from tests.bench.service.process import Served, descendants, resident_mb, serving
 
 PATIENCE_S = 120.0
 HEALTH_PERIOD_S = 0.2
@@ -37,6 +37,8 @@ SETTLED_S = 5.0
 LOOKS = 24
 NEVER_READ = 4
 """Sessions that send frames and read nothing, of which an address may have eight."""
+OBJECTS_PER_S = 200
+"""At most: a connection may send 500 messages a second, and each object takes two."""
 FLOODS, A_FLOOD = 10, 5000
 """Connections, each of which sends so many messages at once; it is closed after 2000."""
 
@@ -74,7 +76,7 @@ class Held:
     def of(cls, served: Served, data: Path) -> Held:
         """Now; memory with that of its parsers."""
         pid = served.process.pid
-        memory_mb = sum(map(resident_mb, [pid, *children(pid)]))
+        memory_mb = sum(map(resident_mb, [pid, *descendants(pid)]))
         disk = sum(path.stat().st_size for path in data.rglob("*") if path.is_file())
         return cls(memory_mb, len(os.listdir(f"/proc/{pid}/fd")), len(os.listdir(f"/proc/{pid}/task")), disk / 1e3)
 
@@ -158,6 +160,7 @@ def _place_objects(served: Served, count: int) -> None:
         client.send(msgpack.packb(hello()))
         client.recv(timeout=PATIENCE_S)
         for number in range(count):
+            time.sleep(1 / OBJECTS_PER_S)
             client.send(msgpack.packb(place(2 * number, f"object {number}")))
             client.send(
                 msgpack.packb({"type": "remove_object", "request": 2 * number + 1, "object": f"object {number}"})

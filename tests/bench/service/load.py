@@ -30,7 +30,7 @@ from protocol.frames import RgbdFrame
 from protocol.messages import Acknowledged, Composite, Dropped, Preset, Wishes
 from tests.bench.report.finished import Part
 from tests.bench.report.run import Run
-from tests.bench.service.process import Served, Unusual, children, resident_mb, serving
+from tests.bench.service.process import Served, Unusual, descendants, resident_mb, serving
 from tests.scenes.plain_light import PLAIN_LIGHT
 
 STREAMING, WATCHING = 8, 24
@@ -267,13 +267,13 @@ async def _watch(url: str, session: str) -> int:
 def _beside_s(pid: int) -> float:
     """Time of the processor so far: the event loop runs in the process's first thread."""
     tasks = [Path(f"/proc/{pid}/task/{pid}/stat")]
-    tasks += [Path(f"/proc/{child}/stat") for child in children(pid, "read_picture")]
+    tasks += [Path(f"/proc/{child}/stat") for child in descendants(pid, "read_picture")]
     ticks = sum(sum(map(int, task.read_text().rpartition(")")[2].split()[11:13])) for task in tasks)
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def _memory_mb(pid: int) -> float:
-    return sum(map(resident_mb, [pid, *children(pid)]))
+    return sum(map(resident_mb, [pid, *descendants(pid)]))
 
 
 def growth(memory_mb: list[float]) -> float:

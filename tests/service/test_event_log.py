@@ -65,6 +65,10 @@ def test_a_line_says_what_it_is_about() -> None:
     assert facts_of(record()) == {}
 
 
+def test_what_ray_puts_on_records_is_not_told() -> None:
+    assert facts_of(record(_ray_timestamp_ns=1)) == {}
+
+
 def test_what_a_client_says_cannot_make_lines_of_its_own() -> None:
     hostile = record(reason='x\n{"event": "forged"}\r\nINFO', args=("\nforged",))
     assert JsonLines().format(hostile).count("\n") == 0

@@ -21,9 +21,9 @@ MOST_STEPS = 16
 """Most Gauss-Newton steps of a solution. Another follows while the last one changed what patches receive by more than
 MOVED."""
 MOVED, DISTANT_MOVED, DISTANT_SHARE = 0.01, 0.05, 0.5
-"""Change of a logarithm; the second value holds for the light from beyond the scan, of which shares of DISTANT_SHARE of
-the steps are taken. Lobes that overlap take the light of each other: what stops sooner is nearer to the prior, and two
-lights of mitsuba_room are 16 degrees off instead of 27."""
+"""Change of a logarithm; the second value holds for the light from beyond the scan, of whose steps that share is taken,
+both while the light is steady. Lobes that overlap take the light of each other: what stops sooner is nearer to the
+prior, and two lights of mitsuba_room are 16 degrees off instead of 27."""
 LEAST_PATCHES = 12
 """With fewer patches there is no solution."""
 
@@ -36,7 +36,7 @@ class Solver:
     def __init__(self, switches: Switches) -> None:
         self._switches = switches
         self._transport = Transport()
-        self._near, self._distant = Unknowns(), Unknowns(most_relaxation=DISTANT_SHARE)
+        self._near, self._distant = Unknowns(), Unknowns()
         self._shell: Shell | None = None
 
     def begin_with(self, shell: Shell | None) -> None:
@@ -61,6 +61,7 @@ class Solver:
         near = near_sources(self._transport, shell, evidence.rows)
         distant = distant_sources(self._transport, closed, evidence.rows, with_indirect=switches.indirect)
         first = patches.outdated if self._near.known > 0 and switches.memory else 1.0
+        self._distant.most_relaxation = DISTANT_SHARE ** (1 - patches.outdated)
         far_settled = DISTANT_MOVED ** (1 - first) * MOVED**first
         for unknowns, sources, settled in ((self._near, near, MOVED), (self._distant, distant, far_settled)):
             for _ in range(MOST_STEPS):

@@ -112,8 +112,11 @@ def _json_value(value: object) -> object:
 
 
 def facts_of(record: logging.LogRecord) -> dict[str, object]:
-    """Context fields of the record: those of its task and those passed as `extra`."""
-    extra = {name: value for name, value in vars(record).items() if name not in _KNOWN}
+    """Context fields of the record: those of its task and those passed as `extra`.
+
+    Names that begin with "_" are others' own: Ray puts such on every record of a process that has loaded it.
+    """
+    extra = {name: value for name, value in vars(record).items() if name not in _KNOWN and not name.startswith("_")}
     return {**(_about.get() or {}), **extra}
 
 

@@ -18,7 +18,7 @@ tell where light comes from for texture."""
 SURFACE_SPREAD = 0.1
 """Standard deviation of a surface's log albedo about its material's (segments.py): more would take a wall in shade for
 a dark one."""
-DARK_EDGE = 0.05
+DARK_EDGE = 0.03
 """Log albedo below its material's from which the prior of a surface's grows linearly: paint may be black. With the tail
 of a Cauchy distribution there are more minima, between which the light jumps."""
 WHITE = 0.005

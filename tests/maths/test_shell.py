@@ -75,6 +75,18 @@ def test_a_lamp_out_of_view_is_found(lit: ShellRoom, place: tuple[float, float, 
     assert found[0] == pytest.approx(truth[0], rel=0.25)
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_light_does_not_depend_on_where_steps_begin(lit: ShellRoom, seed: int) -> None:
+    """Nor on what was solved before: cells that are e times brighter or darker at first, by chance."""
+    room, place = make_room(LAMP, AMBIENT), np.array((1.0, 1.0, 0.7))
+    room.solve(1)
+    room.unknowns.z += np.random.default_rng(seed).normal(size=room.unknowns.known)
+    room.solve(8)
+    found, other = light_at(room, place), light_at(lit, place)
+    assert angle_deg(found, other) < 0.05  # seen: .006
+    assert found[0] == pytest.approx(other[0], rel=1e-3)
+
+
 def test_light_without_direction_has_none() -> None:
     """A white furnace: the ambient light alone."""
     room = make_room(None, AMBIENT, dict.fromkeys(range(3), (0.6, 0.6, 0.6)))

@@ -63,9 +63,8 @@ class Solver:
         first = patches.outdated if self._near.known > 0 and switches.memory else 1.0
         self._distant.most_relaxation = DISTANT_SHARE ** (1 - patches.outdated)
         far_settled = DISTANT_MOVED ** (1 - first) * MOVED**first
-        for unknowns in (self._near, self._distant):
-            unknowns.relaxation = max(unknowns.relaxation, patches.outdated)
         for unknowns, sources, settled in ((self._near, near, MOVED), (self._distant, distant, far_settled)):
+            unknowns.relaxation = max(unknowns.relaxation, patches.outdated)
             for _ in range(MOST_STEPS):
                 step(unknowns, evidence, sources, switches)
                 if unknowns.step < settled:

@@ -144,7 +144,7 @@ class Patches:
             self.arrivals[traced.rows] = traced.arrivals.result()
 
     def copy(self) -> Patches:
-        """What frames add does not reach it. Rays, which `trace` alone changes, are shared."""
+        """What frames add does not reach it. Rays, which `end_trace` alone changes, are shared."""
         other = copy(self)
         for name in _CHANGED_BY_FRAMES:
             setattr(other, name, getattr(self, name).copy())

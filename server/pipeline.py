@@ -30,6 +30,7 @@ from server.room.room import Room
 from server.room.spots import SpotView
 from server.shading.composite import shown_picture
 from server.shading.layer import NOTHING, Layer
+from server.shading.traced_scene import middles_of
 from server.tracking.alignment import Alignment
 from server.transfer.samples import NO_SAMPLES, SampledTransfer, TransferSamples
 from server.volume.volume import Volume
@@ -247,7 +248,7 @@ class Pipeline:
         samples: TransferSamples,
         left_out: dict[str, CullReason],
     ) -> SpineOutputs:
-        sh, split = self._room.light.seen_by_objects(self.light.middle_of_objects(), context.volume.origin_world)
+        sh, split, places = self._room.light.seen_by_objects(middles_of(objects), context.volume.origin_world)
         return SpineOutputs(
             frame=frame,
             objects=objects,
@@ -256,6 +257,7 @@ class Pipeline:
             period=self._transfer.period,
             sh=sh,
             split=split,
+            light_places=places,
             is_light_given=self._room.light.is_given,
             left_out=left_out,
         )

@@ -36,8 +36,9 @@ kernel void bound_samples(const Grid grid, SAMPLE_BUFFERS, global const float *t
     const float4 position = positions[pixel], normal = normals[pixel];
     float4 bound = (float4)(0.0f);
     if (position.w > 0.0f && normal.w > 0.0f) {
-        const Arriving arrives = make_arriving(lit, directions, light_table, 0, nothing_changed());
-        global const float4 *light = coefficients_of(lit, light_table);
+        const int place = place_near(lit.table, light_table, position.xyz);
+        const Arriving arrives = make_arriving(lit, directions, light_table, place, 0, nothing_changed());
+        global const float4 *light = coefficients_of(lit.table, light_table, place);
         global const uint *free = free_mask + sample * MASK_WORDS;
         global const uchar *own = sets + sample * INTERLEAVE;
         const float3 most_hidden = fmax(real_sent.xyz, lit.unseen.xyz);

@@ -87,7 +87,7 @@ kernel void refine_virtual(SCENE_PARAMETERS, const int listed, global const int 
     const int pixel = pixels[item];
     const Volume volume = VOLUME_OF_SCENE;
     const Objects things = OBJECTS_OF_SCENE(own_offset_m(scene.objects.count, grids_of(object_table), shown[pixel]));
-    const Arriving arrives = ARRIVING_OF_SCENE;
+    const Arriving arrives = ARRIVING_OF_SCENE(place_of_object(scene.light.table, light_table, shown[pixel]));
     const int x = pixel % scene.samples.width, y = pixel / scene.samples.width;
     occluded[pixel] = taken_from_virtual(volume, things, arrives, positions[pixel], normals[pixel].xyz, direction_set(y, x),
                                          direction_subset(y, x, scene.every), scene.every);
@@ -106,11 +106,12 @@ kernel void refine_real(REAL_SCENE_PARAMETERS, const int listed, global const in
     if (positions[pixel].w > 0.0f && normals[pixel].w > 0.0f) {
         const Volume volume = SOLIDS_OF_SCENE;
         const Objects things = OBJECTS_OF_SCENE(0.0f);
-        const Arriving arrives = ARRIVING_UNCHANGED;
+        const int place = place_near(scene.light.table, light_table, positions[pixel].xyz);
+        const Arriving arrives = ARRIVING_UNCHANGED(place);
         const float4 without = upsample(scene.samples, shaded, positions, normals, x, y, volume.voxel_m);
         const float3 taken = taken_from_real(volume, things, arrives, scene.objects.ball, positions[pixel].xyz, normals[pixel].xyz,
                                              direction_set(y, x), direction_subset(y, x, scene.every), scene.every, 0, 1, 0);
-        const float3 floor = LEAST_SHADING * 0.28209479f * coefficients_of(scene.light, light_table)[0].xyz + 1e-9f;
+        const float3 floor = LEAST_SHADING * 0.28209479f * coefficients_of(scene.light.table, light_table, place)[0].xyz + 1e-9f;
         result = (float4)(fmax(without.xyz - taken, floor) / fmax(without.xyz, floor), without.w);
     }
     ratio[pixel] = result;

@@ -30,8 +30,9 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, global const floa
     }
     const Volume volume = SOLIDS_OF_SCENE;
     const Objects things = OBJECTS_OF_SCENE(0.0f);
-    const Arriving arrives = ARRIVING_UNCHANGED;
-    global const float4 *light = coefficients_of(scene.light, light_table);
+    const int place = place_near(scene.light.table, light_table, position.xyz);
+    const Arriving arrives = ARRIVING_UNCHANGED(place);
+    global const float4 *light = coefficients_of(scene.light.table, light_table, place);
     global const uint *free = free_mask + sample * MASK_WORDS;
     global const uchar *own = sets + sample * INTERLEAVE;
     float3 without = (float3)(0.0f);
@@ -61,7 +62,8 @@ kernel void bounce_real(SURROUNDINGS_PARAMETERS, SAMPLE_BUFFERS, const int most,
         bounced[sample] = before;
         return;
     }
-    const float3 floor = LEAST_SHADING * 0.28209479f * coefficients_of(scene.light, light_table)[0].xyz + 1e-9f;
+    const int place = place_near(scene.light.table, light_table, positions[pixel].xyz);
+    const float3 floor = LEAST_SHADING * 0.28209479f * coefficients_of(scene.light.table, light_table, place)[0].xyz + 1e-9f;
     const float3 counts = fmax(least[sample].xyz, floor);
     const float part_hidden = clamp(1.0f - openness[sample], 0.0f, 1.0f);
     if (part_hidden == 0.0f || part_hidden * returned <= spare * fmin(fmin(counts.x, counts.y), counts.z)) {
@@ -69,7 +71,7 @@ kernel void bounce_real(SURROUNDINGS_PARAMETERS, SAMPLE_BUFFERS, const int most,
         return;
     }
     const Volume volume = SOLIDS_OF_SCENE;
-    const Arriving arrives = ARRIVING_OF_SCENE;
+    const Arriving arrives = ARRIVING_OF_SCENE(place);
     const float3 origin = positions[pixel].xyz + volume.voxel_m * normal.xyz;
     float4 sum = (float4)(0.0f);
     for (int i = 0; i < most && met[sample * most + i] != NO_MORE_MET; i++) {
@@ -99,7 +101,7 @@ kernel void shadow_virtual(SCENE_PARAMETERS, const int4 around, global const flo
     const int pixel = sample_pixel(grid, row, col);
     const Volume volume = VOLUME_OF_SCENE;
     const Objects things = OBJECTS_OF_SCENE(own_offset_m(scene.objects.count, grids_of(object_table), shown[pixel]));
-    const Arriving arrives = ARRIVING_OF_SCENE;
+    const Arriving arrives = ARRIVING_OF_SCENE(place_of_object(scene.light.table, light_table, shown[pixel]));
     occluded[row * grid.cols + col] = taken_from_virtual(volume, things, arrives, positions[pixel], normals[pixel].xyz, direction_set(row, col),
                                                     direction_subset(row, col, scene.every), scene.every);
 }
@@ -112,9 +114,10 @@ kernel void light_points(SCENE_PARAMETERS, const int points_count, global const 
     if (index >= points_count) return;
     const Volume volume = VOLUME_OF_SCENE;
     const Objects things = OBJECTS_OF_SCENE(offsets_m[index]);
-    const Arriving arrives = ARRIVING_OF_SCENE;
+    const int place = place_near(scene.light.table, light_table, points[index].xyz);
+    const Arriving arrives = ARRIVING_OF_SCENE(place);
     const float3 normal = normals[index].xyz;
     const float4 taken = taken_from_virtual(volume, things, arrives, points[index], normal, direction_set(index >> 3, index & 7), 0, 1);
-    radiances[index] = (float4)(albedos[index].xyz * fmax(open_shading(normal, coefficients_of(scene.light, light_table)) - taken.xyz,
+    radiances[index] = (float4)(albedos[index].xyz * fmax(open_shading(normal, coefficients_of(scene.light.table, light_table, place)) - taken.xyz,
     0.0f), 1.0f);
 }

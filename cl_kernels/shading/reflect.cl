@@ -76,7 +76,8 @@ kernel void reflect_surroundings(const ReflectionParameters parameters, SCENE_BU
     if (position.w > 0.0f && fmax(1.0f - material.x, material.y) >= parameters.least_gloss) {
         const Volume volume = VOLUME_OF_SCENE;
         const Objects things = OBJECTS_OF_SCENE(own_offset_m(scene.objects.count, grids_of(object_table), shown[pixel]));
-        const Arriving arrives = ARRIVING_OF_SCENE;
+        const int place = place_of_object(scene.light.table, light_table, shown[pixel]);
+        const Arriving arrives = ARRIVING_OF_SCENE(place);
         const float3 normal = normals[pixel].xyz, back = normalize(parameters.eye.xyz - position.xyz);
         const float cosine = clamp(dot(normal, back), 0.0f, 1.0f), metal = clamp(material.y, 0.0f, 1.0f);
         const float3 head_on = (1.0f - metal) * (float3)(0.04f) + metal * base_colors[pixel].xyz;
@@ -84,7 +85,7 @@ kernel void reflect_surroundings(const ReflectionParameters parameters, SCENE_BU
         // The fit lacks multiple scattering between microfacets; compensated as in Turquin (2019).
         const float3 gloss = clamp((share.x + share.y * head_on) * (1.0f + head_on * (1.0f / (share.x + share.y) - 1.0f)), 0.0f, 1.0f);
         const float turn = GOLDEN * ((y & 3) * 4 + (x & 3));
-        const float3 arriving = mean_arriving(volume, things, arrives, whole_light_of(scene.light, light_table), position.xyz, normal,
+        const float3 arriving = mean_arriving(volume, things, arrives, whole_light_of(scene.light.table, light_table, place), position.xyz, normal,
         2.0f * dot(normal, back) * normal - back,
                                               material.x * material.x, turn);
         const float dielectric = clamp(share.x + 0.04f * share.y, 0.0f, 1.0f);

@@ -1,7 +1,6 @@
 // Shadow maps along the sharp lights of a room, and shading with them (thesis 7.2.3, fig. 7.7).
 // Provides build_maps, trace_discs, keep_parts, light_virtual, light_real, light_points_by_discs, light_samples, mix_direct,
 // unmix_direct.
-#include "arriving.clh"
 #include "camera.clh"
 #include "clear_origin.clh"
 #include "direct_lights.clh"

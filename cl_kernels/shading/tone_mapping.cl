@@ -25,8 +25,9 @@ kernel void shade_pairs(const Grid grid, SAMPLE_BUFFERS, global const float4 *ra
     const float4 seen = radiance[pixel];
     float4 pair = (float4)(0.0f);
     if (seen.w > 0.0f && positions[pixel].w > 0.0f && normals[pixel].w > 0.0f && openness[sample] >= 0.0f) {
-        const Arriving arrives = make_arriving(lit, directions, light_table, 0, nothing_changed());
-        global const float4 *light = coefficients_of(lit, light_table);
+        const int place = place_near(lit.table, light_table, positions[pixel].xyz);
+        const Arriving arrives = make_arriving(lit, directions, light_table, place, 0, nothing_changed());
+        global const float4 *light = coefficients_of(lit.table, light_table, place);
         float3 shaded = (float3)(0.0f);
         for (int i = 0; i < COEFFICIENTS; i++) shaded += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
         shaded = shading_without(arrives, shaded, openness[sample], hits[sample]);

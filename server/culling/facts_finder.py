@@ -49,18 +49,20 @@ class FactsFinder:
         *,
         has_indirect: bool,
     ) -> SceneFacts:
-        """Facts about a frame. sh: [bands^2, 3] of the whole `light`, in the first picture's units; `split`: in discs;
-        shown: [h, w, 3] sRGB. has_indirect: surfaces light one another."""
+        """Facts about a frame. sh: [places, bands^2, 3] of the whole `light`, in the first picture's units; `split`: in
+        discs; shown: [h, w, 3] sRGB. has_indirect: surfaces light one another."""
         exposure = context.exposure
         picture_most = _most_shown(shown)
         self._brightest = max(self._brightest, picture_most / exposure)
         whole = exposure * sh
-        rest = exposure * split.rest if light.discs else whole
+        rest = exposure * split.rest.reshape(sh.shape) if light.discs else whole
 
         real = np.full(3, ROUNDING * exposure * self._brightest) if has_indirect else np.zeros(3)
         around = np.maximum(real, light.unseen)
-        arriving = np.maximum(most_radiance(whole), around)
-        shading = most_shading(rest) + most_irradiance(light, objects) + SPREAD * around
+        arriving = np.maximum(np.max([most_radiance(seen) for seen in whole], axis=0), around)
+        shading = (
+            np.max([most_shading(seen) for seen in rest], axis=0) + most_irradiance(light, objects) + SPREAD * around
+        )
         sent = shading * most_albedo(objects) if has_indirect else np.zeros(3)
 
         boxes = boxes_in_view(context.camera, context.camera_from_volume, objects)

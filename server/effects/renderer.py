@@ -29,6 +29,7 @@ from server.effects.table import COMPOSE_LAYER, COMPOSITE, EFFECTS, FAINT_SHADOW
 from server.frame_context import FrameContext
 from server.input.measure import Measurement
 from server.maths.direct_lights import SplitLight
+from server.maths.light_places import LightPlaces
 from server.objects.rasterize import Placed
 from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
@@ -90,9 +91,10 @@ class SpineOutputs:
     period: int
     """Frames after which a still view is sampled the same again."""
     sh: NDArray[np.float64]
-    """[bands^2, 3] the light, in the first picture's units."""
+    """[places, bands^2, 3] the light, in the first picture's units."""
     split: SplitLight
     """The same as discs and a rest."""
+    light_places: LightPlaces
     is_light_given: bool
     left_out: Mapping[str, CullReason]
     """What of the spine was left out."""
@@ -189,7 +191,7 @@ class Renderer:
     ) -> tuple[PictureParts, Plan]:
         """What the picture is composed of, and the plan that made it."""
         samples, rays = spine.samples, context.rays
-        light = upload_light(self._engine, spine.sh, rays, samples.indirect, context.exposure)
+        light = upload_light(self._engine, spine.sh, rays, samples.indirect, context.exposure, spine.light_places)
         averages = self._averages(context, spine, settings, light)  # 7.1, H
         if spine.objects:
             light = take_discs(self._engine, light, spine.split, rays, context.exposure)  # 7.2.3

@@ -21,6 +21,7 @@ from server.light.shell.room_model import RoomModel
 from server.light.shell.solution import LookUp, Solution
 from server.light.shell.switches import Switches
 from server.maths.direct_lights import SplitLight, split_light
+from server.maths.light_places import EVERYWHERE, LightPlaces, places_of
 from server.maths.sh import LUMINANCE
 from server.opencl.engine import Engine
 from server.quality.settings import Settings
@@ -93,22 +94,23 @@ class RoomLight:
         return self._model.solution if is_by_place else None
 
     def seen_by_objects(
-        self, position: NDArray[np.float64], origin_world: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], SplitLight]:
-        """Light [bands^2, 3] from beyond the scan for objects at `position` [3] (world), and its discs.
+        self, middles: NDArray[np.float64], origin_world: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], SplitLight, LightPlaces]:
+        """Light [places, bands^2, 3] from beyond the scan for objects with `middles` [objects, 3], volume metres.
 
-        origin_world: [3] of the volume, in whose space discs have their places.
+        Besides, its discs and what they leave, and the places. origin_world: [3] of the volume.
         """
         solution = self._solution
-        if solution is None:
+        if solution is None or not len(middles):
             sh = self.estimate().sh
-            return sh, split_light(sh)
-        whole, rest, lamps = solution.beyond(position, self._settings.bands)
+            return sh[None], split_light(sh), EVERYWHERE
+        places = places_of(middles)
+        whole, rest, lamps = solution.beyond(places.positions + origin_world, self._settings.bands)
         if self._settings.light_color == "white":
             whole, rest = _whitened(whole), _whitened(rest)
             lamps = [replace(lamp, radiance=_whitened(lamp.radiance)) for lamp in lamps]
         discs = tuple(lamp.as_direct_light(origin_world) for lamp in lamps)
-        return whole, SplitLight(rest, discs)
+        return whole, SplitLight(rest, discs), places
 
     def look_up(self, engine: Engine, volume: Volume, positions: NDArray[np.float64]) -> LookUp | None:
         """Begin to trace what `arriving_at` needs; None where there is no solution, or this frame takes another."""
@@ -202,7 +204,7 @@ class RoomLight:
 
 
 def _whitened(sh: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.outer(sh @ LUMINANCE, np.ones(3)))
+    return np.asarray((sh @ LUMINANCE)[..., None] * np.ones(3))
 
 
 def _switches(settings: Settings) -> Switches:

@@ -86,7 +86,7 @@ class SplitLight:
     """A light as discs and a rest."""
 
     rest: Floats
-    """[bands^2, 3] radiance coefficients of the rest."""
+    """[..., bands^2, 3] radiance coefficients of the rest, as of the light."""
     discs: tuple[DirectLight, ...]
     """Strongest first."""
 

@@ -68,16 +68,21 @@ GRID = Struct("Grid", cols="int", rows="int", stride="int", width="int")
 VOLUME_SHAPE = Struct("VolumeShape", bricks="int4", voxel_m="float", truncation_m="float", gaps_at="int")
 """Volume of include/volume.clh. gaps_at: byte of the ray tables at which the gaps begin, behind the solid cells."""
 
-LIGHT_PARAMETERS = Struct(
-    "LightParameters",
-    unseen="float4",
-    count="int",
-    ray_length_m="float",
-    arriving_at="int",
+LIGHT_TABLE = Struct(
+    "LightTable",
+    places="int",
+    directions="int",
     coefficients_at="int",
     whole_at="int",
+    arriving_at="int",
+    positions_at="int",
+    owners_at="int",
 )
-"""Arriving of include/arriving.clh. ..._at: byte of the light's table at which an array begins."""
+"""Arrays of include/light_table.clh, their sizes and the byte of the light's table at which each begins. directions: of
+all sets."""
+
+LIGHT_PARAMETERS = Struct("LightParameters", unseen="float4", table=LIGHT_TABLE, count="int", ray_length_m="float")
+"""Arriving of include/arriving.clh. count: directions of one set."""
 
 CHANGED_PARAMETERS = Struct("ChangedParameters", camera_from_volume="float16", intrinsics="float4", grid="int4")
 """Changed of include/changed.clh."""
@@ -206,6 +211,7 @@ MIXTURE_PARAMETERS = Struct(
     tolerance_m="float",
     virtual_gain="float",
     log_white="float4",
+    light=LIGHT_TABLE,
     virtual_samples=GRID,
     real_samples=GRID,
     has_refined_occluded="int",
@@ -229,6 +235,7 @@ SURFACE_PARAMETERS = Struct("SurfaceParameters", around="int4", region="int4", w
 STRUCTS = (
     GRID,
     VOLUME_SHAPE,
+    LIGHT_TABLE,
     LIGHT_PARAMETERS,
     CHANGED_PARAMETERS,
     OBJECT_PARAMETERS,

@@ -163,11 +163,14 @@ class TemporalReuse:
     def observe(self, decision: ReuseDecision, sh: Floats, picture: Picture | None) -> None:
         """Learn from a fully computed frame whether the view has settled.
 
-        sh: the light [bands^2, 3]. picture: at a checkpoint, the virtual objects over the camera picture with which the
-        view began; None without objects.
+        sh: the light [places, bands^2, 3]. picture: at a checkpoint, the virtual objects over the camera picture with
+        which the view began; None without objects.
         """
         if decision.reason is not None:
             return
+        if self._lights and self._lights[-1].shape != sh.shape:  # seen from other places
+            self._states.clear()
+            self._lights.clear()
         self._lights.append(sh.copy())
         self._echo_frames = max(self._echo_frames - 1, 0)
         count = self._changes.count
@@ -229,8 +232,9 @@ class TemporalReuse:
             share = self._unsettled()
             bound = codes_of_share((1 + share) / (1 - share) - 1) if share < 1 else math.inf
             return bound if bound <= SHARE * ALLOWANCE else None
-        mean = np.maximum(now[0] / math.sqrt(4 * math.pi), 1e-12)
-        bound = codes_of_share(float((most_shading(now - half) / mean).max())) if now.any() or half.any() else 0.0
+        mean = np.maximum(now[:, 0] / math.sqrt(4 * math.pi), 1e-12)
+        changed = np.array([most_shading(change) for change in now - half])
+        bound = codes_of_share(float((changed / mean).max())) if now.any() or half.any() else 0.0
         return bound if bound <= ALLOWANCE else None
 
     def _unsettled(self) -> float:
@@ -238,6 +242,6 @@ class TemporalReuse:
         lights = np.array(self._lights)
         if (lights == lights[-1]).all():
             return 0.0
-        radiances = sh_basis(spherical_fibonacci(_DIRECTIONS), math.isqrt(lights.shape[1])) @ lights
+        radiances = sh_basis(spherical_fibonacci(_DIRECTIONS), math.isqrt(lights.shape[-2])) @ lights
         steps = np.abs(np.diff(radiances, axis=0)).max(axis=0) / RATE
         return float((steps / np.maximum(radiances[-1], 1e-12)).max())

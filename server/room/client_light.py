@@ -87,12 +87,6 @@ class ClientLight:
         smooth = denoise_radiance(self._engine, context.measurement, settings.denoise, settings.denoise_iterations)
         return scene_radiance(self._engine, smooth, context.exposure, self._engine.buffers(_Buffers).smooth_radiance)
 
-    def middle_of_objects(self) -> Floats:
-        """[3] world metres: the middle of all virtual objects, else of what the last frame sees."""
-        middles = [*self._room.objects.middles().values()]
-        view = self._places.newest.view
-        return np.mean(middles, axis=0) if middles else np.zeros(3) if view is None else view
-
     def message(self, frame: RgbdFrame, light: LightEstimate, volume: Volume, exposure: float) -> Light:
         """The light in the client's world. `exposure`: of the frame."""
         lamps, axes = self._room.lamps.lamps_at(volume.origin_world), self._alignment.webxr_from_client

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.input.measure import intrinsics
 from server.maths.direct_lights import DirectLight, SplitLight
+from server.maths.light_places import EVERYWHERE, LightPlaces
 from server.objects.object_table import ObjectTable, object_table
 from server.objects.rasterize import Placed
 from server.opencl.buffers import BufferDescription, DeviceBuffer, StageBuffers
 from server.opencl.engine import Engine, KernelArgument, float4, float16, int4
 from server.opencl.parts import Parts
-from server.opencl.structs import CHANGED_PARAMETERS, LIGHT_PARAMETERS, OBJECT_PARAMETERS, SCENE_PARAMETERS
+from server.opencl.structs import CHANGED_PARAMETERS, LIGHT_PARAMETERS, LIGHT_TABLE, OBJECT_PARAMETERS, SCENE_PARAMETERS
 from server.shading.depth_views import DepthViews
 from server.shading.virtual_point_lights import VirtualPointLights, no_point_lights
 from server.transfer.indirect import Indirect
@@ -33,51 +34,44 @@ from server.volume.volume import Volume
 
 
 class _Buffers(StageBuffers):
-    coefficients = BufferDescription(cl_types.float4)
-    """[bands^2] of all of the light."""
     table = BufferDescription(np.uint8)
     """DeviceLight.table of all of the light."""
-    rest_coefficients = BufferDescription(cl_types.float4)
-    """[bands^2] of the light without its discs."""
     rest_table = BufferDescription(np.uint8)
 
 
 @dataclass(frozen=True)
 class DeviceLight:
-    """The light on the device."""
+    """The light on the device, as it is seen from each of some places."""
 
-    coefficients: cl_array.Array
-    """[bands^2] float4: RGB radiance coefficients."""
     mean: NDArray[np.float64]
-    """[3] radiance, over all directions."""
+    """[3] radiance, over all directions and places."""
     table: Parts
-    """`arriving` [SETS, count] float4: RGB radiance from each direction of the visibility tests, clamped to 0
-    (harmonics can ring below 0, and blocking negative light would brighten). The rest: include/arriving.clh."""
+    """Arrays of include/light_table.clh. `arriving` [places, SETS, count] float4 is clamped to 0: harmonics can ring
+    below 0, and blocking negative light would brighten."""
     sh: NDArray[np.float64]
-    """[bands^2, 3]: coefficients of the whole light."""
+    """[places, bands^2, 3]: coefficients of the whole light."""
+    places: LightPlaces
     unseen: NDArray[np.float64]
     """[3] radiance from blocked directions whose blocker no picture shows; 0 without indirect light."""
     surface_gain: float
     """Radiance in the picture's units per unit of the volume's colours; 0: surfaces send nothing."""
     discs: tuple[DirectLight, ...] = ()
-    """Sharp lights that `coefficients` and `arriving` leave to shadow maps (shadow_map.py); volume axes."""
-    with_discs: cl_array.Array | None = None
-    """[bands^2] float4: coefficients of the whole light; None where `coefficients` are these."""
+    """Sharp lights that the table leaves to shadow maps (shadow_map.py), but for its `whole`; volume axes."""
 
     @property
     def bands(self) -> int:
         """Number of SH bands of the coefficients."""
-        return math.isqrt(int(self.coefficients.shape[0]))
+        return math.isqrt(self.sh.shape[1])
 
     @property
-    def whole(self) -> cl_array.Array:
-        """[bands^2] float4: coefficients of the whole light."""
-        return self.coefficients if self.with_discs is None else self.with_discs
-
-    @property
-    def arriving(self) -> cl_array.Array:
-        """[SETS, count] float4 of the table: radiance from each direction."""
-        return self.table.array("arriving")
+    def layout(self) -> np.void:
+        """LightTable of structs.py."""
+        starts, count = self.table.starts, len(self.sh)
+        return LIGHT_TABLE(
+            places=count,
+            directions=self.table.array("arriving").size // count,
+            **{f"{part}_at": start for part, start in starts.items()},
+        )
 
 
 @dataclass(frozen=True)
@@ -112,7 +106,7 @@ class TracedScene:
     @property
     def bands(self) -> int:
         """Number of SH bands of the light."""
-        return math.isqrt(int(self.light.coefficients.shape[0]))
+        return self.light.bands
 
     def defines(self, engine: Engine) -> dict[str, int]:
         """Preprocessor definitions of the kernels."""
@@ -176,13 +170,8 @@ class TracedScene:
 
 def light_parameters(light: DeviceLight, count: int, ray_length_m: float) -> np.void:
     """LightParameters of structs.py. count: directions of one set."""
-    starts = light.table.starts
-    return LIGHT_PARAMETERS(
-        unseen=float4(*light.unseen, light.surface_gain),
-        count=count,
-        ray_length_m=ray_length_m,
-        **{f"{part}_at": starts[part] for part in ("arriving", "coefficients", "whole")},
-    )
+    unseen = float4(*light.unseen, light.surface_gain)
+    return LIGHT_PARAMETERS(unseen=unseen, table=light.layout, count=count, ray_length_m=ray_length_m)
 
 
 def light_arguments(
@@ -201,6 +190,12 @@ def object_parameters(table: ObjectTable, sent: VirtualPointLights, ball: np.gen
         dims_at=table.rows.starts["dims"],
         **{f"{part}_at": starts[part] for part in ("normals", "cells", "nearest")},
     )
+
+
+def middles_of(objects: Sequence[Placed]) -> NDArray[np.float64]:
+    """[objects, 3] volume metres: the middle of each one's box."""
+    middles = [matrix[:3, :3] @ np.mean(thing.bounds, axis=0) + matrix[:3, 3] for thing, matrix in objects]
+    return np.array(middles, np.float64).reshape(-1, 3)
 
 
 def ball_around(objects: Sequence[Placed]) -> np.generic:
@@ -232,17 +227,18 @@ def upload_light(
     rays: Directions,
     indirect: Indirect | None = None,
     exposure: float = 1.0,
+    places: LightPlaces = EVERYWHERE,
 ) -> DeviceLight:
-    """Upload the light: radiance coefficients [bands^2, 3], the radiance along `rays`.
+    """Upload the light: radiance coefficients [bands^2, 3], or [places, bands^2, 3], and the radiance along `rays`.
 
     indirect: radiance from surfaces, None for none. exposure: radiance in the picture over that in `sh` and volume.
     """
-    sh, buffers = exposure * sh, engine.buffers(_Buffers)
+    sh = exposure * sh.reshape(len(places.positions), -1, 3)
     return DeviceLight(
-        buffers.coefficients.refresh(_float4(sh)),
-        np.maximum(0.5 / np.sqrt(np.pi) * sh[0], 0.0),
-        _upload_table(buffers.table, rays, sh, sh),
+        np.maximum(0.5 / np.sqrt(np.pi) * sh[:, 0], 0.0).mean(axis=0),
+        _upload_table(engine.buffers(_Buffers).table, rays, sh, sh, places),
         sh,
+        places,
         exposure * indirect.mean if indirect else np.zeros(3),
         exposure if indirect else 0.0,
     )
@@ -251,31 +247,31 @@ def upload_light(
 def take_discs(
     engine: Engine, light: DeviceLight, split: SplitLight, rays: Directions, exposure: float = 1.0
 ) -> DeviceLight:
-    """`light` without the discs of `split`, which must be of the same light and `exposure`."""
+    """`light` without the discs of `split`, which must be of the same light, places and `exposure`."""
     if not split.discs:
         return light
-    rest, buffers = exposure * split.rest, engine.buffers(_Buffers)
+    rest = exposure * split.rest.reshape(light.sh.shape)
     return replace(
         light,
-        coefficients=buffers.rest_coefficients.refresh(_float4(rest)),
-        table=_upload_table(buffers.rest_table, rays, rest, light.sh),
+        table=_upload_table(engine.buffers(_Buffers).rest_table, rays, rest, light.sh, light.places),
         discs=tuple(replace(disc, irradiance=exposure * disc.irradiance) for disc in split.discs),
-        with_discs=light.coefficients,
     )
 
 
 def _upload_table(
-    buffer: DeviceBuffer,
-    rays: Directions,
-    sh: NDArray[np.float64],
-    whole: NDArray[np.float64],
+    buffer: DeviceBuffer, rays: Directions, sh: NDArray[np.float64], whole: NDArray[np.float64], places: LightPlaces
 ) -> Parts:
-    """The light's table, laid out as in include/arriving.clh."""
-    return buffer.refresh_parts({"coefficients": _float4(sh), "whole": _float4(whole), "arriving": _arriving(rays, sh)})
-
-
-def _arriving(rays: Directions, sh: NDArray[np.float64]) -> NDArray[np.float32]:
-    return _float4(np.maximum(rays.basis @ sh.astype(np.float32), 0.0))
+    """The light's table, laid out as in include/light_table.clh. sh: without the discs."""
+    arriving = np.stack([rays.basis @ coefficients for coefficients in sh.astype(np.float32)])
+    return buffer.refresh_parts(
+        {
+            "coefficients": _float4(sh),
+            "whole": _float4(whole),
+            "arriving": _float4(np.maximum(arriving, 0.0)),
+            "positions": _float4(places.positions),
+            "owners": np.array(places.owners or (0,), np.int32),
+        }
+    )
 
 
 def _changed_parameters(changed: Changed | None) -> np.void:

@@ -72,7 +72,7 @@ def test_real_surface_loses_what_samples_at_every_pixel_lose(engine: Engine) -> 
     listed = refined[..., 3] > 0
     assert 100 < listed.sum() < 0.6 * listed.size
     transfer = engine.download(stage.transfer.coefficients).astype(float)
-    light = download4(engine, stage.scene.light.coefficients)[:, :3].astype(float)
+    light = download4(engine, stage.scene.light.table.array("coefficients"))[0, :, :3].astype(float)
     shaded = np.concatenate([transfer @ light, engine.download(stage.transfer.openness)[..., None] >= 0], -1)
     surface = buffer_of(engine, stage.surface)
     for y, x in np.argwhere(listed)[::23]:

@@ -68,7 +68,7 @@ kernel void probe(const int items, global const float4 *points, global const flo
     if (item >= items) return;
     const Volume volume = VOLUME_OF_SCENE;
     const Objects things = OBJECTS_OF_SCENE(offset_m);
-    const Arriving light = ARRIVING_OF_SCENE;
+    const Arriving light = ARRIVING_OF_SCENE(0);
     int chosen[LANES];
     float at_m[LANES];
     float3 at[LANES];

@@ -38,7 +38,8 @@ def irradiance(radiance: Floats) -> Floats:
 def test_a_ceiling_lamp_is_found_where_it_is() -> None:
     center, radius_m, color = np.array([2.6, 1.2, 2.4]), 0.4, np.array([20.0, 18.0, 15.0])
     ends, radiance = lit_by((center, radius_m, color))
-    lamps, rest = find_lamps(PLACE, ends, radiance)
+    lamps, parts = find_lamps(PLACE, ends, radiance)
+    rest = parts.rest(ends, radiance)
     lamp = lamps[0]
     np.testing.assert_allclose(lamp.center, center, atol=0.06)
     assert lamp.radius_m == pytest.approx(radius_m, rel=0.15)
@@ -55,7 +56,8 @@ def test_lamps_and_rest_are_the_whole() -> None:
     ends, radiance = lit_by(
         (np.array([2.6, 1.2, 2.4]), 0.4, np.full(3, 20.0)), (np.array([0.6, 3.0, 2.4]), 0.3, np.full(3, 30.0))
     )
-    lamps, rest = find_lamps(PLACE, ends, radiance)
+    lamps, parts = find_lamps(PLACE, ends, radiance)
+    rest = parts.rest(ends, radiance)
     assert 2 <= len(lamps) <= MOST_LIGHTS
     brought = sum(
         (np.pi * lamp.radiance * lamp.radius_m**2 / ((lamp.center - PLACE) ** 2).sum() for lamp in lamps), np.zeros(3)
@@ -65,7 +67,8 @@ def test_lamps_and_rest_are_the_whole() -> None:
 
 def test_even_light_has_no_lamps() -> None:
     ends, radiance = lit_by()
-    lamps, rest = find_lamps(PLACE, ends, radiance)
+    lamps, parts = find_lamps(PLACE, ends, radiance)
+    rest = parts.rest(ends, radiance)
     assert lamps == []
     np.testing.assert_array_equal(rest, radiance)
 
@@ -75,8 +78,19 @@ def test_a_weak_lamp_fades_in() -> None:
     taken = []
     for strength in np.linspace(0.0, 12.0, 60):
         ends, radiance = lit_by((np.array([2.6, 1.2, 2.4]), 0.4, AMBIENT + strength))
-        rest = find_lamps(PLACE, ends, radiance)[1]
+        rest = find_lamps(PLACE, ends, radiance)[1].rest(ends, radiance)
         taken.append(float(irradiance(radiance - rest).sum() / irradiance(radiance).sum()))
     assert taken[0] == 0.0
     assert taken[-1] > STRONG
     assert np.abs(np.diff(taken)).max() < WEAK
+
+
+def test_what_lamps_leave_elsewhere_is_what_is_left_of_the_shell() -> None:
+    """From another place, a lamp takes the same part of the shell."""
+    center = np.array([2.6, 1.2, 2.4])
+    parts = find_lamps(PLACE, *lit_by((center, 0.4, np.full(3, 20.0))))[1]
+    points = center + np.random.default_rng(5).uniform(-0.4, 0.4, (200, 3)) * [1.0, 1.0, 0.0]
+    radiance = np.where(np.linalg.norm(points - center, axis=1, keepdims=True) < 0.3, 20.0, AMBIENT)
+    left = parts.rest(points, radiance)
+    assert (left[radiance[:, 0] < 20] == AMBIENT).all()
+    assert (left[radiance[:, 0] == 20] < 0.6 * 20).all()  # its middle is taken nearly whole, its rim less

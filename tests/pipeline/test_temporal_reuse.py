@@ -29,7 +29,7 @@ CAMERA = CameraModel(width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
 SHAPE = (48, 64)
 FRAME = RgbdFrame(0, 0.0, np.full((*SHAPE, 3), 90, np.uint8), np.full(SHAPE, 900, np.uint16), np.eye(4), 1.0)
 SCENE = SceneVersion()
-LIGHT = lights.lobe_and_sky((0.3, 0.8, 0.4))
+LIGHT = lights.lobe_and_sky((0.3, 0.8, 0.4))[None]
 PICTURE = np.full((*SHAPE, 3), 90, np.uint8)
 PLANES: Any = (np.ones((1, 4, 4), np.float32), np.ones((1, 4), np.int32), np.zeros(1, np.uint8))
 

@@ -8,7 +8,7 @@ between cells.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,32 +79,54 @@ def _touching(centers: Floats) -> list[NDArray[np.int64]]:
     return [np.flatnonzero(groups == group) for group in range(count)]
 
 
+@dataclass(frozen=True)
+class BrightParts:
+    """Parts of the shell whose radiance above a floor lamps have, in their order."""
+
+    floor: Floats
+    """[3] radiance."""
+    centers: tuple[Floats, ...] = ()
+    """[3] world metres each."""
+    shares: tuple[float, ...] = ()
+    """Of what is above the floor in the middle of each."""
+
+    def taken(self, number: int, ends: Floats, rest: Floats) -> Floats:
+        """[m, 3] what lamp `number` takes of `rest` [m, 3], the radiance of `ends` [m, 3] that those before it left."""
+        near = np.exp(-((ends - self.centers[number]) ** 2).sum(axis=1) / (2 * WINDOW_M**2))
+        return np.asarray(self.shares[number] * near[:, None] * np.maximum(rest - self.floor, 0.0))
+
+    def rest(self, ends: Floats, radiance: Floats) -> Floats:
+        """[m, 3] what all lamps leave of the radiance of `ends` on the shell, [m, 3] both."""
+        for number in range(len(self.centers)):
+            radiance = radiance - self.taken(number, ends, radiance)
+        return radiance
+
+
 def find_lamps(
     position: Floats, ends: Floats, radiance: Floats, most: int = MOST_LIGHTS, emitted: float = 0.0
-) -> tuple[list[ShellLamp], Floats]:
-    """At most `most` lamps seen from `position` [3], and the radiance [m, 3] that they leave.
+) -> tuple[list[ShellLamp], BrightParts]:
+    """At most `most` lamps seen from `position` [3], and the parts of the shell that they stand for.
 
     ends: [m, 3] where evenly spread directions from there end on the shell; radiance: [m, 3]. emitted: what comes from
     elsewhere, as a sum of radiance over such directions and channels.
     """
-    rest = radiance.copy()
-    floor = np.median(radiance, axis=0)
+    rest, parts = radiance, BrightParts(np.median(radiance, axis=0))
     total = float(radiance.sum()) + emitted
     lamps: list[ShellLamp] = []
     for _ in range(most):
-        excess = np.maximum(rest - floor, 0.0)
-        weights = excess.sum(axis=1)
+        weights = np.maximum(rest - parts.floor, 0.0).sum(axis=1)
         if weights.sum() <= WEAK * total:
             break
         center = _mode(ends, weights)
         near = np.exp(-((ends - center) ** 2).sum(axis=1) / (2 * WINDOW_M**2))
-        share = float((near * weights).sum()) / total
-        taken = near[:, None] * excess * np.clip((share - WEAK) / (STRONG - WEAK), 0.0, 1.0)
-        if taken.sum() <= 0.0:
+        share = float(np.clip((float(near @ weights) / total - WEAK) / (STRONG - WEAK), 0.0, 1.0))
+        if share <= 0.0:
             break
+        parts = replace(parts, centers=(*parts.centers, center), shares=(*parts.shares, share))
+        taken = parts.taken(len(lamps), ends, rest)
         lamps.append(_disc(position, ends, taken))
         rest = rest - taken
-    return lamps, rest
+    return lamps, parts
 
 
 def _mode(ends: Floats, weights: Floats) -> Floats:

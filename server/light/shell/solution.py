@@ -97,15 +97,15 @@ class Solution:
         rays = self._with_emitters(positions, met, visible)
         return [self._arriving(position, of_place) for position, of_place in zip(positions, rays, strict=True)]
 
-    def beyond(self, position: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
-        """The light from the shell as seen from `position` [3] (world), with no surface in between.
+    def beyond(self, positions: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
+        """The light from the shell as seen from `positions` [n, 3] (world), with no surface in between.
 
-        [bands^2, 3] the whole, [bands^2, 3] what its lamps leave, and the lamps.
+        [n, bands^2, 3] the whole, [n, bands^2, 3] what its lamps leave, and the lamps as they are seen from the middle.
         """
-        asked = position.tobytes(), bands
+        asked = positions.tobytes(), bands
         if asked not in self._beyond:
             self._beyond.clear()
-            self._beyond[asked] = self._seen_beyond(position, bands)
+            self._beyond[asked] = self._seen_beyond(positions, bands)
         return self._beyond[asked]
 
     def estimate(self, bands: int) -> LightEstimate:
@@ -114,22 +114,33 @@ class Solution:
             self._estimates[bands] = distant_light(self.distant, bands)
         return self._estimates[bands]
 
-    def _seen_beyond(self, position: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
+    def _seen_beyond(self, positions: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
+        middle = positions.mean(axis=0)
+        ends, radiance = self._sent_by_shell(middle)
+        sent = self._sent_by_emitters
+        emitting = emitting_lamps(middle, self.emitters, sent, 4 * np.pi / DIRECTIONS * float(radiance.sum()))
+        emitted = DIRECTIONS / (4 * np.pi) * float((self._emitting_angles(middle) @ sent).sum())
+        lamps, parts = find_lamps(middle, ends, radiance, MOST_LIGHTS - len(emitting), emitted)
+        whole, rest = [], []
+        for position in positions:
+            ends, radiance = self._sent_by_shell(position)
+            towards = sh_basis(self.emitters.seen_from(position[None])[0][0], bands)
+            from_emitters = towards.T @ (self._emitting_angles(position)[:, None] * sent)
+            whole.append(_basis(bands) @ radiance + from_emitters)
+            rest.append(_basis(bands) @ parts.rest(ends, radiance))
+        return np.array(whole), np.array(rest), [*emitting, *lamps]
+
+    def _sent_by_shell(self, position: Floats) -> tuple[Floats, Floats]:
+        """[DIRECTIONS, 3] where look-up directions from `position` end on the shell, and its radiance, likewise."""
         directions = look_up_directions()[0]
         start = np.broadcast_to(position, directions.shape)
         cells, shares = self.shell.exits(start, directions)
         ends = position + self.shell.distances(start, directions).min(axis=-1)[:, None] * directions
-        radiance = np.einsum("mc,mcr->mr", shares, self.near.radiance[cells])
-        sent = self._sent_by_emitters
-        emitting = emitting_lamps(position, self.emitters, sent, 4 * np.pi / DIRECTIONS * float(radiance.sum()))
-        towards = sh_basis(self.emitters.seen_from(position[None])[0][0], bands)
-        solid_angles = self.emitters.presence * self.emitters.solid_angles(position[None])[0]
-        emitted = solid_angles @ sent
-        lamps, rest = find_lamps(
-            position, ends, radiance, MOST_LIGHTS - len(emitting), DIRECTIONS / (4 * np.pi) * float(emitted.sum())
-        )
-        whole = _basis(bands) @ radiance + towards.T @ (solid_angles[:, None] * sent)
-        return whole, _basis(bands) @ rest, [*emitting, *lamps]
+        return ends, np.einsum("mc,mcr->mr", shares, self.near.radiance[cells])
+
+    def _emitting_angles(self, position: Floats) -> Floats:
+        """[k] sr under which each emitter is seen from `position`."""
+        return np.asarray(self.emitters.presence * self.emitters.solid_angles(position[None])[0])
 
     @property
     def _sent_by_emitters(self) -> Floats:

@@ -21,7 +21,7 @@ from server.maths.dominant import MOST_LIGHTS
 
 WINDOW_M = 0.5
 """Standard deviation of the window: a ceiling panel or half a window."""
-WEAK, STRONG = 0.05, 0.15
+WEAK, STRONG = 0.02, 0.06
 """Shares of the radiance that arrives from the shell. Below the first value a mode is no lamp; above the second its
 light becomes a disc completely; between the two, in part."""
 LEAST_RADIUS_M, LEAST_BULB_M = 0.05, 0.02

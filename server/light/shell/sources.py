@@ -84,7 +84,6 @@ def distant_sources(transport: Transport, closed: Floats, rows: Ints, *, with_in
     if not with_indirect:
         near[:, CELLS:], known = 0.0, np.zeros_like(known)
     offset, deviation = _priors(transport)
-    deviation[:CELLS] = weights.CELL_LOW
     return Sources(
         shares=np.concatenate([beyond, near], axis=1),
         known=known,

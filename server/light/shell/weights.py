@@ -27,7 +27,7 @@ ONE_ALBEDO = 0.01
 """Replaces the three spreads if albedo is constant."""
 HUBER = 1.5
 """A patch whose residual exceeds so many standard deviations of the noise counts as an outlier."""
-CELL_LOW, CELL_HIGH, CELL_HIDDEN = 0.7, 2.0, 0.7
+CELL_LOW, CELL_HIGH, CELL_HIDDEN = 0.4, 2.0, 0.7
 """Standard deviations of a cell's log radiance about the mean's: of the shell below the height of windows and lamps and
 above it (a lamp is 50 times the mean), and of surface that was not seen."""
 LOBE, LOBE_SPREAD = -1.0, 2.0

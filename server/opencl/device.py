@@ -9,6 +9,7 @@ import pyopencl as cl
 
 from server.opencl import linker
 from server.opencl.device_memory import DeviceMemory
+from server.opencl.pacing import StepTimes
 from server.opencl.pocl_cpu import is_pocl, name_unknown_cpu
 from server.opencl.program import KernelBuildError, ProgramCache
 
@@ -45,6 +46,7 @@ class Device:
         self.context = cl.Context([cl_device])
         self.programs = ProgramCache(self.context)
         self.memory = DeviceMemory()
+        self.step_times = StepTimes()
         self.volume_bytes = VOLUME_BYTES
         """The share of its memory that one volume may use; the rest of the volume is moved to the host."""
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from server.opencl.buffers import BufferDescription, Group, StageBuffers, Workspace
 from server.opencl.device import Device
-from server.opencl.pacing import Pacer
+from server.opencl.pacing import Pacer, Size
 from server.opencl.pending_read import PendingRead
 from server.opencl.profile import Profile
 from server.opencl.program import Define
@@ -39,7 +39,7 @@ class Engine:
         self.workspace = Workspace(self.queue)
         device.memory.add(self.workspace)
         self.profile: Profile = beside.profile if beside else Profile()
-        self.pacer: Pacer = beside.pacer if beside else Pacer()
+        self.pacer: Pacer = beside.pacer if beside else Pacer(times=device.step_times)
         self._kernels: dict[tuple[object, ...], cl.Kernel] = beside._kernels if beside else {}
         self._typed: dict[int, tuple[cl.Kernel, str]] = beside._typed if beside else {}
         self._launched: set[tuple[object, ...]] = beside._launched if beside else set()
@@ -116,11 +116,23 @@ class Engine:
         for offset, part in self.pacer.slices(name, rounded, local, steps):
             shift = offset if any(offset) else None
             variant = (id(kernel), local, shift is None)
-            with nullcontext() if variant in self._launched else self.pacer.aside():  # the first may compile it
+            if variant in self._launched:
                 event = kernel(self.queue, part, local, *passed, global_offset=shift)
-            self._launched.add(variant)
+            else:
+                event = self._first_launch(kernel, part, local, passed, shift)
+                self._launched.add(variant)
             self.pacer.enqueued(name, math.prod(part), steps, event)
             self.profile.add_event(name, event)
+
+    def _first_launch(
+        self, kernel: cl.Kernel, part: Size, local: Size, passed: list[Any], shift: Size | None
+    ) -> cl.Event:
+        """A driver may compile a kernel for its work-groups when it first runs: others have the device until it has."""
+        with self.pacer.aside():
+            event = kernel(self.queue, part, local, *passed, global_offset=shift)
+            if self.pacer.yielding is not None:
+                event.wait()
+        return event
 
     def state(self, kind: type[State]) -> State:
         """The one instance of `kind` that belongs to this engine, made on first use: what a stage keeps of the frame

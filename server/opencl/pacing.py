@@ -23,7 +23,7 @@ from server.opencl.profile import clock_s
 Size = tuple[int, ...]
 
 SLICE_S, SHARED_SLICE_S = 0.05, 0.02
-"""Longest slice; the second where others may want the device. Most launches of a usual frame are shorter and not cut."""
+"""Longest slice; the second where others may want the device. Most launches of a usual frame are shorter."""
 AHEAD_S, SHARED_AHEAD_S = 0.05, 0.02
 """What may be enqueued ahead of the device, by expected time: enough for it never to wait for the host. One slice more
 may be there, and all of it runs before another session has the device."""

@@ -122,6 +122,7 @@ def serve_on(
         def on_prepared() -> None:
             if service.failure is None:
                 _leave_out_of_collections()
+                service.compile_beside()
                 ways = WaysIn(listener, authenticator, certificate, is_left, shows_token)
                 for line in [*ways.lines(), *(ways.code() if draws_code else ())]:
                     say(line)

@@ -201,6 +201,11 @@ class Service:
             self._preparing.cancel()
         self._threads.shutdown(wait=False, cancel_futures=True)
         self._parsers.stop()
+        self._device.end_children()
+
+    def compile_beside(self) -> None:
+        """As `Device.compile_beside`: sessions do not wait for kernels of others. Call when it is prepared."""
+        self._device.compile_beside()
 
     async def _prepare(self) -> None:
         if self._warm_up is not None:

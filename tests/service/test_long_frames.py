@@ -10,7 +10,15 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from protocol.messages import Composite, Hello, Welcome
-from server.service.scheduler import LEAST_QUANTUM_S, NEXT_QUANTUM_S, QUANTUM_S, REQUEST_QUANTUM_S, Scheduler, SessionShare, Turn
+from server.service.scheduler import (
+    LEAST_QUANTUM_S,
+    NEXT_QUANTUM_S,
+    QUANTUM_S,
+    REQUEST_QUANTUM_S,
+    Scheduler,
+    SessionShare,
+    Turn,
+)
 from server.service.serve import BackgroundServer
 from tests.service.fakes import CAMERA, PATIENCE_S, Lab, frame_message
 from tests.service.wire import Wire

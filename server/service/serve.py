@@ -43,6 +43,8 @@ STOP_PATIENCE_S = 10
 """Time limit from the signal to the end of the process."""
 DRAIN_PATIENCE_S = 7
 """Part of it in which sessions end and rooms are saved."""
+CRASHES = ("SIGSEGV", "SIGBUS", "SIGILL", "SIGABRT")
+"""Not SIGFPE: PoCL has a handler for divisions by zero in kernels."""
 NO_AUTHENTICATION = Authenticator()
 
 log = logging.getLogger(__name__)
@@ -122,6 +124,7 @@ def serve_on(
         def on_prepared() -> None:
             if service.failure is None:
                 _leave_out_of_collections()
+                _end_by_crashes()
                 service.compile_beside()
                 ways = WaysIn(listener, authenticator, certificate, is_left, shows_token)
                 for line in [*ways.lines(), *(ways.code() if draws_code else ())]:
@@ -140,6 +143,15 @@ def serve_on(
     if service.failure is not None:
         raise ServeError(service.failure)
     return 0
+
+
+def _end_by_crashes() -> None:
+    """Take the handlers away that LLVM, PoCL's compiler, has left. They return, since a fault then happens again and
+    ends the process; where another process sent the signal, nothing would end."""
+    if threading.current_thread() is threading.main_thread():
+        for name in CRASHES:
+            if hasattr(signal, name):  # not all systems have each
+                signal.signal(getattr(signal, name), signal.SIG_DFL)
 
 
 def _leave_out_of_collections() -> None:

@@ -42,7 +42,7 @@ SEED = 22
 FRAMES_A_SESSION, ROUNDS = 20, 5
 """Frames that are made up, and how often they are sent, with each other's pictures."""
 FRAMES, QUICK_FRAMES = 100_000, 500
-QUIET_FRAMES = 100
+QUIET_FRAMES = 300
 PAUSE_S = 0.1
 """Of the other client after each answer, as with a camera of few frames a second."""
 AHEAD = 2

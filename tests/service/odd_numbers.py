@@ -54,9 +54,9 @@ WILD_SHARE = 12
 """One number in so many is any float."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class OddSession:
-    """What one client sends, in order."""
+    """What one client sends, in order. Its representation would be megabytes."""
 
     hello: dict[str, Any]
     messages: tuple[dict[str, Any], ...]

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 import warnings
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,10 @@ PATIENCE_S = 120.0
 """Longer is taken to hang: it is more than any frame of such pictures takes on a busy machine."""
 FAILURES = (1006, 1011)
 """Close codes of a lost connection and of a server that failed inside."""
+
+
+class Enough(Exception):
+    """Ends the sessions: Hypothesis would go on making some up, and the other client would be timed beside nobody."""
 
 
 @dataclass
@@ -95,7 +100,7 @@ def play_sessions(url: str, frames: int, outcome: Outcome, seed: int = SEED) -> 
     @given(session=sessions(FRAMES_A_SESSION, ROUNDS))
     def one(session: OddSession) -> None:
         if gone or outcome.frames >= frames:
-            return
+            raise Enough
         try:
             play(url, session, outcome)
         except OSError as error:
@@ -104,7 +109,8 @@ def play_sessions(url: str, frames: int, outcome: Outcome, seed: int = SEED) -> 
 
     with warnings.catch_warnings():  # the other client's thread uses `random` while sessions are made up
         warnings.simplefilter("ignore", HypothesisDeprecationWarning)
-        one()
+        with suppress(Enough):
+            one()
     if gone:
         raise gone[0]
 

@@ -54,9 +54,9 @@ WILD_SHARE = 12
 """One number in so many is any float."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class OddSession:
-    """What one client sends, in order. Its representation would be megabytes."""
+    """What one client sends, in order."""
 
     hello: dict[str, Any]
     messages: tuple[dict[str, Any], ...]

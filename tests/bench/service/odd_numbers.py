@@ -109,6 +109,7 @@ def play_sessions(url: str, frames: int, outcome: Outcome, seed: int = SEED) -> 
 
     with warnings.catch_warnings():  # the other client's thread uses `random` while sessions are made up
         warnings.simplefilter("ignore", HypothesisDeprecationWarning)
+        warnings.filterwarnings("ignore", message="Generating overly large repr")
         with suppress(Enough):
             one()
     if gone:

@@ -44,6 +44,9 @@ FRAMES_A_SESSION, ROUNDS = 20, 5
 """Frames that are made up, and how often they are sent, with each other's pictures."""
 FRAMES, QUICK_FRAMES = 100_000, 500
 QUIET_FRAMES = 300
+WARM_UP_FRAMES = 60
+"""Until it needs no kernel for the first time: those of a frame that is interrupted, that looks for lamps, of a volume
+that grows. Each waits for the compiler where PoCL's cache is empty."""
 PAUSE_S = 0.1
 """Of the other client after each answer, as with a camera of few frames a second."""
 AHEAD = 2
@@ -211,7 +214,7 @@ async def be_neighbour(url: str) -> None:
     source = open_source("synthetic:room?frames=8")
     client = await StreamClient.connect(url)
     await client.hello(resized_camera(source.camera, SHORT), Wishes())
-    await answered(client, source, 5)  # its kernels are compiled
+    await answered(client, source, WARM_UP_FRAMES)
     quiet_s: list[float] = []
     for _ in range(QUIET_FRAMES):
         quiet_s += await answered(client, source, 1)

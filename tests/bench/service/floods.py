@@ -76,7 +76,10 @@ class Held:
     def of(cls, served: Served, data: Path) -> Held:
         """Now; memory with that of its parsers."""
         pid = served.process.pid
-        memory_mb = sum(map(resident_mb, [pid, *descendants(pid)]))
+        memory_mb = resident_mb(pid)
+        for child in descendants(pid):
+            with contextlib.suppress(OSError):  # it has just ended
+                memory_mb += resident_mb(child)
         disk = sum(path.stat().st_size for path in data.rglob("*") if path.is_file())
         return cls(memory_mb, len(os.listdir(f"/proc/{pid}/fd")), len(os.listdir(f"/proc/{pid}/task")), disk / 1e3)
 

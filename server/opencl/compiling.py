@@ -2,8 +2,9 @@
 
 PoCL compiles a kernel for its work-groups when it first runs so, and holds a lock meanwhile that every other launch on
 the device waits for: frames of 35 ms of another client took 640 ms. What the process beside has compiled is only loaded
-here, which takes milliseconds. PoCL has no call that compiles and does not run: there the kernel runs once, on zeros
-in place of its arguments. It may crash with them; then it has been compiled, and the process is started again.
+here, which takes milliseconds. PoCL has no call that compiles and does not run: there the kernel runs once, with the
+same numbers, on memory of the same sizes that holds zeros. Should it crash on them, it has been compiled all the same,
+and the process is started again.
 """
 
 from __future__ import annotations
@@ -23,17 +24,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from server.opencl.program import Define
 
-IDLE_S = 60.0
-"""The process ends when it has had nothing to do for so long: it takes 100 MB."""
+IDLE_S = 600.0
+"""The process ends when it has had nothing to do for so long: it takes 100 MB. Who needs it again waits 1 s more."""
 PATIENCE_S = 120.0
 """For one kernel; the longest takes 2 s of a processor that is free. A process that takes longer is ended."""
 NICENESS = 5
-"""Frames go first, but who waits for a kernel waits for a third of a busy processor's time at least, not for a tenth."""
+"""Frames go first, but who waits for a kernel gets a third of a busy processor at least, not a tenth."""
 CAN_COMPILE_BESIDE = sys.platform != "win32"
 """Where pipes can be waited for."""
+_ENDING_S = 1.0
+"""Until a process that closed its pipes has its exit status."""
 SMALL_GRID = 65535
 """PoCL compiles anew for launches with more work-items along an axis."""
-_DUMMY_BYTES = 1 << 16
 _DONE = b"done\n"
 
 log = logging.getLogger(__name__)
@@ -47,8 +49,8 @@ class Launch:
     size: tuple[int, ...]
     local: tuple[int, ...]
     offset: tuple[int, ...] | None
-    argument_bytes: tuple[int, ...]
-    """Of each number or struct; 0: memory."""
+    arguments: tuple[int | str | None, ...]
+    """Bytes of memory; of numbers and structs their own, in hexadecimal; None: no memory."""
 
     @property
     def variant(self) -> tuple[object, ...]:
@@ -84,21 +86,21 @@ class KernelCompiler:
     def close(self) -> None:
         """End the process."""
         with self._working:
+            if self._process is not None:
+                self._process.kill()
             self._end()
 
     def _ask(self, request: bytes) -> None:
-        for _ in range(2):  # the process may just have ended, with nothing to do
-            is_new = self._process is None
-            try:
-                process = self._process = self._process or self._start()
-            except OSError as error:
-                log.warning("no process for compiling kernels could be started: %s", error)
-                return
+        try:
+            process = self._process = self._process or self._start()
             if self._answered(process, request):
                 return
-            self._end()
-            if is_new:
-                return  # the kernel crashed
+            had_ended = self._end() == 0  # with nothing to do, just now; else the kernel crashed
+            self._process = self._start()  # it is there when it is needed again
+            if had_ended:
+                self._answered(self._process, request)
+        except OSError as error:
+            log.warning("no process for compiling kernels could be started: %s", error)
 
     def _answered(self, process: subprocess.Popen[bytes], request: bytes) -> bool:
         assert process.stdin is not None
@@ -122,16 +124,20 @@ class KernelCompiler:
             start_new_session=True,  # a terminal's Ctrl-C is for the server, which ends this process
         )
 
-    def _end(self) -> None:
+    def _end(self) -> int | None:
+        """Exit status of the process; None: there was none."""
         process, self._process = self._process, None
         if process is None:
-            return
+            return None
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_ENDING_S)
         process.kill()
-        process.wait()
+        status = process.wait()
         for pipe in (process.stdin, process.stdout):
             assert pipe is not None
             with contextlib.suppress(OSError):  # what was not sent
                 pipe.close()
+        return status
 
 
 def _key(file: str, defines: dict[str, Define], launch: Launch | None) -> tuple[object, ...]:
@@ -174,9 +180,19 @@ def _do(device: Any, request: dict[str, Any]) -> None:
         return
     launch = Launch(**request["launch"])
     kernel, queue = cl.Kernel(program, launch.kernel), cl.CommandQueue(device.context)
-    zeros = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, _DUMMY_BYTES)
-    cl.enqueue_fill_buffer(queue, zeros, b"\0", 0, _DUMMY_BYTES)
-    kernel.set_args(*(bytes(count) if count else zeros for count in launch.argument_bytes))
+    arguments = [bytes.fromhex(one) if isinstance(one, str) else _zeros(queue, one) for one in launch.arguments]
+    kernel.set_args(*arguments)  # which keeps none of them alive
     offset = None if launch.offset is None else tuple(launch.offset)
     cl.enqueue_nd_range_kernel(queue, kernel, tuple(launch.size), tuple(launch.local), offset)
     queue.finish()
+
+
+def _zeros(queue: Any, size: int | None) -> Any:
+    """Memory that is all zeros; what no kernel touches takes none of the machine's."""
+    import numpy as np
+    import pyopencl as cl
+
+    if size is None:
+        return None
+    flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
+    return cl.Buffer(queue.context, flags, hostbuf=np.zeros(size, np.uint8))

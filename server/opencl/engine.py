@@ -141,7 +141,7 @@ class Engine:
         if compiler is None or made_from is None:
             with self.pacer.aside():
                 return kernel(self.queue, part, local, *passed, global_offset=shift)
-        launch = Launch(self._typed[id(kernel)][1], part, local, shift, tuple(map(_bytes_of, passed)))
+        launch = Launch(self._typed[id(kernel)][1], part, local, shift, tuple(map(_described, passed)))
         if not compiler.knows(*made_from, launch):
             with self.pacer.aside():
                 compiler.compile(*made_from, launch)
@@ -201,11 +201,14 @@ def _type_of(value: KernelArgument) -> Any:
     return value.dtype if isinstance(value, np.generic) else None
 
 
-def _bytes_of(argument: Any) -> int:
-    """As `Launch.argument_bytes`; numbers of Python are passed as four bytes."""
-    if isinstance(argument, np.generic):
-        return argument.nbytes
-    return 4 if isinstance(argument, bool | int | float) else 0
+def _described(argument: Any) -> int | str | None:
+    """As in `Launch.arguments`."""
+    if argument is None:
+        return None
+    if isinstance(argument, cl.MemoryObjectHolder):
+        return int(argument.size)
+    number = _type_of(argument)(argument) if isinstance(argument, bool | int | float) else argument
+    return str(number.tobytes().hex())
 
 
 def _vector(name: str, numbers: NDArray[Any]) -> np.generic:

@@ -33,7 +33,8 @@ even where it was faster: a kernel that found nothing to do in one frame may fin
 for a ray of transfer or a pixel of the ray cast. On a GPU it is less, which only cuts long launches into more slices.
 """
 PROBE = 1 / 16
-"""Share of a slice that the first one of a kernel has whose steps were never timed: they may take 50 times STEP_S."""
+"""Share of a slice that the first one of a kernel has whose steps were never timed, where others may want the device:
+they may take 50 times STEP_S."""
 TELLING = 1 / 20
 """A slice that took less than this share of the longest says more of its launch than of its steps: it counts only where
 its steps took less than STEP_S all the same. Less than PROBE: the first slice of a long launch always counts."""
@@ -125,16 +126,17 @@ class Pacer:
         `steps`: inner steps of a work-item, such as rays. Waits before each slice while too much is enqueued already.
         """
         is_long = math.prod(size) * steps * self._step_s > PROBE * self._slice_s
-        return cut(size, local, lambda: self._most_items(kernel, steps, is_long))
+        may_hold = is_long and self.yielding is not None
+        return cut(size, local, lambda: self._most_items(kernel, steps, may_hold))
 
-    def _most_items(self, kernel: str, steps: int, is_long: bool) -> int:
+    def _most_items(self, kernel: str, steps: int, may_hold: bool) -> int:
         """Work-items of the next slice, once there is room for one. What earlier slices took counts at once: a launch
         may last minutes, in which others begin to use the processor."""
         self._make_room()
-        if is_long and self._times.of(kernel) is None and any(one.kernel == kernel for one in self._ahead):
+        if may_hold and self._times.of(kernel) is None and any(one.kernel == kernel for one in self._ahead):
             self._drain(0.0)
         time = self._times.of(kernel)
-        slice_s = PROBE * self._slice_s if is_long and time is None else self._slice_s
+        slice_s = PROBE * self._slice_s if may_hold and time is None else self._slice_s
         step_s = self._step_s if time is None else max(time.longest_s, self._step_s)
         return max(int(slice_s / (step_s * steps)), 1)
 

@@ -8,7 +8,9 @@ from threading import Lock
 import pyopencl as cl
 
 from server.opencl import linker
+from server.opencl.compiling import CAN_COMPILE_BESIDE, KernelCompiler
 from server.opencl.device_memory import DeviceMemory
+from server.opencl.pacing import StepTimes
 from server.opencl.pocl_cpu import is_pocl, name_unknown_cpu
 from server.opencl.program import KernelBuildError, ProgramCache
 
@@ -45,8 +47,21 @@ class Device:
         self.context = cl.Context([cl_device])
         self.programs = ProgramCache(self.context)
         self.memory = DeviceMemory()
+        self.step_times = StepTimes()
+        self.compiler = KernelCompiler(self.name) if CAN_COMPILE_BESIDE and is_pocl(cl_device.platform) else None
+        """None: a driver that compiles kernels when they are built."""
         self.volume_bytes = VOLUME_BYTES
         """The share of its memory that one volume may use; the rest of the volume is moved to the host."""
+
+    def compile_beside(self) -> None:
+        """Compile kernels in another process from now on, if all wait for a kernel that the driver compiles here."""
+        if self.compiler is not None:
+            self.compiler.is_used = True
+
+    def end_children(self) -> None:
+        """End what works for it beside this process. It may be used afterwards."""
+        if self.compiler is not None:
+            self.compiler.close()
 
 
 def _all_devices() -> list[cl.Device]:

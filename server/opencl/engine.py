@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -13,8 +12,9 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from server.opencl.buffers import BufferDescription, Group, StageBuffers, Workspace
+from server.opencl.compiling import SMALL_GRID, Launch
 from server.opencl.device import Device
-from server.opencl.pacing import Pacer
+from server.opencl.pacing import Pacer, Size
 from server.opencl.pending_read import PendingRead
 from server.opencl.profile import Profile
 from server.opencl.program import Define
@@ -39,9 +39,11 @@ class Engine:
         self.workspace = Workspace(self.queue)
         device.memory.add(self.workspace)
         self.profile: Profile = beside.profile if beside else Profile()
-        self.pacer: Pacer = beside.pacer if beside else Pacer()
+        self.pacer: Pacer = beside.pacer if beside else Pacer(times=device.step_times)
         self._kernels: dict[tuple[object, ...], cl.Kernel] = beside._kernels if beside else {}
         self._typed: dict[int, tuple[cl.Kernel, str]] = beside._typed if beside else {}
+        self._made_from: dict[int, tuple[str, dict[str, Define]]] = beside._made_from if beside else {}
+        """File and defines of each kernel."""
         self._launched: set[tuple[object, ...]] = beside._launched if beside else set()
         self._states: dict[type[Any], Any] = {}
         self._buffers: dict[type[StageBuffers], StageBuffers] = {}
@@ -86,10 +88,17 @@ class Engine:
         named = sorted(defines.items())
         key = (file, name, *named, *(type(value) for _, value in named))  # 1, 1.0 and True are equal in Python
         if key not in self._kernels:
-            with nullcontext() if self.device.programs.has(file, defines) else self.pacer.aside():
-                program = self.device.programs.get(file, defines)
-            self._kernels[key] = cl.Kernel(program, name)
+            self._kernels[key] = kernel = cl.Kernel(self._program(file, defines), name)
+            self._made_from[id(kernel)] = file, defines
         return self._kernels[key]
+
+    def _program(self, file: str, defines: dict[str, Define]) -> cl.Program:
+        if self.device.programs.has(file, defines):
+            return self.device.programs.get(file, defines)
+        with self.pacer.aside():
+            if self.device.compiler is not None:
+                self.device.compiler.compile(file, defines)
+            return self.device.programs.get(file, defines)
 
     def launch(
         self,
@@ -115,12 +124,28 @@ class Engine:
         _, name = self._typed[id(kernel)]
         for offset, part in self.pacer.slices(name, rounded, local, steps):
             shift = offset if any(offset) else None
-            variant = (id(kernel), local, shift is None)
-            with nullcontext() if variant in self._launched else self.pacer.aside():  # the first may compile it
+            variant = (id(kernel), local, shift is None, max(part) < SMALL_GRID)
+            if variant in self._launched:
                 event = kernel(self.queue, part, local, *passed, global_offset=shift)
-            self._launched.add(variant)
+            else:
+                event = self._first_launch(kernel, part, local, passed, shift)
+                self._launched.add(variant)
             self.pacer.enqueued(name, math.prod(part), steps, event)
             self.profile.add_event(name, event)
+
+    def _first_launch(
+        self, kernel: cl.Kernel, part: Size, local: Size, passed: list[Any], shift: Size | None
+    ) -> cl.Event:
+        """The first launch of its kind. A driver may compile for it: others have the device meanwhile."""
+        compiler, made_from = self.device.compiler, self._made_from.get(id(kernel))
+        if compiler is None or made_from is None:
+            with self.pacer.aside():
+                return kernel(self.queue, part, local, *passed, global_offset=shift)
+        launch = Launch(self._typed[id(kernel)][1], part, local, shift, tuple(map(_described, passed)))
+        if not compiler.knows(*made_from, launch):
+            with self.pacer.aside():
+                compiler.compile(*made_from, launch)
+        return kernel(self.queue, part, local, *passed, global_offset=shift)
 
     def state(self, kind: type[State]) -> State:
         """The one instance of `kind` that belongs to this engine, made on first use: what a stage keeps of the frame
@@ -174,6 +199,16 @@ def _type_of(value: KernelArgument) -> Any:
     if isinstance(value, np.void) and value.dtype not in cl_types.vec_type_to_scalar_and_count:
         return None  # a struct: pyopencl's cache on disk takes those of one size for the same type
     return value.dtype if isinstance(value, np.generic) else None
+
+
+def _described(argument: Any) -> int | str | None:
+    """As in `Launch.arguments`."""
+    if argument is None:
+        return None
+    if isinstance(argument, cl.MemoryObjectHolder):
+        return int(argument.size)
+    number = _type_of(argument)(argument) if isinstance(argument, bool | int | float) else argument
+    return str(number.tobytes().hex())
 
 
 def _vector(name: str, numbers: NDArray[Any]) -> np.generic:

@@ -22,9 +22,9 @@ from server.opencl.profile import clock_s
 
 Size = tuple[int, ...]
 
-SLICE_S = 0.05
-"""Longest slice. A launch of a usual frame is shorter and is not cut."""
-AHEAD_S = 0.05
+SLICE_S, SHARED_SLICE_S = 0.05, 0.02
+"""Longest slice; the second where others may want the device. Most launches of a usual frame are shorter."""
+AHEAD_S, SHARED_AHEAD_S = 0.05, 0.02
 """What may be enqueued ahead of the device, by expected time: enough for it never to wait for the host. One slice more
 may be there, and all of it runs before another session has the device."""
 STEP_S = 20e-9
@@ -32,6 +32,12 @@ STEP_S = 20e-9
 even where it was faster: a kernel that found nothing to do in one frame may find it in the next. Measured: 10 to 90 ns
 for a ray of transfer or a pixel of the ray cast. On a GPU it is less, which only cuts long launches into more slices.
 """
+PROBE = 1 / 16
+"""Share of a slice that the first one of a kernel has whose steps were never timed, where others may want the device:
+they may take 50 times STEP_S."""
+TELLING = 1 / 20
+"""A slice that took less than this share of the longest says more of its launch than of its steps: it counts only where
+its steps took less than STEP_S all the same. Less than PROBE: the first slice of a long launch always counts."""
 _FADING = 0.95
 """The longest time of a kernel's step is remembered with this factor a launch."""
 
@@ -57,6 +63,27 @@ class _StepTime:
     usual_s: float
 
 
+class StepTimes:
+    """What steps of kernels took, on one device: a new session's launches are cut by what others' took. Any thread may
+    ask and add; where two add at once, one of them may not count."""
+
+    def __init__(self) -> None:
+        self._times: dict[str, _StepTime] = {}
+
+    def of(self, kernel: str) -> _StepTime | None:
+        """None: it was never timed."""
+        return self._times.get(kernel)
+
+    def add(self, kernel: str, step_s: float) -> None:
+        """A slice's steps took so long each."""
+        known = self._times.get(kernel)
+        if known is None:
+            self._times[kernel] = _StepTime(step_s, step_s)
+        else:
+            known.longest_s = max(step_s, _FADING * known.longest_s)
+            known.usual_s += 0.25 * (step_s - known.usual_s)
+
+
 @dataclass(frozen=True)
 class _Enqueued:
     kernel: str
@@ -69,33 +96,53 @@ class _Enqueued:
 class Pacer:
     """Belongs to a command queue."""
 
-    def __init__(self, slice_s: float = SLICE_S, ahead_s: float = AHEAD_S, step_s: float = STEP_S) -> None:
-        self._slice_s, self._ahead_s, self._step_s = slice_s, ahead_s, step_s
-        self._times: dict[str, _StepTime] = {}
+    def __init__(
+        self,
+        slice_s: float = SLICE_S,
+        ahead_s: float = AHEAD_S,
+        step_s: float = STEP_S,
+        times: StepTimes | None = None,
+    ) -> None:
+        """`times`: of the device; None: those of this queue alone."""
+        self._alone_slice_s, self._alone_ahead_s, self._step_s = slice_s, ahead_s, step_s
+        self._times = times or StepTimes()
         self._ahead: deque[_Enqueued] = deque()
         self._expected_s = 0.0
         """Of all that is ahead."""
         self.yielding: Yielding | None = None
         """None: the frame has the device for itself."""
 
+    @property
+    def _slice_s(self) -> float:
+        return self._alone_slice_s if self.yielding is None else min(self._alone_slice_s, SHARED_SLICE_S)
+
+    @property
+    def _ahead_s(self) -> float:
+        return self._alone_ahead_s if self.yielding is None else min(self._alone_ahead_s, SHARED_AHEAD_S)
+
     def slices(self, kernel: str, size: Size, local: Size, steps: int) -> Iterator[tuple[Size, Size]]:
         """Offset and size of each slice of a launch, in work-items; `size` and all slices are multiples of `local`.
 
         `steps`: inner steps of a work-item, such as rays. Waits before each slice while too much is enqueued already.
         """
-        return cut(size, local, lambda: self._most_items(kernel, steps))
+        is_long = math.prod(size) * steps * self._step_s > PROBE * self._slice_s
+        may_hold = is_long and self.yielding is not None
+        return cut(size, local, lambda: self._most_items(kernel, steps, may_hold))
 
-    def _most_items(self, kernel: str, steps: int) -> int:
+    def _most_items(self, kernel: str, steps: int, may_hold: bool) -> int:
         """Work-items of the next slice, once there is room for one. What earlier slices took counts at once: a launch
         may last minutes, in which others begin to use the processor."""
         self._make_room()
-        time = self._times.get(kernel)
-        longest_s = max(time.longest_s, self._step_s) if time else self._step_s
-        return max(int(self._slice_s / (longest_s * steps)), 1)
+        if may_hold and self._times.of(kernel) is None and any(one.kernel == kernel for one in self._ahead):
+            self._drain(0.0)
+        time = self._times.of(kernel)
+        slice_s = PROBE * self._slice_s if may_hold and time is None else self._slice_s
+        step_s = self._step_s if time is None else max(time.longest_s, self._step_s)
+        return max(int(slice_s / (step_s * steps)), 1)
 
     def enqueued(self, kernel: str, items: int, steps: int, event: cl.Event) -> None:
         """A slice of so many work-items was enqueued."""
-        time = self._times.get(kernel)
+        time = self._times.of(kernel)
         usual_s = time.usual_s if time else self._step_s
         one = _Enqueued(kernel, items * steps, items * steps * usual_s, event)
         self._ahead.append(one)
@@ -135,12 +182,8 @@ class Pacer:
     def _learn(self, one: _Enqueued) -> None:
         started_s, ended_s = (clock_s(one.event, which) for which in (cl.profiling_info.START, cl.profiling_info.END))
         step_s = (ended_s - started_s) / one.steps
-        known = self._times.get(one.kernel)
-        if known is None:
-            self._times[one.kernel] = _StepTime(step_s, step_s)
-        else:
-            known.longest_s = max(step_s, _FADING * known.longest_s)
-            known.usual_s += 0.25 * (step_s - known.usual_s)
+        if ended_s - started_s >= TELLING * self._slice_s or step_s <= self._step_s:
+            self._times.add(one.kernel, step_s)
 
 
 def cut(size: Size, local: Size, most_items: Callable[[], int]) -> Iterator[tuple[Size, Size]]:

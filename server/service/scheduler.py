@@ -5,7 +5,8 @@ A session with expensive frames therefore gets fewer of them and slows only itse
 from the others' least device time minus a small credit, so idle time cannot be saved up.
 
 A frame that takes long is interrupted: after QUANTUM_S it lets sessions with less device time go first, and then after
-each NEXT_QUANTUM_S. Other clients of its room wait until it has ended, since it may have changed the room by half.
+each NEXT_QUANTUM_S. Sessions whose frames are short need not wait for that long: they go first once it has taken LONGER
+times what theirs take. Other clients of its room wait until it has ended, since it may have changed the room by half.
 """
 
 from __future__ import annotations
@@ -27,6 +28,11 @@ NEXT_QUANTUM_S = 0.1
 session waits for 0.2 s, and for twice as long where the processor has other work too."""
 REQUEST_QUANTUM_S = 0.02
 """The same for what is no frame and has time, such as a panorama (0.1 to 0.2 s of a processor)."""
+LONGER = 1.5
+"""A frame that has taken so many times what another session's frames take in the mean lets it go first. Frames of equal
+sessions, which differ by less, do not interrupt each other, and no frame takes more than 1 + 1/LONGER times as long."""
+LEAST_QUANTUM_S = 0.02
+"""No frame is interrupted before: what waits is due by then, or nearly, and the device is emptied for it."""
 _RATE = 0.2  # weight of a new frame in the running mean of costs
 
 
@@ -123,10 +129,13 @@ class Scheduler:
     def is_due(self, turn: Turn, share: SessionShare) -> bool:
         """Whether the session that has the turn is to let another go first."""
         spent_s = self._clock() - turn.resumed_s
-        if spent_s < turn.quantum_s:
+        if spent_s < min(turn.quantum_s, LEAST_QUANTUM_S):
             return False
         with self._changed:
-            return any(other.used_s < share.used_s + spent_s for other in self._able())
+            return any(
+                other.used_s < share.used_s + spent_s and spent_s >= _quantum_beside(other, turn.quantum_s)
+                for other in self._able()
+            )
 
     @contextmanager
     def released(self, turn: Turn, share: SessionShare) -> Iterator[None]:
@@ -203,3 +212,10 @@ class Scheduler:
             share.cost_s = cost_s  # the first frame is not representative
         elif share.cost_s is not None:
             share.cost_s += _RATE * (cost_s - share.cost_s)
+
+
+def _quantum_beside(other: SessionShare, quantum_s: float) -> float:
+    """Time that a frame with that quantum has while a frame of the session `other` waits."""
+    if other.cost_s is None:
+        return quantum_s
+    return min(quantum_s, max(LONGER * other.cost_s, LEAST_QUANTUM_S))

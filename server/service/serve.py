@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import os
 import signal
@@ -42,6 +43,8 @@ STOP_PATIENCE_S = 10
 """Time limit from the signal to the end of the process."""
 DRAIN_PATIENCE_S = 7
 """Part of it in which sessions end and rooms are saved."""
+CRASHES = ("SIGSEGV", "SIGBUS", "SIGILL", "SIGABRT")
+"""Not SIGFPE: PoCL has a handler for divisions by zero in kernels."""
 NO_AUTHENTICATION = Authenticator()
 
 log = logging.getLogger(__name__)
@@ -120,6 +123,9 @@ def serve_on(
 
         def on_prepared() -> None:
             if service.failure is None:
+                _leave_out_of_collections()
+                _end_by_crashes()
+                service.compile_beside()
                 ways = WaysIn(listener, authenticator, certificate, is_left, shows_token)
                 for line in [*ways.lines(), *(ways.code() if draws_code else ())]:
                     say(line)
@@ -137,6 +143,22 @@ def serve_on(
     if service.failure is not None:
         raise ServeError(service.failure)
     return 0
+
+
+def _end_by_crashes() -> None:
+    """Take the handlers away that LLVM, PoCL's compiler, has left. They return, since a fault then happens again and
+    ends the process; where another process sent the signal, nothing would end."""
+    if threading.current_thread() is threading.main_thread():
+        for name in CRASHES:
+            if hasattr(signal, name):  # not all systems have each
+                signal.signal(getattr(signal, name), signal.SIG_DFL)
+
+
+def _leave_out_of_collections() -> None:
+    """Do not look through modules, kernels and the like for garbage again: a collection of all stops every thread for
+    60 ms (two cores of an AMD EPYC) with them."""
+    gc.collect()
+    gc.freeze()
 
 
 @contextlib.contextmanager

@@ -36,6 +36,7 @@ from server.service.edge.connection_limits import ConnectionLimits
 from server.service.graceful_shutdown import GracefulShutdown
 from server.service.limits import DEFAULT_LIMITS, Limits
 from server.service.mailbox import ObjectRequest, PanoramaOrder, WatcherRequest
+from server.service.memory_return import MemoryReturn
 from server.service.monitoring.event_log import about
 from server.service.monitoring.metrics import Metrics
 from server.service.room_registry import RoomFactory, RoomRegistry, key_digest_of
@@ -109,6 +110,7 @@ class Service:
         self.limits = limits if max_sessions is None else replace(limits, sessions=max_sessions)
         self.connection_limits = ConnectionLimits(self.limits)
         self._broadcast = Broadcast()
+        self._memory = MemoryReturn()
         self._session_numbers = count(1)
         self._sessions = 0
         self._watchers = 0
@@ -199,8 +201,14 @@ class Service:
         """Release threads and processes. All sessions have ended before."""
         if self._preparing is not None:
             self._preparing.cancel()
+        self._memory.stop()
         self._threads.shutdown(wait=False, cancel_futures=True)
         self._parsers.stop()
+        self._device.end_children()
+
+    def compile_beside(self) -> None:
+        """As `Device.compile_beside`: sessions do not wait for kernels of others. Call when it is prepared."""
+        self._device.compile_beside()
 
     async def _prepare(self) -> None:
         if self._warm_up is not None:
@@ -313,6 +321,7 @@ class Service:
                         await session.run(self._threads)
                 finally:
                     del self._captures[name]
+                    self._memory.note_end()
                 log.info("session closed", extra={"reason": session.why_ended})
 
     @contextlib.contextmanager

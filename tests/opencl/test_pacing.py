@@ -13,8 +13,9 @@ import pyopencl as cl
 import pytest
 
 from server.opencl import program
+from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.opencl.pacing import Pacer, cut
+from server.opencl.pacing import PROBE, SHARED_SLICE_S, SLICE_S, Pacer, StepTimes, cut
 from server.opencl.profile import Profile
 
 SOURCE = """
@@ -171,6 +172,45 @@ def test_slices_of_a_launch_become_smaller_while_the_device_becomes_slower() -> 
         pacer.enqueued("kernel", items, 1, _Event([], number, items * step_ns))
     assert sizes[:4] == [100, 100, 100, 100]
     assert max(sizes[5:]) < 15, "a tenth of the items in the same time, and slowly more as that is forgotten"
+
+
+def test_a_kernel_that_was_never_timed_begins_with_a_short_slice_that_is_waited_for(engine: Engine) -> None:
+    """With 50 times the time a step is thought to take: no slice takes more than three times the longest."""
+    took_s, step_s, pacer = list[float](), 1e-6, Pacer(slice_s=0.02, ahead_s=0.02, step_s=2e-8)
+    pacer.yielding = Other(engine, 0)
+    for number, (_, (items,)) in enumerate(pacer.slices("kernel", (1_000_000,), (1,), 1)):
+        took_s.append(items * step_s)
+        pacer.enqueued("kernel", items, 1, _Event([], number, int(1e9 * items * step_s)))
+    assert max(took_s) <= PROBE * 0.02 * 50 * 1.01
+    assert max(took_s[1:]) <= 0.0201
+
+
+def test_launches_of_an_engine_are_cut_by_what_those_of_others_on_its_device_took(device: Device) -> None:
+    one, other = Engine(device), Engine(device)
+    assert one.pacer._times is other.pacer._times is device.step_times
+    times, sizes = StepTimes(), list[int]()
+    for pacer in (Pacer(slice_s=0.1, step_s=1e-9, times=times), Pacer(slice_s=0.1, step_s=1e-9, times=times)):
+        for number, (_, (items,)) in enumerate(pacer.slices("kernel", (1000,), (1,), 1)):
+            sizes.append(items)
+            pacer.enqueued("kernel", items, 1, _Event([], number, items * 1_000_000))
+        pacer._drain(0.0)
+    assert sizes == [1000, *[100] * 10]
+
+
+def test_slices_are_shorter_where_others_may_want_the_device(engine: Engine) -> None:
+    pacer, sizes = Pacer(step_s=1e-3), list[int]()
+    for yielding in (None, Other(engine, 0)):
+        pacer.yielding = yielding
+        pacer._times.add("kernel", 1e-3)
+        sizes.append(next(iter(pacer.slices("kernel", (1000,), (1,), 1)))[1][0])
+    assert sizes == [int(SLICE_S / 1e-3), int(SHARED_SLICE_S / 1e-3)]
+
+
+def test_a_short_slice_tells_nothing_of_its_kernels_steps() -> None:
+    pacer = Pacer(slice_s=0.1, step_s=1e-8)
+    pacer.enqueued("kernel", 64, 1, _Event([], 0, 30_000))  # 470 ns a step: its launch
+    pacer._drain(0.0)
+    assert next(iter(pacer.slices("kernel", (100_000,), (1,), 1)))[1] == (100_000,)
 
 
 def test_the_profile_counts_slices_of_one_kernel_together(engine: Engine) -> None:

@@ -229,7 +229,12 @@ def terrain(side: int) -> SceneMesh:
     )
 
 
-FAKE_DEVICE = SimpleNamespace(name="a fake device", memory=SimpleNamespace(bytes_held=4096))
+FAKE_DEVICE = SimpleNamespace(
+    name="a fake device",
+    memory=SimpleNamespace(bytes_held=4096),
+    compile_beside=lambda: None,
+    end_children=lambda: None,
+)
 
 
 class FakeMesh(NamedTuple):

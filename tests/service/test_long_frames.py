@@ -10,7 +10,15 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from protocol.messages import Composite, Hello, Welcome
-from server.service.scheduler import NEXT_QUANTUM_S, QUANTUM_S, REQUEST_QUANTUM_S, Scheduler, SessionShare, Turn
+from server.service.scheduler import (
+    LEAST_QUANTUM_S,
+    NEXT_QUANTUM_S,
+    QUANTUM_S,
+    REQUEST_QUANTUM_S,
+    Scheduler,
+    SessionShare,
+    Turn,
+)
 from server.service.serve import BackgroundServer
 from tests.service.fakes import CAMERA, PATIENCE_S, Lab, frame_message
 from tests.service.wire import Wire
@@ -78,6 +86,35 @@ def test_a_usual_frame_is_not_interrupted(scheduler: Scheduler, clock: Clock) ->
         clock.now_s += 0.9 * QUANTUM_S
         assert not turn.is_due()
         clock.now_s += 0.2 * QUANTUM_S
+        assert turn.is_due()
+    other.end()
+
+
+def test_a_frame_that_takes_longer_than_those_of_another_session_lets_it_go_first(
+    scheduler: Scheduler, clock: Clock
+) -> None:
+    short, equal = scheduler.join(), scheduler.join()
+    short.cost_s, equal.cost_s = 0.03, 0.1
+    with scheduler.acquire(scheduler.join()) as turn:
+        others = [Frame(scheduler, equal, "equal", [])]
+        clock.now_s += 0.11
+        assert not turn.is_due(), "of a session whose frames take as long"
+        others.append(Frame(scheduler, short, "short", []))
+        assert turn.is_due()
+        short.used_s = 10.0
+        assert not turn.is_due(), "it has used more"
+    for other in others:
+        threading.Timer(0.01, other.end).start()
+
+
+def test_no_frame_is_interrupted_before_its_device_is_well_in_use(scheduler: Scheduler, clock: Clock) -> None:
+    tiny = scheduler.join()
+    tiny.cost_s = 0.001
+    with scheduler.acquire(scheduler.join()) as turn:
+        other = Frame(scheduler, tiny, "tiny", [])
+        clock.now_s += 0.9 * LEAST_QUANTUM_S
+        assert not turn.is_due()
+        clock.now_s += 0.2 * LEAST_QUANTUM_S
         assert turn.is_due()
     other.end()
 

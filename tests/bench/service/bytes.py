@@ -32,7 +32,7 @@ from tests.bench.report.finished import ROOT, Part, code_digest
 from tests.bench.report.run import Run
 from tests.bench.service.guests import CAMERA as GUEST_CAMERA
 from tests.bench.service.guests import CUBE, WISHES, clock_frame
-from tests.bench.service.process import Served, descendants, resident_mb, serving
+from tests.bench.service.process import Served, held_mb, serving
 from tests.protocol.samples import CLIENT
 from tests.service.mutations import Mutator
 
@@ -301,7 +301,7 @@ def is_served(url: str) -> bool:
 
 
 def _memory_mb(served: Served) -> float:
-    return sum(map(resident_mb, [served.process.pid, *descendants(served.process.pid)]))
+    return held_mb(served.process.pid)
 
 
 def _limit_memory() -> None:

@@ -28,7 +28,7 @@ from protocol.conformance.scene import CAMERA, frame, hello, place
 from protocol.limits import SUBPROTOCOL
 from tests.bench.report.finished import Part
 from tests.bench.report.run import Run
-from tests.bench.service.process import Served, descendants, resident_mb, serving
+from tests.bench.service.process import Served, held_mb, serving
 
 PATIENCE_S = 120.0
 HEALTH_PERIOD_S = 0.2
@@ -76,7 +76,7 @@ class Held:
     def of(cls, served: Served, data: Path) -> Held:
         """Now; memory with that of its parsers."""
         pid = served.process.pid
-        memory_mb = sum(map(resident_mb, [pid, *descendants(pid)]))
+        memory_mb = held_mb(pid)
         disk = sum(path.stat().st_size for path in data.rglob("*") if path.is_file())
         return cls(memory_mb, len(os.listdir(f"/proc/{pid}/fd")), len(os.listdir(f"/proc/{pid}/task")), disk / 1e3)
 

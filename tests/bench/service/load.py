@@ -30,7 +30,7 @@ from protocol.frames import RgbdFrame
 from protocol.messages import Acknowledged, Composite, Dropped, Preset, Wishes
 from tests.bench.report.finished import Part
 from tests.bench.report.run import Run
-from tests.bench.service.process import Served, Unusual, descendants, resident_mb, serving
+from tests.bench.service.process import Served, Unusual, descendants, held_mb, serving
 from tests.scenes.plain_light import PLAIN_LIGHT
 
 STREAMING, WATCHING = 8, 24
@@ -140,7 +140,7 @@ async def loaded(
     start = {streamer.session: streamer.answered for streamer in streamers}
     began, load.before = time.perf_counter(), await asyncio.to_thread(served.metrics)
     while (passed := time.perf_counter() - began) < seconds:
-        load.memory_mb.append(await asyncio.to_thread(_memory_mb, served.process.pid))
+        load.memory_mb.append(await asyncio.to_thread(held_mb, served.process.pid))
         if len(load.memory_mb) % 20 == 1:
             say(f"load: {passed:.0f} of {seconds:.0f} s, {load.memory_mb[-1]:.0f} MB")
         await _unless_ended(tasks, EVERY_S)
@@ -270,10 +270,6 @@ def _beside_s(pid: int) -> float:
     tasks += [Path(f"/proc/{child}/stat") for child in descendants(pid, "read_picture")]
     ticks = sum(sum(map(int, task.read_text().rpartition(")")[2].split()[11:13])) for task in tasks)
     return ticks / os.sysconf("SC_CLK_TCK")
-
-
-def _memory_mb(pid: int) -> float:
-    return sum(map(resident_mb, [pid, *descendants(pid)]))
 
 
 def growth(memory_mb: list[float]) -> float:

@@ -148,6 +148,15 @@ def resident_mb(pid: int) -> float:
     raise ProcessLookupError(f"no process {pid}")
 
 
+def held_mb(pid: int) -> float:
+    """Resident memory of a process and of those that it started. Raises OSError where there is none of that number."""
+    found = resident_mb(pid)
+    for below in descendants(pid):
+        with suppress(OSError):  # it has just ended
+            found += resident_mb(below)
+    return found
+
+
 def children(pid: int) -> list[int]:
     """Processes that `pid` started."""
     found = []

@@ -12,14 +12,13 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import os
 import select
 import subprocess
 import sys
 import threading
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from server.opencl.program import Define
@@ -36,7 +35,8 @@ _ENDING_S = 1.0
 """Until a process that closed its pipes has its exit status."""
 SMALL_GRID = 65535
 """PoCL compiles anew for launches with more work-items along an axis."""
-_DONE = b"done\n"
+DONE = b"done\n"
+"""Answer to each request."""
 
 log = logging.getLogger(__name__)
 
@@ -113,7 +113,7 @@ class KernelCompiler:
         if not select.select([process.stdout], [], [], PATIENCE_S)[0]:
             log.warning("compiling a kernel took more than %g s", PATIENCE_S)
             return False
-        return process.stdout.readline() == _DONE
+        return process.stdout.readline() == DONE
 
     def _start(self) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
@@ -147,52 +147,5 @@ def _key(file: str, defines: dict[str, Define], launch: Launch | None) -> tuple[
 
 
 def _program() -> str:
-    return f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r}); from {__name__} import main; main()"
-
-
-def main() -> None:
-    """The process: `DEVICE IDLE_S`; requests come as lines of JSON, each is answered by a line."""
-    from server.opencl.device import open_device
-
-    os.nice(NICENESS)
-    # unbuffered, so that `select` sees what is left
-    requests, answers = os.fdopen(os.dup(0), "rb", 0), os.fdopen(os.dup(1), "wb", 0)
-    os.dup2(2, 1)  # what a driver prints is no answer
-    device, idle_s = open_device(sys.argv[1]), float(sys.argv[2])
-    while select.select([requests], [], [], idle_s)[0]:
-        line = requests.readline()
-        if not line:
-            return  # the server has ended
-        _do(device, json.loads(line))
-        answers.write(_DONE)
-
-
-def _do(device: Any, request: dict[str, Any]) -> None:
-    import pyopencl as cl
-
-    from server.opencl.program import KernelBuildError
-
-    try:
-        program = device.programs.get(request["file"], request["defines"])
-    except KernelBuildError:
-        return  # the server finds the same
-    if request["launch"] is None:
-        return
-    launch = Launch(**request["launch"])
-    kernel, queue = cl.Kernel(program, launch.kernel), cl.CommandQueue(device.context)
-    arguments = [bytes.fromhex(one) if isinstance(one, str) else _zeros(queue, one) for one in launch.arguments]
-    kernel.set_args(*arguments)  # which keeps none of them alive
-    offset = None if launch.offset is None else tuple(launch.offset)
-    cl.enqueue_nd_range_kernel(queue, kernel, tuple(launch.size), tuple(launch.local), offset)
-    queue.finish()
-
-
-def _zeros(queue: Any, size: int | None) -> Any:
-    """Memory that is all zeros; what no kernel touches takes none of the machine's."""
-    import numpy as np
-    import pyopencl as cl
-
-    if size is None:
-        return None
-    flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
-    return cl.Buffer(queue.context, flags, hostbuf=np.zeros(size, np.uint8))
+    root = str(Path(__file__).parents[2])
+    return f"import sys; sys.path.insert(0, {root!r}); from server.opencl.compiler_process import main; main()"

@@ -73,6 +73,10 @@ def watched_server(device: Device) -> Iterator[tuple[BackgroundServer, list]]:
         yield server, asked
 
 
+PERIOD_S = 0.1
+"""Between frames: without a GPU a page does not keep up with a server that answers a still view in 15 ms."""
+
+
 @contextmanager
 def standing_camera(url: str, source: Source) -> Iterator[list[Composite]]:
     """The answers to a camera that shows the source's first frame again and again, as they come."""
@@ -81,7 +85,7 @@ def standing_camera(url: str, source: Source) -> Iterator[list[Composite]]:
 
     def capture() -> None:
         for index in count():
-            if ended.is_set():
+            if ended.wait(PERIOD_S):
                 return
             wire.say(frame_message(replace(source[0], index=index), source.camera))
             answers.append(wire.hear_until(Composite)[-1])

@@ -55,7 +55,7 @@ class FactsFinder:
         picture_most = _most_shown(shown)
         self._brightest = max(self._brightest, picture_most / exposure)
         whole = exposure * sh
-        rest = exposure * split.rest.reshape(sh.shape) if light.discs else whole
+        rest = exposure * split.rest if light.discs else whole
 
         real = np.full(3, ROUNDING * exposure * self._brightest) if has_indirect else np.zeros(3)
         around = np.maximum(real, light.unseen)

@@ -103,7 +103,8 @@ class RoomLight:
         solution = self._solution
         if solution is None or not len(middles):
             sh = self.estimate().sh
-            return sh[None], split_light(sh), EVERYWHERE
+            split = split_light(sh)
+            return sh[None], SplitLight(split.rest[None], split.discs), EVERYWHERE
         places = places_of(middles)
         whole, rest, lamps = solution.beyond(places.positions + origin_world, self._settings.bands)
         if self._settings.light_color == "white":

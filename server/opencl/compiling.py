@@ -18,10 +18,8 @@ import sys
 import threading
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from server.opencl.program import Define
+from server.opencl.program import Define, define_options
 
 IDLE_S = 600.0
 """The process ends when it has had nothing to do for so long: it takes 100 MB. Who needs it again waits 1 s more."""
@@ -141,8 +139,6 @@ class KernelCompiler:
 
 
 def _key(file: str, defines: dict[str, Define], launch: Launch | None) -> tuple[object, ...]:
-    from server.opencl.program import define_options
-
     return file, define_options(defines), None if launch is None else launch.variant
 
 

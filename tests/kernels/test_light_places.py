@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from server.maths.light_places import LightPlaces
+from server.maths.light_places import EVERYWHERE, LightPlaces
 from server.objects.rasterize import VirtualSurface
 from server.opencl.engine import Engine
 from server.shading.adaptive import refine_real, refine_virtual
@@ -38,7 +38,7 @@ ABOVE = pose((0.48, 1.5, 0.48))
 class Stage:
     """A floor below two boxes, as real surface; the same pixels as virtual surface of the nearer box."""
 
-    def __init__(self, engine: Engine, light: Floats, places: LightPlaces | None) -> None:
+    def __init__(self, engine: Engine, light: Floats, places: LightPlaces = EVERYWHERE) -> None:
         self.engine = engine
         points = floor_points(side=SIDE)
         positions, normals = buffer(points, UP, (SIDE, SIDE), STRIDE)
@@ -58,7 +58,7 @@ class Stage:
         )
         volume = fill_volume(engine, (floor(),), VOXEL_M)
         self.transfer = transfer_radiance(engine, self.camera, volume, self.surface, STRIDE, RAYS, FAR_M)
-        self.light = upload_light(engine, light, RAYS, **({"places": places} if places else {}))
+        self.light = upload_light(engine, light, RAYS, places=places)
         objects = [placed(engine, solid) for solid in BOXES]
         self.scene: TracedScene = trace_scene(engine, volume, self.light, RAYS, FAR_M, objects)
 
@@ -106,10 +106,10 @@ OF_PIXELS: dict[str, Callable[[Stage], Floats]] = {
 @pytest.mark.parametrize("name", OF_PIXELS)
 def test_each_side_has_the_light_of_its_own_object(engine: Engine, name: str) -> None:
     of = OF_PIXELS[name]
-    left, right = (of(Stage(engine, light, None)) for light in LIGHTS)
+    left, right = (of(Stage(engine, light)) for light in LIGHTS)
     both = of(Stage(engine, np.stack(LIGHTS), PLACES))
     swapped = of(Stage(engine, np.stack(LIGHTS[::-1]), SWAPPED))
-    is_right = Stage(engine, LIGHTS[0], None).is_right
+    is_right = Stage(engine, LIGHTS[0]).is_right
     rows, cols = left.shape[:2]
     is_right = is_right[:: is_right.shape[0] // rows, :: is_right.shape[1] // cols][:rows, :cols]
     middle = np.zeros_like(is_right)
@@ -124,7 +124,7 @@ def test_each_side_has_the_light_of_its_own_object(engine: Engine, name: str) ->
 
 
 def test_points_on_objects_have_the_light_of_the_nearest_place(engine: Engine) -> None:
-    left, right = (Stage(engine, light, None).points() for light in LIGHTS)
+    left, right = (Stage(engine, light).points() for light in LIGHTS)
     both = Stage(engine, np.stack(LIGHTS), PLACES).points()
     half = len(both) // 2  # of either box, which are alike
     np.testing.assert_array_equal(both[:half], left[:half])
@@ -133,6 +133,6 @@ def test_points_on_objects_have_the_light_of_the_nearest_place(engine: Engine) -
 
 
 def test_places_of_one_light_change_nothing(engine: Engine) -> None:
-    one, two = Stage(engine, LIGHTS[0], None), Stage(engine, np.stack([LIGHTS[0]] * 2), PLACES)
+    one, two = Stage(engine, LIGHTS[0]), Stage(engine, np.stack([LIGHTS[0]] * 2), PLACES)
     for name, of in OF_PIXELS.items():
         np.testing.assert_array_equal(of(one), of(two), err_msg=name)

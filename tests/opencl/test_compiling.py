@@ -20,7 +20,7 @@ from server.opencl.engine import Engine
 
 LAUNCH = Launch("kernel", (64,), (64,), None, ("01000000", 256))
 LAUNCHES = """
-import sys, time
+import sys
 from pathlib import Path
 import numpy as np
 from server.opencl.device import open_device

@@ -126,10 +126,10 @@ def serve_on(
                 _leave_out_of_collections()
                 _end_by_crashes()
                 service.compile_beside()
+                tell_ready()  # before people are told: from then on a crash must not be the end
                 ways = WaysIn(listener, authenticator, certificate, is_left, shows_token)
                 for line in [*ways.lines(), *(ways.code() if draws_code else ())]:
                     say(line)
-                tell_ready()
             else:
                 server.should_exit = True
 

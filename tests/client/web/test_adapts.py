@@ -202,17 +202,19 @@ def test_video_gets_fewer_bits_and_goes_on(server: BackgroundServer, seen: Seen,
         page.locator("select[name=color]").select_option("h264")
         link.bytes_per_s = BYTES_PER_S / 6
         start_capture(page)
-        wait_for_text(page, "#sending", "Sent now: video at its full bit rate")
-        wait_for_text(page, "#sending", "Sent now: video at 35 % of its bit rate")
-        count = len(seen.images)
-        seen.wait(lambda images: len(images) > count + 15)
+        wait_for_text(page, "#sending", "% of its bit rate")  # each share on the way is said for two pictures only
+        seen.wait(takes_fewer_bits)
         page.goto("about:blank")
     assert {(image.codec, image.width) for image in seen.images} == {("h264", CAMERA.width)}
-    sizes = [len(image.data) for image in seen.images if not is_key_picture(image.data)]
-    assert median(sizes[-10:]) < 0.7 * median(sizes[:5])
     keys = [is_key_picture(image.data) for image in seen.images]
     assert keys[0]
     assert keys.count(True) < len(keys) / 3
+
+
+def takes_fewer_bits(video: list[ColorImage]) -> bool:
+    """Ten pictures in a row take half of what the first ones took; key pictures are left out."""
+    sizes = [len(image.data) for image in video if not is_key_picture(image.data)]
+    return len(sizes) > 20 and median(sizes[-10:]) < 0.5 * median(sizes[:3])
 
 
 def test_a_recording_is_sent_as_it_is_when_the_link_is_free(

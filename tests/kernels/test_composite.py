@@ -160,6 +160,32 @@ def test_a_nearly_upright_edge_has_a_shade_for_each_column_of_parts(engine: Engi
     assert len(np.unique(np.round(covered * FINE_SUBPIXELS**2))) > 3
 
 
+def test_an_edge_before_another_object_is_as_smooth_as_one_before_the_room(engine: Engine) -> None:
+    """A white quad 20 cm before a darker one: each pixel is their mean by the parts of it that they cover. With the
+    colour of its centre alone it would be the one or the other."""
+    near = np.array([[-0.2, -0.15, 0.8], [-0.01, -0.15, 0.8], [0.03, 0.15, 0.8], [-0.2, 0.15, 0.8]])
+    far = np.array([[-2.0, -2.0, 1.0], [2.0, -2.0, 1.0], [2.0, 2.0, 1.0], [-2.0, 2.0, 1.0]])
+    objects = [
+        (VirtualObject.upload(engine, shape_of(trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]]))), VOLUME_FROM_CAMERA)
+        for corners in (near, far)
+    ]
+    pose = np.linalg.inv(VOLUME_FROM_CAMERA)
+    fine = engine.download(nearest_depths(engine, CAMERA, pose, objects)).view(np.float32)
+    middle = rasterize(engine, CAMERA, pose, objects)
+    positions, normals = (download4(engine, a).astype(float) for a in (middle.position, middle.normal))
+    is_near = engine.download(middle.object_index) == 0
+    virtual = Buffer(positions, normals, np.where(is_near[..., None], 1.0, 0.2) * np.ones(3))
+    black = np.zeros((HEIGHT, WIDTH, 4))
+    black[..., 3] = 1
+    light, nothing = lights.uniform((0.5, 0.5, 0.5)), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    wall = buffer(*plane(1.5))
+    picture = compose(engine, nothing, black, wall, virtual, NONE_TAKEN, light=light, inverse_depths=fine)
+    share = (fine > 1 / 0.9).reshape(HEIGHT, FINE_SUBPIXELS, WIDTH, FINE_SUBPIXELS).mean((1, 3))
+    assert ((share > 0.1) & (share < 0.9)).sum() > 40
+    found = linear_values("srgb8")[picture].mean(-1)
+    np.testing.assert_allclose(found, 0.5 * (share + 0.2 * (1 - share)), atol=0.005)
+
+
 def test_the_largest_camera_has_smooth_edges_too(engine: Engine) -> None:
     """What is drawn finer may be larger than any camera's picture is allowed to be."""
     camera = msgspec.structs.replace(CAMERA, width=1920, height=1200, fx=1500.0, fy=1500.0, cx=960.0, cy=600.0)

@@ -14,6 +14,7 @@ from tests.reference.sh import open_transfer
 
 Floats = NDArray[np.float64]
 UNTOUCHED = 1e-5
+SAME_SURFACE = 0.005
 CLIPPED, DEVIATION = 0.985, 0.4
 
 
@@ -107,11 +108,11 @@ class Mixed:
     is_touched: NDArray[np.bool_]
     """[h, w] whether real surface is multiplied."""
     own: Floats
-    """[h, w, 3] radiance of the virtual surface."""
+    """[h, w, 3] mean radiance of the virtual surface that is seen in it."""
     part: Floats
     """[h, w] of the pixel that it covers."""
     virtual_z: Floats
-    """[h, w] camera depth of that surface, 0 where none is seen."""
+    """[h, w] camera depth of that of it which covers most, 0 where none is seen."""
     real_z: Floats
     """[h, w] 0 where there is no real surface."""
 
@@ -147,18 +148,34 @@ def mix(
     def depth(point: Floats) -> float:
         return float(camera_from_volume[2, :3] @ point[:3] + camera_from_volume[2, 3])
 
-    def share_and_source(x: int, y: int) -> tuple[float, tuple[int, int] | None]:
+    def sources(x: int, y: int) -> dict[tuple[int, int], float]:
+        """The pixels whose virtual surface is seen in a pixel, each with the part of it that it covers."""
         assert virtual is not None
         real_z = depth(real.positions[y, x]) if real.positions[y, x, 3] > 0 else np.inf
         if inverse_depths is None:
             is_front = virtual.positions[y, x, 3] > 0 and real_z - depth(virtual.positions[y, x]) > -tolerance_m
-            return float(is_front), (x, y)
+            return {(x, y): 1.0} if is_front else {}
         f = inverse_depths.shape[0] // height
         parts = inverse_depths[f * y : f * y + f, f * x : f * x + f]
-        share = float(((parts > 0) & (real_z + tolerance_m > 1 / np.maximum(parts, 1e-9))).mean())
+        seen = parts[(parts > 0) & (real_z + tolerance_m > 1 / np.maximum(parts, 1e-9))]
         steps = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, -1), (-1, 1), (1, 1)]
         near = [(x + a, y + b) for a, b in steps if 0 <= x + a < width and 0 <= y + b < height]
-        return share, next(((u, v) for u, v in near if virtual.positions[v, u, 3] > 0), None)
+        depths = {(u, v): depth(virtual.positions[v, u]) for u, v in near if virtual.positions[v, u, 3] > 0}
+        found: dict[tuple[int, int], float] = {}
+        for part in seen if depths else ():
+            apart = {pixel: abs(part * z - 1) for pixel, z in depths.items()}
+            is_own = apart.get((x, y), np.inf) < SAME_SURFACE
+            pixel = (x, y) if is_own else min(depths, key=lambda pixel: abs(part - 1 / depths[pixel]))
+            found[pixel] = found.get(pixel, 0.0) + 1 / f**2
+        return found
+
+    def virtual_color(u: int, v: int) -> Floats:
+        assert virtual is not None
+        assert occluded is not None
+        taken = value_at(occluded, refined_occluded, virtual, u, v)[:3]
+        bands = round(len(light) ** 0.5)
+        shading = np.maximum(open_transfer(virtual.normals[v, u, :3], bands) @ light - taken, 0)
+        return np.asarray(virtual.colors[v, u] * shading)
 
     size = (height, width)
     mixed = Mixed(np.ones((*size, 3)), np.zeros(size, bool), np.zeros((*size, 3)), *(np.zeros(size) for _ in range(3)))
@@ -174,14 +191,12 @@ def mix(
                     dimmed = np.minimum(factor[:3] * restored(radiance, x, y, log_white) / np.maximum(seen, CLIPPED), 1)
                     mixed.factor[y, x] = np.where(seen >= CLIPPED, dimmed, factor[:3])
         if virtual is not None and occluded is not None:
-            share, source = share_and_source(x, y)
-            if share > 0 and source is not None:
-                u, v = source
-                taken = value_at(occluded, refined_occluded, virtual, u, v)[:3]
-                bands = round(len(light) ** 0.5)
-                shading = np.maximum(open_transfer(virtual.normals[v, u, :3], bands) @ light - taken, 0)
-                mixed.own[y, x] = virtual.colors[v, u] * shading
+            found = sources(x, y)
+            if found:
+                share = sum(found.values())
+                mixed.own[y, x] = sum(part / share * virtual_color(*pixel) for pixel, part in found.items())
                 mixed.part[y, x] = 1.0 if radiance[y, x, 3] < 0 else share
+                u, v = max(found, key=lambda pixel: found[pixel])
                 mixed.virtual_z[y, x] = depth(virtual.positions[v, u])
     return mixed
 

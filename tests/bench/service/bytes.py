@@ -50,7 +50,8 @@ MEMORY_GOAL_MB = 3000
 NAMED = re.compile(
     r"`\$|unknown field|required fields? (are|is) missing|truncated|malformed|codec can't decode|Expected `|"
     r"missing required field|Invalid (enum )?value|"
-    r"nested too deeply|limit of|color\.|depth\.|frame\.|camera|hello\.|wishes|object\.|quality|place_object|watch"
+    r"nested too deeply|limit of|color\.|depth\.|frame\.|camera|hello\.|wishes|object\.|quality|place_object|panorama|"
+    r"watch"
 )
 """Words of which one is in every refusal that says what was wrong."""
 

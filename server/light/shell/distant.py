@@ -7,7 +7,7 @@ import numpy as np
 from server.light.light_estimation import LightEstimate
 from server.light.place_light import VALID_SPREAD_DEG
 from server.light.shell.objective import Unknowns
-from server.light.shell.spread import SPREAD_DOUBT, spread_deg
+from server.light.shell.spread import deviations, spread_deg
 from server.maths.lobes import LOBES, lobes_to_sh
 from server.maths.sh import LUMINANCE
 
@@ -20,7 +20,8 @@ def distant_light(unknowns: Unknowns, bands: int) -> LightEstimate:
     sh = to_sh @ radiance
     gradient = to_sh * (radiance @ LUMINANCE)  # by z, the logarithm
     covariance, condition = unknowns.covariance_of(gradient)
-    std = SPREAD_DOUBT * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     tint = sh[0] / max(float(sh[0] @ LUMINANCE), 1e-12)
     angle = spread_deg(sh @ LUMINANCE, covariance)
-    return LightEstimate(sh, np.outer(std, tint), condition, valid=angle <= VALID_SPREAD_DEG, spread_deg=angle)
+    return LightEstimate(
+        sh, np.outer(deviations(covariance), tint), condition, valid=angle <= VALID_SPREAD_DEG, spread_deg=angle
+    )

@@ -17,7 +17,7 @@ from server.light.shell.distant import distant_light
 from server.light.shell.lamps import ShellLamp, emitting_lamps, find_lamps
 from server.light.shell.objective import Unknowns
 from server.light.shell.shell import CORNERS, Shell
-from server.light.shell.spread import SPREAD_DOUBT, spread_deg
+from server.light.shell.spread import deviations, spread_deg
 from server.light.shell.transport import KNOWN, NO_CELL, Met, bright_keys, columns_of, meet
 from server.maths.dominant import MOST_LIGHTS
 from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
@@ -195,13 +195,12 @@ class Solution:
         sh = rays.basis @ radiance
         luminance = radiance @ LUMINANCE
         covariance, _ = self.near.covariance_of(self._gradient(rays))
-        std = SPREAD_DOUBT * np.sqrt(np.maximum(np.diag(covariance), 0.0))
         tint = radiance.mean(axis=0) / max(float(luminance.mean()), 1e-12)
         angle = spread_deg(sh @ LUMINANCE, covariance)
         return PlaceLight(
             position=position,
             sh=sh,
-            std=np.outer(std, tint),
+            std=np.outer(deviations(covariance), tint),
             spread_deg=angle,
             valid=angle <= VALID_SPREAD_DEG,
             seen=float((rays.columns[:DIRECTIONS, 0] == KNOWN).mean()),

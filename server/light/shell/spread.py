@@ -14,6 +14,11 @@ _LINEAR = [3, 1, 2]  # x, y, z
 Floats = NDArray[np.float64]
 
 
+def deviations(covariance: Floats) -> Floats:
+    """[n] standard deviations, for what the curvature tells of n coefficients, [n, n]."""
+    return np.asarray(SPREAD_DOUBT * np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+
+
 def spread_deg(sh: Floats, covariance: Floats) -> float:
     """Angle that 90 % of dominant directions are within, for luminance [n] as harmonics and its covariance [n, n]."""
     vector, spread = sh[_LINEAR], covariance[np.ix_(_LINEAR, _LINEAR)]

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.light.shell import weights as constants
-from server.light.shell.objective import LOGIT
 from server.light.shell.shell import neighbours
 
 Floats = NDArray[np.float64]
@@ -24,11 +23,13 @@ def level_objective(
     regions: NDArray[np.int64],
     prior: Floats,
     deviation: Floats,
+    middle: float,
 ) -> float:
     """Half the sum that is minimised, for a room without saturated cells, clipped patches and outliers.
 
     z [k] log radiance of cells; materials [g] logits of albedo; offsets [f] of log albedo; shares [n, k], known [n],
-    level [n], material_weights [n, g], surfaces [n], regions [n]; prior, deviation [k] of z.
+    level [n], material_weights [n, g], surfaces [n], regions [n]; prior, deviation [k] of z; middle: logit
+    of albedo about which materials lie.
     """
     total = 0.0
     logit = material_weights @ materials
@@ -43,9 +44,24 @@ def level_objective(
     for first, second in neighbours():
         ratio = (z[first] - z[second]) / constants.EDGE
         total += constants.SMOOTHNESS * constants.EDGE**2 * (np.sqrt(1 + ratio**2) - 1)
-    total += (((materials - LOGIT) / constants.ALBEDO_SPREAD) ** 2).sum() / 2
+    total += (((materials - middle) / constants.ALBEDO_SPREAD) ** 2).sum() / 2
     ratio = offsets / constants.SURFACE_SPREAD
     edge = constants.DARK_EDGE
     dark = 2 * (edge / constants.SURFACE_SPREAD) ** 2 * (np.sqrt(1 + (offsets / edge) ** 2) - 1)
     total += np.where(ratio > 0, ratio**2, dark).sum() / 2
     return float(total)
+
+
+def middle_objective(middle: float, first: float, albedos: Floats) -> float:
+    """Half the two terms that m follows from, for materials that go along with it from where it was `first`.
+
+    albedos: [n] logarithms of the patches' as they were then; those of the brightest surface go along.
+    """
+    logits = np.log([constants.MEAN_ALBEDO / (1 - constants.MEAN_ALBEDO)])
+    ordered = np.sort(albedos)
+    ranks = np.linspace(0.91, 0.99, 9) * (len(ordered) - 1)
+    brightest = np.interp(ranks, np.arange(len(ordered)), ordered).mean()
+    grown = brightest + (middle - first) / (1 + np.exp(first))
+    total = ((middle - logits[0]) / constants.MEAN_SPREAD) ** 2
+    total += ((grown - np.log(constants.BRIGHTEST)) / constants.BRIGHTEST_SPREAD) ** 2
+    return float(total) / 2

@@ -12,12 +12,14 @@ materials, bilinear on a grid over the chroma of albedo. o_f is what surface f (
 has besides, d_r and c_r what region r of it has; they are eliminated exactly. Minimised is
 
     sum_p huber(e_p / S_p) + sum_k ((z_k - n_k) / s_k)^2 + sum_(k,l) rho(z_k - z_l)
-    + sum_g ((m_g - m) / s_m)^2 + sum_f tau(o_f) + sum_r (d_r / s_d)^2
+    + sum_g ((m_g - m) / s_m)^2 + ((m - m_0) / s_0)^2 + ((b - log B) / s_b)^2 + sum_f tau(o_f) + sum_r (d_r / s_d)^2
     + sum_p |e'_p / S'_p|^2 + sum_k |(u_k - t) / s_u|^2 + sum_(k,l) c |u_k - u_l|^2 + |t / s_t|^2 + sum_r |c_r / s_c|^2
 
 over neighbouring sources (k,l). tau is (o / s_o)^2, but 2 (d / s_o)^2 (sqrt(1 + (o / d)^2) - 1) below 0, which becomes
-linear, and steep where the albedo exceeds 1. The weights stand in weights.py. A patch that is clipped only counts where
-(1) is below what it shows; its material is the mean one.
+linear, and steep where the albedo exceeds 1. b is the log albedo of the brightest surface, the mean of log s(B_p m) +
+o_f(p) between two ranks; it sets the level. m follows from its own two terms between the steps: all materials, and b,
+go along with it, since little else of the objective changes where all albedo grows and all light falls. The weights
+stand in weights.py. A patch that is clipped only counts where (1) is below what it shows; its material is the mean one.
 """
 
 from __future__ import annotations
@@ -37,6 +39,11 @@ from server.light.shell.sources import Sources
 from server.light.shell.switches import Switches
 
 LOGIT = float(np.log(weights.MEAN_ALBEDO / (1 - weights.MEAN_ALBEDO)))
+ONE_LOGIT = float(np.log(weights.BRIGHTEST / (1 - weights.BRIGHTEST)))
+"""Of all surface, if albedo is constant."""
+BRIGHTEST_RANKS = np.linspace(0.91, 0.99, 9)
+"""Ranks of the patches, as shares of all, whose mean log albedo is the brightest surface's: without outliers, and with
+many patches, so that it changes steadily."""
 LEAST_RELAXATION = 0.05
 """Least share of a Gauss-Newton step that is taken. It falls while steps turn back, and rises again, by TURNING_BACK
 and GOING_ON: the albedo that makes a surface white and the chroma that tells its material follow the light, and are
@@ -71,8 +78,10 @@ class Unknowns:
     """[nodes] logit of albedo."""
     offsets: Floats = field(default_factory=lambda: np.zeros(MOST_PATCHES))
     """[MOST_PATCHES] o of the surface that each patch is part of."""
+    middle: float = LOGIT
+    """m, about which the materials lie."""
     mean: float = 0.0
-    """Log of the mean radiance of light, about which sources lie."""
+    """Log of the mean radiance that pictures show, about which sources lie."""
     radiance: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     """[k, 3] RGB of the sources."""
     curvature: Singles = field(default_factory=lambda: np.zeros((0, 0), np.float32))
@@ -131,13 +140,13 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     Products of matrices are float32: terms are good to a percent, and nothing cancels.
     """
     switches, count = switches or Switches(), sources.count
-    unknowns.mean = float(np.log(evidence.mean / weights.MEAN_ALBEDO))
+    middle, unknowns.mean = unknowns.middle if switches.albedos else ONE_LOGIT, float(np.log(evidence.mean))
     prior = np.where(sources.is_saturated, 0.0, unknowns.mean) + sources.offset
     known_logs = log_chroma(np.log(np.maximum(sources.known, DARKEST)))
     known = np.where(sources.known.max(axis=1) > 0, np.exp(known_logs[:, 0]), 0.0)
     offsets = _means(unknowns.offsets[evidence.rows], evidence.surfaces)
     z = np.concatenate([unknowns.z, prior[unknowns.known :]])
-    z += _begin(z, unknowns.known, evidence, sources, known, offsets)
+    z += _begin(z, unknowns.known, evidence, sources, known, np.log(_logistic(middle)) + offsets)
     cell_chroma = np.concatenate([unknowns.chroma, np.zeros((count - unknowns.known, 2))])
 
     level = _levels(z, sources).astype(np.float32)
@@ -148,7 +157,7 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     known_part = (known / arriving)[:, None] * known_logs[:, 1:]
     is_clipped = evidence.is_clipped[:, None]
     nodes, materials = materials_of(np.where(is_clipped, 0.0, evidence.chroma - sent_chroma - known_part))
-    albedo = 1 / (1 + np.exp(-(materials @ unknowns.materials[nodes])))
+    albedo = _logistic(materials @ unknowns.materials[nodes])
     residual = evidence.level - np.log(arriving) - np.log(albedo)
     error = residual - offsets[evidence.surfaces]
     counts = evidence.precision * (_huber(error * np.sqrt(evidence.precision)) if switches.outliers else 1.0)
@@ -166,7 +175,7 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     right[:count] -= _smoothen(matrix, z, sources.pairs)
     diagonal = np.concatenate([1 / sources.deviation**2, np.full(len(nodes), 1 / spreads.material**2)])
     matrix[np.diag_indices_from(matrix)] += diagonal
-    target = np.concatenate([prior - z, LOGIT - unknowns.materials[nodes]])
+    target = np.concatenate([prior - z, middle - unknowns.materials[nodes]])
     change = unknowns.solve(matrix, right + diagonal * target)
     change *= min(1.0, MOST_STEP / max(float(np.abs(change).max()), 1e-12))
     change *= unknowns.relax(change[:count])
@@ -175,17 +184,19 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     unknowns.materials[nodes] += change[count:]
     offsets = surfaces.offsets(residual - design @ change)
     unknowns.offsets[evidence.rows] = offsets[evidence.surfaces]
+    if switches.albedos:
+        _shift_albedos(unknowns, _logistic(materials @ unknowns.materials[nodes]), offsets, evidence)
     seen = np.where(is_clipped, sent_chroma, evidence.chroma - known_part)
     unknowns.chroma = _solve_chroma(parts, seen, regions.columns(count), spreads.chroma, sources.pairs)
     logs = np.concatenate([np.log(_levels(unknowns.z, sources))[:, None], unknowns.chroma], axis=1)
     unknowns.radiance = np.exp(logs @ _FROM_CHROMA.T)
 
 
-def _begin(z: Floats, count: int, evidence: Evidence, sources: Sources, known: Floats, offsets: Floats) -> Floats:
+def _begin(z: Floats, count: int, evidence: Evidence, sources: Sources, known: Floats, albedos: Floats) -> Floats:
     """[k] by how much sources from `count` on begin above `z`: saturated ones, all alike, at what fits the level best.
 
     From too little light the first steps do not find a lamp; from too much they take all surface for black.
-    known: [n] radiance of photographed surface; offsets: [surfaces].
+    known: [n] radiance of photographed surface; albedos: [surfaces] logarithms.
     """
     is_new = sources.is_saturated.copy()
     is_new[:count] = False
@@ -194,10 +205,28 @@ def _begin(z: Floats, count: int, evidence: Evidence, sources: Sources, known: F
     level = _levels(z, sources)
     brought = sources.shares[:, is_new] @ level[is_new]
     others = sources.shares[:, ~is_new] @ level[~is_new] + known
-    target = evidence.level - np.log(weights.MEAN_ALBEDO) - offsets[evidence.surfaces]
+    target = evidence.level - albedos[evidence.surfaces]
     arriving = np.log(np.maximum(others + np.exp(BEGIN_EXCESS)[:, None] * brought, DARKEST))
     errors = np.abs(target - arriving)[:, ~evidence.is_clipped].sum(axis=1)
     return np.where(is_new, BEGIN_EXCESS[errors.argmin()], 0.0)
+
+
+def _shift_albedos(unknowns: Unknowns, albedo: Floats, offsets: Floats, evidence: Evidence) -> None:
+    """A step of m and, with it, of all materials; its change of m's log albedo counts in `step`.
+
+    albedo: [n] of the patches' materials; offsets: [surfaces].
+    """
+    logs = (np.log(albedo) + offsets[evidence.surfaces])[~evidence.is_clipped]
+    if len(logs) == 0:
+        return
+    before = _logistic(unknowns.middle)
+    slope = 1 - before  # of a log albedo by its logit
+    missing = np.log(weights.BRIGHTEST) - float(np.quantile(logs, BRIGHTEST_RANKS).mean())
+    pull = slope * missing / weights.BRIGHTEST_SPREAD**2 + (LOGIT - unknowns.middle) / weights.MEAN_SPREAD**2
+    change = unknowns.relaxation * pull / ((slope / weights.BRIGHTEST_SPREAD) ** 2 + 1 / weights.MEAN_SPREAD**2)
+    unknowns.middle += change
+    unknowns.materials += change
+    unknowns.step = float(np.hypot(unknowns.step, np.log(_logistic(unknowns.middle) / before)))
 
 
 @dataclass(frozen=True)
@@ -216,6 +245,10 @@ def _levels(z: Floats, sources: Sources) -> Floats:
     """[k] radiance of sources."""
     clipped = np.exp(np.log(np.maximum(sources.clipped, DARKEST)).mean(axis=1))
     return np.asarray(np.where(sources.is_saturated, clipped, 1.0) * np.exp(z))
+
+
+def _logistic(logit: Any) -> Any:
+    return 1 / (1 + np.exp(-logit))
 
 
 def _huber(ratio: Floats) -> Floats:

@@ -31,7 +31,7 @@ class Sources:
     """[k, 3] radiance of saturated sources as pictures show it, 0 for others."""
     is_saturated: NDArray[np.bool_]
     offset: Floats
-    """[k] prior mean of the log radiance, over that of the mean light; of saturated ones, of their relative excess."""
+    """[k] prior mean of the log radiance over the pictures' mean; of saturated ones, of their relative excess."""
     deviation: Floats
     """[k] standard deviation of it."""
     pairs: Ints
@@ -89,7 +89,7 @@ def distant_sources(transport: Transport, closed: Floats, rows: Ints, *, with_in
         known=known,
         clipped=np.concatenate([np.zeros((LOBES, 3)), transport.clipped[:count]]),
         is_saturated=np.concatenate([np.zeros(LOBES, bool), transport.is_saturated[:count]]),
-        offset=np.concatenate([np.full(LOBES, weights.LOBE), offset]),
+        offset=np.concatenate([np.zeros(LOBES), offset]),
         deviation=np.concatenate([np.full(LOBES, weights.LOBE_SPREAD), deviation]),
         pairs=_PAIRS + LOBES,
         least_share=0.0 if with_indirect else LEAST_OPENNESS,

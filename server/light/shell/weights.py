@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-MEAN_ALBEDO = 0.6
-"""Mean reflectance of materials: walls and ceilings are mostly bright. It sets the level of the light."""
+MEAN_ALBEDO, MEAN_SPREAD = 0.33, 0.3
+"""Mean reflectance of a room's materials, with furniture and floors, and the standard deviation of its logit from
+room to room: two thirds lie from .27 to .4."""
+BRIGHTEST, BRIGHTEST_SPREAD = 0.55, 0.1
+"""Albedo of a room's brightest surface (BRIGHTEST_RANKS in objective.py), and the standard deviation of its logarithm:
+it sets the level of the light. The brightest paint differs by 13 % from room to room, mean albedo by 26 %. White paint
+is .8, but little of a room is as white."""
 ALBEDO_SPREAD = 0.5
-"""Standard deviation of the logit of a material's albedo: two thirds lie from .48 to .71, none above 1."""
+"""Standard deviation of the logit of a material's albedo about the mean of the room's."""
 MATERIAL_CHROMA = 0.8
 """Spacing of the grid of materials over log chroma: orange wood and white paint are a node apart. On a finer one, the
 light's colour and the materials' go on exchanging."""
-PATCH_NOISE = 0.15
+PATCH_NOISE = 0.13
 """Standard deviation of a patch's log radiance: transfer by rays, normals, what is not diffuse. With less, a clipped
 speck beside the paint of a few patches is found to be a lamp."""
 REGION_SPREAD = 0.05
 """Standard deviation of a region's log albedo about its surface's: stains, texture. More would take the gradients that
 tell where light comes from for texture."""
-SURFACE_SPREAD = 0.1
+SURFACE_SPREAD = 0.07
 """Standard deviation of a surface's log albedo about its material's (segments.py): more would take a wall in shade for
 a dark one."""
 DARK_EDGE = 0.03
@@ -24,21 +29,21 @@ of a Cauchy distribution there are more minima, between which the light jumps.""
 WHITE = 0.005
 """Deviation of a surface's log albedo above 0: nothing sends back more than it receives."""
 ONE_ALBEDO = 0.01
-"""Replaces the three spreads if albedo is constant."""
-HUBER = 1.5
+"""Replaces the spreads if albedo is constant, and that of the brightest surface."""
+HUBER = 1.0
 """A patch whose residual exceeds so many standard deviations of the noise counts as an outlier."""
-CELL_LOW, CELL_HIGH, CELL_HIDDEN = 0.4, 2.0, 0.7
-"""Standard deviations of a cell's log radiance about the mean's: of the shell below the height of windows and lamps and
-above it (a lamp is 50 times the mean), and of surface that was not seen."""
-LOBE, LOBE_SPREAD = -1.0, 2.0
-"""Mean and standard deviation of the log radiance of distant lobes, about the mean's: most of a sky is darker than its
-mean, and a sun is 50 times it."""
+CELL_LOW, CELL_HIGH, CELL_HIDDEN = 0.4, 2.5, 0.7
+"""Standard deviations of a cell's log radiance about the mean of what pictures show, since most of what they do not
+show is surface like it: of the shell below the height of windows and lamps and above it (a lamp is 100 times as
+bright), and of surface that was not seen."""
+LOBE_SPREAD = 2.0
+"""The same of distant lobes: a sun is 50 times as bright."""
 LIT_EXCESS, LIT_SPREAD = 0.2, 1.0
 """For saturated surface that may be lit paint: mean radiance beyond what the picture shows, relative to that, and the
 standard deviation of its log."""
 LAMP_EXCESS, LAMP_SPREAD = 1.0, 2.0
 """The same for lamps and windows: a bulb is 200 times as bright as a picture shows it."""
-SMOOTHNESS, EDGE = 1.0, 0.5
+SMOOTHNESS, EDGE = 1.3, 0.5
 """Weight of the squared difference of neighbouring cells' log radiance, and the difference from which it grows
 linearly: the rims of lamps and windows."""
 CHROMA_NOISE = 0.06

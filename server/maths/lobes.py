@@ -12,9 +12,8 @@ from server.maths.sh import sh_basis, spherical_fibonacci
 WIDTH_DEG = 35.0
 """Standard deviation of a lobe: narrower ones are not told apart by how diffuse surface is shaded (Ramamoorthi and
 Hanrahan 2001: bands above the second are shaded by less than 3 %)."""
-LOBES = 101
-"""3 for every square width of the sphere: of half as many, one took a light that lies between two of them, and which of
-them it was changed with little."""
+LOBES = 51
+"""1.5 for every square width of the sphere."""
 _DIRECTIONS = 4096  # of sums over the sphere
 
 Floats = NDArray[np.float64]

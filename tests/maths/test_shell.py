@@ -10,7 +10,7 @@ import pytest
 from server.light.shell import weights
 from server.light.shell.distant import distant_light
 from server.light.shell.evidence import DARKEST, log_chroma, materials_of
-from server.light.shell.objective import ONE_LOGIT, Unknowns, step
+from server.light.shell.objective import GIVEN_LOGIT, Unknowns, step
 from server.light.shell.patches import PATCH_M, RAYS, Patches, hemisphere_weights
 from server.light.shell.shell import (
     BEHIND_M,
@@ -385,13 +385,13 @@ def test_a_closed_box_says_nothing_of_what_is_beyond() -> None:
 
 def test_one_albedo_is_one_albedo() -> None:
     """Where it is known, the light of a white corner is known to its level."""
-    room = make_room(None, sky(np.array(OPEN[0])), dict.fromkeys(range(3), (weights.BRIGHTEST,) * 3))
+    room = make_room(None, sky(np.array(OPEN[0])), dict.fromkeys(range(3), (weights.GIVEN_ALBEDO,) * 3))
     truth = sky(np.array(OPEN[0]))(DIRECTIONS)
     unknowns, evidence, distant = Unknowns(), room.evidence, room.distant()
     for _ in range(25):
         step(unknowns, evidence, distant, Switches(albedos=False))
     used = unknowns.materials != Unknowns().materials
     assert used.any()
-    assert np.abs(unknowns.materials[used] - ONE_LOGIT).max() < 0.1
+    assert np.abs(unknowns.materials[used] - GIVEN_LOGIT).max() < 0.1
     light = distant_light(unknowns, 4)
     assert angle_deg(light.sh @ LUMINANCE, BASIS @ truth @ LUMINANCE) < 6

@@ -39,8 +39,7 @@ from server.light.shell.sources import Sources
 from server.light.shell.switches import Switches
 
 LOGIT = float(np.log(weights.MEAN_ALBEDO / (1 - weights.MEAN_ALBEDO)))
-ONE_LOGIT = float(np.log(weights.BRIGHTEST / (1 - weights.BRIGHTEST)))
-"""Of all surface, if albedo is constant."""
+GIVEN_LOGIT = float(np.log(weights.GIVEN_ALBEDO / (1 - weights.GIVEN_ALBEDO)))
 BRIGHTEST_RANKS = np.linspace(0.91, 0.99, 9)
 """Ranks of the patches, as shares of all, whose mean log albedo is the brightest surface's: without outliers, and with
 many patches, so that it changes steadily."""
@@ -81,7 +80,8 @@ class Unknowns:
     middle: float = LOGIT
     """m, about which the materials lie."""
     mean: float = 0.0
-    """Log of the mean radiance that pictures show, about which sources lie."""
+    """Log of the mean radiance about which sources lie: of what pictures show, or of the light where the mean albedo is
+    given."""
     radiance: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     """[k, 3] RGB of the sources."""
     curvature: Singles = field(default_factory=lambda: np.zeros((0, 0), np.float32))
@@ -140,7 +140,7 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     Products of matrices are float32: terms are good to a percent, and nothing cancels.
     """
     switches, count = switches or Switches(), sources.count
-    middle, unknowns.mean = unknowns.middle if switches.albedos else ONE_LOGIT, float(np.log(evidence.mean))
+    middle = _begin_level(unknowns, evidence, finds_level=(finds_level := switches.albedos and sources.finds_level))
     prior = np.where(sources.is_saturated, 0.0, unknowns.mean) + sources.offset
     known_logs = log_chroma(np.log(np.maximum(sources.known, DARKEST)))
     known = np.where(sources.known.max(axis=1) > 0, np.exp(known_logs[:, 0]), 0.0)
@@ -184,12 +184,21 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     unknowns.materials[nodes] += change[count:]
     offsets = surfaces.offsets(residual - design @ change)
     unknowns.offsets[evidence.rows] = offsets[evidence.surfaces]
-    if switches.albedos:
+    if finds_level:
         _shift_albedos(unknowns, _logistic(materials @ unknowns.materials[nodes]), offsets, evidence)
     seen = np.where(is_clipped, sent_chroma, evidence.chroma - known_part)
     unknowns.chroma = _solve_chroma(parts, seen, regions.columns(count), spreads.chroma, sources.pairs)
     logs = np.concatenate([np.log(_levels(unknowns.z, sources))[:, None], unknowns.chroma], axis=1)
     unknowns.radiance = np.exp(logs @ _FROM_CHROMA.T)
+
+
+def _begin_level(unknowns: Unknowns, evidence: Evidence, *, finds_level: bool) -> float:
+    """The logit of albedo about which the materials lie; sets the mean of the sources."""
+    middle = unknowns.middle if finds_level else GIVEN_LOGIT
+    unknowns.mean = float(np.log(evidence.mean / (1.0 if finds_level else weights.GIVEN_ALBEDO)))
+    if unknowns.known == 0:
+        unknowns.materials[:] = middle
+    return middle
 
 
 def _begin(z: Floats, count: int, evidence: Evidence, sources: Sources, known: Floats, albedos: Floats) -> Floats:

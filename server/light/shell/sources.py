@@ -31,11 +31,13 @@ class Sources:
     """[k, 3] radiance of saturated sources as pictures show it, 0 for others."""
     is_saturated: NDArray[np.bool_]
     offset: Floats
-    """[k] prior mean of the log radiance over the pictures' mean; of saturated ones, of their relative excess."""
+    """[k] prior mean of the log radiance over the mean; of saturated ones, of their relative excess."""
     deviation: Floats
     """[k] standard deviation of it."""
     pairs: Ints
     """[m, 2] neighbours."""
+    finds_level: bool = True
+    """The mean albedo of the materials, and so the level of the light, is found with the rest; else it is given."""
     least_share: float = 0.0
     """Patches that receive less than this share of their light from sources and known surface say nothing."""
 
@@ -89,8 +91,9 @@ def distant_sources(transport: Transport, closed: Floats, rows: Ints, *, with_in
         known=known,
         clipped=np.concatenate([np.zeros((LOBES, 3)), transport.clipped[:count]]),
         is_saturated=np.concatenate([np.zeros(LOBES, bool), transport.is_saturated[:count]]),
-        offset=np.concatenate([np.zeros(LOBES), offset]),
+        offset=np.concatenate([np.full(LOBES, weights.LOBE), offset]),
         deviation=np.concatenate([np.full(LOBES, weights.LOBE_SPREAD), deviation]),
         pairs=_PAIRS + LOBES,
+        finds_level=False,
         least_share=0.0 if with_indirect else LEAST_OPENNESS,
     )

@@ -9,6 +9,9 @@ BRIGHTEST, BRIGHTEST_SPREAD = 0.55, 0.1
 """Albedo of a room's brightest surface (BRIGHTEST_RANKS in objective.py), and the standard deviation of its logarithm:
 it sets the level of the light. The brightest paint differs by 13 % from room to room, mean albedo by 26 %. White paint
 is .8, but little of a room is as white."""
+GIVEN_ALBEDO = 0.6
+"""Albedo of all surface if it is constant, and mean albedo for the light from beyond the scan, whose direction turned
+by 23 degrees with the kitchen's volume where the level was found from the brightest surface."""
 ALBEDO_SPREAD = 0.5
 """Standard deviation of the logit of a material's albedo about the mean of the room's."""
 MATERIAL_CHROMA = 0.8
@@ -29,15 +32,16 @@ of a Cauchy distribution there are more minima, between which the light jumps.""
 WHITE = 0.005
 """Deviation of a surface's log albedo above 0: nothing sends back more than it receives."""
 ONE_ALBEDO = 0.01
-"""Replaces the spreads if albedo is constant, and that of the brightest surface."""
+"""Replaces the spreads if albedo is constant."""
 HUBER = 1.0
 """A patch whose residual exceeds so many standard deviations of the noise counts as an outlier."""
 CELL_LOW, CELL_HIGH, CELL_HIDDEN = 0.4, 2.5, 0.7
 """Standard deviations of a cell's log radiance about the mean of what pictures show, since most of what they do not
 show is surface like it: of the shell below the height of windows and lamps and above it (a lamp is 100 times as
 bright), and of surface that was not seen."""
-LOBE_SPREAD = 2.0
-"""The same of distant lobes: a sun is 50 times as bright."""
+LOBE, LOBE_SPREAD = -1.0, 2.0
+"""Mean and standard deviation of the log radiance of distant lobes, about the light's mean: most of a sky is darker
+than its mean, and a sun is 50 times it."""
 LIT_EXCESS, LIT_SPREAD = 0.2, 1.0
 """For saturated surface that may be lit paint: mean radiance beyond what the picture shows, relative to that, and the
 standard deviation of its log."""

@@ -10,7 +10,7 @@ from client.display.layers import DecodedLayer, decode_layer, put_over
 from client.streaming.client import Answer, StreamClient
 from protocol.messages import Wishes
 
-SIGN = b"v -1 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\nf 3 2 1\n"
+SIGN = b"v -1 0 0 1 .2 .1\nv 1 0 0 1 .2 .1\nv 0 2 0 1 .2 .1\nf 1 2 3\nf 3 2 1\n"  # each corner: place and colour
 
 
 async def main(url: str, count: int = 40) -> list[np.ndarray]:

@@ -54,7 +54,7 @@ def test_a_camera_at_rest_is_timed_once_nothing_is_computed_again(device: Device
     part = measure_rest(device, small_stage(tmp_path), 0, 110, lambda _text: None)
     rows = {row.name: row.value for row in part.rows}
     assert np.isfinite(rows["camera at rest: frame, median"])
-    assert 16 < rows["camera at rest: frames until nothing is computed again"] < 90
+    assert 8 < rows["camera at rest: frames until nothing is computed again"] < 90
     settling = measure_rest(device, small_stage(tmp_path), 0, 6, lambda _text: None)
     assert not settling.rows
     assert "did not settle within 6 frames" in settling.unmeasured[0].reason

@@ -23,7 +23,7 @@ speck beside the paint of a few patches is found to be a lamp."""
 REGION_SPREAD = 0.05
 """Standard deviation of a region's log albedo about its surface's: stains, texture. More would take the gradients that
 tell where light comes from for texture."""
-SURFACE_SPREAD = 0.07
+SURFACE_SPREAD = 0.09
 """Standard deviation of a surface's log albedo about its material's (segments.py): more would take a wall in shade for
 a dark one."""
 DARK_EDGE = 0.03

@@ -30,6 +30,7 @@ from server.room.room import Room
 from server.room.spots import SpotView
 from server.shading.composite import shown_picture
 from server.shading.layer import NOTHING, Layer
+from server.shading.touched_discs import without_touched
 from server.shading.traced_scene import middles_of
 from server.tracking.alignment import Alignment
 from server.transfer.samples import NO_SAMPLES, SampledTransfer, TransferSamples
@@ -256,7 +257,7 @@ class Pipeline:
             depth_views=self._transfer.depth_views,
             period=self._transfer.period,
             sh=sh,
-            split=split,
+            split=without_touched(split, objects),
             light_places=places,
             is_light_given=self._room.light.is_given,
             left_out=left_out,

@@ -65,6 +65,16 @@ def test_lamps_and_rest_are_the_whole() -> None:
     np.testing.assert_allclose(brought + irradiance(rest), irradiance(radiance), rtol=1e-9)
 
 
+@pytest.mark.parametrize("radius_m", [0.6, 0.9])
+def test_a_large_lamp_is_one(radius_m: float) -> None:
+    """Its rim, which the window leaves, is no other lamp."""
+    center = np.array([2.0, 1.8, 2.4])
+    lamps, _ = find_lamps(PLACE, *lit_by((center, radius_m, np.full(3, 8.0))))
+    assert len(lamps) == 1
+    np.testing.assert_allclose(lamps[0].center, center, atol=0.1)
+    assert lamps[0].radius_m == pytest.approx(radius_m, rel=0.15)
+
+
 def test_even_light_has_no_lamps() -> None:
     ends, radiance = lit_by()
     lamps, parts = find_lamps(PLACE, ends, radiance)

@@ -81,7 +81,7 @@ def _touching(centers: Floats) -> list[NDArray[np.int64]]:
 
 @dataclass(frozen=True)
 class BrightParts:
-    """Parts of the shell whose radiance above a floor lamps have, in their order."""
+    """Parts of the shell whose radiance above a floor lamps have, in the order in which they are taken."""
 
     floor: Floats
     """[3] radiance."""
@@ -91,7 +91,7 @@ class BrightParts:
     """Of what is above the floor in the middle of each."""
 
     def taken(self, number: int, ends: Floats, rest: Floats) -> Floats:
-        """[m, 3] what lamp `number` takes of `rest` [m, 3], the radiance of `ends` [m, 3] that those before it left."""
+        """[m, 3] what part `number` takes of `rest` [m, 3], the radiance of `ends` [m, 3] that those before it left."""
         near = np.exp(-((ends - self.centers[number]) ** 2).sum(axis=1) / (2 * WINDOW_M**2))
         return np.asarray(self.shares[number] * near[:, None] * np.maximum(rest - self.floor, 0.0))
 
@@ -107,12 +107,13 @@ def find_lamps(
 ) -> tuple[list[ShellLamp], BrightParts]:
     """At most `most` lamps seen from `position` [3], and the parts of the shell that they stand for.
 
+    Modes nearer to each other than the window are one lamp: a large one leaves a rim around its middle.
     ends: [m, 3] where evenly spread directions from there end on the shell; radiance: [m, 3]. emitted: what comes from
     elsewhere, as a sum of radiance over such directions and channels.
     """
     rest, parts = radiance, BrightParts(np.median(radiance, axis=0))
     total = float(radiance.sum()) + emitted
-    lamps: list[ShellLamp] = []
+    of_lamps: list[Floats] = []  # what each takes
     for _ in range(most):
         weights = np.maximum(rest - parts.floor, 0.0).sum(axis=1)
         if weights.sum() <= WEAK * total:
@@ -123,10 +124,20 @@ def find_lamps(
         if share <= 0.0:
             break
         parts = replace(parts, centers=(*parts.centers, center), shares=(*parts.shares, share))
-        taken = parts.taken(len(lamps), ends, rest)
-        lamps.append(_disc(position, ends, taken))
+        taken = parts.taken(len(parts.centers) - 1, ends, rest)
+        _add(of_lamps, ends, taken)
         rest = rest - taken
-    return lamps, parts
+    return [_disc(position, ends, taken) for taken in of_lamps], parts
+
+
+def _add(of_lamps: list[Floats], ends: Floats, taken: Floats) -> None:
+    """To the first lamp whose middle is as near as the window, or as a new one."""
+    middle = _middle(ends, taken)
+    for number, others in enumerate(of_lamps):
+        if np.linalg.norm(_middle(ends, others) - middle) < WINDOW_M:
+            of_lamps[number] = others + taken
+            return
+    of_lamps.append(taken)
 
 
 def _mode(ends: Floats, weights: Floats) -> Floats:
@@ -138,10 +149,16 @@ def _mode(ends: Floats, weights: Floats) -> Floats:
     return np.asarray(center)
 
 
+def _middle(ends: Floats, taken: Floats) -> Floats:
+    """[3] of the radiance `taken` [m, 3] at `ends` [m, 3]."""
+    weights = taken.sum(axis=1)
+    return np.asarray(weights @ ends / weights.sum())
+
+
 def _disc(position: Floats, ends: Floats, taken: Floats) -> ShellLamp:
     """The disc of the same centre, second moment and irradiance as the radiance `taken` [m, 3]."""
     weights = taken.sum(axis=1) / taken.sum()
-    center = weights @ ends
+    center = _middle(ends, taken)
     spread = float(weights @ ((ends - center) ** 2).sum(axis=1))
     radius_m = max(float(np.sqrt(2 * spread)), LEAST_RADIUS_M)
     distance_m = float(np.linalg.norm(center - position))

@@ -1,4 +1,4 @@
-"""Discs of the light at objects: none where an object stands on one, all of it from a radius off the object's box on."""
+"""Discs of the light at objects: none under an object, all of it from a radius off the box on."""
 
 from __future__ import annotations
 

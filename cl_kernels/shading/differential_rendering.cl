@@ -15,6 +15,7 @@
 // transfer [rows][cols][COEFFICIENTS]; hits [rows][cols]: see indirect.cl.
 // -> ratio [rows][cols] (rgb, w = 1), shaded [rows][cols] (rgb of R, w = 1); w = 0 where there is no surface. R is computed even
 // where objects take nothing: other parts of the light (shadow_map.cl), bounces and refined pixels (adaptive.cl) relate to it.
+// scene.every: a sample traces every n-th direction of its set, and its neighbours the others.
 kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, global const float *transfer, global const float4 *hits,
                         global float4 *ratio, global float4 *shaded) {
     const int col = get_global_id(0);
@@ -38,7 +39,8 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, global const floa
     float3 without = (float3)(0.0f);
     for (int i = 0; i < COEFFICIENTS; i++) without += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
     without = shading_without(arrives, without, openness[sample], hits[sample]);
-    const float3 taken = taken_from_real(volume, things, arrives, scene.objects.ball, position.xyz, normal.xyz, 0, 0, 1, own, INTERLEAVE, free);
+    const float3 taken = taken_from_real(volume, things, arrives, scene.objects.ball, position.xyz, normal.xyz, 0,
+                                         direction_subset(row, col, scene.every), scene.every, own, INTERLEAVE, free);
     const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
     ratio[sample] = (float4)(fmax(without - taken, floor) / fmax(without, floor), 1.0f);
     shaded[sample] = (float4)(without, 1.0f);

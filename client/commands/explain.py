@@ -20,6 +20,7 @@ PURPOSES = {
     "draw_depth_views": "draws the depth views for visibility look-up",
     "prepare_rays": "prepares the geometry that rays are traced through",
     "shadow_map": "draws shadow maps of the objects for the dominant lights",
+    "first_shadow": "computes the shadows that virtual objects are lit in, for bounced light",
     "light_objects": "lights the objects, for bounced light on real surfaces and on each other",
     "light_samples": "computes the dominant lights on real surfaces",
     "shadow_real": "computes shadows of virtual objects on real surfaces",

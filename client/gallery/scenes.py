@@ -126,7 +126,8 @@ _NOISE: dict[str, Any] = {
 
 _DRAWN = {"rasterize", "cover", "composite"}
 _SHADED = _DRAWN | {"prepare_rays", "add_objects", "shade_virtual"}
-_STANDS = _SHADED | {"light_objects", "shadow_real", "mark_changes"}
+_SENT = {"first_shadow", "light_objects"}
+_STANDS = _SHADED | _SENT | {"shadow_real", "mark_changes"}
 _MAPPED = {"shadow_map", "light_samples", "direct_real"}
 
 
@@ -148,7 +149,7 @@ GALLERY: dict[str, GalleryScene] = {
         "a ball beside the picture, whose sharp shadow falls into the picture",
         _FLOOR,
         _SUN,
-        _always({"composite", "prepare_rays", "light_objects", "shadow_real", "mark_changes", "bounce_real"}, _MAPPED),
+        _always({"composite", "prepare_rays", "shadow_real", "mark_changes", "bounce_real"}, _SENT, _MAPPED),
         (GalleryObject(0.3, (1.15, 0.35, 0.2)),),
     ),
     "floating": GalleryScene(
@@ -231,7 +232,7 @@ GALLERY: dict[str, GalleryScene] = {
         "a ball as black as soot, off the floor",
         _FLOOR,
         _SOFT,
-        _always(_STANDS - {"light_objects"}, {"bounce_real"}),
+        _always(_STANDS - _SENT, {"bounce_real"}),
         (GalleryObject(0.24, (0.0, 0.0, 0.0), color=(0.0, 0.0, 0.0)),),
     ),
     "comes-in": GalleryScene(

@@ -12,6 +12,7 @@ from server.effects.resources import (
     DirectReal,
     DirectVirtual,
     FaintShadows,
+    FirstShadow,
     Gain,
     KnownLight,
     RefinedReal,
@@ -39,6 +40,9 @@ from server.transfer.indirect import Indirect
 from server.transfer.radiance_transfer import Transfer
 from server.transfer.real_depth_views import RealDepthViews
 from server.transfer.sample_grid import SampleGrid
+
+FIRST_SHADOW_EVERY = 4
+"""Of the directions of a sample, for `first_shadow`: every point of an object sees the shadows of many samples."""
 
 
 def rasterize(context: FrameContext, objects: VirtualObjects) -> VirtualSurface:
@@ -69,10 +73,24 @@ def shadow_map(context: FrameContext, objects: VirtualObjects, light: SharpLight
     return shadow_maps.draw_shadow_maps(context.engine, context.volume, light, objects, context.ray_length_m)
 
 
-def light_objects(context: FrameContext, scene: TracedScene, maps: ShadowMaps | None) -> VirtualPointLights:
+def first_shadow(
+    context: FrameContext,
+    transfer: Transfer,
+    scene: TracedScene,
+    indirect: Indirect | None,
+    maps: ShadowMaps | None,
+    samples: DirectSamples | None,
+) -> FirstShadow:
+    """What virtual things take from real ones, for the light that they send: an object's underside sees its shadow."""
+    return FirstShadow(_shadow(context, transfer, scene, indirect, maps, samples, FIRST_SHADOW_EVERY))
+
+
+def light_objects(
+    context: FrameContext, scene: TracedScene, maps: ShadowMaps | None, shadow: FirstShadow | None
+) -> VirtualPointLights:
     """What virtual objects send to real surface and to one another (7.3.3)."""
     placed = place_points(context.engine, scene.objects)
-    lights = differential.light_points(context.engine, scene, placed)
+    lights = differential.light_points(context.engine, _changed_by(context, scene, shadow), placed)
     if maps is not None:
         shadow_maps.light_points_by_discs(context.engine, placed, lights, maps)
     return lights
@@ -95,8 +113,19 @@ def shadow_real(
     samples: DirectSamples | None,
 ) -> RealShadow:
     """What virtual things take from real ones, less what they send to them (eq. 7.1)."""
-    lit = replace(scene, point_lights=lights)
-    shadow = differential.shadow_real(context.engine, context.camera, context.surface, transfer, lit, indirect)
+    return _shadow(context, transfer, replace(scene, point_lights=lights), indirect, maps, samples)
+
+
+def _shadow(
+    context: FrameContext,
+    transfer: Transfer,
+    scene: TracedScene,
+    indirect: Indirect | None,
+    maps: ShadowMaps | None,
+    samples: DirectSamples | None,
+    every: int = 1,
+) -> RealShadow:
+    shadow = differential.shadow_real(context.engine, context.camera, context.surface, transfer, scene, indirect, every)
     if maps is None or samples is None:
         return shadow
     return replace(shadow, whole=shadow_maps.with_direct(context.engine, shadow, samples, maps))
@@ -146,12 +175,16 @@ def add_objects(
     bounced: BouncedShadow | None,
 ) -> ChangedScene:
     """The scene as virtual objects have changed it: what they send, and what real surface sends besides them."""
-    shadow = bounced or ratio
+    return ChangedScene(_changed_by(context, replace(scene, point_lights=lights), bounced or ratio))
+
+
+def _changed_by(context: FrameContext, scene: TracedScene, shadow: RealShadow | None) -> TracedScene:
+    """`scene` with what real surface sends under `shadow`."""
     if shadow is None:
-        return ChangedScene(replace(scene, point_lights=lights))
+        return scene
     change = shadow.whole or shadow
     changed = Changed(context.camera, context.camera_from_volume, context.surface.positions, change)
-    return ChangedScene(replace(scene, point_lights=lights, changed=changed))
+    return replace(scene, changed=changed)
 
 
 def shade_virtual(context: FrameContext, virtual: VirtualSurface, scene: ChangedScene) -> VirtualOcclusion:

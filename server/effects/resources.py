@@ -43,6 +43,8 @@ Coverage = NewType("Coverage", cl_array.Array)
 """How much of each pixel the objects cover, of rasterize.py."""
 ChangedScene = NewType("ChangedScene", TracedScene)
 """The scene with the light that the objects send and the changed light that real surface sends."""
+FirstShadow = NewType("FirstShadow", RealShadow)
+"""RealShadow of objects that send no light yet, along some of the directions."""
 Reflected = NewType("Reflected", cl_array.Array)
 """Radiance that glossy virtual surface reflects."""
 VirtualOcclusion = NewType("VirtualOcclusion", SampleGrid)

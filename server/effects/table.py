@@ -27,6 +27,7 @@ EFFECTS: EffectTable[SceneFacts] = EffectTable(
         Effect(f.draw_depth_views),
         Effect(f.prepare_rays),
         Effect(f.shadow_map),
+        Effect(f.first_shadow, disabled_by=(rules.no_indirect,), culled_by=(rules.no_influence,)),
         Effect(f.light_objects, disabled_by=(rules.no_indirect,), culled_by=(rules.dark_things,)),
         Effect(f.light_samples, disabled_by=(rules.no_indirect,)),
         Effect(f.add_objects),

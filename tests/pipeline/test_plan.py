@@ -342,7 +342,9 @@ PLAIN: dict[Any, object] = {SharpLight: SOFT, RealDepthViews: TRACED, Indirect: 
             {RealDepthViews: TRACED},
             SceneFacts(objects_in_view=1, adaptive=True, indirect=True, brightness=BOUNDED, influence=NOWHERE),
             SHADED | {"light_objects", "refine_virtual", "match_average", "shadow_map", "direct_virtual"},
-            {**BY_RAYS, "reflect": "glossy"} | dict.fromkeys(OF_REAL, "hardly change") | {"refine_real": ""},
+            {**BY_RAYS, "reflect": "glossy"}
+            | dict.fromkeys((*OF_REAL, "first_shadow"), "hardly change")
+            | {"refine_real": ""},
         ),
         (
             {},

@@ -24,8 +24,9 @@ WINDOW_M = 0.5
 WEAK, STRONG = 0.02, 0.06
 """Shares of the radiance that arrives from the shell. Below the first value a mode is no lamp; above the second its
 light becomes a disc completely; between the two, in part."""
-LEAST_RADIUS_M, LEAST_BULB_M = 0.05, 0.02
-"""Least radius of a disc on the shell, and of one of saturated surface: shadows of smaller discs are no sharper."""
+LEAST_RADIUS_M, LEAST_BULB_M = 0.3, 0.02
+"""Least radius of a disc on the shell, half a cell and half a ceiling panel: smaller ones are not told apart. And of
+one of saturated surface: shadows of smaller discs are no sharper."""
 TOUCHING_M = 1.5 * CELL_M
 """Emitters nearer to each other than this are parts of one window."""
 _SHIFTS = 12
@@ -103,13 +104,19 @@ class BrightParts:
 
 
 def find_lamps(
-    position: Floats, ends: Floats, radiance: Floats, most: int = MOST_LIGHTS, emitted: float = 0.0
+    position: Floats,
+    ends: Floats,
+    radiance: Floats,
+    blur_m2: Floats,
+    most: int = MOST_LIGHTS,
+    emitted: float = 0.0,
 ) -> tuple[list[ShellLamp], BrightParts]:
     """At most `most` lamps seen from `position` [3], and the parts of the shell that they stand for.
 
     Modes nearer to each other than the window are one lamp: a large one leaves a rim around its middle.
-    ends: [m, 3] where evenly spread directions from there end on the shell; radiance: [m, 3]. emitted: what comes from
-    elsewhere, as a sum of radiance over such directions and channels.
+    ends: [m, 3] where evenly spread directions from there end on the shell; radiance: [m, 3]; blur_m2: [m] by how much
+    its variance over the shell is too large (Shell.blur_m2). emitted: what comes from elsewhere, as a sum of radiance
+    over such directions and channels.
     """
     rest, parts = radiance, BrightParts(np.median(radiance, axis=0))
     total = float(radiance.sum()) + emitted
@@ -127,7 +134,7 @@ def find_lamps(
         taken = parts.taken(len(parts.centers) - 1, ends, rest)
         _add(of_lamps, ends, taken)
         rest = rest - taken
-    return [_disc(position, ends, taken) for taken in of_lamps], parts
+    return [_disc(position, ends, taken, blur_m2) for taken in of_lamps], parts
 
 
 def _add(of_lamps: list[Floats], ends: Floats, taken: Floats) -> None:
@@ -155,12 +162,12 @@ def _middle(ends: Floats, taken: Floats) -> Floats:
     return np.asarray(weights @ ends / weights.sum())
 
 
-def _disc(position: Floats, ends: Floats, taken: Floats) -> ShellLamp:
-    """The disc of the same centre, second moment and irradiance as the radiance `taken` [m, 3]."""
+def _disc(position: Floats, ends: Floats, taken: Floats, blur_m2: Floats) -> ShellLamp:
+    """The disc of the same centre, second moment, less `blur_m2`, and irradiance as the radiance `taken` [m, 3]."""
     weights = taken.sum(axis=1) / taken.sum()
     center = _middle(ends, taken)
-    spread = float(weights @ ((ends - center) ** 2).sum(axis=1))
-    radius_m = max(float(np.sqrt(2 * spread)), LEAST_RADIUS_M)
+    spread = float(weights @ (((ends - center) ** 2).sum(axis=1) - blur_m2))
+    radius_m = max(float(np.sqrt(2 * max(spread, 0.0))), LEAST_RADIUS_M)
     distance_m = float(np.linalg.norm(center - position))
     irradiance = 4 * np.pi / len(ends) * taken.sum(axis=0)
     return ShellLamp(center, radius_m, irradiance * distance_m**2 / (np.pi * radius_m**2))

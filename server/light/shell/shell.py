@@ -93,6 +93,15 @@ class Shell:
         return np.asarray(self.low + share.reshape(-1, 3) * (self.high - self.low))
 
     @cached_property
+    def blur_m2(self) -> Floats:
+        """[SIDES] by how much bilinear radiance on a face is wider than what lights it: variance along both axes.
+
+        A lamp smaller than a cell becomes the cell's tent, whose variance is a sixth of the square of its size.
+        """
+        squares = ((self.high - self.low) / SIDE) ** 2 / 6
+        return np.repeat(squares.sum() - squares, 2)
+
+    @cached_property
     def is_low(self) -> NDArray[np.bool_]:
         """[CELLS] cells below the height of windows and lamps."""
         return np.asarray(self.centers[:, 2] < self.floor_m + LAMPS_ABOVE_M)

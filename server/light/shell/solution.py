@@ -16,7 +16,7 @@ from server.light.shell.bright_surface import Emitters
 from server.light.shell.distant import distant_light
 from server.light.shell.lamps import ShellLamp, emitting_lamps, find_lamps
 from server.light.shell.objective import Unknowns
-from server.light.shell.shell import CORNERS, Shell
+from server.light.shell.shell import CORNERS, SIDE, Shell
 from server.light.shell.spread import deviations, spread_deg
 from server.light.shell.transport import KNOWN, NO_CELL, Met, bright_keys, columns_of, meet
 from server.maths.dominant import MOST_LIGHTS
@@ -116,27 +116,29 @@ class Solution:
 
     def _seen_beyond(self, positions: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
         middle = positions.mean(axis=0)
-        ends, radiance = self._sent_by_shell(middle)
+        ends, radiance, blur_m2 = self._sent_by_shell(middle)
         sent = self._sent_by_emitters
         emitting = emitting_lamps(middle, self.emitters, sent, 4 * np.pi / DIRECTIONS * float(radiance.sum()))
         emitted = DIRECTIONS / (4 * np.pi) * float((self._emitting_angles(middle) @ sent).sum())
-        lamps, parts = find_lamps(middle, ends, radiance, MOST_LIGHTS - len(emitting), emitted)
+        lamps, parts = find_lamps(middle, ends, radiance, blur_m2, MOST_LIGHTS - len(emitting), emitted)
         whole, rest = [], []
         for position in positions:
-            ends, radiance = self._sent_by_shell(position)
+            ends, radiance, _ = self._sent_by_shell(position)
             towards = sh_basis(self.emitters.seen_from(position[None])[0][0], bands)
             from_emitters = towards.T @ (self._emitting_angles(position)[:, None] * sent)
             whole.append(_basis(bands) @ radiance + from_emitters)
             rest.append(_basis(bands) @ parts.rest(ends, radiance))
         return np.array(whole), np.array(rest), [*emitting, *lamps]
 
-    def _sent_by_shell(self, position: Floats) -> tuple[Floats, Floats]:
-        """[DIRECTIONS, 3] where look-up directions from `position` end on the shell, and its radiance, likewise."""
+    def _sent_by_shell(self, position: Floats) -> tuple[Floats, Floats, Floats]:
+        """[DIRECTIONS, 3] where look-up directions from `position` end on the shell, its radiance, likewise, and
+        [DIRECTIONS] Shell.blur_m2 there."""
         directions = look_up_directions()[0]
         start = np.broadcast_to(position, directions.shape)
         cells, shares = self.shell.exits(start, directions)
         ends = position + self.shell.distances(start, directions).min(axis=-1)[:, None] * directions
-        return ends, np.einsum("mc,mcr->mr", shares, self.near.radiance[cells])
+        radiance = np.einsum("mc,mcr->mr", shares, self.near.radiance[cells])
+        return ends, radiance, self.shell.blur_m2[cells[:, 0] // SIDE**2]
 
     def _emitting_angles(self, position: Floats) -> Floats:
         """[k] sr under which each emitter is seen from `position`."""

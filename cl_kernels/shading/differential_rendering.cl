@@ -15,35 +15,44 @@
 // transfer [rows][cols][COEFFICIENTS]; hits [rows][cols]: see indirect.cl.
 // -> ratio [rows][cols] (rgb, w = 1), shaded [rows][cols] (rgb of R, w = 1); w = 0 where there is no surface. R is computed even
 // where objects take nothing: other parts of the light (shadow_map.cl), bounces and refined pixels (adaptive.cl) relate to it.
-// scene.every: a sample traces every n-th direction of its set, and its neighbours the others.
-kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, global const float *transfer, global const float4 *hits,
+// One item a block of `step` x `step` samples, whose ratio is that of the first of them with surface.
+kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, global const float *transfer, global const float4 *hits,
                         global float4 *ratio, global float4 *shaded) {
-    const int col = get_global_id(0);
-    const int row = get_global_id(1);
     const Grid grid = scene.samples;
-    if (col >= grid.cols || row >= grid.rows) return;
-    const int sample = row * grid.cols + col;
-    const int pixel = sample_pixel(grid, row, col);
-    const float4 normal = normals[pixel], position = positions[pixel];
-    if (position.w <= 0.0f || normal.w <= 0.0f) {
-        ratio[sample] = shaded[sample] = (float4)(0.0f);
-        return;
+    const int2 begin = step * (int2)(get_global_id(0), get_global_id(1));
+    const int2 end = min(begin + step, (int2)(grid.cols, grid.rows));
+    int sample = -1, pixel = 0;
+    for (int row = begin.y; row < end.y; row++) {
+        for (int col = begin.x; col < end.x; col++) {
+            const int here = sample_pixel(grid, row, col);
+            if (sample >= 0 || positions[here].w <= 0.0f || normals[here].w <= 0.0f) continue;
+            sample = row * grid.cols + col, pixel = here;
+        }
     }
-    const Volume volume = SOLIDS_OF_SCENE;
-    const Objects things = OBJECTS_OF_SCENE(0.0f);
-    const int place = place_near(scene.light.table, light_table, position.xyz);
-    const Arriving arrives = ARRIVING_UNCHANGED(place);
-    global const float4 *light = coefficients_of(scene.light.table, light_table, place);
-    global const uint *free = free_mask + sample * MASK_WORDS;
-    global const uchar *own = sets + sample * INTERLEAVE;
-    float3 without = (float3)(0.0f);
-    for (int i = 0; i < COEFFICIENTS; i++) without += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
-    without = shading_without(arrives, without, openness[sample], hits[sample]);
-    const float3 taken = taken_from_real(volume, things, arrives, scene.objects.ball, position.xyz, normal.xyz, 0,
-                                         direction_subset(row, col, scene.every), scene.every, own, INTERLEAVE, free);
-    const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
-    ratio[sample] = (float4)(fmax(without - taken, floor) / fmax(without, floor), 1.0f);
-    shaded[sample] = (float4)(without, 1.0f);
+    float3 of_ratio = (float3)(0.0f), of_shaded = (float3)(0.0f);
+    if (sample >= 0) {
+        const float3 position = positions[pixel].xyz, normal = normals[pixel].xyz;
+        const Volume volume = SOLIDS_OF_SCENE;
+        const Objects things = OBJECTS_OF_SCENE(0.0f);
+        const int place = place_near(scene.light.table, light_table, position);
+        const Arriving arrives = ARRIVING_UNCHANGED(place);
+        global const float4 *light = coefficients_of(scene.light.table, light_table, place);
+        global const uint *free = free_mask + sample * MASK_WORDS;
+        global const uchar *own = sets + sample * INTERLEAVE;
+        for (int i = 0; i < COEFFICIENTS; i++) of_shaded += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
+        of_shaded = shading_without(arrives, of_shaded, openness[sample], hits[sample]);
+        const float3 taken = taken_from_real(volume, things, arrives, scene.objects.ball, position, normal, 0, 0, 1, own, INTERLEAVE, free);
+        const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
+        of_ratio = fmax(of_shaded - taken, floor) / fmax(of_shaded, floor);
+    }
+    for (int row = begin.y; row < end.y; row++) {
+        for (int col = begin.x; col < end.x; col++) {
+            const int there = sample_pixel(grid, row, col);
+            const int known = positions[there].w > 0.0f && normals[there].w > 0.0f;
+            ratio[row * grid.cols + col] = known ? (float4)(of_ratio, 1.0f) : (float4)(0.0f);
+            shaded[row * grid.cols + col] = known ? (float4)(of_shaded, 1.0f) : (float4)(0.0f);
+        }
+    }
 }
 
 // Light that a sample of real surface gains from other real surface whose shading virtual objects changed (eq. 7.6: R'_ID - R_ID),

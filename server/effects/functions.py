@@ -41,9 +41,6 @@ from server.transfer.radiance_transfer import Transfer
 from server.transfer.real_depth_views import RealDepthViews
 from server.transfer.sample_grid import SampleGrid
 
-FIRST_SHADOW_EVERY = 4
-"""Of the directions of a sample, for `first_shadow`: every point of an object sees the shadows of many samples."""
-
 
 def rasterize(context: FrameContext, objects: VirtualObjects) -> VirtualSurface:
     """Draw the virtual objects into their geometry buffer (fig. 7.5)."""
@@ -81,8 +78,11 @@ def first_shadow(
     maps: ShadowMaps | None,
     samples: DirectSamples | None,
 ) -> FirstShadow:
-    """What virtual things take from real ones, for the light that they send: an object's underside sees its shadow."""
-    return FirstShadow(_shadow(context, transfer, scene, indirect, maps, samples, FIRST_SHADOW_EVERY))
+    """What virtual things take from real ones, for the light that they send: an object's underside sees its shadow.
+
+    At every fourth sample: a point of an object sees the shadows of many.
+    """
+    return FirstShadow(_shadow(context, transfer, scene, indirect, maps, samples, step=2))
 
 
 def light_objects(
@@ -123,9 +123,9 @@ def _shadow(
     indirect: Indirect | None,
     maps: ShadowMaps | None,
     samples: DirectSamples | None,
-    every: int = 1,
+    step: int = 1,
 ) -> RealShadow:
-    shadow = differential.shadow_real(context.engine, context.camera, context.surface, transfer, scene, indirect, every)
+    shadow = differential.shadow_real(context.engine, context.camera, context.surface, transfer, scene, indirect, step)
     if maps is None or samples is None:
         return shadow
     return replace(shadow, whole=shadow_maps.with_direct(context.engine, shadow, samples, maps))

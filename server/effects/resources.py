@@ -44,7 +44,7 @@ Coverage = NewType("Coverage", cl_array.Array)
 ChangedScene = NewType("ChangedScene", TracedScene)
 """The scene with the light that the objects send and the changed light that real surface sends."""
 FirstShadow = NewType("FirstShadow", RealShadow)
-"""RealShadow of objects that send no light yet, along some of the directions."""
+"""RealShadow of objects that send no light yet, in blocks of 2 x 2 samples."""
 Reflected = NewType("Reflected", cl_array.Array)
 """Radiance that glossy virtual surface reflects."""
 VirtualOcclusion = NewType("VirtualOcclusion", SampleGrid)

@@ -66,21 +66,21 @@ def shadow_real(
     transfer: Transfer,
     scene: TracedScene,
     indirect: Indirect | None = None,
-    every: int = 1,
+    step: int = 1,
 ) -> RealShadow:
     """Ratio R' / R of real surface shaded with and without the objects, at the transfer's samples (eq. 7.1).
 
-    indirect: radiance from surfaces at the same samples. every: a sample looks for objects along every n-th of its
-    directions, and its neighbours along the others.
+    indirect: radiance from surfaces at the same samples. step: blocks of step x step samples are shaded as one of them.
     """
     shape, buffers = (transfer.rows, transfer.cols), engine.buffers(_Buffers)
     ratio, shaded = buffers.ratio.array(shape), buffers.shaded.array(shape)
     engine.launch(
         engine.kernel("differential_rendering.cl", "shadow_real", **_sample_defines(engine, transfer, scene)),
-        (transfer.cols, transfer.rows),
-        scene.parameters(engine, sample_grid(camera, transfer), every),
+        (-(-transfer.cols // step), -(-transfer.rows // step)),
+        scene.parameters(engine, sample_grid(camera, transfer)),
         *scene.real_arguments(engine),
         *sample_arguments(engine, surface, transfer),
+        step,
         transfer.coefficients,
         indirect.hits if indirect else no_hits(engine, transfer),
         ratio,

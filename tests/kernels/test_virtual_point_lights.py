@@ -27,10 +27,11 @@ from server.shading.differential_rendering import (
     shadow_real,
     shadow_virtual,
 )
-from server.shading.traced_scene import trace_scene, upload_light
+from server.shading.traced_scene import Changed, trace_scene, upload_light
 from server.shading.virtual_point_lights import place_points
 from server.transfer.indirect import Indirect, MeanSent, gather_hits, no_hits, observe_indirect
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
+from server.transfer.sample_grid import SampleGrid
 from tests.scenes import lights
 from tests.scenes.analytic import Floats, look_at
 from tests.scenes.lanes import KINDS
@@ -89,6 +90,7 @@ def light_floor(
     unseen: ArrayLike = WHITE,
     exposure: float = 1.0,
     stride: int = 3,
+    step: int = 1,
 ) -> Lit:
     """Ratios on a floor whose surroundings send `color`, and beyond pictures `unseen`."""
     light = lights.uniform() if light is None else light
@@ -103,7 +105,7 @@ def light_floor(
     device_light = upload_light(engine, light, rays, indirect=indirect, exposure=exposure)
     traced = trace_scene(engine, volume, device_light, rays, ROOM_M, objects)
     traced = replace(traced, point_lights=light_points(engine, traced))
-    shadow: RealShadow = shadow_real(engine, camera, surface, transfer, traced, indirect)
+    shadow: RealShadow = shadow_real(engine, camera, surface, transfer, traced, indirect, step)
     refined = refine_real(engine, camera, surface, traced, shadow)
     return Lit(
         download4(engine, shadow.values).astype(float),
@@ -174,6 +176,17 @@ def test_rims_say_what_samples_say(engine: Engine, monkeypatch: pytest.MonkeyPat
     apart = middle[both][:, :3] - lit.ratio[both][:, :3]
     assert np.abs(apart.mean(axis=0)).max() < 0.01  # single pixels differ by the directions they trace
     assert np.sqrt((apart**2).mean()) < 0.06
+
+
+@pytest.mark.parametrize("step", [2, 3, 5])
+def test_blocks_are_shaded_as_their_first_sample(engine: Engine, step: int) -> None:
+    """Where they have surface."""
+    each, blocks = (light_floor(engine, [placed(engine, PLATE, np.zeros(3))], step=n) for n in (1, step))
+    rows, cols = np.indices(each.ratio.shape[:2]) // step * step
+    for one, other in ((each.ratio, blocks.ratio), (each.shaded, blocks.shaded)):
+        assert one[..., 3].all()
+        np.testing.assert_array_equal(other, one[rows, cols])
+    assert np.ptp(each.ratio[..., 0]) > 0.1
 
 
 def test_exposure_scales_both_sides(engine: Engine) -> None:
@@ -378,7 +391,8 @@ def seen_floor(points: Floats, normals: Floats) -> tuple[Floats, Floats]:
         seen = met @ camera_from_volume[:3, :3].T + camera_from_volume[:3, 3]
         pixel = seen[:, :2] / np.maximum(seen[:, 2:], 1e-6) * 45 + [31.5, 23.5]
         inside = (seen[:, 2] > 0.01) & (np.abs(pixel - [31.5, 23.5]) < [32, 24]).all(axis=1)
-        shown.append((cosine * (met_in & inside)).sum() / cosine.sum())
+        is_floor = np.abs(met[:, 1] - 0.1) < 2 * VOXEL_M
+        shown.append((cosine * (met_in & inside & is_floor)).sum() / cosine.sum())
         hidden.append((cosine * met_in).sum() / cosine.sum())
     return np.array(shown), np.array(hidden)
 
@@ -401,6 +415,39 @@ def test_a_wall_loses_what_a_shadowed_floor_sends_less(device: Device, kind: typ
     change = ratio[floor_rows][:, :3] - FLOOR_RATIO
     assert np.abs(change).mean() < 0.005  # the wall sends it what it did; only its foot passes for the floor's
     assert np.median(np.abs(change)) < 1e-6
+
+
+def test_an_underside_loses_what_a_shadowed_floor_sends_less(engine: Engine) -> None:
+    """A white plate, under a light and over surface that send 1: each point loses its share of the floor's loss."""
+    view = look_at((0.48, 0.5, 0.9), (0.48, 0.2, 0.2))
+    volume, rays = fill_volume(engine, CORNER, VOXEL_M), direction_sets(81, 4)
+    paint(engine, volume, np.ones((*voxels_of(volume), 3)))
+    surface = seen_surface(engine, volume, CAMERA, view)
+    positions = download4(engine, surface.positions)
+    is_floor = np.abs(positions[..., 1:2] - 0.1) < VOXEL_M
+    ratio = engine.workspace.upload("test_ratio", float4(np.where(is_floor, FLOOR_RATIO, 1.0), positions[..., 3]))
+    changed = Changed(CAMERA, inverse_rigid(view), surface.positions, SampleGrid(1, ratio))
+    hits = engine.workspace.upload("test_hits", float4(np.ones((*positions.shape[:2], 3)), positions[..., 3]))
+    light = upload_light(engine, lights.uniform(), rays, indirect=Indirect(hits, np.ones(3)))
+    traced = trace_scene(engine, volume, light, rays, ROOM_M, [placed(engine, PLATE)])
+    before, after = (
+        download4(engine, light_points(engine, replace(traced, changed=change)).radiances)[:, :3].astype(float)
+        for change in (None, changed)
+    )
+    placed_points = place_points(engine, traced.objects)
+    points, normals = (
+        download4(engine, a)[: placed_points.count, :3].astype(float)
+        for a in (placed_points.points, placed_points.normals)
+    )
+    down = normals[:, 1] < -0.9
+    shown, _ = seen_floor(points[down], normals[down])
+    assert shown.max() > 0.5
+    lost = before[down] - after[down]
+    for channel, change in enumerate(1 - FLOOR_RATIO):
+        slope = (lost[:, channel] @ shown) / (shown @ shown)
+        assert slope == pytest.approx(change, rel=0.1)
+    up = normals[:, 1] > 0.9
+    np.testing.assert_allclose(before[up], after[up], atol=1e-3)  # but for the wall's foot
 
 
 def test_a_dark_floor_has_nothing_to_lose(engine: Engine) -> None:

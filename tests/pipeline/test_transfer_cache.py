@@ -48,11 +48,6 @@ def pictures_of(results: list[FrameResult]) -> Pictures:
     return [result.color for result in results if result.color is not None]
 
 
-def spare_pixels(preset: Preset) -> int:
-    """A cell of 4 x 4 pixels, whose shadow may be just strong enough to be refined in one of two pictures."""
-    return 16 if PRESETS[preset].adaptive else 0
-
-
 @pytest.mark.parametrize(
     ("name", "preset"),
     [
@@ -83,7 +78,7 @@ def test_a_moving_camera_shows_what_it_would_without(
     for cached, repeated, exact in zip(on, again, off, strict=True):
         np.testing.assert_array_equal(cached, repeated)
         apart = np.abs(cached.astype(int) - exact).max(axis=-1)
-        assert (apart > 12).sum() <= spare_pixels(preset)  # seen: 6 at most elsewhere, with samples 2.5 cm apart
+        assert apart.max() <= 12  # seen: 6, with samples 2.5 cm apart
         assert (apart > 1).mean() < 0.03  # seen: 0.016
         assert flip_map(cached, exact).mean() < 0.006  # seen: 0.0038
     assert np.abs(on[0].astype(int) - off[0]).max() <= (1 if PRESETS[preset].image_space else 0)
@@ -99,7 +94,7 @@ def test_a_thing_that_comes_in_shades_nearly_as_without(device: Device, preset: 
     )
     for cached, exact in zip(on, off, strict=True):
         apart = np.abs(cached.astype(int) - exact).max(axis=-1)
-        assert (apart > 18).sum() <= spare_pixels(preset)  # seen: 10 at most elsewhere
+        assert apart.max() <= 18  # seen: 10
         assert (apart > 1).mean() < 0.02  # seen: 0.013
         assert flip_map(cached, exact).mean() < 0.009  # seen: 0.0048
 

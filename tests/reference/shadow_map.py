@@ -65,9 +65,16 @@ class Disc:
         if ahead <= 0:
             return 1.0
         reach = max(ahead * self.tangent, self._texel_m(0) / 2)
-        level = self._level(0.36 * reach)
+        sides = 2 if is_virtual else 1
+        apart = 0.36 * reach
+        level = self._level(apart / sides)
         cosines = np.maximum(self._directions(point) @ normal, 0)
-        covered = [self._covered(at, plane, lift_m, level, reach * place)[0] for place in self.places]
+        steps = (np.arange(sides) - 0.5 * (sides - 1)) / sides * apart
+        within = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        covered = [
+            np.mean([self._covered(at, plane, lift_m, level, reach * place + aside)[0] for aside in within])
+            for place in self.places
+        ]
         return float(1 - cosines @ covered / cosines.sum()) if cosines.sum() > 0 else 1.0
 
     def _directions(self, point: Floats) -> Floats:
@@ -101,7 +108,8 @@ class Disc:
         for ring in range(SEARCH_RINGS):
             radius = reach / 2**ring
             level = self._level(0.7 * radius)
-            for place in self.search * (-0.75 if ring % 2 else 0.75) * radius:
+            both = [self.search, -self.search] if lift_m > 0 else [self.search]
+            for place in np.concatenate(both) * (-0.75 if ring % 2 else 0.75) * radius:
                 covered, offset = self._covered(at, plane, lift_m, level, place)
                 if np.hypot(*offset[:2]) <= 0.71 * self._texel_m(level) - offset[2] * self.tangent:
                     weights, sums = weights + covered, sums - covered * offset[2]

@@ -113,7 +113,8 @@ def find_lamps(
 ) -> tuple[list[ShellLamp], BrightParts]:
     """At most `most` lamps seen from `position` [3], and the parts of the shell that they stand for.
 
-    Modes nearer to each other than the window are one lamp: a large one leaves a rim around its middle.
+    Modes nearer to each other than two standard deviations of the window, where two have one peak, are one lamp: a large
+    one leaves a rim around its middle.
     ends: [m, 3] where evenly spread directions from there end on the shell; radiance: [m, 3]; blur_m2: [m] by how much
     its variance over the shell is too large (Shell.blur_m2). emitted: what comes from elsewhere, as a sum of radiance
     over such directions and channels.
@@ -138,10 +139,10 @@ def find_lamps(
 
 
 def _add(of_lamps: list[Floats], ends: Floats, taken: Floats) -> None:
-    """To the first lamp whose middle is as near as the window, or as a new one."""
+    """To the first lamp whose middle is as near as two standard deviations of the window, or as a new one."""
     middle = _middle(ends, taken)
     for number, others in enumerate(of_lamps):
-        if np.linalg.norm(_middle(ends, others) - middle) < WINDOW_M:
+        if np.linalg.norm(_middle(ends, others) - middle) < 2 * WINDOW_M:
             of_lamps[number] = others + taken
             return
     of_lamps.append(taken)

@@ -113,8 +113,8 @@ def find_lamps(
 ) -> tuple[list[ShellLamp], BrightParts]:
     """At most `most` lamps seen from `position` [3], and the parts of the shell that they stand for.
 
-    Modes nearer to each other than two standard deviations of the window, where two have one peak, are one lamp: a large
-    one leaves a rim around its middle.
+    Modes nearer to each other than two standard deviations of the window are one lamp: two Gaussians then have one
+    peak, and a large lamp leaves a rim around its middle.
     ends: [m, 3] where evenly spread directions from there end on the shell; radiance: [m, 3]; blur_m2: [m] by how much
     its variance over the shell is too large (Shell.blur_m2). emitted: what comes from elsewhere, as a sum of radiance
     over such directions and channels.

@@ -11,37 +11,25 @@
 #include "samples.clh"
 #include "shadows.clh"
 
-static inline int has_surface(const Grid grid, global const float4 *positions, global const float4 *normals, const int row, const int col) {
-    const int pixel = sample_pixel(grid, row, col);
-    return positions[pixel].w > 0.0f && normals[pixel].w > 0.0f;
-}
-
-// The first sample from `begin` to `end` (column, row; half-open) with surface; -1 without any.
-static int first_with_surface(const Grid grid, global const float4 *positions, global const float4 *normals, const int2 begin, const int2 end) {
-    for (int row = begin.y; row < end.y; row++)
-        for (int col = begin.x; col < end.x; col++)
-            if (has_surface(grid, positions, normals, row, col)) return row * grid.cols + col;
-    return -1;
-}
-
 // Real surface: the ratio R' / R of shading with virtual objects to shading without, at the samples of the transfer.
 // transfer [rows][cols][COEFFICIENTS]; hits [rows][cols]: see indirect.cl.
 // -> ratio [rows][cols] (rgb, w = 1), shaded [rows][cols] (rgb of R, w = 1); w = 0 where there is no surface. R is computed even
 // where objects take nothing: other parts of the light (shadow_map.cl), bounces and refined pixels (adaptive.cl) relate to it.
-// One item a block of `step` x `step` samples, whose ratio is that of the first of them with surface.
+// One item a block of `step` x `step` samples, which get the ratio of the first of them, or none where that has no surface.
 kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, global const float *transfer, global const float4 *hits,
                         global float4 *ratio, global float4 *shaded) {
+    const int col = step * get_global_id(0);
+    const int row = step * get_global_id(1);
     const Grid grid = scene.samples;
-    const int2 begin = step * (int2)(get_global_id(0), get_global_id(1));
-    const int2 end = min(begin + step, (int2)(grid.cols, grid.rows));
-    const int sample = first_with_surface(grid, positions, normals, begin, end);
+    if (col >= grid.cols || row >= grid.rows) return;
+    const int sample = row * grid.cols + col;
+    const int pixel = sample_pixel(grid, row, col);
+    const float4 normal = normals[pixel], position = positions[pixel];
     float4 of_ratio = (float4)(0.0f), of_shaded = (float4)(0.0f);
-    if (sample >= 0) {
-        const int pixel = sample_pixel(grid, sample / grid.cols, sample % grid.cols);
-        const float3 position = positions[pixel].xyz, normal = normals[pixel].xyz;
+    if (position.w > 0.0f && normal.w > 0.0f) {
         const Volume volume = SOLIDS_OF_SCENE;
         const Objects things = OBJECTS_OF_SCENE(0.0f);
-        const int place = place_near(scene.light.table, light_table, position);
+        const int place = place_near(scene.light.table, light_table, position.xyz);
         const Arriving arrives = ARRIVING_UNCHANGED(place);
         global const float4 *light = coefficients_of(scene.light.table, light_table, place);
         global const uint *free = free_mask + sample * MASK_WORDS;
@@ -49,16 +37,17 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, g
         float3 without = (float3)(0.0f);
         for (int i = 0; i < COEFFICIENTS; i++) without += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
         without = shading_without(arrives, without, openness[sample], hits[sample]);
-        const float3 taken = taken_from_real(volume, things, arrives, scene.objects.ball, position, normal, 0, 0, 1, own, INTERLEAVE, free);
+        const float3 taken = taken_from_real(volume, things, arrives, scene.objects.ball, position.xyz, normal.xyz, 0, 0, 1, own, INTERLEAVE, free);
         const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
         of_ratio = (float4)(fmax(without - taken, floor) / fmax(without, floor), 1.0f);
         of_shaded = (float4)(without, 1.0f);
     }
-    for (int row = begin.y; row < end.y; row++) {
-        for (int col = begin.x; col < end.x; col++) {
-            const int known = has_surface(grid, positions, normals, row, col);
-            ratio[row * grid.cols + col] = known ? of_ratio : (float4)(0.0f);
-            shaded[row * grid.cols + col] = known ? of_shaded : (float4)(0.0f);
+    for (int i = row; i < min(row + step, grid.rows); i++) {
+        for (int j = col; j < min(col + step, grid.cols); j++) {
+            const int there = sample_pixel(grid, i, j);
+            const int known = positions[there].w > 0.0f && normals[there].w > 0.0f;
+            ratio[i * grid.cols + j] = known ? of_ratio : (float4)(0.0f);
+            shaded[i * grid.cols + j] = known ? of_shaded : (float4)(0.0f);
         }
     }
 }

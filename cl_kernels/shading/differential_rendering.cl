@@ -11,6 +11,19 @@
 #include "samples.clh"
 #include "shadows.clh"
 
+// A block of `step` x `step` samples from (row, col) on, where there is surface; 0 elsewhere.
+static void write_block(const Grid grid, global const float4 *positions, global const float4 *normals, const int row, const int col,
+                        const int step, const float4 of_ratio, const float4 of_shaded, global float4 *ratio, global float4 *shaded) {
+    for (int i = row; i < min(row + step, grid.rows); i++) {
+        for (int j = col; j < min(col + step, grid.cols); j++) {
+            const int there = sample_pixel(grid, i, j);
+            const int known = positions[there].w > 0.0f && normals[there].w > 0.0f;
+            ratio[i * grid.cols + j] = known ? of_ratio : (float4)(0.0f);
+            shaded[i * grid.cols + j] = known ? of_shaded : (float4)(0.0f);
+        }
+    }
+}
+
 // Real surface: the ratio R' / R of shading with virtual objects to shading without, at the samples of the transfer.
 // transfer [rows][cols][COEFFICIENTS]; hits [rows][cols]: see indirect.cl.
 // -> ratio [rows][cols] (rgb, w = 1), shaded [rows][cols] (rgb of R, w = 1); w = 0 where there is no surface. R is computed even
@@ -25,31 +38,25 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, g
     const int sample = row * grid.cols + col;
     const int pixel = sample_pixel(grid, row, col);
     const float4 normal = normals[pixel], position = positions[pixel];
-    float4 of_ratio = (float4)(0.0f), of_shaded = (float4)(0.0f);
-    if (position.w > 0.0f && normal.w > 0.0f) {
-        const Volume volume = SOLIDS_OF_SCENE;
-        const Objects things = OBJECTS_OF_SCENE(0.0f);
-        const int place = place_near(scene.light.table, light_table, position.xyz);
-        const Arriving arrives = ARRIVING_UNCHANGED(place);
-        global const float4 *light = coefficients_of(scene.light.table, light_table, place);
-        global const uint *free = free_mask + sample * MASK_WORDS;
-        global const uchar *own = sets + sample * INTERLEAVE;
-        float3 without = (float3)(0.0f);
-        for (int i = 0; i < COEFFICIENTS; i++) without += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
-        without = shading_without(arrives, without, openness[sample], hits[sample]);
-        const float3 taken = taken_from_real(volume, things, arrives, scene.objects.ball, position.xyz, normal.xyz, 0, 0, 1, own, INTERLEAVE, free);
-        const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
-        of_ratio = (float4)(fmax(without - taken, floor) / fmax(without, floor), 1.0f);
-        of_shaded = (float4)(without, 1.0f);
+    if (position.w <= 0.0f || normal.w <= 0.0f) {
+        write_block(grid, positions, normals, row, col, step, (float4)(0.0f), (float4)(0.0f), ratio, shaded);
+        return;
     }
-    for (int i = row; i < min(row + step, grid.rows); i++) {
-        for (int j = col; j < min(col + step, grid.cols); j++) {
-            const int there = sample_pixel(grid, i, j);
-            const int known = positions[there].w > 0.0f && normals[there].w > 0.0f;
-            ratio[i * grid.cols + j] = known ? of_ratio : (float4)(0.0f);
-            shaded[i * grid.cols + j] = known ? of_shaded : (float4)(0.0f);
-        }
-    }
+    const Volume volume = SOLIDS_OF_SCENE;
+    const Objects things = OBJECTS_OF_SCENE(0.0f);
+    const int place = place_near(scene.light.table, light_table, position.xyz);
+    const Arriving arrives = ARRIVING_UNCHANGED(place);
+    global const float4 *light = coefficients_of(scene.light.table, light_table, place);
+    global const uint *free = free_mask + sample * MASK_WORDS;
+    global const uchar *own = sets + sample * INTERLEAVE;
+    float3 without = (float3)(0.0f);
+    for (int i = 0; i < COEFFICIENTS; i++) without += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
+    without = shading_without(arrives, without, openness[sample], hits[sample]);
+    const float3 taken = taken_from_real(volume, things, arrives, scene.objects.ball, position.xyz, normal.xyz, 0, 0, 1, own, INTERLEAVE, free);
+    const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
+    const float4 of_ratio = (float4)(fmax(without - taken, floor) / fmax(without, floor), 1.0f);
+    const float4 of_shaded = (float4)(without, 1.0f);
+    write_block(grid, positions, normals, row, col, step, of_ratio, of_shaded, ratio, shaded);
 }
 
 // Light that a sample of real surface gains from other real surface whose shading virtual objects changed (eq. 7.6: R'_ID - R_ID),

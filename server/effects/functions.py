@@ -75,14 +75,13 @@ def first_shadow(
     transfer: Transfer,
     scene: TracedScene,
     indirect: Indirect | None,
-    maps: ShadowMaps | None,
     samples: DirectSamples | None,
 ) -> FirstShadow:
     """What virtual things take from real ones, for the light that they send: an object's underside sees its shadow.
 
     At every fourth sample: a point of an object sees the shadows of many.
     """
-    return FirstShadow(_shadow(context, transfer, scene, indirect, maps, samples, step=2))
+    return FirstShadow(_shadow(context, transfer, scene, indirect, samples, step=2))
 
 
 def light_objects(
@@ -109,11 +108,10 @@ def shadow_real(
     scene: TracedScene,
     indirect: Indirect | None,
     lights: VirtualPointLights | None,
-    maps: ShadowMaps | None,
     samples: DirectSamples | None,
 ) -> RealShadow:
     """What virtual things take from real ones, less what they send to them (eq. 7.1)."""
-    return _shadow(context, transfer, replace(scene, point_lights=lights), indirect, maps, samples)
+    return _shadow(context, transfer, replace(scene, point_lights=lights), indirect, samples)
 
 
 def _shadow(
@@ -121,14 +119,13 @@ def _shadow(
     transfer: Transfer,
     scene: TracedScene,
     indirect: Indirect | None,
-    maps: ShadowMaps | None,
     samples: DirectSamples | None,
     step: int = 1,
 ) -> RealShadow:
     shadow = differential.shadow_real(context.engine, context.camera, context.surface, transfer, scene, indirect, step)
-    if maps is None or samples is None:
+    if samples is None:
         return shadow
-    return replace(shadow, whole=shadow_maps.with_direct(context.engine, shadow, samples, maps))
+    return replace(shadow, whole=shadow_maps.with_direct(context.engine, shadow, samples))
 
 
 def bounce_real(
@@ -140,7 +137,6 @@ def bounce_real(
     returned: ReturnedRadiance,
     faint: FaintShadows,
     lights: VirtualPointLights | None,
-    maps: ShadowMaps | None,
     samples: DirectSamples | None,
 ) -> BouncedShadow:
     """`ratio` with what real things then send to one another, less or more (eq. 7.6)."""
@@ -162,9 +158,9 @@ def bounce_real(
             ratio,
         )
 
-    if maps is None or samples is None or not isinstance(ratio.whole, RealShadow):
+    if samples is None or not isinstance(ratio.whole, RealShadow):
         return BouncedShadow(bounced(ratio))
-    return BouncedShadow(shadow_maps.without_direct(engine, bounced(ratio.whole), ratio, samples, maps))
+    return BouncedShadow(shadow_maps.without_direct(engine, bounced(ratio.whole), ratio, samples))
 
 
 def add_objects(

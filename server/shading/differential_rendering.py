@@ -70,7 +70,8 @@ def shadow_real(
 ) -> RealShadow:
     """Ratio R' / R of real surface shaded with and without the objects, at the transfer's samples (eq. 7.1).
 
-    indirect: radiance from surfaces at the same samples. step: blocks of step x step samples are shaded as one of them.
+    indirect: radiance from surfaces at the same samples. step: blocks of step x step samples are shaded as the first
+    of them.
     """
     shape, buffers = (transfer.rows, transfer.cols), engine.buffers(_Buffers)
     ratio, shaded = buffers.ratio.array(shape), buffers.shaded.array(shape)

@@ -141,6 +141,8 @@ class DirectSamples:
 
     without: cl_array.Array
     with_objects: cl_array.Array
+    least: Floats
+    """ShadowMaps.least."""
 
 
 def draw_shadow_maps(
@@ -302,27 +304,25 @@ def light_samples(
         without,
         lit,
     )
-    return DirectSamples(without, lit)
+    return DirectSamples(without, lit, maps.least)
 
 
-def with_direct(engine: Engine, shadow: RealShadow, samples: DirectSamples, maps: ShadowMaps) -> RealShadow:
+def with_direct(engine: Engine, shadow: RealShadow, samples: DirectSamples) -> RealShadow:
     """The ratio under the whole light, from the ratio under its rest."""
     shape, buffers = (shadow.rows, shadow.cols), engine.buffers(_Buffers)
     whole, shaded = buffers.whole_ratio.array(shape), buffers.whole_shaded.array(shape)
     count = shadow.rows * shadow.cols
     mixed = (shadow.values, shadow.shaded, samples.without, samples.with_objects)
-    engine.launch(_kernel(engine, "mix_direct"), (count,), count, float4(*maps.least, 0.0), *mixed, whole, shaded)
+    engine.launch(_kernel(engine, "mix_direct"), (count,), count, float4(*samples.least, 0.0), *mixed, whole, shaded)
     return RealShadow(shadow.stride, whole, shaded)
 
 
-def without_direct(
-    engine: Engine, whole: RealShadow, shadow: RealShadow, samples: DirectSamples, maps: ShadowMaps
-) -> RealShadow:
+def without_direct(engine: Engine, whole: RealShadow, shadow: RealShadow, samples: DirectSamples) -> RealShadow:
     """The ratio under the rest of the light, from the whole light's. shadow: the argument of with_direct."""
     rest = engine.buffers(_Buffers).rest_ratio.array((shadow.rows, shadow.cols))
     count = shadow.rows * shadow.cols
     mixed = (whole.values, shadow.shaded, samples.without, samples.with_objects)
-    engine.launch(_kernel(engine, "unmix_direct"), (count,), count, float4(*maps.least, 0.0), *mixed, rest)
+    engine.launch(_kernel(engine, "unmix_direct"), (count,), count, float4(*samples.least, 0.0), *mixed, rest)
     return replace(shadow, values=rest, whole=whole)
 
 

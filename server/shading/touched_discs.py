@@ -20,14 +20,9 @@ def without_touched(split: SplitLight, objects: Sequence[Placed]) -> SplitLight:
 
     A disc is whole from one radius off the box on, and in between in proportion, so that none appears at once.
     """
-    shares = [min((_distance_in_radii(disc, thing) for thing in objects), default=1.0) for disc in split.discs]
-    if min(shares, default=1.0) >= 1.0:
-        return split
-    discs = (
-        disc if share >= 1.0 else replace(disc, irradiance=share * disc.irradiance)
-        for disc, share in zip(split.discs, shares, strict=True)
-        if share > 0.0
-    )
+    shares = [min([1.0, *(_distance_in_radii(disc, thing) for thing in objects)]) for disc in split.discs]
+    shared = zip(split.discs, shares, strict=True)
+    discs = (replace(disc, irradiance=share * disc.irradiance) for disc, share in shared if share > 0.0)
     return replace(split, discs=tuple(discs))
 
 

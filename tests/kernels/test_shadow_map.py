@@ -476,7 +476,7 @@ def test_an_umbra_keeps_what_surfaces_send(engine: Engine) -> None:
     maps = draw_shadow_maps(engine, volume, split, objects, FAR_M)
     scene = trace_scene(engine, volume, split, rays, FAR_M, objects)
     samples = effects.light_samples(context, transfer, maps)
-    shadow = effects.shadow_real(context, transfer, scene, indirect, None, maps, samples)
+    shadow = effects.shadow_real(context, transfer, scene, indirect, None, samples)
     parts = trace_real(engine, camera, surface, shadow, maps)
     pixels = download4(engine, light_real(engine, camera, surface, shadow, parts, maps)).astype(float)
     assert isinstance(shadow.whole, RealShadow)
@@ -505,12 +505,12 @@ def test_mixed_ratios_are_the_twins_and_come_apart_again(device: Device, engine:
     values = {"ratio": ratio, "rest": rest, "without": without, "lit": lit_part}
     on_device = {name: space.upload(f"mixed_{name}", float4(a)) for name, a in values.items()}
     shadow = RealShadow(4, on_device["ratio"], on_device["rest"])
-    samples = DirectSamples(on_device["without"], on_device["lit"])
-    whole = with_direct(engine, shadow, samples, maps)
+    samples = DirectSamples(on_device["without"], on_device["lit"], maps.least)
+    whole = with_direct(engine, shadow, samples)
     expected = twin.mixed_ratio(ratio, rest, without, lit_part, maps.least)
     np.testing.assert_allclose(download4(engine, whole.values)[..., :3], expected, rtol=relative_tolerance(device))
     assert (expected <= np.maximum(ratio, 1) + 1e-6).all()
-    apart = without_direct(engine, whole, shadow, samples, maps)
+    apart = without_direct(engine, whole, shadow, samples)
     bright = (rest > 0.05) & (ratio * rest + lit_part > 1.01 * maps.least)
     np.testing.assert_allclose(download4(engine, apart.values)[..., :3][bright], ratio[bright], atol=1e-5)
     assert apart.whole is whole

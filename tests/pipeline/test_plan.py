@@ -260,7 +260,7 @@ ASKED = {
     "light_samples": "no indirect",
     "bounce_real": "no indirect",
 }
-SOFT_LIGHT = dict.fromkeys(("direct_virtual", "direct_real", "shadow_map", "light_samples"), "soft")
+SOFT_LIGHT = dict.fromkeys(("direct_virtual", "direct_real", "light_samples"), "soft")
 BY_RAYS = {"draw_depth_views": "traces rays"}
 LIT = ("shade_virtual", "reflect", "match_average", "direct_virtual", "refine_virtual")
 OF_REAL = ("shadow_real", "bounce_real", "direct_real", "refine_real", "mark_changes")

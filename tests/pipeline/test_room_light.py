@@ -85,8 +85,8 @@ def test_stripes_do_not_turn_the_light(
         assert np.isfinite(light.sh).all()
         assert np.isfinite([x for row in light.sh_std or () for x in row if x is not None]).all()
     assert error_deg(table, constant[-1]) > 25.0
-    assert error_deg(table, steady[-1]) < 30.0  # seen: 27
-    assert error_deg(table, direct[-1]) < 30.0  # seen: 23
+    assert error_deg(table, steady[-1]) < 30.0  # seen: 28
+    assert error_deg(table, direct[-1]) < 30.0  # seen: 24
     assert any((np.array(a.sh) != np.array(b.sh)).any() for a, b in zip(steady, direct, strict=True))
 
 

@@ -140,7 +140,8 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     Products of matrices are float32: terms are good to a percent, and nothing cancels.
     """
     switches, count = switches or Switches(), sources.count
-    middle = _begin_level(unknowns, evidence, finds_level=(finds_level := switches.albedos and sources.finds_level))
+    finds_level = switches.albedos and sources.finds_level
+    middle = _begin_level(unknowns, evidence, finds_level=finds_level)
     prior = np.where(sources.is_saturated, 0.0, unknowns.mean) + sources.offset
     known_logs = log_chroma(np.log(np.maximum(sources.known, DARKEST)))
     known = np.where(sources.known.max(axis=1) > 0, np.exp(known_logs[:, 0]), 0.0)
@@ -188,8 +189,7 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
         _shift_albedos(unknowns, _logistic(materials @ unknowns.materials[nodes]), offsets, evidence)
     seen = np.where(is_clipped, sent_chroma, evidence.chroma - known_part)
     unknowns.chroma = _solve_chroma(parts, seen, regions.columns(count), spreads.chroma, sources.pairs)
-    logs = np.concatenate([np.log(_levels(unknowns.z, sources))[:, None], unknowns.chroma], axis=1)
-    unknowns.radiance = np.exp(logs @ _FROM_CHROMA.T)
+    unknowns.radiance = _radiance(unknowns, sources)
 
 
 def _begin_level(unknowns: Unknowns, evidence: Evidence, *, finds_level: bool) -> float:
@@ -254,6 +254,12 @@ def _levels(z: Floats, sources: Sources) -> Floats:
     """[k] radiance of sources."""
     clipped = np.exp(np.log(np.maximum(sources.clipped, DARKEST)).mean(axis=1))
     return np.asarray(np.where(sources.is_saturated, clipped, 1.0) * np.exp(z))
+
+
+def _radiance(unknowns: Unknowns, sources: Sources) -> Floats:
+    """[k, 3] RGB of sources."""
+    logs = np.concatenate([np.log(_levels(unknowns.z, sources))[:, None], unknowns.chroma], axis=1)
+    return np.asarray(np.exp(logs @ _FROM_CHROMA.T))
 
 
 def _logistic(logit: Any) -> Any:

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, TimeoutError, sync_playwright
 
 from server.opencl.device import Device
 from server.service.serve import BackgroundServer
 from tests.client.web.constants import PATIENCE_MS, PICTURES
+from tests.client.web.page import said_by
 from tests.servers import fake_server
 from tests.service.fakes import Lab
 
@@ -154,4 +155,7 @@ def keep_picture() -> Callable[[Page, str], None]:
 
 def wait_for_text(page: Page, selector: str, text: str, times: int = 1) -> None:
     """Until the element says it; `times`: as much patience as usual, where a busy machine needs more."""
-    page.locator(selector).filter(has_text=text).first.wait_for(state="attached", timeout=times * PATIENCE_MS)
+    try:
+        page.locator(selector).filter(has_text=text).first.wait_for(state="attached", timeout=times * PATIENCE_MS)
+    except TimeoutError as error:
+        raise AssertionError(f"not {text!r}: {said_by(page, selector)}") from error

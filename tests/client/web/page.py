@@ -41,11 +41,18 @@ def newer_pictures(page: Page, count: int = 3) -> None:
     page.wait_for_function(f"first => ({caption})() >= first + {count}", arg=first)
 
 
+def said_by(page: Page, *selectors: str) -> dict[str, str | None]:
+    """What the page tells a person, and what these elements say: for a test that waited in vain."""
+    names = [*selectors, "#state", "#stage-said", "#capture-said", "#object-said"]
+    texts = page.evaluate("names => names.map(name => document.querySelector(name)?.textContent ?? null)", names)
+    return dict(zip(names, texts, strict=True))
+
+
 def wait_until(holds: Callable[[], bool], page: Page | None = None) -> None:
     """`page`: its events are handled meanwhile."""
     until_s = time.monotonic() + PATIENCE_MS / 1e3
     while not holds():
-        assert time.monotonic() < until_s
+        assert time.monotonic() < until_s, page and said_by(page)
         if page is None:
             time.sleep(0.02)
         else:

@@ -10,8 +10,8 @@ BRIGHTEST, BRIGHTEST_SPREAD = 0.55, 0.1
 it sets the level of the light. The brightest paint differs by 13 % from room to room, mean albedo by 26 %. White paint
 is .8, but little of a room is as white."""
 GIVEN_ALBEDO = 0.6
-"""Albedo of all surface if it is constant, and mean albedo for the light from beyond the scan, whose direction turned
-by 23 degrees with the kitchen's volume where the level was found from the brightest surface."""
+"""Albedo of all surface if it is constant, and mean albedo for the light from beyond the scan, whose direction is 2
+degrees worse, and changes more with the volume, where the level is found from the brightest surface."""
 ALBEDO_SPREAD = 0.5
 """Standard deviation of the logit of a material's albedo about the mean of the room's."""
 MATERIAL_CHROMA = 0.8

@@ -138,8 +138,8 @@ def test_soft_light_is_drawn_as_before(device: Device, indirect: bool) -> None:
     light = light_of(35.0)
     result = shown(device, light, indirect=indirect)
     left_out = {item.effect: item for item in result.plan.left_out}
-    assert left_out["shadow_map"].reason == "the light is soft"
-    assert left_out["shadow_map"].error_bound == 0.0
+    assert left_out["direct_real"].reason == "the light is soft"
+    assert left_out["direct_real"].error_bound == 0.0
     with patch.object(room_light, "split_light", lambda sh: SplitLight(sh, ())):
         np.testing.assert_array_equal(result.color, shown(device, light, indirect=indirect).color)
     assert (result.color != GREY).any()

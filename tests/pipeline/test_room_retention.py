@@ -127,7 +127,8 @@ def test_idle_times_that_are_damaged_let_all_begin_anew(
     store.enforce_limits(RetentionLimits())
     (file,) = (path for path in store._folder.iterdir() if path.is_file())
     assert file.stat().st_mode & 0o077 == 0
-    file.write_bytes(file.read_bytes()[:-1] + b"x")
+    *most, last = file.read_bytes()
+    file.write_bytes(bytes((*most, last ^ 1)))
     later = RoomStore(store._folder, clock)
     with caplog.at_level(logging.WARNING):
         later.enforce_limits(RetentionLimits())

@@ -2,7 +2,6 @@
 // Provides measure_lightness, relight, tv_l1_prepare, tv_l1_strips, tv_l1_dual, tv_l1_primal, tv_l1_finish, pad, bilateral.
 // Eight pixels of a row are one float8: PoCL vectorises little else. Intermediate images are [rows][stride], stride a multiple
 // of 8.
-#include "portability.clh"
 
 #define KNEE (6.0f / 29.0f)  // CIE 15: L* is a cube root above KNEE^3 and a line below
 

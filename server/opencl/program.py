@@ -15,11 +15,13 @@ from server.opencl.structs import struct_text
 KERNEL_FOLDER = Path(cl_kernels.__file__).parent
 _OPTIONS = ("-cl-std=CL1.2", "-Werror", "-cl-fp32-correctly-rounded-divide-sqrt")
 _PROLOGUE = """#ifdef __clang__
+#if __has_warning("-Wpsabi")
 #pragma clang diagnostic ignored "-Wpsabi"
+#endif
 #endif
 """
 """Where a processor has no registers for float16, clang warns that other compilers would pass it otherwise: no call
-leaves a program."""
+leaves a program. NVIDIA's compiler is a clang that does not know this warning, which would be an error."""
 _INCLUDE = re.compile(r'#include "([^"]+)"')
 
 Define = int | float | str | bool

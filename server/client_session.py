@@ -82,7 +82,7 @@ class ClientSession:
         self._owns_room = room is None
         self._differences = self._room.differences(wishes)
         wishes = self._room.wishes_of(wishes)
-        self._answer = wishes.answer
+        self._answer, self._is_lossless = wishes.answer, wishes.lossless
         self._quality = SessionQuality(device, wishes)
         self._camera = camera
         self._engine = Engine(device, beside=self._room.engine)
@@ -101,7 +101,8 @@ class ClientSession:
         """One frame through the pipeline. A viewpoint shows what others have scanned.
 
         `watched`: somebody wants the picture, whatever the client wished to be answered by. `turn`: with whom the
-        device is shared while the frame is worked on; None: with nobody.
+        device is shared while the frame is worked on; None: with nobody, and no camera waits. Where one does, and the
+        session is not lossless, the light is the newest there is: how new depends on the machine.
 
         Raises ValueError with one line for a frame that is refused; the session's state is then as it was. Waits while
         another client's frame is in the room. Raises what `turn` raises, after which only `close` may be called.
@@ -110,7 +111,8 @@ class ClientSession:
             if isinstance(frame, Viewpoint):
                 volume, place = self._room.reconstruction.volume, self._alignment.room_from_client
                 frame = imagined_frame(self._engine, self._camera, volume, frame, place)
-            result = self._pipeline.process_frame(frame, RenderRequest(self._answer, watched))
+            request, waits = RenderRequest(self._answer, watched), turn is None or self._is_lossless
+            result = self._pipeline.process_frame(frame, request, waits_for_light=waits)
             plan = result.plan
             if result.tracking != "lost":
                 point = self._quality.observe(result.timings, is_reused=result.is_reused)

@@ -43,6 +43,9 @@ class FrameContext:
     """Whether virtual objects may cover parts of pixels."""
     restores_clipped: bool = True
     """Whether shadows fall on the likely radiance of clipped surface; not in the thesis."""
+    waits_for_light: bool = True
+    """Whether the frame waits for the light that is worked out beside it: the same frames then give the same light on
+    any machine. Else it is drawn with the newest there is."""
 
     @property
     def camera_from_volume(self) -> NDArray[np.float64]:

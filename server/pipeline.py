@@ -103,8 +103,8 @@ class Pipeline:
             self._samplings += 1
         self._settings = settings
 
-    def process_frame(self, frame: RgbdFrame, request: RenderRequest) -> FrameResult:
-        """Fuse one frame, estimate the light, render what is virtual (fig. 5.1).
+    def process_frame(self, frame: RgbdFrame, request: RenderRequest, *, waits_for_light: bool = True) -> FrameResult:
+        """Fuse one frame, estimate the light, render what is virtual (fig. 5.1). waits_for_light: as in FrameContext.
 
         Raises ValueError with one line for a frame that is refused; the state is then as it was.
         """
@@ -132,7 +132,7 @@ class Pipeline:
             notes += self._objects.place_on_spots(frame.index, lambda: self._spot_view(frame, geometry, volume))
         notes += self._objects.check_placed(volume)
 
-        context = self._context(geometry, volume)
+        context = self._context(geometry, volume, waits_for_light=waits_for_light)
         objects = room.objects.placed(volume.volume_from_world())
         is_shaded = bool(objects) and request.is_drawn
         is_learning = self._settings.plan == "everything" or not room.light.is_given
@@ -179,7 +179,7 @@ class Pipeline:
         objects = room.objects.placed(volume.volume_from_world()) if room.objects.has_begun else ()
         return self._reuse.decide(frame, scene, objects, period=self._transfer.period)
 
-    def _context(self, geometry: GeometryFrame, volume: Volume) -> FrameContext:
+    def _context(self, geometry: GeometryFrame, volume: Volume, *, waits_for_light: bool) -> FrameContext:
         settings = self._settings
         return FrameContext(
             engine=self._engine,
@@ -195,6 +195,7 @@ class Pipeline:
             ray_length_m=settings.ray_length_m,
             smooth_edges=settings.edges == "smooth",
             restores_clipped=not settings.as_thesis,
+            waits_for_light=waits_for_light,
         )
 
     def _sample_transfer(

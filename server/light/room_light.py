@@ -113,10 +113,10 @@ class RoomLight:
         discs = tuple(lamp.as_direct_light(origin_world) for lamp in lamps)
         return whole, SplitLight(rest, discs), places
 
-    def look_up(self, engine: Engine, volume: Volume, positions: NDArray[np.float64]) -> LookUp | None:
+    def look_up(self, context: FrameContext, positions: NDArray[np.float64]) -> LookUp | None:
         """Begin to trace what `arriving_at` needs; None where there is no solution, or this frame takes another."""
-        solution = None if self._model.is_due else self._solution
-        return solution.look_up(engine, volume, positions) if solution else None
+        solution = None if self._model.is_due(waits=context.waits_for_light) else self._solution
+        return solution.look_up(context.engine, context.volume, positions) if solution else None
 
     def finish(self) -> None:
         """Begin what is worked out beside the frames. The last of a frame."""

@@ -52,7 +52,7 @@ class ToldPlaces:
         self._places = _places(self._view, asked, objects)
         told = {_key(lit.place) for lit in self.newest.lit}
         new = [place.position for place in self._places if _key(place) not in told]
-        self._begun = light.look_up(context.engine, context.volume, np.array(new)) if new else None
+        self._begun = light.look_up(context, np.array(new)) if new else None
 
     def update(self, context: FrameContext, light: RoomLight, *, is_still: bool) -> None:
         """Look up the light at all places. `is_still`: the geometry is that of the frame before."""

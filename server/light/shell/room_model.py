@@ -3,6 +3,8 @@
 While the light is steady every third frame begins a solution, which a thread works out; it is taken over when the
 next one begins, ready or waited for, so that the same frames give the same light on any machine. A first picture, a
 part of the room that is new and a light that changes are solved within the frame.
+
+Frames of a live camera do not wait, but for a first solution: they take one over as soon as it is ready.
 """
 
 from __future__ import annotations
@@ -35,6 +37,9 @@ the second on everything is (a lamp that goes 45 degrees around a table makes .3
 SOLVE_EVERY = 3
 """Frames between two solutions, as long as the light is steady and little of the room is new: evidence is summed in
 between. The goal is that a change is followed within three frames."""
+LATEST = 2 * SOLVE_EVERY
+"""A live frame waits all the same for a solution that began so many frames ago: on a processor that has too much to do
+the light would never be a new one."""
 NEW_SHARE = 0.1
 """If the share of new patches, or of frames that are not in the solution, is at least this, a frame is solved at
 once."""
@@ -72,6 +77,7 @@ class RoomModel:
         self._tracing: _Tracing | None = None
         self._begun_with: Shell | None = None
         self._waiting = self._frames = 0
+        self._is_urgent = False
 
     @property
     def solution(self) -> Solution | None:
@@ -89,9 +95,10 @@ class RoomModel:
             context.volume_from_camera,
         )
 
-    @property
-    def is_due(self) -> bool:
-        """Whether the next update takes a solution over, as far as can be told before."""
+    def is_due(self, *, waits: bool) -> bool:
+        """Whether the next update takes a solution over, as far as can be told before. waits: as in FrameContext."""
+        if not waits and self._solution is not None:
+            return self._next is not None and self._is_ready
         return self._waiting + 1 >= SOLVE_EVERY or self._waiting + 1 > NEW_SHARE * (self._frames + 1)
 
     def update(self, context: FrameContext, up: Floats) -> None:
@@ -111,19 +118,25 @@ class RoomModel:
         self._patches.add(seen)
         self._bright.add(seen.bright, seen.positions)
         self._waiting, self._frames = self._waiting + 1, self._frames + 1
-        must_follow = self._must_follow(change)
+        self._is_urgent = self._is_urgent or self._must_follow(change)
+        waits = context.waits_for_light or self._solution is None
+        if not waits:
+            if not self._is_ready:
+                return
+            self._take_over(engine.pacer)
         is_young = self._waiting > NEW_SHARE * self._frames
-        if not must_follow and not is_young and self._waiting < SOLVE_EVERY:
+        if not self._is_urgent and not is_young and self._waiting < SOLVE_EVERY:
             return
         self._take_over(engine.pacer)
-        if not must_follow and self._is_still():
+        if not self._is_urgent and self._is_still():
             return
         traced = self._patches.begin_trace(engine, volume, self._waiting)
         emitters = self._bright.begin_trace(engine, volume, self._patches, traced.rows)
-        self._waiting = 0
+        solves_now = waits and (self._is_urgent or is_young)
+        self._waiting, self._is_urgent = 0, False
         camera = context.volume_from_camera[:3, 3] + volume.origin_world
         self._tracing = _Tracing(traced, emitters, camera, up)
-        if must_follow or is_young:
+        if solves_now:
             self.finish()
             self._take_over(engine.pacer)
 
@@ -136,6 +149,11 @@ class RoomModel:
         self._bright.end_trace(tracing.emitters)
         patches, bright, traced = self._patches.copy(), self._bright.seen_by(), tracing.patches.rows
         self._next = Beside(lambda: self._solver.solve(patches, bright, traced, tracing.camera, tracing.up))
+
+    @property
+    def _is_ready(self) -> bool:
+        """Whether nothing is worked out that a live frame leaves for the next one."""
+        return self._next is None or self._next.is_done or self._waiting >= LATEST
 
     def _take_over(self, pacer: Pacer) -> None:
         """The solution that was begun last, waited for: others may use the device meanwhile."""

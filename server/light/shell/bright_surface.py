@@ -7,6 +7,7 @@ pictures show of it is averaged over frames, so that it moves with the evidence.
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ from server.light.arrivals import PendingArrivals, begin_arrivals
 from server.light.shell.patches import MOST_PATCHES, MOST_WEIGHT, Patches
 from server.light.shell.picture import SeenBright
 from server.light.shell.weights import GIVEN_ALBEDO
+from server.maths.groups import distinct_rows
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
 
@@ -105,8 +107,8 @@ class Emitters:
     def left_to_others(self, weights: Floats, rows: Ints, ends: Floats) -> Floats:
         """[m] how far rays count that meet saturated surface at `ends` [m, 3]; weights: [n, k], and whose row of it."""
         numbers = {tuple(key): number for number, key in enumerate(self.keys.tolist())}
-        found, inverse = np.unique(_keys(ends), axis=0, return_inverse=True)
-        number = np.array([numbers.get(tuple(key), -1) for key in found.tolist()], np.int64)[inverse.ravel()]
+        found, inverse = distinct_rows(_keys(ends))
+        number = np.array([numbers.get(tuple(key), -1) for key in found.tolist()], np.int64)[inverse]
         result = np.ones(len(ends))
         own = number >= 0
         result[own] -= weights[rows[own], number[own]]
@@ -169,40 +171,34 @@ class BrightSurface:
 
     def add(self, bright: SeenBright, positions: Floats) -> None:
         """Fold a picture in; positions: [m, 3] of all surface that it shows, clipped or not."""
-        keys, inverse = np.unique(_keys(bright.positions), axis=0, return_inverse=True)
-        inverse = inverse.ravel()
-        shown = {tuple(key): number for number, key in enumerate(keys.tolist())}
-        self._note_presence(positions, shown)
-        for key, number in shown.items():
-            own = inverse == number
-            self._add_to(key, bright, own)
-
-    def _note_presence(self, positions: Floats, shown: dict[tuple[int, ...], int]) -> None:
-        """Of a cell that shows as clipped, or where surface is in view that does not."""
-        for key, row in self._rows.items():
-            center, radius_m = self._centers[row] / max(self._squares[row], 1e-12), np.sqrt(self._area(row) / np.pi)
-            nearest = np.sqrt(np.square(positions - center).sum(axis=1).min(initial=np.inf))
-            if key in shown or nearest <= radius_m:
-                self._frames[row] = min(self._frames[row] + 1, PRESENCE)
-                self._presence[row] += (float(key in shown) - self._presence[row]) / self._frames[row]
-
-    def _add_to(self, key: tuple[int, ...], bright: SeenBright, own: NDArray[np.bool_]) -> None:
-        areas = bright.areas_m2[own]
-        across = float(areas.sum())
-        center, normal = areas @ bright.positions[own] / across, areas @ bright.normals[own] / across
-        line = center - bright.eye
-        line /= max(float(np.linalg.norm(line)), 1e-6)
-        length = float(np.linalg.norm(normal))
-        flatness = _flatness(length)
-        cosine = max(-float(normal @ line) / max(length, 1e-6), _LEAST_COSINE)
-        area = across / float(1 - flatness + flatness * cosine)
-        row = self._row_of(key, area)
-        if row < 0:
+        found, cells = distinct_rows(_keys(bright.positions))
+        keys = [tuple(key) for key in found.tolist()]
+        self._note_presence(positions, set(keys))
+        if not keys:
             return
-        keep = 1.0 - 1.0 / MOST_WEIGHT
-        values: tuple[float | Floats, ...] = 1 / area, 1.0, center, normal, areas @ bright.radiance[own] / across
-        for sums, value in zip(self._sums, values, strict=True):
-            sums[row] = keep * sums[row] + area**2 * value
+        shown = _by_cell(bright, cells, len(keys))
+        squares = shown.areas_m2**2
+        fields = shown.positions, shown.normals, shown.radiance
+        added = shown.areas_m2, squares, *(squares[:, None] * values for values in fields)
+        for number, key in enumerate(keys):  # one by one: a new one may take the place of another
+            row = self._row_of(key, float(shown.areas_m2[number]))
+            if row >= 0:
+                for sums, values in zip(self._sums, added, strict=True):
+                    sums[row] = (1.0 - 1.0 / MOST_WEIGHT) * sums[row] + values[number]
+
+    def _note_presence(self, positions: Floats, shown: Set[tuple[int, ...]]) -> None:
+        """Of cells that show as clipped, or where surface is in view that does not."""
+        if not self._rows:
+            return
+        rows = np.array([*self._rows.values()])
+        is_shown = np.array([key in shown for key in self._rows])
+        centers = self._centers[rows] / np.maximum(self._squares[rows], 1e-12)[:, None]
+        apart = np.square(positions - centers[:, None]).sum(axis=-1).min(axis=1, initial=np.inf)
+        areas = self._squares[rows] / np.maximum(self._areas[rows], 1e-12)
+        is_in_view = is_shown | (np.sqrt(apart) <= np.sqrt(areas / np.pi))
+        rows, is_shown = rows[is_in_view], is_shown[is_in_view]
+        self._frames[rows] = np.minimum(self._frames[rows] + 1, PRESENCE)
+        self._presence[rows] += (is_shown - self._presence[rows]) / self._frames[rows]
 
     def _row_of(self, key: tuple[int, ...], area: float) -> int:
         """Its row; a new one takes that of the smallest, if that is smaller. -1: none."""
@@ -273,6 +269,21 @@ class BrightSurface:
         if traced is not None:
             visible = traced.emitters.visible(traced.volume, traced.origins, traced.arrivals.result())
             self.visibility[np.ix_(traced.patches, traced.rows)] = visible
+
+
+def _by_cell(bright: SeenBright, cells: Ints, count: int) -> SeenBright:
+    """Means over the blocks in each of `count` cells, and their areas as seen from the front; cells: [n] of blocks."""
+    across = np.bincount(cells, bright.areas_m2, count)
+    center, normal, radiance = (
+        np.stack([np.bincount(cells, bright.areas_m2 * column, count) for column in values.T], axis=1) / across[:, None]
+        for values in (bright.positions, bright.normals, bright.radiance)
+    )
+    line = center - bright.eye
+    line /= np.maximum(np.linalg.norm(line, axis=1), 1e-6)[:, None]
+    lengths = np.linalg.norm(normal, axis=1)
+    flatness = _flatness(lengths)
+    cosines = np.maximum(-(normal * line).sum(axis=1) / np.maximum(lengths, 1e-6), _LEAST_COSINE)
+    return SeenBright(center, normal, radiance, across / (1 - flatness + flatness * cosines), bright.eye)
 
 
 def _keys(points: Floats) -> Ints:

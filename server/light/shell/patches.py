@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from server.light.arrivals import PendingArrivals, begin_arrivals
 from server.light.shell.known_room import KnownPatches
 from server.light.shell.picture import Seen
+from server.maths.groups import distinct_rows
 from server.maths.sh import spherical_fibonacci
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
@@ -78,6 +79,8 @@ class Patches:
         self.outdated = 0.0
         """Share of the patches whose rays met surface under another light; what is solved is far from the new one."""
         self._frame = 0
+        self._grouped: tuple[Seen, Ints, _Means] | None = None
+        """The last picture's, which is asked for twice."""
 
     @property
     def used(self) -> Ints:
@@ -89,11 +92,11 @@ class Patches:
 
         Equal numbers [k], from 0: patches that face one way.
         """
-        keys, mean = _grouped(seen)
-        rows = np.array([self._rows.get(tuple(key), -1) for key in keys], np.int64)
+        keys, mean = self._groups(seen)
+        rows = self._known_rows(keys)
         is_known = (rows >= 0) & (self.weights[rows] > 0)
         now = mean.of(seen.logarithms)[is_known].mean(axis=1)
-        facing = np.unique(keys[is_known, 3:], axis=0, return_inverse=True)[1].ravel()
+        facing = distinct_rows(keys[is_known, 3:])[1]
         return np.asarray(now - self.logarithms[rows[is_known]].mean(axis=1)), facing
 
     def forget(self, share: float) -> None:
@@ -105,7 +108,7 @@ class Patches:
     def add(self, seen: Seen) -> None:
         """Fold a picture in."""
         self._frame += 1
-        keys, mean = _grouped(seen)
+        keys, mean = self._groups(seen)
         rows = self._rows_of(keys)
         weights = self.weights[rows]
         share = 1.0 / (np.minimum(weights, MOST_WEIGHT - 1) + 1.0)
@@ -167,14 +170,24 @@ class Patches:
         )
         self.variances[rows], self.clipped[rows], self.weights[rows] = known.variances, known.clipped, known.weights
 
+    def _groups(self, seen: Seen) -> tuple[Ints, _Means]:
+        """As of _grouped."""
+        if self._grouped is None or self._grouped[0] is not seen:
+            self._grouped = seen, *_grouped(seen)
+        return self._grouped[1:]
+
+    def _known_rows(self, keys: Ints) -> Ints:
+        """Rows of patches by key, -1 for those that are not there."""
+        return np.array([self._rows.get(key, -1) for key in map(tuple, keys.tolist())], np.int64)
+
     def _rows_of(self, keys: Ints) -> Ints:
         """Rows of patches by key, new ones included."""
-        rows = np.array([self._rows.get(tuple(key), -1) for key in keys], np.int64)
+        rows = self._known_rows(keys)
         new = np.flatnonzero(rows < 0)
         self._make_room(len(self._rows) + len(new) - MOST_PATCHES, rows[rows >= 0])
         free = sorted(set(range(MOST_PATCHES)) - set(self._rows.values())) if len(new) else []
         for place, row in zip(new, free, strict=False):
-            self._rows[tuple(keys[place])] = rows[place] = row
+            self._rows[tuple(keys[place].tolist())] = rows[place] = row
         self.weights[rows[new]], self.traced_in[rows[new]] = 0.0, -1
         self.keys[rows[new]], self.regions[rows[new]] = keys[new], _region_numbers(keys[new])
         return rows
@@ -200,8 +213,7 @@ def _grouped(seen: Seen) -> tuple[Ints, _Means]:
     """Keys of the patches in a picture, [k, 6] distinct, and means over what it shows of each."""
     cells = np.floor(seen.positions / PATCH_M).astype(np.int64)
     facing = np.rint(seen.normals * _FACINGS).astype(np.int64)
-    keys, inverse = np.unique(np.concatenate([cells, facing], axis=1), axis=0, return_inverse=True)
-    inverse = inverse.ravel()
+    keys, inverse = distinct_rows(np.concatenate([cells, facing], axis=1))
     return keys, _Means(inverse, np.bincount(inverse, minlength=len(keys)).astype(np.float64))
 
 

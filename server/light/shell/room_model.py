@@ -28,6 +28,7 @@ from server.light.shell.shell import Shell
 from server.light.shell.solution import Solution
 from server.light.shell.solver import LEAST_PATCHES, Solver
 from server.light.shell.switches import Switches
+from server.maths.groups import medians_of
 from server.opencl.pacing import Pacer
 
 STEADY, CHANGED = 0.2, 0.3
@@ -201,6 +202,6 @@ class RoomModel:
         many = np.flatnonzero(counts >= LEAST_FACING)
         if counts[many].sum() < LEAST_PATCHES:
             return 0.0
-        medians = np.array([np.median(changes[facing == number]) for number in many])
+        medians = medians_of(changes, facing)[many]
         change = np.sqrt(np.average(medians**2, weights=counts[many]))
         return float(np.clip((change - STEADY) / (CHANGED - STEADY), 0.0, 1.0))

@@ -21,6 +21,7 @@ from server.light.shell.room_model import RoomModel
 from server.light.shell.solution import LookUp, Solution
 from server.light.shell.switches import Switches
 from server.maths.direct_lights import SplitLight, split_light
+from server.maths.dominant import dominant_lights
 from server.maths.light_places import EVERYWHERE, LightPlaces, places_of
 from server.maths.sh import LUMINANCE
 from server.opencl.engine import Engine
@@ -51,7 +52,9 @@ class RoomLight:
         plain = LightEstimator(settings.bands, as_thesis=settings.as_thesis, memory=switches.memory)
         self._harmonics = plain if is_plain or settings.as_thesis else None
         self._least_openness = LEAST_OPENNESS if "openness" in settings.robustness else 0.0
-        self._model = RoomModel(switches)
+        self._model = RoomModel(switches, self._prepare)
+        self._asked: NDArray[np.float64] | None = None
+        """[n, 3] places that objects saw the light from last, world."""
         self._given: LightEstimate | None = None
         self._remembered: LightEstimate | None = None
         """The light of earlier frames, until the first new frame."""
@@ -106,12 +109,20 @@ class RoomLight:
             split = split_light(sh)
             return sh[None], SplitLight(split.rest[None], split.discs), EVERYWHERE
         places = places_of(middles)
-        whole, rest, lamps = solution.beyond(places.positions + origin_world, self._settings.bands)
+        self._asked = places.positions + origin_world
+        whole, rest, lamps = solution.beyond(self._asked, self._settings.bands)
         if self._settings.light_color == "white":
             whole, rest = _whitened(whole), _whitened(rest)
             lamps = [replace(lamp, radiance=_whitened(lamp.radiance)) for lamp in lamps]
         discs = tuple(lamp.as_direct_light(origin_world) for lamp in lamps)
         return whole, SplitLight(rest, discs), places
+
+    def _prepare(self, solution: Solution) -> None:
+        """Find what takes long and every frame asks of a new solution."""
+        asked, bands = self._asked, self._settings.bands
+        dominant_lights(self._colored(solution.estimate(bands)).sh)
+        if asked is not None:
+            solution.beyond(asked, bands)
 
     def look_up(self, context: FrameContext, positions: NDArray[np.float64]) -> LookUp | None:
         """Begin to trace what `arriving_at` needs; None where there is no solution, or this frame takes another."""

@@ -9,6 +9,7 @@ Frames of a live camera do not wait, but for a first solution: they take one ove
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 
@@ -68,8 +69,9 @@ class _Tracing:
 class RoomModel:
     """Radiance of all that is not scanned surface, with the evidence for it. World axes and metres."""
 
-    def __init__(self, switches: Switches | None = None) -> None:
-        self._switches = switches or Switches()
+    def __init__(self, switches: Switches | None = None, prepare: Callable[[Solution], None] = lambda _: None) -> None:
+        """prepare: find what frames will ask of a solution, beside them too; a solution remembers it."""
+        self._switches, self._prepare = switches or Switches(), prepare
         self._patches, self._bright = Patches(), BrightSurface()
         self._solver = Solver(self._switches)
         self._solution: Solution | None = None
@@ -149,7 +151,14 @@ class RoomModel:
         self._patches.end_trace(tracing.patches)
         self._bright.end_trace(tracing.emitters)
         patches, bright, traced = self._patches.copy(), self._bright.seen_by(), tracing.patches.rows
-        self._next = Beside(lambda: self._solver.solve(patches, bright, traced, tracing.camera, tracing.up))
+
+        def solve() -> Solution | None:
+            solution = self._solver.solve(patches, bright, traced, tracing.camera, tracing.up)
+            if solution is not None:
+                self._prepare(solution)
+            return solution
+
+        self._next = Beside(solve)
 
     @property
     def _is_ready(self) -> bool:

@@ -4,6 +4,7 @@ per device."""
 from __future__ import annotations
 
 import re
+import warnings
 from pathlib import Path
 from threading import Lock
 
@@ -22,7 +23,12 @@ _PROLOGUE = """#ifdef __clang__
 """
 """Where a processor has no registers for float16, clang warns that other compilers would pass it otherwise: no call
 leaves a program. NVIDIA's compiler is a clang that does not know this warning, which would be an error."""
+_LINE = re.compile(r'#line (\d+) "([^"]+)"')
+_UNNAMED = re.compile(r"<kernel>:(\d+):")
 _INCLUDE = re.compile(r'#include "([^"]+)"')
+
+# Warnings are errors, so what a compiler says besides tells nobody anything: NVIDIA's, an empty line for each program.
+warnings.filterwarnings("ignore", category=cl.CompilerWarning)
 
 Define = int | float | str | bool
 
@@ -60,6 +66,25 @@ def with_headers(text: str, name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
+def with_places(message: str, source: str) -> str:
+    """A compiler's message with `file:line:` in place of `<kernel>:line:`.
+
+    NVIDIA's compiler counts lines through and passes over what `#line` in the source says of them.
+    """
+    places, file, number = [], "<kernel>", 0
+    for line in source.splitlines():
+        number += 1
+        places.append(f"{file}:{number}:")
+        if found := _LINE.match(line):
+            number, file = int(found[1]) - 1, found[2]
+
+    def place(found: re.Match[str]) -> str:
+        at = int(found[1]) - 1
+        return places[at] if 0 <= at < len(places) else found[0]
+
+    return _UNNAMED.sub(place, message)
+
+
 class ProgramCache:
     """Programs of one context, keyed by file and defines. Safe to use from several threads."""
 
@@ -93,5 +118,6 @@ class ProgramCache:
             program: cl.Program = cl.Program(self._context, source).build(options)
         except cl.RuntimeError as error:
             place = f"cl_kernels/{path.relative_to(KERNEL_FOLDER)}"
-            raise KernelBuildError(f"{place} with {' '.join(defines) or 'no defines'}: {error}") from error
+            told = with_places(str(error), source)
+            raise KernelBuildError(f"{place} with {' '.join(defines) or 'no defines'}: {told}") from error
         return program

@@ -12,7 +12,7 @@ import pytest
 from server.opencl import program
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.opencl.program import KernelBuildError, ProgramCache, define_options
+from server.opencl.program import KernelBuildError, ProgramCache, define_options, with_places
 
 HALVE = """
 kernel void halve(global float *result) { result[get_global_id(0)] = VALUE / 2; }
@@ -103,6 +103,19 @@ def test_nothing_that_is_compiled_holds_the_path_of_the_kernels(
     cache.get("get.cl", {"VALUE": 2})
     assert "-DVALUE=2" in compiled
     assert str(folder) not in "".join(compiled)
+
+
+def test_lines_that_are_counted_through_are_named() -> None:
+    """As NVIDIA's compiler counts them; what names files already stays."""
+    source = 'int a;\n#line 1 "some.cl"\nint b;\n#line 1 "some.clh"\nint c;\nint d;\n#line 3 "some.cl"\nint e;\n'
+    for told, named in {
+        "<kernel>:3:5: error: b": "some.cl:1:5: error: b",
+        "<kernel>:6:1: error: d\n<kernel>:8:2: error: e": "some.clh:2:1: error: d\nsome.cl:3:2: error: e",
+        "other.cl:7:1: error": "other.cl:7:1: error",
+        "<kernel>:1:1: before any file": "<kernel>:1:1: before any file",
+        "<kernel>:99:1: nowhere": "<kernel>:99:1: nowhere",
+    }.items():
+        assert with_places(told, source) == named
 
 
 def test_a_build_error_names_file_options_and_line(cache: ProgramCache, folder: Path) -> None:

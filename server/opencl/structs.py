@@ -41,16 +41,17 @@ class Struct:
         size = _rounded(end, self.alignment)
         layout: Any = {"names": [*fields], "formats": dtypes, "offsets": offsets, "itemsize": size}
         self.dtype: np.dtype[Any] = np.dtype(layout)
+        self._names: frozenset[str] = frozenset(fields)
         types = {field: of.name if isinstance(of, Struct) else of for field, of in fields.items()}
         members = "".join(f"    {of} {field};\n" for field, of in types.items())
         self.c_text = f"typedef struct {{\n{members}}} {name};\n"
 
     def __call__(self, **values: object) -> np.void:
         """A kernel argument. Raises TypeError where a field is missing or unknown."""
-        names = self.dtype.names or ()
-        if values.keys() != set(names):
-            wrong = ", ".join(sorted(values.keys() ^ set(names)))
-            raise TypeError(f"{self.name} has the fields {', '.join(names)}; missing or unknown: {wrong}")
+        if values.keys() != self._names:
+            wrong = ", ".join(sorted(values.keys() ^ self._names))
+            names = ", ".join(self.dtype.names or ())
+            raise TypeError(f"{self.name} has the fields {names}; missing or unknown: {wrong}")
         filled: NDArray[np.void] = np.zeros(1, self.dtype)
         for field, value in values.items():
             filled[field] = value

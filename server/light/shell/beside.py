@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Generic, TypeVar
@@ -19,7 +20,13 @@ class Beside(Generic[Result]):
 
     def __init__(self, work: Callable[[], Result]) -> None:
         self._future: Future[Result] = Future()
+        self._began_s = time.monotonic()
         threading.Thread(target=self._run, args=(work,), name="beside").start()
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since it was begun."""
+        return time.monotonic() - self._began_s
 
     @property
     def is_done(self) -> bool:

@@ -40,8 +40,8 @@ SOLVE_EVERY = 3
 """Frames between two solutions, as long as the light is steady and little of the room is new: evidence is summed in
 between. The goal is that a change is followed within three frames."""
 LATEST_S = 0.5
-"""A live frame waits all the same for a solution that began so long ago: on a processor that has too much to do the
-light would never be a new one. A person sees light that is later."""
+"""A live frame waits all the same for a solution that began so long ago, and SOLVE_EVERY frames: on a processor that
+has too much to do the light would never be a new one. A person sees light that is later."""
 NEW_SHARE = 0.1
 """If the share of new patches, or of frames that are not in the solution, is at least this, a frame is solved at
 once."""
@@ -163,7 +163,9 @@ class RoomModel:
     @property
     def _is_ready(self) -> bool:
         """Whether nothing is worked out that a live frame leaves for the next one."""
-        return self._next is None or self._next.is_done or self._next.age_s >= LATEST_S
+        if self._next is None or self._next.is_done:
+            return True
+        return self._waiting >= SOLVE_EVERY and self._next.age_s >= LATEST_S
 
     def _take_over(self, pacer: Pacer) -> None:
         """The solution that was begun last, waited for: others may use the device meanwhile."""

@@ -317,8 +317,8 @@ def test_a_save_is_of_one_moment(device: Device, room: Room, store: RoomStore, m
         threading.Event(),
     )
 
-    def noted(*given: Any) -> FrameResult:
-        result = process(*given)
+    def noted(*given: Any, **named: Any) -> FrameResult:
+        result = process(*given, **named)
         had[room.reconstruction.volume.frames] = print_of(room)
         return result
 

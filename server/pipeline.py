@@ -103,7 +103,7 @@ class Pipeline:
             self._samplings += 1
         self._settings = settings
 
-    def process_frame(self, frame: RgbdFrame, request: RenderRequest, *, waits_for_light: bool = True) -> FrameResult:
+    def process_frame(self, frame: RgbdFrame, request: RenderRequest, *, waits_for_light: bool) -> FrameResult:
         """Fuse one frame, estimate the light, render what is virtual (fig. 5.1). waits_for_light: as in FrameContext.
 
         Raises ValueError with one line for a frame that is refused; the state is then as it was.

@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from itertools import chain
 from typing import Protocol
 
 import pyopencl as cl
@@ -121,19 +120,14 @@ class Pacer:
     def _ahead_s(self) -> float:
         return self._alone_ahead_s if self.yielding is None else min(self._alone_ahead_s, SHARED_AHEAD_S)
 
-    def slices(self, kernel: str, size: Size, local: Size, steps: int) -> Iterable[tuple[Size, Size]]:
+    def slices(self, kernel: str, size: Size, local: Size, steps: int) -> Iterator[tuple[Size, Size]]:
         """Offset and size of each slice of a launch, in work-items; `size` and all slices are multiples of `local`.
 
         `steps`: inner steps of a work-item, such as rays. Waits before each slice while too much is enqueued already.
         """
-        items = math.prod(size)
-        is_long = items * steps * self._step_s > PROBE * self._slice_s
+        is_long = math.prod(size) * steps * self._step_s > PROBE * self._slice_s
         may_hold = is_long and self.yielding is not None
-        most = self._most_items(kernel, steps, may_hold)
-        if items <= most:
-            return (((0,) * len(size), size),)
-        asked = chain((most,), iter(lambda: self._most_items(kernel, steps, may_hold), None))
-        return cut(size, local, lambda: next(asked))
+        return cut(size, local, lambda: self._most_items(kernel, steps, may_hold))
 
     def _most_items(self, kernel: str, steps: int, may_hold: bool) -> int:
         """Work-items of the next slice, once there is room for one. What earlier slices took counts at once: a launch

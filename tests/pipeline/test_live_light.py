@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import msgspec
@@ -19,6 +18,7 @@ from server.light.shell import room_model
 from server.light.shell.room_model import LATEST_S, SOLVE_EVERY
 from server.opencl.device import Device
 from tests.scenes.analytic import Floats
+from tests.scenes.turns import Alone
 
 STEADY = 25
 """Frames after which two more are no tenth of all, for which a solution would begin at once."""
@@ -38,19 +38,6 @@ class Slow:
     def result(self) -> Any:
         self.was_waited_for = not self.is_done
         return self._work()
-
-
-class Turn:
-    """Of a session that has the device for itself."""
-
-    def is_due(self) -> bool:
-        return False
-
-    def give_way(self, *, may_end: bool) -> None:
-        raise AssertionError(may_end)
-
-    def released(self) -> AbstractContextManager[None]:
-        return nullcontext()
 
 
 @pytest.fixture
@@ -81,7 +68,7 @@ def test_a_live_frame_takes_the_newest_light_that_is_ready(
     lights: list[Floats] = []
 
     def show(frames: range) -> None:
-        lights.extend(np.array(pipeline.process(source[index], turn=Turn()).light.sh) for index in frames)
+        lights.extend(np.array(pipeline.process(source[index], turn=Alone()).light.sh) for index in frames)
 
     show(range(3))
     assert [work.was_waited_for for work in begun] == [True, False], "the first frame has no other light"
@@ -99,15 +86,15 @@ def test_a_live_frame_waits_in_the_end(device: Device, source: SyntheticSource, 
     pipeline = session(device, source)
     waited: list[bool] = []
     for index in range(2):
-        pipeline.process(source[index], turn=Turn())
+        pipeline.process(source[index], turn=Alone())
     begun[-1].age_s = LATEST_S
     for index in range(2, 2 + SOLVE_EVERY):
-        pipeline.process(source[index], turn=Turn())
+        pipeline.process(source[index], turn=Alone())
         waited.append(begun[1].was_waited_for)
     assert waited == [False, False, True], "frames may be far apart where many cameras share a device"
     begun[-1].age_s = 0.9 * LATEST_S
     for index in range(6, 16):
-        pipeline.process(source[index], turn=Turn())
+        pipeline.process(source[index], turn=Alone())
     assert [work.was_waited_for for work in begun] == [True, True, False]
     pipeline.close()
 
@@ -122,13 +109,13 @@ def test_a_change_of_the_light_is_not_forgotten_meanwhile(
     while shown < STEADY or begun[-1].is_done:  # until one has just begun
         for work in begun:
             work.is_done = True
-        pipeline.process(source[shown % len(source)], turn=Turn())
+        pipeline.process(source[shown % len(source)], turn=Alone())
         shown += 1
     count = len(begun)
-    pipeline.process(moved[shown % len(source)], turn=Turn())
+    pipeline.process(moved[shown % len(source)], turn=Alone())
     assert len(begun) == count
     begun[-1].is_done = True
-    pipeline.process(moved[(shown + 1) % len(source)], turn=Turn())
+    pipeline.process(moved[(shown + 1) % len(source)], turn=Alone())
     assert len(begun) == count + 1, "long before it would have been its turn"
     pipeline.close()
 
@@ -138,7 +125,7 @@ def test_others_wait_and_have_the_same_light(device: Device, source: SyntheticSo
     alone, lossless = session(device, source), session(device, source, lossless=True)
     for index in range(5):
         expected = alone.process(source[index]).light
-        found = lossless.process(source[index], turn=Turn()).light
+        found = lossless.process(source[index], turn=Alone()).light
         assert found.sh == expected.sh
     assert all(work.was_waited_for for work in begun[:-2])
     alone.close()

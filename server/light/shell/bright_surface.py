@@ -17,7 +17,7 @@ from server.light.arrivals import PendingArrivals, begin_arrivals
 from server.light.shell.patches import MOST_PATCHES, MOST_WEIGHT, Patches
 from server.light.shell.picture import SeenBright
 from server.light.shell.weights import GIVEN_ALBEDO
-from server.maths.groups import distinct_rows
+from server.maths.distinct_rows import distinct_rows
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from server.light.arrivals import PendingArrivals, begin_arrivals
 from server.light.shell.known_room import KnownPatches
 from server.light.shell.picture import Seen
-from server.maths.groups import distinct_rows
+from server.maths.distinct_rows import distinct_rows
 from server.maths.sh import spherical_fibonacci
 from server.opencl.engine import Engine
 from server.volume.volume import Volume

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from server.frame_context import FrameContext
 from server.light.light_estimation import LightEstimate
@@ -29,7 +30,6 @@ from server.light.shell.shell import Shell
 from server.light.shell.solution import Solution
 from server.light.shell.solver import LEAST_PATCHES, Solver
 from server.light.shell.switches import Switches
-from server.maths.groups import medians_of
 from server.opencl.pacing import Pacer
 
 STEADY, CHANGED = 0.2, 0.3
@@ -69,9 +69,9 @@ class _Tracing:
 class RoomModel:
     """Radiance of all that is not scanned surface, with the evidence for it. World axes and metres."""
 
-    def __init__(self, switches: Switches | None = None, prepare: Callable[[Solution], None] = lambda _: None) -> None:
+    def __init__(self, switches: Switches, prepare: Callable[[Solution], None]) -> None:
         """prepare: find what frames will ask of a solution, beside them too; a solution remembers it."""
-        self._switches, self._prepare = switches or Switches(), prepare
+        self._switches, self._prepare = switches, prepare
         self._patches, self._bright = Patches(), BrightSurface()
         self._solver = Solver(self._switches)
         self._solution: Solution | None = None
@@ -123,15 +123,13 @@ class RoomModel:
         self._waiting, self._frames = self._waiting + 1, self._frames + 1
         self._is_urgent = self._is_urgent or self._must_follow(change)
         waits = context.waits_for_light or self._solution is None
-        if not waits:
-            if not self._is_ready:
-                return
-            self._take_over(engine.pacer)
-        is_young = self._waiting > NEW_SHARE * self._frames
-        if not self._is_urgent and not is_young and self._waiting < SOLVE_EVERY:
+        if not waits and not self._is_ready:
             return
-        self._take_over(engine.pacer)
-        if not self._is_urgent and self._is_still():
+        is_young = self._waiting > NEW_SHARE * self._frames
+        is_due = self._is_urgent or is_young or self._waiting >= SOLVE_EVERY
+        if is_due or not waits:
+            self._take_over(engine.pacer)
+        if not is_due or (not self._is_urgent and self._is_still()):
             return
         traced = self._patches.begin_trace(engine, volume, self._waiting)
         emitters = self._bright.begin_trace(engine, volume, self._patches, traced.rows)
@@ -213,6 +211,6 @@ class RoomModel:
         many = np.flatnonzero(counts >= LEAST_FACING)
         if counts[many].sum() < LEAST_PATCHES:
             return 0.0
-        medians = medians_of(changes, facing)[many]
+        medians = ndimage.median(changes, facing, many)
         change = np.sqrt(np.average(medians**2, weights=counts[many]))
         return float(np.clip((change - STEADY) / (CHANGED - STEADY), 0.0, 1.0))

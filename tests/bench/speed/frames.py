@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,6 +25,7 @@ from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from tests.bench.rendering.flip import flip_map
 from tests.bench.report.finished import Part
+from tests.scenes.turns import Alone
 
 WARM_UP = 8
 """Frames whose time does not count: kernels are compiled, and the scan begins."""
@@ -54,21 +54,6 @@ class Stage:
             mesh = load_mesh(self.mesh.read_bytes(), "glb")
             session.place_object("thing", mesh, Placement(position_m=self.position_m, scale=self.scale))
         return session
-
-
-class Alone:
-    """The turn of a session that shares the device with nobody."""
-
-    def is_due(self) -> bool:
-        """As of FrameTurn; so are the others."""
-        return False
-
-    def give_way(self, *, may_end: bool) -> None:
-        """Never asked for."""
-
-    def released(self) -> AbstractContextManager[None]:
-        """Of no consequence."""
-        return nullcontext()
 
 
 @dataclass

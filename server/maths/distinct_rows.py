@@ -1,4 +1,4 @@
-"""Values that belong together: distinct rows of a table of whole numbers, and medians of groups."""
+"""The distinct rows of a table of whole numbers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 _MOST = 1 << 62
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
@@ -25,14 +24,3 @@ def distinct_rows(rows: Ints) -> tuple[Ints, Ints]:
         return found, inverse.ravel()
     numbers, inverse = np.unique(np.ravel_multi_index(tuple((rows - low).T), spans), return_inverse=True)
     return np.stack(np.unravel_index(numbers, spans), axis=1) + low, inverse
-
-
-def medians_of(values: Floats, groups: Ints) -> Floats:
-    """[k] medians of `values` [n] by the number of their group [n], from 0; NaN for a group without values."""
-    ordered = values[np.lexsort((values, groups))]
-    counts = np.bincount(groups)
-    first = np.cumsum(counts) - counts
-    lower, upper = first + np.maximum(counts - 1, 0) // 2, first + counts // 2
-    last = max(len(values) - 1, 0)
-    medians = (ordered[np.minimum(lower, last)] + ordered[np.minimum(upper, last)]) / 2
-    return np.where(counts > 0, medians, np.nan)

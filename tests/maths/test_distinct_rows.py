@@ -1,11 +1,11 @@
-"""Distinct rows and medians of groups, beside NumPy's own."""
+"""Distinct rows, beside NumPy's own."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from server.maths.groups import distinct_rows, medians_of
+from server.maths.distinct_rows import distinct_rows
 
 
 @pytest.mark.parametrize("spread", [1, 3, 1000, 1 << 40], ids=["one", "few", "many", "too far apart for one number"])
@@ -23,15 +23,3 @@ def test_rows_are_numpys(spread: int, shape: tuple[int, int]) -> None:
 def test_no_rows() -> None:
     found, inverse = distinct_rows(np.zeros((0, 3), np.int64))
     assert (found.shape, inverse.shape) == ((0, 3), (0,))
-
-
-def test_medians_are_numpys() -> None:
-    """Of groups of one, two and many, and of one that is empty."""
-    random = np.random.default_rng(5)
-    groups = np.concatenate([[0], [1, 1], random.integers(3, 9, 200)])
-    values = random.normal(size=len(groups))
-    order = random.permutation(len(groups))
-    found = medians_of(values[order], groups[order])
-    assert np.isnan(found[2])
-    for number in (0, 1, *range(3, 9)):
-        assert found[number] == np.median(values[groups == number])

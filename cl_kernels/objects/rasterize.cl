@@ -356,9 +356,11 @@ static int object_of(const int triangle, const int count, const global int8 *obj
 // `attributes` [v, 3] float4: normal; linear base colour; texture coordinates of base colour and of roughness and
 // metalness. `materials` [m] float4: roughness, metalness, numbers of the textures of base colour and of roughness (G)
 // and metalness (B), -1 for none. `material_of` [t] a triangle's, in its mesh.
-// The ray of pixel (u, v) is model_from_pixel's column 3 + t * its columns 0 to 2 times (u, v, 1), with t the depth;
+// `visible` and the tiles of `region`, in which it is known, are those of a picture with `parts` pixels, along either side, for each of
+// these; of them pixel (parts u, parts v) has the centre of pixel (u, v).
+// The ray of pixel (u, v) of that picture is model_from_pixel's column 3 + t * its columns 0 to 2 times (u, v, 1), with t the depth;
 // its last row is not part of the ray: it maps a model point to its depth.
-// Writes the pixels `around` (x0 y0 x1 y1, half-open); `visible` is known in the tiles of `region`.
+// Writes the pixels `around` (x0 y0 x1 y1, half-open).
 kernel void shade_surface(const SurfaceParameters parameters, const global int *visible, const global int8 *objects,
                           const global float16 *matrices, const global float *vertices, const global int *triangles,
                           const global float4 *attributes, const global int *material_of,
@@ -370,20 +372,21 @@ kernel void shade_surface(const SurfaceParameters parameters, const global int *
     const int2 pixel = around.xy + (int2)(get_global_id(0), get_global_id(1));
     if (pixel.x >= around.z || pixel.y >= around.w) return;
     const int index = pixel.y * parameters.width + pixel.x;
-    const int2 tile = pixel / TILE;
+    const int2 part = pixel * parameters.parts, tile = part / TILE;
     const bool drawn = tile.x >= region.x && tile.y >= region.y && tile.x < region.z && tile.y < region.w;
-    if (!drawn || visible[index] == NOBODY) {
+    const int shown = drawn ? visible[part.y * parameters.parts * parameters.width + part.x] : NOBODY;
+    if (shown == NOBODY) {
         object_index[index] = -1;
         position[index] = normal[index] = base_color[index] = surface[index] = (float4)(0.0f);
         return;
     }
-    const int number = object_index[index] = object_of(visible[index], parameters.object_count, objects);
+    const int number = object_index[index] = object_of(shown, parameters.object_count, objects);
     const int8 object = objects[number];
     const float16 model_from_pixel = matrices[3 * number + 1];
-    const int triangle = object.s1 + visible[index] - object.s5;
+    const int triangle = object.s1 + shown - object.s5;
     const int3 v = vload3(triangle, triangles) + object.s0;
     const float3 a = vload3(v.x, vertices), ab = vload3(v.y, vertices) - a, ac = vload3(v.z, vertices) - a;
-    const float3 direction = transform_vector(model_from_pixel, (float3)(pixel.x, pixel.y, 1.0f));
+    const float3 direction = transform_vector(model_from_pixel, (float3)(part.x, part.y, 1.0f));
     const float3 hit = intersect_plane(a, ab, ac, model_from_pixel.s37b, direction);
     const float3 share = shares_inside(hit), point = point_on_ray(model_from_pixel, a, ab, ac, direction, hit.z);
     const global float4 *at_a = attributes + 3 * v.x, *at_b = attributes + 3 * v.y, *at_c = attributes + 3 * v.z;
@@ -393,7 +396,8 @@ kernel void shade_surface(const SurfaceParameters parameters, const global int *
     float2 roughness_metalness = material.xy;
     if (material.z >= 0.0f || material.w >= 0.0f) {
         const Textures textures = {texture_table, levels, texels, values};
-        const float4 changes = share_changes(ab, ac, model_from_pixel, model_from_pixel.s37b - a, direction);
+        const float4 changes =
+            parameters.parts * share_changes(ab, ac, model_from_pixel, model_from_pixel.s37b - a, direction);
         const float4 uv = at_a[2], to_b = at_b[2] - uv, to_c = at_c[2] - uv;
         if (material.z >= 0.0f)
             color.xyz *= textured(textures, (int)material.z, uv.xy, to_b.xy, to_c.xy, share.yz, changes, COLOR_PROBES);

@@ -16,7 +16,6 @@ from server.reuse.temporal_reuse import ECHO, NOISE
 
 PURPOSES = {
     "rasterize": "draws the virtual objects",
-    "cover": "computes their coverage of each pixel, for smooth edges",
     "draw_depth_views": "draws the depth views for visibility look-up",
     "prepare_rays": "prepares the geometry that rays are traced through",
     "shadow_map": "draws shadow maps of the objects for the dominant lights",

@@ -124,7 +124,7 @@ _NOISE: dict[str, Any] = {
     "noise_dependent_effects": frozenset({"bounce_real"}),
 }
 
-_DRAWN = {"rasterize", "cover", "composite"}
+_DRAWN = {"rasterize", "composite"}
 _SHADED = _DRAWN | {"prepare_rays", "add_objects", "shade_virtual"}
 _SENT = {"first_shadow", "light_objects"}
 _STANDS = _SHADED | _SENT | {"shadow_real", "mark_changes"}

@@ -73,7 +73,6 @@ class FactsFinder:
             objects_in_view=len(in_view),
             adaptive=context.sampling.adaptive,
             indirect=has_indirect,
-            smooth_edges=context.smooth_edges,
             glossy=any(is_glossy(table) for table in materials),
             reflected=max((most_reflected(table, albedo=1.0) for table in materials), default=0.0),
             gain=gain,

@@ -67,11 +67,6 @@ def no_indirect(facts: SceneFacts) -> CullReason | None:
     return None if facts.indirect else NO_INDIRECT
 
 
-def hard_edges(facts: SceneFacts) -> CullReason | None:
-    """A wish."""
-    return None if facts.smooth_edges else CullReason("asked for: hard edges", SHOWN)
-
-
 def not_refined(facts: SceneFacts) -> CullReason | None:
     """A preset's."""
     return None if facts.adaptive else CullReason("asked for: the preset does not refine", SHOWN)

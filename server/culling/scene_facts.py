@@ -40,7 +40,6 @@ class SceneFacts:
     adaptive: bool = False
     indirect: bool = False
     """Whether surfaces send light."""
-    smooth_edges: bool = True
     glossy: bool = False
     """Whether any virtual surface in view is not matt."""
     reflected: float = 1.0

@@ -8,7 +8,6 @@ from server.effects.resources import (
     BouncedShadow,
     ChangedScene,
     ChangeMask,
-    Coverage,
     DirectReal,
     DirectVirtual,
     FaintShadows,
@@ -43,13 +42,9 @@ from server.transfer.sample_grid import SampleGrid
 
 
 def rasterize(context: FrameContext, objects: VirtualObjects) -> VirtualSurface:
-    """Draw the virtual objects into their geometry buffer (fig. 7.5)."""
-    return raster.rasterize(context.engine, context.camera, context.camera_from_volume, objects)
-
-
-def cover(context: FrameContext, objects: VirtualObjects) -> Coverage:
-    """How much of each pixel the virtual objects cover."""
-    return Coverage(raster.nearest_depths(context.engine, context.camera, context.camera_from_volume, objects))
+    """Draw the virtual objects into their geometry buffer (fig. 7.5), and how much of each pixel they cover."""
+    parts = raster.subpixels(context.camera) if context.smooth_edges else 1
+    return raster.rasterize(context.engine, context.camera, context.camera_from_volume, objects, parts=parts)
 
 
 def draw_depth_views(context: FrameContext, objects: VirtualObjects, real: RealDepthViews) -> DepthViews:

@@ -48,7 +48,7 @@ from server.transfer.samples import TransferSamples
 
 Picture = NDArray[np.uint8]
 
-LASTING = frozenset({"virtual", "coverage"})
+LASTING = frozenset({"virtual"})
 """The same for all direction sets, and written only where an object has moved."""
 DRAWN_BY_CLIENT = CullReason("asked for: the client draws by itself", 0.0)
 
@@ -275,7 +275,6 @@ def composite_inputs(context: FrameContext, parts: PictureParts) -> CompositeInp
         refined_occluded=parts.refined_occluded,
         refined_ratio=parts.refined_ratio,
         upsampling=context.sampling.upsampling,
-        coverage=parts.coverage,
         reflected=parts.reflected,
         gain=1.0 if parts.gain is None else parts.gain,
         direct_virtual=_direct_virtual(context, parts),

@@ -39,8 +39,6 @@ class FaintShadows:
 
 Gain = NewType("Gain", float)
 """Factor on the shading of virtual surface (7.1, H)."""
-Coverage = NewType("Coverage", cl_array.Array)
-"""How much of each pixel the objects cover, of rasterize.py."""
 ChangedScene = NewType("ChangedScene", TracedScene)
 """The scene with the light that the objects send and the changed light that real surface sends."""
 FirstShadow = NewType("FirstShadow", RealShadow)
@@ -74,7 +72,6 @@ class PictureParts:
     bounced: BouncedShadow | None = None
     refined_occluded: RefinedVirtual | None = None
     refined_ratio: RefinedReal | None = None
-    coverage: Coverage | None = None
     reflected: Reflected | None = None
     gain: Gain | None = None
     """None: the light's own scale."""

@@ -23,7 +23,6 @@ FAINT_SHADOWS: Approximation[SceneFacts] = Approximation(
 EFFECTS: EffectTable[SceneFacts] = EffectTable(
     (
         Effect(f.rasterize, culled_by=(rules.out_of_view,)),
-        Effect(f.cover, disabled_by=(rules.hard_edges,), culled_by=(rules.out_of_view,)),
         Effect(f.draw_depth_views),
         Effect(f.prepare_rays),
         Effect(f.shadow_map),

@@ -20,13 +20,15 @@ class Pinhole:
 
 
 def finer(camera: CameraModel, parts: int) -> Pinhole:
-    """The camera, its distortion ignored, with `parts` times as many pixels along either side."""
-    shift = (parts - 1) / 2
+    """The camera, its distortion ignored, with `parts` times as many pixels along either side.
+
+    The centre of pixel (x, y) is that of pixel (parts x, parts y) here.
+    """
     return Pinhole(
         width=parts * camera.width,
         height=parts * camera.height,
         fx=parts * camera.fx,
         fy=parts * camera.fy,
-        cx=parts * camera.cx + shift,
-        cy=parts * camera.cy + shift,
+        cx=parts * camera.cx,
+        cy=parts * camera.cy,
     )

@@ -33,14 +33,13 @@ __all__ = [
     "Placed",
     "VirtualSurface",
     "boxes_in_view",
-    "nearest_depths",
     "rasterize",
     "subpixels",
 ]
 
 FINE_SUBPIXELS, COARSE_SUBPIXELS = 4, 2
 """Subpixels along each side of a pixel, for coverage. A nearly level or upright edge passes a row of them at once: it
-has one shade more than that, and with three shades furniture has visible steps."""
+has two shades more than that, since those between two pixels count half for each."""
 FINE_PIXELS = 640 * 480
 """Pictures up to this size have fine subpixels. In larger ones steps are smaller, and the cost grows by the area."""
 
@@ -64,8 +63,6 @@ class VirtualSurfaceBuffers(StageBuffers):
 
 class _Buffers(StageBuffers):
     lists = BufferGroup(RasterBuffers)
-    fine_lists = BufferGroup(RasterBuffers)
-    """Lists of nearest_depths."""
 
 
 @dataclass(frozen=True)
@@ -81,9 +78,14 @@ class VirtualSurface:
     object_index: cl_array.Array
     """[h, w] int32: position in the sequence of objects, -1 where there is none."""
     boxes: tuple[PixelBox | None, ...]
-    """For each object x0, y0, x1, y1 (half-open, inside the picture) that holds all its pixels; None: not in view."""
+    """For each object x0, y0, x1, y1 (half-open, inside the picture) that holds all pixels of which it covers a part;
+    None: not in view."""
     material: cl_array.Array | None = None
     """[h, w] float4: perceptual roughness, metalness, 0, w = 1; 0 where there is none; rasterize() always has it."""
+    nearest: cl_array.Array | None = None
+    """[s h, s w] uint32: bits of 1 / depth (1/metre) of the nearest object at the centres of subpixels, s along either
+    side of a pixel, 0 where there is none. Pixel (x, y) has its centre at subpixel (s x, s y). None where s is 1: a
+    pixel is covered if its centre is."""
 
 
 def rasterize(
@@ -92,29 +94,22 @@ def rasterize(
     camera_from_volume: Matrix,
     objects: Sequence[Placed],
     buffers: VirtualSurfaceBuffers | None = None,
+    parts: int = 1,
 ) -> VirtualSurface:
     """Draw `objects`, each with its `volume_from_model`, as a pinhole camera sees them (its distortion is ignored).
 
     `camera_from_volume` [4, 4] float64, rigid: camera axes x right, y down, z forward. buffers: of the result;
-    None: the engine's. Waits for the device where there is much more to draw than the last time, or something to clip.
+    None: the engine's. parts: subpixels along either side of a pixel. One picture is drawn, of subpixels; what a pixel
+    shows is what is at its centre. Waits for the device where there is much more to draw than the last time, or
+    something to clip.
     """
-    boxes = boxes_in_view(camera, camera_from_volume, objects)
-    lists = engine.buffers(_Buffers).lists
-    picture = tabulate(engine, camera, camera_from_volume, objects, boxes, lists.tables)
-    _, visible = _draw(engine, picture, lists)
+    lists, fine = engine.buffers(_Buffers).lists, finer(camera, parts)
+    picture = _tabulated(engine, fine, camera_from_volume, objects, lists)
+    nearest, visible = _draw(engine, picture, lists)
     buffers = buffers or engine.buffers(VirtualSurfaceBuffers)
-    object_index, position, normal, base_color, material = _shade(engine, picture, visible, buffers)
-    return VirtualSurface(position, normal, base_color, object_index, boxes, material)
-
-
-def nearest_depths(
-    engine: Engine, camera: CameraModel, camera_from_volume: Matrix, objects: Sequence[Placed]
-) -> cl_array.Array:
-    """[s h, s w] uint32: bits of 1 / depth (1/metre) of the nearest object at the centres of s x s subpixels a pixel;
-    0 where there is none. s: of `subpixels`."""
-    return drawn_depths(
-        engine, finer(camera, subpixels(camera)), camera_from_volume, objects, engine.buffers(_Buffers).fine_lists
-    )
+    object_index, position, normal, base_color, material = _shade(engine, camera, picture, parts, visible, buffers)
+    boxes = boxes_in_view(camera, camera_from_volume, objects)
+    return VirtualSurface(position, normal, base_color, object_index, boxes, material, nearest if parts > 1 else None)
 
 
 def subpixels(camera: CameraModel) -> int:
@@ -133,8 +128,7 @@ def drawn_depths(
 
     The array is valid until the next call with the same `buffers`.
     """
-    boxes = boxes_in_view(camera, camera_from_volume, objects)
-    return _draw(engine, tabulate(engine, camera, camera_from_volume, objects, boxes, buffers.tables), buffers)[0]
+    return _draw(engine, _tabulated(engine, camera, camera_from_volume, objects, buffers), buffers)[0]
 
 
 def boxes_in_view(
@@ -144,6 +138,17 @@ def boxes_in_view(
     matrices = np.array([matrix for _, matrix in objects], np.float64).reshape(-1, 4, 4)
     low, high = (np.array([thing.bounds[k] for thing, _ in objects], np.float64).reshape(-1, 3) for k in (0, 1))
     return pixel_boxes(camera, camera_from_volume @ matrices, low, high)
+
+
+def _tabulated(
+    engine: Engine,
+    camera: CameraModel | Pinhole,
+    camera_from_volume: Matrix,
+    objects: Sequence[Placed],
+    buffers: RasterBuffers,
+) -> Picture:
+    boxes = boxes_in_view(camera, camera_from_volume, objects)
+    return tabulate(engine, camera, camera_from_volume, objects, boxes, buffers.tables)
 
 
 def _kernel(engine: Engine, name: str) -> cl.Kernel:
@@ -200,22 +205,31 @@ def _raster(engine: Engine, picture: Picture, lists: Lists, buffers: RasterBuffe
 
 
 def _shade(
-    engine: Engine, picture: Picture, visible: cl_array.Array, buffers: VirtualSurfaceBuffers
+    engine: Engine,
+    camera: CameraModel,
+    picture: Picture,
+    parts: int,
+    visible: cl_array.Array,
+    buffers: VirtualSurfaceBuffers,
 ) -> list[cl_array.Array]:
-    """Index of each pixel's object [h, w] int32; position, normal, base colour and material, [h, w] float4."""
-    arena, object_index = picture.arena, buffers.object_index.array(visible.shape)
-    described = (buffers.position, buffers.normal, buffers.base_color, buffers.material)
-    fields = [buffer.array(visible.shape) for buffer in described]
-    with buffers.drawn.redraw(object_index, picture.region, picture.all_tiles) as tiles:
-        x0, y0 = TILE * tiles[0], TILE * tiles[1]
-        x1, y1 = min(TILE * tiles[2], picture.camera.width), min(TILE * tiles[3], picture.camera.height)
+    """Index of each pixel's object [h, w] int32; position, normal, base colour and material, [h, w] float4.
+
+    picture, visible: of `parts` subpixels along either side of a pixel.
+    """
+    shape, arena = (camera.height, camera.width), picture.arena
+    described = (buffers.object_index, buffers.position, buffers.normal, buffers.base_color, buffers.material)
+    fields = [buffer.array(shape) for buffer in described]
+    x0, y0, x1, y1 = (-(-TILE * side // parts) for side in picture.region)  # whose centres lie in the region
+    drawn = (x0, y0, min(x1, camera.width), min(y1, camera.height))
+    with buffers.drawn.redraw(fields[0], drawn, (0, 0, camera.width, camera.height)) as around:
         engine.launch(
             _kernel(engine, "shade_surface"),
-            (x1 - x0, y1 - y0),
+            (around[2] - around[0], around[3] - around[1]),
             SURFACE_PARAMETERS(
-                around=int4(x0, y0, x1, y1),
+                around=int4(*around),
                 region=int4(*picture.region),
-                width=picture.camera.width,
+                width=camera.width,
+                parts=parts,
                 object_count=picture.count,
             ),
             visible,
@@ -230,7 +244,6 @@ def _shade(
             arena.levels,
             arena.texels,
             arena.channel_values,
-            object_index,
             *fields,
         )
-    return [object_index, *fields]
+    return fields

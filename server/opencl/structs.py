@@ -208,6 +208,7 @@ VIEW_TRANSFER_PARAMETERS = Struct(
 MIXTURE_PARAMETERS = Struct(
     "MixtureParameters",
     camera_from_volume="float16",
+    around="int4",
     height="int",
     tolerance_m="float",
     virtual_gain="float",
@@ -230,7 +231,9 @@ LAYER_PARAMETERS = Struct(
 )
 """Parameters of layer.cl. ..._at: byte of the layer's buffer at which an array begins."""
 
-SURFACE_PARAMETERS = Struct("SurfaceParameters", around="int4", region="int4", width="int", object_count="int")
+SURFACE_PARAMETERS = Struct(
+    "SurfaceParameters", around="int4", region="int4", width="int", parts="int", object_count="int"
+)
 """Parameters of shade_surface in rasterize.cl."""
 
 STRUCTS = (

@@ -13,9 +13,10 @@ from protocol.frames import CameraModel
 from server.input.measure import linear_values
 from server.maths.rigid import inverse_rigid
 from server.maths.sh import LUMINANCE
+from server.objects.dirty_region import EMPTY, box_around
 from server.objects.rasterize import VirtualSurface
 from server.opencl.buffers import BufferDescription, StageBuffers
-from server.opencl.engine import Engine, KernelArgument, float4, float16
+from server.opencl.engine import Engine, KernelArgument, float4, float16, int4
 from server.opencl.structs import MIXTURE_PARAMETERS
 from server.shading.change_mask import mark_changes
 from server.shading.traced_scene import DeviceLight
@@ -81,8 +82,6 @@ class CompositeInputs:
     """[h, w] float4: what stands for `occluded` where w = 1."""
     refined_ratio: cl_array.Array | None = None
     upsampling: Upsampling = "bilateral"
-    coverage: cl_array.Array | None = None
-    """Of nearest_depths, for smooth edges. Without it a pixel is covered if its centre is."""
     reflected: cl_array.Array | None = None
     """[h, w] float4 of reflect_surroundings."""
     gain: float = 1.0
@@ -119,6 +118,7 @@ def mixture_parameters(mixture: CompositeInputs) -> np.void:
     occluded, ratio, camera = mixture.occluded, mixture.ratio, mixture.camera
     return MIXTURE_PARAMETERS(
         camera_from_volume=float16(inverse_rigid(mixture.volume_from_camera)),
+        around=int4(*(box_around(mixture.virtual.boxes) if mixture.virtual else EMPTY)),
         height=camera.height,
         tolerance_m=mixture.tolerance_m,
         virtual_gain=mixture.gain,
@@ -136,6 +136,7 @@ def launch_mixture(
 ) -> None:
     """Enqueue a kernel whose arguments are its `parameters`, MIXTURE_BUFFERS of composite_inputs.clh and `others`."""
     camera, light, virtual, ratio = mixture.camera, mixture.light, mixture.virtual, mixture.ratio
+    nearest = virtual.nearest if virtual else None
     unused = engine.unused
 
     def given(array: cl_array.Array | None) -> cl_array.Array:
@@ -151,7 +152,7 @@ def launch_mixture(
         HAS_OBJECTS=virtual is not None,
         HAS_SHADOWS=ratio is not None,
         BICUBIC=mixture.upsampling == "bicubic",
-        SUBPIXELS=0 if mixture.coverage is None else mixture.coverage.shape[0] // camera.height,
+        SUBPIXELS=0 if nearest is None else nearest.shape[0] // camera.height,
         HAS_GLOSS=mixture.reflected is not None,
         HAS_DIRECT=bool(light.discs),
         LANES=engine.lanes,
@@ -164,7 +165,7 @@ def launch_mixture(
         mixture.surface.positions,
         mixture.surface.normals,
         *((virtual.position, virtual.normal, virtual.base_color) if virtual else (unused, unused, unused)),
-        given(mixture.coverage),
+        given(nearest),
         given(mixture.reflected),
         virtual.object_index if virtual else unused,
         light.table.memory,

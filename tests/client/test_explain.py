@@ -23,7 +23,7 @@ def test_a_plan_is_said_an_effect_a_line() -> None:
         LeftOut(effect="shadow_real", reason="far away", error_bound=0.25),
         LeftOut(effect="bounce_real", reason="far away", error_bound=0.25),
         LeftOut(effect="light_objects", reason="dark", error_bound=0.5),
-        LeftOut(effect="cover", reason="asked for", error_bound=255.0),
+        LeftOut(effect="refine_real", reason="asked for", error_bound=255.0),
         LeftOut(effect="lamplight", reason="not drawn", error_bound=None),
     )
     text = list(lines("a source, frame 3", Plan(run=("composite",), left_out=left_out)))
@@ -32,7 +32,7 @@ def test_a_plan_is_said_an_effect_a_line() -> None:
     assert "puts the picture together" in said["composite"]
     assert said["reflect"].endswith("nothing is glossy (changes nothing)")
     assert said["shadow_real"].endswith("(changes no pixel by more than 0.25/255)")
-    assert said["cover"].endswith("asked for (change not bounded)")
+    assert said["refine_real"].endswith("asked for (change not bounded)")
     assert said["lamplight"].endswith("(change unknown)")
     assert "change no pixel by more than 0.75/255" in text[-1]  # one reason counts once
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.objects import raster_lists
-from server.objects.rasterize import NEAR_M, VirtualSurfaceBuffers, nearest_depths, rasterize
+from server.objects.rasterize import FINE_SUBPIXELS, NEAR_M, VirtualSurfaceBuffers, rasterize
 from server.objects.virtual_object import VirtualObject
 from server.opencl.device import Device
 from server.opencl.engine import Engine
@@ -40,14 +40,18 @@ def rays(camera: CameraModel) -> NDArray[np.float64]:
     return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
 
 
+PARTS = (1, FINE_SUBPIXELS)
+"""Subpixels along either side of a pixel. Those of the twin are pixels; what is at their centres is the same."""
+
 # ---- against the twin --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("parts", PARTS)
 @pytest.mark.parametrize("name", SOUPS)
-def test_matches_twin(engine: Engine, name: str) -> None:
+def test_matches_twin(engine: Engine, name: str, parts: int) -> None:
     soup = random_soup(len(name), *SOUPS[name])
     matrix = pose((0.1, -0.05, 0.0), (1, 2, 3), 0.4)
-    picture = draw(engine, (soup, matrix), view=pose((0, 0, 0), (0, 1, 0), 0.1))
+    picture = draw(engine, (soup, matrix), view=pose((0, 0, 0), (0, 1, 0), 0.1), parts=parts)
     camera_from_model = pose((0, 0, 0), (0, 1, 0), 0.1) @ matrix
     vertices, triangles = soup.vertices.astype(np.float64), soup.triangles.astype(np.int64)
     visible = twin.raster_tiles(CAMERA, twin.setup_triangles(CAMERA, camera_from_model, vertices, triangles))
@@ -67,10 +71,11 @@ def test_matches_twin(engine: Engine, name: str) -> None:
     np.testing.assert_allclose(picture.color[check], mean[check][:, 3:], atol=1e-5)
 
 
-def test_normals_match_twin(engine: Engine) -> None:
+@pytest.mark.parametrize("parts", PARTS)
+def test_normals_match_twin(engine: Engine, parts: int) -> None:
     ball = shape_of(trimesh.creation.torus(0.5, 0.2, 24, 12))
     matrix = pose((0.05, 0.0, 1.5), (1, 1, 0), 0.7, 0.6)
-    picture = draw(engine, (ball, matrix))
+    picture = draw(engine, (ball, matrix), parts=parts)
     vertices, triangles = ball.vertices.astype(np.float64), ball.triangles.astype(np.int64)
     visible = twin.raster_tiles(CAMERA, twin.setup_triangles(CAMERA, matrix, vertices, triangles))
     check = picture.covered & (visible >= 0)
@@ -98,13 +103,13 @@ def opencv_depth(camera: CameraModel, points: NDArray[np.float64], triangles: ND
     return cv2.triangleRasterizeDepth(points, indices, depth, view, field_rad, NEAR_M, 100.0, settings)
 
 
-def compare_with_opencv(engine: Engine, mesh: Mesh) -> None:
+def compare_with_opencv(engine: Engine, mesh: Mesh, parts: int) -> None:
     camera = CameraModel(width=318, height=239, fx=280.0, fy=280.0, cx=158.5, cy=119.0)
     low, high = mesh.bounds
     scale = 1 / float((high - low).max())
     matrix = pose((0, 0, 0), (0.2, 1.0, 0.1), 2.5, scale)
     matrix[:3, 3] = (0.02, 0.01, 1.2) - matrix[:3, :3] @ (low + high) / 2
-    picture = draw(engine, (mesh, matrix), camera=camera)
+    picture = draw(engine, (mesh, matrix), camera=camera, parts=parts)
     depth = opencv_depth(camera, mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3], mesh.triangles)
     both, either = picture.covered & (depth < 99), picture.covered | (depth < 99)
     assert both.sum() > 3000
@@ -115,15 +120,16 @@ def compare_with_opencv(engine: Engine, mesh: Mesh) -> None:
     assert picture.covered[y0:y1, x0:x1].sum() == picture.covered.sum()
 
 
+@pytest.mark.parametrize("parts", PARTS)
 @pytest.mark.parametrize("name", ["sphere", "torus", "box", "capsule"])
-def test_matches_opencv(engine: Engine, name: str) -> None:
+def test_matches_opencv(engine: Engine, name: str, parts: int) -> None:
     shapes = {
         "sphere": trimesh.creation.icosphere(subdivisions=4),
         "torus": trimesh.creation.torus(0.5, 0.2),
         "box": trimesh.creation.box((1.0, 0.7, 0.4)),
         "capsule": trimesh.creation.capsule(1.0, 0.3),
     }
-    compare_with_opencv(engine, shape_of(shapes[name]))
+    compare_with_opencv(engine, shape_of(shapes[name]), parts)
 
 
 @pytest.mark.data
@@ -138,7 +144,7 @@ def test_matches_opencv(engine: Engine, name: str) -> None:
     ],
 )
 def test_public_meshes_match_opencv(engine: Engine, name: str) -> None:
-    compare_with_opencv(engine, public_mesh(name))
+    compare_with_opencv(engine, public_mesh(name), FINE_SUBPIXELS)
 
 
 # ---- against a path tracer ---------------------------------------------------------------------------------------
@@ -388,12 +394,12 @@ def test_nothing_is_left_where_an_object_was(device: Device, engine: Engine) -> 
     for points in places:
         objects = [(thing, pose(point)) for point in points]
         fresh = Engine(device)
-        first = download(fresh, rasterize(fresh, CAMERA, EYE, objects))
-        found = download(engine, rasterize(engine, CAMERA, EYE, objects))
-        for field in ("index", "position", "normal", "color"):
-            np.testing.assert_array_equal(getattr(found, field), getattr(first, field))
-        fine = [e.download(nearest_depths(e, CAMERA, EYE, objects)) for e in (engine, fresh)]
-        np.testing.assert_array_equal(*fine)
+        for parts in PARTS:
+            surfaces = [(e, rasterize(e, CAMERA, EYE, objects, parts=parts)) for e in (engine, fresh)]
+            found, first = (download(e, surface) for e, surface in surfaces)
+            for field in ("index", "position", "normal", "color"):
+                np.testing.assert_array_equal(getattr(found, field), getattr(first, field))
+        np.testing.assert_array_equal(*(e.download(surface.nearest) for e, surface in surfaces))
         fresh.close()
 
 
@@ -452,8 +458,10 @@ def test_a_mesh_whose_triangles_share_no_vertices_looks_the_same(engine: Engine,
         file.visual.vertex_colors = np.tile(np.uint8([200, 150, 90, 255]), (len(file.vertices), 1))
         mesh = load_mesh(file.export(file_type="ply"), "ply")
         thing = VirtualObject.upload(engine, mesh)
-        pictures.append(download(engine, rasterize(engine, CAMERA, EYE, [(thing, view)])))
-        covers.append(engine.download(nearest_depths(engine, CAMERA, EYE, [(thing, view)])).copy())
+        surface = rasterize(engine, CAMERA, EYE, [(thing, view)], parts=FINE_SUBPIXELS)
+        assert surface.nearest is not None
+        pictures.append(download(engine, surface))
+        covers.append(engine.download(surface.nearest).copy())
         distances.append(engine.download(thing.grid.distance).copy())
     shared = pictures[0]
     assert (shared.index >= 0).sum() > 300

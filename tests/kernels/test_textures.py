@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.objects.rasterize import rasterize
+from server.objects.rasterize import FINE_SUBPIXELS, rasterize
 from server.objects.virtual_object import VirtualObject
 from server.opencl.engine import Engine
 from server.opencl.program import with_headers
@@ -185,9 +185,9 @@ def floor_mesh(material: Material, repeats: float, length_m: float = 12.0, color
     return replace(plain, uv=np.hstack([uv, uv]).astype(np.float32), materials=(material,))
 
 
-def draw(engine: Engine, *placed: tuple[Mesh, Floats]) -> dict[str, NDArray[np.float32]]:
+def draw(engine: Engine, *placed: tuple[Mesh, Floats], parts: int = 1) -> dict[str, NDArray[np.float32]]:
     objects = [(VirtualObject.upload(engine, mesh, cells=8), matrix) for mesh, matrix in placed]
-    surface = rasterize(engine, CAMERA, np.eye(4), objects)
+    surface = rasterize(engine, CAMERA, np.eye(4), objects, parts=parts)
     names = ("position", "base_color", "material")
     fields = {
         n: engine.download(getattr(surface, n)).view(np.float32).reshape(CAMERA.height, CAMERA.width, 4) for n in names
@@ -211,11 +211,12 @@ def supersampled(levels: twin.Levels, repeats: float, length_m: float, rays: int
     return total / rays**2, all_met
 
 
-def test_checkerboard_at_a_grazing_angle_does_not_alias(engine: Engine) -> None:
+@pytest.mark.parametrize("parts", [1, FINE_SUBPIXELS])
+def test_checkerboard_at_a_grazing_angle_does_not_alias(engine: Engine, parts: int) -> None:
     """As close to 256 rays a pixel as those are to the truth's own scale of change; one ray a pixel is far off."""
     image, repeats, length_m = checkers(64, 8), 12.0, 12.0
     mesh = floor_mesh(Material(color_texture=Texture(image)), repeats)
-    found = draw(engine, (mesh, np.eye(4)))["base_color"]
+    found = draw(engine, (mesh, np.eye(4)), parts=parts)["base_color"]
     expected, met = supersampled(levels_of(image), repeats, length_m, 16)
     single, _ = supersampled(levels_of(image), repeats, length_m, 1)
     assert met.mean() > 0.5

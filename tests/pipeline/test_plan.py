@@ -250,7 +250,7 @@ def test_the_coarse_value_is_taken_where_its_bound_fits(spent: float, everything
 
 # ---- the real table ----------------------------------------------------------------------------------------------
 
-DRAWN = {"rasterize", "cover"}
+DRAWN = {"rasterize"}
 SHADED = DRAWN | {"prepare_rays", "add_objects", "shade_virtual"}
 BOUNDED = Brightness(picture=0.9, arriving=2.0, shading=1.0, object_sent=0.8, real_sent=0.9)
 ASKED = {
@@ -292,7 +292,7 @@ PLAIN: dict[Any, object] = {SharpLight: SOFT, RealDepthViews: TRACED, Indirect: 
             SceneFacts(objects_in_view=0, influence=NOWHERE, brightness=BOUNDED),
             set(),
             {
-                **dict.fromkeys(("rasterize", "cover"), "there is no virtual object"),
+                "rasterize": "there is no virtual object",
                 **dict.fromkeys(("shade_virtual", "refine_virtual", "reflect"), ""),
                 **dict.fromkeys(("shadow_real", "bounce_real", "refine_real", "mark_changes"), ""),
                 **dict.fromkeys(("direct_virtual", "direct_real"), ""),
@@ -312,14 +312,14 @@ PLAIN: dict[Any, object] = {SharpLight: SOFT, RealDepthViews: TRACED, Indirect: 
                 "match_average": "own scale",
                 "refine_virtual": "does not refine",
             }
-            | dict.fromkeys(("rasterize", "cover", "shade_virtual"), "in view")
+            | dict.fromkeys(("rasterize", "shade_virtual"), "in view")
             | {"reflect": "", "direct_virtual": ""},
         ),
         (
             {},
             SceneFacts(objects_in_view=0, adaptive=True, indirect=True, influence=NOWHERE, brightness=BOUNDED),
             set(),
-            dict.fromkeys(("rasterize", "cover", *LIT), "in view")
+            dict.fromkeys(("rasterize", *LIT), "in view")
             | dict.fromkeys(OF_REAL, "hardly change")
             | {"reflect": "", "refine_real": ""},
         ),

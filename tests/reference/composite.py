@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.stats import truncnorm
@@ -117,6 +118,24 @@ class Mixed:
     """[h, w] 0 where there is no real surface."""
 
 
+def pixel_windows(fine: NDArray[Any], f: int) -> NDArray[Any]:
+    """[h, w, f + 1, f + 1] the subpixels of each pixel, from border to border. fine: [f h, f w], pixel (x, y) has its
+    middle at (f x, f y). Beyond the border of the picture, that on it stands."""
+    windows = sliding_window_view(np.pad(fine, f // 2, mode="edge"), (f + 1, f + 1))
+    return windows[::f, ::f][: fine.shape[0] // f, : fine.shape[1] // f]
+
+
+def part_weights(f: int) -> Floats:
+    """[f + 1, f + 1] shares of a pixel: subpixels on the border count half for each of two."""
+    along = np.array([0.5, *np.ones(f - 1), 0.5]) / f
+    return np.outer(along, along)
+
+
+def covered(fine: NDArray[Any], f: int) -> Floats:
+    """[h, w] share of each pixel that `fine` [f h, f w] covers, where it is above 0."""
+    return np.asarray((pixel_windows(fine > 0, f) * part_weights(f)).sum((-2, -1)))
+
+
 def mix(
     radiance: Floats,
     real: Buffer,
@@ -135,10 +154,12 @@ def mix(
     """What is mixed at each pixel: the nearer of virtual and real surface, real ones times `ratio`.
 
     radiance [h, w, 4]; light [n, 3]. A virtual surface at most `tolerance_m` behind a real one is in front.
-    inverse_depths [f h, f w] of the nearest object at the parts of each pixel, 0 for none; else the middle counts.
+    inverse_depths [f h, f w] of the nearest object at subpixels (pixel_windows), 0 for none; else the middle counts.
     log_white [3]: see `restored`; None: clipped channels are taken as they are.
     """
     height, width = radiance.shape[:2]
+    fine = np.zeros((height, width)) if inverse_depths is None else inverse_depths
+    windows = pixel_windows(fine, fine.shape[0] // height)
 
     def value_at(samples: Samples, refined: Samples | None, surface: Buffer, x: int, y: int) -> Floats:
         if refined is not None and refined.values[y, x, 3] > 0:
@@ -155,18 +176,17 @@ def mix(
         if inverse_depths is None:
             is_front = virtual.positions[y, x, 3] > 0 and real_z - depth(virtual.positions[y, x]) > -tolerance_m
             return {(x, y): 1.0} if is_front else {}
-        f = inverse_depths.shape[0] // height
-        parts = inverse_depths[f * y : f * y + f, f * x : f * x + f]
-        seen = parts[(parts > 0) & (real_z + tolerance_m > 1 / np.maximum(parts, 1e-9))]
+        parts = windows[y, x]
+        is_seen = (parts > 0) & (real_z + tolerance_m > 1 / np.maximum(parts, 1e-9))
         steps = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, -1), (-1, 1), (1, 1)]
         near = [(x + a, y + b) for a, b in steps if 0 <= x + a < width and 0 <= y + b < height]
         depths = {(u, v): depth(virtual.positions[v, u]) for u, v in near if virtual.positions[v, u, 3] > 0}
         found: dict[tuple[int, int], float] = {}
-        for part in seen if depths else ():
+        for part, weight in zip(parts[is_seen], part_weights(len(parts) - 1)[is_seen], strict=True) if depths else ():
             apart = {pixel: abs(part * z - 1) for pixel, z in depths.items()}
             is_own = apart.get((x, y), np.inf) < SAME_SURFACE
             pixel = (x, y) if is_own else min(depths, key=lambda pixel: abs(part - 1 / depths[pixel]))
-            found[pixel] = found.get(pixel, 0.0) + 1 / f**2
+            found[pixel] = found.get(pixel, 0.0) + weight
         return found
 
     def virtual_color(u: int, v: int) -> Floats:

@@ -58,7 +58,7 @@ def camera_picture(seed: int = 1) -> tuple[Codes, Floats]:
     return codes, np.insert(linear_values("srgb8")[codes].astype(float), 3, 1, -1)
 
 
-def upload_virtual(engine: Engine, virtual: Buffer) -> VirtualSurface:
+def upload_virtual(engine: Engine, virtual: Buffer, inverse_depths: Floats | None = None) -> VirtualSurface:
     space, covered = engine.workspace, virtual.positions[..., 3]
     return VirtualSurface(
         space.upload("virtual_positions", float4(virtual.positions[..., :3], covered)),
@@ -66,6 +66,7 @@ def upload_virtual(engine: Engine, virtual: Buffer) -> VirtualSurface:
         space.upload("virtual_colors", float4(virtual.colors, covered)),
         space.upload("virtual_index", np.where(covered > 0, 0, -1).astype(np.int32)),
         ((0, 0, WIDTH, HEIGHT),),
+        nearest=None if inverse_depths is None else space.upload("nearest", inverse_depths.astype(np.float32)),
     )
 
 
@@ -101,13 +102,12 @@ def mixture_of(
         surface,
         TOLERANCE_M,
         upload_light(engine, light, direction_sets(81, round(len(light) ** 0.5))),
-        upload_virtual(engine, virtual) if virtual else None,
+        upload_virtual(engine, virtual, inverse_depths) if virtual else None,
         upload_samples(engine, "occluded", occluded),
         upload_samples(engine, "ratio", ratio),
         upload_every(engine, "refined_occluded", refined_occluded),
         upload_every(engine, "refined_ratio", refined_ratio),
         upsampling,
-        None if inverse_depths is None else engine.workspace.upload("fine", inverse_depths.astype(np.float32)),
         restores_clipped=restores_clipped,
     )
 

@@ -52,10 +52,14 @@ def download(engine: Engine, surface: VirtualSurface) -> Picture:
 
 
 def draw(
-    engine: Engine, *placed: tuple[Mesh, NDArray[np.float64]], camera: CameraModel = CAMERA, view: Any = EYE
+    engine: Engine,
+    *placed: tuple[Mesh, NDArray[np.float64]],
+    camera: CameraModel = CAMERA,
+    view: Any = EYE,
+    parts: int = 1,
 ) -> Picture:
     objects = [(VirtualObject.upload(engine, mesh, cells=8), matrix) for mesh, matrix in placed]
-    return download(engine, rasterize(engine, camera, view, objects))
+    return download(engine, rasterize(engine, camera, view, objects, parts=parts))
 
 
 def random_soup(seed: int, count: int, size_m: float, center: tuple[float, float, float], spread_m: float) -> Mesh:

@@ -79,9 +79,9 @@ static inline float3 vector_in(global const uint *entry, const int at) {
     return (float3)(as_float(entry[at]), as_float(entry[at + 1]), as_float(entry[at + 2]));
 }
 
-// Whether an entry of the cell at this point is of the same surface.
+// Whether an entry is of this cell, and of the surface at this point.
 static inline int is_of(global const uint *entry, const Cell cell, const float3 position, const float3 normal) {
-    return fabs(dot(vector_in(entry, POSITION) - position, normal)) <= cell.side_m && dot(vector_in(entry, NORMAL), normal) >= FACING;
+    return holds(entry, cell.key) && fabs(dot(vector_in(entry, POSITION) - position, normal)) <= cell.side_m && dot(vector_in(entry, NORMAL), normal) >= FACING;
 }
 
 // positions, normals [h][w]: the geometry buffer; entries [places][WORDS]. -> found [rows][cols]: the place of a sample's entry,
@@ -100,8 +100,8 @@ kernel void find_samples(const TransferCacheParameters p, global const float4 *p
     const Cell cell = cell_of(p, position.xyz, normal.xyz);
     for (int way = 0; way < WAYS; way++) {
         global uint *entry = entries + (size_t)cell.places[way] * WORDS;
-        if (!holds(entry, cell.key)) continue;
-        if (p.now - (int)entry[TRACED] >= (int)entry[LASTS] || !is_of(entry, cell, position.xyz, normal.xyz)) return;
+        if (!is_of(entry, cell, position.xyz, normal.xyz)) continue;
+        if (p.now - (int)entry[TRACED] >= (int)entry[LASTS]) return;
         entry[USED] = (uint)p.now;
         for (int i = 0; i < COEFFICIENTS; i++) transfer[sample * COEFFICIENTS + i] = as_float(entry[TRANSFER + i]);
         for (int i = 0; i < MASK_WORDS; i++) free_mask[sample * MASK_WORDS + i] = entry[MASK_AT + i];
@@ -115,8 +115,9 @@ kernel void find_samples(const TransferCacheParameters p, global const float4 *p
     }
 }
 
-// Samples that were not found, and would be stored at the same place, agree on the first of them. claims [places]: all UINT_MAX before.
-// -> found: -2 - place where a sample asks for one. Places whose entry is another cell's, found in this frame, stay.
+// Samples that were not found ask for a place: that of their entry, which is too old, else the one that was not found for the longest
+// time, but none that was found in this frame. Surfaces in one cell that face several ways may have an entry each. Samples that ask for the
+// same place agree on the first of them. claims [places]: all UINT_MAX before. -> found: -2 - place where a sample asks for one.
 kernel void claim_entries(const TransferCacheParameters p, global const float4 *positions, global const float4 *normals,
                           global const uint *entries, global uint *claims, global int *found) {
     const int col = get_global_id(0);
@@ -126,11 +127,15 @@ kernel void claim_entries(const TransferCacheParameters p, global const float4 *
     const float4 position = positions[pixel], normal = normals[pixel];
     if (found[sample] != NOT_STORED || position.w <= 0.0f || normal.w <= 0.0f) return;
     const Cell cell = cell_of(p, position.xyz, normal.xyz);
-    int place = NOT_STORED;
+    int place = NOT_STORED, oldest = p.now;
+    for (int way = 0; way < WAYS; way++) {
+        global const uint *entry = entries + (size_t)cell.places[way] * WORDS;
+        if ((int)entry[USED] >= oldest) continue;
+        oldest = (int)entry[USED];
+        place = cell.places[way];
+    }
     for (int way = WAYS - 1; way >= 0; way--)
-        if ((int)entries[(size_t)cell.places[way] * WORDS + USED] != p.now) place = cell.places[way];
-    for (int way = 0; way < WAYS; way++)
-        if (holds(entries + (size_t)cell.places[way] * WORDS, cell.key)) place = cell.places[way];
+        if (is_of(entries + (size_t)cell.places[way] * WORDS, cell, position.xyz, normal.xyz)) place = cell.places[way];
     if (place == NOT_STORED) return;
     found[sample] = -2 - place;
     atomic_min(&claims[place], (uint)sample);
@@ -158,8 +163,8 @@ kernel void store_samples(const TransferCacheParameters p, global const float4 *
     const float3 position = positions[pixel].xyz, normal = normals[pixel].xyz;
     const Cell cell = cell_of(p, position, normal);
     global uint *entry = entries + (size_t)place * WORDS;
-    const int is_known = holds(entry, cell.key);
-    const int lasts = is_known && is_of(entry, cell, position, normal) ? min(2 * (int)entry[LASTS], p.longest) : p.period;
+    const int is_known = is_of(entry, cell, position, normal);
+    const int lasts = is_known ? min(2 * (int)entry[LASTS], p.longest) : p.period;
     entry[KEY] = cell.key.x;
     entry[KEY + 1] = cell.key.y;
     entry[TRACED] = (uint)(p.now - (is_known ? 0 : (int)(mixed(cell.key.x + cell.key.y) % (uint)p.period)));

@@ -2,10 +2,11 @@
 
 Transfer and the light from surfaces belong to a place of the scanned surface, not to a frame. They are kept by cell
 of the world. A cell is 1.4 to 2 times as long as the distance between samples, so a moving camera finds again what it
-saw a frame, or a turn, ago. A sample that finds nothing is traced and stored. A cell is traced again after PERIOD
-frames, then after twice as many each time, LONGEST at most, because a young scan grows and an old one hardly does. So
-an entry is off by what the scan has changed in as many frames as it was old, LONGEST at most, and belongs to a point
-in the same cell. Surface that moves is no exception: what a point sees of the scan depends on where it is only.
+saw a frame, or a turn, ago. A sample that finds nothing is traced and stored. Surfaces in one cell that face two ways
+have an entry each. A cell is traced again after PERIOD frames, then after twice as many each time, LONGEST at most,
+because a young scan grows and an old one hardly does. So an entry is off by what the scan has changed in as many
+frames as it was old, LONGEST at most, and belongs to a point in the same cell. Surface that moves is no exception:
+what a point sees of the scan depends on where it is only.
 
 Transfer that is looked up in depth views (image_space.py) is kept likewise, with what the camera's picture adds near a
 point when it is looked up. What of the picture is not in the scan belongs to no place and is left out.

@@ -66,8 +66,10 @@ class Entry:
     value: float
 
 
-def _is_of(entry: Entry, cell: Cell, point: Floats, normal: Floats) -> bool:
-    """Whether it is of the same surface."""
+def _is_of(entry: Entry | None, cell: Cell, point: Floats, normal: Floats) -> bool:
+    """Whether it is of this cell, and of the same surface."""
+    if entry is None or entry.key != cell.key:
+        return False
     off_m = abs((entry.position - point) @ normal)
     return bool(off_m <= cell.side_m and entry.normal @ normal >= FACING)
 
@@ -89,10 +91,10 @@ class Table:
         for i in np.flatnonzero(valid):
             cell = cell_of(points[i], normals[i], eye, spacing, self.places)
             for place in cell.places:
-                entry = self.entries.get(place)
-                if entry is None or entry.key != cell.key:
+                if not _is_of(self.entries.get(place), cell, points[i], normals[i]):
                     continue
-                if now - entry.traced < entry.lasts and _is_of(entry, cell, points[i], normals[i]):
+                entry = self.entries[place]
+                if now - entry.traced < entry.lasts:
                     entry.used, found[i] = now, place
                 break
         return found
@@ -112,16 +114,16 @@ class Table:
         claims: dict[int, tuple[int, Cell]] = {}
         for i in np.flatnonzero(valid & (found < 0)):
             cell = cell_of(points[i], normals[i], eye, spacing, self.places)
-            own = [place for place in cell.places if place in self.entries and self.entries[place].key == cell.key]
-            idle = [place for place in cell.places if place not in self.entries or self.entries[place].used != now]
+            own = [place for place in cell.places if _is_of(self.entries.get(place), cell, points[i], normals[i])]
+            used = {place: self.entries[place].used if place in self.entries else 0 for place in cell.places}
+            idle = sorted((place for place in cell.places if used[place] < now), key=lambda place: used[place])
             if own or idle:
-                claims.setdefault((own[-1:] or idle)[0], (int(i), cell))
+                claims.setdefault((own or idle)[0], (int(i), cell))
         places = found.copy()
         for place, (i, cell) in claims.items():
             entry = self.entries.get(place)
-            is_known = entry is not None and entry.key == cell.key
-            is_same = entry is not None and is_known and _is_of(entry, cell, points[i], normals[i])
-            lasts = min(2 * entry.lasts, self.longest) if entry is not None and is_same else self.period
+            is_known = _is_of(entry, cell, points[i], normals[i])
+            lasts = min(2 * entry.lasts, self.longest) if entry is not None and is_known else self.period
             earlier = 0 if is_known else mixed((cell.key[0] + cell.key[1]) & _MASK) % self.period
             self.entries[place] = Entry(cell.key, now - earlier, lasts, now, points[i], normals[i], float(values[i]))
             places[i] = place

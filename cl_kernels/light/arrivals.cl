@@ -40,6 +40,12 @@ kernel void trace_arrivals(const VolumeShape shape, global const int *slots, glo
         chosen[lane] = set + min(first + lane, per_set - 1);
         skipped |= (normal.w > 0.0f && dot(normal.xyz, directions[chosen[lane]].xyz) <= 0.0f) << lane;
     }
+    const int asked = min(LANES, per_set - first);
+    arrivals += point * per_set + first;
+    if (skipped == (1 << LANES) - 1) {
+        for (int lane = 0; lane < asked; lane++) arrivals[lane] = (float4)(0.0f);
+        return;
+    }
     const float3 origin = normal.w > 0.0f ? clear_of_surface(volume, place.xyz, normal.xyz) : place.xyz;
     const Rays rays = volume_rays(volume, origin, directions, chosen);
     floatn begin, end;
@@ -48,7 +54,7 @@ kernel void trace_arrivals(const VolumeShape shape, global const int *slots, glo
     const floatn t = find_solid_voxels(volume, rays, begin, end);
     float met[LANES];
     STORE_LANES(t < end ? t : 0.0f, met);
-    for (int lane = 0; lane < min(LANES, per_set - first); lane++) {
+    for (int lane = 0; lane < asked; lane++) {
         float4 arrival = (float4)(0.0f);
         if (met[lane] > 0.0f) {
             const float3 direction = directions[chosen[lane]].xyz;
@@ -59,6 +65,6 @@ kernel void trace_arrivals(const VolumeShape shape, global const int *slots, glo
             const float distance_m = met[lane] * volume.voxel_m;
             arrival = is_known ? (float4)(color.xyz, distance_m) : (float4)(0.0f, 0.0f, 0.0f, -distance_m);
         }
-        arrivals[point * per_set + first + lane] = arrival;
+        arrivals[lane] = arrival;
     }
 }

@@ -56,6 +56,10 @@ GOLDEN_TURN = (3 - sqrt(5)) / 2
 """Share of a full turn by which successive points of a spherical Fibonacci lattice advance."""
 
 
+BUNDLE = 8
+"""Directions of a work-item (include/lanes.clh)."""
+
+
 def spherical_fibonacci(count: int, advance: float = GOLDEN_TURN) -> NDArray[np.float64]:
     """`count` unit directions [count, 3] of nearly equal solid angle 4 pi / count; `advance` in full turns."""
     index = np.arange(count) + 0.5
@@ -63,6 +67,24 @@ def spherical_fibonacci(count: int, advance: float = GOLDEN_TURN) -> NDArray[np.
     azimuth = index * (2 * pi * advance)
     radius = np.sqrt(1 - z * z)
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], -1)
+
+
+def in_bundles(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[n, 3] the same, in an order in which BUNDLE that follow each other point about the same way.
+
+    Rays that are traced together then take about the same path, and every k-th is as evenly spread as before.
+    """
+    return np.asarray(directions[_bundled(directions, np.arange(len(directions)))])
+
+
+def _bundled(directions: NDArray[np.float64], chosen: NDArray[np.int64]) -> NDArray[np.int64]:
+    """`chosen`, halved along the axis along which they are spread the most, and so on."""
+    if len(chosen) <= BUNDLE:
+        return chosen
+    parts = directions[chosen]
+    chosen = chosen[np.argsort(parts[:, np.ptp(parts, axis=0).argmax()], kind="stable")]
+    half = -(-len(chosen) // (2 * BUNDLE)) * BUNDLE
+    return np.concatenate([_bundled(directions, chosen[:half]), _bundled(directions, chosen[half:])])
 
 
 def rotate_sh(coefficients: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,8 +7,8 @@ pictures show of it is averaged over frames, so that it moves with the evidence.
 
 from __future__ import annotations
 
-from collections.abc import Set
-from dataclasses import dataclass
+from collections.abc import Sequence, Set
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +70,10 @@ class Emitters:
     def count(self) -> int:
         """Number of emitters."""
         return len(self.areas_m2)
+
+    def only(self, chosen: Ints) -> Emitters:
+        """Those of the numbers `chosen` [m]."""
+        return Emitters(**{part.name: getattr(self, part.name)[chosen] for part in fields(self)})
 
     def seen_from(self, points: Floats) -> tuple[Floats, Floats, Floats]:
         """Unit directions [n, k, 3] from `points` [n, 3], distances [n, k] and areas across them [n, k]."""
@@ -246,29 +250,38 @@ class BrightSurface:
         emitters, rows = self.emitters()
         return EmittersSeen(emitters, (self.visibility[:, rows] > 0).astype(np.float64))
 
-    def begin_trace(self, engine: Engine, volume: Volume, patches: Patches, traced: Ints) -> TracedEmitters | None:
+    def begin_trace(self, engine: Engine, volume: Volume, patches: Patches, traced: Ints) -> list[TracedEmitters]:
         """Trace which patches see which emitters: those in `traced` anew, of the others what is not known."""
         emitters, rows = self.emitters()
-        if not emitters.count:
-            return None
         moved = np.linalg.norm(emitters.centers - self._traced_at[rows], axis=1) > MOVED_M
         self._traced_at[rows[moved]] = emitters.centers[moved]
         self.visibility[:, rows[moved]] = -1
         self.visibility[traced] = -1
         used = patches.used
-        unknown = used[(self.visibility[np.ix_(used, rows)] < 0).any(axis=1)]
-        if not len(unknown):
-            return None
-        origins = patches.positions[unknown] + volume.voxel_m * patches.normals[unknown]
-        directions = emitters.seen_from(origins)[0]
-        arrivals = begin_arrivals(engine, volume, origins - volume.origin_world, None, directions)
-        return TracedEmitters(emitters, rows, volume, unknown, origins, arrivals)
+        is_unknown = np.asarray(self.visibility[np.ix_(used, rows)] < 0)
+        is_new = np.asarray(is_unknown.all(axis=1))[:, None]
+        begun = []
+        for is_asked in (is_unknown & is_new, is_unknown & ~is_new):  # all emitters from few patches, few from the rest
+            chosen, asked = np.flatnonzero(is_asked.any(axis=0)), used[is_asked.any(axis=1)]
+            if len(asked):
+                begun.append(_begin(engine, volume, patches, asked, emitters.only(chosen), rows[chosen]))
+        return begun
 
-    def end_trace(self, traced: TracedEmitters | None) -> None:
+    def end_trace(self, begun: Sequence[TracedEmitters]) -> None:
         """Take over which emitters are visible, waited for."""
-        if traced is not None:
+        for traced in begun:
             visible = traced.emitters.visible(traced.volume, traced.origins, traced.arrivals.result())
             self.visibility[np.ix_(traced.patches, traced.rows)] = visible
+
+
+def _begin(
+    engine: Engine, volume: Volume, patches: Patches, asked: Ints, emitters: Emitters, rows: Ints
+) -> TracedEmitters:
+    """Trace from the patches `asked` [n] towards `emitters`, of `rows`."""
+    origins = patches.positions[asked] + volume.voxel_m * patches.normals[asked]
+    directions = emitters.seen_from(origins)[0]
+    arrivals = begin_arrivals(engine, volume, origins - volume.origin_world, None, directions)
+    return TracedEmitters(emitters, rows, volume, asked, origins, arrivals)
 
 
 def _by_cell(bright: SeenBright, cells: Ints, count: int) -> SeenBright:

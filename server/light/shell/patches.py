@@ -17,7 +17,7 @@ from server.light.arrivals import PendingArrivals, begin_arrivals
 from server.light.shell.known_room import KnownPatches
 from server.light.shell.picture import Seen
 from server.maths.distinct_rows import distinct_rows
-from server.maths.sh import spherical_fibonacci
+from server.maths.sh import in_bundles, spherical_fibonacci
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
 
@@ -232,7 +232,7 @@ class _Means:
 @cache
 def ray_directions() -> Floats:
     """[RAYS, 3] unit, world axes."""
-    return spherical_fibonacci(RAYS)
+    return in_bundles(spherical_fibonacci(RAYS))
 
 
 def hemisphere_weights(normals: Floats) -> Floats:

@@ -59,7 +59,7 @@ class _Tracing:
     """What a solution waits for, and is solved for."""
 
     patches: TracedPatches
-    emitters: TracedEmitters | None
+    emitters: list[TracedEmitters]
     camera: Floats
     """[3] world metres."""
     up: Floats

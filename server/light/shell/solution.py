@@ -20,7 +20,7 @@ from server.light.shell.shell import CORNERS, SIDE, Shell
 from server.light.shell.spread import deviations, spread_deg
 from server.light.shell.transport import KNOWN, NO_CELL, Met, bright_keys, columns_of, meet
 from server.maths.dominant import MOST_LIGHTS
-from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
+from server.maths.sh import LUMINANCE, in_bundles, sh_basis, spherical_fibonacci
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
 
@@ -35,7 +35,7 @@ Floats = NDArray[np.float64]
 @cache
 def look_up_directions() -> Floats:
     """[1, DIRECTIONS, 3] unit, evenly spread."""
-    return spherical_fibonacci(DIRECTIONS)[None]
+    return in_bundles(spherical_fibonacci(DIRECTIONS))[None]
 
 
 @cache

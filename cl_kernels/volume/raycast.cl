@@ -163,56 +163,49 @@ typedef struct {
     intn inside;               // all are pixels of the picture
 } Around;
 
-// Adds the pixels x, x + SPACING, ... of row y.
-static inline void look_beside(const Rays rays, const float voxel_m, const int2 size, const int x, const int y,
-                               global const float4 *positions, global const float4 *normals, Around *around) {
-    float height[LANES], nx[LANES], ny[LANES], nz[LANES], away[LANES];
-    int seen[LANES], inside[LANES];
-    for (int lane = 0; lane < LANES; lane++) {
-        const int at = x + SPACING * lane;
-        inside[lane] = -(at >= 0 && at < size.x && y >= 0 && y < size.y);
-        const int pixel = inside[lane] ? y * size.x + at : 0;
-        const float4 normal = inside[lane] ? normals[pixel] : (float4)(0.0f);
-        const float3 offset = positions[pixel].xyz / voxel_m - rays.origin;
-        height[lane] = dot(offset, normal.xyz);
-        away[lane] = dot(offset, offset);
-        nx[lane] = normal.x, ny[lane] = normal.y, nz[lane] = normal.z;
-        seen[lane] = -(normal.w > 0.0f);
+// What LANES + 1 rays of a row of those that were walked have seen, from the camera: normals, distance of the planes from it in voxels,
+// square of the distance of the points; masks of those that have seen surface, and of those inside the picture.
+typedef struct {
+    float nx[LANES + 1], ny[LANES + 1], nz[LANES + 1], height[LANES + 1], away[LANES + 1];
+    int seen[LANES + 1], inside[LANES + 1];
+} Walked;
+
+// Of the pixels x, x + SPACING, ... of row y.
+static inline void load_walked(const float3 origin, const float voxel_m, const int2 size, const int x, const int y,
+                               global const float4 *positions, global const float4 *normals, Walked *walked) {
+    for (int i = 0; i <= LANES; i++) {
+        const int at = x + SPACING * i, inside = at < size.x && y < size.y, pixel = inside ? y * size.x + at : 0;
+        const float4 normal = inside ? normals[pixel] : (float4)(0.0f);
+        const float3 offset = positions[pixel].xyz / voxel_m - origin;
+        walked->height[i] = dot(offset, normal.xyz);
+        walked->away[i] = dot(offset, offset);
+        walked->nx[i] = normal.x, walked->ny[i] = normal.y, walked->nz[i] = normal.z;
+        walked->seen[i] = -(normal.w > 0.0f);
+        walked->inside[i] = -inside;
     }
-    const intn is_seen = LOAD_LANES(seen);
-    const floatn towards = LOAD_LANES(nx) * rays.direction.x + LOAD_LANES(ny) * rays.direction.y + LOAD_LANES(nz) * rays.direction.z;
-    const intn meets = is_seen & MASK(towards < -LEAST_SLOPE);
-    const floatn t = LOAD_LANES(height) / (meets ? towards : -1.0f);
-    around->nearest = meets ? fmin(around->nearest, t) : around->nearest;
-    around->farthest = meets ? fmax(around->farthest, t) : around->farthest;
-    around->first = is_seen ? fmin(around->first, sqrt(LOAD_LANES(away))) : around->first;
-    around->met &= meets;
-    around->seen |= is_seen;
-    around->inside &= LOAD_LANES(inside);
 }
 
-// The pixels that `raycast` has left out: the third index says which of a square of four. As long as a ray is within a
-// voxel of those beside it, the volume holds nothing that they would miss. So where they have seen nothing, it sees nothing; where it
-// meets the planes that they have seen at one place, a Newton step from there finds the crossing; where at several, as at a silhouette,
-// it is tried at the nearest of them, at the distance of the nearest point that was seen, and at the farthest of them. -> rest: the
-// number of others, which is 0 before, then of each its pixel and the bits of where its ray begins, in voxels: shortly before what was
-// seen beside it.
-kernel void raycast_between(VIEW_PARAMETERS, global float4 *positions, global float4 *normals, global int *rest) {
-    const int dx = get_global_id(2) != 1, dy = get_global_id(2) != 0;
-    const int x = SPACING * get_global_id(0) * LANES + dx;
-    const int y = SPACING * get_global_id(1) + dy;
-    if (x >= width || y >= height || get_global_id(2) > 2) return;
-    const Volume volume = VOLUME_OF_PARAMETERS;
-    const View view = view_of_row(volume, intrinsics, volume_from_camera, width, x, y, greatest_depth_m, nearest, farthest);
-    const intn all = MASK(view.begin < view.end), none = MASK(view.begin != view.begin);
-    Around around = {1e9f, 0.0f, 1e9f, all, none, all};
-    for (int i = -dy; i <= dy; i += 2)
-        for (int j = -dx; j <= dx; j += 2)
-            look_beside(view.rays, volume.voxel_m, (int2)(width, height), x + j, y + i, positions, normals, &around);
-    const float focal = fmin(intrinsics.s0, intrinsics.s1);
+// Adds LANES of them, from the first or from the second on.
+static inline void look_beside(const Rays rays, const Walked *walked, const int from, Around *around) {
+    const intn is_seen = LOAD_LANES(walked->seen + from);
+    const floatn towards = LOAD_LANES(walked->nx + from) * rays.direction.x + LOAD_LANES(walked->ny + from) * rays.direction.y +
+                           LOAD_LANES(walked->nz + from) * rays.direction.z;
+    const intn meets = is_seen & MASK(towards < -LEAST_SLOPE);
+    const floatn t = LOAD_LANES(walked->height + from) / (meets ? towards : -1.0f);
+    around->nearest = meets ? fmin(around->nearest, t) : around->nearest;
+    around->farthest = meets ? fmax(around->farthest, t) : around->farthest;
+    around->first = is_seen ? fmin(around->first, sqrt(LOAD_LANES(walked->away + from))) : around->first;
+    around->met &= meets;
+    around->seen |= is_seen;
+    around->inside &= LOAD_LANES(walked->inside + from);
+}
+
+// The rays of pixels x, x + SPACING, ... of row y, between others. focal: the lesser of both axes, pixels.
+static inline void cast_between(const Volume volume, const View view, const Around around, const float focal, const int width, const int x,
+                                const int y, global float4 *positions, global float4 *normals, global int *rest) {
     const floatn middle = 0.5f * (around.nearest + around.farthest);
     const intn smooth = around.met & MASK(around.farthest - around.nearest < SMOOTH) & MASK(around.farthest < focal);
-    const intn empty = around.inside & ~around.seen & MASK(view.end < focal);
+    const intn all = MASK(view.begin < view.end), empty = around.inside & ~around.seen & MASK(view.end < focal);
     Vectors facing = {0.0f, 0.0f, 0.0f};
     floatn t = 0.0f;
     if (ANY(smooth)) t = cross_near(volume, view.rays, middle, smooth, &facing);
@@ -234,6 +227,32 @@ kernel void raycast_between(VIEW_PARAMETERS, global float4 *positions, global fl
         const int place = atomic_inc(rest);
         rest[2 * place + 1] = pixels[lane];
         rest[2 * place + 2] = as_int(begin[lane]);
+    }
+}
+
+// The pixels that `raycast` has left out, three of each square of four. As long as a ray is within a
+// voxel of those beside it, the volume holds nothing that they would miss. So where they have seen nothing, it sees nothing; where it
+// meets the planes that they have seen at one place, a Newton step from there finds the crossing; where at several, as at a silhouette,
+// it is tried at the nearest of them, at the distance of the nearest point that was seen, and at the farthest of them. -> rest: the
+// number of others, which is 0 before, then of each its pixel and the bits of where its ray begins, in voxels: shortly before what was
+// seen beside it.
+kernel void raycast_between(VIEW_PARAMETERS, global float4 *positions, global float4 *normals, global int *rest) {
+    const int left = SPACING * get_global_id(0) * LANES, top = SPACING * get_global_id(1);
+    if (left >= width || top >= height) return;
+    const Volume volume = VOLUME_OF_PARAMETERS;
+    const float3 origin = volume_from_camera.s37b / volume.voxel_m;
+    Walked rows[2];
+    for (int i = 0; i < 2; i++)
+        load_walked(origin, volume.voxel_m, (int2)(width, height), left, top + i * SPACING, positions, normals, rows + i);
+    for (int which = 0; which < 3; which++) {
+        const int dx = which != 1, dy = which != 0, x = left + dx, y = top + dy;
+        if (x >= width || y >= height) continue;
+        const View view = view_of_row(volume, intrinsics, volume_from_camera, width, x, y, greatest_depth_m, nearest, farthest);
+        const intn all = MASK(view.begin < view.end), none = MASK(view.begin != view.begin);
+        Around around = {1e9f, 0.0f, 1e9f, all, none, all};
+        for (int i = 0; i <= dy; i++)
+            for (int j = 0; j <= dx; j++) look_beside(view.rays, rows + i, j, &around);
+        cast_between(volume, view, around, fmin(intrinsics.s0, intrinsics.s1), width, x, y, positions, normals, rest);
     }
 }
 

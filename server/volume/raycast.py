@@ -80,7 +80,7 @@ def raycast(
     rest[:1].fill(np.int32(0))
     squares = (-(-camera.width // (_SPACING * lanes)), -(-camera.height // _SPACING))
     engine.launch(_kernel(engine, "raycast"), squares, *view, positions, normals)
-    engine.launch(_kernel(engine, "raycast_between"), (*squares, 3), *view, positions, normals, rest, local=(16, 4, 1))
+    engine.launch(_kernel(engine, "raycast_between"), squares, *view, positions, normals, rest)
     few = (max(64 // lanes, 1),)  # items of a group: only the first of them have work
     engine.launch(_kernel(engine, "raycast_rest"), (-(-pixels // lanes),), *view, rest, positions, normals, local=few)
     return Surface(positions, normals, buffers.labels.array(size))

@@ -57,7 +57,7 @@ class Shell:
 
     def distances(self, points: Floats, directions: Floats) -> Floats:
         """[..., 3] metres along rays from `points` [..., 3] inside of it to the faces across each axis."""
-        return _distances(self, points @ self.axes.T, directions @ self.axes.T)
+        return _distances(self.low, self.high, points @ self.axes.T, directions @ self.axes.T)
 
     def exits(self, points: Floats, directions: Floats) -> tuple[NDArray[np.int64], Floats]:
         """[..., CORNERS] cells, and their shares, by which rays from `points` [..., 3] inside of it end on it.
@@ -65,20 +65,23 @@ class Shell:
         Radiance is bilinear between the middles of a face's cells, and even beyond the outermost ones. directions:
         [..., 3].
         """
-        origin, direction = points @ self.axes.T, directions @ self.axes.T
-        distance = _distances(self, origin, direction)
-        axis = distance.argmin(axis=-1)[..., None]
-        end = origin + np.take_along_axis(distance, axis, -1) * direction
-        place = np.clip((end - self.low) / (self.high - self.low) * SIDE - 0.5, 0.0, SIDE - 1 - 1e-9)
-        is_high = np.take_along_axis(direction, axis, -1) > 0
-        across = np.take_along_axis(place, np.array([[1, 2], [0, 2], [0, 1]])[axis[..., 0]], -1)
-        low = across.astype(np.int64)
-        share = across - low
-        cell = ((2 * axis + is_high) * SIDE + low[..., :1]) * SIDE + low[..., 1:]
-        first, second = share[..., :1], share[..., 1:]
-        firsts, seconds = np.concatenate([1 - first, first], -1), np.concatenate([1 - second, second], -1)
-        shares = (firsts[..., :, None] * seconds[..., None, :]).reshape(*axis.shape[:-1], CORNERS)
-        return cell + np.array([0, 1, SIDE, SIDE + 1]), shares
+        # An axis at a time: numbers that lie beside each other are gone through twice as fast.
+        origin, direction = (self.axes @ rays.reshape(-1, 3).T for rays in (points, directions))
+        sides = zip(self.low, self.high, origin, direction, strict=True)
+        x, y, z = (_distances(low, high, *along) for low, high, *along in sides)
+        axis = np.where((x <= y) & (x <= z), 0, np.where(y <= z, 1, 2))
+        end = origin + np.minimum(np.minimum(x, y), z) * direction
+        size = (self.high - self.low)[:, None]
+        place = np.clip((end - self.low[:, None]) / size * SIDE - 0.5, 0.0, SIDE - 1 - 1e-9)
+        is_high = np.choose(axis, direction > 0)
+        across, along = np.where(axis == 0, place[1], place[0]), np.where(axis == 2, place[1], place[2])
+        row, column = across.astype(np.int64), along.astype(np.int64)
+        first, second = across - row, along - column
+        cell = ((2 * axis + is_high) * SIDE + row) * SIDE + column
+        both = first * second
+        shares = np.stack([1 - first - second + both, second - both, first - both, both], axis=-1)
+        cells, shape = cell[:, None] + np.array([0, 1, SIDE, SIDE + 1]), (*points.shape[:-1], CORNERS)
+        return cells.reshape(shape), shares.reshape(shape)
 
     @cached_property
     def centers(self) -> Floats:
@@ -107,9 +110,9 @@ class Shell:
         return np.asarray(self.centers[:, 2] < self.floor_m + LAMPS_ABOVE_M)
 
 
-def _distances(shell: Shell, origin: Floats, direction: Floats) -> Floats:
+def _distances(low: Floats, high: Floats, origin: Floats, direction: Floats) -> Floats:
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance = np.where(direction > 0, shell.high - origin, shell.low - origin) / direction
+        distance = np.where(direction > 0, high - origin, low - origin) / direction
     return np.asarray(np.where(np.isfinite(distance), distance, np.inf))
 
 

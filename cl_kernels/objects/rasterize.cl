@@ -356,8 +356,8 @@ static int object_of(const int triangle, const int count, const global int8 *obj
 // `attributes` [v, 3] float4: normal; linear base colour; texture coordinates of base colour and of roughness and
 // metalness. `materials` [m] float4: roughness, metalness, numbers of the textures of base colour and of roughness (G)
 // and metalness (B), -1 for none. `material_of` [t] a triangle's, in its mesh.
-// `visible` and the tiles of `region`, in which it is known, are those of a picture with `parts` pixels, along either side, for each of
-// these; of them pixel (parts u, parts v) has the centre of pixel (u, v).
+// `visible`, and the tiles of `region` in which it is known, are of a picture `parts` times as large along either side, whose pixel
+// (parts u, parts v) has the centre of pixel (u, v).
 // The ray of pixel (u, v) of that picture is model_from_pixel's column 3 + t * its columns 0 to 2 times (u, v, 1), with t the depth;
 // its last row is not part of the ray: it maps a model point to its depth.
 // Writes the pixels `around` (x0 y0 x1 y1, half-open).

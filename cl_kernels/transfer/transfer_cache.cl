@@ -81,7 +81,8 @@ static inline float3 vector_in(global const uint *entry, const int at) {
 
 // Whether an entry is of this cell, and of the surface at this point.
 static inline int is_of(global const uint *entry, const Cell cell, const float3 position, const float3 normal) {
-    return holds(entry, cell.key) && fabs(dot(vector_in(entry, POSITION) - position, normal)) <= cell.side_m && dot(vector_in(entry, NORMAL), normal) >= FACING;
+    return holds(entry, cell.key) && fabs(dot(vector_in(entry, POSITION) - position, normal)) <= cell.side_m &&
+           dot(vector_in(entry, NORMAL), normal) >= FACING;
 }
 
 // positions, normals [h][w]: the geometry buffer; entries [places][WORDS]. -> found [rows][cols]: the place of a sample's entry,

@@ -72,7 +72,7 @@ def spherical_fibonacci(count: int, advance: float = GOLDEN_TURN) -> NDArray[np.
 def in_bundles(directions: NDArray[np.float64]) -> NDArray[np.float64]:
     """[n, 3] the same, in an order in which BUNDLE that follow each other point about the same way.
 
-    Rays that are traced together then take about the same path, and every k-th is as evenly spread as before.
+    Rays that are traced together then take about the same path.
     """
     return np.asarray(directions[_bundled(directions, np.arange(len(directions)))])
 

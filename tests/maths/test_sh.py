@@ -82,6 +82,18 @@ def test_fibonacci_directions_are_even(count: int) -> None:
         assert np.abs(4 * np.pi / count * basis.T @ basis - np.eye(9)).max() < 4 / count
 
 
+@pytest.mark.parametrize("count", [1024, 81, 5])
+def test_bundles_are_the_same_directions_and_narrow(count: int) -> None:
+    lattice = sh.spherical_fibonacci(count)
+    bundled = sh.in_bundles(lattice)
+    np.testing.assert_array_equal(np.unique(bundled, axis=0), np.unique(lattice, axis=0))
+    whole = count // sh.BUNDLE * sh.BUNDLE
+    lengths = [np.linalg.norm(d[:whole].reshape(-1, sh.BUNDLE, 3).mean(axis=1), axis=1) for d in (bundled, lattice)]
+    if whole:
+        assert np.mean(lengths[0]) > (0.99 if count == 1024 else 0.88)
+        assert np.mean(lengths[1]) < 0.75
+
+
 @pytest.mark.parametrize("bands", [2, 4, 6])
 def test_rotated_coefficients_are_those_of_the_rotated_function(bands: int) -> None:
     random = np.random.default_rng(3)

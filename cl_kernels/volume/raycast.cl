@@ -230,12 +230,11 @@ static inline void cast_between(const Volume volume, const View view, const Arou
     }
 }
 
-// The pixels that `raycast` has left out, three of each square of four. As long as a ray is within a
-// voxel of those beside it, the volume holds nothing that they would miss. So where they have seen nothing, it sees nothing; where it
-// meets the planes that they have seen at one place, a Newton step from there finds the crossing; where at several, as at a silhouette,
-// it is tried at the nearest of them, at the distance of the nearest point that was seen, and at the farthest of them. -> rest: the
-// number of others, which is 0 before, then of each its pixel and the bits of where its ray begins, in voxels: shortly before what was
-// seen beside it.
+// The pixels that `raycast` has left out, three of each square of four. As long as a ray is within a voxel of those beside it, the volume
+// holds nothing that they would miss. So where they have seen nothing, it sees nothing; where it meets the planes that they have seen at one
+// place, a Newton step from there finds the crossing; where at several, as at a silhouette, it is tried at the nearest of them, at the
+// distance of the nearest point that was seen, and at the farthest of them. -> rest: the number of others, which is 0 before, then of each
+// its pixel and the bits of where its ray begins, in voxels: shortly before what was seen beside it.
 kernel void raycast_between(VIEW_PARAMETERS, global float4 *positions, global float4 *normals, global int *rest) {
     const int left = SPACING * get_global_id(0) * LANES, top = SPACING * get_global_id(1);
     if (left >= width || top >= height) return;

@@ -4,6 +4,7 @@
 // Equation 7.1 adds the difference of two shadings R and R' to the picture scaled by the picture itself. For a Lambertian
 // surface the picture is albedo times R, so the factor that leaves the albedo alone is R' / R; it needs no tone mapper.
 // With light from surfaces (7.3.3), R and R' include one bounce: visible surface sends the radiance that the camera saw.
+#include "direct_mix.clh"
 #include "direction_sets.clh"
 #include "met.clh"
 #include "open_shading.clh"
@@ -11,15 +12,25 @@
 #include "samples.clh"
 #include "shadows.clh"
 
-// A block of `step` x `step` samples from (row, col) on, where there is surface; 0 elsewhere.
+// What the discs of the light bring to the samples [rows][cols], without and with objects (light_samples of shadow_map.cl), and
+// the least shading that counts, see direct_mix.clh. has_discs: 0: the light has none.
+#define DISC_SAMPLES const int has_discs, const float4 least, global const float4 *without_discs, global const float4 *with_discs
+
+// A block of `step` x `step` samples from (row, col) on, where there is surface; 0 elsewhere. whole, whole_shaded: under all light.
 static void write_block(const Grid grid, global const float4 *positions, global const float4 *normals, const int row, const int col,
-                        const int step, const float4 of_ratio, const float4 of_shaded, global float4 *ratio, global float4 *shaded) {
+                        const int step, const float4 of_ratio, const float4 of_shaded, global float4 *ratio, global float4 *shaded,
+                        DISC_SAMPLES, global float4 *whole, global float4 *whole_shaded) {
     for (int i = row; i < min(row + step, grid.rows); i++) {
         for (int j = col; j < min(col + step, grid.cols); j++) {
-            const int there = sample_pixel(grid, i, j);
+            const int there = sample_pixel(grid, i, j), sample = i * grid.cols + j;
             const int known = positions[there].w > 0.0f && normals[there].w > 0.0f;
-            ratio[i * grid.cols + j] = known ? of_ratio : (float4)(0.0f);
-            shaded[i * grid.cols + j] = known ? of_shaded : (float4)(0.0f);
+            const float4 its_ratio = known ? of_ratio : (float4)(0.0f), its_shaded = known ? of_shaded : (float4)(0.0f);
+            ratio[sample] = its_ratio;
+            shaded[sample] = its_shaded;
+            if (!has_discs) continue;
+            const float3 without = without_discs[sample].xyz, with = with_discs[sample].xyz;
+            whole[sample] = (float4)(mixed_ratio(its_ratio.xyz, its_shaded.xyz, without, with, least.xyz), its_ratio.w);
+            whole_shaded[sample] = (float4)(fmax(its_shaded.xyz, least.xyz) + without, its_shaded.w);
         }
     }
 }
@@ -29,8 +40,9 @@ static void write_block(const Grid grid, global const float4 *positions, global 
 // -> ratio [rows][cols] (rgb, w = 1), shaded [rows][cols] (rgb of R, w = 1); w = 0 where there is no surface. R is computed even
 // where objects take nothing: other parts of the light (shadow_map.cl), bounces and refined pixels (adaptive.cl) relate to it.
 // One item a block of `step` x `step` samples, which get the ratio of the first of them, or none where that has no surface.
+// whole, whole_shaded [rows][cols]: ratio and R with what the discs bring, written if has_discs.
 kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, global const float *transfer, global const float4 *hits,
-                        global float4 *ratio, global float4 *shaded) {
+                        DISC_SAMPLES, global float4 *ratio, global float4 *shaded, global float4 *whole, global float4 *whole_shaded) {
     const int col = step * get_global_id(0);
     const int row = step * get_global_id(1);
     const Grid grid = scene.samples;
@@ -39,7 +51,8 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, g
     const int pixel = sample_pixel(grid, row, col);
     const float4 normal = normals[pixel], position = positions[pixel];
     if (position.w <= 0.0f || normal.w <= 0.0f) {
-        write_block(grid, positions, normals, row, col, step, (float4)(0.0f), (float4)(0.0f), ratio, shaded);
+        write_block(grid, positions, normals, row, col, step, (float4)(0.0f), (float4)(0.0f), ratio, shaded, has_discs, least,
+                    without_discs, with_discs, whole, whole_shaded);
         return;
     }
     const Volume volume = SOLIDS_OF_SCENE;
@@ -56,51 +69,65 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, g
     const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
     const float4 of_ratio = (float4)(fmax(without - taken, floor) / fmax(without, floor), 1.0f);
     const float4 of_shaded = (float4)(without, 1.0f);
-    write_block(grid, positions, normals, row, col, step, of_ratio, of_shaded, ratio, shaded);
+    write_block(grid, positions, normals, row, col, step, of_ratio, of_shaded, ratio, shaded, has_discs, least, without_discs, with_discs,
+                whole, whole_shaded);
 }
 
-// Light that a sample of real surface gains from other real surface whose shading virtual objects changed (eq. 7.6: R'_ID - R_ID),
-// added to the ratio. met [rows][cols][most]: some of its blocked directions, and where they meet surface (indirect.cl).
-// ratio, shaded [rows][cols]: of shadow_real; changed: that ratio. returned: bound on the change of radiance from a blocked
-// direction; a sample that it can change by at most `spare` times `least` [rows][cols] (at most `shaded`) gains nothing.
-// -> bounced [rows][cols] (rgb, w = 1), w = 0 as in ratio.
+// The ratio under the light without its discs from the ratio under the whole light: the inverse of mixed_ratio. rest: R of the former.
+static inline float4 without_discs_of(const float4 whole, const float3 rest, const float3 without, const float3 with, const float3 least) {
+    const float3 before = fmax(rest, least);
+    return (float4)((whole.xyz * (before + without) - with) / before, whole.w);
+}
+
+// The ratio `before` of a sample of real surface with the light that it gains from other real surface whose shading virtual objects
+// changed (eq. 7.6: R'_ID - R_ID). Arguments as in bounce_real.
+static float4 bounced_ratio(const Volume volume, const Arriving arrives, const float4 position, const float3 normal, const float4 before,
+                            const float openness, const float3 shaded, const float3 rest, const float3 floor, global const uchar *own,
+                            const int most, global const uint *met, const float returned, const float spare) {
+    const float3 counts = fmax(rest, floor);
+    const float part_hidden = clamp(1.0f - openness, 0.0f, 1.0f);
+    if (part_hidden == 0.0f || part_hidden * returned <= spare * fmin(fmin(counts.x, counts.y), counts.z)) return before;
+    const float3 origin = position.xyz + volume.voxel_m * normal;
+    float4 sum = (float4)(0.0f);
+    for (int i = 0; i < most && met[i] != NO_MORE_MET; i++) {
+        const int j = direction_of_met(met[i]);
+        const float3 direction = arrives.directions[own[j % INTERLEAVE] * arrives.count + j].xyz;
+        const float3 at_m = origin + distance_of_met(met[i]) * direction;
+        const float3 change = change_at(arrives.changed, at_m, SAME_POINT * volume.voxel_m) - 1.0f;
+        const float3 more = any(change != 0.0f) ? change * sent_at(volume, arrives, at_m / volume.voxel_m, 0) : (float3)(0.0f);
+        sum += fmax(dot(normal, direction), 0.0f) * (float4)(more, 1.0f);  // a cell's normal may differ from the sample's
+    }
+    const float3 gained = part_hidden * sum.xyz / fmax(sum.w, 1e-6f);
+    const float3 without = fmax(shaded, floor);
+    return (float4)(fmax(before.xyz * without + gained, floor) / without, 1.0f);
+}
+
+// Real surface: the ratio under all light with one bounce between real surfaces. met [rows][cols][most]: some of a sample's blocked
+// directions, and where they meet surface (indirect.cl). changed: the ratio of shadow_real under all light; shaded, rest [rows][cols]:
+// R under all light and under that without discs, the same where it has none. returned: bound on the change of radiance from a
+// blocked direction; a sample that it can change by at most `spare` times `rest` gains nothing.
+// -> bounced [rows][cols] (rgb, w = 1), w = 0 as in `changed`; bounced_rest: the ratio without the discs, written if has_discs.
 kernel void bounce_real(SURROUNDINGS_PARAMETERS, SAMPLE_BUFFERS, const int most, global const uint *met, global const float4 *shaded,
-                        const float returned, const float spare, global const float4 *least, global float4 *bounced) {
+                        global const float4 *rest, const float returned, const float spare, DISC_SAMPLES, global float4 *bounced,
+                        global float4 *bounced_rest) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     const Grid grid = scene.samples;
     if (col >= grid.cols || row >= grid.rows) return;
     const int sample = row * grid.cols + col;
     const int pixel = sample_pixel(grid, row, col);
-    const float4 normal = normals[pixel], before = changed_ratio[sample];
-    if (before.w <= 0.0f) {
-        bounced[sample] = before;
-        return;
+    float4 ratio = changed_ratio[sample];
+    if (ratio.w > 0.0f) {
+        const int place = place_near(scene.light.table, light_table, positions[pixel].xyz);
+        const float3 floor = LEAST_SHADING * 0.28209479f * coefficients_of(scene.light.table, light_table, place)[0].xyz + 1e-9f;
+        const Volume volume = SOLIDS_OF_SCENE;
+        const Arriving arrives = ARRIVING_OF_SCENE(place);
+        ratio = bounced_ratio(volume, arrives, positions[pixel], normals[pixel].xyz, ratio, openness[sample], shaded[sample].xyz,
+                              rest[sample].xyz, floor, sets + sample * INTERLEAVE, most, met + sample * most, returned, spare);
     }
-    const int place = place_near(scene.light.table, light_table, positions[pixel].xyz);
-    const float3 floor = LEAST_SHADING * 0.28209479f * coefficients_of(scene.light.table, light_table, place)[0].xyz + 1e-9f;
-    const float3 counts = fmax(least[sample].xyz, floor);
-    const float part_hidden = clamp(1.0f - openness[sample], 0.0f, 1.0f);
-    if (part_hidden == 0.0f || part_hidden * returned <= spare * fmin(fmin(counts.x, counts.y), counts.z)) {
-        bounced[sample] = before;
-        return;
-    }
-    const Volume volume = SOLIDS_OF_SCENE;
-    const Arriving arrives = ARRIVING_OF_SCENE(place);
-    const float3 origin = positions[pixel].xyz + volume.voxel_m * normal.xyz;
-    float4 sum = (float4)(0.0f);
-    for (int i = 0; i < most && met[sample * most + i] != NO_MORE_MET; i++) {
-        const uint there = met[sample * most + i];
-        const int j = direction_of_met(there);
-        const float3 direction = arrives.directions[sets[sample * INTERLEAVE + j % INTERLEAVE] * arrives.count + j].xyz;
-        const float3 at_m = origin + distance_of_met(there) * direction;
-        const float3 change = change_at(arrives.changed, at_m, SAME_POINT * volume.voxel_m) - 1.0f;
-        const float3 more = any(change != 0.0f) ? change * sent_at(volume, arrives, at_m / volume.voxel_m, 0) : (float3)(0.0f);
-        sum += fmax(dot(normal.xyz, direction), 0.0f) * (float4)(more, 1.0f);  // a cell's normal may differ from the sample's
-    }
-    const float3 gained = part_hidden * sum.xyz / fmax(sum.w, 1e-6f);
-    const float3 without = fmax(shaded[sample].xyz, floor);
-    bounced[sample] = (float4)(fmax(before.xyz * without + gained, floor) / without, 1.0f);
+    bounced[sample] = ratio;
+    if (has_discs)
+        bounced_rest[sample] = without_discs_of(ratio, rest[sample].xyz, without_discs[sample].xyz, with_discs[sample].xyz, least.xyz);
 }
 
 // Virtual surface: the radiance that real and virtual occluders take from it, at the samples that it covers.

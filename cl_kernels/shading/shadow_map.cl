@@ -1,6 +1,5 @@
 // Shadow maps along the sharp lights of a room, and shading with them (thesis 7.2.3, fig. 7.7).
-// Provides build_maps, trace_discs, keep_parts, light_virtual, light_real, light_points_by_discs, light_samples, mix_direct,
-// unmix_direct.
+// Provides build_maps, trace_discs, keep_parts, light_virtual, light_real, light_points_by_discs, light_samples.
 #include "camera.clh"
 #include "clear_origin.clh"
 #include "direct_lights.clh"
@@ -339,23 +338,4 @@ kernel void light_samples(const Grid grid, global const float4 *positions, globa
     const Brought sent = brought_by_discs(lights, position, normal, 0, left, ahead);
     store_vectors(sent.without, 1.0f, sample, last, without);
     store_vectors(sent.with, 1.0f, sample, last, with);
-}
-
-// ratio, shaded [count]: R' / R and R of the rest of the light (w = 1 valid); without, with: light from its discs
-// -> whole, whole_shaded: R' / R and R of both together. least: see direct_mix.clh.
-kernel void mix_direct(const int count, const float4 least, global const float4 *ratio, global const float4 *shaded,
-                       global const float4 *without, global const float4 *with, global float4 *whole, global float4 *whole_shaded) {
-    const int i = get_global_id(0);
-    if (i >= count) return;
-    whole[i] = (float4)(mixed_ratio(ratio[i].xyz, shaded[i].xyz, without[i].xyz, with[i].xyz, least.xyz), ratio[i].w);
-    whole_shaded[i] = (float4)(fmax(shaded[i].xyz, least.xyz) + without[i].xyz, shaded[i].w);
-}
-
-// The inverse: the ratio of the rest, from the ratio of both.
-kernel void unmix_direct(const int count, const float4 least, global const float4 *whole, global const float4 *shaded,
-                         global const float4 *without, global const float4 *with, global float4 *ratio) {
-    const int i = get_global_id(0);
-    if (i >= count) return;
-    const float3 rest = fmax(shaded[i].xyz, least.xyz);
-    ratio[i] = (float4)((whole[i].xyz * (rest + without[i].xyz) - with[i].xyz) / rest, whole[i].w);
 }

@@ -29,9 +29,9 @@ from server.shading import adaptive, change_mask, depth_views
 from server.shading import differential_rendering as differential
 from server.shading import shadow_map as shadow_maps
 from server.shading.depth_views import DepthViews
-from server.shading.differential_rendering import RealShadow
+from server.shading.differential_rendering import DirectSamples, RealShadow
 from server.shading.reflect import reflect_surroundings
-from server.shading.shadow_map import DirectSamples, ShadowMaps
+from server.shading.shadow_map import ShadowMaps
 from server.shading.tone_mapping import Averages
 from server.shading.traced_scene import Changed, TracedScene, trace_scene
 from server.shading.virtual_point_lights import VirtualPointLights, place_points
@@ -76,7 +76,8 @@ def first_shadow(
 
     At every fourth sample: a point of an object sees the shadows of many.
     """
-    return FirstShadow(_shadow(context, transfer, scene, indirect, samples, step=2))
+    engine, camera, surface = context.engine, context.camera, context.surface
+    return FirstShadow(differential.shadow_real(engine, camera, surface, transfer, scene, indirect, samples, step=2))
 
 
 def light_objects(
@@ -106,21 +107,8 @@ def shadow_real(
     samples: DirectSamples | None,
 ) -> RealShadow:
     """What virtual things take from real ones, less what they send to them (eq. 7.1)."""
-    return _shadow(context, transfer, replace(scene, point_lights=lights), indirect, samples)
-
-
-def _shadow(
-    context: FrameContext,
-    transfer: Transfer,
-    scene: TracedScene,
-    indirect: Indirect | None,
-    samples: DirectSamples | None,
-    step: int = 1,
-) -> RealShadow:
-    shadow = differential.shadow_real(context.engine, context.camera, context.surface, transfer, scene, indirect, step)
-    if samples is None:
-        return shadow
-    return replace(shadow, whole=shadow_maps.with_direct(context.engine, shadow, samples))
+    lit = replace(scene, point_lights=lights)
+    return differential.shadow_real(context.engine, context.camera, context.surface, transfer, lit, indirect, samples)
 
 
 def bounce_real(
@@ -135,27 +123,21 @@ def bounce_real(
     samples: DirectSamples | None,
 ) -> BouncedShadow:
     """`ratio` with what real things then send to one another, less or more (eq. 7.6)."""
-    engine, lit, met = context.engine, replace(scene, point_lights=lights), indirect.met
-    assert met is not None
-
-    def bounced(shadow: RealShadow) -> RealShadow:
-        return differential.bounce_real(
-            engine,
-            context.camera,
-            context.camera_from_volume,
-            context.surface,
-            transfer,
-            lit,
-            shadow,
-            met,
-            returned,
-            faint.sample_share,
-            ratio,
-        )
-
-    if samples is None or not isinstance(ratio.whole, RealShadow):
-        return BouncedShadow(bounced(ratio))
-    return BouncedShadow(shadow_maps.without_direct(engine, bounced(ratio.whole), ratio, samples))
+    assert indirect.met is not None
+    shadow = differential.bounce_real(
+        context.engine,
+        context.camera,
+        context.camera_from_volume,
+        context.surface,
+        transfer,
+        replace(scene, point_lights=lights),
+        ratio,
+        indirect.met,
+        returned,
+        faint.sample_share,
+        samples,
+    )
+    return BouncedShadow(shadow)
 
 
 def add_objects(

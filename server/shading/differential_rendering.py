@@ -17,7 +17,7 @@ from protocol.frames import CameraModel
 from server.objects.dirty_region import DirtyRegion, box_around
 from server.objects.rasterize import VirtualSurface
 from server.opencl.buffers import BufferDescription, StageBuffers, Workspace
-from server.opencl.engine import Engine, int4
+from server.opencl.engine import Engine, KernelArgument, float4, int4
 from server.shading.traced_scene import Changed, TracedScene
 from server.shading.virtual_point_lights import PlacedPoints, VirtualPointLights, place_points
 from server.transfer.indirect import Indirect, no_hits
@@ -36,8 +36,13 @@ class _Buffers(StageBuffers):
     """[rows, cols] R' / R of real surface (eq. 7.1), w = 1 valid."""
     shaded = BufferDescription(cl_types.float4)
     """[rows, cols] R."""
+    whole_ratio = BufferDescription(cl_types.float4)
+    whole_shaded = BufferDescription(cl_types.float4)
+    """[rows, cols] `ratio` and `shaded` under the whole light."""
     bounced = BufferDescription(cl_types.float4)
-    """[rows, cols] the ratio with the change of what real surfaces send to each other."""
+    """[rows, cols] the ratio with the change of what real surfaces send to each other, under the whole light."""
+    bounced_rest = BufferDescription(cl_types.float4)
+    """[rows, cols] that ratio under the light without its discs."""
     occluded = BufferDescription(cl_types.float4)
     """[rows, cols] radiance that occluders take from virtual surface."""
     point_radiances = BufferDescription(cl_types.float4)
@@ -55,8 +60,19 @@ class RealShadow(SampleGrid):
 
     shaded: cl_array.Array
     """[rows, cols] float4: R, shading of white surface without objects, w = 1 valid."""
-    whole: SampleGrid | None = None
-    """The ratio under the light with its discs (shadow_map.py); None where the light has none."""
+    whole: RealShadow | None = None
+    """Both under the light with its discs (shadow_map.py); None where the light has none."""
+
+
+@dataclass(frozen=True)
+class DirectSamples:
+    """Radiance of white surface from the discs of the light (shadow_map.py), at the samples of a RealShadow:
+    [rows, cols] float4 each."""
+
+    without: cl_array.Array
+    with_objects: cl_array.Array
+    least: NDArray[np.float64]
+    """[3] the least shading that counts, see include/direct_mix.clh."""
 
 
 def shadow_real(
@@ -66,15 +82,19 @@ def shadow_real(
     transfer: Transfer,
     scene: TracedScene,
     indirect: Indirect | None = None,
+    samples: DirectSamples | None = None,
     step: int = 1,
 ) -> RealShadow:
     """Ratio R' / R of real surface shaded with and without the objects, at the transfer's samples (eq. 7.1).
 
-    indirect: radiance from surfaces at the same samples. step: blocks of step x step samples are shaded as the first
-    of them.
+    indirect: radiance from surfaces at the same samples; samples: what the discs of the light bring there. step: blocks
+    of step x step samples are shaded as the first of them.
     """
     shape, buffers = (transfer.rows, transfer.cols), engine.buffers(_Buffers)
     ratio, shaded = buffers.ratio.array(shape), buffers.shaded.array(shape)
+    whole: RealShadow | None = None
+    if samples is not None:
+        whole = RealShadow(transfer.stride, buffers.whole_ratio.array(shape), buffers.whole_shaded.array(shape))
     engine.launch(
         engine.kernel("differential_rendering.cl", "shadow_real", **_sample_defines(engine, transfer, scene)),
         (-(-transfer.cols // step), -(-transfer.rows // step)),
@@ -84,11 +104,13 @@ def shadow_real(
         step,
         transfer.coefficients,
         indirect.hits if indirect else no_hits(engine, transfer),
+        *_direct_arguments(engine, samples),
         ratio,
         shaded,
+        *((whole.values, whole.shaded) if whole else (engine.unused, engine.unused)),
         steps=scene.rays.count,
     )
-    return RealShadow(transfer.stride, ratio, shaded)
+    return RealShadow(transfer.stride, ratio, shaded, whole)
 
 
 def bounce_real(
@@ -102,15 +124,18 @@ def bounce_real(
     met: cl_array.Array,
     returned: float = math.inf,
     spare: float = 0.0,
-    least: RealShadow | None = None,
+    samples: DirectSamples | None = None,
 ) -> RealShadow:
     """`shadow` with the change of the light between real surfaces (eq. 7.6: R'_ID - R_ID).
 
     met: of Indirect. returned: bound on the change of the radiance that any real surface sends. Where it is at most
-    `spare` times R (of `least`, or else of `shadow`), a sample gains nothing.
+    `spare` times R under the light without its discs, a sample gains nothing. samples: those that `shadow` was made
+    with.
     """
-    bounced = engine.buffers(_Buffers).bounced.array((transfer.rows, transfer.cols))
-    shadowed = replace(scene, changed=Changed(camera, camera_from_volume, surface.positions, shadow))
+    shape, buffers = (transfer.rows, transfer.cols), engine.buffers(_Buffers)
+    before, bounced = shadow.whole or shadow, buffers.bounced.array(shape)
+    rest = buffers.bounced_rest.array(shape) if samples else engine.unused
+    shadowed = replace(scene, changed=Changed(camera, camera_from_volume, surface.positions, before))
     engine.launch(
         engine.kernel("differential_rendering.cl", "bounce_real", **_sample_defines(engine, transfer, scene)),
         (transfer.cols, transfer.rows),
@@ -119,14 +144,24 @@ def bounce_real(
         *sample_arguments(engine, surface, transfer),
         met.shape[2],
         met,
+        before.shaded,
         shadow.shaded,
         returned,
         spare,
-        (least or shadow).shaded,
+        *_direct_arguments(engine, samples),
         bounced,
+        rest,
         steps=scene.rays.count,
     )
-    return replace(shadow, values=bounced)
+    changed = replace(before, values=bounced)
+    return replace(shadow, values=rest, whole=changed) if samples else changed
+
+
+def _direct_arguments(engine: Engine, samples: DirectSamples | None) -> tuple[KernelArgument, ...]:
+    """DISC_SAMPLES of differential_rendering.cl."""
+    if samples is None:
+        return 0, float4(0, 0, 0, 0), engine.unused, engine.unused
+    return 1, float4(*samples.least, 0.0), samples.without, samples.with_objects
 
 
 def _sample_defines(engine: Engine, transfer: Transfer, scene: TracedScene) -> dict[str, int]:

@@ -33,7 +33,7 @@ from server.opencl.engine import Engine, KernelArgument, float4, int4
 from server.opencl.program import Define
 from server.opencl.structs import DIRECT_PARAMETERS
 from server.shading.change_mask import mark_changes
-from server.shading.differential_rendering import MOST_POINTS, VIRTUAL_STRIDE, RealShadow
+from server.shading.differential_rendering import MOST_POINTS, VIRTUAL_STRIDE, DirectSamples, RealShadow
 from server.shading.kept_discs import KeptDiscs
 from server.shading.traced_scene import DeviceLight, ball_around
 from server.shading.virtual_point_lights import PlacedPoints, VirtualPointLights
@@ -78,11 +78,6 @@ class _Buffers(StageBuffers):
     samples_without = BufferDescription(cl_types.float4)
     samples_with = BufferDescription(cl_types.float4)
     """[rows, cols] what the discs bring, without and with objects."""
-    whole_ratio = BufferDescription(cl_types.float4)
-    whole_shaded = BufferDescription(cl_types.float4)
-    """[rows, cols] R' / R and R under the whole light."""
-    rest_ratio = BufferDescription(cl_types.float4)
-    """[rows, cols] R' / R under the light without its discs."""
     objects = BufferGroup(RasterBuffers)
     """Of the picture of all maps."""
 
@@ -133,16 +128,6 @@ class ShadowMaps:
         """TRACE_PARAMETERS of shadow_map.cl."""
         places = engine.buffers(_Buffers).ray_places.constant(_float2(ray_places()))
         return (*self.volume.arguments(), np.float32(self.ray_length_m), places)
-
-
-@dataclass(frozen=True)
-class DirectSamples:
-    """Radiance of white surface from the discs, at the samples of a ratio: [rows, cols] float4 each."""
-
-    without: cl_array.Array
-    with_objects: cl_array.Array
-    least: Floats
-    """ShadowMaps.least."""
 
 
 def draw_shadow_maps(
@@ -305,25 +290,6 @@ def light_samples(
         lit,
     )
     return DirectSamples(without, lit, maps.least)
-
-
-def with_direct(engine: Engine, shadow: RealShadow, samples: DirectSamples) -> RealShadow:
-    """The ratio under the whole light, from the ratio under its rest."""
-    shape, buffers = (shadow.rows, shadow.cols), engine.buffers(_Buffers)
-    whole, shaded = buffers.whole_ratio.array(shape), buffers.whole_shaded.array(shape)
-    count = shadow.rows * shadow.cols
-    mixed = (shadow.values, shadow.shaded, samples.without, samples.with_objects)
-    engine.launch(_kernel(engine, "mix_direct"), (count,), count, float4(*samples.least, 0.0), *mixed, whole, shaded)
-    return RealShadow(shadow.stride, whole, shaded)
-
-
-def without_direct(engine: Engine, whole: RealShadow, shadow: RealShadow, samples: DirectSamples) -> RealShadow:
-    """The ratio under the rest of the light, from the whole light's. shadow: the argument of with_direct."""
-    rest = engine.buffers(_Buffers).rest_ratio.array((shadow.rows, shadow.cols))
-    count = shadow.rows * shadow.cols
-    mixed = (whole.values, shadow.shaded, samples.without, samples.with_objects)
-    engine.launch(_kernel(engine, "unmix_direct"), (count,), count, float4(*samples.least, 0.0), *mixed, rest)
-    return replace(shadow, values=rest, whole=whole)
 
 
 def _draw_objects(

@@ -17,10 +17,9 @@ from server.maths.disc_places import disc_places, ray_places, search_places
 from server.objects.rasterize import VirtualSurface
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.shading.differential_rendering import RealShadow
+from server.shading.differential_rendering import DirectSamples, RealShadow, bounce_real, shadow_real
 from server.shading.shadow_map import (
     MAP_SIDE,
-    DirectSamples,
     ShadowMaps,
     draw_shadow_maps,
     light_points_by_discs,
@@ -29,8 +28,6 @@ from server.shading.shadow_map import (
     light_virtual,
     most_irradiance,
     trace_real,
-    with_direct,
-    without_direct,
 )
 from server.shading.traced_scene import DeviceLight, take_discs, trace_scene, upload_light
 from server.shading.virtual_point_lights import place_points
@@ -455,37 +452,66 @@ def test_rays_are_as_long_as_they_are_said_to_be(engine: Engine) -> None:
 SKY, BESIDE_M = 0.2, 0.1
 
 
+class BesideAWall:
+    """16 x 16 samples of floor beside a wall, under an even sky and a disc that a small bar hides."""
+
+    def __init__(self, engine: Engine, sky: float) -> None:
+        self.engine, self.light = engine, disc(2.0, (0.0, 0.8, 0.6))
+        self.middle = np.array([0.48, FLOOR_Y, 0.2 + BESIDE_M])
+        bar = box(self.middle + 0.3 * self.light.direction - 0.02, self.middle + 0.3 * self.light.direction + 0.02)
+        points = np.tile(self.middle, (16, 16, 1))
+        points[..., 0] += 0.005 * np.linspace(-1, 1, 256).reshape(16, 16)
+        self.camera, rays, even = camera_of(points), direction_sets(81, 4), lights.uniform((sky,) * 3)
+        volume, _ = floor_beside_a_wall(engine)
+        surface = upload_surface(engine, points, np.broadcast_to(UP, points.shape), np.ones((16, 16), bool))
+        self.surface = surface
+        self.transfer = transfer_radiance(engine, self.camera, volume, surface, 1, rays, FAR_M)
+        self.indirect = observe_indirect(engine, self.camera, volume, surface, self.transfer, rays, FAR_M, MeanSent())
+        rest = upload_light(engine, even, rays, indirect=self.indirect)
+        split = take_discs(engine, rest, SplitLight(even, (self.light,)), rays)
+        objects = [placed(engine, bar)]
+        self.context = context_of(engine, self.camera, surface, volume, rays, FAR_M)
+        self.maps = draw_shadow_maps(engine, volume, split, objects, FAR_M)
+        self.scene = trace_scene(engine, volume, split, rays, FAR_M, objects)
+
+    def shadow(self, samples: DirectSamples, step: int = 1) -> RealShadow:
+        engine, camera, indirect = self.engine, self.camera, self.indirect
+        return shadow_real(engine, camera, self.surface, self.transfer, self.scene, indirect, samples, step)
+
+    def bounced(self, shadow: RealShadow, samples: DirectSamples, returned: float) -> RealShadow:
+        assert self.indirect.met is not None
+        return bounce_real(
+            self.engine,
+            self.camera,
+            np.eye(4),
+            self.surface,
+            self.transfer,
+            self.scene,
+            shadow,
+            self.indirect.met,
+            returned,
+            samples=samples,
+        )
+
+
 def test_an_umbra_keeps_what_surfaces_send(engine: Engine) -> None:
     """Floor beside a wall, under an even sky and a disc that a small bar hides: R' / R is the sky and what the wall
     sends over that and the disc, in closed form, at samples and at pixels.
 
     The bar hides 1 / 200 of the sky: most samples have no direction that meets it, and R is the same there.
     """
-    light, middle = disc(2.0, (0.0, 0.8, 0.6)), np.array([0.48, FLOOR_Y, 0.2 + BESIDE_M])
-    bar = box(middle + 0.3 * light.direction - 0.02, middle + 0.3 * light.direction + 0.02)
-    points = np.tile(middle, (16, 16, 1))
-    points[..., 0] += 0.005 * np.linspace(-1, 1, 256).reshape(16, 16)
-    camera, rays, even = camera_of(points), direction_sets(81, 4), lights.uniform((SKY,) * 3)
-    volume, _ = floor_beside_a_wall(engine)
-    surface = upload_surface(engine, points, np.broadcast_to(UP, points.shape), np.ones((16, 16), bool))
-    transfer = transfer_radiance(engine, camera, volume, surface, 1, rays, FAR_M)
-    indirect = observe_indirect(engine, camera, volume, surface, transfer, rays, FAR_M, MeanSent())
-    rest = upload_light(engine, even, rays, indirect=indirect)
-    split = take_discs(engine, rest, SplitLight(even, (light,)), rays)
-    objects, context = [placed(engine, bar)], context_of(engine, camera, surface, volume, rays, FAR_M)
-    maps = draw_shadow_maps(engine, volume, split, objects, FAR_M)
-    scene = trace_scene(engine, volume, split, rays, FAR_M, objects)
-    samples = effects.light_samples(context, transfer, maps)
-    shadow = effects.shadow_real(context, transfer, scene, indirect, None, samples)
-    parts = trace_real(engine, camera, surface, shadow, maps)
-    pixels = download4(engine, light_real(engine, camera, surface, shadow, parts, maps)).astype(float)
-    assert isinstance(shadow.whole, RealShadow)
+    case = BesideAWall(engine, SKY)
+    samples = effects.light_samples(case.context, case.transfer, case.maps)
+    shadow = case.shadow(samples)
+    parts = trace_real(engine, case.camera, case.surface, shadow, case.maps)
+    pixels = download4(engine, light_real(engine, case.camera, case.surface, shadow, parts, case.maps)).astype(float)
+    assert shadow.whole is not None
     buffers = (shadow.values, shadow.shaded, shadow.whole.values, shadow.whole.shaded)
     by_rays, shaded, ratio, whole = (download4(engine, a)[..., :3].astype(float) for a in buffers)
 
     hidden = wall_seen_from(BESIDE_M + VOXEL_M, SIDE_M, SIDE_M - FLOOR_Y)
     expected = SKY * (1 - hidden) + hidden * np.array(WALL_COLOR)
-    brought = exact(middle[None], light, ())[0]
+    brought = exact(case.middle[None], case.light, ())[0]
     missed = (by_rays == 1).all(axis=-1)
     assert 0.5 < missed.mean() < 1
     for at in (missed, ~missed):
@@ -496,24 +522,33 @@ def test_an_umbra_keeps_what_surfaces_send(engine: Engine) -> None:
     assert (pixels[..., 3] == 1).all()
 
 
-def test_mixed_ratios_are_the_twins_and_come_apart_again(device: Device, engine: Engine) -> None:
-    random, shape = np.random.default_rng(3), (12, 20)
-    ratio, rest, without = (random.uniform(0, high, (*shape, 3)) for high in (1.2, 1.5, 2.0))
-    lit_part = without * random.uniform(0, 1, (*shape, 3))
-    rest[:3] = random.uniform(-0.1, 0.001, (3, 20, 3))  # nothing but ringing
-    space, maps = engine.workspace, lit(engine, disc(5.0)).maps
-    values = {"ratio": ratio, "rest": rest, "without": without, "lit": lit_part}
-    on_device = {name: space.upload(f"mixed_{name}", float4(a)) for name, a in values.items()}
-    shadow = RealShadow(4, on_device["ratio"], on_device["rest"])
-    samples = DirectSamples(on_device["without"], on_device["lit"], maps.least)
-    whole = with_direct(engine, shadow, samples)
-    expected = twin.mixed_ratio(ratio, rest, without, lit_part, maps.least)
-    np.testing.assert_allclose(download4(engine, whole.values)[..., :3], expected, rtol=relative_tolerance(device))
+@pytest.mark.parametrize("step", [1, 2])
+@pytest.mark.parametrize("sky", [SKY, -0.3])
+def test_mixed_ratios_are_the_twins_and_come_apart_again(device: Device, engine: Engine, sky: float, step: int) -> None:
+    """With any light from discs at the samples: under a sky, and where the rest of the light is nothing but ringing."""
+    case = BesideAWall(engine, sky)
+    random, shape = np.random.default_rng(3), (16, 16, 3)
+    without, least = random.uniform(0, 2, shape), np.array([1e-2, 2e-2, 3e-2])
+    with_objects = without * random.uniform(0, 1, shape)
+    values = {"without": without, "with": with_objects}
+    samples = DirectSamples(*(engine.workspace.upload(f"mixed_{n}", float4(a)) for n, a in values.items()), least)
+    shadow = case.shadow(samples, step)
+    assert shadow.whole is not None
+    buffers = (shadow.values, shadow.shaded, shadow.whole.values, shadow.whole.shaded)
+    ratio, rest, whole, whole_shaded = (download4(engine, a).astype(float)[..., :3] for a in buffers)
+    assert (rest < 0).any() == (sky < 0)
+    assert (ratio != 1).any() == (sky > 0)
+
+    expected = twin.mixed_ratio(ratio, rest, without, with_objects, least)
+    np.testing.assert_allclose(whole, expected, rtol=relative_tolerance(device))
+    np.testing.assert_allclose(whole_shaded, np.maximum(rest, least) + without, rtol=relative_tolerance(device))
     assert (expected <= np.maximum(ratio, 1) + 1e-6).all()
-    apart = without_direct(engine, whole, shadow, samples)
-    bright = (rest > 0.05) & (ratio * rest + lit_part > 1.01 * maps.least)
+
+    apart = case.bounced(shadow, samples, returned=0.0)  # by nothing: the same ratios
+    assert apart.whole is not None
+    np.testing.assert_array_equal(download4(engine, apart.whole.values)[..., :3], whole.astype(np.float32))
+    bright = (rest > 0.05) & (ratio * rest + with_objects > 1.01 * least)
     np.testing.assert_allclose(download4(engine, apart.values)[..., :3][bright], ratio[bright], atol=1e-5)
-    assert apart.whole is whole
 
 
 def test_pixels_of_real_surface_hold_the_whole_ratio(engine: Engine) -> None:

@@ -105,7 +105,7 @@ def light_floor(
     device_light = upload_light(engine, light, rays, indirect=indirect, exposure=exposure)
     traced = trace_scene(engine, volume, device_light, rays, ROOM_M, objects)
     traced = replace(traced, point_lights=light_points(engine, traced))
-    shadow: RealShadow = shadow_real(engine, camera, surface, transfer, traced, indirect, step)
+    shadow: RealShadow = shadow_real(engine, camera, surface, transfer, traced, indirect, step=step)
     refined = refine_real(engine, camera, surface, traced, shadow)
     return Lit(
         download4(engine, shadow.values).astype(float),

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 import pyopencl as cl
@@ -120,13 +121,13 @@ class ShadowMaps:
         return (
             DIRECT_PARAMETERS(ball=float4(*self.ball), least=float4(*self.least, 0.0), count=len(self.light.discs)),
             self.rows,
-            engine.buffers(_Buffers).disc_places.constant(_float2(np.concatenate([search_places(), disc_places()]))),
+            engine.buffers(_Buffers).disc_places.constant(_disc_places()),
             self.objects,
         )
 
     def trace_arguments(self, engine: Engine) -> tuple[KernelArgument, ...]:
         """TRACE_PARAMETERS of shadow_map.cl."""
-        places = engine.buffers(_Buffers).ray_places.constant(_float2(ray_places()))
+        places = engine.buffers(_Buffers).ray_places.constant(_ray_places())
         return (*self.volume.arguments(), np.float32(self.ray_length_m), places)
 
 
@@ -392,6 +393,18 @@ def _rows(discs: Sequence[DirectLight], axes: Floats, radius_m: float) -> NDArra
     distance = np.linalg.norm(disc_places(), axis=1)
     rows[:count, 3, 3] = (1 / np.sqrt(1 + np.outer(tangent, distance) ** 2)).mean(axis=1)
     return rows
+
+
+@cache
+def _disc_places() -> NDArray[np.float32]:
+    """_Buffers.disc_places."""
+    return _float2(np.concatenate([search_places(), disc_places()]))
+
+
+@cache
+def _ray_places() -> NDArray[np.float32]:
+    """_Buffers.ray_places."""
+    return _float2(ray_places())
 
 
 def _float2(places: Floats) -> NDArray[np.float32]:

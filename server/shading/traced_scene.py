@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -96,6 +95,8 @@ class TracedScene:
     """Length of rays."""
     objects: Sequence[Placed]
     table: ObjectTable
+    ball: np.generic
+    """Around all objects, as ball_around returns it."""
     point_lights: VirtualPointLights | None = None
     """Radiance that the objects send; None: none."""
     changed: Changed | None = None
@@ -116,11 +117,6 @@ class TracedScene:
     def by_rays(self) -> TracedScene:
         """The same scene, with visibility traced through the volume."""
         return replace(self, depth_views=None)
-
-    @cached_property
-    def ball(self) -> np.generic:
-        """Ball around all objects, as ball_around returns it."""
-        return ball_around(self.objects)
 
     def parameters(self, engine: Engine, samples: np.void, every: int = 1) -> np.void:
         """SceneParameters for a kernel that shades at `samples`, a GRID."""
@@ -218,7 +214,8 @@ def trace_scene(
     engine: Engine, volume: Volume, light: DeviceLight, rays: Directions, ray_length_m: float, objects: Sequence[Placed]
 ) -> TracedScene:
     """The scene of one frame. Its objects send no light yet."""
-    return TracedScene(volume, light, rays, ray_length_m, objects, object_table(engine, objects))
+    ball = ball_around(objects)
+    return TracedScene(volume, light, rays, ray_length_m, objects, object_table(engine, objects), ball)
 
 
 def upload_light(

@@ -1,4 +1,4 @@
-"""Float64 twin of the first half of server/light/shell/objective.py: equation (1) and its sum, written term by term."""
+"""Float64 twin of server/light/shell/objective.py: equations (1) and (2) and their sums, written term by term."""
 
 from __future__ import annotations
 
@@ -65,3 +65,42 @@ def middle_objective(middle: float, first: float, albedos: Floats) -> float:
     total = ((middle - logits[0]) / constants.MEAN_SPREAD) ** 2
     total += ((grown - np.log(constants.BRIGHTEST)) / constants.BRIGHTEST_SPREAD) ** 2
     return float(total) / 2
+
+
+def chroma_objective(
+    chroma: Floats,
+    parts: Floats,
+    seen: Floats,
+    surfaces: NDArray[np.int64],
+    regions: NDArray[np.int64],
+    brightest: NDArray[np.bool_],
+) -> float:
+    """Half the sum over equation (2), at the best t, a_f and c_r.
+
+    chroma [k, 2] of sources; parts [n, k] T; seen [n, 2] less what known surface brings; surfaces [n], regions [n];
+    brightest [n]: patches of the brightest surface.
+    """
+    residual = seen - parts @ chroma
+    total = sum(_of_surface(residual[surfaces == f], regions[surfaces == f]) for f in np.unique(surfaces))
+    pull, weight = 1 / constants.CELL_CHROMA**2, 1 / constants.TINT**2
+    tint = pull * chroma.sum(axis=0) / (pull * len(chroma) + weight)
+    total += pull * ((chroma - tint) ** 2).sum() + weight * (tint**2).sum()
+    for first, second in neighbours():
+        total += constants.CHROMA_SMOOTHNESS * ((chroma[first] - chroma[second]) ** 2).sum()
+    white = residual[brightest].mean(axis=0) - constants.WHITE_CHROMA
+    return float(total + (white**2).sum() / constants.WHITE_CHROMA_SPREAD**2) / 2
+
+
+def _of_surface(residual: Floats, regions: NDArray[np.int64]) -> float:
+    """The least sum over one surface's patches, over its own chroma and its regions'; residual [n, 2]."""
+    precision, own = 1 / constants.CHROMA_NOISE**2, np.zeros(2)
+    numbers, members = np.unique(regions, return_inverse=True)
+    besides, counts = np.zeros((len(numbers), 2)), np.bincount(members)[:, None]
+    for _ in range(400):  # in turn, each the best given the other
+        left = np.stack([np.bincount(members, column) for column in (residual - own).T], axis=1)
+        bends = 1 / (constants.REGION_CHROMA**2 + (besides**2).sum(axis=1, keepdims=True))
+        besides = precision * left / (precision * counts + bends)
+        others = (residual - besides[members]).sum(axis=0)
+        own = precision * others / (precision * len(residual) + 1 / constants.SURFACE_CHROMA**2)
+    total = precision * ((residual - own - besides[members]) ** 2).sum() + (own**2).sum() / constants.SURFACE_CHROMA**2
+    return float(total + np.log1p((besides**2).sum(axis=1) / constants.REGION_CHROMA**2).sum())

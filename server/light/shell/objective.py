@@ -3,36 +3,40 @@
 Patch p of surface shows, for the mean logarithm of the channels y and two chroma coordinates q (`LOG_CHROMA`),
 
     y_p = log(sum_k A_pk x_k + h_p) + log s(B_p m) + o_f(p) + d_r(p) + e_p                     (1)
-    q_p = sum_k T_pk u_k + (h_p / E_p) q(h_p) + c_r(p) + e'_p,    T_pk = A_pk x_k / E_p        (2)
+    q_p = sum_k T_pk u_k + (h_p / E_p) q(h_p) + a_f(p) + c_r(p) + e'_p,    T_pk = A_pk x_k / E_p        (2)
 
 with A_pk the share of p's cosine-weighted hemisphere that is source k (sources.py), x_k = exp(z_k) its radiance
 (of saturated surface x_k = b_k exp(z_k), beyond b_k, which the clipped picture shows), h_p what photographed surface
 brings, E_p the sum in (1), u_k the chroma of source k. s is the logistic function, B_p m the logit of the albedo of
 materials, bilinear on a grid over the chroma of albedo. o_f is what surface f (segments.py: a floor, a painted stripe)
-has besides, d_r and c_r what region r of it has; they are eliminated exactly. Minimised is
+has besides, a_f its chroma, d_r and c_r what region r of it has further; they are eliminated exactly (elimination.py).
+Minimised is
 
     sum_p huber(e_p / S_p) + sum_k ((z_k - n_k) / s_k)^2 + sum_(k,l) rho(z_k - z_l)
     + sum_g ((m_g - m) / s_m)^2 + ((m - m_0) / s_0)^2 + ((b - log B) / s_b)^2 + sum_f tau(o_f) + sum_r (d_r / s_d)^2
-    + sum_p |e'_p / S'_p|^2 + sum_k |(u_k - t) / s_u|^2 + sum_(k,l) c |u_k - u_l|^2 + |t / s_t|^2 + sum_r |c_r / s_c|^2
+    + sum_p |e'_p / S'_p|^2 + sum_k |(u_k - t) / s_u|^2 + sum_(k,l) c |u_k - u_l|^2 + |t / s_t|^2 + sum_f |a_f / s_a|^2
+    + sum_r log(1 + |c_r / s_c|^2) + |(w - w_0) / s_w|^2
 
 over neighbouring sources (k,l). tau is (o / s_o)^2, but 2 (d / s_o)^2 (sqrt(1 + (o / d)^2) - 1) below 0, which becomes
 linear, and steep where the albedo exceeds 1. b is the log albedo of the brightest surface, the mean of log s(B_p m) +
-o_f(p) between two ranks; it sets the level. m follows from its own two terms between the steps: all materials, and b,
-go along with it, since little else of the objective changes where all albedo grows and all light falls. The weights
-stand in weights.py. A patch that is clipped only counts where (1) is below what it shows; its material is the mean one.
+o_f(p) between two ranks; it sets the level. w is the mean chroma of albedo of the patches between these ranks. m
+follows from its own two terms between the steps: all materials, and b, go along with it, since little else of the
+objective changes where all albedo grows and all light falls. The weights stand in weights.py. A patch that is clipped
+only counts where (1) is below what it shows; its material is the mean one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lu_factor, lu_solve
-from scipy.sparse import csr_matrix
 
 from server.light.shell import weights
+from server.light.shell.chroma import solve_chroma
+from server.light.shell.elimination import Offsets, Regions, add_smoothness
 from server.light.shell.evidence import DARKEST, LOG_CHROMA, NODES, Evidence, log_chroma, materials_of
 from server.light.shell.patches import MOST_PATCHES
 from server.light.shell.sources import Sources
@@ -134,8 +138,17 @@ class Unknowns:
         return gradient @ solved[:count, :rows], float(np.abs(self.curvature).sum(axis=0).max() * inverse)
 
 
-def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Switches | None = None) -> None:
+def step(
+    unknowns: Unknowns,
+    evidence: Evidence,
+    sources: Sources,
+    switches: Switches | None = None,
+    *,
+    with_chroma: bool = True,
+) -> None:
     """One Gauss-Newton step, in place. Sources that are new begin at their prior, or as of `_begin`.
+
+    with_chroma: solve (2) too; else sources keep their chroma.
 
     Products of matrices are float32: terms are good to a percent, and nothing cancels.
     """
@@ -148,30 +161,29 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     offsets = _means(unknowns.offsets[evidence.rows], evidence.surfaces)
     z = np.concatenate([unknowns.z, prior[unknowns.known :]])
     z += _begin(z, unknowns.known, evidence, sources, known, np.log(_logistic(middle)) + offsets)
-    cell_chroma = np.concatenate([unknowns.chroma, np.zeros((count - unknowns.known, 2))])
+    unknowns.chroma = np.concatenate([unknowns.chroma, np.zeros((count - unknowns.known, 2))])
 
     level = _levels(z, sources).astype(np.float32)
     arriving = np.maximum(sources.shares @ level + known, DARKEST)
     parts = sources.shares * level
     parts /= arriving.astype(np.float32)[:, None]  # T
-    sent_chroma = parts @ cell_chroma.astype(np.float32)
+    sent_chroma = (parts @ unknowns.chroma.astype(np.float32)).astype(np.float64)
     known_part = (known / arriving)[:, None] * known_logs[:, 1:]
     is_clipped = evidence.is_clipped[:, None]
     nodes, materials = materials_of(np.where(is_clipped, 0.0, evidence.chroma - sent_chroma - known_part))
     albedo = _logistic(materials @ unknowns.materials[nodes])
     residual = evidence.level - np.log(arriving) - np.log(albedo)
     error = residual - offsets[evidence.surfaces]
-    counts = evidence.precision * (_huber(error * np.sqrt(evidence.precision)) if switches.outliers else 1.0)
-    counts[evidence.is_clipped & (error < 0)] = 0.0
+    counts = _counts(error, evidence, switches)
     counts[(known == 0) & (sources.shares.sum(axis=1) <= sources.least_share)] = 0.0
 
     design = np.concatenate([parts, ((1 - albedo)[:, None] * materials).astype(np.float32)], axis=1)
     spreads = _albedo_spreads(switches)
-    regions = _Regions.of(design, counts, evidence)
+    regions = Regions.of(design, counts, evidence)
     whitest = -_means(np.log(albedo), evidence.surfaces)
-    surfaces = _Surfaces.of(offsets, whitest, regions, spreads)
+    surfaces = _albedo_offsets(offsets, whitest, regions, spreads)
     residual = residual - surfaces.center[evidence.surfaces]
-    matrix, vector = _without_regions(design, residual[:, None], regions, spreads.region, surfaces)
+    matrix, vector = surfaces.normal_equations(design, residual[:, None])
     right = vector[:, 0].astype(np.float64)
     right[:count] -= _smoothen(matrix, z, sources.pairs)
     diagonal = np.concatenate([1 / sources.deviation**2, np.full(len(nodes), 1 / spreads.material**2)])
@@ -183,12 +195,21 @@ def step(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Swi
     unknowns.step = float(np.sqrt(np.mean((parts @ change[:count]) ** 2)))
     unknowns.z = z + change[:count]
     unknowns.materials[nodes] += change[count:]
-    offsets = surfaces.offsets(residual - design @ change)
+    offsets = surfaces.of_surfaces(residual - design @ change)
     unknowns.offsets[evidence.rows] = offsets[evidence.surfaces]
+    albedos = np.log(_logistic(materials @ unknowns.materials[nodes])) + offsets[evidence.surfaces]
     if finds_level:
-        _shift_albedos(unknowns, _logistic(materials @ unknowns.materials[nodes]), offsets, evidence)
-    seen = np.where(is_clipped, sent_chroma, evidence.chroma - known_part)
-    unknowns.chroma = _solve_chroma(parts, seen, regions.columns(count), spreads.chroma, sources.pairs)
+        _shift_albedos(unknowns, albedos[~evidence.is_clipped])
+    if with_chroma:
+        unknowns.chroma = solve_chroma(
+            parts,
+            np.where(is_clipped, sent_chroma, evidence.chroma - known_part),
+            sent_chroma,
+            regions,
+            sources.pairs,
+            _brightest(albedos, ~evidence.is_clipped) if finds_level else None,
+            finds_albedos=switches.albedos,
+        )
     unknowns.radiance = _radiance(unknowns, sources)
 
 
@@ -220,17 +241,16 @@ def _begin(z: Floats, count: int, evidence: Evidence, sources: Sources, known: F
     return np.where(is_new, BEGIN_EXCESS[errors.argmin()], 0.0)
 
 
-def _shift_albedos(unknowns: Unknowns, albedo: Floats, offsets: Floats, evidence: Evidence) -> None:
+def _shift_albedos(unknowns: Unknowns, albedos: Floats) -> None:
     """A step of m and, with it, of all materials; its change of m's log albedo counts in `step`.
 
-    albedo: [n] of the patches' materials; offsets: [surfaces].
+    albedos: [n] logarithms, of patches that are not clipped.
     """
-    logs = (np.log(albedo) + offsets[evidence.surfaces])[~evidence.is_clipped]
-    if len(logs) == 0:
+    if len(albedos) == 0:
         return
     before = _logistic(unknowns.middle)
     slope = 1 - before  # of a log albedo by its logit
-    missing = np.log(weights.BRIGHTEST) - float(np.quantile(logs, BRIGHTEST_RANKS).mean())
+    missing = np.log(weights.BRIGHTEST) - float(np.quantile(albedos, BRIGHTEST_RANKS).mean())
     pull = slope * missing / weights.BRIGHTEST_SPREAD**2 + (LOGIT - unknowns.middle) / weights.MEAN_SPREAD**2
     change = unknowns.relaxation * pull / ((slope / weights.BRIGHTEST_SPREAD) ** 2 + 1 / weights.MEAN_SPREAD**2)
     unknowns.middle += change
@@ -238,16 +258,41 @@ def _shift_albedos(unknowns: Unknowns, albedo: Floats, offsets: Floats, evidence
     unknowns.step = float(np.hypot(unknowns.step, np.log(_logistic(unknowns.middle) / before)))
 
 
+def _brightest(albedos: Floats, is_usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """[n] patches of the brightest surface, of those that are usable, by logarithms of albedo [n]."""
+    if not is_usable.any():
+        return is_usable
+    least, most = np.quantile(albedos[is_usable], BRIGHTEST_RANKS[[0, -1]])
+    return np.asarray(is_usable & (albedos >= least) & (albedos <= most))
+
+
 @dataclass(frozen=True)
 class _AlbedoSpreads:
     material: float = weights.ALBEDO_SPREAD
     surface: float = weights.SURFACE_SPREAD
     region: float = weights.REGION_SPREAD
-    chroma: float = weights.REGION_CHROMA
+
+
+def _counts(error: Floats, evidence: Evidence, switches: Switches) -> Floats:
+    """[n] weights of the patches, by the error [n] of (1)."""
+    counts = evidence.precision * (_huber(error * np.sqrt(evidence.precision)) if switches.outliers else 1.0)
+    return np.where(evidence.is_clipped & (error < 0), 0.0, counts)
 
 
 def _albedo_spreads(switches: Switches) -> _AlbedoSpreads:
-    return _AlbedoSpreads() if switches.albedos else _AlbedoSpreads(*[weights.ONE_ALBEDO] * 4)
+    return _AlbedoSpreads() if switches.albedos else _AlbedoSpreads(*[weights.ONE_ALBEDO] * 3)
+
+
+def _albedo_offsets(offsets: Floats, whitest: Floats, regions: Regions, spreads: _AlbedoSpreads) -> Offsets:
+    """By the last `offsets` [surfaces] and the greatest, `whitest`, with which an albedo is 1.
+
+    The prior grows slowly for dark ones, since paint may be black, and sharply from `whitest` on.
+    """
+    is_white = offsets >= whitest
+    variance = spreads.surface**2 * np.sqrt(1 + (np.minimum(offsets, 0.0) / weights.DARK_EDGE) ** 2)
+    beyond = np.where(is_white, 1 / weights.WHITE**2, 0.0)  # precision of a second prior, about `whitest`
+    variance = variance / (1 + variance * beyond)
+    return Offsets.of(regions, spreads.region**2, variance, variance * beyond * whitest)
 
 
 def _levels(z: Floats, sources: Sources) -> Floats:
@@ -275,128 +320,10 @@ def _means(values: Floats, groups: Ints) -> Floats:
     return np.asarray(np.bincount(groups, values) / np.bincount(groups))
 
 
-def _members(shares: Floats, starts: Ints) -> csr_matrix:
-    """[groups, n] `shares` [n] of the members of groups that stand one after the other; starts: [groups + 1]."""
-    return csr_matrix((shares.astype(np.float32), np.arange(len(shares)), starts), (len(starts) - 1, len(shares)))
-
-
-@dataclass(frozen=True)
-class _Regions:
-    """Weighted sums of the design's columns over the patches, all of them and those of each region."""
-
-    counts: Floats
-    """[n] weights of the patches."""
-    members: csr_matrix
-    """[regions, n] the weights of each one's patches."""
-    totals: Floats
-    """[regions] of weights."""
-    gram: Singles
-    """[c, c] sums of products of two columns."""
-    sums: Singles
-    """[regions, c] of columns."""
-    surfaces: Ints
-    """[regions] which surface each is part of."""
-
-    @staticmethod
-    def of(design: Singles, counts: Floats, evidence: Evidence) -> _Regions:
-        """Of the columns of `design` [n, c] with weights `counts` [n]."""
-        starts = np.searchsorted(evidence.regions, np.arange(evidence.regions[-1] + 2))
-        members = _members(counts, starts)
-        rooted = design * np.sqrt(counts).astype(np.float32)[:, None]
-        totals = np.bincount(evidence.regions, counts).astype(np.float64)
-        return _Regions(counts, members, totals, rooted.T @ rooted, members @ design, evidence.surfaces[starts[:-1]])
-
-    def columns(self, count: int) -> _Regions:
-        """The same for the first `count` columns."""
-        return replace(self, gram=self.gram[:count, :count], sums=self.sums[:, :count])
-
-    def sums_of(self, values: Floats) -> Floats:
-        """[regions, ...] weighted sums of values [n, ...]."""
-        return np.asarray(self.members @ values)
-
-
-@dataclass(frozen=True)
-class _Surfaces:
-    """What is left of regions' sums once the regions' own offsets are eliminated, surface by surface."""
-
-    regions: _Regions
-    keeps: Floats
-    """[regions] share of a sum over a region that its own offset leaves."""
-    center: Floats
-    """[surfaces] prior mean of its offset."""
-    factor: Floats
-    """[surfaces] variance of its offset given all else."""
-
-    @staticmethod
-    def of(offsets: Floats, whitest: Floats, regions: _Regions, spreads: _AlbedoSpreads) -> _Surfaces:
-        """By the last `offsets` [surfaces] and the greatest, `whitest`, with which an albedo is 1.
-
-        The prior grows slowly for dark ones, since paint may be black, and sharply from `whitest` on.
-        """
-        is_white = offsets >= whitest
-        variance = spreads.surface**2 * np.sqrt(1 + (np.minimum(offsets, 0.0) / weights.DARK_EDGE) ** 2)
-        beyond = np.where(is_white, 1 / weights.WHITE**2, 0.0)  # precision of a second prior, about `whitest`
-        variance = variance / (1 + variance * beyond)
-        keeps = 1 / (1 + spreads.region**2 * regions.totals)
-        totals = np.bincount(regions.surfaces, keeps * regions.totals)
-        return _Surfaces(regions, keeps, variance * beyond * whitest, variance / (1 + variance * totals))
-
-    def sums(self, by_region: NDArray[Any]) -> NDArray[Any]:
-        """[surfaces, ...] of sums over regions [regions, ...]."""
-        starts = np.searchsorted(self.regions.surfaces, np.arange(len(self.factor) + 1))
-        return np.asarray(_members(self.keeps, starts) @ by_region)
-
-    def offsets(self, residual: Floats) -> Floats:
-        """[surfaces] the best, for residuals [n] from which `center` was taken."""
-        return np.asarray(self.center + self.factor * self.sums(self.regions.sums_of(residual)))
-
-
-def _without_regions(
-    design: Singles, residuals: Floats, regions: _Regions, spread: float, surfaces: _Surfaces | None = None
-) -> tuple[Singles, Singles]:
-    """Normal matrix and vector [c, m] of `design` [n, c], without the offsets of regions and of surfaces.
-
-    residuals: [n, m]. spread: deviation of a region's offset.
-    """
-    factor, differences = spread**2 / (1 + spread**2 * regions.totals), regions.sums_of(residuals)
-    weighted = (regions.counts[:, None] * residuals).astype(np.float32)
-    root = regions.sums * np.sqrt(factor).astype(np.float32)[:, None]
-    matrix = regions.gram - root.T @ root
-    vector = design.T @ weighted - regions.sums.T @ (factor[:, None] * differences).astype(np.float32)
-    if surfaces is not None:
-        of_surfaces = surfaces.sums(regions.sums)
-        root = of_surfaces * np.sqrt(surfaces.factor).astype(np.float32)[:, None]
-        matrix -= root.T @ root
-        of_differences = surfaces.factor[:, None] * surfaces.sums(differences)
-        vector -= of_surfaces.T @ of_differences.astype(np.float32)
-    return matrix, vector
-
-
-def _add_smoothness(matrix: Singles, pairs: Ints, strength: Floats | float) -> None:
-    first, second = pairs.T
-    np.add.at(matrix, (first, first), strength)
-    np.add.at(matrix, (second, second), strength)
-    np.subtract.at(matrix, (first, second), strength)
-    np.subtract.at(matrix, (second, first), strength)
-
-
 def _smoothen(matrix: Singles, z: Floats, pairs: Ints) -> Floats:
     """[k] half the gradient of the sum of rho at z [k]; its curvature is added to `matrix`."""
     differences = z[pairs[:, 0]] - z[pairs[:, 1]]
     strength = weights.SMOOTHNESS / np.sqrt(1 + (differences / weights.EDGE) ** 2)
-    _add_smoothness(matrix, pairs, strength)
+    add_smoothness(matrix, pairs, strength)
     up, down = (np.bincount(side, strength * differences, len(z)) for side in pairs.T)
     return np.asarray(up - down)
-
-
-def _solve_chroma(parts: Singles, seen: Floats, regions: _Regions, spread: float, pairs: Ints) -> Floats:
-    """[k, 2] chroma of the sources: equation (2) is linear in it and the light's; `seen` [n, 2]."""
-    ratio = (weights.PATCH_NOISE / weights.CHROMA_NOISE) ** 2  # of the weights of chroma to those of level
-    matrix, vector = _without_regions(parts, seen, regions, spread * np.sqrt(ratio))
-    matrix, vector = np.float32(ratio) * matrix, np.float32(ratio) * vector
-    _add_smoothness(matrix, pairs, weights.CHROMA_SMOOTHNESS)
-    matrix[np.diag_indices_from(matrix)] += 1 / weights.CELL_CHROMA**2
-    # The light's own chroma t is eliminated: u about t, t about 0.
-    pull = 1 / weights.CELL_CHROMA**2
-    matrix -= np.float32(pull**2 / (parts.shape[1] * pull + 1 / weights.TINT**2))
-    return lu_solve(lu_factor(matrix, check_finite=False), vector, check_finite=False).astype(np.float64)  # type: ignore[no-any-return]

@@ -24,6 +24,9 @@ MOVED, DISTANT_MOVED, DISTANT_SHARE = 0.01, 0.05, 0.5
 """Change of a logarithm; the second value holds for the light from beyond the scan, of whose steps that share is taken,
 both while the light is steady. Lobes that overlap take the light of each other: what stops sooner is nearer to the
 prior, and two lights of mitsuba_room are 16 degrees off instead of 27."""
+CHROMA_MOVED = 0.05
+"""While a step changes what patches receive by no more than this, the light keeps the colours that a solution's first
+step found: they follow the level slowly, and take a third of a step's time."""
 LEAST_PATCHES = 12
 """With fewer patches there is no solution."""
 
@@ -65,8 +68,8 @@ class Solver:
         far_settled = DISTANT_MOVED ** (1 - first) * MOVED**first
         for unknowns, sources, settled in ((self._near, near, MOVED), (self._distant, distant, far_settled)):
             unknowns.relaxation = max(unknowns.relaxation, patches.outdated)
-            for _ in range(MOST_STEPS):
-                step(unknowns, evidence, sources, switches)
+            for number in range(MOST_STEPS):
+                step(unknowns, evidence, sources, switches, with_chroma=number == 0 or unknowns.step > CHROMA_MOVED)
                 if unknowns.step < settled:
                     break
         hidden, shown = dict(self._transport.hidden), patches.logarithms[rows]

@@ -1,0 +1,67 @@
+"""The chroma of the light, equation (2) of objective.py: linear, given how much each source brings.
+
+A cast of the room and a cast of its light look alike. What tells them apart: along one surface, where light of two
+colours mixes, the cast changes; and a room's brightest surface is nearly always white paint.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lu_factor, lu_solve
+
+from server.light.shell import weights
+from server.light.shell.elimination import Offsets, Regions, add_smoothness
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+
+def solve_chroma(
+    parts: Singles,
+    seen: Floats,
+    sent: Floats,
+    regions: Regions,
+    pairs: Ints,
+    brightest: NDArray[np.bool_] | None,
+    *,
+    finds_albedos: bool = True,
+) -> Floats:
+    """[k, 2] chroma of the sources.
+
+    parts: [n, k], T; seen: [n, 2], q less what known surface brings; sent: [n, 2] chroma that the sources sent at the
+    last step; regions: of `parts` and perhaps more. brightest: [n] patches of the brightest surface, None where it is
+    not known to be white. finds_albedos: surfaces have colours of their own.
+    """
+    regions = regions.columns(parts.shape[1], (weights.PATCH_NOISE / weights.CHROMA_NOISE) ** 2)
+    offsets = _albedo_offsets(regions, seen - sent, finds_albedos=finds_albedos)
+    matrix, vector = offsets.normal_equations(parts, seen)
+    if brightest is not None and brightest.any():
+        sees, weight = parts[brightest].mean(axis=0), np.float32(1 / weights.WHITE_CHROMA_SPREAD**2)
+        matrix += weight * np.outer(sees, sees)
+        vector += weight * np.outer(sees, seen[brightest].mean(axis=0) - weights.WHITE_CHROMA).astype(np.float32)
+    add_smoothness(matrix, pairs, weights.CHROMA_SMOOTHNESS)
+    matrix[np.diag_indices_from(matrix)] += 1 / weights.CELL_CHROMA**2
+    # The light's own chroma t is eliminated: u about t, t about 0.
+    pull = 1 / weights.CELL_CHROMA**2
+    matrix -= np.float32(pull**2 / (parts.shape[1] * pull + 1 / weights.TINT**2))
+    return lu_solve(lu_factor(matrix, check_finite=False), vector, check_finite=False).astype(np.float64)  # type: ignore[no-any-return]
+
+
+def _albedo_offsets(regions: Regions, residuals: Floats, *, finds_albedos: bool) -> Offsets:
+    """Chroma of albedo: a surface's, and a region's besides, of which Cauchy's distribution is the prior.
+
+    residuals: [n, 2] at the last step. A region's prior is the Gaussian whose penalty grows as fast as Cauchy's at the
+    offset that the region has there.
+    """
+    surface, region = weights.SURFACE_CHROMA**2, weights.REGION_CHROMA**2
+    if not finds_albedos:
+        surface = region = weights.ONE_ALBEDO**2
+    center = np.zeros(regions.surfaces[-1] + 1)
+    offsets = Offsets.of(regions, region, surface, center)
+    if not finds_albedos:
+        return offsets
+    means = regions.sums_of(residuals) / np.maximum(regions.totals, 1e-9)[:, None]
+    besides = means - offsets.of_surfaces(residuals)[regions.surfaces]
+    return Offsets.of(regions, region + (besides**2).sum(axis=1), surface, center)

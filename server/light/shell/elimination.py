@@ -1,0 +1,132 @@
+"""What regions and surfaces have of their own, eliminated exactly from the normal equations of the objective.
+
+An observation of patch p is a row of the design times the unknowns, plus an offset of its surface, plus one of its
+region within the surface. Offsets have Gaussian priors, and each concerns few patches, so the best ones are known in
+closed form given all else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+
+from server.light.shell.evidence import Evidence
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Regions:
+    """Weighted sums of the design's columns over the patches, all of them and those of each region."""
+
+    counts: Floats
+    """[n] weights of the patches: 1 / variance of their noise."""
+    members: csr_matrix
+    """[regions, n] the weights of each one's patches."""
+    totals: Floats
+    """[regions] of weights."""
+    gram: Singles
+    """[c, c] sums of products of two columns."""
+    sums: Singles
+    """[regions, c] of columns."""
+    surfaces: Ints
+    """[regions] which surface each is part of."""
+
+    @staticmethod
+    def of(design: Singles, counts: Floats, evidence: Evidence) -> Regions:
+        """Of the columns of `design` [n, c] with weights `counts` [n]."""
+        starts = np.searchsorted(evidence.regions, np.arange(evidence.regions[-1] + 2))
+        members = _members(counts, starts)
+        rooted = design * np.sqrt(counts).astype(np.float32)[:, None]
+        totals = np.bincount(evidence.regions, counts).astype(np.float64)
+        return Regions(counts, members, totals, rooted.T @ rooted, members @ design, evidence.surfaces[starts[:-1]])
+
+    def columns(self, count: int, weight: float) -> Regions:
+        """The same for the first `count` columns, with weights `weight` times as great."""
+        return Regions(
+            weight * self.counts,
+            self.members * np.float32(weight),
+            weight * self.totals,
+            np.float32(weight) * self.gram[:count, :count],
+            np.float32(weight) * self.sums[:, :count],
+            self.surfaces,
+        )
+
+    def sums_of(self, values: Floats) -> Floats:
+        """[regions, ...] weighted sums of values [n, ...]."""
+        return np.asarray(self.members @ values)
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """Priors of the offsets, and what they leave of sums over patches."""
+
+    regions: Regions
+    of_region: Floats | float
+    """[regions] or one for all: variance of a region's."""
+    keeps: Floats
+    """[regions] share of a sum over a region that its own offset leaves."""
+    center: Floats
+    """[surfaces] prior mean of a surface's."""
+    factor: Floats
+    """[surfaces] variance of a surface's given all else."""
+
+    @staticmethod
+    def of(regions: Regions, of_region: Floats | float, of_surface: Floats | float, center: Floats) -> Offsets:
+        """of_region, of_surface: variances; center: [surfaces]."""
+        keeps = 1 / (1 + of_region * regions.totals)
+        totals = np.bincount(regions.surfaces, keeps * regions.totals)
+        return Offsets(regions, of_region, keeps, center, np.asarray(of_surface / (1 + of_surface * totals)))
+
+    def normal_equations(self, design: Singles, residuals: Floats) -> tuple[Singles, Singles]:
+        """[c, c] and [c, m]: matrix and vector of `design` [n, c] for residuals [n, m] from which `center` was taken,
+        without the offsets."""
+        regions, several = self.regions, self._has_several
+        keeps, alone = self.keeps, ~several[self.regions.surfaces]
+        factor = self.of_region * keeps + np.where(alone, self.factor[regions.surfaces] * keeps**2, 0.0)
+        differences = regions.sums_of(residuals)
+        weighted = (regions.counts[:, None] * residuals).astype(np.float32)
+        root = regions.sums * np.sqrt(factor).astype(np.float32)[:, None]
+        matrix = regions.gram - root.T @ root
+        vector = design.T @ weighted - regions.sums.T @ (factor[:, None] * differences).astype(np.float32)
+        of_surfaces, of_several = self._sums(regions.sums)[several], self.factor[several]
+        root = of_surfaces * np.sqrt(of_several).astype(np.float32)[:, None]
+        matrix -= root.T @ root
+        of_differences = of_several[:, None] * self._sums(differences)[several]
+        vector -= of_surfaces.T @ of_differences.astype(np.float32)
+        return matrix, vector
+
+    def of_surfaces(self, residuals: Floats) -> Floats:
+        """[surfaces, ...] the best offsets of surfaces, for residuals [n, ...] from which `center` was taken."""
+        sums = self._sums(self.regions.sums_of(residuals))
+        return np.asarray((sums.T * self.factor + self.center).T)
+
+    @property
+    def _has_several(self) -> NDArray[np.bool_]:
+        """[surfaces] regions; of a single one both offsets are eliminated at once."""
+        return np.asarray(np.bincount(self.regions.surfaces, minlength=len(self.factor)) > 1)
+
+    def _sums(self, by_region: NDArray[Any]) -> NDArray[Any]:
+        """[surfaces, ...] of sums over regions [regions, ...]."""
+        starts = np.searchsorted(self.regions.surfaces, np.arange(len(self.factor) + 1))
+        return np.asarray(_members(self.keeps, starts) @ by_region)
+
+
+def add_smoothness(matrix: Singles, pairs: Ints, strength: Floats | float) -> None:
+    """Add the curvature of `strength` times the squared difference of the unknowns of each pair [n, 2]."""
+    first, second = pairs.T
+    np.add.at(matrix, (first, first), strength)
+    np.add.at(matrix, (second, second), strength)
+    np.subtract.at(matrix, (first, second), strength)
+    np.subtract.at(matrix, (second, first), strength)
+
+
+def _members(shares: Floats, starts: Ints) -> csr_matrix:
+    """[groups, n] `shares` [n] of the members of groups that stand one after the other; starts: [groups + 1]."""
+    return csr_matrix((shares.astype(np.float32), np.arange(len(shares)), starts), (len(starts) - 1, len(shares)))

@@ -19,10 +19,10 @@ Minimised is
 
 over neighbouring sources (k,l). tau is (o / s_o)^2, but 2 (d / s_o)^2 (sqrt(1 + (o / d)^2) - 1) below 0, which becomes
 linear, and steep where the albedo exceeds 1. b is the log albedo of the brightest surface, the mean of log s(B_p m) +
-o_f(p) between two ranks; it sets the level. w is the mean chroma of albedo of the patches between these ranks. m
-follows from its own two terms between the steps: all materials, and b, go along with it, since little else of the
-objective changes where all albedo grows and all light falls. The weights stand in weights.py. A patch that is clipped
-only counts where (1) is below what it shows; its material is the mean one.
+o_f(p) between two ranks; it sets the level. w is the mean chroma of albedo of the patches between these ranks; for the
+light from beyond the scan, b and w are left out. m follows from its own two terms between the steps: all materials, and
+b, go along with it, since little else of the objective changes where all albedo grows and all light falls. The weights
+stand in weights.py. A patch that is clipped only counts where (1) is below what it shows; its material is the mean one.
 """
 
 from __future__ import annotations

@@ -52,15 +52,18 @@ def level_objective(
     return float(total)
 
 
-def middle_objective(middle: float, first: float, albedos: Floats) -> float:
+def middle_objective(middle: float, first: float, albedos: Floats, chroma: Floats) -> float:
     """Half the two terms that m follows from, for materials that go along with it from where it was `first`.
 
-    albedos: [n] logarithms of the patches' as they were then; those of the brightest surface go along.
+    albedos: [n] logarithms of the patches' as they were then, chroma [n, 2]; those of the brightest white surface go
+    along.
     """
     logits = np.log([constants.MEAN_ALBEDO / (1 - constants.MEAN_ALBEDO)])
-    ordered = np.sort(albedos)
-    ranks = np.linspace(0.91, 0.99, 9) * (len(ordered) - 1)
-    brightest = np.interp(ranks, np.arange(len(ordered)), ordered).mean()
+    off = np.linalg.norm(chroma - constants.WHITE_CHROMA, axis=1) / constants.WHITE_TOLERANCE
+    counts = np.exp(-(off**2) / 2) + constants.NOT_WHITE
+    ordered = np.argsort(albedos)
+    ranks = np.array([(counts[ordered[:i]].sum() + counts[ordered[i]] / 2) / counts.sum() for i in range(len(counts))])
+    brightest = np.interp(np.linspace(0.91, 0.99, 9), ranks, albedos[ordered]).mean()
     grown = brightest + (middle - first) / (1 + np.exp(first))
     total = ((middle - logits[0]) / constants.MEAN_SPREAD) ** 2
     total += ((grown - np.log(constants.BRIGHTEST)) / constants.BRIGHTEST_SPREAD) ** 2

@@ -18,11 +18,12 @@ Minimised is
     + sum_r log(1 + |c_r / s_c|^2) + |(w - w_0) / s_w|^2
 
 over neighbouring sources (k,l). tau is (o / s_o)^2, but 2 (d / s_o)^2 (sqrt(1 + (o / d)^2) - 1) below 0, which becomes
-linear, and steep where the albedo exceeds 1. b is the log albedo of the brightest surface, the mean of log s(B_p m) +
-o_f(p) between two ranks; it sets the level. w is the mean chroma of albedo of the patches between these ranks; for the
-light from beyond the scan, b and w are left out. m follows from its own two terms between the steps: all materials, and
-b, go along with it, since little else of the objective changes where all albedo grows and all light falls. The weights
-stand in weights.py. A patch that is clipped only counts where (1) is below what it shows; its material is the mean one.
+linear, and steep where the albedo exceeds 1. b is the log albedo of the brightest white surface, the mean of log s(B_p
+m) + o_f(p) between two ranks of patches that count as their chroma is like w_0, white paint's; it sets the level. w is
+the mean chroma of albedo of the patches, of any chroma, between these ranks; for the light from beyond the scan, b and
+w are left out. m follows from its own two terms between the steps: all materials, and b, go along with it, since little
+else of the objective changes where all albedo grows and all light falls. The weights stand in weights.py. A patch that
+is clipped only counts where (1) is below what it shows; its material is the mean one.
 """
 
 from __future__ import annotations
@@ -45,8 +46,8 @@ from server.light.shell.switches import Switches
 LOGIT = float(np.log(weights.MEAN_ALBEDO / (1 - weights.MEAN_ALBEDO)))
 GIVEN_LOGIT = float(np.log(weights.GIVEN_ALBEDO / (1 - weights.GIVEN_ALBEDO)))
 BRIGHTEST_RANKS = np.linspace(0.91, 0.99, 9)
-"""Ranks of the patches, as shares of all, whose mean log albedo is the brightest surface's: without outliers, and with
-many patches, so that it changes steadily."""
+"""Ranks of the patches, as shares of all, that are the brightest surface: without outliers, and with many patches, so
+that what they show in the mean changes steadily."""
 LEAST_RELAXATION = 0.05
 """Least share of a Gauss-Newton step that is taken. It falls while steps turn back, and rises again, by TURNING_BACK
 and GOING_ON: the albedo that makes a surface white and the chroma that tells its material follow the light, and are
@@ -168,9 +169,9 @@ def step(
     parts = sources.shares * level
     parts /= arriving.astype(np.float32)[:, None]  # T
     sent_chroma = (parts @ unknowns.chroma.astype(np.float32)).astype(np.float64)
-    known_part = (known / arriving)[:, None] * known_logs[:, 1:]
-    is_clipped = evidence.is_clipped[:, None]
-    nodes, materials = materials_of(np.where(is_clipped, 0.0, evidence.chroma - sent_chroma - known_part))
+    seen = evidence.chroma - (known / arriving)[:, None] * known_logs[:, 1:]
+    seen = np.where(evidence.is_clipped[:, None], sent_chroma, seen)
+    nodes, materials = materials_of(seen - sent_chroma)
     albedo = _logistic(materials @ unknowns.materials[nodes])
     residual = evidence.level - np.log(arriving) - np.log(albedo)
     error = residual - offsets[evidence.surfaces]
@@ -199,11 +200,11 @@ def step(
     unknowns.offsets[evidence.rows] = offsets[evidence.surfaces]
     albedos = np.log(_logistic(materials @ unknowns.materials[nodes])) + offsets[evidence.surfaces]
     if finds_level:
-        _shift_albedos(unknowns, albedos[~evidence.is_clipped])
+        _shift_albedos(unknowns, albedos[~evidence.is_clipped], (seen - sent_chroma)[~evidence.is_clipped])
     if with_chroma:
         unknowns.chroma = solve_chroma(
             parts,
-            np.where(is_clipped, sent_chroma, evidence.chroma - known_part),
+            seen,
             sent_chroma,
             regions,
             sources.pairs,
@@ -241,21 +242,33 @@ def _begin(z: Floats, count: int, evidence: Evidence, sources: Sources, known: F
     return np.where(is_new, BEGIN_EXCESS[errors.argmin()], 0.0)
 
 
-def _shift_albedos(unknowns: Unknowns, albedos: Floats) -> None:
+def _shift_albedos(unknowns: Unknowns, albedos: Floats, chroma: Floats) -> None:
     """A step of m and, with it, of all materials; its change of m's log albedo counts in `step`.
 
-    albedos: [n] logarithms, of patches that are not clipped.
+    albedos: [n] logarithms, of patches that are not clipped; chroma: [n, 2] of their albedo.
     """
     if len(albedos) == 0:
         return
     before = _logistic(unknowns.middle)
     slope = 1 - before  # of a log albedo by its logit
-    missing = np.log(weights.BRIGHTEST) - float(np.quantile(albedos, BRIGHTEST_RANKS).mean())
+    missing = np.log(weights.BRIGHTEST) - _brightest_white(albedos, chroma)
     pull = slope * missing / weights.BRIGHTEST_SPREAD**2 + (LOGIT - unknowns.middle) / weights.MEAN_SPREAD**2
     change = unknowns.relaxation * pull / ((slope / weights.BRIGHTEST_SPREAD) ** 2 + 1 / weights.MEAN_SPREAD**2)
     unknowns.middle += change
     unknowns.materials += change
     unknowns.step = float(np.hypot(unknowns.step, np.log(_logistic(unknowns.middle) / before)))
+
+
+def _brightest_white(albedos: Floats, chroma: Floats) -> float:
+    """Mean of the log albedos [n] between BRIGHTEST_RANKS of patches that count as their chroma [n, 2] is like white's.
+
+    Others count a little: where nothing is white, the brightest are taken.
+    """
+    off = ((chroma - weights.WHITE_CHROMA) ** 2).sum(axis=1)
+    counts = np.exp(-off / (2 * weights.WHITE_TOLERANCE**2)) + weights.NOT_WHITE
+    order = np.argsort(albedos, kind="stable")
+    ranks = (np.cumsum(counts[order]) - counts[order] / 2) / counts.sum()
+    return float(np.interp(BRIGHTEST_RANKS, ranks, albedos[order]).mean())
 
 
 def _brightest(albedos: Floats, is_usable: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -124,7 +124,7 @@ class Service:
         """Capturing sessions by name."""
         self._resumable_sessions: dict[str, CaptureSession] = {}
         """Sessions that survive a lost connection, by their keys."""
-        self.shutdown.begin_hooks.append(self._stop_waiting_for_clients)
+        self.shutdown.begin_hooks += [self._stop_waiting_for_clients, self._leave_out_later_frames]
         self.shutdown.answer_hooks.append(self._finish_frames)
         self._scheduler = Scheduler(concurrent_frames)
         self._factory = pipeline_factory or _real_pipeline()
@@ -332,6 +332,10 @@ class Service:
             yield
         finally:
             self._resumable_sessions.pop(key or "", None)
+
+    def _leave_out_later_frames(self) -> None:
+        for session in tuple(self._captures.values()):
+            session.leave_out_later_frames()
 
     async def _finish_frames(self) -> None:
         await asyncio.gather(*(session.finish() for session in tuple(self._captures.values())))

@@ -205,9 +205,13 @@ class CaptureSession:
         self._returned.set_result(connection)
         await self._done_with[connection].wait()
 
-    async def finish(self) -> None:
-        """Event loop: leave out later frames. Returns once what has arrived is answered or the session has ended."""
+    def leave_out_later_frames(self) -> None:
+        """Event loop: from now on no frame is taken."""
         self._is_finishing = True
+
+    async def finish(self) -> None:
+        """Event loop: returns once what has arrived is answered or the session has ended."""
+        self.leave_out_later_frames()
         while not (self._has_ended or self._mailbox.is_idle()):
             await asyncio.sleep(0.01)
 

@@ -99,11 +99,11 @@ def _of_surface(residual: Floats, regions: NDArray[np.int64]) -> float:
     precision, own = 1 / constants.CHROMA_NOISE**2, np.zeros(2)
     numbers, members = np.unique(regions, return_inverse=True)
     besides, counts = np.zeros((len(numbers), 2)), np.bincount(members)[:, None]
-    for _ in range(400):  # in turn, each the best given the other
-        left = np.stack([np.bincount(members, column) for column in (residual - own).T], axis=1)
-        bends = 1 / (constants.REGION_CHROMA**2 + (besides**2).sum(axis=1, keepdims=True))
-        besides = precision * left / (precision * counts + bends)
-        others = (residual - besides[members]).sum(axis=0)
-        own = precision * others / (precision * len(residual) + 1 / constants.SURFACE_CHROMA**2)
+    sums = np.stack([np.bincount(members, column) for column in residual.T], axis=1)
+    for _ in range(60):  # Cauchy's penalty as a Gaussian's of the width that the last offsets have
+        variance = constants.REGION_CHROMA**2 + (besides**2).sum(axis=1, keepdims=True)
+        keeps = precision / (1 + precision * counts * variance)
+        own = (keeps * sums).sum(axis=0) / ((keeps * counts).sum() + 1 / constants.SURFACE_CHROMA**2)
+        besides = variance * keeps * (sums - counts * own)
     total = precision * ((residual - own - besides[members]) ** 2).sum() + (own**2).sum() / constants.SURFACE_CHROMA**2
     return float(total + np.log1p((besides**2).sum(axis=1) / constants.REGION_CHROMA**2).sum())

@@ -26,7 +26,7 @@ def solve_chroma(
     pairs: Ints,
     brightest: NDArray[np.bool_] | None,
     *,
-    finds_albedos: bool = True,
+    finds_albedos: bool,
 ) -> Floats:
     """[k, 2] chroma of the sources.
 

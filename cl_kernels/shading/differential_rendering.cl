@@ -11,6 +11,7 @@
 #include "real_shading.clh"
 #include "samples.clh"
 #include "shadows.clh"
+#include "sharers.clh"
 
 // What the discs of the light bring to the samples [rows][cols], without and with objects (light_samples of shadow_map.cl), and
 // the least shading that counts, see direct_mix.clh. has_discs: 0: the light has none.
@@ -39,36 +40,42 @@ static void write_block(const Grid grid, global const float4 *positions, global 
 // transfer [rows][cols][COEFFICIENTS]; hits [rows][cols]: see indirect.cl.
 // -> ratio [rows][cols] (rgb, w = 1), shaded [rows][cols] (rgb of R, w = 1); w = 0 where there is no surface. R is computed even
 // where objects take nothing: other parts of the light (shadow_map.cl), bounces and refined pixels (adaptive.cl) relate to it.
-// One item a block of `step` x `step` samples, which get the ratio of the first of them, or none where that has no surface.
+// SHARERS items a block of `step` x `step` samples, which get the ratio of the first of them, or none where that has no surface.
 // whole, whole_shaded [rows][cols]: ratio and R with what the discs bring, written if has_discs.
 kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, global const float *transfer, global const float4 *hits,
                         DISC_SAMPLES, global float4 *ratio, global float4 *shaded, global float4 *whole, global float4 *whole_shaded) {
-    const int col = step * get_global_id(0);
+    SHARED_PARTS
+    const int sharer = SHARER;
+    const int col = step * (get_global_id(0) / SHARERS);
     const int row = step * get_global_id(1);
     const Grid grid = scene.samples;
-    if (col >= grid.cols || row >= grid.rows) return;
-    const int sample = row * grid.cols + col;
-    const int pixel = sample_pixel(grid, row, col);
+    const int is_inside = col < grid.cols && row < grid.rows, sample = is_inside ? row * grid.cols + col : 0;
+    const int pixel = is_inside ? sample_pixel(grid, row, col) : 0;
     const float4 normal = normals[pixel], position = positions[pixel];
-    if (position.w <= 0.0f || normal.w <= 0.0f) {
-        write_block(grid, positions, normals, row, col, step, (float4)(0.0f), (float4)(0.0f), ratio, shaded, has_discs, least,
-                    without_discs, with_discs, whole, whole_shaded);
-        return;
-    }
-    const Volume volume = SOLIDS_OF_SCENE;
-    const Objects things = OBJECTS_OF_SCENE(0.0f);
+    const int is_known = is_inside && position.w > 0.0f && normal.w > 0.0f;
     const int place = place_near(scene.light.table, light_table, position.xyz);
     const Arriving arrives = ARRIVING_UNCHANGED(place);
-    global const float4 *light = coefficients_of(scene.light.table, light_table, place);
-    global const uint *free = free_mask + sample * MASK_WORDS;
-    global const uchar *own = sets + sample * INTERLEAVE;
-    float3 without = (float3)(0.0f);
-    for (int i = 0; i < COEFFICIENTS; i++) without += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
-    without = shading_without(arrives, without, openness[sample], hits[sample]);
-    const float3 taken = taken_from_real(volume, things, arrives, scene.objects.ball, position.xyz, normal.xyz, 0, 0, 1, own, INTERLEAVE, free);
-    const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
-    const float4 of_ratio = (float4)(fmax(without - taken, floor) / fmax(without, floor), 1.0f);
-    const float4 of_shaded = (float4)(without, 1.0f);
+    float4 own_part = (float4)(0.0f);
+    if (is_known) {
+        const Volume volume = SOLIDS_OF_SCENE;
+        const Objects things = OBJECTS_OF_SCENE(0.0f);
+        global const uint *free = free_mask + sample * MASK_WORDS;
+        global const uchar *own = sets + sample * INTERLEAVE;
+        own_part.xyz = taken_from_real(volume, things, arrives, scene.objects.ball, position.xyz, normal.xyz, 0, sharer, SHARERS, own,
+                                       INTERLEAVE, free);
+    }
+    const float3 taken = SUM_OF_SHARERS(own_part).xyz / SHARERS;
+    if (!(is_inside & (sharer == 0))) return;
+    float4 of_ratio = (float4)(0.0f), of_shaded = (float4)(0.0f);
+    if (is_known) {
+        global const float4 *light = coefficients_of(scene.light.table, light_table, place);
+        float3 without = (float3)(0.0f);
+        for (int i = 0; i < COEFFICIENTS; i++) without += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
+        without = shading_without(arrives, without, openness[sample], hits[sample]);
+        const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
+        of_ratio = (float4)(fmax(without - taken, floor) / fmax(without, floor), 1.0f);
+        of_shaded = (float4)(without, 1.0f);
+    }
     write_block(grid, positions, normals, row, col, step, of_ratio, of_shaded, ratio, shaded, has_discs, least, without_discs, with_discs,
                 whole, whole_shaded);
 }
@@ -136,30 +143,43 @@ kernel void bounce_real(SURROUNDINGS_PARAMETERS, SAMPLE_BUFFERS, const int most,
 // at the samples `around` (x0 y0 x1 y1, half-open).
 kernel void shadow_virtual(SCENE_PARAMETERS, const int4 around, global const float4 *positions, global const float4 *normals, global const int *shown,
                            global float4 *occluded) {
-    const int col = around.x + get_global_id(0);
+    SHARED_PARTS
+    const int sharer = SHARER;
+    const int col = around.x + get_global_id(0) / SHARERS;
     const int row = around.y + get_global_id(1);
     const Grid grid = scene.samples;
-    if (col >= around.z || row >= around.w) return;
-    const int pixel = sample_pixel(grid, row, col);
-    const Volume volume = VOLUME_OF_SCENE;
-    const Objects things = OBJECTS_OF_SCENE(own_offset_m(scene.objects.count, grids_of(object_table), shown[pixel]));
-    const Arriving arrives = ARRIVING_OF_SCENE(place_of_object(scene.light.table, light_table, shown[pixel]));
-    occluded[row * grid.cols + col] = taken_from_virtual(volume, things, arrives, positions[pixel], normals[pixel].xyz, direction_set(row, col),
-                                                    direction_subset(row, col, scene.every), scene.every);
+    const int is_inside = col < around.z && row < around.w;
+    float4 own = (float4)(0.0f);
+    if (is_inside) {
+        const int pixel = sample_pixel(grid, row, col), every = scene.every;
+        const Volume volume = VOLUME_OF_SCENE;
+        const Objects things = OBJECTS_OF_SCENE(own_offset_m(scene.objects.count, grids_of(object_table), shown[pixel]));
+        const Arriving arrives = ARRIVING_OF_SCENE(place_of_object(scene.light.table, light_table, shown[pixel]));
+        own = taken_from_virtual(volume, things, arrives, positions[pixel], normals[pixel].xyz, direction_set(row, col),
+                                 direction_subset(row, col, every) + every * sharer, every * SHARERS);
+    }
+    const float4 taken = SUM_OF_SHARERS(own) / SHARERS;
+    if (is_inside & (sharer == 0)) occluded[row * grid.cols + col] = taken;
 }
 
 // Radiance of points on virtual objects. points, normals (volume space), albedos [points_count] -> radiances [points_count] (rgb).
-// offsets_m [points_count]: distance from the surface at which rays begin.
+// offsets_m [points_count]: distance from the surface at which rays begin. SHARERS items a point.
 kernel void light_points(SCENE_PARAMETERS, const int points_count, global const float4 *points, global const float4 *normals,
                          global const float4 *albedos, global const float *offsets_m, global float4 *radiances) {
-    const int index = get_global_id(0);
-    if (index >= points_count) return;
-    const Volume volume = VOLUME_OF_SCENE;
-    const Objects things = OBJECTS_OF_SCENE(offsets_m[index]);
-    const int place = place_near(scene.light.table, light_table, points[index].xyz);
-    const Arriving arrives = ARRIVING_OF_SCENE(place);
-    const float3 normal = normals[index].xyz;
-    const float4 taken = taken_from_virtual(volume, things, arrives, points[index], normal, direction_set(index >> 3, index & 7), 0, 1);
-    radiances[index] = (float4)(albedos[index].xyz * fmax(open_shading(normal, coefficients_of(scene.light.table, light_table, place)) - taken.xyz,
-    0.0f), 1.0f);
+    SHARED_PARTS
+    const int sharer = SHARER;
+    const int index = get_global_id(0) / SHARERS, is_inside = index < points_count, at = is_inside ? index : 0;
+    const int place = place_near(scene.light.table, light_table, points[at].xyz);
+    const float3 normal = normals[at].xyz;
+    float4 own = (float4)(0.0f);
+    if (is_inside) {
+        const Volume volume = VOLUME_OF_SCENE;
+        const Objects things = OBJECTS_OF_SCENE(offsets_m[at]);
+        const Arriving arrives = ARRIVING_OF_SCENE(place);
+        own = taken_from_virtual(volume, things, arrives, points[at], normal, direction_set(at >> 3, at & 7), sharer, SHARERS);
+    }
+    const float3 taken = SUM_OF_SHARERS(own).xyz / SHARERS;
+    if (!(is_inside & (sharer == 0))) return;
+    const float3 open = open_shading(normal, coefficients_of(scene.light.table, light_table, place));
+    radiances[at] = (float4)(albedos[at].xyz * fmax(open - taken, 0.0f), 1.0f);
 }

@@ -10,6 +10,7 @@ is tighter, and without evidence for coloured light from somewhere, shadows are 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import pyopencl as cl
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.maths.bayes import NormalEquations, Posterior, solve_plain, solve_with_evidence, solve_with_ratio
+from server.maths.dominant import DominantLight, dominant_lights
 from server.maths.memory import remembered
 from server.maths.nonnegative import nonnegative_mean, nonnegative_sum
 from server.maths.sh import LUMINANCE, band_of
@@ -70,6 +72,12 @@ class LightEstimate:
     spread_deg: float | None = None
     """Angle that 90 % of the possible dominant directions are within; None where unknown."""
 
+    @cached_property
+    def dominant_lights(self) -> tuple[DominantLight, ...]:
+        """Of `sh`, strongest first (maths/dominant.py)."""
+        return dominant_lights(self.sh)
+
+    @cached_property
     def whitened(self) -> LightEstimate:
         """The same luminance without colours, as the thesis assumes light to be (7.1)."""
         white = np.ones(3)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from protocol.messages import ArrivingLight, DirectedLight, Lamp, Light, RgbOrNull
 from server.light.light_estimation import LightEstimate
 from server.light.place_light import VALID_SPREAD_DEG, LitPlace
-from server.maths.dominant import dominant_lights
 from server.maths.emitters import Emitter
 from server.maths.sh import dominant_direction, dominant_intensity, sh_rotation, webxr_floats
 
@@ -60,7 +59,7 @@ def light_message(
                 irradiance=_rgb(exposure * light.irradiance),
                 spread_deg=math.degrees(light.spread_rad),
             )
-            for light in dominant_lights(estimate.sh)  # as split_light asks: found once
+            for light in estimate.dominant_lights
         ),
         lamps=tuple(_lamp(lamp, exposure) for lamp in lamps),
         exposure=exposure,

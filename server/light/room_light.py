@@ -19,9 +19,9 @@ from server.light.place_light import PlaceLight
 from server.light.shell.known_room import KnownRoom
 from server.light.shell.room_model import RoomModel
 from server.light.shell.solution import LookUp, Solution
+from server.light.shell.solver_process import Asked
 from server.light.shell.switches import Switches
 from server.maths.direct_lights import SplitLight, split_light
-from server.maths.dominant import dominant_lights
 from server.maths.light_places import EVERYWHERE, LightPlaces, places_of
 from server.maths.sh import LUMINANCE
 from server.opencl.engine import Engine
@@ -52,7 +52,7 @@ class RoomLight:
         plain = LightEstimator(settings.bands, as_thesis=settings.as_thesis, memory=switches.memory)
         self._harmonics = plain if is_plain or settings.as_thesis else None
         self._least_openness = LEAST_OPENNESS if "openness" in settings.robustness else 0.0
-        self._model = RoomModel(switches, self._prepare)
+        self._model = RoomModel(switches, self._asked_of_solutions)
         self._asked: NDArray[np.float64] | None = None
         """[n, 3] places that objects saw the light from last, world."""
         self._given: LightEstimate | None = None
@@ -117,12 +117,8 @@ class RoomLight:
         discs = tuple(lamp.as_direct_light(origin_world) for lamp in lamps)
         return whole, SplitLight(rest, discs), places
 
-    def _prepare(self, solution: Solution) -> None:
-        """Find what takes long and every frame asks of a new solution."""
-        asked, bands = self._asked, self._settings.bands
-        dominant_lights(self._colored(solution.estimate(bands)).sh)
-        if asked is not None:
-            solution.beyond(asked, bands)
+    def _asked_of_solutions(self) -> Asked:
+        return Asked(self._settings.bands, self._settings.light_color == "white", self._asked)
 
     def look_up(self, context: FrameContext, positions: NDArray[np.float64]) -> LookUp | None:
         """Begin to trace what `arriving_at` needs; None where there is no solution, or this frame takes another."""
@@ -179,7 +175,11 @@ class RoomLight:
         self._remembered = known.remembered
 
     def _colored(self, estimate: LightEstimate) -> LightEstimate:
-        return estimate.whitened() if self._settings.light_color == "white" else estimate
+        return estimate.whitened if self._settings.light_color == "white" else estimate
+
+    def close(self) -> None:
+        """End what is worked out beside the frames; it cannot be used any more."""
+        self._model.close()
 
     def begin(self, context: FrameContext) -> None:
         """Let the device gather what a frame says of the light; `update` takes it in."""

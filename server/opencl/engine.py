@@ -83,6 +83,11 @@ class Engine:
         """Neighbours that a work-item of a vectorised kernel does at once (include/lanes.clh)."""
         return 1 if self.device.is_gpu else 8
 
+    @property
+    def sharers(self) -> int:
+        """Work-items that share the directions of a sample, where it has many (include/sharers.clh)."""
+        return 32 if self.device.is_gpu else 1
+
     def kernel(self, file: str, name: str, **defines: Define) -> cl.Kernel:
         """Kernel `name` of the kernel file `file`; retrieved once, because a kernel object carries its arguments."""
         named = sorted(defines.items())

@@ -1,1 +1,1 @@
-"""Decoding of untrusted meshes and images in child processes, whose crash does not affect the server."""
+"""Decoding of untrusted meshes and images in child processes (server/children)."""

@@ -16,10 +16,10 @@ from protocol.codec import ProtocolError
 from protocol.colors import ColorReader
 from protocol.frames import CameraModel
 from protocol.limits import MAX_IMAGE_PIXELS
+from server.children.nursery import ChildDied, JobSpec, Nursery
+from server.children.process_pool import IS_SUPPORTED, ProcessPool
+from server.children.turns import MAX_INTERRUPTIONS, Account, Overdrawn, Turns
 from server.parsing.mesh_bytes import MAX_PACKED_BYTES, mesh_from_bytes
-from server.parsing.nursery import ChildDied, JobSpec, Nursery
-from server.parsing.process_pool import IS_SUPPORTED, ProcessPool
-from server.parsing.turns import MAX_INTERRUPTIONS, Account, Overdrawn, Turns
 from server.scene.limits import MeshError
 from server.scene.mesh import Mesh, load_mesh
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.images import decode_picture
-from server.parsing.child import shared_memory
+from server.children.child import shared_memory
 
 SIZE = struct.Struct("<II")
 

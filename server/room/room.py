@@ -142,4 +142,5 @@ class Room:
     def close(self) -> None:
         """Free the device memory."""
         self.objects.clear()
+        self.light.close()
         self.engine.close()

@@ -27,6 +27,8 @@ from server.volume.raycast import Surface
 
 VIRTUAL_STRIDE = 2
 """Occlusion of virtual surfaces is traced at every second pixel; the unoccluded part is exact at every pixel."""
+SHARED_ITEMS = 64
+"""Work-items of a group, as in include/sharers.clh."""
 MOST_POINTS = 8192
 """At most this many points on objects are lit one by one; the others see an even light."""
 
@@ -97,7 +99,7 @@ def shadow_real(
         whole = RealShadow(transfer.stride, buffers.whole_ratio.array(shape), buffers.whole_shaded.array(shape))
     engine.launch(
         engine.kernel("differential_rendering.cl", "shadow_real", **_sample_defines(engine, transfer, scene)),
-        (-(-transfer.cols // step), -(-transfer.rows // step)),
+        (engine.sharers * -(-transfer.cols // step), -(-transfer.rows // step)),
         scene.parameters(engine, sample_grid(camera, transfer)),
         *scene.real_arguments(engine),
         *sample_arguments(engine, surface, transfer),
@@ -108,7 +110,8 @@ def shadow_real(
         ratio,
         shaded,
         *((whole.values, whole.shaded) if whole else (engine.unused, engine.unused)),
-        steps=scene.rays.count,
+        local=_local(engine),
+        steps=-(-scene.rays.count // engine.sharers),
     )
     return RealShadow(transfer.stride, ratio, shaded, whole)
 
@@ -165,7 +168,16 @@ def _direct_arguments(engine: Engine, samples: DirectSamples | None) -> tuple[Ke
 
 
 def _sample_defines(engine: Engine, transfer: Transfer, scene: TracedScene) -> dict[str, int]:
-    return scene.defines(engine) | {"MASK_WORDS": transfer.free_mask.shape[2], "INTERLEAVE": transfer.interleave}
+    return _defines(engine, scene) | {"MASK_WORDS": transfer.free_mask.shape[2], "INTERLEAVE": transfer.interleave}
+
+
+def _defines(engine: Engine, scene: TracedScene) -> dict[str, int]:
+    return scene.defines(engine) | {"SHARERS": engine.sharers}
+
+
+def _local(engine: Engine) -> tuple[int, int]:
+    """Of samples that `Engine.sharers` work-items do; see include/sharers.clh."""
+    return (16, 4) if engine.sharers == 1 else (engine.sharers, SHARED_ITEMS // engine.sharers)
 
 
 def shadow_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, scene: TracedScene) -> SampleGrid:
@@ -176,8 +188,8 @@ def shadow_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface,
     covered = occluded.inside(box_around(virtual.boxes))
     with buffers.drawn.redraw(occluded.values, covered, occluded.all) as (x0, y0, x1, y1):
         engine.launch(
-            engine.kernel("differential_rendering.cl", "shadow_virtual", **scene.defines(engine)),
-            (x1 - x0, y1 - y0),
+            engine.kernel("differential_rendering.cl", "shadow_virtual", **_defines(engine, scene)),
+            (engine.sharers * (x1 - x0), y1 - y0),
             scene.parameters(engine, grid_of(occluded, camera), scene.rays.interleave),
             *scene.arguments(engine),
             int4(x0, y0, x1, y1),
@@ -185,7 +197,8 @@ def shadow_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface,
             virtual.normal,
             virtual.object_index,
             occluded.values,
-            steps=-(-scene.rays.count // scene.rays.interleave),
+            local=_local(engine),
+            steps=-(-scene.rays.count // (scene.rays.interleave * engine.sharers)),
         )
     return occluded
 
@@ -201,8 +214,8 @@ def light_points(engine: Engine, scene: TracedScene, placed: PlacedPoints | None
     is_rest_even = lit < placed.count
     radiances = buffer.upload(placed.under_even_light(scene.light.mean)) if is_rest_even else buffer.array((lit,))
     engine.launch(
-        engine.kernel("differential_rendering.cl", "light_points", **scene.defines(engine)),
-        (lit,),
+        engine.kernel("differential_rendering.cl", "light_points", **_defines(engine, scene)),
+        (engine.sharers * lit,),
         traced.parameters(engine, NO_GRID),
         *traced.arguments(engine),
         lit,
@@ -211,6 +224,6 @@ def light_points(engine: Engine, scene: TracedScene, placed: PlacedPoints | None
         placed.albedos,
         placed.offsets_m,
         radiances,
-        steps=scene.rays.count,
+        steps=-(-scene.rays.count // engine.sharers),
     )
     return replace(placed.point_lights, radiances=radiances)

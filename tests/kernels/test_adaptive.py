@@ -112,7 +112,8 @@ def test_virtual_surface_near_edges_is_as_at_every_pixel(engine: Engine, monkeyp
     near = adaptive.grown(twin.edges(positions, normals, VOXEL_M), adaptive.MARGIN_PX)
     assert 20 < (near & covered).sum() < covered.sum()
     np.testing.assert_array_equal(refined[..., 3] > 0, near & covered)
-    np.testing.assert_array_equal(refined[near & covered], every[near & covered])
+    sums = 0.0 if engine.sharers == 1 else 1e-5  # in another order
+    np.testing.assert_allclose(refined[near & covered], every[near & covered], rtol=sums)
     assert (every[near & covered][:, :3] > 0).any()
 
 

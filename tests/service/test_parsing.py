@@ -24,11 +24,11 @@ from protocol.colors import ColorReader
 from protocol.frames import CameraModel
 from protocol.images import decode_color, encode_color
 from protocol.messages import Acknowledged, Composite, Dropped, PlaceObject
+from server.children.nursery import ChildDied
+from server.children.process_pool import ProcessPool
 from server.objects.scene_objects import mesh_digest
 from server.parsing.mesh_bytes import mesh_from_bytes, mesh_to_bytes
-from server.parsing.nursery import ChildDied
 from server.parsing.parsers import MESH_JOB, PICTURE_JOB, Parsers
-from server.parsing.process_pool import ProcessPool
 from server.scene.limits import MeshError
 from server.scene.materials import Beyond, Material, Texture
 from server.scene.mesh import Mesh, load_mesh

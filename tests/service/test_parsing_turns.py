@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import pytest
 
+from server.children.turns import MAX_INTERRUPTIONS, Account, Overdrawn, Turns
 from server.parsing.parsers import MESH_CHILDREN, MESH_JOB, Parsers
-from server.parsing.turns import MAX_INTERRUPTIONS, Account, Overdrawn, Turns
 from server.scene.limits import MeshError
 from tests.service.fakes import PATIENCE_S
 

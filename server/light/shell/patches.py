@@ -39,7 +39,7 @@ MOST_WEIGHT = 30.0
 _FORGOTTEN = 1e-3  # frames: a patch of less weight is none
 _CHANGED_BY_FRAMES = (
     *("weights", "positions", "normals", "logarithms", "variances", "clipped"),
-    *("keys", "regions", "seen_in", "traced_in", "_rows"),
+    *("keys", "regions", "seen_in", "traced_in"),
 )
 _FACINGS = 1.2  # normals are rounded to multiples of 1 / 1.2: 26 ways to face
 
@@ -147,8 +147,9 @@ class Patches:
             self.arrivals[traced.rows] = traced.arrivals.result()
 
     def copy(self) -> Patches:
-        """What frames add does not reach it. Rays, which `end_trace` alone changes, are shared."""
+        """For reading: what frames add does not reach it. Rays, which `end_trace` alone changes, are shared."""
         other = copy(self)
+        other._rows, other._grouped = {}, None
         for name in _CHANGED_BY_FRAMES:
             setattr(other, name, getattr(self, name).copy())
         return other

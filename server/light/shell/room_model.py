@@ -1,6 +1,6 @@
 """The light of one room, from the pictures so far: what they show is summed, and solved beside the frames.
 
-While the light is steady every third frame begins a solution, which a thread works out; it is taken over when the
+While the light is steady every third frame begins a solution, which a process works out; it is taken over when the
 next one begins, ready or waited for, so that the same frames give the same light on any machine. A first picture, a
 part of the room that is new and a light that changes are solved within the frame.
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,8 @@ from server.light.shell.patches import Patches, TracedPatches
 from server.light.shell.picture import PatchesInPicture, Seen
 from server.light.shell.shell import Shell
 from server.light.shell.solution import Solution
-from server.light.shell.solver import LEAST_PATCHES, Solver
+from server.light.shell.solver import LEAST_PATCHES
+from server.light.shell.solver_process import Asked, SolverProcess, Task
 from server.light.shell.switches import Switches
 from server.opencl.pacing import Pacer
 
@@ -69,11 +71,11 @@ class _Tracing:
 class RoomModel:
     """Radiance of all that is not scanned surface, with the evidence for it. World axes and metres."""
 
-    def __init__(self, switches: Switches, prepare: Callable[[Solution], None]) -> None:
-        """prepare: find what frames will ask of a solution, beside them too; a solution remembers it."""
-        self._switches, self._prepare = switches, prepare
+    def __init__(self, switches: Switches, asked: Callable[[], Asked]) -> None:
+        """asked: what frames will ask of the next solution."""
+        self._switches, self._asked = switches, asked
         self._patches, self._bright = Patches(), BrightSurface()
-        self._solver = Solver(self._switches)
+        self._solver = SolverProcess(self._switches)
         self._solution: Solution | None = None
         self._next: Beside[Solution | None] | None = None
         self._picture: PatchesInPicture | None = None
@@ -148,15 +150,13 @@ class RoomModel:
         tracing, self._tracing = self._tracing, None
         self._patches.end_trace(tracing.patches)
         self._bright.end_trace(tracing.emitters)
-        patches, bright, traced = self._patches.copy(), self._bright.seen_by(), tracing.patches.rows
+        patches, bright = self._patches.copy(), self._bright.seen_by()
+        task = Task(patches, bright, tracing.patches.rows, tracing.camera, tracing.up, self._asked())
+        self._next = Beside(partial(self._solver.solve, task))
 
-        def solve() -> Solution | None:
-            solution = self._solver.solve(patches, bright, traced, tracing.camera, tracing.up)
-            if solution is not None:
-                self._prepare(solution)
-            return solution
-
-        self._next = Beside(solve)
+    def close(self) -> None:
+        """End what is worked out beside the frames."""
+        self._solver.close()
 
     @property
     def _is_ready(self) -> bool:

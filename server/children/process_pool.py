@@ -12,9 +12,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
-from server.parsing.child import ANSWER, DONE, REQUEST
-from server.parsing.nursery import ChildDied, JobSpec, Nursery
-from server.parsing.turns import Turn
+from server.children.child import ANSWER, DONE, REQUEST
+from server.children.nursery import ChildDied, JobSpec, Nursery
+from server.children.turns import Turn
 
 IS_SUPPORTED = hasattr(os, "memfd_create") and hasattr(fcntl, "F_ADD_SEALS")
 """Whether this system supports sealed shared memory."""
@@ -87,6 +87,10 @@ class ChildProcess:
                 os.kill(self.pid, signal.SIGKILL)
             self._status = self._nursery.reap(self.pid)
             self._has_ended = True
+
+    def leave(self) -> None:
+        """Close the pipes: it ends once it has answered. Takes no lock, so that a finaliser may call it."""
+        self._close()
 
     def kill(self) -> None:
         """End the process and free its memory and pipes."""

@@ -12,7 +12,7 @@ import threading
 from contextlib import suppress
 from dataclasses import dataclass
 
-from server.parsing.child import NUMBER, READY
+from server.children.child import NUMBER, READY
 
 LOADING_TIMEOUT_S = 60.0
 
@@ -26,7 +26,7 @@ class JobSpec:
     """Job and resource limits of one kind of child."""
 
     job: str
-    """`module:function`, see server.parsing.child."""
+    """`module:function`, see server.children.child."""
     memory_mib: int
     """Address space limit."""
     timeout_s: float
@@ -90,7 +90,7 @@ class Nursery:
         control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         control.settimeout(LOADING_TIMEOUT_S)
         spec = self._spec
-        arguments = ["-P", "-m", "server.parsing.child", spec.job, str(spec.memory_mib), str(spec.timeout_s)]
+        arguments = ["-P", "-m", "server.children.child", spec.job, str(spec.memory_mib), str(spec.timeout_s)]
         with theirs:
             try:
                 self._process = subprocess.Popen(

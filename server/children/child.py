@@ -1,4 +1,4 @@
-"""Children that read what clients send: `python -m server.parsing.child MODULE:FUNCTION MIB SECONDS`.
+"""Children that do one job apart from the server: `python -m server.children.child MODULE:FUNCTION MIB SECONDS`.
 
 The process loads the function and forks children over a socket, its standard input (nursery.py): a message with
 descriptors (requests, answers and memory shared with the server) is answered by the id of a new child or minus an error
@@ -117,7 +117,7 @@ def _answer(job: Job, body: bytes) -> tuple[int, bytes]:
 
 
 if __name__ == "__main__":
-    from server.parsing.child import main  # use the module instance that jobs import, not `__main__`
+    from server.children.child import main  # use the module instance that jobs import, not `__main__`
 
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # decoders' messages about invalid input are not useful

@@ -54,6 +54,7 @@ class Engine:
         self.queue.finish()
         if self._concurrent is not None:
             self._concurrent.finish()
+        self.pacer.settle()
 
     @property
     def concurrent(self) -> Engine:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import Protocol
@@ -120,14 +120,28 @@ class Pacer:
     def _ahead_s(self) -> float:
         return self._alone_ahead_s if self.yielding is None else min(self._alone_ahead_s, SHARED_AHEAD_S)
 
-    def slices(self, kernel: str, size: Size, local: Size, steps: int) -> Iterator[tuple[Size, Size]]:
+    def slices(self, kernel: str, size: Size, local: Size, steps: int) -> Iterable[tuple[Size, Size]]:
         """Offset and size of each slice of a launch, in work-items; `size` and all slices are multiples of `local`.
 
         `steps`: inner steps of a work-item, such as rays. Waits before each slice while too much is enqueued already.
         """
+        if self._fits(kernel, math.prod(size) * steps):
+            return (((0,) * len(size), size),)
         is_long = math.prod(size) * steps * self._step_s > PROBE * self._slice_s
         may_hold = is_long and self.yielding is not None
         return cut(size, local, lambda: self._most_items(kernel, steps, may_hold))
+
+    def _fits(self, kernel: str, steps: int) -> bool:
+        """Whether a launch of so many steps in all is one slice for which nobody waits, without a look at the device."""
+        time = self._times.of(kernel)
+        if time is None or self._expected_s > self._ahead_s or (self.yielding is not None and self.yielding.is_due()):
+            return False
+        return steps * max(time.longest_s, self._step_s) <= self._slice_s
+
+    def settle(self) -> None:
+        """Learn from what the device has done. At the end of a frame; launches that fit do not ask."""
+        while self._ahead and self._ahead[0].event.command_execution_status == cl.command_execution_status.COMPLETE:
+            self._learn(self._next())
 
     def _most_items(self, kernel: str, steps: int, may_hold: bool) -> int:
         """Work-items of the next slice, once there is room for one. What earlier slices took counts at once: a launch
@@ -159,8 +173,7 @@ class Pacer:
             yield
 
     def _make_room(self) -> None:
-        while self._ahead and self._ahead[0].event.command_execution_status == cl.command_execution_status.COMPLETE:
-            self._learn(self._next())
+        self.settle()
         if self.yielding is not None and self.yielding.is_due():
             self._drain(0.0)
             self.yielding.give_way()

@@ -132,7 +132,7 @@ class Pacer:
         return cut(size, local, lambda: self._most_items(kernel, steps, may_hold))
 
     def _fits(self, kernel: str, steps: int) -> bool:
-        """Whether a launch of so many steps in all is one slice for which nobody waits, without a look at the device."""
+        """Whether a launch of so many steps is one slice that waits for nobody, without a look at the device."""
         time = self._times.of(kernel)
         if time is None or self._expected_s > self._ahead_s or (self.yielding is not None and self.yielding.is_due()):
             return False

@@ -163,6 +163,14 @@ def test_memory_is_bounded_and_keeps_what_was_seen_last() -> None:
     assert {tuple(p) for p in np.round(last, 6)} >= {tuple(p) for p in np.round(kept, 6)}
 
 
+def test_a_picture_of_more_patches_than_there_is_room_for_fills_it() -> None:
+    patches, places = Patches(), PATCH_M * (np.arange(3 * (MOST_PATCHES + 500)).reshape(-1, 3) + 0.5)
+    patches.add(one(places, 0.5))
+    assert (patches.weights == 1).all()
+    np.testing.assert_allclose(patches.logarithms, np.log(0.5))
+    assert {tuple(p) for p in np.round(places, 6)} >= {tuple(p) for p in np.round(patches.positions, 6)}
+
+
 def test_a_change_of_light_leaves_nothing_of_the_old() -> None:
     patches = Patches()
     patches.add(one(np.zeros(3), 0.1))

@@ -29,6 +29,7 @@ from server.light.shell.shell import (
 from server.light.shell.sources import distant_sources
 from server.light.shell.switches import Switches
 from server.light.shell.transport import SATURATED, Transport, meet
+from server.maths.lobes import LOBES
 from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
 from tests.reference.room_objective import chroma_objective, level_objective, middle_objective
 from tests.scenes.analytic import Floats
@@ -237,7 +238,8 @@ def test_the_solve_is_stable(case: str) -> None:
     unknowns = room.unknowns
     assert np.isfinite(unknowns.radiance).all()
     assert unknowns.radiance.max() < 1e5
-    covariance, condition = unknowns.covariance_of(np.eye(unknowns.known))
+    told = unknowns.solved()
+    covariance, condition = told.covariance, told.condition
     assert np.isfinite(covariance).all()
     assert (np.diag(covariance) > 0).all()
     # A cell is known at least as well as beforehand.
@@ -391,7 +393,7 @@ def test_light_from_far_away_is_found(towards: tuple[float, float, float], with_
     unknowns, evidence, distant = Unknowns(), room.evidence, room.distant(with_indirect=with_indirect)
     for _ in range(25):
         step(unknowns, evidence, distant)
-    light = distant_light(unknowns, 4)
+    light = distant_light(unknowns.solved(LOBES), 4)
     assert angle_deg(light.sh @ LUMINANCE, BASIS @ truth @ LUMINANCE) < 18  # seen: 4 to 17
     assert light.sh[0].mean() == pytest.approx((BASIS @ truth)[0].mean(), rel=0.4)
     assert light.spread_deg is not None
@@ -401,7 +403,7 @@ def test_light_from_far_away_is_found(towards: tuple[float, float, float], with_
 
 
 def test_before_a_solve_there_is_no_distant_light() -> None:
-    light = distant_light(Unknowns(), 3)
+    light = distant_light(Unknowns().solved(), 3)
     assert not light.sh.any()
     assert light.std is None
     assert not light.valid
@@ -413,7 +415,7 @@ def test_a_closed_box_says_nothing_of_what_is_beyond() -> None:
     closed = distant_sources(room.transport, np.ones(SIDES), evidence.rows, with_indirect=True)
     for _ in range(25):
         step(unknowns, evidence, closed)
-    light = distant_light(unknowns, 4)
+    light = distant_light(unknowns.solved(LOBES), 4)
     assert not light.valid
     assert light.spread_deg is not None
     assert light.spread_deg > 60
@@ -429,5 +431,5 @@ def test_one_albedo_is_one_albedo() -> None:
     used = unknowns.materials != Unknowns().materials
     assert used.any()
     assert np.abs(unknowns.materials[used] - GIVEN_LOGIT).max() < 0.1
-    light = distant_light(unknowns, 4)
+    light = distant_light(unknowns.solved(LOBES), 4)
     assert angle_deg(light.sh @ LUMINANCE, BASIS @ truth @ LUMINANCE) < 6

@@ -6,22 +6,21 @@ import numpy as np
 
 from server.light.light_estimation import LightEstimate
 from server.light.place_light import VALID_SPREAD_DEG
-from server.light.shell.objective import Unknowns
+from server.light.shell.solved import Solved
 from server.light.shell.spread import deviations, spread_deg
 from server.maths.lobes import LOBES, lobes_to_sh
 from server.maths.sh import LUMINANCE
 
 
-def distant_light(unknowns: Unknowns, bands: int) -> LightEstimate:
-    """Of the first LOBES sources; no light before a first solve."""
-    if unknowns.known == 0:
+def distant_light(solved: Solved, bands: int) -> LightEstimate:
+    """Of the first LOBES sources, whose covariance is known; no light before a first solve."""
+    if solved.known == 0:
         return LightEstimate(np.zeros((bands * bands, 3)), None, float("inf"), valid=False)
-    radiance, to_sh = unknowns.radiance[:LOBES], lobes_to_sh(bands)
+    radiance, to_sh = solved.radiance[:LOBES], lobes_to_sh(bands)
     sh = to_sh @ radiance
     gradient = to_sh * (radiance @ LUMINANCE)  # by z, the logarithm
-    covariance, condition = unknowns.covariance_of(gradient)
+    covariance = solved.covariance_of(gradient)
     tint = sh[0] / max(float(sh[0] @ LUMINANCE), 1e-12)
     angle = spread_deg(sh @ LUMINANCE, covariance)
-    return LightEstimate(
-        sh, np.outer(deviations(covariance), tint), condition, valid=angle <= VALID_SPREAD_DEG, spread_deg=angle
-    )
+    std, is_valid = np.outer(deviations(covariance), tint), angle <= VALID_SPREAD_DEG
+    return LightEstimate(sh, std, solved.condition, valid=is_valid, spread_deg=angle)

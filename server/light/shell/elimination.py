@@ -119,12 +119,11 @@ class Offsets:
 
 
 def add_smoothness(matrix: Singles, pairs: Ints, strength: Floats | float) -> None:
-    """Add the curvature of `strength` times the squared difference of the unknowns of each pair [n, 2]."""
-    first, second = pairs.T
-    np.add.at(matrix, (first, first), strength)
-    np.add.at(matrix, (second, second), strength)
-    np.subtract.at(matrix, (first, second), strength)
-    np.subtract.at(matrix, (second, first), strength)
+    """Add the curvature of `strength` times the squared difference of the unknowns of pairs [n, 2], all distinct."""
+    strength = np.broadcast_to(strength, len(pairs))
+    matrix[np.diag_indices_from(matrix)] += np.bincount(pairs.ravel(), np.repeat(strength, 2), len(matrix))
+    for first, second in (pairs.T, pairs.T[::-1]):
+        matrix[first, second] -= strength
 
 
 def _members(shares: Floats, starts: Ints) -> csr_matrix:

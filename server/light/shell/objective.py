@@ -40,6 +40,7 @@ from server.light.shell.chroma import solve_chroma
 from server.light.shell.elimination import Offsets, Regions, add_smoothness
 from server.light.shell.evidence import DARKEST, LOG_CHROMA, NODES, Evidence, log_chroma, materials_of
 from server.light.shell.patches import MOST_PATCHES
+from server.light.shell.solved import Solved
 from server.light.shell.sources import Sources
 from server.light.shell.switches import Switches
 
@@ -124,19 +125,23 @@ class Unknowns:
         self.factors = lu_factor(self.curvature, check_finite=False)
         return lu_solve(self.factors, right.astype(np.float32), check_finite=False).astype(np.float64)  # type: ignore[no-any-return]
 
-    def covariance_of(self, gradient: Floats) -> tuple[Floats, float]:
-        """[m, m] covariance of what changes by `gradient` [m, sources] with z, and the curvature's condition.
+    def solved(self, count: int | None = None) -> Solved:
+        """What it tells of all sources, with the covariance of the first `count`; None: of all."""
+        if self.known == 0:
+            return Solved(np.zeros((0, 3)), np.zeros((0, 0), np.float32), float("inf"), self.mean, self.step)
+        count = self.known if count is None else count
+        right = np.eye(len(self.curvature), count, dtype=np.float32)
+        covariance = lu_solve(self.factors, right, check_finite=False)[:count]
+        return Solved(self.radiance, covariance, self._condition(), self.mean, self.step)
 
-        The condition is that of the 1-norm from below: the norm of the inverse is taken from _COLUMNS of its columns.
-        """
-        rows, count = gradient.shape
+    def _condition(self) -> float:
+        """In the 1-norm and from below: the norm of the inverse is taken from _COLUMNS of its columns."""
         weakest = np.argsort(np.diag(self.curvature))[:_COLUMNS]
-        right = np.zeros((len(self.curvature), rows + len(weakest)), np.float32)
-        right[:count, :rows] = gradient.T
-        right[weakest, rows + np.arange(len(weakest))] = 1.0
+        right = np.zeros((len(self.curvature), len(weakest)), np.float32)
+        right[weakest, np.arange(len(weakest))] = 1.0
         solved = lu_solve(self.factors, right, check_finite=False).astype(np.float64)
-        inverse = np.abs(solved[:, rows:]).sum(axis=0).max()
-        return gradient @ solved[:count, :rows], float(np.abs(self.curvature).sum(axis=0).max() * inverse)
+        inverse = np.abs(solved).sum(axis=0).max()
+        return float(np.abs(self.curvature).sum(axis=0).max() * inverse)
 
 
 def step(

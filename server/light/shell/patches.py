@@ -39,8 +39,9 @@ MOST_WEIGHT = 30.0
 _FORGOTTEN = 1e-3  # frames: a patch of less weight is none
 _CHANGED_BY_FRAMES = (
     *("weights", "positions", "normals", "logarithms", "variances", "clipped"),
-    *("keys", "regions", "seen_in", "traced_in"),
+    *("keys", "regions", "seen_in", "traced_in", "_numbers"),
 )
+_FREE = -1  # number of a row without a patch
 _FACINGS = 1.2  # normals are rounded to multiples of 1 / 1.2: 26 ways to face
 
 Floats = NDArray[np.float64]
@@ -61,7 +62,8 @@ class Patches:
 
     def __init__(self) -> None:
         n = MOST_PATCHES
-        self._rows: dict[tuple[int, ...], int] = {}
+        self._numbers = np.full(n, _FREE)
+        """_key_numbers of the patch in each row."""
         self.weights = np.zeros(n)
         """Frames in the mean; 0: a row without a patch."""
         self.positions, self.normals, self.logarithms = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
@@ -106,19 +108,25 @@ class Patches:
         self.outdated = max(OUTDATED_LEFT * self.outdated, share)
 
     def add(self, seen: Seen) -> None:
-        """Fold a picture in."""
+        """Fold a picture in; of one with more than MOST_PATCHES patches, those that find a row."""
         self._frame += 1
         keys, mean = self._groups(seen)
         rows = self._rows_of(keys)
+        has_row = rows >= 0
+        rows = rows[has_row]
+
+        def shown(values: Floats) -> Floats:
+            return mean.of(values)[has_row]
+
         weights = self.weights[rows]
         share = 1.0 / (np.minimum(weights, MOST_WEIGHT - 1) + 1.0)
         columns = share[:, None]
-        self.logarithms[rows] += columns * (mean.of(seen.logarithms) - self.logarithms[rows])
-        self.positions[rows] += columns * (mean.of(seen.positions) - self.positions[rows])
-        normals = self.normals[rows] + columns * (mean.of(seen.normals) - self.normals[rows])
+        self.logarithms[rows] += columns * (shown(seen.logarithms) - self.logarithms[rows])
+        self.positions[rows] += columns * (shown(seen.positions) - self.positions[rows])
+        normals = self.normals[rows] + columns * (shown(seen.normals) - self.normals[rows])
         self.normals[rows] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-        self.variances[rows] += share * (mean.of(seen.variances[:, None])[:, 0] - self.variances[rows])
-        self.clipped[rows] += share * (mean.of(seen.clipped[:, None])[:, 0] - self.clipped[rows])
+        self.variances[rows] += share * (shown(seen.variances[:, None])[:, 0] - self.variances[rows])
+        self.clipped[rows] += share * (shown(seen.clipped[:, None])[:, 0] - self.clipped[rows])
         self.weights[rows] = np.minimum(weights + 1.0, MOST_WEIGHT)
         self.seen_in[rows] = self._frame
 
@@ -149,20 +157,19 @@ class Patches:
     def copy(self) -> Patches:
         """For reading: what frames add does not reach it. Rays, which `end_trace` alone changes, are shared."""
         other = copy(self)
-        other._rows, other._grouped = {}, None
+        other._grouped = None
         for name in _CHANGED_BY_FRAMES:
             setattr(other, name, getattr(self, name).copy())
         return other
 
     def known(self) -> KnownPatches:
         """All but their rays."""
-        keys = np.array(list(self._rows), np.int64).reshape(-1, 6)
-        rows = np.array(list(self._rows.values()), np.int64)
+        rows = np.flatnonzero(self._numbers != _FREE)
         arrays = (self.positions, self.normals, self.logarithms, self.variances, self.clipped, self.weights)
-        return KnownPatches(keys, *(array[rows] for array in arrays))
+        return KnownPatches(self.keys[rows], *(array[rows] for array in arrays))
 
     def resume(self, known: KnownPatches) -> None:
-        """Begin with these; their rays are traced with the next."""
+        """Begin with these, at most MOST_PATCHES; their rays are traced with the next."""
         rows = self._rows_of(known.keys)
         self.positions[rows], self.normals[rows], self.logarithms[rows] = (
             known.positions,
@@ -179,28 +186,39 @@ class Patches:
 
     def _known_rows(self, keys: Ints) -> Ints:
         """Rows of patches by key, -1 for those that are not there."""
-        return np.array([self._rows.get(key, -1) for key in map(tuple, keys.tolist())], np.int64)
+        numbers, order = _key_numbers(keys), np.argsort(self._numbers)
+        rows = order[np.minimum(np.searchsorted(self._numbers, numbers, sorter=order), MOST_PATCHES - 1)]
+        return np.where(self._numbers[rows] == numbers, rows, -1)
 
     def _rows_of(self, keys: Ints) -> Ints:
-        """Rows of patches by key, new ones included."""
+        """Rows of patches by key, new ones included; -1 for those that find no more room."""
         rows = self._known_rows(keys)
         new = np.flatnonzero(rows < 0)
-        self._make_room(len(self._rows) + len(new) - MOST_PATCHES, rows[rows >= 0])
-        free = sorted(set(range(MOST_PATCHES)) - set(self._rows.values())) if len(new) else []
-        for place, row in zip(new, free, strict=False):
-            self._rows[tuple(keys[place].tolist())] = rows[place] = row
-        self.weights[rows[new]], self.traced_in[rows[new]] = 0.0, -1
-        self.keys[rows[new]], self.regions[rows[new]] = keys[new], _region_numbers(keys[new])
+        self._make_room(len(new), rows[rows >= 0])
+        free = np.flatnonzero(self._numbers == _FREE)[: len(new)]
+        new = new[: len(free)]
+        rows[new] = free
+        self._numbers[free] = _key_numbers(keys[new])
+        self.weights[free], self.traced_in[free] = 0.0, -1
+        self.keys[free], self.regions[free] = keys[new], _region_numbers(keys[new])
         return rows
 
-    def _make_room(self, excess: int, wanted: Ints) -> None:
-        """Forget `excess` patches, those seen longest ago first and `wanted` rows last."""
+    def _make_room(self, wanted: int, kept: Ints) -> None:
+        """Forget patches until `wanted` rows are free, those seen longest ago first and `kept` rows last."""
+        used = np.flatnonzero(self._numbers != _FREE)
+        excess = len(used) + wanted - MOST_PATCHES
         if excess <= 0:
             return
         seen_in = self.seen_in.copy()
-        seen_in[wanted] = self._frame
-        for key in sorted(self._rows, key=lambda other: int(seen_in[self._rows[other]]))[:excess]:
-            self.weights[self._rows.pop(key)] = 0.0
+        seen_in[kept] = self._frame
+        forgotten = used[np.argsort(seen_in[used], kind="stable")[:excess]]
+        self.weights[forgotten], self._numbers[forgotten] = 0.0, _FREE
+
+
+def _key_numbers(keys: Ints) -> Ints:
+    """[n] a number for each key [n, 6], distinct within 19 km."""
+    cells = (keys[:, :3] + (1 << 17)) @ (1 << (18 * np.arange(3, dtype=np.int64)))
+    return np.asarray((cells << 6) + (keys[:, 3:] + 1) @ np.array([1, 4, 16]))
 
 
 def _region_numbers(keys: Ints) -> Ints:

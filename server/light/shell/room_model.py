@@ -187,7 +187,7 @@ class RoomModel:
 
     def estimate(self, bands: int) -> LightEstimate:
         """The light from beyond the scan."""
-        return self._solution.estimate(bands) if self._solution else distant_light(Unknowns(), bands)
+        return self._solution.estimate(bands) if self._solution else distant_light(Unknowns().solved(), bands)
 
     def known(self) -> KnownRoom:
         """What it is solved from."""

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 
 from server.light.arrivals import PendingArrivals, begin_arrivals, trace_arrivals
 from server.light.light_estimation import LightEstimate
@@ -15,8 +16,8 @@ from server.light.place_light import VALID_SPREAD_DEG, PlaceLight
 from server.light.shell.bright_surface import Emitters
 from server.light.shell.distant import distant_light
 from server.light.shell.lamps import ShellLamp, emitting_lamps, find_lamps
-from server.light.shell.objective import Unknowns
 from server.light.shell.shell import CORNERS, SIDE, Shell
+from server.light.shell.solved import Solved
 from server.light.shell.spread import deviations, spread_deg
 from server.light.shell.transport import KNOWN, NO_CELL, Met, bright_keys, columns_of, meet
 from server.maths.dominant import MOST_LIGHTS
@@ -64,10 +65,10 @@ class Solution:
     hidden: Mapping[int, int]
     """As of Transport."""
     emitters: Emitters
-    near: Unknowns
+    near: Solved
     """With all that is not scanned on the shell."""
-    distant: Unknowns
-    """With what comes in at open sides of the shell at infinity."""
+    distant: Solved
+    """With what comes in at open sides of the shell at infinity; the covariance is that of the lobes."""
     rows: NDArray[np.int64]
     """[n] of the patches that it explains."""
     shown: Floats
@@ -196,7 +197,7 @@ class Solution:
         radiance = self._radiance_of(rays)
         sh = rays.basis @ radiance
         luminance = radiance @ LUMINANCE
-        covariance, _ = self.near.covariance_of(self._gradient(rays))
+        covariance = self.near.covariance_of(self._gradient(rays))
         tint = radiance.mean(axis=0) / max(float(luminance.mean()), 1e-12)
         angle = spread_deg(sh @ LUMINANCE, covariance)
         return PlaceLight(
@@ -210,13 +211,12 @@ class Solution:
 
     def _gradient(self, rays: _Rays) -> Floats:
         """[bands^2, known] of coefficients of luminance by z."""
-        ray, corner = np.nonzero(rays.columns >= 0)
-        cells = rays.columns[ray, corner]
-        sent = rays.shares[ray, corner] * (self.near.radiance @ LUMINANCE)[cells]
-        bands = BANDS * BANDS
-        place = cells * bands + np.arange(bands)[:, None]
-        sums = np.bincount(place.ravel(), (rays.basis[:, ray] * sent).ravel(), self.near.known * bands)
-        return np.asarray(sums.reshape(-1, bands).T)
+        is_cell = rays.columns >= 0
+        cells = rays.columns[is_cell]
+        sent = rays.shares[is_cell] * (self.near.radiance @ LUMINANCE)[cells]
+        ends = np.concatenate([[0], np.cumsum(is_cell.sum(axis=1))])
+        by_ray = csr_matrix((sent, cells, ends), shape=(len(is_cell), self.near.known))
+        return np.asarray((by_ray.T @ rays.basis.T).T)
 
 
 @dataclass(frozen=True)

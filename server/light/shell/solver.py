@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,14 +14,15 @@ from server.light.shell.solution import Solution
 from server.light.shell.sources import distant_sources, near_sources
 from server.light.shell.switches import Switches
 from server.light.shell.transport import Transport
+from server.maths.lobes import LOBES
 
 MOST_STEPS = 16
 """Most Gauss-Newton steps of a solution. Another follows while the last one changed what patches receive by more than
 MOVED."""
-MOVED, DISTANT_MOVED, DISTANT_SHARE = 0.01, 0.05, 0.5
+MOVED, DISTANT_MOVED, NEW_MOVED, DISTANT_SHARE = 0.02, 0.05, 0.01, 0.5
 """Change of a logarithm; the second value holds for the light from beyond the scan, of whose steps that share is taken,
-both while the light is steady. Lobes that overlap take the light of each other: what stops sooner is nearer to the
-prior, and two lights of mitsuba_room are 16 degrees off instead of 27."""
+both while the light is steady; the third for a light that is new. Lobes that overlap take the light of each other: what
+stops sooner is nearer to the prior, and two lights of mitsuba_room are 16 degrees off instead of 27."""
 CHROMA_MOVED = 0.05
 """While a step changes what patches receive by no more than this, the light keeps the colours that a solution's first
 step found: they follow the level slowly, and take a third of a step's time."""
@@ -65,12 +64,12 @@ class Solver:
         distant = distant_sources(self._transport, closed, evidence.rows, with_indirect=switches.indirect)
         first = patches.outdated if self._near.known > 0 and switches.memory else 1.0
         self._distant.most_relaxation = DISTANT_SHARE ** (1 - patches.outdated)
-        far_settled = DISTANT_MOVED ** (1 - first) * MOVED**first
-        for unknowns, sources, settled in ((self._near, near, MOVED), (self._distant, distant, far_settled)):
+        for unknowns, sources, steady in ((self._near, near, MOVED), (self._distant, distant, DISTANT_MOVED)):
+            settled = steady ** (1 - first) * NEW_MOVED**first
             unknowns.relaxation = max(unknowns.relaxation, patches.outdated)
             for number in range(MOST_STEPS):
                 step(unknowns, evidence, sources, switches, with_chroma=number == 0 or unknowns.step > CHROMA_MOVED)
                 if unknowns.step < settled:
                     break
         hidden, shown = dict(self._transport.hidden), patches.logarithms[rows]
-        return Solution(shell, hidden, bright.emitters, replace(self._near), replace(self._distant), rows, shown)
+        return Solution(shell, hidden, bright.emitters, self._near.solved(), self._distant.solved(LOBES), rows, shown)

@@ -107,7 +107,7 @@ class Transport:
         back, bright = arrivals[:, 3] < 0, _is_bright(arrivals)
         keys = 2 * _cell_numbers(ends[back], HIDDEN_M)
         self._add_cells(keys, is_saturated=False)
-        np.add.at(sums, (row[back], columns_of(self.hidden, keys)), share[back])
+        np.add.at(sums.reshape(-1), COLUMNS * row[back] + columns_of(self.hidden, keys), share[back])
         self._by_rays[rows] = sums
         keys = bright_keys(ends[bright])
         self._add_cells(keys, is_saturated=True)
@@ -134,12 +134,13 @@ class Transport:
         shares = emitters.shares(patches.positions[rows], patches.normals[rows])
         weights = emitters.weights(shares, RAYS // 2)
         sums = self._by_rays[rows].astype(np.float64)
-        np.add.at(sums.T, columns, (weights * shares * bright.visible[rows]).T)
+        for column, brought in zip(columns, (weights * shares * bright.visible[rows]).T, strict=True):
+            sums[:, column] += brought  # several may share the last one
         row = np.searchsorted(rows, self._bright_rows)
         is_used = rows[np.minimum(row, len(rows) - 1)] == self._bright_rows
         row, ends, ray_shares = row[is_used], self._bright_ends[is_used], self._bright_shares[is_used]
         counts = emitters.left_to_others(weights, row, ends)
-        np.add.at(sums, (row, columns_of(self.hidden, bright_keys(ends))), counts * ray_shares)
+        np.add.at(sums.reshape(-1), COLUMNS * row + columns_of(self.hidden, bright_keys(ends)), counts * ray_shares)
         self.shares[rows] = sums
 
     def _add_cells(self, keys: Ints, *, is_saturated: bool) -> None:

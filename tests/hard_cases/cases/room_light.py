@@ -15,6 +15,7 @@ from server.light.shell.objective import Unknowns, step
 from server.light.shell.shell import SIDES
 from server.light.shell.sources import distant_sources
 from server.light.shell.transport import Transport
+from server.maths.lobes import LOBES
 from server.maths.sh import LUMINANCE
 from tests.hard_cases.catalogue import Family, Found, Trial
 from tests.scenes.lights import unit
@@ -62,7 +63,7 @@ def solved(room: ShellRoom, closed: Floats | None = None) -> Unknowns:
 
 
 def direction_of(unknowns: Unknowns) -> Found:
-    light = distant_light(unknowns, 4)
+    light = distant_light(unknowns.solved(LOBES), 4)
     return Found(unit((light.sh @ LUMINANCE)[_LINEAR]), TOWARDS, known=light.valid)
 
 
@@ -148,7 +149,7 @@ def twice(_trial: Trial) -> Found:
         room.patches.logarithms[used] += np.log(2.0)
         room.patches.arrivals[used, :, :3] *= 2.0
 
-    one, other = (distant_light(solved(corner(change)), 4).sh for change in (None, brighter))
+    one, other = (distant_light(solved(corner(change)).solved(LOBES), 4).sh for change in (None, brighter))
     return Found(other / one[0].mean(), 2 * one / one[0].mean())
 
 
@@ -165,7 +166,7 @@ def _black(room: ShellRoom) -> None:
     "that nothing sees lie at their prior.",
 )
 def black(_trial: Trial) -> Found:
-    return Found(distant_light(solved(corner(_black)), 4).sh, 0)
+    return Found(distant_light(solved(corner(_black)).solved(LOBES), 4).sh, 0)
 
 
 def _from_behind(room: ShellRoom) -> None:
@@ -190,11 +191,11 @@ def from_behind(_trial: Trial) -> Found:
     known=False,
 )
 def closed_room(_trial: Trial) -> Found:
-    light = distant_light(solved(make_room(LAMP, AMBIENT), np.ones(SIDES)), 4)
+    light = distant_light(solved(make_room(LAMP, AMBIENT), np.ones(SIDES)).solved(LOBES), 4)
     return Found(float(light.valid), 0, known=light.valid)
 
 
 @ROOM_LIGHT.case("nothing seen", 0, "radiance", "no estimate is made of nothing: exactly zero.", known=False)
 def nothing(_trial: Trial) -> Found:
-    estimate = distant_light(Unknowns(), 4)
+    estimate = distant_light(Unknowns().solved(), 4)
     return Found(estimate.sh, 0, known=estimate.valid or estimate.std is not None)

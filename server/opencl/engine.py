@@ -94,12 +94,17 @@ class Engine:
 
     def kernel(self, file: str, name: str, **defines: Define) -> cl.Kernel:
         """Kernel `name` of the kernel file `file`; retrieved once, because a kernel object carries its arguments."""
-        # As text: 1, 1.0 and True are equal in Python.
-        key = (file, name, *sorted([f"{define}={value!r}" for define, value in defines.items()]))
-        if key not in self._kernels:
-            self._kernels[key] = kernel = cl.Kernel(self._program(file, defines), name)
-            self._made_from[id(kernel)] = file, defines
-        return self._kernels[key]
+        key = (file, name, *defines.items(), *map(type, defines.values()))  # 1, 1.0 and True are equal in Python
+        kernel = self._kernels.get(key)
+        if kernel is None:
+            in_order = dict(sorted(defines.items()))
+            if list(in_order) != list(defines):
+                kernel = self.kernel(file, name, **in_order)
+            else:
+                kernel = cl.Kernel(self._program(file, defines), name)
+                self._made_from[id(kernel)] = file, defines
+            self._kernels[key] = kernel
+        return kernel
 
     def _program(self, file: str, defines: dict[str, Define]) -> cl.Program:
         if self.device.programs.has(file, defines):

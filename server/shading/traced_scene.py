@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -62,13 +63,14 @@ class DeviceLight:
         """Number of SH bands of the coefficients."""
         return math.isqrt(self.sh.shape[1])
 
-    @property
+    @cached_property
     def layout(self) -> np.void:
         """LightTable of structs.py."""
-        starts, count = self.table.starts, len(self.sh)
+        starts = self.table.starts
+        places, sets, per_set = self.table.shapes["arriving"][0]
         return LIGHT_TABLE(
-            places=count,
-            directions=self.table.array("arriving").size // count,
+            places=places,
+            directions=sets * per_set,
             **{f"{part}_at": start for part, start in starts.items()},
         )
 
@@ -259,12 +261,15 @@ def _upload_table(
     buffer: DeviceBuffer, rays: Directions, sh: NDArray[np.float64], whole: NDArray[np.float64], places: LightPlaces
 ) -> Parts:
     """The light's table, laid out as in include/light_table.clh. sh: without the discs."""
-    arriving = np.stack([rays.basis @ coefficients for coefficients in sh.astype(np.float32)])
+    coefficients = _float4(sh)
+    basis = rays.basis.reshape(-1, sh.shape[1])
+    arriving = np.stack([basis @ place.view(np.float32).reshape(-1, 4) for place in coefficients])
+    np.maximum(arriving, 0.0, out=arriving)
     return buffer.refresh_parts(
         {
-            "coefficients": _float4(sh),
+            "coefficients": coefficients,
             "whole": _float4(whole),
-            "arriving": _float4(np.maximum(arriving, 0.0)),
+            "arriving": arriving.view(cl_types.float4).reshape(len(sh), *rays.basis.shape[:2]),
             "positions": _float4(places.positions),
             "owners": np.array(places.owners or (0,), np.int32),
         }

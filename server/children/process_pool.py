@@ -58,7 +58,7 @@ class ChildProcess:
     def is_alive(self) -> bool:
         """Whether the process is running."""
         with self._ending:
-            if self._has_ended:
+            if self._has_ended or self._answers < 0:
                 return False
             told = select.poll()
             told.register(self._answers, 0)  # the end of its pipe, which comes with its own

@@ -138,7 +138,7 @@ class SolverProcess:
             except ChildDied as error:
                 if self._is_closed:
                     raise
-                log.warning("the process that solves a room's light %s: it is started again", error)
+                self._replace(str(error))
         if self._solver is None:
             log.warning("a room's light is solved in the server's own process from now on")
             self._solver = Solver(self._switches)
@@ -154,9 +154,10 @@ class SolverProcess:
             child.end()
 
     def _asked(self, task: Task) -> Solution | None:
-        begins = self._child is None or not self._child.is_alive
-        child = self._begun() if begins else self._child
-        assert child is not None
+        if self._child is not None and not self._child.is_alive:
+            self._replace("has ended")
+        begins = self._child is None
+        child = self._child or self._begun()
         request = Request(task.without_known_rays(not begins), self._switches, begins, self._shell)
         answer = pickle.loads(child.ask(pickle.dumps(request, pickle.HIGHEST_PROTOCOL)))
         if isinstance(answer, Failed):
@@ -166,9 +167,13 @@ class SolverProcess:
             self._shell = answer.shell
         return answer
 
-    def _begun(self) -> ChildProcess:
+    def _replace(self, reason: str) -> None:
+        log.warning("the process that solves a room's light %s: another is started", reason)
         if self._child is not None:
             self._child.kill()
+            self._child = None
+
+    def _begun(self) -> ChildProcess:
         child = ChildProcess(_nursery(), JOB)
         weakref.finalize(self, child.leave)
         with self._changing:

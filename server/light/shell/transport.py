@@ -31,6 +31,7 @@ KNOWN, NO_CELL = -1, -2
 """Values in place of a cell: KNOWN is photographed surface; NO_CELL is hidden or saturated surface from which no patch
 has received light."""
 _MIDDLE = 1 << 19  # half the cells along an axis: 150 km
+_AT_ONCE = 64  # patches whose rays are worked on together: 32 768 rays, some MB
 _MOST_COUNTED = 1e4  # rays that the mean of a saturated cell remembers
 
 Floats = NDArray[np.float64]
@@ -87,8 +88,8 @@ class Transport:
         """Fold in the patches whose rays were traced; all patches, where the shell has changed."""
         rows = traced if shell is self._shell else patches.used
         self._shell = shell
-        if len(rows):
-            self._update_rays(patches, rows, shell)
+        for first in range(0, len(rows), _AT_ONCE):
+            self._update_rays(patches, rows[first : first + _AT_ONCE], shell)
         if len(patches.used):
             self._update_emitters(patches, bright, patches.used)
 

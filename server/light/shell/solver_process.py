@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 JOB = JobSpec("server.light.shell.solver_child:answer", memory_mib=4096, timeout_s=60.0, max_answer_bytes=64 << 20)
 """A child takes 0.1 GB, a solution 0.1 to 1 s (the first) and 2 MB: the limits stop what has gone wrong."""
 
+NOT_NEEDED = "is not needed any more: the room is closed"
+
 Floats = NDArray[np.float64]
 
 
@@ -136,8 +138,6 @@ class SolverProcess:
             try:
                 return self._asked(task)
             except ChildDied as error:
-                if self._is_closed:
-                    raise
                 self._replace(str(error))
         if self._solver is None:
             log.warning("a room's light is solved in the server's own process from now on")
@@ -168,6 +168,8 @@ class SolverProcess:
         return answer
 
     def _replace(self, reason: str) -> None:
+        if self._is_closed:
+            raise ChildDied(NOT_NEEDED)
         log.warning("the process that solves a room's light %s: another is started", reason)
         if self._child is not None:
             self._child.kill()
@@ -180,5 +182,5 @@ class SolverProcess:
             self._child = child
         if self._is_closed:  # meanwhile
             child.kill()
-            raise ChildDied("is not needed any more")
+            raise ChildDied(NOT_NEEDED)
         return child

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import mean
@@ -25,6 +24,7 @@ from tests.bench.accuracy.scenes import Shot, SweptScene
 from tests.bench.light.environment import environment_difference, irradiance_error
 from tests.bench.rendering.flip import flip_map
 from tests.bench.rendering.ssim import ssim_map
+from tests.bench.report.processor import ProcessorTime
 
 SETTLING = 2
 """First frames of a run, which do not count: kernels are compiled, arrays made."""
@@ -74,9 +74,9 @@ def measure_point(device: Device, scene: SweptScene, knob: str, settings: dict[s
             objects = tuple(ObjectFile(path, None) for path in scene.write_objects(Path(folder)))
             place_objects(pipeline, objects, lambda _: None)
         for shot in shots:
-            started = time.process_time()
+            spent = ProcessorTime()
             results.append(pipeline.process(shot.frame))
-            cpu_ms.append((time.process_time() - started) * 1e3)
+            cpu_ms.append(spent.ms())
         device_bytes = pipeline.device_bytes
     finally:
         pipeline.close()

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import re
-import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -32,6 +31,7 @@ from server.opencl.device import Device, open_device
 from tests.bench.rendering.flip import flip_map
 from tests.bench.rendering.speed import EVERYTHING as WHOLE_STAGE
 from tests.bench.rendering.speed import StageClock, clocked
+from tests.bench.report.processor import ProcessorTime
 from tests.bench.report.report import Report, Row, Unmeasured
 
 OUT = Path("out/bench/plan")
@@ -106,18 +106,17 @@ def played(device: Device, source: GallerySource, plan: str, cache: str = "off")
         pipeline = None
         for _ in range(len(source)):
             if pipeline is None:
-                started = time.process_time()
+                spent = ProcessorTime()
                 pipeline, result = next(results)
                 clock = StageClock(pipeline._engine.queue)
                 rendering_ms = 0.0
             else:
                 assert clock is not None
                 with clocked(pipeline, clock):
-                    started = time.process_time()
+                    spent = ProcessorTime()
                     _, result = next(results)
                 rendering_ms = clock.cpu_ms[WHOLE_STAGE][-1]
-            cpu_ms = (time.process_time() - started) * 1e3
-            frames.append(Played(result.color, result.plan, cpu_ms, rendering_ms))
+            frames.append(Played(result.color, result.plan, spent.ms(), rendering_ms))
     return frames
 
 

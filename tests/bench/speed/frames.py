@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
@@ -25,6 +24,7 @@ from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from tests.bench.rendering.flip import flip_map
 from tests.bench.report.finished import Part
+from tests.bench.report.processor import ProcessorTime
 from tests.scenes.turns import Alone
 
 WARM_UP = 8
@@ -62,16 +62,16 @@ class Measured:
 
     timings: list[Timings] = field(default_factory=list)
     cpu_ms: list[float] = field(default_factory=list)
-    """Of all threads."""
+    """Of all threads, and of the process that solves the light."""
 
     def process(
         self, session: ClientSession, frame: RgbdFrame, *, counts: bool, turn: Alone | None = None
     ) -> FrameResult:
         """One frame; its times are kept if it `counts`."""
-        started = time.process_time()
+        spent = ProcessorTime()
         result = session.process(frame, turn=turn)
         if counts:
-            self.cpu_ms.append((time.process_time() - started) * 1e3)
+            self.cpu_ms.append(spent.ms())
             self.timings.append(result.timings)
         return result
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -26,6 +25,7 @@ from server.scene.mesh import Mesh, load_mesh
 from server.scene.placement import Placement
 from server.scene.vase import vase_glb
 from tests.bench.report.finished import ROOT
+from tests.bench.report.processor import ProcessorTime
 from tests.bench.thesis.numbers import ROWS
 
 OUT = ROOT / "out" / "bench" / "accuracy"
@@ -73,9 +73,9 @@ def turn_by_turn(
 
 
 def _answer(device: Device, pipeline: ClientSession, frame: RgbdFrame) -> Answer:
-    start = time.process_time()
+    spent = ProcessorTime()
     result = pipeline.process(frame)
-    return Answer(result, (time.process_time() - start) * 1e3 / cores_of(device))
+    return Answer(result, spent.ms() / cores_of(device))
 
 
 def cores_of(device: Device) -> int:

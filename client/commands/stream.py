@@ -9,11 +9,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -182,6 +182,8 @@ class _Stream:
         """Frame number -> time of sending and bytes, for unanswered frames."""
         self._captured: dict[int, RgbdFrame] = {}
         """Unanswered frames; layers are composed over their pictures, and the page of results shows them."""
+        self._writing: asyncio.Task[None] | None = None
+        """The last answer's, after it was shown."""
         self._last_sent_s = -math.inf
         self._began_s = 0.0
         total = None if job.frames.stop >= ENDLESS else len(job.frames)
@@ -248,10 +250,12 @@ class _Stream:
                 await client.close("the source has ended")
             await receiving
             await sending
+            await self._written()
         finally:
             receiving.cancel()
             sending.cancel()
-            await asyncio.gather(receiving, sending, return_exceptions=True)
+            waiting = (receiving, sending) if self._writing is None else (receiving, sending, self._writing)
+            await asyncio.gather(*waiting, return_exceptions=True)
         self._summary.seconds = time.perf_counter() - start_s
         for line in self._in_view.problems():
             self._print_once(line)
@@ -325,6 +329,7 @@ class _Stream:
 
         files: Mapping[MeshFormat, bytes] = await client.request_mesh(show)
         if self._writer is not None:
+            await self._written()
             await asyncio.to_thread(self._writer.write_mesh, files)
 
     async def _receive(self, client: StreamClient) -> None:
@@ -345,11 +350,12 @@ class _Stream:
             waited_s = None if drawn is None or not drawn.waited_ms else drawn.waited_ms / 1e3
             measured = AnsweredFrame(0.0, returned_s, computed_s, 0, bytes_down=size, waited_s=waited_s)
             self._measure(answer.light.frame, measured, reconnected)
-        picture = await asyncio.to_thread(self._write_answer, answer)
+        output = await asyncio.to_thread(self._decoded, answer)
         coding = self._fixed if self._adaptive is None else self._adaptive.coding
         shown_s = time.perf_counter()
         if not self._summary.answered:
             self._summary.first_picture_s = shown_s - self._began_s
+        picture = None if output is None else output.color
         self._view.show(shown_s, answer.light, drawn, picture, coding, reconnected)
         waited_ms = 0.0 if drawn is None else drawn.waited_ms
         self._statistics.note_answer(answer.light.frame, returned_s, shown_s, computed_s, size, waited_ms / 1e3)
@@ -361,20 +367,27 @@ class _Stream:
         self._summary.answered += 1
         self._summary.light = answer.light
         self._advance()
-
-    def _write_answer(self, answer: Answer) -> NDArray[np.uint8] | None:
-        """Write an answer if there is a folder. Returns its picture if that was decoded."""
-        own = self._captured.pop(answer.light.frame, None)
-        if answer.drawn is None:
-            if self._writer is not None:
-                self._writer.write_light(answer.light)
-            return None
-        if self._writer is None and not self._view.wants_pictures:
-            return None
-        output = frame_output(answer, self._job.source.camera, own)
         if self._writer is not None:
-            self._writer.write(output)
-        return output.color
+            await self._written()  # one at a time, so that a slow disk holds frames up instead of filling memory
+            write = (
+                partial(self._writer.write_light, answer.light)
+                if output is None
+                else partial(self._writer.write, output)
+            )
+            self._writing = asyncio.create_task(asyncio.to_thread(write))
+
+    async def _written(self) -> None:
+        """Wait until the last answer is written. Raises OutputError."""
+        writing, self._writing = self._writing, None
+        if writing is not None:
+            await writing
+
+    def _decoded(self, answer: Answer) -> FrameOutput | None:
+        """The answer with its picture; None if there is none, or nobody wants it."""
+        own = self._captured.pop(answer.light.frame, None)
+        if answer.drawn is None or (self._writer is None and not self._view.wants_pictures):
+            return None
+        return frame_output(answer, self._job.source.camera, own)
 
     def _measure(self, number: int, answered: AnsweredFrame, reconnected: int) -> None:
         """Pass a measurement to the adaptation, completed by the time of sending and the bytes sent."""

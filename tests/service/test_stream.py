@@ -15,6 +15,7 @@ from rich.console import Console
 from client.cli import run_command
 from client.commands import stream as streaming
 from client.commands.stream import stream
+from client.display.stream_statistics import StreamStatistics
 from client.errors import ObjectError, OutputError, SourceError
 from client.objects.object_file import ObjectFile
 from client.results.description import describe
@@ -62,6 +63,48 @@ def test_stream_writes_jpeg_quality_pictures_and_exact_numbers(server, tmp_path:
         assert ours[name] == theirs[name]
     picture = cv2.imread(str(tmp_path / "stream" / "frames" / "000001.png"), cv2.IMREAD_COLOR_RGB)
     assert np.abs(picture.mean((0, 1)) - (255 - rgbd_frame(1).color).mean((0, 1))).max() < 3
+
+
+def test_an_answer_is_shown_before_it_is_written(server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One after the other, in their order; a slow disk does not make pictures late."""
+    events: list[tuple[str, int]] = []
+    note, write = StreamStatistics.note_answer, OutputWriter.write
+
+    def noted(self: StreamStatistics, number: int, *times: float) -> None:
+        events.append(("shown", number))
+        note(self, number, *times)
+
+    def written(self: OutputWriter, output: FrameOutput) -> None:
+        events.append(("begun", output.frame))
+        write(self, output)
+        events.append(("written", output.frame))
+
+    monkeypatch.setattr(StreamStatistics, "note_answer", noted)
+    monkeypatch.setattr(OutputWriter, "write", written)
+    quietly(FakeSource(6), server.url, out=tmp_path, realtime=False)
+    assert [what for what in events if what[0] != "shown"] == [
+        (what, number) for number in range(6) for what in ("begun", "written")
+    ]
+    for number in range(6):
+        assert events.index(("shown", number)) < events.index(("begun", number))
+
+
+@pytest.mark.parametrize("number", [2, 5])
+def test_a_disk_that_refuses_ends_the_stream(
+    server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    """The last frame too, which nothing comes after."""
+    write = OutputWriter.write
+
+    def refused(self: OutputWriter, output: FrameOutput) -> None:
+        if output.frame == number:
+            raise OutputError("the disk is full")
+        write(self, output)
+
+    monkeypatch.setattr(OutputWriter, "write", refused)
+    with pytest.raises(OutputError, match="the disk is full"):
+        quietly(FakeSource(6), server.url, out=tmp_path, realtime=False)
+    assert "frames/000001.png" in files(tmp_path)
 
 
 def test_without_realtime_every_frame_is_answered(server) -> None:

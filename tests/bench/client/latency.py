@@ -10,24 +10,25 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from urllib.parse import parse_qs, urlsplit
 
-import msgspec
 import numpy as np
 from rich.console import Console
 
 from client.commands.stream import Sending, StreamSummary, stream
 from client.display.stream_statistics import STAGES
+from client.objects.object_file import ObjectFile
 from client.sources.frame_source import Source
+from client.sources.volume import default_volume, default_voxel
 from client.streaming.client import Access
 from client.streaming.video import IS_POSSIBLE
 from protocol.colors import ColorReader
 from protocol.frames import RgbdFrame
-from protocol.messages import Frame
+from protocol.messages import Frame, Wishes
 from protocol.recording import read_messages
 from tests.bench.client.bandwidth import kitchen, psnr_db
-from tests.bench.light.runs import wishes_for
 from tests.bench.report.finished import Part
-from tests.bench.report.run import Run
+from tests.bench.report.run import Run, data_folder
 from tests.bench.service.process import Served, serving
+from tests.bench.speed.suite import OBJECT, OBJECT_SCALE, ON_TABLE_M
 from tests.service.proxy import impaired
 
 QUICK_FRAMES, FRAMES = 450, 1200
@@ -92,7 +93,7 @@ class ThereAndBack:
 
 
 def latency_part(name: str, run: Run, _out: Path) -> Part:
-    """Of the kitchen at its own rate over the link of this name, GR15FAST."""
+    """Of the kitchen at its own rate over the link of this name, one object, as `probeless stream` does by itself."""
     link, count = LINKS[name], run.of(QUICK_FRAMES, FRAMES)
     part = Part(sizes={f"frames of latency, {name}": count})
     with TemporaryDirectory() as folder, serving(Path(folder) / "log") as served, link.to(served) as url:
@@ -112,12 +113,14 @@ def latency_part(name: str, run: Run, _out: Path) -> Part:
 
 def _measure(url: str, count: int, sending: Sending, record: Path | None = None) -> StreamSummary:
     source = kitchen()
-    wishes = msgspec.structs.replace(wishes_for(source, range(len(source))), preset="gr15fast")
+    volume_m = default_volume(source, range(len(source)))
+    thing = ObjectFile(data_folder(OBJECT), ON_TABLE_M, scale=OBJECT_SCALE)
     with TemporaryDirectory() as out:
         return stream(
             ThereAndBack(source, count),
             url,
-            wishes=wishes,
+            objects=(thing,),
+            wishes=Wishes(volume_m=volume_m, voxel_m=default_voxel(volume_m), up=source.up),
             out=Path(out),
             record=record,
             access=Access(),

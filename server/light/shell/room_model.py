@@ -29,7 +29,7 @@ from server.light.shell.patches import Patches, TracedPatches
 from server.light.shell.picture import PatchesInPicture, Seen
 from server.light.shell.shell import Shell
 from server.light.shell.solution import Solution
-from server.light.shell.solver import LEAST_PATCHES
+from server.light.shell.solver import LEAST_PATCHES, STILL
 from server.light.shell.solver_process import Asked, SolverProcess, Task
 from server.light.shell.switches import Switches
 from server.opencl.pacing import Pacer
@@ -47,9 +47,6 @@ has too much to do the light would never be a new one. A person sees light that 
 NEW_SHARE = 0.1
 """If the share of new patches, or of frames that are not in the solution, is at least this, a frame is solved at
 once."""
-STILL = 0.005
-"""The solution stays as it is while the mean log radiance of patches (root mean square), and what they receive by the
-last step, change by no more than this: half a per cent is less than a code of a picture."""
 LEAST_FACING = 5
 """Least number of patches that face one way, for a median."""
 

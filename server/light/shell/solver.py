@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from server.light.shell.bright_surface import EmittersSeen
 from server.light.shell.evidence import evidence_of
 from server.light.shell.objective import Unknowns, step
-from server.light.shell.patches import PATCH_M, Patches
+from server.light.shell.patches import MOST_PATCHES, PATCH_M, Patches
 from server.light.shell.shell import Shell, closed_sides, shell_around
 from server.light.shell.solution import Solution
 from server.light.shell.sources import distant_sources, near_sources
@@ -18,11 +18,14 @@ from server.maths.lobes import LOBES
 
 MOST_STEPS = 16
 """Most Gauss-Newton steps of a solution. Another follows while the last one changed what patches receive by more than
-MOVED."""
+MOVED, or less where what they show hardly changes, down to STILL."""
 MOVED, DISTANT_MOVED, NEW_MOVED, DISTANT_SHARE = 0.02, 0.05, 0.01, 0.5
 """Change of a logarithm; the second value holds for the light from beyond the scan, of whose steps that share is taken,
 both while the light is steady; the third for a light that is new. Lobes that overlap take the light of each other: what
 stops sooner is nearer to the prior, and two lights of mitsuba_room are 16 degrees off instead of 27."""
+STILL = 0.005
+"""What patches show has not changed while the root mean square of the change of its logarithm is at most this, and a
+solution has settled while its last step's is: half a per cent is less than a code of a picture."""
 CHROMA_MOVED = 0.05
 """While a step changes what patches receive by no more than this, the light keeps the colours that a solution's first
 step found: they follow the level slowly, and take a third of a step's time."""
@@ -40,6 +43,8 @@ class Solver:
         self._transport = Transport()
         self._near, self._distant = Unknowns(), Unknowns()
         self._shell: Shell | None = None
+        self._shown = np.full((MOST_PATCHES, 3), np.inf)
+        """Mean log radiance of patches in the last solution."""
 
     def begin_with(self, shell: Shell | None) -> None:
         """Keep the size and place of the shell of an earlier solution."""
@@ -64,7 +69,8 @@ class Solver:
         distant = distant_sources(self._transport, closed, evidence.rows, with_indirect=switches.indirect)
         first = patches.outdated if self._near.known > 0 and switches.memory else 1.0
         self._distant.most_relaxation = DISTANT_SHARE ** (1 - patches.outdated)
-        for unknowns, sources, steady in ((self._near, near, MOVED), (self._distant, distant, DISTANT_MOVED)):
+        moved = MOVED * float(np.clip(self._change(patches, rows) / STILL, STILL / MOVED, 1.0))
+        for unknowns, sources, steady in ((self._near, near, moved), (self._distant, distant, DISTANT_MOVED)):
             settled = steady ** (1 - first) * NEW_MOVED**first
             unknowns.relaxation = max(unknowns.relaxation, patches.outdated)
             for number in range(MOST_STEPS):
@@ -73,3 +79,11 @@ class Solver:
                     break
         hidden, shown = dict(self._transport.hidden), patches.logarithms[rows]
         return Solution(shell, hidden, bright.emitters, self._near.solved(), self._distant.solved(LOBES), rows, shown)
+
+    def _change(self, patches: Patches, rows: NDArray[np.int64]) -> float:
+        """By how much what patches show has changed since the last solution, root mean square; infinite at first."""
+        before, now = self._shown[rows], patches.logarithms[rows]
+        self._shown[:] = np.inf
+        self._shown[rows] = now
+        is_known = np.isfinite(before)
+        return float(np.sqrt(np.mean((now - before)[is_known] ** 2))) if is_known.any() else float("inf")

@@ -29,7 +29,7 @@ from client.results.description import describe
 from client.results.frame_output import FrameOutput, captured_of
 from client.results.output_folder import OutputWriter
 from client.sources.frame_source import ENDLESS, Source, is_live
-from client.streaming.adaptive import Adaptive, AnsweredFrame
+from client.streaming.adaptive import SMOOTHING, Adaptive, AnsweredFrame
 from client.streaming.client import Access, Answer, ClientError, RoomPlace, StreamClient
 from client.streaming.coding import Coding, picture_bytes
 from client.streaming.video import IS_POSSIBLE, VideoEncoder
@@ -185,6 +185,8 @@ class _Stream:
         self._writing: asyncio.Task[None] | None = None
         """The last answer's, after it was shown."""
         self._last_sent_s = -math.inf
+        self._preparing_s = 0.0
+        """To read and encode a frame, which is not on its way before."""
         self._began_s = 0.0
         total = None if job.frames.stop >= ENDLESS else len(job.frames)
         self._bar = progress.add_task(job.source.name, total=total, note="connecting")
@@ -287,17 +289,20 @@ class _Stream:
             await self._send_one(client, position)
 
     def _may_send(self, client: StreamClient) -> bool:
-        """Whether a frame sent now would not wait for the server or the link."""
+        """Whether a frame prepared from now on would not wait for the server or the link."""
         if self._adaptive is None or not client.has_room:
             return client.has_room
-        return self._adaptive.may_send(time.perf_counter(), self._last_sent_s, client.unanswered)
+        sent_s = time.perf_counter() + self._preparing_s
+        return self._adaptive.may_send(sent_s, self._last_sent_s, client.unanswered)
 
     async def _send_one(self, client: StreamClient, position: int) -> None:
+        begun_s = time.perf_counter()
         frame = await asyncio.to_thread(self._job.source.__getitem__, position)
         captured_s = time.perf_counter()
         coding = self._fixed if self._adaptive is None else self._adaptive.coding
         message = await client.encode_frame(frame, coding)
         sent_s = self._last_sent_s = time.perf_counter()
+        self._preparing_s += SMOOTHING * (sent_s - begun_s - self._preparing_s)
         size = picture_bytes(message)
         self._in_flight[frame.index] = sent_s, size
         if self._writer is not None or self._job.wishes.answer == "layer":

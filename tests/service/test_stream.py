@@ -2,6 +2,7 @@
 
 import io
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,9 @@ from client.objects.object_file import ObjectFile
 from client.results.description import describe
 from client.results.frame_output import FrameOutput, captured_of
 from client.results.output_folder import OutputWriter
+from client.streaming.adaptive import Adaptive
 from client.streaming.client import ClientError, RoomPlace
+from protocol.frames import RgbdFrame
 from protocol.messages import Bye, Composite, Frame, Hello, Light, PlaceObject, Welcome
 from protocol.recording import read_messages
 from tests.service.fakes import EXPLODE_MM, REFUSE_MM, fake_result, rgbd_frame
@@ -107,6 +110,26 @@ def test_a_disk_that_refuses_ends_the_stream(
     assert "frames/000001.png" in files(tmp_path)
 
 
+def test_a_frame_is_prepared_while_the_server_computes_the_last(server, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reading and encoding take their time: the next frame is begun by so much before the server is expected to end."""
+    read_s, leads_s = 0.05, []
+    may_send = Adaptive.may_send
+
+    class SlowSource(FakeSource):
+        def __getitem__(self, index: int) -> RgbdFrame:
+            time.sleep(read_s)
+            return super().__getitem__(index)
+
+    def asked(self: Adaptive, sent_s: float, last_sent_s: float, unanswered: int) -> bool:
+        leads_s.append(sent_s - time.perf_counter())
+        return may_send(self, sent_s, last_sent_s, unanswered)
+
+    monkeypatch.setattr(Adaptive, "may_send", asked)
+    quietly(SlowSource(12, fps=15.0), server.url)
+    assert leads_s[0] < 0.5 * read_s
+    assert max(leads_s) > 0.8 * read_s
+
+
 def test_without_realtime_every_frame_is_answered(server) -> None:
     summary = quietly(FakeSource(30), server.url, realtime=False)
     assert (summary.sent, summary.answered, summary.skipped, summary.dropped) == (30, 30, 0, 0)
@@ -120,10 +143,17 @@ def test_the_command_loses_no_frame_of_a_folder_while_the_server_is_busy(server,
     assert "12 frames answered" in capsys.readouterr().out
 
 
-def test_the_command_keeps_the_rate_where_it_is_asked_to(server, lab, capsys) -> None:
+def test_the_command_keeps_the_rate_where_it_is_asked_to(server, lab, capsys, monkeypatch) -> None:
+    """The server is busy until a frame was skipped."""
     lab.hold = True
-    releasing = threading.Timer(2.0, lambda: lab.release(12))
-    releasing.start()
+    advance = streaming._Stream._advance
+
+    def released(self: streaming._Stream) -> None:
+        if self._summary.skipped == 1:
+            lab.release(12)
+        advance(self)
+
+    monkeypatch.setattr(streaming._Stream, "_advance", released)
     assert run_command(["stream", "synthetic:table?frames=12", "--server", server.url, "--realtime"]) == 0
     assert ", 0 skipped" not in capsys.readouterr().out
 

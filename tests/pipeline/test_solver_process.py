@@ -7,6 +7,7 @@ import logging
 import os
 import pickle
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -166,9 +167,16 @@ def test_one_that_dies_at_work_is_replaced(
     assert pid_of(solver) != first
 
 
+@pytest.mark.parametrize("what", ["no Python", "no job"])
 def test_where_none_can_be_started_it_is_solved_here(
-    tasks: list[Task], recorded: list[bytes], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    what: str,
+    tasks: list[Task],
+    recorded: list[bytes],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    if what == "no Python":
+        monkeypatch.setattr(sys, "executable", "/no/such/python")
     nursery = Nursery(replace(JOB, job="no.such.module:answer"))
     monkeypatch.setattr(solver_process, "_nursery", lambda: nursery)
     solver = SolverProcess(Switches())

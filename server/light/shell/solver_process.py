@@ -10,6 +10,7 @@ import logging
 import pickle
 import threading
 import weakref
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass
 from functools import cache
@@ -121,7 +122,8 @@ class SolverProcess:
         self._is_closed = False
         self._changing = threading.Lock()
         if IS_SUPPORTED:
-            _nursery().load()
+            with suppress(ChildDied):  # `solve` tells
+                _nursery().load()
 
     def begin_with(self, shell: Shell | None) -> None:
         """Keep the size and place of the shell of an earlier solution."""

@@ -38,13 +38,15 @@ const welcome = (more: object = {}): object => ({
   type: "welcome", session: "s", server: "p", device: "d", max_inflight: 2, key: "secret", resumed: false, room: null, ...more,
 });
 
-function begin(wishes: Wishes = {}, pace: Adaptive | null = null): { stream: CaptureStream; wanted: () => number; heard: ServerMessage[]; frame: (number: number, camera?: CameraModel) => Numbered } {
+function begin(wishes: Wishes = {}, pace: Adaptive | null = null, encoding: () => void = () => undefined): { stream: CaptureStream; wanted: () => number; heard: ServerMessage[]; frame: (number: number, camera?: CameraModel) => Numbered } {
   FakeSocket.all = [];
   Object.assign(globalThis, { WebSocket: FakeSocket });
   let wanted = 0;
   const heard: ServerMessage[] = [];
-  const packed = (frame: Numbered): Promise<Frame> =>
-    Promise.resolve({ type: "frame", frame: frame.number, timestamp_s: frame.timestamp_s, world_from_camera: frame.world_from_camera });
+  const packed = (frame: Numbered): Promise<Frame> => {
+    encoding();
+    return Promise.resolve({ type: "frame", frame: frame.number, timestamp_s: frame.timestamp_s, world_from_camera: frame.world_from_camera });
+  };
   const stream = new CaptureStream("ws://host/v1/stream", { client: "test", keep_s: 30, wishes }, packed, {
     onWanted: () => wanted++,
     onState: () => undefined,
@@ -60,8 +62,8 @@ function begin(wishes: Wishes = {}, pace: Adaptive | null = null): { stream: Cap
 
 const framesOf = (socket: FakeSocket): number[] => socket.sent.filter((each) => each.type === "frame").map((each) => each.frame);
 
-async function opened(wishes?: Wishes, pace?: Adaptive): Promise<ReturnType<typeof begin>> {
-  const session = begin(wishes, pace);
+async function opened(wishes?: Wishes, pace?: Adaptive, encoding?: () => void): Promise<ReturnType<typeof begin>> {
+  const session = begin(wishes, pace, encoding);
   await session.stream.offer(session.frame(0));
   FakeSocket.last.onopen();
   FakeSocket.last.say(welcome());
@@ -177,6 +179,28 @@ test("with a pace a frame is asked for when the one before it is past the slowes
   assert.ok(Math.abs(pace.busy_s - 0.2) < 1e-3); // that the server let it wait is no transfer
   later(210);
   assert.equal(wanted(), 5);
+  stream.stop("");
+});
+
+test("a frame is asked for so early that it is encoded when the one before it is done", async (context) => {
+  context.mock.timers.enable({ apis: ["setTimeout"] });
+  let now_ms = 0;
+  context.mock.method(performance, "now", () => now_ms);
+  const pace = new Adaptive(1 / 15, 0.02);
+  const { stream, wanted, frame } = await opened({}, pace, () => (now_ms += 80));
+  const later = (ms: number): void => {
+    now_ms += ms;
+    context.mock.timers.tick(ms);
+  };
+  await stream.offer(frame(1)); // 20 of 80 ms are expected of the next
+  later(220);
+  FakeSocket.last.say(composite(1));
+  await stream.offer(frame(2)); // 35
+  const before = wanted();
+  later(160);
+  assert.equal(wanted(), before);
+  later(10);
+  assert.equal(wanted(), before + 1); // 30 ms before the server is expected to have done with it
   stream.stop("");
 });
 

@@ -25,7 +25,7 @@ const SHARE = 0.9;
 /** If the server is even slower, quality costs only latency: a direction may take at most a share of this interval. */
 const LONGEST_TRANSFER_S = 0.2;
 /** Weight of the newest measurement. */
-const SMOOTHING = 0.25;
+export const SMOOTHING = 0.25;
 /** Number of consecutive slow frames before one rung down. */
 const BAD_ANSWERS = 2;
 /** Number of consecutive fast frames before one rung up; doubled after each failed try. */

@@ -4,7 +4,7 @@
 import { CAPTURING, Connection, type ConnectionState, REFUSED_CAPTURE } from "../connection";
 import type { CameraModel, Composite, Frame, Layer, Light, ServerMessage } from "../protocol";
 import type { Request, Setup } from "../session";
-import type { Adaptive } from "./adaptive";
+import { type Adaptive, SMOOTHING } from "./adaptive";
 import { isSameCamera } from "./axes";
 import { bytesOf, measuredOf } from "./link";
 import { type Captured, now_ms, type Packed } from "./source";
@@ -40,6 +40,8 @@ export class CaptureStream {
   private isEncoding = false;
   private readonly unanswered = new Map<number, { captured_ms: number; sent_ms: number; bytes: number }>();
   private lastSent_ms = -Infinity;
+  /** To encode a frame, which is not on its way before. */
+  private encoding_ms = 0;
   private timer: ReturnType<typeof setTimeout> | undefined;
   private readonly requests = new Map<number, Request>();
   /** Number of the connection: work begun on an earlier one is not sent on this one. */
@@ -72,10 +74,12 @@ export class CaptureStream {
     if (isOther || !this.hasRoom()) return false;
     const { epoch } = this;
     this.isEncoding = true;
+    const begun_ms = now_ms();
     try {
       const message = await this.encodeFrame(frame);
       if (epoch !== this.epoch) return false;
       this.lastSent_ms = now_ms();
+      this.encoding_ms += SMOOTHING * (this.lastSent_ms - begun_ms - this.encoding_ms);
       this.unanswered.set(frame.number, { captured_ms: frame.captured_ms, sent_ms: this.lastSent_ms, bytes: bytesOf(message) });
       this.connection?.send(message);
       return true;
@@ -151,9 +155,9 @@ export class CaptureStream {
     this.hooks.onWanted();
   }
 
-  /** Time until a frame can be sent without waiting behind another. */
+  /** Time until a frame that is encoded from then on will not wait behind another. */
   private wait_ms(): number {
-    return 1000 * (this.pace?.wait_s(now_ms() / 1000, this.lastSent_ms / 1000, this.unanswered.size) ?? 0);
+    return 1000 * (this.pace?.wait_s((now_ms() + this.encoding_ms) / 1000, this.lastSent_ms / 1000, this.unanswered.size) ?? 0);
   }
 
   private receive(message: ServerMessage): void {

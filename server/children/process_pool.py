@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import mmap
 import os
 import select
@@ -16,7 +15,12 @@ from server.children.child import ANSWER, DONE, REQUEST
 from server.children.nursery import ChildDied, JobSpec, Nursery
 from server.children.turns import Turn
 
-IS_SUPPORTED = hasattr(os, "memfd_create") and hasattr(fcntl, "F_ADD_SEALS")
+try:
+    import fcntl
+except ImportError:  # Windows
+    IS_SUPPORTED = False
+else:
+    IS_SUPPORTED = hasattr(os, "memfd_create") and hasattr(fcntl, "F_ADD_SEALS")
 """Whether this system supports sealed shared memory."""
 PIPE_BYTES = 1 << 20
 STOPPED = "was stopped: the server ends"

@@ -178,9 +178,8 @@ class RoomModel:
         solution = self._solution
         if solution is None or self._patches.fresh > 0:
             return False
-        moved = self._patches.logarithms[solution.rows] - solution.shown
-        is_same = float(np.sqrt(np.mean(moved**2))) <= STILL
-        return is_same and solution.near.step <= STILL and solution.distant.step <= STILL
+        change = solution.change_in(self._patches)
+        return max(change, solution.near.step, solution.distant.step) <= STILL
 
     def estimate(self, bands: int) -> LightEstimate:
         """The light from beyond the scan."""

@@ -16,6 +16,7 @@ from server.light.place_light import VALID_SPREAD_DEG, PlaceLight
 from server.light.shell.bright_surface import Emitters
 from server.light.shell.distant import distant_light
 from server.light.shell.lamps import ShellLamp, emitting_lamps, find_lamps
+from server.light.shell.patches import Patches
 from server.light.shell.shell import CORNERS, SIDE, Shell
 from server.light.shell.solved import Solved
 from server.light.shell.spread import deviations, spread_deg
@@ -77,6 +78,10 @@ class Solution:
     """What `beyond` found last."""
     _estimates: dict[int, LightEstimate] = field(default_factory=dict)
     """Of `estimate`, by the number of bands."""
+
+    def change_in(self, patches: Patches) -> float:
+        """By how much the logarithm of what its patches show has changed since, root mean square."""
+        return float(np.sqrt(np.mean((patches.logarithms[self.rows] - self.shown) ** 2)))
 
     def radiance_at(self, engine: Engine, volume: Volume, position: Floats, directions: Floats) -> Floats:
         """[m, 3] radiance that arrives at `position` [3] (world) against `directions` [m, 3]."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from server.light.shell.bright_surface import EmittersSeen
 from server.light.shell.evidence import evidence_of
 from server.light.shell.objective import Unknowns, step
-from server.light.shell.patches import MOST_PATCHES, PATCH_M, Patches
+from server.light.shell.patches import PATCH_M, Patches
 from server.light.shell.shell import Shell, closed_sides, shell_around
 from server.light.shell.solution import Solution
 from server.light.shell.sources import distant_sources, near_sources
@@ -43,8 +43,7 @@ class Solver:
         self._transport = Transport()
         self._near, self._distant = Unknowns(), Unknowns()
         self._shell: Shell | None = None
-        self._shown = np.full((MOST_PATCHES, 3), np.inf)
-        """Mean log radiance of patches in the last solution."""
+        self._last: Solution | None = None
 
     def begin_with(self, shell: Shell | None) -> None:
         """Keep the size and place of the shell of an earlier solution."""
@@ -69,7 +68,8 @@ class Solver:
         distant = distant_sources(self._transport, closed, evidence.rows, with_indirect=switches.indirect)
         first = patches.outdated if self._near.known > 0 and switches.memory else 1.0
         self._distant.most_relaxation = DISTANT_SHARE ** (1 - patches.outdated)
-        moved = MOVED * float(np.clip(self._change(patches, rows) / STILL, STILL / MOVED, 1.0))
+        change = self._last.change_in(patches) if self._last else np.inf
+        moved = MOVED * float(np.clip(change / STILL, STILL / MOVED, 1.0))
         for unknowns, sources, steady in ((self._near, near, moved), (self._distant, distant, DISTANT_MOVED)):
             settled = steady ** (1 - first) * NEW_MOVED**first
             unknowns.relaxation = max(unknowns.relaxation, patches.outdated)
@@ -78,12 +78,6 @@ class Solver:
                 if unknowns.step < settled:
                     break
         hidden, shown = dict(self._transport.hidden), patches.logarithms[rows]
-        return Solution(shell, hidden, bright.emitters, self._near.solved(), self._distant.solved(LOBES), rows, shown)
-
-    def _change(self, patches: Patches, rows: NDArray[np.int64]) -> float:
-        """By how much what patches show has changed since the last solution, root mean square; infinite at first."""
-        before, now = self._shown[rows], patches.logarithms[rows]
-        self._shown[:] = np.inf
-        self._shown[rows] = now
-        is_known = np.isfinite(before)
-        return float(np.sqrt(np.mean((now - before)[is_known] ** 2))) if is_known.any() else float("inf")
+        solved = self._near.solved(), self._distant.solved(LOBES)
+        self._last = Solution(shell, hidden, bright.emitters, *solved, rows, shown)
+        return self._last

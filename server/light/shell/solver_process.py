@@ -30,7 +30,7 @@ from server.light.shell.switches import Switches
 log = logging.getLogger(__name__)
 
 JOB = JobSpec("server.light.shell.solver_child:answer", memory_mib=4096, timeout_s=60.0, max_answer_bytes=64 << 20)
-"""A child takes 0.1 GB, a solution 0.1 to 1 s (the first) and 2 MB: the limits stop what has gone wrong."""
+"""A child takes 0.1 GB, a solution 0.1 to 1 s (the first) and 0.5 MB: the limits stop what has gone wrong."""
 
 NOT_NEEDED = "is not needed any more: the room is closed"
 

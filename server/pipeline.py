@@ -217,6 +217,7 @@ class Pipeline:
             self._room.objects.up,
             context.ray_length_m,
             with_indirect=self._settings.indirect != "none",
+            is_kept=reuse.reason is not None,
         )
         if reuse.reason is not None:
             self._cache.keep(samples, reuse.samples_version, frozenset({"cells"}))

@@ -1,9 +1,9 @@
 // Radiance transfer that earlier frames found at places of the world, in a hash table of cells.
-// Provides find_samples, claim_entries, store_samples.
+// Provides find_samples, choose_samples, store_samples.
 //
 // A cell is about as large as the distance between samples there, so that a sample of the next frame finds what one of this frame left.
-// Two places of the table are tried for a cell. Which sample fills a place depends on the numbers of the samples only, not on
-// the order in which work-items run.
+// Two places of the table are tried for a cell. Which sample fills a place, and which are traced, depends on the numbers of the samples
+// only, not on the order in which work-items run.
 #include "samples.clh"
 
 #ifndef BANDS
@@ -21,6 +21,9 @@
 #define FLAT 2.0f    // height of a cell along the axis that its surface faces, in sides: noise of the surface rarely leaves it
 #define FACING 0.8f  // least cosine between normals of one surface
 #define NOT_STORED (-1)
+#define LENT (1 << 30)  // with the number of the sample whose values a sample takes; a table has fewer places
+#define ORDERS 16       // of samples in a block of 4 x 4, for those that are new and for those that are old
+#define BLOCK 4
 
 // Words of an entry. The first is 0 where there is none.
 #define KEY 0
@@ -85,12 +88,25 @@ static inline int is_of(global const uint *entry, const Cell cell, const float3 
            dot(vector_in(entry, NORMAL), normal) >= FACING;
 }
 
+// Where a new sample stands in the order in which those of its block are traced: each is far from those before it.
+static inline int order_of_new(const int row, const int col) {
+    const uchar order[BLOCK * BLOCK] = {0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5};
+    return order[row % BLOCK * BLOCK + col % BLOCK];
+}
+
+// Where an old entry stands: at another place in each frame, so that none waits for more than ORDERS of them.
+static inline int order_of_old(const int place, const int now) {
+    return (place + now) % ORDERS;
+}
+
 // positions, normals [h][w]: the geometry buffer; entries [places][WORDS]. -> found [rows][cols]: the place of a sample's entry,
-// whose values are then in transfer, openness, flatness, free_mask, sets (see radiance_transfer.cl) hits and met (see indirect.cl); or
-// NOT_STORED, where they are as they were.
+// whose values are then in transfer, openness, flatness, free_mask, sets (see radiance_transfer.cl) hits and met (see indirect.cl); the
+// same as -2 - place where it is too old; or NOT_STORED, where they are as they were. counts [2 * ORDERS + 1], 0 before: surface samples
+// that have no entry, by order, then entries that are too old. claims [places], all UINT_MAX before: the first sample of each of these.
 kernel void find_samples(const TransferCacheParameters p, global const float4 *positions, global const float4 *normals,
                          global uint *entries, global float *transfer, global float *openness, global float *flatness,
-                         global uint *free_mask, global uchar *sets, global float4 *hits, global uint *met, global int *found) {
+                         global uint *free_mask, global uchar *sets, global float4 *hits, global uint *met, global int *found,
+                         global int *counts, global uint *claims) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= p.grid.cols || row >= p.grid.rows) return;
@@ -100,10 +116,10 @@ kernel void find_samples(const TransferCacheParameters p, global const float4 *p
     if (position.w <= 0.0f || normal.w <= 0.0f) return;
     const Cell cell = cell_of(p, position.xyz, normal.xyz);
     for (int way = 0; way < WAYS; way++) {
-        global uint *entry = entries + (size_t)cell.places[way] * WORDS;
+        const int place = cell.places[way];
+        global uint *entry = entries + (size_t)place * WORDS;
         if (!is_of(entry, cell, position.xyz, normal.xyz)) continue;
-        if (p.now - (int)entry[TRACED] >= (int)entry[LASTS]) return;
-        entry[USED] = (uint)p.now;
+        const int is_met = atomic_xchg(&entry[USED], (uint)p.now) == (uint)p.now;
         for (int i = 0; i < COEFFICIENTS; i++) transfer[sample * COEFFICIENTS + i] = as_float(entry[TRANSFER + i]);
         for (int i = 0; i < MASK_WORDS; i++) free_mask[sample * MASK_WORDS + i] = entry[MASK_AT + i];
         for (int i = 0; i < MOST_MET; i++) met[sample * MOST_MET + i] = entry[MET + i];
@@ -111,55 +127,129 @@ kernel void find_samples(const TransferCacheParameters p, global const float4 *p
         flatness[sample] = as_float(entry[FLATNESS]);
         sets[sample] = (uchar)entry[SET];
         hits[sample] = (float4)(vector_in(entry, HITS), as_float(entry[HITS + 3]));
-        found[sample] = cell.places[way];
+        const int is_old = p.now - (int)entry[TRACED] >= (int)entry[LASTS];
+        found[sample] = is_old ? -2 - place : place;
+        if (is_old) atomic_min(&claims[place], (uint)sample);
+        if (is_old && !is_met) atomic_inc(&counts[ORDERS + order_of_old(place, p.now)]);
         return;
     }
+    atomic_inc(&counts[order_of_new(row, col)]);
 }
 
-// Samples that were not found ask for a place: that of their entry, which is too old, else the one that was not found for the longest
-// time, but none that was found in this frame. Surfaces in one cell that face several ways may have an entry each. Samples that ask for the
-// same place agree on the first of them. claims [places]: all UINT_MAX before. -> found: -2 - place where a sample asks for one.
-kernel void claim_entries(const TransferCacheParameters p, global const float4 *positions, global const float4 *normals,
-                          global const uint *entries, global uint *claims, global int *found) {
+// How many orders are traced: all whose samples are `left` at most, but always the first that has any.
+static inline int orders_in(global const int *counts, const int left) {
+    int orders = 0, sum = 0;
+    while (orders < ORDERS && (sum == 0 || sum + counts[orders] <= left)) sum += counts[orders++];
+    return orders;
+}
+
+static inline int sum_of(global const int *counts, const int orders) {
+    int sum = 0;
+    for (int i = 0; i < orders; i++) sum += counts[i];
+    return sum;
+}
+
+// The nearest sample on the same surface, of those up to BLOCK - 1 samples away, that has values: it is found, or new and of the first
+// `orders`. NOT_STORED where there is none.
+static int lender_of(const Grid grid, global const float4 *positions, global const float4 *normals, global const int *found,
+                     const int orders, const int row, const int col, const float side_m) {
+    const int pixel = sample_pixel(grid, row, col);
+    const float3 position = positions[pixel].xyz, normal = normals[pixel].xyz;
+    int lender = NOT_STORED;
+    float nearest = INFINITY;
+    for (int y = max(row - BLOCK + 1, 0); y < min(row + BLOCK, grid.rows); y++)
+        for (int x = max(col - BLOCK + 1, 0); x < min(col + BLOCK, grid.cols); x++) {
+            const int sample = y * grid.cols + x, at = sample_pixel(grid, y, x);
+            if (found[sample] == NOT_STORED && order_of_new(y, x) >= orders) continue;
+            const float4 there = positions[at];
+            const float3 offset = there.xyz - position;
+            const float apart = dot(offset, offset);
+            if (there.w <= 0.0f || normals[at].w <= 0.0f || apart >= nearest || fabs(dot(offset, normal)) > side_m ||
+                dot(normals[at].xyz, normal) < FACING)
+                continue;
+            lender = sample;
+            nearest = apart;
+        }
+    return lender;
+}
+
+// Which samples are traced: all where p.most is not less than there are; else p.most, new ones first, in an order that covers the picture
+// evenly, then one of each entry that is too old. New ones that wait take the values of one beside them; where none is on the same surface, they are traced, too. The others keep what the
+// entry has. New samples that are traced ask for a place: the one that was not found for the longest time, but none that was found in this
+// frame. Surfaces in one cell that face several ways may have an entry each. Samples that ask for the same place agree on the first of them.
+// found, counts, claims: of find_samples. -> kept [rows][cols]: the place of a sample's entry, LENT + the sample whose values it takes; of
+// those that are traced NOT_STORED, or -2 - place where one asks for a place. The last of counts: how many samples and entries wait.
+kernel void choose_samples(const TransferCacheParameters p, global const float4 *positions, global const float4 *normals,
+                           global const uint *entries, global const int *found, global int *counts, global uint *claims,
+                           global int *kept) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= p.grid.cols || row >= p.grid.rows) return;
     const int sample = row * p.grid.cols + col, pixel = sample_pixel(p.grid, row, col);
     const float4 position = positions[pixel], normal = normals[pixel];
-    if (found[sample] != NOT_STORED || position.w <= 0.0f || normal.w <= 0.0f) return;
+    const int there = found[sample];
+    kept[sample] = there;
+    if (there >= 0 || position.w <= 0.0f || normal.w <= 0.0f) return;
+    const int orders = orders_in(counts, p.most);
+    if (there != NOT_STORED) {
+        const int place = -2 - there, is_first = claims[place] == (uint)sample;
+        if (p.most >= p.grid.rows * p.grid.cols) return;
+        if (is_first && order_of_old(place, p.now) < orders_in(counts + ORDERS, p.most - sum_of(counts, orders))) return;
+        kept[sample] = place;
+        if (!is_first) return;
+        claims[place] = UINT_MAX;
+        atomic_inc(&counts[2 * ORDERS]);
+        return;
+    }
     const Cell cell = cell_of(p, position.xyz, normal.xyz);
+    if (order_of_new(row, col) >= orders) {
+        const int lender = lender_of(p.grid, positions, normals, found, orders, row, col, cell.side_m);
+        if (lender != NOT_STORED) {
+            kept[sample] = LENT + lender;
+            atomic_inc(&counts[2 * ORDERS]);
+            return;
+        }
+    }
     int place = NOT_STORED, oldest = p.now;
     for (int way = 0; way < WAYS; way++) {
-        global const uint *entry = entries + (size_t)cell.places[way] * WORDS;
-        if ((int)entry[USED] >= oldest) continue;
-        oldest = (int)entry[USED];
+        const int used = (int)entries[(size_t)cell.places[way] * WORDS + USED];
+        if (used >= oldest) continue;
+        oldest = used;
         place = cell.places[way];
     }
-    for (int way = WAYS - 1; way >= 0; way--)
-        if (is_of(entries + (size_t)cell.places[way] * WORDS, cell, position.xyz, normal.xyz)) place = cell.places[way];
     if (place == NOT_STORED) return;
-    found[sample] = -2 - place;
+    kept[sample] = -2 - place;
     atomic_min(&claims[place], (uint)sample);
 }
 
-// Arguments as in find_samples and claim_entries; the arrays of samples now hold values of this frame. The first traced frame of a
-// cell is told earlier by a part of the period, so that cells do not all become too old at once. An entry of the same surface as before
-// lasts twice as long, up to p.longest frames. disc_frames [places]: see
-// shadow_map.cl; 0 where an entry is new. -> found: the place of the sample's entry, else NOT_STORED.
+// Arguments as in find_samples and choose_samples; the arrays of samples now hold values of this frame, but those of samples that take
+// the values of others. The first traced frame of a cell is told earlier by a part of the period, so that cells do not all become too old
+// at once. An entry of the same surface as before lasts twice as long, up to p.longest frames. disc_frames [places]: see shadow_map.cl; 0
+// where an entry is new. -> kept: the place of the sample's entry, else NOT_STORED.
 kernel void store_samples(const TransferCacheParameters p, global const float4 *positions, global const float4 *normals, global uint *entries,
-                          global const float *transfer, global const float *openness, global const float *flatness,
-                          global const uint *free_mask, global const uchar *sets, global const float4 *hits, global const uint *met,
-                          global uint *claims, global int *disc_frames, global int *found) {
+                          global float *transfer, global float *openness, global float *flatness, global uint *free_mask, global uchar *sets,
+                          global float4 *hits, global uint *met, global uint *claims, global int *disc_frames, global int *kept) {
     const int col = get_global_id(0);
     const int row = get_global_id(1);
     if (col >= p.grid.cols || row >= p.grid.rows) return;
     const int sample = row * p.grid.cols + col, pixel = sample_pixel(p.grid, row, col);
-    if (found[sample] >= NOT_STORED) return;
-    const int place = -2 - found[sample];
+    if (kept[sample] >= LENT) {
+        const int lender = kept[sample] - LENT;
+        for (int i = 0; i < COEFFICIENTS; i++) transfer[sample * COEFFICIENTS + i] = transfer[lender * COEFFICIENTS + i];
+        for (int i = 0; i < MASK_WORDS; i++) free_mask[sample * MASK_WORDS + i] = free_mask[lender * MASK_WORDS + i];
+        for (int i = 0; i < MOST_MET; i++) met[sample * MOST_MET + i] = met[lender * MOST_MET + i];
+        openness[sample] = openness[lender];
+        flatness[sample] = flatness[lender];
+        sets[sample] = sets[lender];
+        hits[sample] = hits[lender];
+        kept[sample] = NOT_STORED;
+    }
+    if (kept[sample] >= NOT_STORED) return;
+    const int place = -2 - kept[sample];
     const int is_first = claims[place] == (uint)sample;
-    found[sample] = is_first ? place : NOT_STORED;
+    kept[sample] = is_first ? place : NOT_STORED;
     if (!is_first) return;
-    claims[place] = 0xffffffffu;
+    claims[place] = UINT_MAX;
     disc_frames[place] = 0;
     const float3 position = positions[pixel].xyz, normal = normals[pixel].xyz;
     const Cell cell = cell_of(p, position, normal);
@@ -172,8 +262,8 @@ kernel void store_samples(const TransferCacheParameters p, global const float4 *
     entry[USED] = (uint)p.now;
     entry[LASTS] = (uint)lasts;
     entry[SET] = sets[sample];
-    const float kept[8] = {position.x, position.y, position.z, normal.x, normal.y, normal.z, openness[sample], flatness[sample]};
-    for (int i = 0; i < 8; i++) entry[POSITION + i] = as_uint(kept[i]);
+    const float of_sample[8] = {position.x, position.y, position.z, normal.x, normal.y, normal.z, openness[sample], flatness[sample]};
+    for (int i = 0; i < 8; i++) entry[POSITION + i] = as_uint(of_sample[i]);
     const float4 sent = hits[sample];
     const float of_hits[4] = {sent.x, sent.y, sent.z, sent.w};
     for (int i = 0; i < 4; i++) entry[HITS + i] = as_uint(of_hits[i]);

@@ -165,9 +165,10 @@ TRANSFER_CACHE_PARAMETERS = Struct(
     period="int",
     longest="int",
     places="int",
+    most="int",
 )
 """Parameters of transfer_cache.cl. eye: where the camera is, volume metres; spacing: metres between samples that are a
-metre away."""
+metre away; most: samples that a frame traces."""
 
 LOOK_UP_PARAMETERS = Struct(
     "LookUpParameters",

@@ -49,21 +49,10 @@ class Indirect:
 
 
 def observe_indirect(
-    engine: Engine,
-    camera: CameraModel,
-    volume: Volume,
-    surface: Surface,
-    transfer: Transfer,
-    rays: Directions,
-    ray_length_m: float,
-    mean: MeanSent,
-    found: cl_array.Array | None = None,
+    engine: Engine, transfer: Transfer, rays: Directions, hits: cl_array.Array, mean: MeanSent
 ) -> Indirect:
-    """Indirect light at the samples of `transfer`, from the surfaces that block their directions.
-
-    `mean`: of the session. `found`: of transfer_cache.py; samples that were found there keep their values.
-    """
-    hits = gather_hits(engine, camera, volume, surface, transfer, rays, ray_length_m, found=found)
+    """Indirect light at the samples of `transfer`, from the surfaces that block their directions: the `hits` of
+    `gather_hits`, once all samples have theirs. `mean`: of the session."""
     return Indirect(hits, mean.update(engine, hits), room_for_met(engine, transfer, rays))
 
 
@@ -79,7 +68,9 @@ def gather_hits(
     found: cl_array.Array | None = None,
 ) -> cl_array.Array:
     """[rows, cols] float4: sums over a sample's blocked directions that meet surface with a colour: cosine times
-    radiance (rgb) and cosine (w), both times `every`. The directions that met surface are in `room_for_met`."""
+    radiance (rgb) and cosine (w), both times `every`. The directions that met surface are in `room_for_met`.
+
+    `found`: of transfer_cache.py; samples that were found there keep their values."""
     hits, met = room_for_hits(engine, transfer), room_for_met(engine, transfer, rays, every)
     words = transfer.free_mask.shape[2]
     defines = {"MASK_WORDS": words, "LANES": engine.lanes, "INTERLEAVE": transfer.interleave}

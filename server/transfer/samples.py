@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from protocol.messages import LeftOut
 from server.opencl.engine import Engine
-from server.transfer.indirect import Indirect, MeanSent, observe_indirect
+from server.transfer.indirect import Indirect, MeanSent, gather_hits, observe_indirect
 from server.transfer.radiance_transfer import Directions, Transfer
 from server.transfer.real_depth_views import RealDepthViews
 from server.transfer.sampling import Sampling, TransferSampler
-from server.transfer.transfer_cache import LONGEST, TransferCache
+from server.transfer.transfer_cache import LONGEST, ORDERS, TransferCache
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
 
@@ -87,8 +87,15 @@ class SampledTransfer:
 
     def left_out(self) -> tuple[LeftOut, ...]:
         """What of the last frame's transfer may have been found instead of traced."""
-        reason = f"traced at most {LONGEST} frames ago at the same place of the world"
-        return (LeftOut(effect="transfer_of_known_places", reason=reason, error_bound=None),) if self._has_found else ()
+        if not self._has_found or self._cache is None:
+            return ()
+        reason = f"traced at most {LONGEST + ORDERS} frames ago at the same place of the world"
+        known = LeftOut(effect="transfer_of_known_places", reason=reason, error_bound=None)
+        share = self._cache.share_waiting()
+        if share == 0.0:
+            return (known,)
+        waits = f"{share:.1%} of the samples wait for their turn: new ones take the values of one beside them"
+        return known, LeftOut(effect="transfer_of_new_places", reason=waits, error_bound=None)
 
     def sample(
         self,
@@ -99,20 +106,23 @@ class SampledTransfer:
         ray_length_m: float,
         *,
         with_indirect: bool,
+        is_kept: bool = False,
     ) -> TransferSamples:
-        """Transfer of the real world without virtual objects (eq. 5.2). up: [3] unit, world axes."""
+        """Transfer of the real world without virtual objects (eq. 5.2). up: [3] unit, world axes. is_kept: frames to
+        come are drawn with it, so that no sample waits for its turn."""
         engine, camera, rays = self._engine, self._camera, self._sampler.rays
         cache, found = self._cache if self._sampler.is_kept else None, None
         self._has_found = cache is not None
         if cache:
             stride = self._sampler.sampling.stride
-            found = cache.find(camera, volume, surface, volume_from_camera, stride, rays, ray_length_m)
-        transfer = self._sampler.transfer(volume, surface, volume_from_camera, up, ray_length_m, found)
-        sent = None
-        if with_indirect:
-            sent = observe_indirect(
-                engine, camera, volume, surface, transfer, rays, ray_length_m, self._mean_sent, found
+            found = cache.find(
+                camera, volume, surface, volume_from_camera, stride, rays, ray_length_m, traces_all=is_kept
             )
-        if cache:
+        transfer = self._sampler.transfer(volume, surface, volume_from_camera, up, ray_length_m, found)
+        hits = None
+        if with_indirect:
+            hits = gather_hits(engine, camera, volume, surface, transfer, rays, ray_length_m, found=found)
+        if cache:  # after it all samples have their values
             transfer = replace(transfer, cells=cache.store())
+        sent = None if hits is None else observe_indirect(engine, transfer, rays, hits, self._mean_sent)
         return TransferSamples(transfer, sent)

@@ -5,8 +5,14 @@ of the world. A cell is 1.4 to 2 times as long as the distance between samples, 
 saw a frame, or a turn, ago. A sample that finds nothing is traced and stored. Surfaces in one cell that face two ways
 have an entry each. A cell is traced again after PERIOD frames, then after twice as many each time, LONGEST at most,
 because a young scan grows and an old one hardly does. So an entry is off by what the scan has changed in as many
-frames as it was old, LONGEST at most, and belongs to a point in the same cell. Surface that moves is no exception:
-what a point sees of the scan depends on where it is only.
+frames as it was old, and belongs to a point in the same cell. Surface that moves is no exception: what a point sees of
+the scan depends on where it is only.
+
+A frame traces MOST_TRACED of its samples at most, in an order that covers the picture evenly: new ones first, each of
+them as far as possible from those before it, then those whose cell is too old. New ones that wait take the values of
+the nearest sample on the same surface, three samples away at most, and are traced where there is none; the next frames
+find or trace them. Old ones that wait stand as they are, ORDERS frames at most. So a first frame, or one that turns to
+what was never seen, costs little more than others.
 
 Transfer that is looked up in depth views (image_space.py) is kept likewise, with what the camera's picture adds near a
 point when it is looked up. What of the picture is not in the scan belongs to no place and is left out.
@@ -24,6 +30,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, float4
+from server.opencl.pending_read import PendingRead
 from server.opencl.structs import TRANSFER_CACHE_PARAMETERS
 from server.transfer.indirect import room_for_hits, room_for_met
 from server.transfer.radiance_transfer import Cells, Directions, Transfer, sample_grid, traced_transfer
@@ -32,6 +39,11 @@ from server.volume.volume import Volume
 
 PERIOD, LONGEST = 16, 64
 """Frames after which a cell is traced again, at first and at most: half a second and two seconds at 30 frames/s."""
+ORDERS = 16
+"""Frames that an old cell waits at most for its turn, as in transfer_cache.cl."""
+MOST_TRACED = 1 / 8
+"""Of a frame's samples: two of each block of 4 x 4, so that all of a new picture has values from the beginning. A
+moving camera calls for a twentieth; with a thirtieth, pictures of the real kitchen differ by FLIP .0003 more."""
 PLACES_A_SAMPLE = 4
 """Size of the table, in samples of a frame, rounded up to a power of two. Views of the last seconds fit, and few cells
 collide."""
@@ -48,7 +60,11 @@ class _Buffers(StageBuffers):
     claims = BufferDescription(np.uint32)
     """[places] the sample that fills a place in this frame."""
     found = BufferDescription(np.int32)
-    """[rows, cols] as find_samples and store_samples return it."""
+    """[rows, cols] as find_samples returns it."""
+    kept = BufferDescription(np.int32)
+    """[rows, cols] as choose_samples and store_samples return it."""
+    counts = BufferDescription(np.int32)
+    """[2 ORDERS + 1] of find_samples and choose_samples."""
     disc_parts = BufferDescription(cl_types.float4)
     disc_frames = BufferDescription(np.int32)
     """[places] of Cells."""
@@ -71,7 +87,7 @@ class _Frame:
 
 
 class TransferCache:
-    """One session's. Call `find`, trace what was not found, then `store`."""
+    """One session's. Call `find`, trace what is not kept, then `store`."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
@@ -79,6 +95,7 @@ class TransferCache:
         self._of: tuple[object, ...] = ()
         self._now = 0
         self._frame: _Frame | None = None
+        self._counts: PendingRead | None = None
 
     def forget(self) -> None:
         """Begin anew with the next frame: transfer is found in another way."""
@@ -93,17 +110,21 @@ class TransferCache:
         stride: int,
         rays: Directions,
         ray_length_m: float,
+        *,
+        traces_all: bool = False,
     ) -> cl_array.Array:
-        """[rows, cols] int32: at least 0 where a sample was found. Its values are then in the arrays that
-        `transfer_radiance` and `gather_hits` return, which leave it out.
+        """[rows, cols] int32: at least 0 where a sample is not traced. Its values are in the arrays that
+        `transfer_radiance` and `gather_hits` return, which leave it out, or will be there after `store`.
 
-        What was found by other rays, in another volume or by another camera model is forgotten.
+        traces_all: none that is new or too old waits. What was found by other rays, in another volume or by another
+        camera model is forgotten.
         """
         engine, transfer = self._engine, traced_transfer(self._engine, camera, stride, rays)
         hits, met = room_for_hits(engine, transfer), room_for_met(engine, transfer, rays)
         defines = {"BANDS": transfer.bands, "MASK_WORDS": transfer.free_mask.shape[2], "MOST_MET": met.shape[2]}
         words = _WORDS_BESIDE + defines["MASK_WORDS"] + transfer.bands**2 + defines["MOST_MET"]
-        places = places_for(transfer.rows * transfer.cols, words)
+        samples = transfer.rows * transfer.cols
+        places = places_for(samples, words)
         self._forget_others(camera, volume, stride, rays, ray_length_m, places, words)
         self._now += 1
         parameters = TRANSFER_CACHE_PARAMETERS(
@@ -114,16 +135,21 @@ class TransferCache:
             period=PERIOD,
             longest=LONGEST,
             places=places,
+            most=samples if traces_all else int(MOST_TRACED * samples),
         )
         self._frame = _Frame(surface, transfer, hits, met, places, words, parameters, defines)
-        found = self._buffers.found.array((transfer.rows, transfer.cols))
+        buffers, size = self._buffers, (transfer.cols, transfer.rows)
+        found, kept = (of.array((transfer.rows, transfer.cols)) for of in (buffers.found, buffers.kept))
+        counts = buffers.counts.array((2 * ORDERS + 1,))
+        counts.fill(np.int32(0))
+        entries, claims = buffers.entries.array((places, words)), buffers.claims.array((places,))
         engine.launch(
             engine.kernel("transfer_cache.cl", "find_samples", **defines),
-            (transfer.cols, transfer.rows),
+            size,
             parameters,
             surface.positions,
             surface.normals,
-            self._buffers.entries.array((places, words)),
+            entries,
             transfer.coefficients,
             transfer.openness,
             transfer.flatness,
@@ -132,31 +158,36 @@ class TransferCache:
             hits,
             met,
             found,
+            counts,
+            claims,
         )
-        return found
+        engine.launch(
+            engine.kernel("transfer_cache.cl", "choose_samples", **defines),
+            size,
+            parameters,
+            surface.positions,
+            surface.normals,
+            entries,
+            found,
+            counts,
+            claims,
+            kept,
+        )
+        self._counts = engine.begin_download(counts)
+        return kept
 
     def store(self) -> Cells:
-        """Keep what the samples that `find` had not found have now. Returns the cells of all samples."""
+        """Keep what the samples that `find` left to be traced have now, and give it to those that wait beside them.
+        Returns the cells of all samples."""
         engine, frame, buffers = self._engine, self._frame, self._buffers
         assert frame is not None
         transfer, surface, places = frame.transfer, frame.surface, frame.places
         entries, claims = buffers.entries.array((places, frame.words)), buffers.claims.array((places,))
         parts, frames = buffers.disc_parts.array((places,)), buffers.disc_frames.array((places,))
-        found = buffers.found.array((transfer.rows, transfer.cols))
-        size = (transfer.cols, transfer.rows)
-        engine.launch(
-            engine.kernel("transfer_cache.cl", "claim_entries", **frame.defines),
-            size,
-            frame.parameters,
-            surface.positions,
-            surface.normals,
-            entries,
-            claims,
-            found,
-        )
+        kept = buffers.kept.array((transfer.rows, transfer.cols))
         engine.launch(
             engine.kernel("transfer_cache.cl", "store_samples", **frame.defines),
-            size,
+            (transfer.cols, transfer.rows),
             frame.parameters,
             surface.positions,
             surface.normals,
@@ -170,9 +201,16 @@ class TransferCache:
             frame.met,
             claims,
             frames,
-            found,
+            kept,
         )
-        return Cells(found, claims, parts, frames, self._now)
+        return Cells(kept, claims, parts, frames, self._now)
+
+    def share_waiting(self) -> float:
+        """Of the last frame's samples, how many were new or too old and were not traced, 0 to 1."""
+        if self._counts is None or self._frame is None:
+            return 0.0
+        transfer = self._frame.transfer
+        return int(self._counts.result()[-1]) / (transfer.rows * transfer.cols)
 
     def _forget_others(
         self,

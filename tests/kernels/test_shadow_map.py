@@ -31,7 +31,7 @@ from server.shading.shadow_map import (
 )
 from server.shading.traced_scene import DeviceLight, take_discs, trace_scene, upload_light
 from server.shading.virtual_point_lights import place_points
-from server.transfer.indirect import MeanSent, observe_indirect
+from server.transfer.indirect import MeanSent, gather_hits, observe_indirect
 from server.transfer.radiance_transfer import Directions, direction_sets, transfer_radiance
 from server.transfer.sample_grid import SampleGrid
 from tests.reference import shadow_map as twin
@@ -466,7 +466,8 @@ class BesideAWall:
         surface = upload_surface(engine, points, np.broadcast_to(UP, points.shape), np.ones((16, 16), bool))
         self.surface = surface
         self.transfer = transfer_radiance(engine, self.camera, volume, surface, 1, rays, FAR_M)
-        self.indirect = observe_indirect(engine, self.camera, volume, surface, self.transfer, rays, FAR_M, MeanSent())
+        hits = gather_hits(engine, self.camera, volume, surface, self.transfer, rays, FAR_M)
+        self.indirect = observe_indirect(engine, self.transfer, rays, hits, MeanSent())
         rest = upload_light(engine, even, rays, indirect=self.indirect)
         split = take_discs(engine, rest, SplitLight(even, (self.light,)), rays)
         objects = [placed(engine, bar)]

@@ -13,10 +13,10 @@ from protocol.frames import CameraModel
 from server.opencl.engine import Engine
 from server.transfer import transfer_cache
 from server.transfer.indirect import room_for_hits, room_for_met
-from server.transfer.radiance_transfer import Cells, Transfer, direction_sets, traced_transfer
-from server.transfer.transfer_cache import TransferCache, places_for
+from server.transfer.radiance_transfer import Transfer, direction_sets, traced_transfer
+from server.transfer.transfer_cache import ORDERS, TransferCache, places_for
 from server.volume.volume import Volume
-from tests.reference.transfer_cache import Table, cell_of
+from tests.reference.transfer_cache import LENT, Samples, Table, cell_of
 from tests.scenes.analytic import Floats
 from tests.scenes.lights import random_directions
 from tests.scenes.solids import SCENES, fill_volume, upload_surface
@@ -42,51 +42,73 @@ class Frames:
         self.twin = Table(places, period, transfer_cache.LONGEST)
         self.random = np.random.default_rng(7)
         self._engine = engine
-        self._now = 0
+        self.now = 0
         self._near = self.random.uniform(0.3, 1.1, (90, 3))
 
-    def samples(self, eye: Floats, places: int) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """Points [n, 3] near a few places of surface, so that frames meet cells again, and their normals."""
+    def samples(self, eye: Floats) -> Samples:
+        """Points near a few places of surface, most often of that of their part of the picture, so that frames meet
+        cells again and samples have others of their surface beside them; and their normals."""
         count = ROWS * COLS
         points, normals = np.empty((count, 3)), np.empty((count, 3))
         for i in range(count):
             while True:
-                which = self.random.integers(len(self._near))
+                block = i // COLS // 5 * 4 + i % COLS // 5
+                which = block if self.random.random() < 0.6 else self.random.integers(len(self._near))
                 points[i] = (self._near[which] + self.random.normal(0, 0.002 if i % 7 else 0.03, 3)).astype(np.float32)
                 tilted = FACES[which % len(FACES)] + self.random.normal(0, 0.1 if i % 5 else 0.6, 3)
                 normals[i] = (tilted / np.linalg.norm(tilted)).astype(np.float32)
-                if cell_of(points[i], normals[i], eye, SPACING, places).margin > CLEAR:
+                if cell_of(points[i], normals[i], eye, SPACING, self.twin.places).margin > CLEAR:
                     break
-        return points, normals, self.random.random(count) > 0.05
+        return Samples(points, normals, self.random.random(count) > 0.05, COLS, eye, SPACING)
 
-    def step(self, eye: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64], Cells, NDArray[np.int64]]:
-        """One frame. Returns the places found by kernel and twin, and the places of all samples after it, likewise.
-
-        All arrays of samples that were found are compared with what the twin's entries were filled from.
-        """
-        self._now += 1
-        points, normals, valid = self.samples(eye, self.twin.places)
+    def find(self, samples: Samples, reach_m: float = REACH_M) -> NDArray[np.int64]:
+        """[n] as TransferCache.find returns it."""
         shape = (ROWS, COLS)
-        surface = upload_surface(
-            self._engine, points.reshape(*shape, 3), normals.reshape(*shape, 3), valid.reshape(shape)
-        )
+        points, normals = samples.points.reshape(*shape, 3), samples.normals.reshape(*shape, 3)
+        surface = upload_surface(self._engine, points, normals, samples.valid.reshape(shape))
         pose = np.eye(4)
-        pose[:3, 3] = eye
-        found = self.cache.find(CAMERA, self.volume, surface, pose, STRIDE, RAYS, REACH_M)
-        by_kernel = self._engine.download(found).astype(np.int64).ravel().copy()
-        by_twin = self.twin.find(points, normals, valid, eye, SPACING, self._now)
+        pose[:3, 3] = samples.eye
+        kept = self.cache.find(CAMERA, self.volume, surface, pose, STRIDE, RAYS, reach_m)
+        return self._engine.download(kept).astype(np.int64).ravel().copy()
+
+    def step(self, eye: Floats) -> tuple[Samples, NDArray[np.int64]]:
+        """One frame, and how its samples came to their values, by the kernels as by the twin.
+
+        All arrays of samples that are not traced are compared with what the twin's entries were filled from; so are,
+        in the end, those of samples that take the values of others, and the places of all.
+        """
+        self.now += 1
+        samples = self.samples(eye)
+        kept = self.find(samples)
+        most = int(transfer_cache.MOST_TRACED * ROWS * COLS)
+        np.testing.assert_array_equal(kept, self.twin.choose(samples, self.now, most))
         values = self.random.integers(1, 200, ROWS * COLS).astype(float)
-        np.testing.assert_array_equal(by_kernel, by_twin)
-        self._fill(by_kernel < 0, values)
+        is_kept, is_lent = (kept >= 0) & (kept < LENT), kept >= LENT
+        values[is_kept] = [self.twin.entries[int(place)].value for place in kept[is_kept]]
+        self._fill(kept < 0, values)
+        self._check(is_kept, values)
+        cells = self.cache.store()
+        values[is_lent] = values[kept[is_lent] - LENT]
+        self._check(is_kept | is_lent, values)
+        after = self.twin.store(samples, self.now, kept, values)
+        np.testing.assert_array_equal(self._engine.download(cells.places).ravel(), after)
+        assert (self._engine.download(cells.claims) == 0xFFFFFFFF).all()
+        waits = is_lent.sum() + self.waiting_entries(kept)
+        assert self.cache.share_waiting() == waits / (ROWS * COLS)
+        return samples, kept
+
+    def waiting_entries(self, kept: NDArray[np.int64]) -> int:
+        """How many cells were too old in the last frame, and were not traced."""
+        found = {int(place) for place in kept if 0 <= place < LENT}
+        entries = [self.twin.entries[place] for place in found]
+        return sum(self.now - entry.traced >= entry.lasts for entry in entries)
+
+    def _check(self, chosen: NDArray[np.bool_], values: Floats) -> None:
         for array in self._arrays():
             of_sample = self._engine.download(array).view(array.dtype).reshape(ROWS * COLS, -1)
             if of_sample.dtype.names:
                 of_sample = of_sample.view(np.float32).reshape(ROWS * COLS, -1)
-            for i in np.flatnonzero(by_kernel >= 0):
-                assert (of_sample[i] == self.twin.entries[int(by_kernel[i])].value).all()
-        cells = self.cache.store()
-        after = self.twin.store(points, normals, valid, eye, SPACING, self._now, by_twin, values)
-        return by_kernel, by_twin, cells, after
+            assert (of_sample[chosen] == values[chosen, None]).all()
 
     def _arrays(self) -> list[cl_array.Array]:
         transfer: Transfer = traced_transfer(self._engine, CAMERA, STRIDE, RAYS)
@@ -110,16 +132,19 @@ class Frames:
             array.set(host, self._engine.queue)
 
 
+@pytest.mark.parametrize("share", [1.0, 1 / 8, 1 / 32])
 @pytest.mark.parametrize(("most_places", "period"), [(1 << 20, 16), (256, 16), (64, 3)])
 def test_samples_are_found_and_kept_as_by_the_twin(
-    engine: Engine, monkeypatch: pytest.MonkeyPatch, most_places: int, period: int
+    engine: Engine, monkeypatch: pytest.MonkeyPatch, most_places: int, period: int, share: float
 ) -> None:
-    """A wide table, one that is too small, and one whose cells soon are too old, and then last longer."""
+    """A wide table, one that is too small, and one whose cells soon are too old, and then last longer; with samples
+    that wait for their turn and without."""
     monkeypatch.setattr(transfer_cache, "MOST_BYTES", most_places * 4 * WORDS)
     monkeypatch.setattr(transfer_cache, "PERIOD", period)
     monkeypatch.setattr(transfer_cache, "LONGEST", 3 * period)
+    monkeypatch.setattr(transfer_cache, "MOST_TRACED", share)
     frames = Frames(engine, places_for(ROWS * COLS, WORDS), period)
-    shares = []
+    shares, lent = [], []
     for eye in (
         np.zeros(3),
         np.zeros(3),
@@ -127,28 +152,41 @@ def test_samples_are_found_and_kept_as_by_the_twin(
         np.array([0.5, 0.5, -0.6]),
         *[np.zeros(3)] * 20,
     ):
-        found, _, cells, after = frames.step(eye)
-        np.testing.assert_array_equal(engine.download(cells.places).ravel(), after)
-        assert (engine.download(cells.claims) == 0xFFFFFFFF).all()
-        shares.append((found >= 0).mean())
+        _, kept = frames.step(eye)
+        shares.append(((kept >= 0) & (kept < LENT)).mean())
+        lent.append((kept >= LENT).mean())
     assert shares[0] == 0
-    assert shares[1] > (0.3 if most_places > 64 else 0.05)
+    assert (lent[0] > 0.15) == (share < 1)
+    assert shares[1] > (0.3 if most_places > 64 else 0.05) * (1 if share == 1 else 0.3)
     lasting = {entry.lasts for entry in frames.twin.entries.values()}
-    assert lasting >= {period} if period > 3 else lasting == {period, 2 * period, 3 * period}
+    assert lasting >= {period} if period > 3 or share < 1 else lasting == {period, 2 * period, 3 * period}
     assert max(shares) < 0.97  # some are invalid, and some face another way than their cell
 
 
 def test_another_way_of_sampling_begins_anew(engine: Engine) -> None:
     frames = Frames(engine, places_for(ROWS * COLS, WORDS), transfer_cache.PERIOD)
     frames.step(np.zeros(3))
-    found, _, _, _ = frames.step(np.zeros(3))
-    assert (found >= 0).any()
-    points, normals, valid = frames.samples(np.zeros(3), frames.twin.places)
-    surface = upload_surface(
-        engine, points.reshape(ROWS, COLS, 3), normals.reshape(ROWS, COLS, 3), valid.reshape(ROWS, COLS)
-    )
-    found = frames.cache.find(CAMERA, frames.volume, surface, np.eye(4), STRIDE, RAYS, 0.5 * REACH_M)
-    assert (engine.download(found) == -1).all()
+    samples, kept = frames.step(np.zeros(3))
+    assert ((kept >= 0) & (kept < LENT)).any()
+    kept = frames.find(samples, 0.5 * REACH_M)
+    assert ((kept < 0) | (kept >= LENT)).all()
+
+
+@pytest.mark.parametrize("share", [0.0, 1 / 8])
+def test_no_cell_waits_for_ever(engine: Engine, monkeypatch: pytest.MonkeyPatch, share: float) -> None:
+    """However few are traced: each cell that is in view again and again is traced ORDERS frames after its time."""
+    monkeypatch.setattr(transfer_cache, "MOST_TRACED", share)
+    monkeypatch.setattr(transfer_cache, "PERIOD", 3)
+    monkeypatch.setattr(transfer_cache, "LONGEST", 6)
+    frames = Frames(engine, places_for(ROWS * COLS, WORDS), 3)
+    samples = frames.samples(np.zeros(3))
+    monkeypatch.setattr(frames, "samples", lambda _: samples)
+    for _ in range(80):
+        _, kept = frames.step(np.zeros(3))
+        seen = [entry for entry in frames.twin.entries.values() if entry.used == frames.now]
+        assert max((frames.now - entry.traced - entry.lasts for entry in seen), default=0) <= ORDERS
+    if share > 0:
+        assert (kept >= LENT).mean() < 0.02
 
 
 def test_the_table_has_four_places_a_sample_up_to_its_bound() -> None:

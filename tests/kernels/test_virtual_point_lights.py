@@ -29,7 +29,14 @@ from server.shading.differential_rendering import (
 )
 from server.shading.traced_scene import Changed, trace_scene, upload_light
 from server.shading.virtual_point_lights import place_points
-from server.transfer.indirect import Indirect, MeanSent, gather_hits, no_hits, observe_indirect
+from server.transfer.indirect import (
+    Indirect,
+    MeanSent,
+    gather_hits,
+    no_hits,
+    observe_indirect,
+    room_for_met,
+)
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
 from server.transfer.sample_grid import SampleGrid
 from tests.scenes import lights
@@ -281,7 +288,8 @@ def test_surface_that_no_picture_shows_sends_the_mean(engine: Engine) -> None:
     volume = fill_volume(engine, (floor(), WALL), VOXEL_M)  # no voxel has a colour
     surface = upload_surface(engine, positions[..., :3], normals[..., :3], positions[..., 3] > 0)
     transfer = transfer_radiance(engine, camera_of(positions), volume, surface, 3, rays, ROOM_M)
-    seen = observe_indirect(engine, camera_of(positions), volume, surface, transfer, rays, ROOM_M, MeanSent())
+    hits = gather_hits(engine, camera_of(positions), volume, surface, transfer, rays, ROOM_M)
+    seen = observe_indirect(engine, transfer, rays, hits, MeanSent())
     assert not seen.mean.any()
     assert not download4(engine, no_hits(engine, transfer)).any()
     assert black[..., 0].min() > 0.1
@@ -370,8 +378,8 @@ def bounced_wall(
     hits = engine.workspace.upload("test_hits", float4(np.ones_like(ratio), valid))
     shadow = RealShadow(stride, engine.workspace.upload("test_ratio", float4(ratio, valid)), shaded)
     light = upload_light(engine, lights.uniform(), rays, indirect=Indirect(hits, np.ones(3)))
-    met = observe_indirect(engine, CAMERA, volume, surface, transfer, rays, ROOM_M, MeanSent()).met
-    assert met is not None
+    gather_hits(engine, CAMERA, volume, surface, transfer, rays, ROOM_M)
+    met = room_for_met(engine, transfer, rays)
     traced = trace_scene(engine, volume, light, rays, ROOM_M, [])
     returned = float(np.abs(FLOOR_RATIO - 1).max())
     bounced = bounce_real(engine, CAMERA, inverse_rigid(view), surface, transfer, traced, shadow, met, returned, spare)

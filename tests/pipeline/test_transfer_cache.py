@@ -24,20 +24,21 @@ from server.transfer.sampling import PRESETS
 from server.transfer.transfer_cache import TransferCache
 from tests.bench.rendering.flip import flip_map
 from tests.data import data_folder
+from tests.reference.transfer_cache import LENT
 
 Pictures = list[NDArray[np.uint8]]
 
 
 @pytest.fixture
 def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Of the samples of each frame, which were found."""
+    """Of the samples of each frame, how many have what is kept at their place."""
     seen: list[float] = []
     find = TransferCache.find
 
-    def watched(cache: TransferCache, *arguments: object) -> cl_array.Array:
-        found: cl_array.Array = find(cache, *arguments)  # type: ignore[arg-type]
-        seen.append(float((found.get() >= 0).mean()))
-        return found
+    def watched(cache: TransferCache, *arguments: object, **options: object) -> cl_array.Array:
+        kept: cl_array.Array = find(cache, *arguments, **options)  # type: ignore[arg-type]
+        seen.append(float(((kept.get() >= 0) & (kept.get() < LENT)).mean()))
+        return kept
 
     monkeypatch.setattr(TransferCache, "find", watched)
     return seen
@@ -63,10 +64,7 @@ def pictures_of(results: list[FrameResult]) -> Pictures:
 def test_a_moving_camera_shows_what_it_would_without(
     device: Device, shares: list[float], name: str, preset: Preset
 ) -> None:
-    """Nearly bit for bit in the first frame, and but for some codes in a few pixels in the others; again the same.
-
-    Surface that only the sensor knows is nowhere in what is kept; in image space it counts without: one code.
-    """
+    """But for some codes in a few pixels; again the same."""
     source = GallerySource(name, width=160)
     on, again, off = (
         pictures_of([result for _, result in play(device, source, wishes_of(source, cache=cache, preset=preset))])
@@ -74,14 +72,33 @@ def test_a_moving_camera_shows_what_it_would_without(
     )
     assert len(shares) == 2 * len(source)
     assert shares[0] == 0
-    assert min(shares[1 : len(source)]) > 0.5  # seen: 0.59
+    assert min(shares[1 : len(source)]) > 0.12  # seen: 0.18; a frame traces an eighth of what is new,
+    assert shares[len(source) - 1] > 0.6  # seen: 0.66
     for cached, repeated, exact in zip(on, again, off, strict=True):
         np.testing.assert_array_equal(cached, repeated)
         apart = np.abs(cached.astype(int) - exact).max(axis=-1)
         assert apart.max() <= 12  # seen: 6, with samples 2.5 cm apart
         assert (apart > 1).mean() < 0.03  # seen: 0.016
         assert flip_map(cached, exact).mean() < 0.006  # seen: 0.0038
-    assert np.abs(on[0].astype(int) - off[0]).max() <= (1 if PRESETS[preset].image_space else 0)
+
+
+@pytest.mark.parametrize("preset", ["reg4", "gr15fast", "art4"])
+def test_where_no_sample_waits_the_first_frame_is_that_without(
+    device: Device, monkeypatch: pytest.MonkeyPatch, preset: Preset
+) -> None:
+    """Surface that only the sensor knows is nowhere in what is kept; in image space it counts without: one code."""
+    source = GallerySource("closed-room", width=160)
+    first: dict[float | str, NDArray[np.uint8]] = {}
+    waits: dict[float | str, bool] = {}
+    for share, cache in ((1.0, "on"), (1 / 8, "on"), ("off", "off")):
+        monkeypatch.setattr(transfer_cache, "MOST_TRACED", share)
+        _, result = next(iter(play(device, source, wishes_of(source, cache=cache, preset=preset))))
+        assert result.color is not None
+        first[share] = result.color
+        waits[share] = "transfer_of_new_places" in {left.effect for left in result.plan.left_out}
+    assert waits == {1.0: False, 1 / 8: True, "off": False}
+    assert np.abs(first[1.0].astype(int) - first["off"]).max() <= (1 if PRESETS[preset].image_space else 0)
+    assert 0 < np.abs(first[1 / 8].astype(int) - first["off"]).max() <= 4  # seen: 2
 
 
 @pytest.mark.parametrize("preset", ["reg4", "art4", "gr15fast"])
@@ -103,8 +120,9 @@ def test_a_thing_that_comes_in_shades_nearly_as_without(device: Device, preset: 
 def test_cells_that_are_traced_again_show_what_has_changed(
     device: Device, monkeypatch: pytest.MonkeyPatch, shares: list[float], preset: Preset, codes: int
 ) -> None:
-    """With cells that last one frame, all is as without, but for what ART takes from the frames before there, and but
-    for surface that only the sensor knows in image space."""
+    """With cells that last one frame and samples that do not wait, all is as without, but for what ART takes from the
+    frames before there, and but for surface that only the sensor knows in image space."""
+    monkeypatch.setattr(transfer_cache, "MOST_TRACED", 1.0)
     monkeypatch.setattr(transfer_cache, "PERIOD", 1)
     monkeypatch.setattr(transfer_cache, "LONGEST", 1)
     source = GallerySource("hand", width=160)
@@ -140,7 +158,7 @@ def test_a_real_kitchen_is_lit_the_same_and_shown_nearly_so(
         session.place_object("duck", duck, Placement(position_m=(-0.6, 0.0, 1.8), scale=0.1))
         found[cache] = [session.process(source[index]) for index in range(6)]
         session.close()
-    assert min(shares[2:]) > 0.7
+    assert shares[5] > 0.7  # seen: 0.79
     for cached, exact in zip(found["on"], found["off"], strict=True):
         assert cached.light.sh == exact.light.sh
         assert [at.sh for at in cached.light.at] == [at.sh for at in exact.light.at]

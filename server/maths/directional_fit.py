@@ -24,7 +24,8 @@ Floats = NDArray[np.float64]
 
 
 def directional_sh(direction: Floats, spread_rad: float, bands: int) -> Floats:
-    """Coefficients [bands^2] of a light that lets a white surface facing it shade to 1 (whole series, spread 0)."""
+    """Coefficients [..., bands^2] of a light from `direction` [..., 3] that lets a white surface facing it shade to 1
+    (whole series, spread 0)."""
     band = band_of(bands * bands)
     return np.asarray(pi * np.exp(-band * (band + 1) * spread_rad**2 / 2) * sh_basis(direction, bands))
 
@@ -146,5 +147,5 @@ def _limits(count: int) -> tuple[Floats, Floats]:
 def _candidates(bands: int, spreads: tuple[float, ...]) -> tuple[Floats, Floats]:
     """Directions [d, 3], and lights along them [bands^2, spreads * d], spread by spread."""
     directions = spherical_fibonacci(_DIRECTIONS)
-    columns = [directional_sh(direction, spread, bands) for spread in spreads for direction in directions]
-    return directions, np.stack(columns, axis=1)
+    lights = np.concatenate([directional_sh(directions, spread, bands) for spread in spreads])
+    return directions, np.ascontiguousarray(lights.T)

@@ -45,10 +45,8 @@ def level_objective(
         ratio = (z[first] - z[second]) / constants.EDGE
         total += constants.SMOOTHNESS * constants.EDGE**2 * (np.sqrt(1 + ratio**2) - 1)
     total += (((materials - middle) / constants.ALBEDO_SPREAD) ** 2).sum() / 2
-    ratio = offsets / constants.SURFACE_SPREAD
-    edge = constants.DARK_EDGE
-    dark = 2 * (edge / constants.SURFACE_SPREAD) ** 2 * (np.sqrt(1 + (offsets / edge) ** 2) - 1)
-    total += np.where(ratio > 0, ratio**2, dark).sum() / 2
+    edge = np.where(offsets < 0, constants.DARK_EDGE, constants.BRIGHT_EDGE)
+    total += ((edge / constants.SURFACE_SPREAD) ** 2 * (np.sqrt(1 + (offsets / edge) ** 2) - 1)).sum()
     return float(total)
 
 

@@ -17,8 +17,8 @@ Minimised is
     + sum_p |e'_p / S'_p|^2 + sum_k |(u_k - t) / s_u|^2 + sum_(k,l) c |u_k - u_l|^2 + |t / s_t|^2 + sum_f |a_f / s_a|^2
     + sum_r log(1 + |c_r / s_c|^2) + |(w - w_0) / s_w|^2
 
-over neighbouring sources (k,l). tau is (o / s_o)^2, but 2 (d / s_o)^2 (sqrt(1 + (o / d)^2) - 1) below 0, which becomes
-linear, and steep where the albedo exceeds 1. b is the log albedo of the brightest white surface, the mean of log s(B_p
+over neighbouring sources (k,l). tau is 2 (d / s_o)^2 (sqrt(1 + (o / d)^2) - 1), which becomes linear at d, sooner below
+0 than above, and steep where the albedo exceeds 1. b is the log albedo of the brightest white surface, the mean of log s(B_p
 m) + o_f(p) between two ranks of patches that count as their chroma is like w_0, white paint's; it sets the level. w is
 the mean chroma of albedo of the patches, of any chroma, between these ranks; for the light from beyond the scan, b and
 w are left out. m follows from its own two terms between the steps: all materials, and b, go along with it, since little
@@ -304,10 +304,12 @@ def _albedo_spreads(switches: Switches) -> _AlbedoSpreads:
 def _albedo_offsets(offsets: Floats, whitest: Floats, regions: Regions, spreads: _AlbedoSpreads) -> Offsets:
     """By the last `offsets` [surfaces] and the greatest, `whitest`, with which an albedo is 1.
 
-    The prior grows slowly for dark ones, since paint may be black, and sharply from `whitest` on.
+    The prior grows slowly for dark ones, since paint may be black, and for bright ones, less slowly: white things among
+    grey ones; and sharply from `whitest` on.
     """
     is_white = offsets >= whitest
-    variance = spreads.surface**2 * np.sqrt(1 + (np.minimum(offsets, 0.0) / weights.DARK_EDGE) ** 2)
+    edge = np.where(offsets < 0, weights.DARK_EDGE, weights.BRIGHT_EDGE)
+    variance = spreads.surface**2 * np.sqrt(1 + (offsets / edge) ** 2)
     beyond = np.where(is_white, 1 / weights.WHITE**2, 0.0)  # precision of a second prior, about `whitest`
     variance = variance / (1 + variance * beyond)
     return Offsets.of(regions, spreads.region**2, variance, variance * beyond * whitest)

@@ -28,9 +28,11 @@ tell where light comes from for texture."""
 SURFACE_SPREAD = 0.09
 """Standard deviation of a surface's log albedo about its material's (segments.py): more would take a wall in shade for
 a dark one."""
-DARK_EDGE = 0.03
-"""Log albedo below its material's from which the prior of a surface's grows linearly: paint may be black. With the tail
-of a Cauchy distribution there are more minima, between which the light jumps."""
+DARK_EDGE, BRIGHT_EDGE = 0.03, 0.1
+"""Log albedo below and above its material's from which the prior of a surface's grows linearly: paint may be black, and
+a mug white among grey things, which have the same chroma. The real kitchen's white mug sends back .85 of the light that
+is found; where the prior of bright surfaces is Gaussian, 1.07. With the tail of a Cauchy distribution there are more
+minima, between which the light jumps."""
 WHITE = 0.005
 """Deviation of a surface's log albedo above 0: nothing sends back more than it receives."""
 ONE_ALBEDO = 0.01

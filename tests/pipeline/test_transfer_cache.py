@@ -64,7 +64,7 @@ def pictures_of(results: list[FrameResult]) -> Pictures:
 def test_a_moving_camera_shows_what_it_would_without(
     device: Device, shares: list[float], name: str, preset: Preset
 ) -> None:
-    """But for some codes in a few pixels; again the same. ART traces pixels anew where samples differ much: in one frame
+    """But for some codes in a few pixels; again the same. ART traces pixels anew where samples differ: in one frame
     eight at the ball's foot, where it does so with what is kept, as dark as in RM's picture, and without does not."""
     unsure = 8 if PRESETS[preset].adaptive else 0
     source = GallerySource(name, width=160)

@@ -95,6 +95,7 @@ class TransferCache:
         self._of: tuple[object, ...] = ()
         self._now = 0
         self._frame: _Frame | None = None
+        self._is_stored = True
         self._counts: PendingRead | None = None
 
     def forget(self) -> None:
@@ -143,6 +144,9 @@ class TransferCache:
         counts = buffers.counts.array((2 * ORDERS + 1,))
         counts.fill(np.int32(0))
         entries, claims = buffers.entries.array((places, words)), buffers.claims.array((places,))
+        if not self._is_stored:  # the last frame was given up
+            claims.fill(np.uint32(_UNCLAIMED))
+        self._is_stored = False
         engine.launch(
             engine.kernel("transfer_cache.cl", "find_samples", **defines),
             size,
@@ -203,6 +207,7 @@ class TransferCache:
             frames,
             kept,
         )
+        self._is_stored = True
         return Cells(kept, claims, parts, frames, self._now)
 
     def share_waiting(self) -> float:

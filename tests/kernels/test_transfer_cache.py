@@ -80,8 +80,7 @@ class Frames:
         self.now += 1
         samples = self.samples(eye)
         kept = self.find(samples)
-        most = int(transfer_cache.MOST_TRACED * ROWS * COLS)
-        np.testing.assert_array_equal(kept, self.twin.choose(samples, self.now, most))
+        np.testing.assert_array_equal(kept, self.twin.choose(samples, self.now, self.most))
         values = self.random.integers(1, 200, ROWS * COLS).astype(float)
         is_kept, is_lent = (kept >= 0) & (kept < LENT), kept >= LENT
         values[is_kept] = [self.twin.entries[int(place)].value for place in kept[is_kept]]
@@ -96,6 +95,17 @@ class Frames:
         waits = is_lent.sum() + self.waiting_entries(kept)
         assert self.cache.share_waiting() == waits / (ROWS * COLS)
         return samples, kept
+
+    def give_up(self, eye: Floats) -> None:
+        """A frame in which nothing is stored."""
+        self.now += 1
+        samples = self.samples(eye)
+        np.testing.assert_array_equal(self.find(samples), self.twin.choose(samples, self.now, self.most))
+
+    @property
+    def most(self) -> int:
+        """Samples that a frame traces."""
+        return int(transfer_cache.MOST_TRACED * ROWS * COLS)
 
     def waiting_entries(self, kept: NDArray[np.int64]) -> int:
         """How many cells were too old in the last frame, and were not traced."""
@@ -170,6 +180,17 @@ def test_another_way_of_sampling_begins_anew(engine: Engine) -> None:
     assert ((kept >= 0) & (kept < LENT)).any()
     kept = frames.find(samples, 0.5 * REACH_M)
     assert ((kept < 0) | (kept >= LENT)).all()
+
+
+def test_a_frame_that_was_given_up_leaves_no_claims(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each third frame ends before anything is stored."""
+    monkeypatch.setattr(transfer_cache, "PERIOD", 3)
+    frames = Frames(engine, places_for(ROWS * COLS, WORDS), 3)
+    for _ in range(8):
+        frames.step(np.zeros(3))
+        _, kept = frames.step(np.zeros(3))
+        frames.give_up(np.zeros(3))
+    assert ((kept >= 0) & (kept < LENT)).mean() > 0.4
 
 
 @pytest.mark.parametrize("share", [0.0, 1 / 8])

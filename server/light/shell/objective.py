@@ -21,9 +21,9 @@ over neighbouring sources (k,l). tau is 2 (d / s_o)^2 (sqrt(1 + (o / d)^2) - 1),
 0 than above, and steep where the albedo exceeds 1. b is the log albedo of the brightest white surface, the mean of log
 s(B_p m) + o_f(p) between two ranks of patches that count as their chroma is like w_0, white paint's; it sets the level.
 w is the mean chroma of albedo of the patches, of any chroma, between these ranks; for the light from beyond the scan, b
-and w are left out. m follows from its own two terms between the steps: all materials, and b, go along with it, since
-little else of the objective changes where all albedo grows and all light falls. The weights stand in weights.py. A
-patch that is clipped only counts where (1) is below what it shows; its material is the mean one.
+and w are left out, and tau is quadratic above 0. m follows from its own two terms between the steps: all materials, and
+b, go along with it, since little else of the objective changes where all albedo grows and all light falls. The weights
+stand in weights.py. A patch that is clipped only counts where (1) is below what it shows; its material is the mean one.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ def step(
     counts[(known == 0) & (sources.shares.sum(axis=1) <= sources.least_share)] = 0.0
 
     design = np.concatenate([parts, ((1 - albedo)[:, None] * materials).astype(np.float32)], axis=1)
-    spreads = _albedo_spreads(switches)
+    spreads = _albedo_spreads(switches, finds_level=finds_level)
     regions = Regions.of(design, counts, evidence)
     whitest = -_means(np.log(albedo), evidence.surfaces)
     surfaces = _albedo_offsets(offsets, whitest, regions, spreads)
@@ -289,6 +289,7 @@ class _AlbedoSpreads:
     material: float = weights.ALBEDO_SPREAD
     surface: float = weights.SURFACE_SPREAD
     region: float = weights.REGION_SPREAD
+    bright_edge: float = np.inf
 
 
 def _counts(error: Floats, evidence: Evidence, switches: Switches) -> Floats:
@@ -297,8 +298,10 @@ def _counts(error: Floats, evidence: Evidence, switches: Switches) -> Floats:
     return np.where(evidence.is_clipped & (error < 0), 0.0, counts)
 
 
-def _albedo_spreads(switches: Switches) -> _AlbedoSpreads:
-    return _AlbedoSpreads() if switches.albedos else _AlbedoSpreads(*[weights.ONE_ALBEDO] * 3)
+def _albedo_spreads(switches: Switches, *, finds_level: bool) -> _AlbedoSpreads:
+    if not switches.albedos:
+        return _AlbedoSpreads(*[weights.ONE_ALBEDO] * 3)
+    return _AlbedoSpreads(bright_edge=weights.BRIGHT_EDGE if finds_level else np.inf)
 
 
 def _albedo_offsets(offsets: Floats, whitest: Floats, regions: Regions, spreads: _AlbedoSpreads) -> Offsets:
@@ -308,7 +311,7 @@ def _albedo_offsets(offsets: Floats, whitest: Floats, regions: Regions, spreads:
     grey ones; and sharply from `whitest` on.
     """
     is_white = offsets >= whitest
-    edge = np.where(offsets < 0, weights.DARK_EDGE, weights.BRIGHT_EDGE)
+    edge = np.where(offsets < 0, weights.DARK_EDGE, spreads.bright_edge)
     variance = spreads.surface**2 * np.sqrt(1 + (offsets / edge) ** 2)
     beyond = np.where(is_white, 1 / weights.WHITE**2, 0.0)  # precision of a second prior, about `whitest`
     variance = variance / (1 + variance * beyond)

@@ -31,8 +31,9 @@ a dark one."""
 DARK_EDGE, BRIGHT_EDGE = 0.03, 0.1
 """Log albedo below and above its material's from which the prior of a surface's grows linearly: paint may be black, and
 a mug white among grey things, which have the same chroma. The real kitchen's white mug sends back .85 of the light that
-is found; where the prior of bright surfaces is Gaussian, 1.07. With the tail of a Cauchy distribution there are more
-minima, between which the light jumps."""
+is found; where the prior of bright surfaces is Gaussian, 1.07. The second is for the light by place: that from beyond
+the scan, whose mean albedo is given, would turn by up to 10 degrees with the volume. With the tail of a Cauchy
+distribution there are more minima, between which the light jumps."""
 WHITE = 0.005
 """Deviation of a surface's log albedo above 0: nothing sends back more than it receives."""
 ONE_ALBEDO = 0.01

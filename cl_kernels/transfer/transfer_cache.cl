@@ -174,11 +174,12 @@ static int lender_of(const Grid grid, global const float4 *positions, global con
 }
 
 // Which samples are traced: all where p.most is not less than there are; else p.most, new ones first, in an order that covers the picture
-// evenly, then one of each entry that is too old. New ones that wait take the values of one beside them; where none is on the same surface, they are traced, too. The others keep what the
-// entry has. New samples that are traced ask for a place: the one that was not found for the longest time, but none that was found in this
-// frame. Surfaces in one cell that face several ways may have an entry each. Samples that ask for the same place agree on the first of them.
-// found, counts, claims: of find_samples. -> kept [rows][cols]: the place of a sample's entry, LENT + the sample whose values it takes; of
-// those that are traced NOT_STORED, or -2 - place where one asks for a place. The last of counts: how many samples and entries wait.
+// evenly, then one of each entry that is too old. New ones that wait take the values of one beside them; where none is on the same
+// surface, they are traced, too. The others keep what the entry has. New samples that are traced ask for a place: the one that was not
+// found for the longest time, but none that was found in this frame. Surfaces in one cell that face several ways may have an entry each.
+// Samples that ask for the same place agree on the first of them. found, counts, claims: of find_samples. -> kept [rows][cols]: the place
+// of a sample's entry, LENT + the sample whose values it takes; of those that are traced NOT_STORED, or -2 - place where one asks for a
+// place. The last of counts: how many samples and entries wait.
 kernel void choose_samples(const TransferCacheParameters p, global const float4 *positions, global const float4 *normals,
                            global const uint *entries, global const int *found, global int *counts, global uint *claims,
                            global int *kept) {

@@ -80,8 +80,12 @@ kernel void mark_shown(const int width, const int height, global const float4 *r
 // Radiance that occluders take from the virtual surface at `pixels` [listed]; positions, normals, shown [h][w]: the virtual geometry
 // buffer. scene.every: as in shadow_virtual; the picture is a mean over 4 x 4 pixels (upsample.clh).
 // -> occluded [h][w] (rgb, w = 1); other pixels are not written.
-kernel void refine_virtual(SCENE_PARAMETERS, const int listed, global const int *pixels, global const float4 *positions,
-                           global const float4 *normals, global const int *shown, global float4 *occluded) {
+//
+// An item traces bundles of rays already. The hint keeps Intel's runtime for processors from bundling items too, which it does wrongly here
+// (2026.2: values of other items, NaN).
+kernel __attribute__((vec_type_hint(float8))) void refine_virtual(SCENE_PARAMETERS, const int listed, global const int *pixels,
+                                                                  global const float4 *positions, global const float4 *normals,
+                                                                  global const int *shown, global float4 *occluded) {
     const int item = get_global_id(0);
     if (item >= listed) return;
     const int pixel = pixels[item];

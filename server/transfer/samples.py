@@ -89,7 +89,7 @@ class SampledTransfer:
         """What of the last frame's transfer may have been found instead of traced."""
         if not self._has_found or self._cache is None:
             return ()
-        reason = f"traced at most {LONGEST + ORDERS} frames ago at the same place of the world"
+        reason = f"kept at the same place of the world; in view, traced again after {LONGEST + ORDERS} frames at most"
         known = LeftOut(effect="transfer_of_known_places", reason=reason, error_bound=None)
         share = self._cache.share_waiting()
         if share == 0.0:

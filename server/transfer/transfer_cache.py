@@ -4,15 +4,17 @@ Transfer and the light from surfaces belong to a place of the scanned surface, n
 of the world. A cell is 1.4 to 2 times as long as the distance between samples, so a moving camera finds again what it
 saw a frame, or a turn, ago. A sample that finds nothing is traced and stored. Surfaces in one cell that face two ways
 have an entry each. A cell is traced again after PERIOD frames, then after twice as many each time, LONGEST at most,
-because a young scan grows and an old one hardly does. So an entry is off by what the scan has changed in as many
-frames as it was old, and belongs to a point in the same cell. Surface that moves is no exception: what a point sees of
-the scan depends on where it is only.
+because a young scan grows and an old one hardly does. An entry belongs to a point in the same cell. Surface that moves
+is no exception: what a point sees of the scan depends on where it is only.
 
-A frame traces MOST_TRACED of its samples at most, in an order that covers the picture evenly: new ones first, each of
-them as far as possible from those before it, then those whose cell is too old. New ones that wait take the values of
-the nearest sample on the same surface, three samples away at most, and are traced where there is none; the next frames
-find or trace them. Old ones that wait stand as they are, ORDERS frames at most. So a first frame, or one that turns to
-what was never seen, costs little more than others.
+A frame traces MOST_TRACED of its samples, in an order that covers the picture evenly: new ones first, each of them as
+far as possible from those before it, then one of each cell that is too old. New ones that wait take the values of the
+nearest sample on the same surface, three samples away at most; where there is none, they are traced as well. The next
+frames find or trace them. Old ones that wait stand as they are, ORDERS frames at most. So a first frame, or one that
+turns to what was never seen, costs little more than others.
+
+So an entry is off by what the scan has changed around it in LONGEST + ORDERS frames at most while it is in view; one
+that comes into view again, by what has changed since it left it, for ORDERS frames.
 
 Transfer that is looked up in depth views (image_space.py) is kept likewise, with what the camera's picture adds near a
 point when it is looked up. What of the picture is not in the scan belongs to no place and is left out.
@@ -42,8 +44,9 @@ PERIOD, LONGEST = 16, 64
 ORDERS = 16
 """Frames that an old cell waits at most for its turn, as in transfer_cache.cl."""
 MOST_TRACED = 1 / 8
-"""Of a frame's samples: two of each block of 4 x 4, so that all of a new picture has values from the beginning. A
-moving camera calls for a twentieth; with a thirtieth, pictures of the real kitchen differ by FLIP .0003 more."""
+"""Of a frame's samples, without those that must be: two of each block of 4 x 4, so that all of a new picture has values
+from the beginning. A moving camera calls for a twentieth; with a thirtieth, pictures of the real kitchen differ by FLIP
+.0003 more."""
 PLACES_A_SAMPLE = 4
 """Size of the table, in samples of a frame, rounded up to a power of two. Views of the last seconds fit, and few cells
 collide."""

@@ -29,14 +29,7 @@ from server.shading.differential_rendering import (
 )
 from server.shading.traced_scene import Changed, trace_scene, upload_light
 from server.shading.virtual_point_lights import place_points
-from server.transfer.indirect import (
-    Indirect,
-    MeanSent,
-    gather_hits,
-    no_hits,
-    observe_indirect,
-    room_for_met,
-)
+from server.transfer.indirect import Indirect, MeanSent, gather_hits, no_hits, observe_indirect, room_for_met
 from server.transfer.radiance_transfer import direction_sets, transfer_radiance
 from server.transfer.sample_grid import SampleGrid
 from tests.scenes import lights

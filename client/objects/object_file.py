@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
+
+from msgspec import structs
 
 from client.errors import ObjectError
 from client.objects import obj_to_glb
 from client.objects.glb import check_glb, gltf_to_glb
 from protocol.limits import MAX_MESH_BYTES
-from protocol.messages import ObjectFormat, Spot, SpotKind
+from protocol.messages import Light, ObjectFormat, Spot, SpotKind
 
 FORMATS = ("glb", "gltf", "obj", "ply", "stl")
 LARGEST_SCALE = 1000.0
 _USE = (
     "FILE[@PLACE[,SIZE[,yaw_deg]]] with PLACE x,y,z, pixel:U,V[:FRAME], floor, table or auto and SIZE a scale or 0.3m"
 )
+_OBJECT_ID = re.compile(r"object-(\d+)")  # as object_id
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,22 @@ def parse_object(text: str) -> ObjectFile:
 def object_id(number: int) -> str:
     """Name of the n-th `--object` in the session; the same in `run` and `stream`."""
     return f"object-{number}"
+
+
+def as_asked(light: Light) -> Light:
+    """`light` with the lights at objects numbered as their `--object` stand, and in that order.
+
+    A server has them in the order in which they were placed: one that waits for its spot comes last. Objects of others
+    keep their numbers.
+    """
+    at = [structs.replace(one, index=_number_of(one.object, one.index)) for one in light.at]
+    return structs.replace(light, at=tuple(sorted(at, key=lambda one: one.index if one.of == "object" else -1)))
+
+
+def _number_of(name: str | None, number: int) -> int:
+    """Of the `--object` with this name, else `number`."""
+    found = _OBJECT_ID.fullmatch(name or "")
+    return int(found[1]) if found else number
 
 
 def pack_mesh(path: Path) -> tuple[ObjectFormat, bytes]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TextIO
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.errors import OWN_PACKAGES, OutputError
+from client.objects.object_file import as_asked
 from client.results.camera_pictures import encode_camera_picture
 from client.results.description import RunDescription
 from client.results.frame_output import FrameOutput
@@ -72,6 +74,7 @@ class OutputWriter:
 
     def write(self, output: FrameOutput) -> None:
         """Write one frame. Raises OutputError if the disk refuses or a number is not finite."""
+        output = replace(output, light=as_asked(output.light))
         try:
             picture = self.folder / "frames" / f"{output.frame:06d}.png"
             picture.write_bytes(encode_png(output.color))
@@ -98,6 +101,7 @@ class OutputWriter:
 
     def write_light(self, light: Light) -> None:
         """Write the light of a frame without a picture. Raises OutputError."""
+        light = as_asked(light)
         try:
             self._line("light.jsonl", _json(light_row(light), light.frame))
         except OSError as error:

@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
@@ -15,6 +16,7 @@ from client.results.frame_output import FrameOutput
 from client.results.output_folder import OutputWriter
 from protocol.messages import LeftOut, Light, Plan, Timings
 from tests.client.lights import light_of
+from tests.client.results_page import DESCRIPTION, light_at_object
 from tests.protocol.samples import SERVER
 
 LIGHT_FIELDS = [
@@ -95,6 +97,26 @@ def test_light_at_places(tmp_path: Path) -> None:
     assert view["sh"] == [list(one) for one in told.at[0].sh]
     assert thing["sh_std"] == [[None] * 3] * 16
     assert [len(view["sh_webxr"]), len(view["position"]), len(view["dominant_direction"])] == [27, 3, 3]
+
+
+def test_lights_at_objects_are_in_the_order_of_the_command_line(tmp_path: Path) -> None:
+    """Also where the first one was placed last; what another client calls its object keeps its number."""
+    at = light_at_object(0).at[0]
+    names = (("object-2", 2.0), ("lamp", 1.0), ("object-0", 0.0))  # and where they stand
+    lights = tuple(
+        msgspec.structs.replace(at, index=i, object=name, position=(x, 0.0, 1.0)) for i, (name, x) in enumerate(names)
+    )
+    view = msgspec.structs.replace(at, of="view")
+    with OutputWriter(tmp_path / "out", DESCRIPTION) as writer:
+        writer.write(output_of(0, light=light_of(0, at=(view, *lights))))
+        writer.write_light(light_of(1, at=(view, *lights)))
+    for line in (tmp_path / "out" / "light.jsonl").read_text().splitlines():
+        assert [(lit["of"], lit["index"], lit["position"][0]) for lit in json.loads(line)["at"]] == [
+            ("view", 0, 0.1),
+            ("object", 0, 0.0),
+            ("object", 1, 1.0),
+            ("object", 2, 2.0),
+        ]
 
 
 def test_trajectory_lines(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from tests.hard_cases.cases.camera import INPUT, TRACKING
 from tests.hard_cases.cases.groups import GROUPS
 from tests.hard_cases.cases.harmonics import HARMONICS
+from tests.hard_cases.cases.kept_transfer import KEPT
 from tests.hard_cases.cases.light_sums import LIGHT_SUMS
 from tests.hard_cases.cases.rendering import RASTER, SHADOWS
 from tests.hard_cases.cases.room_light import ROOM_LIGHT
@@ -19,6 +20,7 @@ FAMILIES: tuple[Family, ...] = (
     SUMS,
     HARMONICS,
     TRANSFER,
+    KEPT,
     VOLUME,
     TRACKING,
     INPUT,

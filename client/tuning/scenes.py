@@ -38,9 +38,9 @@ Progress = Callable[[int], None]
 """Called with the number of processed frames of an operating point."""
 SIZE = "640x480"
 LIT_SIZE = "480x360"
-FRAMES, SETTLING = 9, 3
+FRAMES, SETTLING = 15, 3
 """Frames of the stage, and how many are not measured, as they compile kernels and allocate arrays."""
-LIT_FRAMES, LIT_SETTLING = 12, 2
+LIT_FRAMES, LIT_SETTLING = 34, 2  # medians of 10 lights differ by 2 degrees, which is more than points do
 _STEP = 2  # frames of the camera path between pictures, about a tenth of a second of walking
 _WALK = 240
 _LEAST_HEIGHT = 0.3

@@ -255,8 +255,8 @@ def test_views_are_drawn_in_turn(engine: Engine) -> None:
     [
         # of 12, those of 100 or 101 bricks: 12, 7, 2, none
         ((100, 101, 120, 120, 120, 120, 123, 200), (99,) * 8, [12, 2, 5, 5, 4, 2, 2, 5]),
-        # of one frame at 2; then of 2 and 3 at 4 to 6 ...; none of 16 or more
-        ((100,) * 8, (1, 2, 3, 4, 30, 31, 32, 90), [12, 5, 5, 5, 5, 5, 4, 2]),
+        # of one frame: 7 and 2 at 2, the other 3 at 3; of 2 at 4: 7; of 3 and 4 at 30: 7, then the others; none of 16 or more
+        ((100,) * 8, (1, 2, 3, 4, 30, 31, 32, 90), [12, 9, 5, 9, 9, 5, 2, 2]),
     ],
     ids=["more bricks", "more frames"],
 )
@@ -269,6 +269,7 @@ def test_more_views_are_drawn_while_the_volume_grows(
 ) -> None:
     """Those out of date besides those whose turn it is, oldest first, up to the most that a frame draws."""
     monkeypatch.setattr(auxiliary_views, "MOST_PER_FRAME", 5)
+    monkeypatch.setattr(auxiliary_views, "MOST_YOUNG", 7)
     monkeypatch.setattr(auxiliary_views, "draw_views", lambda *args: drawn.append(len(args[-1])))
     volume = fill_volume(engine, SCENES["ball above a floor"], VOXEL_M)
     drawn: list[int] = []

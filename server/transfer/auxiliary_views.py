@@ -43,7 +43,7 @@ A camera that enters a room sees most of it within a second; light would leak th
 YOUNG_FRAMES = 16
 """A view of a volume of fewer frames is redrawn when the number of frames has doubled: few noisy frames leave holes."""
 MOST_YOUNG = 128
-"""Most of these that one frame redraws: all in 8 frames. With 24 the light of the first 12 frames of a noisy room errs by 23
+"""Most of these that one frame redraws: all in 8 frames. With 24 the light of a noisy room's first 12 frames errs by 23
 degrees in the mean instead of 6, with all by 5.6 (GR15FAST; `probeless tune`)."""
 MOST_PER_FRAME = 24
 """Most views that one frame redraws for growth: all of them in 43 frames while the volume grows."""

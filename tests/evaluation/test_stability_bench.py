@@ -96,6 +96,7 @@ def test_the_catalogue_covers_what_it_should() -> None:
         "sums",
         "spherical harmonics",
         "transfer",
+        "kept transfer",
         "volume",
         "tracking",
         "input",

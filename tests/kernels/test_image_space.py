@@ -255,7 +255,7 @@ def test_views_are_drawn_in_turn(engine: Engine) -> None:
     [
         # of 12, those of 100 or 101 bricks: 12, 7, 2, none
         ((100, 101, 120, 120, 120, 120, 123, 200), (99,) * 8, [12, 2, 5, 5, 4, 2, 2, 5]),
-        # of one frame: 7 and 2 at 2, the other 3 at 3; of 2 at 4: 7; of 3 and 4 at 30: 7, then the others; none of 16 or more
+        # of one frame: 7 and 2 at 2, the other 3 at 3; of 2 at 4: 7; of 3 and 4 at 30: 7, then the others; not of 16
         ((100,) * 8, (1, 2, 3, 4, 30, 31, 32, 90), [12, 9, 5, 9, 9, 5, 2, 2]),
     ],
     ids=["more bricks", "more frames"],

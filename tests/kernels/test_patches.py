@@ -14,6 +14,7 @@ from server.light.shell.patches import (
     RAYS,
     Patches,
     hemisphere_weights,
+    patch_side_m,
     ray_directions,
 )
 from server.light.shell.picture import Seen
@@ -141,6 +142,37 @@ def test_a_patch_is_the_mean_of_its_frames() -> None:
     np.testing.assert_allclose(patches.logarithms[row], np.log(0.2), atol=1e-12)
     assert patches.weights[row] == 3
     np.testing.assert_allclose(patches.changes(one(np.array([0.06, 0.04, 0.05]), 0.3))[0], [np.log(1.5)], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("size_m", "voxel_m", "side_m"),
+    [
+        ((6.0, 3.0, 6.0), 0.02, 0.15),
+        ((2.2, 1.5, 1.3), 0.009, 0.15),  # the corner of a room, 3 m across
+        ((1.5, 0.6, 1.0), 0.006, 0.075),
+        ((1.08, 0.5, 0.86), 0.0045, 0.075),
+        ((0.5, 0.3, 0.5), 0.0025, 0.0375),
+        ((0.5, 0.3, 0.5), 0.02, 0.08),  # four voxels
+        ((0.5, 0.3, 0.5), 0.1, 0.15),
+    ],
+)
+def test_patches_are_as_large_as_what_is_scanned(
+    engine: Engine, size_m: tuple[float, float, float], voxel_m: float, side_m: float
+) -> None:
+    volume = Volume(engine, (1.0, -2.0, 0.5, 1.0 + size_m[0], -2.0 + size_m[1], 0.5 + size_m[2]), voxel_m)
+    assert patch_side_m(volume) == pytest.approx(side_m)
+
+
+def test_small_patches_are_told_apart_and_resumed() -> None:
+    patches = Patches(0.02)
+    places = np.array([[0.01, 0.01, 0.01], [0.03, 0.01, 0.01]])
+    patches.add(one(places, 0.5))
+    known = patches.known()
+    assert len(known.keys) == 2
+    again = Patches(known.side_m)
+    again.resume(known)
+    again.add(one(places, 0.5))
+    assert sorted(again.weights)[-3:] == [0.0, 2.0, 2.0]
 
 
 def test_a_patch_never_weighs_more_than_its_memory() -> None:

@@ -26,6 +26,8 @@ class KnownPatches:
     clipped: Floats
     weights: Floats
     """[n] each."""
+    side_m: float = 0.15
+    """Of the grid's cells. Saves of earlier programs do not tell it: it was this one."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,14 @@ from server.opencl.engine import Engine
 from server.volume.volume import Volume
 
 PATCH_M = 0.15
-"""Side of the grid's cells. Shading changes little within one, except at contacts; a room has about 1000 patches."""
+"""Side of the grid's cells in a room. Shading changes little within one, except at contacts; a room has about 1000
+patches."""
+ROOM_M = 2.5
+"""Diagonal of the smallest volume that is a room, or a corner of one. What is smaller is a table with things on it, of
+which a patch must not hold a whole one: with PATCH_M the light of the stage set, 1.5 m across, errs by 16 degrees, with
+half of it by 8, with a quarter by 8 too, but stripes painted on a table then turn it by 50 instead of 28."""
+LEAST_VOXELS = 4.0
+"""Least side of a cell, in voxels: finer than that the scan has no normals."""
 REGION_M = 0.4
 """Side of the regions over which a material may differ from what its colour says (objective.py)."""
 MOST_PATCHES = 1536
@@ -48,6 +55,14 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
+def patch_side_m(volume: Volume) -> float:
+    """Side of the patches of what is scanned into this volume: PATCH_M, and half of that each time it is less than
+    ROOM_M across, half of that, and so on."""
+    across_m = float(np.linalg.norm(np.subtract(volume.bounds_m[3:], volume.bounds_m[:3])))
+    side_m = PATCH_M * 2.0 ** np.floor(np.log2(across_m / ROOM_M))
+    return float(min(max(side_m, LEAST_VOXELS * volume.voxel_m), PATCH_M))
+
+
 @dataclass(frozen=True)
 class TracedPatches:
     """Patches whose rays are on their way."""
@@ -60,8 +75,10 @@ class TracedPatches:
 class Patches:
     """The patches of a room, in rows 0 to `count` of its arrays."""
 
-    def __init__(self) -> None:
+    def __init__(self, side_m: float = PATCH_M) -> None:
+        """`side_m`: of the grid's cells."""
         n = MOST_PATCHES
+        self.side_m = side_m
         self._numbers = np.full(n, _FREE)
         """_key_numbers of the patch in each row."""
         self.weights = np.zeros(n)
@@ -131,6 +148,11 @@ class Patches:
         self.seen_in[rows] = self._frame
 
     @property
+    def is_empty(self) -> bool:
+        """Whether it has no patch yet."""
+        return bool(np.all(self._numbers == _FREE))
+
+    @property
     def fresh(self) -> int:
         """Number of patches whose rays were not traced yet."""
         return int(((self.weights > 0) & (self.traced_in < 0)).sum())
@@ -165,8 +187,16 @@ class Patches:
     def known(self) -> KnownPatches:
         """All but their rays."""
         rows = np.flatnonzero(self._numbers != _FREE)
-        arrays = (self.positions, self.normals, self.logarithms, self.variances, self.clipped, self.weights)
-        return KnownPatches(self.keys[rows], *(array[rows] for array in arrays))
+        return KnownPatches(
+            self.keys[rows],
+            self.positions[rows],
+            self.normals[rows],
+            self.logarithms[rows],
+            self.variances[rows],
+            self.clipped[rows],
+            self.weights[rows],
+            self.side_m,
+        )
 
     def resume(self, known: KnownPatches) -> None:
         """Begin with these, at most MOST_PATCHES; their rays are traced with the next."""
@@ -181,7 +211,7 @@ class Patches:
     def _groups(self, seen: Seen) -> tuple[Ints, _Means]:
         """As of _grouped."""
         if self._grouped is None or self._grouped[0] is not seen:
-            self._grouped = seen, *_grouped(seen)
+            self._grouped = seen, *_grouped(seen, self.side_m)
         return self._grouped[1:]
 
     def _known_rows(self, keys: Ints) -> Ints:
@@ -200,7 +230,7 @@ class Patches:
         rows[new] = free
         self._numbers[free] = _key_numbers(keys[new])
         self.weights[free], self.traced_in[free] = 0.0, -1
-        self.keys[free], self.regions[free] = keys[new], _region_numbers(keys[new])
+        self.keys[free], self.regions[free] = keys[new], _region_numbers(keys[new], self.side_m)
         return rows
 
     def _make_room(self, wanted: int, kept: Ints) -> None:
@@ -216,21 +246,21 @@ class Patches:
 
 
 def _key_numbers(keys: Ints) -> Ints:
-    """[n] a number for each key [n, 6], distinct within 19 km."""
+    """[n] a number for each key [n, 6], distinct within 131 072 cells: 19 km in a room."""
     cells = (keys[:, :3] + (1 << 17)) @ (1 << (18 * np.arange(3, dtype=np.int64)))
     return np.asarray((cells << 6) + (keys[:, 3:] + 1) @ np.array([1, 4, 16]))
 
 
-def _region_numbers(keys: Ints) -> Ints:
+def _region_numbers(keys: Ints, side_m: float) -> Ints:
     """[n] a number for each region of patches, by their keys [n, 6]."""
-    cells = np.floor(keys[:, :3] * (PATCH_M / REGION_M)).astype(np.int64)
+    cells = np.floor(keys[:, :3] * (side_m / REGION_M)).astype(np.int64)
     parts = np.concatenate([cells, keys[:, 3:]], axis=1) + (1 << 9)
     return np.asarray(parts @ (1 << (10 * np.arange(6, dtype=np.int64))))
 
 
-def _grouped(seen: Seen) -> tuple[Ints, _Means]:
+def _grouped(seen: Seen, side_m: float) -> tuple[Ints, _Means]:
     """Keys of the patches in a picture, [k, 6] distinct, and means over what it shows of each."""
-    cells = np.floor(seen.positions / PATCH_M).astype(np.int64)
+    cells = np.floor(seen.positions / side_m).astype(np.int64)
     facing = np.rint(seen.normals * _FACINGS).astype(np.int64)
     keys, inverse = distinct_rows(np.concatenate([cells, facing], axis=1))
     return keys, _Means(inverse, np.bincount(inverse, minlength=len(keys)).astype(np.float64))

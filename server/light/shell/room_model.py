@@ -25,7 +25,7 @@ from server.light.shell.bright_surface import BrightSurface, TracedEmitters
 from server.light.shell.distant import distant_light
 from server.light.shell.known_room import KnownRoom
 from server.light.shell.objective import Unknowns
-from server.light.shell.patches import Patches, TracedPatches
+from server.light.shell.patches import Patches, TracedPatches, patch_side_m
 from server.light.shell.picture import PatchesInPicture, Seen
 from server.light.shell.shell import Shell
 from server.light.shell.solution import Solution
@@ -34,10 +34,10 @@ from server.light.shell.solver_process import Asked, SolverProcess, Task
 from server.light.shell.switches import Switches
 from server.opencl.pacing import Pacer
 
-STEADY, CHANGED = 0.2, 0.3
-"""Change of log radiance: the median over patches that face one way, then the root mean square over all ways to face.
-Up to the first value nothing is forgotten (the real kitchen, whose exposure varies, has .19 at most, rooms .03); from
-the second on everything is (a lamp that goes 45 degrees around a table makes .32)."""
+STEADY, CHANGED = 0.25, 0.35
+"""Change of log radiance: the median over patches that face one way, then the root mean square over all ways to face,
+by the root of how many do. Up to the first value nothing is forgotten (the real kitchen, whose exposure varies, has .23
+at most, rooms .03); from the second on everything is (a lamp that goes 45 degrees around a table makes .36)."""
 SOLVE_EVERY = 3
 """Frames between two solutions, as long as the light is steady and little of the room is new: evidence is summed in
 between. The goal is that a change is followed within three frames."""
@@ -47,7 +47,7 @@ has too much to do the light would never be a new one. A person sees light that 
 NEW_SHARE = 0.1
 """If the share of new patches, or of frames that are not in the solution, is at least this, a frame is solved at
 once."""
-LEAST_FACING = 5
+LEAST_FACING = 8
 """Least number of patches that face one way, for a median."""
 
 Floats = NDArray[np.float64]
@@ -114,6 +114,8 @@ class RoomModel:
         seen, self._picture = self._picture.seen(), None
         if not seen.count:
             return
+        if self._patches.is_empty:
+            self._patches = Patches(patch_side_m(volume))
         change = self._change(seen) if switches.memory else 1.0
         self._patches.forget(change)
         self._bright.forget(change)
@@ -191,6 +193,7 @@ class RoomModel:
 
     def resume(self, known: KnownRoom) -> None:
         """Go on from there, with the next frame."""
+        self._patches = Patches(known.patches.side_m)
         self._patches.resume(known.patches)
         self._begun_with = known.shell
         self._solver.begin_with(known.shell)
@@ -208,5 +211,5 @@ class RoomModel:
         if counts[many].sum() < LEAST_PATCHES:
             return 0.0
         medians = ndimage.median(changes, facing, many)
-        change = np.sqrt(np.average(medians**2, weights=counts[many]))
+        change = np.sqrt(np.average(medians**2, weights=np.sqrt(counts[many])))
         return float(np.clip((change - STEADY) / (CHANGED - STEADY), 0.0, 1.0))

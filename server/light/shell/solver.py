@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from server.light.shell.bright_surface import EmittersSeen
 from server.light.shell.evidence import evidence_of
 from server.light.shell.objective import Unknowns, step
-from server.light.shell.patches import PATCH_M, Patches
+from server.light.shell.patches import Patches
 from server.light.shell.shell import Shell, closed_sides, shell_around
 from server.light.shell.solution import Solution
 from server.light.shell.sources import distant_sources, near_sources
@@ -60,9 +60,9 @@ class Solver:
         if len(rows) < LEAST_PATCHES:
             return None
         positions, normals = patches.positions[rows], patches.normals[rows]
-        self._shell = shell = shell_around(positions, normals, camera[None], up, PATCH_M, self._shell)
+        self._shell = shell = shell_around(positions, normals, camera[None], up, patches.side_m, self._shell)
         self._transport.update(patches, bright, traced, shell)
-        closed = closed_sides(positions, normals, shell.axes, PATCH_M)
+        closed = closed_sides(positions, normals, shell.axes, patches.side_m)
         evidence = evidence_of(patches, rows, switches)
         near = near_sources(self._transport, shell, evidence.rows)
         distant = distant_sources(self._transport, closed, evidence.rows, with_indirect=switches.indirect)

@@ -24,14 +24,16 @@ from server.volume.volume import Volume
 PATCH_M = 0.15
 """Side of the grid's cells in a room. Shading changes little within one, except at contacts; a room has about 1000
 patches."""
-ROOM_M = 2.5
+ROOM_M = 2.0
 """Diagonal of the smallest volume that is a room, or a corner of one. What is smaller is a table with things on it, of
 which a patch must not hold a whole one: with PATCH_M the light of the stage set, 1.5 m across, errs by 16 degrees, with
-half of it by 8, with a quarter by 8 too, but stripes painted on a table then turn it by 50 instead of 28."""
+half of it by 8, with a quarter by 8 too, but stripes painted on a table then turn it by 50 instead of 28. The corner of
+a room 3 m across (mitsuba_room) errs by 21 degrees with half of it instead of 14: one surface falls into many."""
 LEAST_VOXELS = 4.0
 """Least side of a cell, in voxels: finer than that the scan has no normals."""
 REGION_M = 0.4
-"""Side of the regions over which a material may differ from what its colour says (objective.py)."""
+"""Side of the regions over which a material may differ from what its colour says (objective.py), beside patches of
+PATCH_M; beside smaller ones as much smaller."""
 MOST_PATCHES = 1536
 """Beyond this number a new patch replaces the one that was not seen for longest. One picture shows an eighth of it."""
 RAYS = 1024
@@ -230,7 +232,7 @@ class Patches:
         rows[new] = free
         self._numbers[free] = _key_numbers(keys[new])
         self.weights[free], self.traced_in[free] = 0.0, -1
-        self.keys[free], self.regions[free] = keys[new], _region_numbers(keys[new], self.side_m)
+        self.keys[free], self.regions[free] = keys[new], _region_numbers(keys[new])
         return rows
 
     def _make_room(self, wanted: int, kept: Ints) -> None:
@@ -251,9 +253,9 @@ def _key_numbers(keys: Ints) -> Ints:
     return np.asarray((cells << 6) + (keys[:, 3:] + 1) @ np.array([1, 4, 16]))
 
 
-def _region_numbers(keys: Ints, side_m: float) -> Ints:
+def _region_numbers(keys: Ints) -> Ints:
     """[n] a number for each region of patches, by their keys [n, 6]."""
-    cells = np.floor(keys[:, :3] * (side_m / REGION_M)).astype(np.int64)
+    cells = np.floor(keys[:, :3] * (PATCH_M / REGION_M)).astype(np.int64)
     parts = np.concatenate([cells, keys[:, 3:]], axis=1) + (1 << 9)
     return np.asarray(parts @ (1 << (10 * np.arange(6, dtype=np.int64))))
 

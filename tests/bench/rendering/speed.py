@@ -1,7 +1,8 @@
 """What rendering costs: each effect against the picture's size and the object's triangles, and the whole stage.
 
-Frames go through the whole pipeline; the stage's work is timed where it is done. Before an effect starts and after it
-ends the device has nothing queued. Processor time over two cores stands beside the wall's, which other load distorts.
+Frames of a moving camera go through the whole pipeline; the stage's work is timed where it is done. Before an effect
+starts and after it ends the device has nothing queued. Processor time over two cores stands beside the wall's, which
+other load distorts.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from statistics import median
 from typing import Any
 from unittest.mock import patch
@@ -19,7 +21,8 @@ import msgspec
 import pyopencl as cl
 import trimesh
 
-from client.options.source import open_source
+from client.synthetic.source import SyntheticSource, open_synthetic
+from protocol.frames import RgbdFrame
 from server.client_session import ClientSession
 from server.effects import plan, renderer
 from server.effects.plan import Effect
@@ -49,11 +52,16 @@ Times = dict[str, list[float]]
 
 @dataclass
 class StageClock:
-    """Milliseconds of each effect and of the whole stage, a list entry a frame."""
+    """Milliseconds of each effect and of the whole stage, a list entry a frame that has it."""
 
     queue: cl.CommandQueue
     wall_ms: Times = field(default_factory=lambda: defaultdict(list))
     cpu_ms: Times = field(default_factory=lambda: defaultdict(list))
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self.wall_ms.clear()
+        self.cpu_ms.clear()
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
@@ -76,6 +84,16 @@ class StageClock:
             return composite(*arguments)
 
 
+@cache
+def _source(size: str) -> SyntheticSource:
+    return open_synthetic(f"synthetic:{SCENE}?size={size}")
+
+
+@cache
+def _frame(size: str, index: int) -> RgbdFrame:
+    return _source(size)[index]
+
+
 def speed_part(run: Run) -> Part:
     """Rows against pixels, against triangles, and the budget."""
     part = Part(sizes={"frames of rendering's speed": run.of(4, 15)})
@@ -92,24 +110,25 @@ def speed_part(run: Run) -> Part:
 
 def _add(part: Part, run: Run, preset: str, size: str, triangles: int) -> None:
     row = f"{preset.upper()}, {size}, {triangles} triangles"
-    source = open_source(f"synthetic:{SCENE}?size={size}")
+    source = _source(size)
     wishes = at_preset(wishes_for(source, range(1)), preset)
     refused = refusal(wishes)
     if refused:
         part.leave_out(row, refused)
         return
     run.say(row)
-    light = tuple((float(r), float(g), float(b)) for r, g, b in source.truth(0).sh)  # type: ignore[attr-defined]
-    frames = [source[i] for i in range(WARM_UP)]
+    light = tuple((float(r), float(g), float(b)) for r, g, b in source.truth(0).sh)
     pipeline = ClientSession(run.device, source.camera, msgspec.structs.replace(wishes, light=light))
     pipeline.place_object("object-0", torus(triangles), Placement(position_m=PLACE_M))
     clock = StageClock(pipeline._engine.queue)
     with clocked(pipeline, clock):
         for index in range(WARM_UP + run.of(4, 15)):
-            pipeline.process(frames[min(index, WARM_UP - 1)])
+            if index == WARM_UP:
+                clock.forget()
+            pipeline.process(_frame(size, index))
     pipeline.close()
     for name, spent in clock.cpu_ms.items():
-        times = median(clock.wall_ms[name][WARM_UP:]), median(spent[WARM_UP:]) / CORES
+        times = median(clock.wall_ms[name]), median(spent) / CORES
         is_held = name == EVERYTHING and (preset, size, triangles) == (FAST, SIZE, COUNT)
         part.add(
             f"{row}: {name}: processor time of {CORES} cores, median",

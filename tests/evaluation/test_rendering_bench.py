@@ -42,7 +42,7 @@ from tests.bench.rendering.pictures import (
 )
 from tests.bench.rendering.report import write_report
 from tests.bench.rendering.rows import add_pasted, add_score
-from tests.bench.rendering.speed import SECTIONS, StageClock, torus
+from tests.bench.rendering.speed import EVERYTHING, SECTIONS, StageClock, speed_of, torus
 from tests.bench.rendering.turning import (
     BALL_CENTER,
     BALL_RADIUS_M,
@@ -267,6 +267,15 @@ def test_effects_are_timed_one_by_one_and_give_what_they_give(engine: Engine) ->
     assert [clock.run_effect(more, {"number": number}) for number in (4, 5)] == [5, 6]
     assert set(clock.wall_ms) == set(clock.cpu_ms) == {"<lambda>"}
     assert len(clock.wall_ms["<lambda>"]) == 2
+
+
+def test_frames_that_are_timed_are_computed(device: Device) -> None:
+    """A camera at rest would have its pictures settled, and effects without a time."""
+    part = speed_of(Run(device, False, SILENT), "rm", "160x120", 1_000)
+    times = {row.name.split(": ")[1]: row.value for row in part.rows if "wall" in row.name}
+    assert {"rasterize", "shadow_real", "shade_virtual", EVERYTHING} <= set(times)
+    assert min(times.values()) > 0
+    assert times[EVERYTHING] > times["shadow_real"] + times["shade_virtual"]
 
 
 def test_pictures_of_changes(truth: CompositeTruth) -> None:

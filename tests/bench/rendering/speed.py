@@ -97,25 +97,25 @@ def _frame(size: str, index: int) -> RgbdFrame:
 def speed_part(run: Run) -> Part:
     """Rows against pixels, against triangles, and the budget."""
     part = Part(sizes={"frames of rendering's speed": run.of(4, 15)})
-    for size in SIZES:
-        _add(part, run, FAST, size, COUNT)
-    for count in SECTIONS:
-        if count != COUNT:
-            _add(part, run, FAST, SIZE, count)
-    for preset in PRESETS:
-        if preset != FAST:
-            _add(part, run, preset, SIZE, COUNT)
+    parts = [speed_of(run, FAST, size, COUNT) for size in SIZES]
+    parts += [speed_of(run, FAST, SIZE, count) for count in SECTIONS if count != COUNT]
+    parts += [speed_of(run, preset, SIZE, COUNT) for preset in PRESETS if preset != FAST]
+    for one in parts:
+        part.rows += one.rows
+        part.unmeasured += one.unmeasured
     return part
 
 
-def _add(part: Part, run: Run, preset: str, size: str, triangles: int) -> None:
+def speed_of(run: Run, preset: str, size: str, triangles: int) -> Part:
+    """Rows of each effect and of the whole stage."""
+    part = Part()
     row = f"{preset.upper()}, {size}, {triangles} triangles"
     source = _source(size)
     wishes = at_preset(wishes_for(source, range(1)), preset)
     refused = refusal(wishes)
     if refused:
         part.leave_out(row, refused)
-        return
+        return part
     run.say(row)
     light = tuple((float(r), float(g), float(b)) for r, g, b in source.truth(0).sh)
     pipeline = ClientSession(run.device, source.camera, msgspec.structs.replace(wishes, light=light))
@@ -137,6 +137,7 @@ def _add(part: Part, run: Run, preset: str, size: str, triangles: int) -> None:
             f"<= {BUDGET_MS}" if is_held else "",
         )
         part.add(f"{row}: {name}: wall, median", times[0], "ms")
+    return part
 
 
 @contextmanager

@@ -58,6 +58,8 @@ class _GivenLight:
 
     sh: Coefficients | None = None
     axes: Literal["world", "webxr"] = "world"
+    tone_mapping: Literal["auto", "average"] = "auto"
+    """Panoramas are in units of their own, not in those of the camera's picture."""
 
 
 def prepare(options: CaptureOptions, lossless: bool = False, answer: str | None = None) -> Capture:
@@ -110,7 +112,7 @@ def prepare(options: CaptureOptions, lossless: bool = False, answer: str | None 
         lamps=choices.lamps or DEFAULTS.lamps,
         exposure=choices.exposure or DEFAULTS.exposure,
         edges=choices.edges or DEFAULTS.edges,
-        tone_mapping=choices.tone_mapping or DEFAULTS.tone_mapping,
+        tone_mapping=choices.tone_mapping or light.tone_mapping,
         robustness=robustness,
         plan=choices.plan or DEFAULTS.plan,
         cache=choices.cache or DEFAULTS.cache,
@@ -269,7 +271,7 @@ def _given_light(options: CaptureOptions) -> _GivenLight:
     if options.light is not None:
         return _GivenLight(read_light(Path(options.light)))
     if options.panorama is not None:
-        return _GivenLight(read_panorama_light(Path(options.panorama), options.bands), "webxr")
+        return _GivenLight(read_panorama_light(Path(options.panorama), options.bands), "webxr", "average")
     return _GivenLight()
 
 

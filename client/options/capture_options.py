@@ -112,7 +112,7 @@ ToneMapping = Annotated[
     str | None,
     typer.Option(
         metavar="light|average",
-        help="what virtual objects are as bright as; default: light; with --as-thesis and no --light: average",
+        help="what virtual objects are as bright as; default: light; with --panorama, or --as-thesis alone: average",
     ),
 ]
 Plan = Annotated[

@@ -16,6 +16,9 @@ from server.light.panorama import PanoramaError, panorama_sh, read_panorama
 
 _COUNTS = tuple(bands * bands for bands in range(1, MAX_SH_BANDS + 1))
 
+PANORAMAS = (".hdr", ".exr")
+"""Endings of files that hold one."""
+
 Coefficients = tuple[Rgb, ...]
 
 
@@ -25,6 +28,8 @@ def read_light(path: Path, radiance_of_white: float = 1.0) -> Coefficients:
     `sh_all` has precedence over `sh`. A line with `exposure` is divided by it, which gives the units of the session's
     first picture. Other files are divided by `radiance_of_white`, the radiance of a white pixel. Raises OptionError.
     """
+    if path.suffix.lower() in PANORAMAS and path.is_file():
+        raise OptionError(f"--light {path}: is a panorama; give it with --panorama")
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

@@ -91,6 +91,13 @@ def test_a_file_that_is_no_panorama(tmp_path: Path) -> None:
         read_panorama_light(tmp_path / "none.hdr", 4)
 
 
+@pytest.mark.parametrize("name", ["sky.hdr", "sky.EXR"])
+def test_a_panorama_is_no_light(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"#?RADIANCE")
+    with pytest.raises(OptionError, match="is a panorama; give it with --panorama"):
+        read_light(tmp_path / name)
+
+
 def test_options_become_wishes(tmp_path: Path) -> None:
     source = str(folders.redwood(tmp_path / "redwood"))
     light, sky = tmp_path / "light.json", tmp_path / "sky.hdr"
@@ -101,6 +108,8 @@ def test_options_become_wishes(tmp_path: Path) -> None:
     np.testing.assert_array_equal(given.light, LIGHT)
     around = prepare(CaptureOptions(source, panorama=str(sky), bands=3)).wishes
     assert (len(around.light), around.light_axes) == (9, "webxr")
+    assert (given.tone_mapping, around.tone_mapping) == ("auto", "average")  # a panorama's units are its own
+    assert prepare(CaptureOptions(source, panorama=str(sky), tone_mapping="light")).wishes.tone_mapping == "light"
     assert prepare(CaptureOptions(source)).wishes.light is None
     with pytest.raises(OptionError, match="leave one of the two out"):
         prepare(CaptureOptions(source, light=str(light), panorama=str(sky)))

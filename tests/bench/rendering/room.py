@@ -30,7 +30,7 @@ from tests.bench.truth.room_composites import RoomTruth, SetTruth, set_truth
 
 LIGHTS, SURFACES = ("key", "studio"), ("white", "tex")
 """Of the sets that have composites."""
-ESTIMATED, NO_BOUNCE = "RM, its own light", "RM, no indirect light"
+ESTIMATED, NO_BOUNCE, AVERAGES = "RM, its own light", "RM, no indirect light", "RM, as bright as averages"
 SHORT = {"RM, rays of 0.1 m": "rm", "ART4, rays of 0.1 m": "art4"}
 """As the thesis runs them in fig. 7.11: what is farther away does not shade."""
 ESTIMATED_GOALS = {"white_direct": 0.08, "white_gi": 0.10, "tex_gi": 0.12}
@@ -40,7 +40,7 @@ FRAMES, QUICK_FRAMES = 6, 2
 
 Floats = NDArray[np.float64]
 Composites = dict[str, list[Codes]]
-"""By preset, `NO_BOUNCE` and `SHORT` under the true light; by `ESTIMATED`."""
+"""By preset, `NO_BOUNCE`, `AVERAGES` and `SHORT` under the true light; by `ESTIMATED`."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +86,7 @@ def _composites(part: Part, room: Room, truth: SetTruth) -> Composites:
     given = msgspec.structs.replace(wishes, light=tuple((float(r), float(g), float(b)) for r, g, b in truth.light))
     asked = {preset: at_preset(given, preset) for preset in PRESETS}
     asked[ESTIMATED] = at_preset(wishes, REFERENCE)
+    asked[AVERAGES] = msgspec.structs.replace(asked[REFERENCE], tone_mapping="average")
     if item.transport == "gi":
         asked[NO_BOUNCE] = msgspec.structs.replace(asked[REFERENCE], indirect="none")
     else:
@@ -108,11 +109,11 @@ def _add_scores(part: Part, room: Room, truth: SetTruth, found: Composites) -> N
     item = truth.item
     of_pasted = add_pasted(part, item.name, truth)
     _add_floor(part, room, truth)
-    for name in (*PRESETS, *SHORT, ESTIMATED):
+    for name in (*PRESETS, *SHORT, AVERAGES, ESTIMATED):
         if name in found:
             row = f"{item.name}: {name.upper() if name in PRESETS else name}" + (", true light" * (name != ESTIMATED))
             goals = _error_goal(item, name), SHADOW_GOALS.get(name)
-            add_score(part, row, truth, found[name], of_pasted, *goals, is_held=name not in SHORT)
+            add_score(part, row, truth, found[name], of_pasted, *goals, is_held=name not in (*SHORT, AVERAGES))
 
 
 def _error_goal(item: RoomSet, name: str) -> float | None:

@@ -329,11 +329,14 @@ def test_scanned_walls_close_their_sides() -> None:
     points, normals = np.concatenate([wall, floor]), np.repeat([[1.0, 0, 0], [0, 0, 1.0]], len(place), axis=0)
     np.testing.assert_array_equal(closed_sides(points, normals, np.eye(3), PATCH_M), [1, 0, 0, 0, 1, 0])
     np.testing.assert_array_equal(closed_sides(points, -normals, np.eye(3), PATCH_M), np.zeros(6))
+    on_a_table = closed_sides(points, normals, np.eye(3), PATCH_M, has_walls=False)
+    np.testing.assert_array_equal(on_a_table, [0, 0, 0, 0, 1, 0])
     some = np.arange(len(wall) - 1, len(points))  # all of the floor, and one patch of wall
     assert 0 < closed_sides(points[some], normals[some], np.eye(3), PATCH_M)[0] < 0.3
     camera, to_wall = np.array([[0.3, 1.0, 1.5]]), np.array([[-1.0, 0.0, 0.0]])
-    for facing, distance_m in ((normals, 0.3), (-normals, BEHIND_M + CAMERA_M)):
-        shell = shell_around(points, facing, camera, UP, PATCH_M, None)
+    behind_m = BEHIND_M + CAMERA_M
+    for facing, has_walls, distance_m in ((normals, True, 0.3), (-normals, True, behind_m), (normals, False, behind_m)):
+        shell = shell_around(points, facing, camera, UP, PATCH_M, None, has_walls=has_walls)
         assert shell.distances(camera, to_wall).min() == pytest.approx(distance_m, abs=0.01)
 
 

@@ -145,4 +145,4 @@ def test_things_on_a_table_tell_where_light_comes_from(device: Device, look: str
         assert isinstance(source, SyntheticSource)
         found = lights(device, source, [source[index] for index in (0, 32, 63, 95)], indirect="none")
         errors.append(error_deg(source, found[-1]))
-    assert np.mean(errors) < 12.0  # seen: 7.6 and 10.1, with patches of 15 cm 17.2 and 24.9
+    assert np.mean(errors) < 12.0  # seen: 8.3 and 10.1, with patches of 15 cm 17.2 and 24.9

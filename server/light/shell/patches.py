@@ -150,6 +150,11 @@ class Patches:
         self.seen_in[rows] = self._frame
 
     @property
+    def has_walls(self) -> bool:
+        """Whether upright surface may be a wall; in a scan that is smaller than a room's it is of things on a table."""
+        return self.side_m >= PATCH_M
+
+    @property
     def is_empty(self) -> bool:
         """Whether it has no patch yet."""
         return bool(np.all(self._numbers == _FREE))

@@ -147,11 +147,11 @@ def wall_axes(normals: Floats, up: Floats) -> Floats:
     return np.stack([along, np.cross(up, along), up])
 
 
-def closed_sides(positions: Floats, normals: Floats, axes: Floats, patch_m: float) -> Floats:
+def closed_sides(positions: Floats, normals: Floats, axes: Floats, patch_m: float, *, has_walls: bool = True) -> Floats:
     """[SIDES] how far each side of a room is scanned wall, from 0, open, to 1.
 
     positions, normals: [n, 3] of patches of side `patch_m`, world; a side is closed by those at the end of the scan
-    that face into the room.
+    that face into the room. has_walls: else upright surface is of things on a table, and closes nothing.
     """
     surface, facing = positions @ axes.T, normals @ axes.T
     ends = _ends(surface)
@@ -160,16 +160,25 @@ def closed_sides(positions: Floats, normals: Floats, axes: Floats, patch_m: floa
         axis, is_high = divmod(side, 2)
         inward = facing[:, axis] * (-1 if is_high else 1) > _INWARD
         is_wall = inward & (np.abs(surface[:, axis] - ends[is_high, axis]) < WALL_M)
-        closed[side] = min(float(is_wall.sum()) * patch_m**2 / CLOSED_M2, 1.0)
+        if has_walls or axis == 2:
+            closed[side] = min(float(is_wall.sum()) * patch_m**2 / CLOSED_M2, 1.0)
     return closed
 
 
 def shell_around(
-    positions: Floats, normals: Floats, cameras: Floats, up: Floats, patch_m: float, before: Shell | None
+    positions: Floats,
+    normals: Floats,
+    cameras: Floats,
+    up: Floats,
+    patch_m: float,
+    before: Shell | None,
+    *,
+    has_walls: bool = True,
 ) -> Shell:
     """The shell around `positions` [n, 3] of surface and `cameras` [m, 3], world metres.
 
-    before: the last one, returned unless the shell has changed by more than noise makes. patch_m: see closed_sides.
+    before: the last one, returned unless the shell has changed by more than noise makes. patch_m, has_walls: see
+    closed_sides.
     """
     axes = wall_axes(normals, upright(normals, up)) if before is None else before.axes
     low, high = _ends(positions @ axes.T)
@@ -177,7 +186,7 @@ def shell_around(
     seen_from = cameras @ axes.T
     if before is not None:
         seen_from = np.concatenate([seen_from, before.cameras])
-    open_share = 1.0 - closed_sides(positions, normals, axes, patch_m).reshape(3, 2).T
+    open_share = 1.0 - closed_sides(positions, normals, axes, patch_m, has_walls=has_walls).reshape(3, 2).T
     reach = CAMERA_M + np.array([BEHIND_M, BEHIND_M, 0.0]) * open_share
     seen = np.stack([seen_from.min(0), seen_from.max(0)])
     low, high = np.minimum(low, seen[0] - reach[0]), np.maximum(high, seen[1] + reach[1])

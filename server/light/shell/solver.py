@@ -60,9 +60,12 @@ class Solver:
         if len(rows) < LEAST_PATCHES:
             return None
         positions, normals = patches.positions[rows], patches.normals[rows]
-        self._shell = shell = shell_around(positions, normals, camera[None], up, patches.side_m, self._shell)
+        side_m, has_walls = patches.side_m, patches.has_walls
+        self._shell = shell = shell_around(
+            positions, normals, camera[None], up, side_m, self._shell, has_walls=has_walls
+        )
         self._transport.update(patches, bright, traced, shell)
-        closed = closed_sides(positions, normals, shell.axes, patches.side_m)
+        closed = closed_sides(positions, normals, shell.axes, side_m, has_walls=has_walls)
         evidence = evidence_of(patches, rows, switches)
         near = near_sources(self._transport, shell, evidence.rows)
         distant = distant_sources(self._transport, closed, evidence.rows, with_indirect=switches.indirect)

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import os
 import time
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from client.sources.volume import default_volume
+from client.synthetic.source import open_synthetic
 from protocol.frames import CameraModel, RgbdFrame
+from server.tracking import camera_tracking
 from tests.bench.geometry.filters import energy
 from tests.bench.geometry.surface import SurfaceView
 from tests.bench.peers import contestant
@@ -150,6 +154,25 @@ def test_a_contestant_has_a_process_of_its_own() -> None:
             worker.process(frames[2])
     with pytest.raises(ContestantLostError, match="no attribute 'Nobody'"):
         _ = Worker(Entry("x", "tests.pipeline.test_geometry_bench", "Nobody"), scene).process(frames[0])
+
+
+@pytest.mark.parametrize("entry", [entry for entry in ENTRIES if entry.name in (OURS, OURS_TRACKING)])
+def test_our_own_contestants_play(entry: Entry, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each frame has times of what it is measured for."""
+    monkeypatch.setattr(camera_tracking, "bilateral_depth", camera_tracking.bilateral_depth)  # one puts a clock there
+    source = open_synthetic("synthetic:table?size=160x120")
+    bounds_m = default_volume(source, range(3))
+    start = source[0].world_from_camera
+    assert start is not None
+    contestant = getattr(import_module(entry.module), entry.attribute)(Scene(source.camera, bounds_m, 0.01, start))
+    for index in range(3):
+        turn = Turn()
+        contestant.process(source[index], turn)
+        wanted = {INTEGRATE, RAYCAST} if entry.name == OURS else {TRACK}
+        assert wanted <= set(turn.wall_ms)
+        assert min(turn.wall_ms[name] for name in wanted) > 0
+        if entry.name == OURS:
+            assert np.isfinite(contestant.depth(source[index])).any()
 
 
 def test_differences_show_their_side() -> None:

@@ -61,7 +61,7 @@ class GivenPoses:
 
     def process(self, frame: RgbdFrame, turn: Turn) -> None:
         self._stages.turn = turn
-        self._stages.forget()
+        self._stages.begin()
         self._shown = self.geometry.scan(frame)
 
     def depth(self, frame: RgbdFrame) -> NDArray[np.float32]:  # noqa: ARG002

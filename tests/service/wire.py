@@ -39,6 +39,7 @@ class Wire:
             compression=None,
             max_size=None,
             proxy=None,
+            open_timeout=PATIENCE_S,  # a server that starts again on a busy machine answers late
         ).__enter__()  # closed by `hang_up`
 
     def say(self, *messages: ClientMessage) -> None:

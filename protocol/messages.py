@@ -193,7 +193,8 @@ class Wishes(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     up: Vector3 | None = None
     """World direction; None: found from the scan, else the first camera's -y, as the notes of the answers say."""
     light: tuple[Rgb, ...] | None = None
-    """Radiance SH to render with instead of an estimate: 1, 4, 9 ... coefficients; None: estimate one."""
+    """Radiance SH to render with instead of an estimate: 1, 4, 9 ... coefficients, in units of the first picture, whose
+    white is 1 (for other units, as most panoramas have, see `tone_mapping`); None: estimate one."""
     light_axes: Literal["world", "webxr"] = "world"
     """Axes of `light`; `webxr`: up as +y and the first camera's view near -z."""
     light_at: tuple[Vector3, ...] = ()

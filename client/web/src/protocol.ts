@@ -112,7 +112,10 @@ export interface Wishes {
   voxel_m?: number | null;
   /** World direction; null: found from the scan, else the first camera's -y, as the notes of the answers say. */
   up?: [number, number, number] | null;
-  /** Radiance SH to render with instead of an estimate: 1, 4, 9 ... coefficients; null: estimate one. */
+  /**
+   * Radiance SH to render with instead of an estimate: 1, 4, 9 ... coefficients, in units of the first picture, whose
+   * white is 1 (for other units, as most panoramas have, see `tone_mapping`); null: estimate one.
+   */
   light?: Array<[number, number, number]> | null;
   /** Axes of `light`; `webxr`: up as +y and the first camera's view near -z. */
   light_axes?: "webxr" | "world";

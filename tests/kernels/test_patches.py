@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -154,13 +156,33 @@ def test_a_patch_is_the_mean_of_its_frames() -> None:
         ((0.5, 0.3, 0.5), 0.0025, 0.0375),
         ((0.5, 0.3, 0.5), 0.02, 0.08),  # four voxels
         ((0.5, 0.3, 0.5), 0.1, 0.15),
+        ((0.0, 0.0, 0.0), 0.01, 0.04),
     ],
 )
 def test_patches_are_as_large_as_what_is_scanned(
-    engine: Engine, size_m: tuple[float, float, float], voxel_m: float, side_m: float
+    size_m: tuple[float, float, float], voxel_m: float, side_m: float
 ) -> None:
-    volume = Volume(engine, (1.0, -2.0, 0.5, 1.0 + size_m[0], -2.0 + size_m[1], 0.5 + size_m[2]), voxel_m)
-    assert patch_side_m(volume) == pytest.approx(side_m)
+    positions = np.array([1.0, -2.0, 0.5]) + np.array(size_m) * np.linspace(0, 1, 300)[:, None]
+    stray = np.vstack([positions, [[40.0, 0.0, 0.0]]])
+    assert patch_side_m(positions, voxel_m) == patch_side_m(stray, voxel_m) == pytest.approx(side_m)
+
+
+def test_patches_are_put_together_where_the_scan_has_grown() -> None:
+    patches = Patches(0.075)
+    places = np.array([[0.02, 0.02, 0.02], [0.1, 0.02, 0.02], [0.2, 0.02, 0.02]])
+    shown = np.repeat(np.log([[0.2], [0.4], [0.9]]), 3, axis=1)
+    for _ in range(3):
+        patches.add(replace(one(places, 1.0), logarithms=shown))
+    larger = patches.grown(0.15)
+    rows = larger.seen
+    order = np.argsort(larger.positions[rows, 0])
+    assert (larger.side_m, larger.fresh) == (0.15, 2)
+    assert not patches.has_walls
+    assert larger.has_walls
+    np.testing.assert_allclose(larger.positions[rows][order], [[0.06, 0.02, 0.02], [0.2, 0.02, 0.02]], atol=1e-12)
+    means = [(np.log(0.2) + np.log(0.4)) / 2, np.log(0.9)]
+    np.testing.assert_allclose(larger.logarithms[rows][order, 0], means, atol=1e-12)
+    np.testing.assert_array_equal(larger.weights[rows], 3.0)
 
 
 def test_small_patches_are_told_apart_and_resumed() -> None:

@@ -30,9 +30,9 @@ from server.volume.raycast import raycast
 from server.volume.volume import Volume
 from tests.scenes import corners
 from tests.scenes.analytic import Floats, look_at
-from tests.scenes.corners import FLOOR, WALL, corner_frame
+from tests.scenes.corners import FLOOR, WALL, corner_frame, degrees_across
 from tests.scenes.kept_rooms import BALL, CUBE, PLACE, client_of, print_of, scan, voxels_of
-from tests.scenes.lights import degrees_between, lobe_and_sky
+from tests.scenes.lights import lobe_and_sky
 from tests.scenes.rooms import CAMERA, VOXEL_M, frame_at, view_at, wishes
 from tests.scenes.volumes import fuse_frame
 
@@ -162,7 +162,7 @@ def corner(device: Device) -> Iterator[Room]:
     light = show(ClientSession(device, corners.CAMERA, CORNER, room), [FLOOR, WALL] * 6, 0)
     assert light.spread_deg is not None
     assert light.spread_deg < 60  # seen: 49
-    assert degrees_between(light.dominant_direction, TOWARDS) < 6  # seen: 2.8
+    assert degrees_across(light.dominant_direction, TOWARDS) < 8  # seen: 4.1
     yield room
     room.close()
 
@@ -178,10 +178,8 @@ def test_what_two_planes_told_holds_for_one(device: Device, corner: Room, store:
         ClientSession(device, corners.CAMERA, CORNER, again),
     )
     lights = [show(client, [FLOOR] * 4, 12) for client in (went_on, came_back)]
-    assert (
-        degrees_between(lights[1].dominant_direction, lights[0].dominant_direction) < 10
-    )  # seen: 7; both are within 33 degrees by their spread
-    assert degrees_between(lights[1].dominant_direction, TOWARDS) < 14
+    assert degrees_across(lights[1].dominant_direction, lights[0].dominant_direction) < 5
+    assert degrees_across(lights[1].dominant_direction, TOWARDS) < 8
     again.close()
 
 
@@ -192,7 +190,7 @@ def test_a_light_that_has_changed_is_found_in_a_room_that_came_back(
     again = loaded(store, "corner", device)
     client, turned = ClientSession(device, corners.CAMERA, CORNER, again), (0.98, 0.2, 0.0)
     light = show(client, [FLOOR, WALL] * 8, 12, 0.3 * lobe_and_sky(turned))
-    assert degrees_between(light.dominant_direction, turned) < 8  # seen: 3.3
+    assert degrees_across(light.dominant_direction, turned) < 12  # 47 before; seen: 9, after other frames 5 to 10
     again.close()
 
 

@@ -116,6 +116,20 @@ def test_it_finds_what_the_solver_finds(solver: SolverProcess, tasks: list[Task]
         np.testing.assert_array_equal(found.near.covariance, one.near.covariance)
 
 
+def test_a_solver_begins_anew_where_patches_were_put_together(tasks: list[Task]) -> None:
+    """What it knew was of other rows."""
+    before, task = tasks[:2]
+    task = replace(task, traced=task.patches.used)
+    task.patches.side_m *= 2
+    went_on, anew = Solver(Switches()), Solver(Switches())
+    anew.begin_with(before.solve(went_on).shell)  # type: ignore[union-attr]
+    found, expected = task.solve(went_on), task.solve(anew)
+    assert found is not None
+    assert expected is not None
+    np.testing.assert_array_equal(found.near.radiance, expected.near.radiance)
+    np.testing.assert_array_equal(found.distant.radiance, expected.distant.radiance)
+
+
 def test_what_frames_ask_comes_with_the_solution(solver: SolverProcess, tasks: list[Task]) -> None:
     places = np.array([[0.0, 0.0, 1.0]])
     task = replace(tasks[-1], asked=replace(tasks[-1].asked, positions=places))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.messages import Wishes
@@ -42,6 +43,13 @@ def corner_frame(part: int, index: int, light: Floats) -> RgbdFrame:
     color = np.where(seen[..., None], np.clip(ALBEDO * whole * 65535, 0, 65535), 0).astype(np.uint16)
     units = np.where(seen, np.rint(depth_m / CAMERA.depth_scale_m), 0).astype(np.uint16)
     return RgbdFrame(index, index / 30, color, units, pose)
+
+
+def degrees_across(direction: ArrayLike, towards: ArrayLike) -> float:
+    """Angle between two directions as seen along the edge: about the third axis, which no surface faces, two planes
+    tell next to nothing."""
+    (x, y), (to_x, to_y) = np.asarray(direction)[:2], np.asarray(towards)[:2]
+    return float(np.degrees(np.abs(np.arctan2(x * to_y - y * to_x, x * to_x + y * to_y))))
 
 
 def _shading(points: Floats, own: int, other: int, light: Floats) -> Floats:

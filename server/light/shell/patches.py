@@ -25,10 +25,12 @@ PATCH_M = 0.15
 """Side of the grid's cells in a room. Shading changes little within one, except at contacts; a room has about 1000
 patches."""
 ROOM_M = 2.0
-"""Diagonal of the smallest volume that is a room, or a corner of one. What is smaller is a table with things on it, of
+"""Diagonal of the smallest scan that is a room, or a corner of one. What is smaller is a table with things on it, of
 which a patch must not hold a whole one: with PATCH_M the light of the stage set, 1.5 m across, errs by 16 degrees, with
 half of it by 8, with a quarter by 8 too, but stripes painted on a table then turn it by 50 instead of 28. The corner of
 a room 3 m across (mitsuba_room) errs by 21 degrees with half of it instead of 14: one surface falls into many."""
+_OUTLIERS = 0.01
+"""Share of the surface that may lie farther out on either side: stray depth."""
 LEAST_VOXELS = 4.0
 """Least side of a cell, in voxels: finer than that the scan has no normals."""
 REGION_M = 0.4
@@ -57,12 +59,13 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-def patch_side_m(volume: Volume) -> float:
-    """Side of the patches of what is scanned into this volume: PATCH_M, and half of that each time it is less than
-    ROOM_M across, half of that, and so on."""
-    across_m = float(np.linalg.norm(np.subtract(volume.bounds_m[3:], volume.bounds_m[:3])))
+def patch_side_m(positions: Floats, voxel_m: float) -> float:
+    """Side of the patches of a scan of surface at `positions` [n, 3]: PATCH_M, and half of that each time it is less
+    than ROOM_M across, half of that, and so on."""
+    low, high = np.quantile(positions, (_OUTLIERS, 1 - _OUTLIERS), axis=0)
+    across_m = max(float(np.linalg.norm(high - low)), voxel_m)
     side_m = PATCH_M * 2.0 ** np.floor(np.log2(across_m / ROOM_M))
-    return float(min(max(side_m, LEAST_VOXELS * volume.voxel_m), PATCH_M))
+    return float(min(max(side_m, LEAST_VOXELS * voxel_m), PATCH_M))
 
 
 @dataclass(frozen=True)
@@ -190,6 +193,22 @@ class Patches:
         for name in _CHANGED_BY_FRAMES:
             setattr(other, name, getattr(self, name).copy())
         return other
+
+    def grown(self, side_m: float) -> Patches:
+        """The same with cells of `side_m`; their rays are not traced yet."""
+        rows = self.seen
+        larger = Patches(side_m)
+        seen = Seen(
+            self.positions[rows], self.normals[rows], self.logarithms[rows], self.variances[rows], self.clipped[rows]
+        )
+        larger.add(seen)
+        larger.weights[larger.seen] = self.weights[rows].max(initial=0.0)
+        return larger
+
+    @property
+    def seen(self) -> Ints:
+        """Rows of all patches, with or without rays."""
+        return np.flatnonzero(self.weights > 0)
 
     def known(self) -> KnownPatches:
         """All but their rays."""

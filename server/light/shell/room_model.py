@@ -115,11 +115,12 @@ class RoomModel:
         if not seen.count:
             return
         if self._patches.is_empty:
-            self._patches = Patches(patch_side_m(volume))
+            self._patches = Patches(patch_side_m(seen.positions, volume.voxel_m))
         change = self._change(seen) if switches.memory else 1.0
         self._patches.forget(change)
         self._bright.forget(change)
         self._patches.add(seen)
+        self._keep_side(volume.voxel_m)
         self._bright.add(seen.bright, seen.positions)
         self._waiting, self._frames = self._waiting + 1, self._frames + 1
         self._is_urgent = self._is_urgent or self._must_follow(change)
@@ -141,6 +142,14 @@ class RoomModel:
         if solves_now:
             self.finish()
             self._take_over(engine.pacer)
+
+    def _keep_side(self, voxel_m: float) -> None:
+        """Larger patches once the scan has outgrown a table."""
+        if self._patches.has_walls:
+            return
+        side_m = patch_side_m(self._patches.positions[self._patches.seen], voxel_m)
+        if side_m > self._patches.side_m:
+            self._patches, self._is_urgent = self._patches.grown(side_m), True
 
     def finish(self) -> None:
         """Begin the solution whose rays are on their way, if there is one."""

@@ -40,14 +40,19 @@ class Solver:
 
     def __init__(self, switches: Switches) -> None:
         self._switches = switches
-        self._transport = Transport()
-        self._near, self._distant = Unknowns(), Unknowns()
         self._shell: Shell | None = None
-        self._last: Solution | None = None
+        self._begin_anew(0.0)
 
     def begin_with(self, shell: Shell | None) -> None:
         """Keep the size and place of the shell of an earlier solution."""
         self._shell = shell
+
+    def _begin_anew(self, side_m: float) -> None:
+        """Forget all that belongs to rows of patches."""
+        self._transport = Transport()
+        self._near, self._distant = Unknowns(), Unknowns()
+        self._last: Solution | None = None
+        self._side_m = side_m
 
     def solve(
         self, patches: Patches, bright: EmittersSeen, traced: NDArray[np.int64], camera: Floats, up: Floats
@@ -61,6 +66,8 @@ class Solver:
             return None
         positions, normals = patches.positions[rows], patches.normals[rows]
         side_m, has_walls = patches.side_m, patches.has_walls
+        if side_m != self._side_m:  # they were put together
+            self._begin_anew(side_m)
         self._shell = shell = shell_around(
             positions, normals, camera[None], up, side_m, self._shell, has_walls=has_walls
         )

@@ -40,7 +40,7 @@ from server.reuse.temporal_reuse import ReuseDecision
 from server.shading.composite import CompositeInputs, composite, composite_on_device, shown_picture
 from server.shading.layer import Layer, compose_layer
 from server.shading.tone_mapping import AverageMemory, Averages, measure_averages
-from server.shading.traced_scene import DeviceLight, take_discs, upload_light
+from server.shading.traced_scene import DeviceLight, upload_light
 from server.transfer.indirect import Indirect
 from server.transfer.radiance_transfer import TURNS, Transfer
 from server.transfer.real_depth_views import RealDepthViews
@@ -190,23 +190,18 @@ class Renderer:
         self, context: FrameContext, spine: SpineOutputs, settings: Settings, shown: Picture
     ) -> tuple[PictureParts, Plan]:
         """What the picture is composed of, and the plan that made it."""
-        samples, rays = spine.samples, context.rays
-        light = upload_light(self._engine, spine.sh, rays, samples.indirect, context.exposure, spine.light_places)
-        averages = self._averages(context, spine, settings, light)  # 7.1, H
-        if spine.objects:
-            light = take_discs(self._engine, light, spine.split, rays, context.exposure)  # 7.2.3
+        averages = self._averages(context, spine, settings)  # 7.1, H
+        light = _upload(context, spine, spine.split if spine.objects else None)  # 7.2.3
         gain = averages.gain if averages is not None else 1.0
         has_indirect = settings.indirect != "none"
         facts = self._facts.find(
-            context, spine.objects, samples, light, spine.sh, spine.split, shown, gain, has_indirect=has_indirect
+            context, spine.objects, spine.samples, light, spine.sh, spine.split, shown, gain, has_indirect=has_indirect
         )
         given = _given(context, spine, light, averages, facts)
         effects = make_plan(EFFECTS, PictureParts, given, facts, everything=self._everything, stages=spine.left_out)
         return effects.execute(given), effects.described()
 
-    def _averages(
-        self, context: FrameContext, spine: SpineOutputs, settings: Settings, light: DeviceLight
-    ) -> Averages | None:
+    def _averages(self, context: FrameContext, spine: SpineOutputs, settings: Settings) -> Averages | None:
         """Mean luminances of the picture and of its shading; None where virtual things are not to match them."""
         wished, transfer = settings.tone_mapping, spine.samples.transfer
         keeps_scale = wished == "light" or (wished == "auto" and spine.is_light_given)
@@ -219,7 +214,7 @@ class Renderer:
             context.surface,
             transfer,
             context.rays,
-            light,
+            _upload(context, spine, None),
             spine.samples.indirect,
             context.ray_length_m,
         )
@@ -232,6 +227,12 @@ class Renderer:
             first = self._cache.keep(FirstSight(shown.copy(), context.measurement), reuse.view_version)
         context = replace(context, measurement=first.measurement)
         return composite(context.engine, first.shown, composite_inputs(context, parts))
+
+
+def _upload(context: FrameContext, spine: SpineOutputs, split: SplitLight | None) -> DeviceLight:
+    """The frame's light, whole or without the discs of `split`."""
+    indirect = spine.samples.indirect
+    return upload_light(context.engine, spine.sh, context.rays, indirect, context.exposure, spine.light_places, split)
 
 
 def _given(

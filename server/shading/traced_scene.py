@@ -12,7 +12,6 @@ from functools import cached_property
 
 import numpy as np
 import pyopencl.array as cl_array
-import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
@@ -21,11 +20,12 @@ from server.maths.direct_lights import DirectLight, SplitLight
 from server.maths.light_places import EVERYWHERE, LightPlaces
 from server.objects.object_table import ObjectTable, object_table
 from server.objects.rasterize import Placed
-from server.opencl.buffers import BufferDescription, DeviceBuffer, StageBuffers
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, KernelArgument, float4, float16, int4
 from server.opencl.parts import Parts
-from server.opencl.structs import CHANGED_PARAMETERS, LIGHT_PARAMETERS, LIGHT_TABLE, OBJECT_PARAMETERS, SCENE_PARAMETERS
+from server.opencl.structs import CHANGED_PARAMETERS, LIGHT_PARAMETERS, OBJECT_PARAMETERS, SCENE_PARAMETERS
 from server.shading.depth_views import DepthViews
+from server.shading.light_table import table_layout, tabulate_light
 from server.shading.virtual_point_lights import VirtualPointLights, no_point_lights
 from server.transfer.indirect import Indirect
 from server.transfer.radiance_transfer import Directions
@@ -37,6 +37,7 @@ class _Buffers(StageBuffers):
     table = BufferDescription(np.uint8)
     """DeviceLight.table of all of the light."""
     rest_table = BufferDescription(np.uint8)
+    """The same without discs."""
 
 
 @dataclass(frozen=True)
@@ -66,13 +67,7 @@ class DeviceLight:
     @cached_property
     def layout(self) -> np.void:
         """LightTable of structs.py."""
-        starts = self.table.starts
-        places, sets, per_set = self.table.shapes["arriving"][0]
-        return LIGHT_TABLE(
-            places=places,
-            directions=sets * per_set,
-            **{f"{part}_at": start for part, start in starts.items()},
-        )
+        return table_layout(self.table)
 
 
 @dataclass(frozen=True)
@@ -227,52 +222,25 @@ def upload_light(
     indirect: Indirect | None = None,
     exposure: float = 1.0,
     places: LightPlaces = EVERYWHERE,
+    split: SplitLight | None = None,
 ) -> DeviceLight:
     """Upload the light: radiance coefficients [bands^2, 3], or [places, bands^2, 3], and the radiance along `rays`.
 
     indirect: radiance from surfaces, None for none. exposure: radiance in the picture over that in `sh` and volume.
+    split: of `sh`; its discs are left out of the table.
     """
     sh = exposure * sh.reshape(len(places.positions), -1, 3)
+    discs = split.discs if split else ()
+    rest = exposure * split.rest.reshape(sh.shape) if split and discs else sh
+    buffers = engine.buffers(_Buffers)
     return DeviceLight(
         np.maximum(0.5 / np.sqrt(np.pi) * sh[:, 0], 0.0).mean(axis=0),
-        _upload_table(engine.buffers(_Buffers).table, rays, sh, sh, places),
+        tabulate_light(engine, buffers.rest_table if discs else buffers.table, rays, rest, sh, places),
         sh,
         places,
         exposure * indirect.mean if indirect else np.zeros(3),
         exposure if indirect else 0.0,
-    )
-
-
-def take_discs(
-    engine: Engine, light: DeviceLight, split: SplitLight, rays: Directions, exposure: float = 1.0
-) -> DeviceLight:
-    """`light` without the discs of `split`, which must be of the same light, places and `exposure`."""
-    if not split.discs:
-        return light
-    rest = exposure * split.rest.reshape(light.sh.shape)
-    return replace(
-        light,
-        table=_upload_table(engine.buffers(_Buffers).rest_table, rays, rest, light.sh, light.places),
-        discs=tuple(replace(disc, irradiance=exposure * disc.irradiance) for disc in split.discs),
-    )
-
-
-def _upload_table(
-    buffer: DeviceBuffer, rays: Directions, sh: NDArray[np.float64], whole: NDArray[np.float64], places: LightPlaces
-) -> Parts:
-    """The light's table, laid out as in include/light_table.clh. sh: without the discs."""
-    coefficients = _float4(sh)
-    basis = rays.basis.reshape(-1, sh.shape[1])
-    arriving = np.stack([basis @ place.view(np.float32).reshape(-1, 4) for place in coefficients])
-    np.maximum(arriving, 0.0, out=arriving)
-    return buffer.refresh_parts(
-        {
-            "coefficients": coefficients,
-            "whole": _float4(whole),
-            "arriving": arriving.view(cl_types.float4).reshape(len(sh), *rays.basis.shape[:2]),
-            "positions": _float4(places.positions),
-            "owners": np.array(places.owners or (0,), np.int32),
-        }
+        tuple(replace(disc, irradiance=exposure * disc.irradiance) for disc in discs),
     )
 
 
@@ -293,10 +261,3 @@ def _changed_parameters(changed: Changed | None) -> np.void:
 def _changed_buffers(engine: Engine, changed: Changed | None) -> tuple[cl_array.Array, cl_array.Array]:
     """CHANGED_BUFFERS of include/scene.clh."""
     return (changed.positions, changed.ratio.values) if changed else (engine.unused, engine.unused)
-
-
-def _float4(rgb: NDArray[np.floating]) -> NDArray[np.float32]:
-    """[..., 3] -> [...] float4 with w = 0."""
-    padded = np.zeros((*rgb.shape[:-1], 4), np.float32)
-    padded[..., :3] = rgb
-    return padded.view(cl_types.float4)[..., 0]

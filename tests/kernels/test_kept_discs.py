@@ -13,7 +13,7 @@ from server.objects.rasterize import Placed
 from server.opencl.engine import Engine
 from server.shading.kept_discs import KeptDiscs
 from server.shading.shadow_map import ShadowMaps, draw_shadow_maps, trace_real
-from server.shading.traced_scene import take_discs, upload_light
+from server.shading.traced_scene import upload_light
 from server.transfer.radiance_transfer import Cells, direction_sets
 from server.transfer.sample_grid import SampleGrid
 from server.volume.raycast import Surface
@@ -32,8 +32,7 @@ LIGHT = DirectLight(lights.unit((0.3, 1.0, 0.2)), np.ones(3), float(np.radians(1
 
 
 def maps_of(engine: Engine, volume: Volume, disc: DirectLight) -> ShadowMaps:
-    light = upload_light(engine, lights.uniform(), RAYS)
-    light = take_discs(engine, light, SplitLight(lights.uniform(), (disc,)), RAYS)
+    light = upload_light(engine, lights.uniform(), RAYS, split=SplitLight(lights.uniform(), (disc,)))
     return draw_shadow_maps(engine, volume, light, [placed(engine, box((0.8, 0.2, 0.8), (0.85, 0.3, 0.85)))], 10.0)
 
 
@@ -130,9 +129,7 @@ def test_maps_are_drawn_anew_where_an_object_or_a_disc_has_moved(engine: Engine)
     lamp = lamp_at(np.array([0.5, 2.0, 0.5]), 0.3, np.ones(3))
 
     def drawn(disc: DirectLight, objects: list[Placed]) -> tuple[int, Floats]:
-        light = take_discs(
-            engine, upload_light(engine, lights.uniform(), RAYS), SplitLight(lights.uniform(), (disc,)), RAYS
-        )
+        light = upload_light(engine, lights.uniform(), RAYS, split=SplitLight(lights.uniform(), (disc,)))
         engine.profile.begin()
         maps = draw_shadow_maps(engine, volume, light, objects, 10.0)
         count = engine.profile.launches

@@ -29,7 +29,7 @@ from server.shading.shadow_map import (
     most_irradiance,
     trace_real,
 )
-from server.shading.traced_scene import DeviceLight, take_discs, trace_scene, upload_light
+from server.shading.traced_scene import DeviceLight, trace_scene, upload_light
 from server.shading.virtual_point_lights import place_points
 from server.transfer.indirect import MeanSent, gather_hits, observe_indirect
 from server.transfer.radiance_transfer import Directions, direction_sets, transfer_radiance
@@ -140,8 +140,7 @@ def lit(
     ray_length_m: float = FAR_M,
 ) -> Lit:
     rays, volume = direction_sets(81, 4), fill_volume(engine, scene, VOXEL_M)
-    light = upload_light(engine, lights.uniform(), rays)
-    light = take_discs(engine, light, SplitLight(lights.uniform(), discs), rays)
+    light = upload_light(engine, lights.uniform(), rays, split=SplitLight(lights.uniform(), discs))
     objects = [placed(engine, solid) for solid in solids]
     return Lit(engine, draw_shadow_maps(engine, volume, light, objects, ray_length_m))
 
@@ -468,8 +467,7 @@ class BesideAWall:
         self.transfer = transfer_radiance(engine, self.camera, volume, surface, 1, rays, FAR_M)
         hits = gather_hits(engine, self.camera, volume, surface, self.transfer, rays, FAR_M)
         self.indirect = observe_indirect(engine, self.transfer, rays, hits, MeanSent())
-        rest = upload_light(engine, even, rays, indirect=self.indirect)
-        split = take_discs(engine, rest, SplitLight(even, (self.light,)), rays)
+        split = upload_light(engine, even, rays, indirect=self.indirect, split=SplitLight(even, (self.light,)))
         objects = [placed(engine, bar)]
         self.context = context_of(engine, self.camera, surface, volume, rays, FAR_M)
         self.maps = draw_shadow_maps(engine, volume, split, objects, FAR_M)
@@ -634,7 +632,7 @@ def test_mirrors_show_all_of_the_light(engine: Engine) -> None:
     assert split_light(light).discs
 
     def split_upload(engine: Engine, sh: Floats, rays: Directions, **rest: Any) -> DeviceLight:
-        return take_discs(engine, upload_light(engine, sh, rays, **rest), split_light(sh), rays)
+        return upload_light(engine, sh, rays, **rest, split=split_light(sh))
 
     whole, _ = glossy_surface.reflect(engine, *glossy_surface.surfaces(), light=light)
     with patch.object(glossy_surface, "upload_light", split_upload):
@@ -646,7 +644,7 @@ def test_mirrors_show_all_of_the_light(engine: Engine) -> None:
 def test_exposure_brightens_both_parts(engine: Engine) -> None:
     light = lights.uniform((0.3,) * 3) + np.outer(directional_sh(TOWARD, 0.2, 4), (1.0, 0.8, 0.5))
     rays, split = direction_sets(81, 4), split_light(light)
-    one, three = (take_discs(engine, upload_light(engine, light, rays, exposure=e), split, rays, e) for e in (1.0, 3.0))
+    one, three = (upload_light(engine, light, rays, exposure=e, split=split) for e in (1.0, 3.0))
     np.testing.assert_allclose(three.discs[0].irradiance, 3 * one.discs[0].irradiance)
     rest, whole = (download4(engine, three.table.array(part))[0, :, :3] for part in ("coefficients", "whole"))
     np.testing.assert_allclose(rest, 3 * split.rest, atol=1e-5)

@@ -672,7 +672,8 @@ class Light(Message, frozen=True, kw_only=True, tag="light"):
     spread_deg: float | None = None
     """Angle in degrees that 90 % of the possible dominant directions are within; null where unknown."""
     position: Vector3 | None = None
-    """World, metres: the middle of what the frame sees, from where `sh` is meant. Null until a frame was placed."""
+    """World, metres: the middle of what the frame sees, from where `sh` is meant; it stays until that has moved by a
+    twentieth of its distance from the camera. Null until a frame was placed."""
     at: tuple[ArrivingLight, ...] = ()
     """Light arriving at places: the view, then `wishes.light_at` in their order, then objects in theirs."""
 

@@ -19,6 +19,10 @@ MOST_OBJECTS = 64
 """Objects with a light of their own, which costs 2 ms and 1 kB each where the light has changed; the others have
 `Light.sh`."""
 
+VIEW_STEP = 0.05
+"""Share of its distance from the camera by which the middle of the view moves before the light is told of another place:
+a place costs 2 ms, and a camera that is held in hand moves by less from frame to frame."""
+
 Floats = NDArray[np.float64]
 Key = tuple[str, int, bytes]
 
@@ -30,7 +34,7 @@ class ToldPlaces:
         self.newest = LightPlaces()
         """World axes of the room, metres; where the camera is lost, those of the last frame that was placed."""
         self._middle: ViewMiddle | None = None
-        self._view: Floats = np.zeros(3)
+        self._view: Floats | None = None
         self._places: list[Place] = []
         self._begun: LookUp | None = None
         self._sh: Floats = np.zeros(0)
@@ -45,10 +49,11 @@ class ToldPlaces:
 
         asked: [n, 3] world; objects: the middle of each by name.
         """
-        origin = context.volume.origin_world
-        eye = context.volume_from_camera[:3, 3]
+        eye, origin = context.volume_from_camera[:3, 3], context.volume.origin_world
         middle = self._middle.seen_from(eye) if self._middle else None
-        self._view = (eye if middle is None else middle) + origin
+        view = eye if middle is None else middle
+        if self._view is None or np.linalg.norm(view + origin - self._view) > VIEW_STEP * np.linalg.norm(view - eye):
+            self._view = view + origin
         self._places = _places(self._view, asked, objects)
         told = {_key(lit.place) for lit in self.newest.lit}
         new = [place.position for place in self._places if _key(place) not in told]

@@ -182,6 +182,22 @@ def test_a_still_view_keeps_the_light_and_a_moved_object_gets_another(device: De
     pipeline.close()
 
 
+def test_the_middle_of_the_view_stays_while_a_camera_hardly_moves(device: Device) -> None:
+    """It is 1 m away. The light told is that of the place told."""
+    pipeline = session(device)
+    places = []
+    for index, shift_m in enumerate((0.0, 0.01, -0.02, 0.2, 0.21)):
+        shown = frame()
+        pose = shown.world_from_camera.copy()
+        pose[0, 3] += shift_m
+        places.append(pipeline.process(replace(shown, index=index, world_from_camera=pose)).light.position)
+    first, *near, moved, beside = np.array(places)
+    np.testing.assert_array_equal(near, [first, first])
+    assert moved[0] - first[0] > 0.1
+    np.testing.assert_array_equal(beside, moved)
+    pipeline.close()
+
+
 def test_a_lost_camera_keeps_the_light_of_the_last_frame(device: Device) -> None:
     pipeline = ClientSession(device, rooms.CAMERA, rooms.wishes("track", light_at=((0.0, 0.0, 1.0),)))
     for step in range(3):

@@ -640,7 +640,10 @@ export interface Light {
   valid: boolean;
   /** Angle in degrees that 90 % of the possible dominant directions are within; null where unknown. */
   spread_deg: number | null;
-  /** World, metres: the middle of what the frame sees, from where `sh` is meant. Null until a frame was placed. */
+  /**
+   * World, metres: the middle of what the frame sees, from where `sh` is meant; it stays until that has moved by a
+   * twentieth of its distance from the camera. Null until a frame was placed.
+   */
   position: [number, number, number] | null;
   /** Light arriving at places: the view, then `wishes.light_at` in their order, then objects in theirs. */
   at: Array<ArrivingLight>;

@@ -20,7 +20,7 @@ MOST_OBJECTS = 64
 `Light.sh`."""
 
 VIEW_STEP = 0.05
-"""Share of its distance from the camera by which the middle of the view moves before the light is told of another place:
+"""Share of its distance from the camera by which the middle of the view moves before the light is told of a new place:
 a place costs 2 ms, and a camera that is held in hand moves by less from frame to frame."""
 
 Floats = NDArray[np.float64]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from protocol.messages import ArrivingLight
 from server.maths.sh import rotate_sh
@@ -77,6 +78,15 @@ def test_the_last_frames_are_judged() -> None:
     assert compare(frames, light()[None]).last().angles_deg.max() < 1e-3
 
 
+def test_coefficients_inside_their_intervals_are_counted() -> None:
+    """After one scale; what is not known may be anything."""
+    found, true = light(), 2.0 * light()
+    true[5, 1] += 1.0
+    of_some = compare([(structs.replace(told(found), sh_std=((0.1, 0.1, None),) * 16),)], true[None])
+    assert one(found, true).inside[0, 0] == 1.0
+    assert 1 - 2 / 48 <= of_some.inside[0, 0] < 1.0
+
+
 def test_light_in_a_closed_room(device: Device) -> None:
     """A ceiling lamp that no picture shows. Figures of whole runs are in docs/benchmarks/light.md."""
     folder = data_folder("rooms") / "r1_ceiling"
@@ -87,3 +97,4 @@ def test_light_in_a_closed_room(device: Device) -> None:
     assert np.median(arrived.irradiance[-5:]) <= 0.25  # seen: .14
     assert abs(np.median(arrived.level[-5:]) - 1) <= 0.35  # seen: .2
     assert (last <= arrived.spreads_deg[-5:]).mean() >= 0.9  # seen: 1
+    assert arrived.inside[-5:].mean() >= 0.85  # of the 95 % intervals; without LEAST_SPREAD_DEG in them .6

@@ -22,5 +22,5 @@ def distant_light(solved: Solved, bands: int) -> LightEstimate:
     covariance = solved.covariance_of(gradient)
     tint = sh[0] / max(float(sh[0] @ LUMINANCE), 1e-12)
     angle = spread_deg(sh @ LUMINANCE, covariance)
-    std, is_valid = np.outer(deviations(covariance), tint), angle <= VALID_SPREAD_DEG
+    std, is_valid = deviations(sh, covariance, tint), angle <= VALID_SPREAD_DEG
     return LightEstimate(sh, std, solved.condition, valid=is_valid, spread_deg=angle)

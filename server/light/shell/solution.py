@@ -208,7 +208,7 @@ class Solution:
         return PlaceLight(
             position=position,
             sh=sh,
-            std=np.outer(deviations(covariance), tint),
+            std=deviations(sh, covariance, tint),
             spread_deg=angle,
             valid=angle <= VALID_SPREAD_DEG,
             seen=float((rays.columns[:DIRECTIONS, 0] == KNOWN).mean()),

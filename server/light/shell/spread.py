@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,9 +16,18 @@ _LINEAR = [3, 1, 2]  # x, y, z
 Floats = NDArray[np.float64]
 
 
-def deviations(covariance: Floats) -> Floats:
-    """[n] standard deviations, for what the curvature tells of n coefficients, [n, n]."""
-    return np.asarray(SPREAD_DOUBT * np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+def deviations(sh: Floats, covariance: Floats, tint: Floats) -> Floats:
+    """[n, 3] standard deviations of radiance `sh` [n, 3] as harmonics, by the covariance [n, n] of their luminance.
+
+    tint: [3] colour of what is not known, of luminance 1. Besides, all of the light may be turned by LEAST_SPREAD_DEG:
+    about random axes that changes the coefficients of band l by their length times sqrt(l (l + 1)), all alike.
+    """
+    told = SPREAD_DOUBT * np.outer(np.sqrt(np.maximum(np.diag(covariance), 0.0)), tint)
+    bands = np.array([l for l in range(math.isqrt(len(sh))) for _ in range(2 * l + 1)])
+    lengths = np.sqrt(np.stack([np.bincount(bands, column**2) for column in sh.T], axis=1))[bands]
+    turn = np.radians(LEAST_SPREAD_DEG) / _QUANTILE_90
+    turned = turn * np.sqrt(bands * (bands + 1) / (2 * bands + 1))[:, None] * lengths
+    return np.asarray(np.hypot(told, turned))
 
 
 def spread_deg(sh: Floats, covariance: Floats) -> float:

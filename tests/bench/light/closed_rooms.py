@@ -22,6 +22,7 @@ from protocol.messages import ArrivingLight, Wishes
 from server.maths.light_direction import direction_error_deg
 from server.maths.sh import lambert_transfer, spherical_fibonacci
 from server.pipeline import FrameResult
+from tests.bench.light.coverage import Estimate, is_inside
 from tests.bench.light.environment import NORMALS, irradiance_error
 from tests.bench.light.runs import at_preset, results_of, wishes_for
 from tests.bench.rendering.flip import flip_map
@@ -54,6 +55,8 @@ class Arrived:
     """Greatest relative error of a channel's share of the irradiance."""
     spreads_deg: Floats
     is_valid: NDArray[np.bool_]
+    inside: Floats
+    """Share of the coefficients, 3 x 16, whose true value lies inside the 95 % interval of `sh_std` after one scale."""
 
     def last(self) -> Arrived:
         """The frames that are judged."""
@@ -70,15 +73,17 @@ def level_and_chroma(found: Floats, true: Floats) -> tuple[float, float]:
 def compare(found: list[tuple[ArrivingLight, ...]], truth: Floats) -> Arrived:
     """found: a frame's lights at places, in the order of truth [places, 16, 3]."""
     rows = [[_errors(light, true) for light, true in zip(lights, truth, strict=True)] for lights in found]
-    columns = [np.array([[place[k] for place in row] for row in rows]) for k in range(6)]
-    return Arrived(*columns[:5], columns[5].astype(bool))
+    columns = [np.array([[place[k] for place in row] for row in rows]) for k in range(7)]
+    return Arrived(*columns[:5], columns[5].astype(bool), columns[6])
 
 
 def _errors(light: ArrivingLight, true: Floats) -> tuple[float, ...]:
     sh = np.array(light.sh, np.float64)
     level, chroma = level_and_chroma(sh, true)
     spread = 180.0 if light.spread_deg is None else light.spread_deg
-    return direction_error_deg(sh, true), irradiance_error(sh, true), level, chroma, spread, float(light.valid)
+    std = np.array([[np.inf if value is None else value for value in row] for row in light.sh_std])
+    inside = float(is_inside(Estimate(sh, std, true)).mean())
+    return direction_error_deg(sh, true), irradiance_error(sh, true), level, chroma, spread, float(light.valid), inside
 
 
 def _irradiance(light: Floats) -> Floats:
@@ -135,6 +140,7 @@ def _add_errors(part: Part, name: str, arrived: Arrived) -> None:
         ("all places: level, median off 1 by", abs(np.median(last.level) - 1), "", "<= 0.2"),
         ("all places: chroma of irradiance", 100 * np.median(last.chroma), "%", "<= 10"),
         ("angles within the spread that is said", 100 * (last.angles_deg <= last.spreads_deg).mean(), "%", ">= 90"),
+        ("coefficients inside the 95 % interval of sh_std", 100 * last.inside.mean(), "%", ">= 90"),
         ("spread over error", np.median(last.spreads_deg) / np.median(last.angles_deg), "", "<= 2.5"),
         ("valid", 100 * last.is_valid.mean(), "%", ">= 60"),
         ("greatest error where valid", np.where(last.is_valid, last.angles_deg, 0.0).max(), "deg", f"<= {FAR_OFF_DEG}"),

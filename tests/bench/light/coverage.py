@@ -32,11 +32,12 @@ def coverage(estimates: Sequence[Estimate]) -> Floats:
     deviation is not known has no interval and does not count; NaN where none has.
     """
     known = np.array([np.isfinite(item.std) for item in estimates])
-    inside = np.array([_inside(item) for item in estimates]) & known
+    inside = np.array([is_inside(item) for item in estimates]) & known
     count = known.sum(axis=(0, 2))
     return np.asarray(np.where(count > 0, inside.sum(axis=(0, 2)) / np.maximum(count, 1), np.nan))
 
 
-def _inside(item: Estimate) -> NDArray[np.bool_]:
+def is_inside(item: Estimate) -> NDArray[np.bool_]:
+    """[n, 3] whether the true coefficient lies inside its interval; always where the deviation is infinite."""
     apart = np.abs(item.mean - best_scale(item.true, item.mean) * item.true)
     return np.asarray(apart <= QUANTILE_95 * item.std)

@@ -48,6 +48,7 @@ def tabulate_light(
     known, content = engine.state(_Tabulated).of, packed.tobytes()
     memory, of_rays, before = known.get(buffer, (None, None, None))
     if memory is not table.memory or of_rays is not rays or before != content:
+        known.pop(buffer, None)  # until the table is whole
         engine.workspace.copy(table.memory, packed)
         kernel = engine.kernel("shading/light_table.cl", "tabulate_arriving", BANDS=round(sh.shape[1] ** 0.5))
         layout = table_layout(table)

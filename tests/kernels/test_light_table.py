@@ -59,3 +59,18 @@ def test_a_light_that_stays_is_not_tabulated_again(engine: Engine) -> None:
         launches.append(engine.profile.launches)
     assert launches == [0, 1, 1, 1, 1]
     np.testing.assert_array_equal(arriving(engine, light), first)
+
+
+def test_a_table_that_was_left_half_made_is_made_again(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    sh, rays = random_light(4), direction_sets(81, 4)
+    first = arriving(engine, upload_light(engine, sh, rays, places=PLACES))
+
+    def refuse(*_: object, **__: object) -> None:
+        raise InterruptedError
+
+    with monkeypatch.context() as patch, pytest.raises(InterruptedError):
+        patch.setattr(engine, "launch", refuse)
+        upload_light(engine, 2 * sh, rays, places=PLACES)
+    again = upload_light(engine, sh, rays, places=PLACES)
+    np.testing.assert_array_equal(arriving(engine, again), first)
+    np.testing.assert_allclose(download4(engine, again.table.array("whole"))[..., :3], sh, rtol=1e-6)

@@ -195,7 +195,7 @@ class Patches:
         return other
 
     def grown(self, side_m: float) -> Patches:
-        """The same with cells of `side_m`; their rays are not traced yet."""
+        """The same with cells of `side_m`, all as old as the oldest; their rays are not traced yet."""
         rows = self.seen
         larger = Patches(side_m)
         seen = Seen(

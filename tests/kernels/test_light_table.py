@@ -68,9 +68,10 @@ def test_a_table_that_was_left_half_made_is_made_again(engine: Engine, monkeypat
     def refuse(*_: object, **__: object) -> None:
         raise InterruptedError
 
-    with monkeypatch.context() as patch, pytest.raises(InterruptedError):
+    with monkeypatch.context() as patch:
         patch.setattr(engine, "launch", refuse)
-        upload_light(engine, 2 * sh, rays, places=PLACES)
+        with pytest.raises(InterruptedError):
+            upload_light(engine, 2 * sh, rays, places=PLACES)
     again = upload_light(engine, sh, rays, places=PLACES)
     np.testing.assert_array_equal(arriving(engine, again), first)
     np.testing.assert_allclose(download4(engine, again.table.array("whole"))[..., :3], sh, rtol=1e-6)

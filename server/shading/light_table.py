@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
@@ -50,7 +52,7 @@ def tabulate_light(
     if memory is not table.memory or of_rays is not rays or before != content:
         known.pop(buffer, None)  # until the table is whole
         engine.workspace.copy(table.memory, packed)
-        kernel = engine.kernel("shading/light_table.cl", "tabulate_arriving", BANDS=round(sh.shape[1] ** 0.5))
+        kernel = engine.kernel("shading/light_table.cl", "tabulate_arriving", BANDS=math.isqrt(sh.shape[1]))
         layout = table_layout(table)
         size = int(layout["directions"]), len(sh)
         engine.launch(kernel, size, layout, table.memory, rays.on_device(engine), local=_LOCAL)

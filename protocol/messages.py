@@ -562,7 +562,7 @@ class Timings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     host: float = 0.0
     """Milliseconds of `total` in which no kernel ran: the host's own work. The rows contain it."""
     launches: int = 0
-    """Kernels."""
+    """Kernels launched; one that is cut into slices counts once."""
     reads: int = 0
     """Times that the host waited for memory of the device."""
     read_bytes: int = 0

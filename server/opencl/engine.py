@@ -136,6 +136,7 @@ class Engine:
             self._typed[id(kernel)] = kernel, kernel.function_name
         passed: list[Any] = [a.data if isinstance(a, cl_array.Array) else a for a in arguments]
         _, name = self._typed[id(kernel)]
+        self.profile.launches += 1
         for offset, part in self.pacer.slices(name, rounded, local, steps):
             shift = offset if any(offset) else None
             variant = (id(kernel), local, shift is None, max(part) < SMALL_GRID)

@@ -36,8 +36,9 @@ PROBE = 1 / 16
 """Share of a slice that the first one of a kernel has whose steps were never timed, where others may want the device:
 they may take 50 times STEP_S."""
 TELLING = 1 / 20
-"""A slice that took less than this share of the longest says more of its launch than of its steps: it counts only where
-its steps took less than STEP_S all the same. Less than PROBE: the first slice of a long launch always counts."""
+"""A slice that took less than this share of the longest says more of its launch than of its steps: these took at most
+what it says. So it counts only where that is less than is known already; else a kernel that was held up once would stay
+in slices too short to tell otherwise. Less than PROBE: the first slice of a long launch always counts."""
 _FADING = 0.95
 """The longest time of a kernel's step is remembered with this factor a launch."""
 
@@ -195,7 +196,9 @@ class Pacer:
     def _learn(self, one: _Enqueued) -> None:
         started_s, ended_s = (clock_s(one.event, which) for which in (cl.profiling_info.START, cl.profiling_info.END))
         step_s = (ended_s - started_s) / one.steps
-        if ended_s - started_s >= TELLING * self._slice_s or step_s <= self._step_s:
+        known = self._times.of(one.kernel)
+        bound_s = self._step_s if known is None else max(known.longest_s, self._step_s)
+        if ended_s - started_s >= TELLING * self._slice_s or step_s <= bound_s:
             self._times.add(one.kernel, step_s)
 
 

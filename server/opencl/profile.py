@@ -26,7 +26,9 @@ def clock_s(event: cl.Event, which: int) -> float:
 
 
 @dataclass(frozen=True)
-class _Launch:
+class _Slice:
+    """A launch, or a part of one that was cut (pacing.py)."""
+
     row: str
     kernel: str
     event: cl.Event
@@ -38,7 +40,7 @@ class _Launch:
 class _Interval:
     """When a kernel ran, on the host's clock."""
 
-    launch: _Launch
+    slice: _Slice
     begin_s: float
     end_s: float
     """Without the time in which one that began before it was running."""
@@ -63,26 +65,29 @@ class Profile:
 
     def __init__(self) -> None:
         self.row = "input"
-        self._launches: list[_Launch] = []
+        self._slices: list[_Slice] = []
         self._depth = 0
         self.begin()
 
     def begin(self) -> None:
         """A frame begins; what one that failed has left is forgotten."""
-        self._launches.clear()
+        self._slices.clear()
         self._began_s = time.perf_counter()
         self._entered: list[tuple[float, str]] = [(self._began_s, self.row)]
+        self.launches = 0
+        """Kernels launched since then; one that was cut into slices counts once, so the count is the frame's own and not
+        of how busy the machine is."""
         self.reads = self.read_bytes = 0
         """Times that the host has waited for memory since then, and their bytes."""
 
     def add_event(self, kernel: str, event: cl.Event) -> None:
-        """Count a kernel, just launched, under the current row."""
-        self._launches.append(_Launch(self.row, kernel, event, time.perf_counter()))
+        """The time of a launch or slice, just enqueued, counts under the current row."""
+        self._slices.append(_Slice(self.row, kernel, event, time.perf_counter()))
 
     @property
-    def launches(self) -> int:
-        """Kernels since the frame began."""
-        return len(self._launches)
+    def slices(self) -> int:
+        """Of all launches since the frame began; one that was not cut is one."""
+        return len(self._slices)
 
     def count_read(self, size: int) -> None:
         """The host waits for `size` bytes of the device."""
@@ -117,8 +122,8 @@ class Profile:
         free_s, busy_s = self._began_s, 0.0
         for one in self._intervals(ended_s):
             self._add_idle(rows, free_s, one.begin_s)
-            rows[one.launch.row] += (one.end_s - one.begin_s) * 1e3
-            kernels[one.launch.kernel] += one.device_ms
+            rows[one.slice.row] += (one.end_s - one.begin_s) * 1e3
+            kernels[one.slice.kernel] += one.device_ms
             free_s, busy_s = one.end_s, busy_s + one.end_s - one.begin_s
         self._add_idle(rows, free_s, ended_s)
         total_s = ended_s - self._began_s
@@ -127,13 +132,13 @@ class Profile:
 
     def _intervals(self, ended_s: float) -> list[_Interval]:
         """When each kernel ran within the frame, in the order in which they began."""
-        if not self._launches:
+        if not self._slices:
             return []
-        events = [launch.event for launch in self._launches]
+        events = [one.event for one in self._slices]
         times = [(clock_s(event, _TIMES.START), clock_s(event, _TIMES.END)) for event in events]
         # An event is stamped as queued just before the host reads its own clock, and all have ended by now: the least
         # of these differences is nearest to that of the clocks.
-        offsets = [one.enqueued_s - clock_s(one.event, _TIMES.QUEUED) for one in self._launches]
+        offsets = [one.enqueued_s - clock_s(one.event, _TIMES.QUEUED) for one in self._slices]
         offset_s = min(*offsets, ended_s - max(device_end_s for _, device_end_s in times))
         found = []
         last_s = self._began_s
@@ -141,7 +146,7 @@ class Profile:
             device_begin_s, device_end_s = times[number]
             begin_s = min(max(device_begin_s + offset_s, last_s), ended_s)
             last_s = min(max(device_end_s + offset_s, begin_s), ended_s)
-            found.append(_Interval(self._launches[number], begin_s, last_s, (device_end_s - device_begin_s) * 1e3))
+            found.append(_Interval(self._slices[number], begin_s, last_s, (device_end_s - device_begin_s) * 1e3))
         return found
 
     def _add_idle(self, rows: dict[str, float], begin_s: float, end_s: float) -> None:

@@ -62,7 +62,7 @@ def test_the_second_queue_waits_where_it_is_told_to_and_is_closed_with_the_first
     held = engine.bytes_held
     other.workspace.array("own", (100,), np.int32)
     assert engine.bytes_held == held + 400
-    assert engine.profile.launches >= 3  # more where the machine is busy, and launches are cut
+    assert engine.profile.launches == 3
     engine.finish()
     engine.close()
     assert other.workspace.bytes_held == 0

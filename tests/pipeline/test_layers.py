@@ -14,7 +14,6 @@ from protocol.codec import encode
 from server.client_session import ClientSession
 from server.effects.table import effect_names
 from server.opencl.device import Device
-from server.opencl.pacing import StepTimes
 from server.pipeline import FrameResult
 from server.shading.layer import NEUTRAL, NOTHING
 from tests.scenes.played_layers import answered, played
@@ -39,8 +38,7 @@ def test_lights_are_the_same_however_frames_are_answered(device: Device, name: s
     assert len(set(lights(of_pictures))) > frames // 3
 
 
-def test_a_light_is_found_without_drawing(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "step_times", StepTimes())  # a busy machine's would cut launches into slices
+def test_a_light_is_found_without_drawing(device: Device) -> None:
     source = GallerySource("sharp-sun", width=80)
     # What a frame leaves to the next depends on its answer: its caches, and what surfaces send in the mean.
     wishes = msgspec.structs.replace(wishes_of(source), cache="off")

@@ -419,7 +419,7 @@ export interface Timings {
   total: number;
   /** Milliseconds of `total` in which no kernel ran: the host's own work. The rows contain it. */
   host: number;
-  /** Kernels. */
+  /** Kernels launched; one that is cut into slices counts once. */
   launches: number;
   /** Times that the host waited for memory of the device. */
   reads: number;

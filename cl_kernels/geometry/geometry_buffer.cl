@@ -1,5 +1,5 @@
 // The geometry buffer of the hybrid depth picture (thesis 4.2.2): positions, normals and labels.
-// Provides label_surface, fit_normals.
+// Provides geometry_buffer.
 #include "agreement.clh"
 #include "camera.clh"
 #include "planes.clh"
@@ -8,37 +8,6 @@
 #define LABEL_STATIC 1
 #define LABEL_DYNAMIC 2
 #define LABEL_FILLED 3
-
-// depth, sensed, predicted: planes (see merge.cl; sensed is negative where sensor and volume agree); model_positions,
-// model_normals [h][w]: the volume's surface -> positions, normals, labels [h][w]: the volume's surface where the filtered
-// depth agrees with it, else the point at the filtered depth, labelled by whether the sensor agrees, with normal 0.
-kernel void label_surface(const int width, const int height, const int pitch, global const float *depth,
-                          global const float *sensed, global const float *predicted, const float4 intrinsics,
-                          const float16 volume_from_camera, const float voxel_m, global const float4 *model_positions,
-                          global const float4 *model_normals, global float4 *positions, global float4 *normals,
-                          global uchar *labels) {
-    const int x = get_global_id(0);
-    const int y = get_global_id(1);
-    if (x >= width || y >= height) return;
-    const int pixel = y * width + x;
-    const int at = plane_index(pitch, x, y);
-    const float z = depth[at], volume = fabs(predicted[at]), sensor = fabs(sensed[at]);
-    const float near = AGREEMENT_M(z, voxel_m);
-    const int has_shifted = sensed[at] > 0.0f && fabs(sensor - volume) < near;  // by less than lambda_D, but everywhere around
-    if (z > 0.0f && volume > 0.0f && fabs(z - volume) < near && !has_shifted) {
-        positions[pixel] = model_positions[pixel];
-        normals[pixel] = model_normals[pixel];
-        labels[pixel] = LABEL_STATIC;
-    } else if (z > 0.0f) {
-        positions[pixel] = (float4)(transform_point(volume_from_camera, z * unproject(intrinsics, x, y)), 1.0f);
-        normals[pixel] = (float4)(0.0f);
-        labels[pixel] = sensor > 0.0f && fabs(z - sensor) < near ? LABEL_DYNAMIC : LABEL_FILLED;
-    } else {
-        positions[pixel] = (float4)(0.0f);
-        normals[pixel] = (float4)(0.0f);
-        labels[pixel] = LABEL_NONE;
-    }
-}
 
 // Slopes of eight planes: relative change of the inverse depth per pixel along x and y.
 typedef struct {
@@ -82,26 +51,74 @@ static Slopes fit_slopes(global const float *depth, const int pitch, const int a
     return result;
 }
 
-// depth: plane; labels [h][w] -> normals [h][w], unit, towards the camera, of dynamic and filled pixels; w = 0 if unknown.
-kernel void fit_normals(const int width, const int height, const int pitch, global const float *depth,
-                        global const uchar *labels, const float4 intrinsics, const float16 volume_from_camera,
-                        global float4 *normals) {
+// What is known of the eight pixels from (x, y) on: planes (see merge.cl; sensed is negative where sensor and volume agree) and
+// the volume's surface.
+typedef struct {
+    global const float *depth;
+    global const float *sensed;
+    global const float *predicted;
+    global const float4 *positions;
+    global const float4 *normals;
+    float4 intrinsics;
+    float16 volume_from_camera;
+    float voxel_m;
+} Inputs;
+
+typedef struct {
+    float4 position;
+    float4 normal;
+    uchar label;
+} SurfacePoint;
+
+// The volume's surface where the filtered depth agrees with it, else the point at the filtered depth, labelled by whether the sensor
+// agrees, with normal 0. at, pixel: of (x, y) in the planes and in the picture.
+static SurfacePoint surface_at(const Inputs inputs, const int x, const int y, const int at, const int pixel) {
+    const float z = inputs.depth[at], volume = fabs(inputs.predicted[at]), sensor = fabs(inputs.sensed[at]);
+    const float near = AGREEMENT_M(z, inputs.voxel_m);
+    const int has_shifted = inputs.sensed[at] > 0.0f && fabs(sensor - volume) < near;  // by less than lambda_D, but everywhere around
+    SurfacePoint point = {(float4)(0.0f), (float4)(0.0f), LABEL_NONE};
+    if (z > 0.0f && volume > 0.0f && fabs(z - volume) < near && !has_shifted) {
+        point.position = inputs.positions[pixel];
+        point.normal = inputs.normals[pixel];
+        point.label = LABEL_STATIC;
+    } else if (z > 0.0f) {
+        point.position = (float4)(transform_point(inputs.volume_from_camera, z * unproject(inputs.intrinsics, x, y)), 1.0f);
+        point.label = sensor > 0.0f && fabs(z - sensor) < near ? LABEL_DYNAMIC : LABEL_FILLED;
+    }
+    return point;
+}
+
+// depth, sensed, predicted: planes; model_positions, model_normals [h][w]. One item eight pixels of a row
+// -> positions, normals, labels [h][w] of surface_at; where they are not the volume's, normals fitted to the depth around, unit, towards
+// the camera; w = 0 if unknown.
+kernel void geometry_buffer(const int width, const int height, const int pitch, global const float *depth,
+                            global const float *sensed, global const float *predicted, const float4 intrinsics,
+                            const float16 volume_from_camera, const float voxel_m, global const float4 *model_positions,
+                            global const float4 *model_normals, global float4 *positions, global float4 *normals,
+                            global uchar *labels) {
     const int x = 8 * get_global_id(0);
     const int y = get_global_id(1);
     if (x >= width || y >= height) return;
-    const int pixel = y * width + x;
+    const Inputs inputs = {depth, sensed, predicted, model_positions, model_normals, intrinsics, volume_from_camera, voxel_m};
+    const int pixel = y * width + x, at = plane_index(pitch, x, y);
     const int count = min(8, width - x);
-    int needed = 0;
-    for (int i = 0; i < count; i++) needed |= labels[pixel + i] >= LABEL_DYNAMIC;
-    if (!needed) return;
-    const Slopes slopes = fit_slopes(depth, pitch, plane_index(pitch, x, y), intrinsics.s0);
+    int fitted = 0;  // a bit for each pixel whose normal is to be found
+    for (int i = 0; i < count; i++) {
+        const SurfacePoint point = surface_at(inputs, x + i, y, at + i, pixel + i);
+        positions[pixel + i] = point.position;
+        normals[pixel + i] = point.normal;
+        labels[pixel + i] = point.label;
+        fitted |= (point.label >= LABEL_DYNAMIC) << i;
+    }
+    if (!fitted) return;
+    const Slopes slopes = fit_slopes(depth, pitch, at, intrinsics.s0);
     float a[8], b[8];
     int valid[8];
     vstore8(slopes.x, 0, a);
     vstore8(slopes.y, 0, b);
     vstore8(slopes.valid, 0, valid);
     for (int i = 0; i < count; i++) {
-        if (labels[pixel + i] < LABEL_DYNAMIC || !valid[i]) continue;
+        if (!((fitted >> i) & 1) || !valid[i]) continue;
         const float across = a[i] * (x + i - intrinsics.s2) + b[i] * (y - intrinsics.s3);
         const float3 facing = normalize((float3)(-a[i] * intrinsics.s0, -b[i] * intrinsics.s1, across - 1.0f));
         normals[pixel + i] = (float4)(transform_vector(volume_from_camera, facing), 1.0f);

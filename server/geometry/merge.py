@@ -169,16 +169,15 @@ class _Merge:
         """Positions, normals and labels of a plane of depth."""
         buffers, shape, model = self._surface_buffers, self._size[::-1], self._model
         surface = Surface(buffers.positions.array(shape), buffers.normals.array(shape), buffers.labels.array(shape))
-        lens, pose = intrinsics(self._camera), float16(self._volume_from_camera)
         self._launch(
             "geometry_buffer.cl",
-            "label_surface",
-            self._size,
+            "geometry_buffer",
+            self._groups,
             depth,
             self._sensed,
             self._predicted,
-            lens,
-            pose,
+            intrinsics(self._camera),
+            float16(self._volume_from_camera),
             self._volume.voxel_m,
             model.positions,
             model.normals,
@@ -186,8 +185,6 @@ class _Merge:
             surface.normals,
             surface.labels,
         )
-        outputs = surface.labels, lens, pose, surface.normals
-        self._launch("geometry_buffer.cl", "fit_normals", self._groups, depth, *outputs)
         return surface
 
     def _launch(self, file: str, name: str, items: tuple[int, int], *arguments: KernelArgument) -> None:

@@ -63,51 +63,30 @@ def intrinsics(lens: CameraModel | DepthCamera) -> np.generic:
 
 def measure(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> Measurement:
     """Upload `frame` and rectify it. Its pictures must have the sizes of the camera's lenses."""
-    radiance, codes = _measure_color(engine, camera, frame)
-    units = engine.buffers(_Buffers).depth_units.upload(frame.depth)
-    if camera.depth is None:
-        depth_m = _measure_depth(engine, camera, units)
-    else:
-        depth_m = register_depth(engine, camera, units, GREATEST_DEPTH_M)
-    is_shown = camera.color_encoding == "srgb8" and not camera.is_distorted
-    return Measurement(radiance, depth_m, codes if is_shown else None)
-
-
-def _measure_color(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> tuple[cl_array.Array, cl_array.Array]:
-    """The radiance, and the codes that it was made from."""
-    buffers = engine.buffers(_Buffers)
-    radiance = buffers.radiance.array((camera.height, camera.width))
-    is_linear = camera.color_encoding == "linear16"
+    buffers, shape = engine.buffers(_Buffers), (camera.height, camera.width)
+    is_linear, has_depth = camera.color_encoding == "linear16", camera.depth is None
     codes = (buffers.linear16_codes if is_linear else buffers.srgb8_codes).upload(frame.color)
+    units = buffers.depth_units.upload(frame.depth)
+    radiance = buffers.radiance.array(shape)
+    depth_m = buffers.depth_m.array(shape) if has_depth else register_depth(engine, camera, units, GREATEST_DEPTH_M)
     engine.launch(
-        engine.kernel("measure.cl", "measure_color", LINEAR16=is_linear, DISTORTED=camera.is_distorted),
-        (camera.width, camera.height),
-        camera.width,
-        camera.height,
+        engine.kernel(
+            "measure.cl", "measure", LINEAR16=is_linear, DISTORTED=camera.is_distorted, HAS_DEPTH=has_depth
+        ),
+        shape[::-1],
+        *shape[::-1],
         codes,
         buffers.linear_values.constant(linear_values(camera.color_encoding)),
         intrinsics(camera),
         _distortion(camera),
-        radiance,
-    )
-    return radiance, codes
-
-
-def _measure_depth(engine: Engine, camera: CameraModel, units: cl_array.Array) -> cl_array.Array:
-    depth_m = engine.buffers(_Buffers).depth_m.array((camera.height, camera.width))
-    engine.launch(
-        engine.kernel("measure.cl", "measure_depth", DISTORTED=camera.is_distorted),
-        (camera.width, camera.height),
-        camera.width,
-        camera.height,
         units,
-        intrinsics(camera),
-        _distortion(camera),
         camera.depth_scale_m,
         GREATEST_DEPTH_M,
+        radiance,
         depth_m,
     )
-    return depth_m
+    is_shown = not is_linear and not camera.is_distorted
+    return Measurement(radiance, depth_m, codes if is_shown else None)
 
 
 def _distortion(camera: CameraModel) -> np.generic:

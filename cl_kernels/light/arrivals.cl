@@ -19,29 +19,34 @@ static float3 clear_of_surface(const Volume volume, const float3 point, const fl
     return origin + (volume.voxel_m - distance_m) * outwards;
 }
 
-// One item LANES directions of a point. `table`, one after the other: points [count], volume metres, w unused; normals [count] of
+// One item LANES directions of a point. Groups of rays (opencl/structs.py), in the order of their items; of those that are not there
+// first_item is more than any. A group's rows of `table`, one after the other: points [count], volume metres, w unused; normals [count] of
 // the surface that a point lies on: rays begin clear of it and directions below its plane are skipped; w = 0: it lies on none;
 // directions [sets][per_set] unit. Point i takes set i % sets.
-// -> arrivals [count][per_set]: radiance (rgb) of the surface that is met, and its distance in metres (w): positive, surface
-// that was photographed; negative, a back or surface without a colour; 0, nothing is met, or the direction is skipped.
+// -> arrivals, group by group [count][per_set]: radiance (rgb) of the surface that is met, and its distance in metres (w): positive,
+// surface that was photographed; negative, a back or surface without a colour; 0, nothing is met, or the direction is skipped.
 kernel void trace_arrivals(const VolumeShape shape, global const int *slots, global const ulong *solid,
                            global const uchar *octets, global const float2 *voxels, global const uint *colors,
-                           const int count, const int per_set, const int sets, global const float4 *table,
-                           global float4 *arrivals) {
-    const int first = get_global_id(0) * LANES;
-    const int point = get_global_id(1);
-    if (first >= per_set || point >= count) return;
+                           const int items, const RayGroup first_group, const RayGroup second_group, const RayGroup third_group,
+                           global const float4 *table, global float4 *arrivals) {
+    const int item = get_global_id(0);
+    if (item >= items) return;
+    const RayGroup group = item >= third_group.first_item ? third_group : item >= second_group.first_item ? second_group : first_group;
+    const int per_point = (group.per_set + LANES - 1) / LANES;
+    const int point = (item - group.first_item) / per_point;
+    const int first = (item - group.first_item) % per_point * LANES;
     const Volume volume = make_volume(shape, slots, solid, octets, voxels);
-    global const float4 *directions = table + 2 * count;
-    const float4 place = table[point], normal = table[count + point];
-    const int set = (point % sets) * per_set;
+    table += group.first_row;
+    global const float4 *directions = table + 2 * group.count;
+    const float4 place = table[point], normal = table[group.count + point];
+    const int set = (point % group.sets) * group.per_set;
     int chosen[LANES], skipped = 0;
     for (int lane = 0; lane < LANES; lane++) {
-        chosen[lane] = set + min(first + lane, per_set - 1);
+        chosen[lane] = set + min(first + lane, group.per_set - 1);
         skipped |= (normal.w > 0.0f && dot(normal.xyz, directions[chosen[lane]].xyz) <= 0.0f) << lane;
     }
-    const int asked = min(LANES, per_set - first);
-    arrivals += point * per_set + first;
+    const int asked = min(LANES, group.per_set - first);
+    arrivals += group.first_arrival + point * group.per_set + first;
     if (skipped == (1 << LANES) - 1) {
         for (int lane = 0; lane < asked; lane++) arrivals[lane] = (float4)(0.0f);
         return;

@@ -70,9 +70,7 @@ def measure(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> Measuremen
     radiance = buffers.radiance.array(shape)
     depth_m = buffers.depth_m.array(shape) if has_depth else register_depth(engine, camera, units, GREATEST_DEPTH_M)
     engine.launch(
-        engine.kernel(
-            "measure.cl", "measure", LINEAR16=is_linear, DISTORTED=camera.is_distorted, HAS_DEPTH=has_depth
-        ),
+        engine.kernel("measure.cl", "measure", LINEAR16=is_linear, DISTORTED=camera.is_distorted, HAS_DEPTH=has_depth),
         shape[::-1],
         *shape[::-1],
         codes,

@@ -9,7 +9,7 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
-from server.light.arrivals import trace_arrivals
+from server.light.arrivals import RayGroup, trace_arrivals
 from server.maths.sh import sh_basis, spherical_fibonacci
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
@@ -49,7 +49,7 @@ def arriving_radiance(
     """
     # The volume's axes are the world's. Float32 rays need finite places.
     in_volume = np.clip(points + volume.volume_from_world()[:3, 3], -_FAR_M, _FAR_M)
-    met = trace_arrivals(engine, volume, in_volume, None, directions[None]).astype(np.float64)
+    met = trace_arrivals(engine, volume, RayGroup(in_volume, None, directions[None])).astype(np.float64)
     is_seen = met[..., 3] > 0
     return np.where(is_seen[..., None], met[..., :3], beyond(points, directions)), is_seen
 

@@ -75,8 +75,8 @@ class Profile:
         self._began_s = time.perf_counter()
         self._entered: list[tuple[float, str]] = [(self._began_s, self.row)]
         self.launches = 0
-        """Kernels launched since then; one that was cut into slices counts once, so the count is the frame's own and not
-        of how busy the machine is."""
+        """Kernels launched since then. One that was cut into slices counts once: the count is of the frame, not of how
+        busy the machine is."""
         self.reads = self.read_bytes = 0
         """Times that the host has waited for memory since then, and their bytes."""
 

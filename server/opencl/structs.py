@@ -96,6 +96,12 @@ all sets."""
 LIGHT_PARAMETERS = Struct("LightParameters", unseen="float4", table=LIGHT_TABLE, count="int", ray_length_m="float")
 """Arriving of include/arriving.clh. count: directions of one set."""
 
+RAY_GROUP = Struct(
+    "RayGroup", first_item="int", count="int", per_set="int", sets="int", first_row="int", first_arrival="int"
+)
+"""Rays of arrivals.cl from `count` points, each along one of `sets` sets of `per_set` directions: where their items,
+rows of the table and arrivals begin."""
+
 CHANGED_PARAMETERS = Struct("ChangedParameters", camera_from_volume="float16", intrinsics="float4", grid="int4")
 """Changed of include/changed.clh."""
 
@@ -253,6 +259,7 @@ STRUCTS = (
     VOLUME_SHAPE,
     LIGHT_TABLE,
     LIGHT_PARAMETERS,
+    RAY_GROUP,
     CHANGED_PARAMETERS,
     OBJECT_PARAMETERS,
     SCENE_PARAMETERS,

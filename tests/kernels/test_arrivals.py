@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from server.light.arrivals import trace_arrivals
+from server.light.arrivals import RayGroup, begin_arrivals, trace_arrivals
 from server.maths.sh import spherical_fibonacci
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
@@ -40,7 +40,7 @@ def test_matches_twin(device, kind) -> None:  # type: ignore[no-untyped-def]
         points = random.uniform(0.05, 0.95, (COUNT, 3)) * SIDE_M
         normals = random_directions(COUNT, 4)
         sets = np.stack([spherical_fibonacci(RAYS) @ np.linalg.qr(random.normal(size=(3, 3)))[0] for _ in range(SETS)])
-        found = trace_arrivals(engine, volume, points, normals, sets).astype(np.float64)
+        found = trace_arrivals(engine, volume, RayGroup(points, normals, sets)).astype(np.float64)
         tsdf, weight, _ = dense_voxels(engine, volume)
         expected, facing = twin(
             points, normals, sets[np.arange(COUNT) % SETS], tsdf.astype(np.float64), weight.astype(np.float64),
@@ -64,11 +64,11 @@ def test_a_point_meets_what_is_there(engine: Engine) -> None:
     paint(engine, volume, np.full((*voxels_of(volume), 3), 0.25), near)
     middle = SIDE_M / 2
     directions = np.array([[[0.0, -1.0, 0.0], [0.0, 1.0, 0.0], [0.6, -0.8, 0.0]]])
-    above = trace_arrivals(engine, volume, np.array([[middle, 0.4, middle]]), None, directions)[0]
+    above = trace_arrivals(engine, volume, RayGroup(np.array([[middle, 0.4, middle]]), None, directions))[0]
     np.testing.assert_allclose(above[0], [0.25, 0.25, 0.25, 0.3], atol=VOXEL_M + 5e-3)
     np.testing.assert_array_equal(above[1], 0.0)
     np.testing.assert_allclose(above[2, 3], 0.3 / 0.8, atol=1.5 * VOXEL_M)
-    below = trace_arrivals(engine, volume, np.array([[middle, 0.01, middle]]), None, -directions)[0]
+    below = trace_arrivals(engine, volume, RayGroup(np.array([[middle, 0.01, middle]]), None, -directions))[0]
     assert below[0, 3] < 0
     np.testing.assert_array_equal(below[0, :3], 0.0)
 
@@ -77,8 +77,8 @@ def test_directions_below_the_plane_are_skipped(engine: Engine) -> None:
     volume = fill_volume(engine, (floor(),), VOXEL_M)
     paint(engine, volume, np.full((*voxels_of(volume), 3), 0.5))
     point, down = np.array([[SIDE_M / 2, 0.4, SIDE_M / 2]]), np.array([[[0.0, -1.0, 0.0]]])
-    assert trace_arrivals(engine, volume, point, np.array([[0.0, 1.0, 0.0]]), down)[0, 0, 3] == 0.0
-    assert trace_arrivals(engine, volume, point, np.array([[0.0, -1.0, 0.0]]), down)[0, 0, 3] > 0.0
+    assert trace_arrivals(engine, volume, RayGroup(point, np.array([[0.0, 1.0, 0.0]]), down))[0, 0, 3] == 0.0
+    assert trace_arrivals(engine, volume, RayGroup(point, np.array([[0.0, -1.0, 0.0]]), down))[0, 0, 3] > 0.0
 
 
 def test_rays_of_buried_surface_begin_clear_of_it(engine: Engine) -> None:
@@ -89,4 +89,23 @@ def test_rays_of_buried_surface_begin_clear_of_it(engine: Engine) -> None:
     directions = spherical_fibonacci(RAYS)[None]
     for depth in (0.0, 1.0, 2.0):
         point = np.array([[middle, 0.1 - depth * VOXEL_M, middle]])
-        np.testing.assert_array_equal(trace_arrivals(engine, volume, point, up, directions)[..., 3], 0.0)
+        np.testing.assert_array_equal(trace_arrivals(engine, volume, RayGroup(point, up, directions))[..., 3], 0.0)
+
+
+@KINDS
+def test_groups_traced_at_once_are_as_alone(device, kind) -> None:  # type: ignore[no-untyped-def]
+    engine = kind(device)
+    volume, _, _ = painted(engine, next(iter(SCENES)), 1 / 3)
+    random = np.random.default_rng(5)
+    groups = []
+    for count, per_set, sets, on_surface in ((7, 37, 3, True), (COUNT, 1, COUNT, False), (1, 16, 1, False)):
+        directions = random_directions(per_set * sets, count).reshape(sets, per_set, 3)
+        normals = random_directions(count, 6) if on_surface else None
+        groups.append(RayGroup(random.uniform(0.05, 0.95, (count, 3)) * SIDE_M, normals, directions))
+    for some in (groups, groups[:2]):
+        for group, together in zip(some, begin_arrivals(engine, volume, some).results(), strict=True):
+            alone = trace_arrivals(engine, volume, group)
+            assert together.shape == (*group.shape, 4)
+            np.testing.assert_array_equal(together, alone)
+            assert alone.any()
+    engine.close()

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
+from numpy.typing import NDArray
 
-from server.light.arrivals import PendingArrivals
-from server.light.shell import bright_surface
+from server.light.arrivals import begin_arrivals
 from server.light.shell.bright_surface import CELL_M, BrightSurface
 from server.light.shell.patches import PATCH_M, Patches
 from server.light.shell.picture import Seen, SeenBright
@@ -32,29 +31,26 @@ def patches_before_the_lamps() -> Patches:
     return patches
 
 
-def test_only_what_is_not_known_is_traced(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_what_is_not_known_is_traced(engine: Engine) -> None:
     """All emitters from patches whose rays are traced anew; from the others the one that has moved."""
-    begin, asked = bright_surface.begin_arrivals, []
-
-    def counted(engine: Engine, volume: Volume, points: Floats, normals: None, directions: Floats) -> PendingArrivals:
-        asked.append(directions.shape[:2])
-        return begin(engine, volume, points, normals, directions)
-
-    monkeypatch.setattr(bright_surface, "begin_arrivals", counted)
     volume = Volume(engine, (-1.0, -1.0, -1.0, 2.0, 2.0, 2.0), 0.05)  # nothing stands between
     patches, surface = patches_before_the_lamps(), BrightSurface()
+
+    def asked_by(traced: NDArray[np.int64]) -> list[tuple[int, int]]:
+        begun = surface.begin_trace(volume, patches, traced)
+        groups = [one.rays for one in begun]
+        surface.end_trace(volume, begun, begin_arrivals(engine, volume, groups).results())
+        return [group.shape for group in groups]
+
     for lamp in LAMPS:
         show(surface, lamp)
     used = patches.used
-    for traced, expected in ((used, [(25, 3)]), (used[:2], [(2, 3)])):
-        surface.end_trace(surface.begin_trace(engine, volume, patches, traced))
-        assert asked == expected
-        asked.clear()
+    assert asked_by(used) == [(25, 3)]
+    assert asked_by(used[:2]) == [(2, 3)]
     for _ in range(4):
         show(surface, LAMPS[1] + np.array([0.1, 0.0, 0.0]))
     surface.visibility[used, surface.emitters()[1][0]] = 0  # what is known stays
-    surface.end_trace(surface.begin_trace(engine, volume, patches, used[:2]))
-    assert asked == [(2, 3), (23, 1)]
+    assert asked_by(used[:2]) == [(2, 3), (23, 1)]
     rows = surface.emitters()[1]
     visible = surface.visibility[np.ix_(used, rows)]
     assert (visible[:2] == 1).all()

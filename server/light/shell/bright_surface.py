@@ -13,12 +13,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from server.light.arrivals import PendingArrivals, begin_arrivals
+from server.light.arrivals import RayGroup
 from server.light.shell.patches import MOST_PATCHES, MOST_WEIGHT, Patches
 from server.light.shell.picture import SeenBright
 from server.light.shell.weights import GIVEN_ALBEDO
 from server.maths.distinct_rows import distinct_rows
-from server.opencl.engine import Engine
 from server.volume.volume import Volume
 
 CELL_M = 0.3
@@ -138,17 +137,16 @@ class EmittersSeen:
 
 @dataclass(frozen=True)
 class TracedEmitters:
-    """Rays from patches towards emitters on their way."""
+    """Rays from patches towards emitters, which are to be traced."""
 
     emitters: Emitters
     rows: Ints
     """[k] of the emitters."""
-    volume: Volume
     patches: Ints
     """[n] rows."""
     origins: Floats
     """[n, 3] of the rays, world metres."""
-    arrivals: PendingArrivals
+    rays: RayGroup
 
 
 class BrightSurface:
@@ -251,8 +249,8 @@ class BrightSurface:
         emitters, rows = self.emitters()
         return EmittersSeen(emitters, (self.visibility[:, rows] > 0).astype(np.float64))
 
-    def begin_trace(self, engine: Engine, volume: Volume, patches: Patches, traced: Ints) -> list[TracedEmitters]:
-        """Trace which patches see which emitters: those in `traced` anew, of the others what is not known."""
+    def begin_trace(self, volume: Volume, patches: Patches, traced: Ints) -> list[TracedEmitters]:
+        """Choose which patches are to see which emitters: those in `traced` anew, of the others what is not known."""
         emitters, rows = self.emitters()
         moved = np.linalg.norm(emitters.centers - self._traced_at[rows], axis=1) > MOVED_M
         self._traced_at[rows[moved]] = emitters.centers[moved]
@@ -265,24 +263,23 @@ class BrightSurface:
         for is_asked in (is_unknown & is_new, is_unknown & ~is_new):  # all emitters from few patches, few from the rest
             chosen, asked = np.flatnonzero(is_asked.any(axis=0)), used[is_asked.any(axis=1)]
             if len(asked):
-                begun.append(_begin(engine, volume, patches, asked, emitters.only(chosen), rows[chosen]))
+                begun.append(_begin(volume, patches, asked, emitters.only(chosen), rows[chosen]))
         return begun
 
-    def end_trace(self, begun: Sequence[TracedEmitters]) -> None:
-        """Take over which emitters are visible, waited for."""
-        for traced in begun:
-            visible = traced.emitters.visible(traced.volume, traced.origins, traced.arrivals.result())
+    def end_trace(
+        self, volume: Volume, begun: Sequence[TracedEmitters], arrivals: Sequence[NDArray[np.float32]]
+    ) -> None:
+        """Take over which emitters are visible; arrivals: what the rays of each met."""
+        for traced, met in zip(begun, arrivals, strict=True):
+            visible = traced.emitters.visible(volume, traced.origins, met)
             self.visibility[np.ix_(traced.patches, traced.rows)] = visible
 
 
-def _begin(
-    engine: Engine, volume: Volume, patches: Patches, asked: Ints, emitters: Emitters, rows: Ints
-) -> TracedEmitters:
-    """Trace from the patches `asked` [n] towards `emitters`, of `rows`."""
+def _begin(volume: Volume, patches: Patches, asked: Ints, emitters: Emitters, rows: Ints) -> TracedEmitters:
+    """From the patches `asked` [n] towards `emitters`, of `rows`."""
     origins = patches.positions[asked] + volume.voxel_m * patches.normals[asked]
-    directions = emitters.seen_from(origins)[0]
-    arrivals = begin_arrivals(engine, volume, origins - volume.origin_world, None, directions)
-    return TracedEmitters(emitters, rows, volume, asked, origins, arrivals)
+    rays = RayGroup(origins - volume.origin_world, None, emitters.seen_from(origins)[0])
+    return TracedEmitters(emitters, rows, asked, origins, rays)
 
 
 def _by_cell(bright: SeenBright, cells: Ints, count: int) -> SeenBright:

@@ -13,13 +13,11 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from server.light.arrivals import PendingArrivals, begin_arrivals
+from server.light.arrivals import RayGroup
 from server.light.shell.known_room import KnownPatches
 from server.light.shell.picture import Seen
 from server.maths.distinct_rows import distinct_rows
 from server.maths.sh import in_bundles, spherical_fibonacci
-from server.opencl.engine import Engine
-from server.volume.volume import Volume
 
 PATCH_M = 0.15
 """Side of the grid's cells in a room. Shading changes little within one, except at contacts; a room has about 1000
@@ -70,11 +68,10 @@ def patch_side_m(positions: Floats, voxel_m: float) -> float:
 
 @dataclass(frozen=True)
 class TracedPatches:
-    """Patches whose rays are on their way."""
+    """Patches whose rays are to be traced."""
 
     rows: Ints
-    arrivals: PendingArrivals | None
-    """None where there are no rows."""
+    rays: RayGroup
 
 
 class Patches:
@@ -167,24 +164,23 @@ class Patches:
         """Number of patches whose rays were not traced yet."""
         return int(((self.weights > 0) & (self.traced_in < 0)).sum())
 
-    def begin_trace(self, engine: Engine, volume: Volume, frames: int = 1) -> TracedPatches:
-        """Trace the rays of patches that have none yet, and of those traced longest ago, TRACED_A_FRAME for each of
-        `frames`, or more where the light is another. Until `end_trace`, their arrivals are the last ones."""
+    def begin_trace(self, origin_world: Floats, frames: int = 1) -> TracedPatches:
+        """Choose those that have no rays yet, and of the others those traced longest ago, TRACED_A_FRAME for each of
+        `frames`, or more where the light is another. Until `end_trace`, their arrivals are the last ones.
+
+        origin_world: [3] of the volume in which they are traced.
+        """
         alive = np.flatnonzero(self.weights > 0)
         order = alive[np.argsort(self.traced_in[alive], kind="stable")]
         fresh = int((self.traced_in[order] < 0).sum())
         rows = order[: max(fresh, frames * TRACED_A_FRAME, round(self.outdated * len(order)))]
-        if len(rows) == 0:
-            return TracedPatches(rows, None)
         self.traced_normals[rows] = normals = self.normals[rows]
-        origins = self.positions[rows] - volume.origin_world
         self.traced_in[rows] = self._frame
-        return TracedPatches(rows, begin_arrivals(engine, volume, origins, normals, ray_directions()[None]))
+        return TracedPatches(rows, RayGroup(self.positions[rows] - origin_world, normals, ray_directions()[None]))
 
-    def end_trace(self, traced: TracedPatches) -> None:
-        """Take over what the rays met, waited for."""
-        if traced.arrivals is not None:
-            self.arrivals[traced.rows] = traced.arrivals.result()
+    def end_trace(self, traced: TracedPatches, arrivals: NDArray[np.float32]) -> None:
+        """Take over what the rays met."""
+        self.arrivals[traced.rows] = arrivals
 
     def copy(self) -> Patches:
         """For reading: what frames add does not reach it. Rays, which `end_trace` alone changes, are shared."""

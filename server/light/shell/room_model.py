@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from server.frame_context import FrameContext
+from server.light.arrivals import PendingArrivals, begin_arrivals
 from server.light.light_estimation import LightEstimate
 from server.light.shell.beside import Beside
 from server.light.shell.bright_surface import BrightSurface, TracedEmitters
@@ -33,6 +34,7 @@ from server.light.shell.solver import LEAST_PATCHES, STILL
 from server.light.shell.solver_process import Asked, SolverProcess, Task
 from server.light.shell.switches import Switches
 from server.opencl.pacing import Pacer
+from server.volume.volume import Volume
 
 STEADY, CHANGED = 0.25, 0.35
 """Change of log radiance: the median over patches that face one way, then the root mean square over all ways to face,
@@ -57,8 +59,11 @@ Floats = NDArray[np.float64]
 class _Tracing:
     """What a solution waits for, and is solved for."""
 
+    volume: Volume
     patches: TracedPatches
     emitters: list[TracedEmitters]
+    arrivals: PendingArrivals
+    """Of the patches, then of the emitters."""
     camera: Floats
     """[3] world metres."""
     up: Floats
@@ -133,12 +138,13 @@ class RoomModel:
             self._take_over(engine.pacer)
         if not is_due or (not self._is_urgent and self._is_still()):
             return
-        traced = self._patches.begin_trace(engine, volume, self._waiting)
-        emitters = self._bright.begin_trace(engine, volume, self._patches, traced.rows)
+        traced = self._patches.begin_trace(volume.origin_world, self._waiting)
+        emitters = self._bright.begin_trace(volume, self._patches, traced.rows)
+        arrivals = begin_arrivals(engine, volume, [traced.rays, *(one.rays for one in emitters)])
         solves_now = waits and (self._is_urgent or is_young)
         self._waiting, self._is_urgent = 0, False
         camera = context.volume_from_camera[:3, 3] + volume.origin_world
-        self._tracing = _Tracing(traced, emitters, camera, up)
+        self._tracing = _Tracing(volume, traced, emitters, arrivals, camera, up)
         if solves_now:
             self.finish()
             self._take_over(engine.pacer)
@@ -156,8 +162,9 @@ class RoomModel:
         if self._tracing is None:
             return
         tracing, self._tracing = self._tracing, None
-        self._patches.end_trace(tracing.patches)
-        self._bright.end_trace(tracing.emitters)
+        of_patches, *of_emitters = tracing.arrivals.results()
+        self._patches.end_trace(tracing.patches, of_patches)
+        self._bright.end_trace(tracing.volume, tracing.emitters, of_emitters)
         patches, bright = self._patches.copy(), self._bright.seen_by()
         task = Task(patches, bright, tracing.patches.rows, tracing.camera, tracing.up, self._asked())
         self._next = Beside(partial(self._solver.solve, task))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from server.light.arrivals import PendingArrivals, begin_arrivals, trace_arrivals
+from server.light.arrivals import PendingArrivals, RayGroup, begin_arrivals, trace_arrivals
 from server.light.light_estimation import LightEstimate
 from server.light.place_light import VALID_SPREAD_DEG, PlaceLight
 from server.light.shell.bright_surface import Emitters
@@ -85,19 +85,20 @@ class Solution:
 
     def radiance_at(self, engine: Engine, volume: Volume, position: Floats, directions: Floats) -> Floats:
         """[m, 3] radiance that arrives at `position` [3] (world) against `directions` [m, 3]."""
-        arrivals = trace_arrivals(engine, volume, position[None] - volume.origin_world, None, directions[None])
+        rays = RayGroup(position[None] - volume.origin_world, None, directions[None])
+        arrivals = trace_arrivals(engine, volume, rays)
         return np.asarray(self._radiance_of(self._met(position[None], directions, arrivals))[0])
 
     def look_up(self, engine: Engine, volume: Volume, positions: Floats) -> LookUp:
         """Begin to trace what `arriving` needs for each of `positions` [n, 3] (world)."""
         evenly = np.broadcast_to(look_up_directions(), (len(positions), DIRECTIONS, 3))
         directions = np.concatenate([evenly, self.emitters.seen_from(positions)[0]], axis=1)
-        rays = begin_arrivals(engine, volume, positions - volume.origin_world, None, directions)
-        return LookUp(self, volume, positions, rays)
+        rays = RayGroup(positions - volume.origin_world, None, directions)
+        return LookUp(self, volume, positions, begin_arrivals(engine, volume, [rays]))
 
     def arriving(self, look_up: LookUp) -> list[PlaceLight]:
         """The light at each position of a look-up of this solution."""
-        positions, arrivals = look_up.positions, look_up.rays.result()
+        positions, arrivals = look_up.positions, look_up.rays.results()[0]
         met = self._met(positions, look_up_directions()[0], arrivals[:, :DIRECTIONS])
         visible = self.emitters.visible(look_up.volume, positions, arrivals[:, DIRECTIONS:])
         rays = self._with_emitters(positions, met, visible)

@@ -180,6 +180,12 @@ class Engine:
         """For a kernel argument that the kernel, as it is compiled, does not read."""
         return self.buffers(_UnusedBuffers).one.array((1,))
 
+    def fill(self, array: cl_array.Array, value: float) -> None:
+        """Set all elements of `array`. Not a kernel, as `array.fill` is: a tenth of the host's time."""
+        if array.size:
+            pattern = array.dtype.type(value)
+            cl.enqueue_fill_buffer(self.queue, array.base_data, pattern, array.offset, array.nbytes)
+
     def download(self, array: cl_array.Array) -> NDArray[Any]:
         """Copy to the host; waits for everything queued before."""
         self.profile.count_read(array.nbytes)

@@ -188,7 +188,7 @@ def camera_depths(
     neighbours, negative where only the sensor knows it; [1] int32: 1 if there is such a pixel."""
     depths = depth_room(engine, camera)
     any_unknown = engine.buffers(_Buffers).any_unknown.array((1,))
-    any_unknown.fill(np.int32(0))
+    engine.fill(any_unknown, 0)
     engine.launch(
         engine.kernel("image_space.cl", "measure_depths", **defines),
         (camera.width, camera.height),

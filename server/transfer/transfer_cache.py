@@ -145,10 +145,10 @@ class TransferCache:
         buffers, size = self._buffers, (transfer.cols, transfer.rows)
         found, kept = (of.array((transfer.rows, transfer.cols)) for of in (buffers.found, buffers.kept))
         counts = buffers.counts.array((2 * ORDERS + 1,))
-        counts.fill(np.int32(0))
+        engine.fill(counts, 0)
         entries, claims = buffers.entries.array((places, words)), buffers.claims.array((places,))
         if not self._is_stored:  # the last frame was given up
-            claims.fill(np.uint32(_UNCLAIMED))
+            engine.fill(claims, _UNCLAIMED)
         self._is_stored = False
         engine.launch(
             engine.kernel("transfer_cache.cl", "find_samples", **defines),
@@ -234,10 +234,11 @@ class TransferCache:
         if self._of and self._of[0] is volume and self._of[1:] == asked:
             return
         self._of = (volume, *asked)
-        self._buffers.entries.upload(np.zeros((places, words), np.uint32))
-        self._buffers.claims.upload(np.full(places, _UNCLAIMED, np.uint32))
-        self._buffers.disc_parts.array((places,))
-        self._buffers.disc_frames.upload(np.zeros(places, np.int32))
+        engine, buffers = self._engine, self._buffers
+        engine.fill(buffers.entries.array((places, words)), 0)
+        engine.fill(buffers.claims.array((places,)), _UNCLAIMED)
+        engine.fill(buffers.disc_frames.array((places,)), 0)
+        buffers.disc_parts.array((places,))
 
 
 def places_for(samples: int, words: int) -> int:

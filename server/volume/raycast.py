@@ -77,7 +77,7 @@ def raycast(
     )
     pixels = camera.width * camera.height
     rest = engine.buffers(_RayBuffers).rest.array((2 * pixels + 1,))
-    rest[:1].fill(np.int32(0))
+    engine.fill(rest[:1], 0)
     squares = (-(-camera.width // (_SPACING * lanes)), -(-camera.height // _SPACING))
     engine.launch(_kernel(engine, "raycast"), squares, *view, positions, normals)
     engine.launch(_kernel(engine, "raycast_between"), squares, *view, positions, normals, rest)
@@ -93,8 +93,8 @@ def _ray_bounds(
     tiles = (-(-camera.height // _TILE), -(-camera.width // _TILE))
     buffers = engine.buffers(_RayBuffers)
     nearest, farthest = buffers.nearest.array(tiles), buffers.farthest.array(tiles)
-    nearest.fill(np.int32(_FARTHEST))
-    farthest.fill(np.int32(0))
+    engine.fill(nearest, _FARTHEST)
+    engine.fill(farthest, 0)
     if volume.allocated_bricks:
         engine.launch(
             _kernel(engine, "bound_rays"),

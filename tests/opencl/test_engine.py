@@ -83,6 +83,17 @@ def test_vector_arrays_keep_their_components(engine: Engine) -> None:
     np.testing.assert_array_equal(vectors(engine.download(array)), values)
 
 
+@pytest.mark.parametrize("dtype", [np.int32, np.uint32, np.uint8, np.float32])
+def test_filling_sets_all_of_a_slice_and_nothing_else(engine: Engine, dtype: type[np.generic]) -> None:
+    values = engine.workspace.upload("values", np.arange(1000).astype(dtype))
+    engine.fill(values[100:900], 7)
+    engine.fill(values[:0], 9)
+    expected = np.arange(1000).astype(dtype)
+    expected[100:900] = 7
+    np.testing.assert_array_equal(engine.download(values), expected)
+    assert engine.profile.launches == 0
+
+
 def test_a_kernel_is_retrieved_once(engine: Engine) -> None:
     first = engine.kernel("engine_test.cl", "echo", A=1, B=2)
     assert engine.kernel("engine_test.cl", "echo", B=2, A=1) is first

@@ -183,6 +183,7 @@ class Engine:
     def fill(self, array: cl_array.Array, value: float) -> None:
         """Set all elements of `array`. Not a kernel, as `array.fill` is: a tenth of the host's time."""
         if array.size:
+            assert isinstance(array.base_data, cl.MemoryObjectHolder)
             pattern = array.dtype.type(value)
             cl.enqueue_fill_buffer(self.queue, array.base_data, pattern, array.offset, array.nbytes)
 

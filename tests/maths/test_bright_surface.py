@@ -164,6 +164,6 @@ def test_a_bulb_in_view_is_solved(excess: float) -> None:
     room.transport.update(room.patches, bright, rows, room.shell)
     unknowns, evidence = Unknowns(), room.evidence
     for _ in range(30):
-        step(unknowns, evidence, near_sources(room.transport, room.shell, evidence.rows))
+        step(unknowns, evidence, near_sources(room.transport, room.shell, room.patches, evidence.rows))
     column = columns_of(room.transport.hidden, bright_keys(emitters.centers))[0]
     assert np.exp(unknowns.z[column]) == pytest.approx(excess, rel=0.25)

@@ -56,7 +56,7 @@ class ShellRoom:
     @property
     def near(self) -> Sources:
         """The shell's cells."""
-        return near_sources(self.transport, self.shell, self.evidence.rows)
+        return near_sources(self.transport, self.shell, self.patches, self.evidence.rows)
 
     def distant(self, *, with_indirect: bool = True) -> Sources:
         """Lobes, and the cells of sides that were scanned."""

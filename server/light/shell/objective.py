@@ -18,11 +18,13 @@ Minimised is
     + sum_r log(1 + |c_r / s_c|^2) + |(w - w_0) / s_w|^2
 
 over neighbouring sources (k,l). tau is 2 (d / s_o)^2 (sqrt(1 + (o / d)^2) - 1), which becomes linear at d, sooner below
-0 than above, and steep where the albedo exceeds 1. b is the log albedo of the brightest white surface, the mean of log
-s(B_p m) + o_f(p) between two ranks of patches that count as their chroma is like w_0, white paint's; it sets the level.
-w is the mean chroma of albedo of the patches, of any chroma, between these ranks; for the light from beyond the scan, b
-and w are left out, and tau is quadratic above 0. m follows from its own two terms between the steps: all materials, and
-b, go along with it, since little else of the objective changes where all albedo grows and all light falls. The weights
+0 than above, and steep where the albedo exceeds 1. n_k of floor that was not scanned is the log of what the other
+sources bring there, with nothing in between, plus the mean log albedo of floor that was; of all others it is one value.
+b is the log albedo of the brightest white surface, the mean of log s(B_p m) + o_f(p) between two ranks of patches that
+count as their chroma is like w_0, white paint's; it sets the level. w is the mean chroma of albedo of the patches, of
+any chroma, between these ranks; for the light from beyond the scan, b and w are left out, and tau is quadratic above 0.
+n_k and m follow between the steps, m from its own two terms: all materials, and b, go along with it, since little else
+of the objective changes where all albedo grows and all light falls. The weights
 stand in weights.py. A patch that is clipped only counts where (1) is below what it shows; its material is the mean one.
 """
 
@@ -40,6 +42,7 @@ from server.light.shell.chroma import solve_chroma
 from server.light.shell.elimination import Offsets, Regions, add_smoothness
 from server.light.shell.evidence import DARKEST, LOG_CHROMA, NODES, Evidence, log_chroma, materials_of
 from server.light.shell.patches import MOST_PATCHES
+from server.light.shell.shell import CELLS, FLOOR
 from server.light.shell.solved import Solved
 from server.light.shell.sources import Sources
 from server.light.shell.switches import Switches
@@ -171,8 +174,8 @@ def step(
 
     level = _levels(z, sources).astype(np.float32)
     arriving = np.maximum(sources.shares @ level + known, DARKEST)
-    parts = sources.shares * level
-    parts /= arriving.astype(np.float32)[:, None]  # T
+    _set_floor_prior(prior, level, evidence.level - np.log(arriving), ~evidence.is_clipped, sources)
+    parts = _parts(sources.shares, level, arriving)
     sent_chroma = (parts @ unknowns.chroma.astype(np.float32)).astype(np.float64)
     seen = evidence.chroma - (known / arriving)[:, None] * known_logs[:, 1:]
     seen = np.where(evidence.is_clipped[:, None], sent_chroma, seen)
@@ -217,6 +220,28 @@ def step(
             finds_albedos=switches.albedos,
         )
     unknowns.radiance = _radiance(unknowns, sources)
+
+
+def _parts(shares: Singles, level: Singles, arriving: Floats) -> Singles:
+    """[n, k] T of (2)."""
+    parts = shares * level
+    parts /= arriving.astype(np.float32)[:, None]
+    return parts
+
+
+def _set_floor_prior(
+    prior: Floats, level: Singles, albedos: Floats, is_usable: NDArray[np.bool_], sources: Sources
+) -> None:
+    """Floor that was not scanned sends back what arrives there, times the albedo of scanned floor; in place.
+
+    level: [k] radiance of the sources; albedos: [n] logarithms, of patches of which those that are usable count.
+    """
+    if sources.floor is None:
+        return
+    floor, others = albedos[is_usable & sources.floor.is_scanned], albedos[is_usable]
+    of_room = others.sum() / max(len(others), 1)
+    albedo = (floor.sum() + weights.FLOOR_PATCHES * of_room) / (len(floor) + weights.FLOOR_PATCHES)
+    prior[FLOOR] = np.log(np.maximum(sources.floor.shares @ level[:CELLS], DARKEST)) + albedo
 
 
 def _begin_level(unknowns: Unknowns, evidence: Evidence, *, finds_level: bool) -> float:

@@ -17,6 +17,8 @@ SIDE = 6
 SIDES = 6
 """In the order -x, +x, -y, +y, -z, +z of the shell's axes."""
 CELLS = SIDES * SIDE * SIDE
+FLOOR = slice(4 * SIDE * SIDE, 5 * SIDE * SIDE)
+"""The cells of its floor."""
 CORNERS = 4
 """Number of cells between which a point of the shell is interpolated."""
 LEAST_HEIGHT_M = 2.4
@@ -103,6 +105,10 @@ class Shell:
         """
         squares = ((self.high - self.low) / SIDE) ** 2 / 6
         return np.repeat(squares.sum() - squares, 2)
+
+    def is_on_floor(self, positions: Floats, normals: Floats) -> NDArray[np.bool_]:
+        """[n] whether patches at `positions` [n, 3] that face `normals` [n, 3], world, are of the scanned floor."""
+        return np.asarray((normals @ self.axes[2] > _INWARD) & (positions @ self.axes[2] < self.floor_m + WALL_M))
 
     @cached_property
     def is_low(self) -> NDArray[np.bool_]:

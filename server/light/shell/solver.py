@@ -74,7 +74,7 @@ class Solver:
         self._transport.update(patches, bright, traced, shell)
         closed = closed_sides(positions, normals, shell.axes, side_m, has_walls=has_walls)
         evidence = evidence_of(patches, rows, switches)
-        near = near_sources(self._transport, shell, evidence.rows)
+        near = near_sources(self._transport, shell, patches, evidence.rows)
         distant = distant_sources(self._transport, closed, evidence.rows, with_indirect=switches.indirect)
         first = patches.outdated if self._near.known > 0 and switches.memory else 1.0
         self._distant.most_relaxation = DISTANT_SHARE ** (1 - patches.outdated)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from server.light.light_estimation import LEAST_OPENNESS
 from server.light.shell import weights
+from server.light.shell.patches import Patches
 from server.light.shell.shell import CELLS, SIDE, Shell, neighbours
 from server.light.shell.transport import Transport
 from server.maths.lobes import LOBES
@@ -17,6 +18,16 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _PAIRS = neighbours()
+
+
+@dataclass(frozen=True)
+class Floor:
+    """The shell's floor sends back what arrives there."""
+
+    shares: NDArray[np.float32]
+    """[SIDE^2, CELLS] as Transport.floor."""
+    is_scanned: NDArray[np.bool_]
+    """[n] patches that are of scanned floor."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +51,8 @@ class Sources:
     """The mean albedo of the materials, and so the level of the light, is found with the rest; else it is given."""
     least_share: float = 0.0
     """Patches that receive less than this share of their light from sources and known surface say nothing."""
+    floor: Floor | None = None
+    """Where the first CELLS sources are the shell's. None: its floor is like all that is not seen."""
 
     @property
     def count(self) -> int:
@@ -47,8 +60,8 @@ class Sources:
         return len(self.offset)
 
 
-def near_sources(transport: Transport, shell: Shell, rows: Ints) -> Sources:
-    """All that is not scanned lies on the shell, for the patches in `rows` [n]."""
+def near_sources(transport: Transport, shell: Shell, patches: Patches, rows: Ints) -> Sources:
+    """All that is not scanned lies on the shell, for the `patches` in `rows` [n]."""
     count = transport.columns
     offset, deviation = _priors(transport)
     deviation[:CELLS] = np.where(shell.is_low, weights.CELL_LOW, weights.CELL_HIGH)
@@ -60,6 +73,7 @@ def near_sources(transport: Transport, shell: Shell, rows: Ints) -> Sources:
         offset=offset,
         deviation=deviation,
         pairs=_PAIRS,
+        floor=Floor(transport.floor, shell.is_on_floor(patches.positions[rows], patches.normals[rows])),
     )
 
 

@@ -16,7 +16,7 @@ from scipy.sparse import csr_matrix
 
 from server.light.shell.bright_surface import CELL_M, EmittersSeen
 from server.light.shell.patches import MOST_PATCHES, RAYS, Patches, hemisphere_weights, ray_directions
-from server.light.shell.shell import CELLS, CORNERS, SIDE, SIDES, Shell
+from server.light.shell.shell import CELLS, CORNERS, FLOOR, SIDE, SIDES, Shell
 from server.maths.lobes import LOBES, lobes_along
 
 HIDDEN_M = 0.6
@@ -66,6 +66,9 @@ class Transport:
         in at."""
         self.known: Floats = np.zeros((MOST_PATCHES, 3))
         """[patches, 3] radiance that known surface brings."""
+        self.floor: NDArray[np.float32] = np.zeros((SIDE * SIDE, CELLS), np.float32)
+        """[SIDE^2, CELLS] share of the shell's cells of the cosine-weighted hemispheres of those of its floor, with
+        nothing in between."""
         self.is_saturated = np.zeros(COLUMNS, bool)
         self.clipped: Floats = np.zeros((COLUMNS, 3))
         """[COLUMNS, 3] mean radiance of saturated cells as pictures show it."""
@@ -86,8 +89,9 @@ class Transport:
 
     def update(self, patches: Patches, bright: EmittersSeen, traced: Ints, shell: Shell) -> None:
         """Fold in the patches whose rays were traced; all patches, where the shell has changed."""
-        rows = traced if shell is self._shell else patches.used
-        self._shell = shell
+        rows = traced
+        if shell is not self._shell:
+            self._shell, rows, self.floor = shell, patches.used, floor_shares(shell)
         for first in range(0, len(rows), _AT_ONCE):
             self._update_rays(patches, rows[first : first + _AT_ONCE], shell)
         if len(patches.used):
@@ -165,6 +169,17 @@ def _summed(rows: Ints, columns: Ints, shares: Floats, count: int) -> Floats:
     place = COLUMNS * rows[:, None] + columns
     sums = np.bincount(place.ravel(), shares.ravel(), count * COLUMNS)
     return np.asarray(sums.reshape(-1, COLUMNS), np.float64)
+
+
+def floor_shares(shell: Shell) -> NDArray[np.float32]:
+    """As of Transport.floor."""
+    weights = hemisphere_weights(shell.axes[2:])[0]
+    rays = np.flatnonzero(weights)
+    row = np.repeat(np.arange(SIDE * SIDE), len(rays))
+    origins, directions = (shell.centers[FLOOR] @ shell.axes)[row], ray_directions()[np.tile(rays, SIDE * SIDE)]
+    columns, corners = shell.exits(origins, directions)
+    sums = _summed(row, columns, corners * np.tile(weights[rays], SIDE * SIDE)[:, None], SIDE * SIDE)
+    return sums[:, :CELLS].astype(np.float32)
 
 
 def bright_keys(points: Floats) -> Ints:

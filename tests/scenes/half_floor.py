@@ -17,6 +17,8 @@ LIGHT, REST = 4.0, 0.35
 """Radiance of the wall x = SIZE_M[0], and of the other walls and the ceiling."""
 WALL, FLOOR = np.array([0.6, 0.6, 0.57]), np.array([0.45, 0.3, 0.2])
 """Albedos."""
+GRID_M = 0.05
+"""Spacing of the points at which the floor's light is worked out."""
 SCANNED_M = 1.6
 """Floor up to here along x was scanned."""
 
@@ -30,13 +32,24 @@ def floor_radiance(points: Floats) -> Floats:
     return np.asarray(arriving[:, None] * FLOOR)
 
 
+def _floor_nearby(points: Floats) -> Floats:
+    """[n, 3] floor_radiance, of a grid's point at most 4 cm away."""
+    count = np.ceil(SIZE_M[:2] / GRID_M).astype(int)
+    middles = np.stack(np.meshgrid(*((np.arange(n) + 0.5) * GRID_M for n in count), indexing="ij"), axis=-1).reshape(
+        -1, 2
+    )
+    sent = floor_radiance(np.pad(middles, ((0, 0), (0, 1)))).reshape(*count, 3)
+    row, column = np.clip(points[:, :2] / GRID_M, 0, count - 1).astype(int).T
+    return np.asarray(sent[row, column])
+
+
 def half_floor_room() -> tuple[Patches, Transport, Shell]:
     """The room ready to be solved."""
     at, facing, albedo = _scanned()
     axis, ends, toward = _ends(at, np.broadcast_to(ray_directions(), (len(at), *ray_directions().shape)))
     is_floor, is_light = (axis == 2) & ~toward, (axis == 0) & toward
     radiance = np.where(is_light[..., None], LIGHT, np.full((*axis.shape, 3), REST))
-    radiance[is_floor] = floor_radiance(ends[is_floor])
+    radiance[is_floor] = _floor_nearby(ends[is_floor])
     is_scanned = ~toward & ((axis < 2) | (ends[..., 0] < SCANNED_M))
     arrivals = np.zeros((*axis.shape, 4))
     arrivals[is_scanned, :3] = radiance[is_scanned]

@@ -24,8 +24,8 @@ b is the log albedo of the brightest white surface, the mean of log s(B_p m) + o
 count as their chroma is like w_0, white paint's; it sets the level. w is the mean chroma of albedo of the patches, of
 any chroma, between these ranks; for the light from beyond the scan, b and w are left out, and tau is quadratic above 0.
 n_k and m follow between the steps, m from its own two terms: all materials, and b, go along with it, since little else
-of the objective changes where all albedo grows and all light falls. The weights
-stand in weights.py. A patch that is clipped only counts where (1) is below what it shows; its material is the mean one.
+of the objective changes where all albedo grows and all light falls. The weights stand in weights.py. A patch that is
+clipped only counts where (1) is below what it shows; its material is the mean one.
 """
 
 from __future__ import annotations

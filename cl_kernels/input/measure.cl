@@ -80,7 +80,7 @@ static float measured_depth(const int width, global const ushort *depth, const f
 }
 
 // color [h][w][3], to_linear: radiance per code value; depth [h][w] in units of depth_scale_m (0 and 65535: none), seen through the
-// same lens; without HAS_DEPTH neither it nor depth_m is used -> radiance [h][w] as of measured_color; depth_m [h][w].
+// same lens; without ONE_LENS neither it nor depth_m is used -> radiance [h][w] as of measured_color; depth_m [h][w].
 kernel void measure(const int width, const int height, global const color_t *color, global const float *to_linear,
                     const float4 intrinsics, const float8 distortion, global const ushort *depth, const float depth_scale_m,
                     const float greatest_depth_m, global float4 *radiance, global float *depth_m) {
@@ -89,7 +89,7 @@ kernel void measure(const int width, const int height, global const color_t *col
     if (x >= width || y >= height) return;
     const Source source = source_of(width, height, intrinsics, distortion, x, y);
     radiance[y * width + x] = measured_color(width, height, color, to_linear, source);
-#ifdef HAS_DEPTH
+#ifdef ONE_LENS
     depth_m[y * width + x] = measured_depth(width, depth, depth_scale_m, greatest_depth_m, source);
 #endif
 }

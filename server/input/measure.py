@@ -64,13 +64,13 @@ def intrinsics(lens: CameraModel | DepthCamera) -> np.generic:
 def measure(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> Measurement:
     """Upload `frame` and rectify it. Its pictures must have the sizes of the camera's lenses."""
     buffers, shape = engine.buffers(_Buffers), (camera.height, camera.width)
-    is_linear, has_depth = camera.color_encoding == "linear16", camera.depth is None
+    is_linear, one_lens = camera.color_encoding == "linear16", camera.depth is None
     codes = (buffers.linear16_codes if is_linear else buffers.srgb8_codes).upload(frame.color)
     units = buffers.depth_units.upload(frame.depth)
     radiance = buffers.radiance.array(shape)
-    depth_m = buffers.depth_m.array(shape) if has_depth else register_depth(engine, camera, units, GREATEST_DEPTH_M)
+    depth_m = buffers.depth_m.array(shape) if one_lens else register_depth(engine, camera, units, GREATEST_DEPTH_M)
     engine.launch(
-        engine.kernel("measure.cl", "measure", LINEAR16=is_linear, DISTORTED=camera.is_distorted, HAS_DEPTH=has_depth),
+        engine.kernel("measure.cl", "measure", LINEAR16=is_linear, DISTORTED=camera.is_distorted, ONE_LENS=one_lens),
         shape[::-1],
         *shape[::-1],
         codes,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from msgspec import structs
@@ -9,7 +11,9 @@ from msgspec import structs
 from protocol.messages import ArrivingLight
 from server.maths.sh import rotate_sh
 from server.opencl.device import Device
-from tests.bench.light.closed_rooms import Arrived, arrived_in, compare, level_and_chroma
+from server.pipeline import FrameResult
+from tests.bench.light import closed_rooms
+from tests.bench.light.closed_rooms import Arrived, arrived_in, closed_rooms_part, compare, level_and_chroma
 from tests.bench.report.run import Run
 from tests.data import data_folder
 from tests.scenes.analytic import Floats
@@ -87,10 +91,32 @@ def test_coefficients_inside_their_intervals_are_counted() -> None:
     assert 1 - 2 / 48 <= of_some.inside[0, 0] < 1.0
 
 
+def test_rooms_without_objects_and_noise_are_measured_too(
+    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `python -m tests.bench.rooms` makes them."""
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made/probes.json").write_text("{}")
+    found = compare([(told(rotate_sh(light(), about_z(5.0))),) * 5] * 20, np.array([light()] * 5))
+    asked: list[Path] = []
+
+    def arrived(_run: Run, source: Path, _room: Path) -> tuple[Arrived, list[FrameResult]]:
+        asked.append(source)
+        return found, []
+
+    monkeypatch.setattr(closed_rooms, "data_folder", lambda _name: tmp_path)
+    monkeypatch.setattr(closed_rooms, "arrived_in", arrived)
+    part = closed_rooms_part(Run(device, quick=True, say=print))
+    assert asked == [tmp_path / "made"]
+    rows = [row.name for row in part.rows]
+    assert "room made: table and floor: dominant direction" in rows
+    assert not any("FLIP" in name or "noisy" in name for name in rows)
+
+
 def test_light_in_a_closed_room(device: Device) -> None:
     """A ceiling lamp that no picture shows. Figures of whole runs are in docs/benchmarks/light.md."""
     folder = data_folder("rooms") / "r1_ceiling"
-    arrived = arrived_in(Run(device, quick=True, say=print), folder, folder, frames=10, objects=())[0]
+    arrived = arrived_in(Run(device, quick=True, say=print), folder, folder, frames=10, with_objects=False)[0]
     last = arrived.angles_deg[-5:]
     assert np.median(last) <= 10  # seen: 3
     assert last.max() <= 25  # seen: 9

@@ -43,7 +43,7 @@ HUBER = 1.0
 CELL_LOW, CELL_HIGH, CELL_HIDDEN = 0.4, 2.5, 0.7
 """Standard deviations of a cell's log radiance about the mean of what pictures show, since most of what they do not
 show is surface like it: of the shell below the height of windows and lamps and above it (a lamp is 100 times as
-bright), and of surface that was not seen."""
+bright), and of surface that was not seen. Of floor, about what it sends back of the light that arrives there."""
 FLOOR_PATCHES = 10
 """The mean albedo of all patches counts as so many of floor where that of floor that was not scanned is asked for: a
 fifth of a square metre."""

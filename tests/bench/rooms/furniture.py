@@ -22,6 +22,8 @@ TABLE_M = 0.74
 """Height of the table's top."""
 WARM, COOL, WHITE = np.array([1.0, 0.72, 0.42]), np.array([0.75, 0.9, 1.15]), np.array([1.0, 0.93, 0.82])
 """Colours of bulbs, of windows and of panels."""
+PANE = WHITE / 2
+"""Albedo of what sends light."""
 
 
 @dataclass(frozen=True)
@@ -221,19 +223,19 @@ class _Builder:
 
     def panel(self, x: float, z: float, width: float, depth: float, radiance: Floats) -> None:
         """On the ceiling, with half sides."""
-        self.square([x, 0.01 - self.height, z], [0, 0, depth], [width, 0, 0], WHITE / 2, radiance=radiance)
+        self.square([x, 0.01 - self.height, z], [0, 0, depth], [width, 0, 0], PANE, radiance=radiance)
 
     def window(self, wall: Literal["behind", "beside", "ahead"], at: float, half: float, radiance: Floats) -> None:
         """On a wall; at: along it. Beside: on the side that the camera does not turn to."""
         y = -1.5
         if wall == "behind":
-            self.square([at, y, 0.01 - self.z], [half, 0, 0], [0, 0.55, 0], WHITE / 2, radiance=radiance)
+            self.square([at, y, 0.01 - self.z], [half, 0, 0], [0, 0.55, 0], PANE, radiance=radiance)
         elif wall == "ahead":
-            self.square([at, y, self.z - 0.01], [0, 0.45, 0], [half, 0, 0], WHITE / 2, radiance=radiance)
+            self.square([at, y, self.z - 0.01], [0, 0.45, 0], [half, 0, 0], PANE, radiance=radiance)
         elif self.room.side > 0:
-            self.square([0.01 - self.x, y, at], [0, 0.55, 0], [0, 0, half], WHITE / 2, radiance=radiance)
+            self.square([0.01 - self.x, y, at], [0, 0.55, 0], [0, 0, half], PANE, radiance=radiance)
         else:
-            self.square([self.x - 0.01, y, at], [0, 0, half], [0, 0.55, 0], WHITE / 2, radiance=radiance)
+            self.square([self.x - 0.01, y, at], [0, 0, half], [0, 0.55, 0], PANE, radiance=radiance)
 
     def _planks(self, base: Floats) -> Floats:
         image = np.zeros((TEXELS, TEXELS, 3))
@@ -277,7 +279,7 @@ def _spots(build: _Builder) -> None:
 
 
 def _lamp_behind_and_window(build: _Builder) -> None:
-    build.ball([build.room.side * (build.x - 0.4), -1.5, 0.5 - build.z], 0.13, WHITE / 2, 55 * WARM)
+    build.ball([build.room.side * (build.x - 0.4), -1.5, 0.5 - build.z], 0.13, PANE, 55 * WARM)
     build.window("beside", -0.6, 0.5, 6 * COOL)
 
 
@@ -293,10 +295,8 @@ LIGHTS: dict[str, Callable[[_Builder], None]] = {
     "window-beside": lambda build: build.window("beside", build.random.uniform(-1, 0.2), 0.6, 8 * COOL),
     "window-ahead": lambda build: build.window("ahead", -0.3 * build.room.side, 0.4, 8 * COOL),
     "windows": _two_windows,
-    "lamp": lambda build: build.ball([-build.room.side * (build.x - 0.5), -1.55, 0.9], 0.12, WHITE / 2, 60 * WARM),
-    "lamp-over-table": lambda build: build.ball(
-        [-0.35 * build.room.side + 0.1, -1.95, 0.45], 0.11, WHITE / 2, 60 * WARM
-    ),
+    "lamp": lambda build: build.ball([-build.room.side * (build.x - 0.5), -1.55, 0.9], 0.12, PANE, 60 * WARM),
+    "lamp-over-table": lambda build: build.ball([-0.35 * build.room.side + 0.1, -1.95, 0.45], 0.11, PANE, 60 * WARM),
     "lamp-and-window": _lamp_behind_and_window,
 }
 """What lights a room, by name."""

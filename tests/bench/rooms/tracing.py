@@ -32,7 +32,7 @@ class TracedRoom:
         shapes = {f"shape{number}": _described(shape) for number, shape in enumerate(room.shapes)}
         self._scene = mitsuba.load_dict({"type": "scene", **shapes})
         self._tracer = mitsuba.load_dict({"type": "path", "max_depth": MOST_BOUNCES})
-        self._rays_traced = 0
+        self._calls = 0
 
     def picture(self, world_from_camera: Floats, directions: Callable[[int], Floats], samples: int) -> Floats:
         """[pixels, 3] the mean of `samples` rays of each pixel.
@@ -65,9 +65,9 @@ class TracedRoom:
         return 4 * np.pi / PLACE_RAYS * sh_basis(along, BANDS).T @ arriving
 
     def _arriving(self, origins: Floats, directions: Floats) -> Floats:
-        self._rays_traced += 1
+        self._calls += 1
         sampler = mitsuba.load_dict({"type": "independent"})
-        sampler.seed(self._rays_traced, len(origins))
+        sampler.seed(self._calls, len(origins))
         rays = mitsuba.RayDifferential3f(_vectors(mitsuba.Point3f, origins), _vectors(mitsuba.Vector3f, directions))
         return _array(self._tracer.sample(self._scene, sampler, rays)[0])
 

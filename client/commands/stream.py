@@ -28,6 +28,7 @@ from client.options.light_places import PanoramaOut, write_panorama
 from client.results.description import describe
 from client.results.frame_output import FrameOutput, captured_of
 from client.results.output_folder import OutputWriter
+from client.results.write_behind import WriteBehind
 from client.sources.frame_source import ENDLESS, Source, is_live
 from client.streaming.adaptive import SMOOTHING, Adaptive, AnsweredFrame
 from client.streaming.client import Access, Answer, ClientError, RoomPlace, StreamClient
@@ -182,8 +183,8 @@ class _Stream:
         """Frame number -> time of sending and bytes, for unanswered frames."""
         self._captured: dict[int, RgbdFrame] = {}
         """Unanswered frames; layers are composed over their pictures, and the page of results shows them."""
-        self._writing: asyncio.Task[None] | None = None
-        """The last answer's, after it was shown."""
+        self._behind = WriteBehind()
+        """Writes answers after they were shown."""
         self._last_sent_s = -math.inf
         self._preparing_s = 0.0
         """To read and encode a frame, which is not on its way before."""
@@ -208,7 +209,8 @@ class _Stream:
             await self._place_objects(client, meshes)
             if self._adaptive is not None:
                 self._adaptive = _adaptive(job, await client.ping())
-            await self._exchange(client)
+            with self._behind:
+                await self._exchange(client)
         finally:
             await client.close("the source has ended")
         found = {stage: self._statistics.percentiles(stage) for stage in STAGES}
@@ -252,12 +254,11 @@ class _Stream:
                 await client.close("the source has ended")
             await receiving
             await sending
-            await self._written()
+            await asyncio.to_thread(self._behind.finish)
         finally:
             receiving.cancel()
             sending.cancel()
-            waiting = (receiving, sending) if self._writing is None else (receiving, sending, self._writing)
-            await asyncio.gather(*waiting, return_exceptions=True)
+            await asyncio.gather(receiving, sending, return_exceptions=True)
         self._summary.seconds = time.perf_counter() - start_s
         for line in self._in_view.problems():
             self._print_once(line)
@@ -334,7 +335,7 @@ class _Stream:
 
         files: Mapping[MeshFormat, bytes] = await client.request_mesh(show)
         if self._writer is not None:
-            await self._written()
+            await asyncio.to_thread(self._behind.finish)
             await asyncio.to_thread(self._writer.write_mesh, files)
 
     async def _receive(self, client: StreamClient) -> None:
@@ -373,19 +374,13 @@ class _Stream:
         self._summary.light = answer.light
         self._advance()
         if self._writer is not None:
-            await self._written()  # one at a time, so that a slow disk holds frames up instead of filling memory
-            write = (
+            self._behind.begin(
                 partial(self._writer.write_light, answer.light)
                 if output is None
                 else partial(self._writer.write, output)
             )
-            self._writing = asyncio.create_task(asyncio.to_thread(write))
-
-    async def _written(self) -> None:
-        """Wait until the last answer is written. Raises OutputError."""
-        writing, self._writing = self._writing, None
-        if writing is not None:
-            await writing
+            while (written := self._behind.due()) is not None:
+                await asyncio.wrap_future(written)
 
     def _decoded(self, answer: Answer) -> FrameOutput | None:
         """The answer with its picture; None if there is none, or nobody wants it."""

@@ -132,7 +132,7 @@ class Pipeline:
             notes += self._objects.place_on_spots(frame.index, lambda: self._spot_view(frame, geometry, volume))
         notes += self._objects.check_placed(volume)
 
-        context = self._context(geometry, volume, waits_for_light=waits_for_light)
+        context = self._context(geometry, volume, reuse, waits_for_light=waits_for_light)
         objects = room.objects.placed(volume.volume_from_world())
         is_shaded = bool(objects) and request.is_drawn
         is_learning = self._settings.plan == "everything" or not room.light.is_given
@@ -179,7 +179,9 @@ class Pipeline:
         objects = room.objects.placed(volume.volume_from_world()) if room.objects.has_begun else ()
         return self._reuse.decide(frame, scene, objects, period=self._transfer.period)
 
-    def _context(self, geometry: GeometryFrame, volume: Volume, *, waits_for_light: bool) -> FrameContext:
+    def _context(
+        self, geometry: GeometryFrame, volume: Volume, reuse: ReuseDecision, *, waits_for_light: bool
+    ) -> FrameContext:
         settings = self._settings
         return FrameContext(
             engine=self._engine,
@@ -196,6 +198,7 @@ class Pipeline:
             smooth_edges=settings.edges == "smooth",
             restores_clipped=not settings.as_thesis,
             waits_for_light=waits_for_light,
+            follows_discs=not settings.has_caches or reuse.reason is not None,
         )
 
     def _sample_transfer(

@@ -1,5 +1,5 @@
 // Shadow maps along the sharp lights of a room, and shading with them (thesis 7.2.3, fig. 7.7).
-// Provides build_maps, trace_discs, keep_parts, light_virtual, light_real, light_points_by_discs, light_samples.
+// Provides build_maps, trace_discs, light_virtual, light_real, light_points_by_discs, light_samples.
 #include "camera.clh"
 #include "clear_origin.clh"
 #include "direct_lights.clh"
@@ -136,12 +136,11 @@ kernel void trace_discs(const Grid grid, const int4 around, global const float4 
     parts[sample] = result;
 }
 
-// The first sample of those that ask for a cell fills it. Arguments as in trace_discs; now: number of this frame.
-kernel void keep_parts(const int count, const int now, global const float4 *parts, global const int *cells, global uint *claims,
-                       global float4 *kept, global int *frames) {
-    const int sample = get_global_id(0);
-    if (sample >= count || cells[sample] < 0 || claims[cells[sample]] != (uint)sample) return;
+// With has_cells, the first sample of those that asked for a cell fills it. Arguments as in trace_discs; now: number of this frame.
+static inline void keep_part(const int sample, const int now, global const float4 *parts, global const int *cells, global uint *claims,
+                             global float4 *kept, global int *frames) {
     const int place = cells[sample];
+    if (place < 0 || claims[place] != (uint)sample) return;
     claims[place] = 0xffffffffu;
     kept[place] = parts[sample];
     frames[place] = now;
@@ -313,10 +312,11 @@ kernel void light_points_by_discs(const int points_count, global const float4 *p
 }
 
 // Samples of real surface: positions, normals [h][w]; parts [rows][cols]: of trace_discs. One item LANES samples
-// -> without, with [rows][cols]: light from the discs on white surface without and with objects (rgb).
+// -> without, with [rows][cols]: light from the discs on white surface without and with objects (rgb). Keeps the parts (keep_part).
 kernel void light_samples(const Grid grid, global const float4 *positions, global const float4 *normals, global const float4 *parts,
-                          DIRECT_PARAMETERS,
-                          global float4 *without, global float4 *with) {
+                          DIRECT_PARAMETERS, global float4 *without, global float4 *with,
+                          const int has_cells, const int now, global const int *cells, global uint *claims, global float4 *kept,
+                          global int *frames) {
     const int col = get_global_id(0) * LANES;
     const int row = get_global_id(1);
     if (col >= grid.cols || row >= grid.rows) return;
@@ -338,4 +338,5 @@ kernel void light_samples(const Grid grid, global const float4 *positions, globa
     const Brought sent = brought_by_discs(lights, position, normal, 0, left, ahead);
     store_vectors(sent.without, 1.0f, sample, last, without);
     store_vectors(sent.with, 1.0f, sample, last, with);
+    for (int i = sample; has_cells && i <= min(sample + LANES - 1, last); i++) keep_part(i, now, parts, cells, claims, kept, frames);
 }

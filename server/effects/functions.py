@@ -62,7 +62,14 @@ def prepare_rays(
 
 def shadow_map(context: FrameContext, objects: VirtualObjects, light: SharpLight) -> ShadowMaps:
     """Shadow maps along the discs of the light (7.2.3)."""
-    return shadow_maps.draw_shadow_maps(context.engine, context.volume, light, objects, context.ray_length_m)
+    return shadow_maps.draw_shadow_maps(
+        context.engine,
+        context.volume,
+        light,
+        objects,
+        context.ray_length_m,
+        follows_discs=context.follows_discs,
+    )
 
 
 def first_shadow(
@@ -95,7 +102,7 @@ def light_samples(context: FrameContext, transfer: Transfer, maps: ShadowMaps) -
     """What the discs bring to the samples of real surface, with objects and without."""
     samples = SampleGrid(transfer.stride, transfer.openness)
     parts = shadow_maps.trace_real(context.engine, context.camera, context.surface, samples, maps, transfer.cells)
-    return shadow_maps.light_samples(context.engine, context.camera, context.surface, parts, maps)
+    return shadow_maps.light_samples(context.engine, context.camera, context.surface, parts, maps, transfer.cells)
 
 
 def shadow_real(
@@ -223,7 +230,6 @@ def direct_virtual(context: FrameContext, virtual: VirtualSurface, maps: ShadowM
 
 def direct_real(
     context: FrameContext,
-    transfer: Transfer,
     ratio: RealShadow,
     maps: ShadowMaps,
     bounced: BouncedShadow | None,
@@ -232,7 +238,7 @@ def direct_real(
 ) -> DirectReal:
     """What virtual things take from real ones of the whole light, its discs at every pixel (7.2.3)."""
     engine, camera, surface, shadow = context.engine, context.camera, context.surface, bounced or ratio
-    parts = shadow_maps.trace_real(engine, camera, surface, shadow, maps, transfer.cells)
+    parts = shadow_maps.trace_real(engine, camera, surface, shadow, maps)
     upsampling = context.sampling.upsampling
     return DirectReal(
         shadow_maps.light_real(engine, camera, surface, shadow, parts, maps, refined, upsampling, changed)

@@ -1,8 +1,9 @@
-"""How long what real surface leaves of the discs of the light stays true.
+"""How long what was found for the discs of the light stays true.
 
-It is kept by place of the surface (trace_discs of shadow_map.cl) and found anew with the place's radiance transfer,
-after 64 frames at most. The light of a room is estimated every few frames, and its discs move by a degree or so each
-time: a small part of how wide a lamp or window is seen. So it is found anew before that only if discs have moved far.
+The light of a room is estimated every few frames, and its discs move by a degree or so each time: a small part of how
+wide a lamp or window is seen. So they stay where virtual objects were drawn as they see them (shadow_map.py) until they
+have moved noticeably. What real surface leaves of them is kept by place of the surface (trace_discs of shadow_map.cl)
+and found anew with the place's radiance transfer, after 64 frames at most; before that only if discs have moved far.
 """
 
 from __future__ import annotations
@@ -17,6 +18,10 @@ from server.maths.direct_lights import DirectLight
 FAR = 0.2
 """How far a disc may move and grow, in its radii. Behind a straight edge, the part of a disc that is seen changes by at
 most 2 / pi of this: 13 % of the light of the disc, in the penumbra of real things, with and without virtual ones."""
+STEADY = 0.15
+"""The same for where discs are drawn, 10 % of the light of a disc in the penumbra of virtual things. In the kitchen a
+solution moves a disc by .06 in the median. Less than FAR: where discs move on, what is kept at most places still holds.
+"""
 _REMEMBERED = 80
 """Frames: more than a place's radiance transfer is kept for."""
 
@@ -33,16 +38,17 @@ class KeptDiscs:
             self._traced.clear()
         first = now
         for number, traced in reversed(self._traced):
-            if not _are_near(traced, discs):
+            if not are_near(traced, discs, FAR):
                 break
             first = number
         self._traced.append((now, tuple(discs)))
         return first
 
 
-def _are_near(traced: Sequence[DirectLight], discs: Sequence[DirectLight]) -> bool:
-    return len(traced) == len(discs) and all(
-        difference(before, disc) <= FAR for before, disc in zip(traced, discs, strict=True)
+def are_near(earlier: Sequence[DirectLight], discs: Sequence[DirectLight], most: float) -> bool:
+    """Whether each disc has moved and grown by at most so much."""
+    return len(earlier) == len(discs) and all(
+        difference(before, disc) <= most for before, disc in zip(earlier, discs, strict=True)
     )
 
 

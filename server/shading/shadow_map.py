@@ -35,7 +35,7 @@ from server.opencl.program import Define
 from server.opencl.structs import DIRECT_PARAMETERS
 from server.shading.change_mask import mark_changes
 from server.shading.differential_rendering import MOST_POINTS, VIRTUAL_STRIDE, DirectSamples, RealShadow
-from server.shading.kept_discs import KeptDiscs
+from server.shading.kept_discs import STEADY, KeptDiscs, are_near
 from server.shading.traced_scene import DeviceLight, ball_around
 from server.shading.virtual_point_lights import PlacedPoints, VirtualPointLights
 from server.transfer.auxiliary_views import view_axes
@@ -132,19 +132,31 @@ class ShadowMaps:
 
 
 def draw_shadow_maps(
-    engine: Engine, volume: Volume, light: DeviceLight, objects: Sequence[Placed], ray_length_m: float
+    engine: Engine,
+    volume: Volume,
+    light: DeviceLight,
+    objects: Sequence[Placed],
+    ray_length_m: float,
+    *,
+    follows_discs: bool = True,
 ) -> ShadowMaps:
-    """Depth maps of `objects`, each with its `volume_from_model`, from every disc of `light`."""
+    """Depth maps of `objects`, each with its `volume_from_model`, from every disc of `light`. follows_discs: as in
+    FrameContext."""
     ball = np.array(ball_around(objects).tolist(), np.float64)
     discs = [_seen_from(disc, ball) for disc in light.discs]
+    last = engine.state(_LastMaps)
+    shown = _Shown.of(objects)
+    if not follows_discs and last.shown == shown and are_near(last.discs, discs, STEADY):
+        discs = [replace(drawn, irradiance=disc.irradiance) for drawn, disc in zip(last.discs, discs, strict=True)]
     axes = view_axes(np.stack([disc.direction for disc in discs]))
     rows = _rows(discs, axes, float(ball[3]))
     uploaded = engine.buffers(_Buffers).rows.refresh(rows.view(cl_types.float4)[..., 0])
     drawn = engine.buffers(_Buffers).maps.array((MOST_LIGHTS, (4 * MAP_SIDE**2 - _COARSEST_SIDE**2) // 3))
-    last, now = engine.state(_LastMaps), _Shown.of(rows, objects)
-    if last.shown != now:
+    seen_from = rows[:, :3].tobytes()  # irradiance does not matter
+    if (last.shown, last.seen_from) != (shown, seen_from):
         _draw_objects(engine, axes, rows, uploaded, ball, objects, drawn)
-        last.shown, last.things = now, [thing for thing, _ in objects]
+        last.shown, last.seen_from, last.discs = shown, seen_from, discs
+        last.things = [thing for thing, _ in objects]
     return ShadowMaps(volume, light, ray_length_m, uploaded, ball, tuple(discs), drawn)
 
 
@@ -204,7 +216,7 @@ def trace_real(
 ) -> SampleGrid:
     """The part of each disc that real surfaces do not block, at the samples of `ratio`: float4, w = 1 valid.
 
-    cells: of these samples; parts are kept there until the discs have moved (kept_discs.py).
+    cells: of these samples; parts that light_samples kept there are used until the discs have moved (kept_discs.py).
     """
     for traced, parts in maps.traced:
         if traced is surface and (parts.stride, parts.values.shape) == (ratio.stride, ratio.values.shape):
@@ -274,9 +286,14 @@ def light_points_by_discs(
 
 
 def light_samples(
-    engine: Engine, camera: CameraModel, surface: Surface, parts: SampleGrid, maps: ShadowMaps
+    engine: Engine,
+    camera: CameraModel,
+    surface: Surface,
+    parts: SampleGrid,
+    maps: ShadowMaps,
+    cells: Cells | None = None,
 ) -> DirectSamples:
-    """Radiance from the discs at all samples of `parts`."""
+    """Radiance from the discs at all samples of `parts`, of trace_real. cells: of that too; keeps the parts there."""
     shape, buffers = (parts.rows, parts.cols), engine.buffers(_Buffers)
     without, lit = buffers.samples_without.array(shape), buffers.samples_with.array(shape)
     engine.launch(
@@ -289,6 +306,9 @@ def light_samples(
         *maps.arguments(engine),
         without,
         lit,
+        cells is not None,
+        cells.now if cells else 0,
+        *_kept(engine, cells),
     )
     return DirectSamples(without, lit, maps.least)
 
@@ -325,22 +345,23 @@ def _draw_objects(
 class _Shown:
     """What shadow maps show."""
 
-    discs: bytes
     things: tuple[int, ...]
     """Identities of the objects."""
     places: bytes
 
     @staticmethod
-    def of(rows: NDArray[np.float32], objects: Sequence[Placed]) -> _Shown:
-        """rows: of _rows; their irradiance does not matter."""
-        places = np.array([matrix for _, matrix in objects]).tobytes()
-        return _Shown(rows[:, :3].tobytes(), tuple(id(thing) for thing, _ in objects), places)
+    def of(objects: Sequence[Placed]) -> _Shown:
+        return _Shown(tuple(id(thing) for thing, _ in objects), np.array([matrix for _, matrix in objects]).tobytes())
 
 
 class _LastMaps:
     """What the engine's maps show: they are drawn anew where a disc or an object is another, or has moved."""
 
     shown: _Shown | None = None
+    seen_from: bytes = b""
+    """The discs, of _rows."""
+    discs: Sequence[DirectLight] = ()
+    """As they are at the centre of the ball around the objects."""
     things: Sequence[VirtualObject] = ()
     """Kept alive, so that no other object gets the identity of one of them."""
 
@@ -357,7 +378,6 @@ def _trace_discs(
     cells: Cells | None = None,
 ) -> None:
     since = engine.state(KeptDiscs).since(maps.discs, cells.now) if cells else 0
-    kept = (cells.places, cells.claims, cells.disc_parts, cells.disc_frames) if cells else (engine.unused,) * 4
     engine.launch(
         _kernel(engine, "trace_discs"),
         (around[2] - around[0], around[3] - around[1]),
@@ -371,11 +391,13 @@ def _trace_discs(
         parts.values,
         cells is not None,
         since,
-        *kept,
+        *_kept(engine, cells),
     )
-    if cells is not None:
-        count = parts.rows * parts.cols
-        engine.launch(_kernel(engine, "keep_parts"), (count,), count, cells.now, parts.values, *kept)
+
+
+def _kept(engine: Engine, cells: Cells | None) -> tuple[cl_array.Array, ...]:
+    """Where parts are kept, for trace_discs and light_samples."""
+    return (cells.places, cells.claims, cells.disc_parts, cells.disc_frames) if cells else (engine.unused,) * 4
 
 
 def _rows(discs: Sequence[DirectLight], axes: Floats, radius_m: float) -> NDArray[np.float32]:

@@ -11,8 +11,8 @@ from protocol.frames import CameraModel
 from server.maths.direct_lights import DirectLight, SplitLight, lamp_at
 from server.objects.rasterize import Placed
 from server.opencl.engine import Engine
-from server.shading.kept_discs import KeptDiscs
-from server.shading.shadow_map import ShadowMaps, draw_shadow_maps, trace_real
+from server.shading.kept_discs import STEADY, KeptDiscs
+from server.shading.shadow_map import ShadowMaps, draw_shadow_maps, light_samples, trace_real
 from server.shading.traced_scene import upload_light
 from server.transfer.radiance_transfer import Cells, direction_sets
 from server.transfer.sample_grid import SampleGrid
@@ -64,7 +64,9 @@ def test_parts_are_kept_until_the_discs_have_moved_far(engine: Engine) -> None:
 
     def traced(disc: DirectLight, cells: Cells | None = None) -> Floats:
         maps = maps_of(engine, volume, disc)
-        return download4(engine, trace_real(engine, camera, surface, samples, maps, cells).values).astype(float)
+        parts = trace_real(engine, camera, surface, samples, maps, cells)
+        light_samples(engine, camera, surface, parts, maps, cells)
+        return download4(engine, parts.values).astype(float)
 
     def shared(parts: Floats) -> Floats:
         """As the first sample of each cell has it."""
@@ -153,3 +155,40 @@ def test_maps_are_drawn_anew_where_an_object_or_a_disc_has_moved(engine: Engine)
         count, again = drawn(brighter if disc is lamp else disc, objects)
         assert count == 0
         np.testing.assert_array_equal(again, picture)
+
+
+def test_a_disc_stays_where_it_was_drawn_until_it_has_moved(engine: Engine) -> None:
+    """In brightness it is followed at once; after --cache off and in a still view, in all."""
+    volume = fill_volume(engine, (floor(FLOOR_Y),), 0.02)
+    thing = placed(engine, box((0.4, 0.2, 0.4), (0.45, 0.3, 0.45)))
+    beside = np.eye(4)
+    beside[0, 3] = 0.02
+    lamp = lamp_at(np.array([0.5, 2.0, 0.5]), 0.3, np.ones(3))
+
+    def drawn(disc: DirectLight, place: Placed = thing, *, follows_discs: bool = False) -> tuple[bool, DirectLight]:
+        light = upload_light(engine, lights.uniform(), RAYS, split=SplitLight(lights.uniform(), (disc,)))
+        engine.profile.begin()
+        maps = draw_shadow_maps(engine, volume, light, [place], 10.0, follows_discs=follows_discs)
+        return engine.profile.launches > 0, maps.discs[0]
+
+    def moved(radii: float, irradiance: float = 1.0) -> DirectLight:
+        return lamp_at(np.array([0.5 + 0.3 * radii, 2.0, 0.5]), 0.3, np.full(3, irradiance))
+
+    assert drawn(lamp)[0]
+    is_new, disc = drawn(moved(0.9 * STEADY, irradiance=2.0))
+    assert not is_new
+    assert disc.center_m is not None
+    np.testing.assert_array_equal(disc.center_m, lamp.center_m)
+    seen = moved(0.9 * STEADY, irradiance=2.0).seen_from(np.array([0.425, 0.25, 0.425]))
+    np.testing.assert_allclose(disc.irradiance, seen.irradiance, rtol=1e-5)
+    assert not drawn(moved(-0.9 * STEADY))[0]  # about where it was drawn, not about where it was last
+
+    for there, place, follows in (
+        (moved(1.1 * STEADY), thing, False),
+        (moved(1.1 * STEADY + 0.01), thing, True),
+        (moved(1.1 * STEADY), (thing[0], beside @ thing[1]), False),
+    ):
+        is_new, disc = drawn(there, place, follows_discs=follows)
+        assert is_new
+        assert disc.center_m is not None
+        np.testing.assert_array_equal(disc.center_m, there.center_m)

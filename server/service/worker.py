@@ -1,4 +1,4 @@
-"""Worker thread of one capturing session: owns the pipeline, decodes frames, encodes answers. Uses no asyncio."""
+"""Worker thread of one capturing session: owns the pipeline, reads frames, encodes answers. Uses no asyncio."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
 from msgspec import structs
 
 from protocol.codec import ProtocolError, encode, one_line
 from protocol.colors import ColorReader
 from protocol.frames import CameraModel, RgbdFrame, Viewpoint
-from protocol.images import decode_depth
 from protocol.messages import (
     NOT_SAVED,
     Acknowledged,
@@ -38,6 +36,7 @@ from server.meshing.files import mesh_files
 from server.scene.mesh import Mesh
 from server.scene.placement import Placement, requested_placement
 from server.service.edge.connection import POLICY, UNAUTHORIZED, ClientGone, Refusal
+from server.service.frame_reader import FrameReader
 from server.service.load_shedding import LoadShedding, SamplingRequest
 from server.service.mailbox import Mailbox, ObjectRequest, PanoramaOrder, QueuedMessage, WatcherRequest
 from server.service.mesh_message import mesh_parts
@@ -119,7 +118,7 @@ class Worker:
         self._outbox = outbox
         self._share = context.scheduler.join(hello.room)
         self._load_mesh = context.mesh_loader()
-        self._colors = context.color_reader(hello.camera)
+        self._frames = FrameReader(hello.camera, context.color_reader(hello.camera))
         self._arrived_s = self._waited_ms = 0.0
         """Arrival time and waiting time of the newest frame."""
         self._load_shedding = LoadShedding(hello.wishes, context.target_period_s)
@@ -146,7 +145,7 @@ class Worker:
                     self._handle(pipeline, queued)
         finally:
             self._context.scheduler.leave(self._share)
-            self._colors.close()
+            self._frames.close()
 
     def _handle(self, pipeline: ClientSession, queued: QueuedMessage) -> None:
         self._outbox.answer_to(queued.connection)
@@ -221,9 +220,9 @@ class Worker:
         known = next((answer for number, answer in self._answers if number == frame.frame), None)
         if known is not None:
             return self._send_answer(known)
-        overhead = _Overhead(self._outbox)
+        overhead = _Overhead(self._outbox, self._frames)
         try:
-            rgbd = self._decode(frame)
+            rgbd = self._read(frame)
         except ProtocolError as error:
             return self._drop(frame, "unreadable", error)
         if self._load_shedding.limit(self._context.scheduler.busy, pipeline.predicted_s):
@@ -289,25 +288,12 @@ class Worker:
         else:
             order.answer.set_result(data)
 
-    def _decode(self, frame: Frame) -> RgbdFrame | Viewpoint:
+    def _read(self, frame: Frame) -> RgbdFrame | Viewpoint:
         start_s = time.perf_counter()
-        camera, lens = self._hello.camera, self._hello.camera.depth_lens
-        pose = None if frame.world_from_camera is None else np.array(frame.world_from_camera, np.float64).reshape(4, 4)
-        if frame.color is None:
-            assert pose is not None  # of a frame that decodes
-            return Viewpoint(frame.frame, frame.timestamp_s, pose)
-        no_depth = np.zeros((lens.height, lens.width), np.uint16)
-        rgbd = RgbdFrame(
-            index=frame.frame,
-            timestamp_s=frame.timestamp_s,
-            color=self._colors.decode(frame.color),
-            depth=no_depth if frame.depth is None else decode_depth(frame.depth, camera),
-            world_from_camera=pose,
-            exposure=frame.exposure,
-            has_depth=frame.depth is not None,
-        )
-        self._context.metrics.decode_s.observe(time.perf_counter() - start_s)
-        return rgbd
+        read = self._frames.read(frame)
+        if isinstance(read, RgbdFrame):
+            self._context.metrics.decode_s.observe(time.perf_counter() - start_s)
+        return read
 
     def _drop(self, frame: Frame, cause: str, error: ValueError) -> None:
         self._context.metrics.dropped.labels(cause).inc()
@@ -381,9 +367,10 @@ class _FrameTurn:
 class _Overhead:
     """Time that one frame takes outside of the pipeline: wall time without waiting for the socket, and CPU time."""
 
-    def __init__(self, outbox: Outbox) -> None:
-        self._outbox = outbox
-        self._wall_s, self._cpu_s = -time.perf_counter() + outbox.waited_s, -time.thread_time()
+    def __init__(self, outbox: Outbox, frames: FrameReader) -> None:
+        self._outbox, self._frames = outbox, frames
+        self._wall_s = -time.perf_counter() + outbox.waited_s
+        self._cpu_s = -time.thread_time() - frames.cpu_s_beside
 
     @contextlib.contextmanager
     def excluded(self) -> Iterator[None]:
@@ -398,7 +385,7 @@ class _Overhead:
     def record(self, metrics: Metrics) -> None:
         """Record both times; call when the frame is answered."""
         metrics.overhead_s.observe(self._wall_s + time.perf_counter() - self._outbox.waited_s)
-        metrics.overhead_cpu_s.observe(self._cpu_s + time.thread_time())
+        metrics.overhead_cpu_s.observe(self._cpu_s + time.thread_time() + self._frames.cpu_s_beside)
 
 
 def apply_control(

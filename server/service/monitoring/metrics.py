@@ -61,7 +61,7 @@ class Metrics:
             "overhead_seconds", "Time of a frame outside of the pipeline, waiting for its turn or the socket left out"
         )
         self.overhead_cpu_s = self._histogram(
-            "overhead_cpu_seconds", "Time of the processor that a session's thread took outside of the pipeline"
+            "overhead_cpu_seconds", "Time of the processor that a session's threads took outside of the pipeline"
         )
         self.launches = self._counter("launches", "Kernels of all frames")
         self.reads = self._counter("reads", "Times that frames waited for memory of the device")

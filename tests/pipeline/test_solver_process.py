@@ -7,6 +7,7 @@ import logging
 import os
 import pickle
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -243,3 +244,15 @@ def test_a_closed_session_leaves_none(device: Device) -> None:
     pid = pid_of(session._room.light._model._solver)
     session.close()
     assert has_ended(pid)
+
+
+def test_a_program_that_ends_leaves_no_process_and_says_nothing() -> None:
+    program = (
+        "from server.light.shell import solver_process as s; from server.light.shell.switches import Switches;"
+        "s.SolverProcess(Switches()); print(s._nursery()._process.pid)"
+    )
+    command = [sys.executable, "-W", "default::ResourceWarning", "-c", program]
+    ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(ended.stdout), 0)

@@ -6,6 +6,7 @@ child that has died is replaced, and sent everything again. Both ends are this p
 
 from __future__ import annotations
 
+import atexit
 import logging
 import pickle
 import threading
@@ -106,7 +107,9 @@ class Failed:
 @cache
 def _nursery() -> Nursery:
     """Of all rooms; it ends with this process."""
-    return Nursery(JOB)
+    nursery = Nursery(JOB)
+    atexit.register(nursery.stop)
+    return nursery
 
 
 class SolverProcess:

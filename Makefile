@@ -75,8 +75,12 @@ test-second-device: export PROBELESS_TEST_DEVICE := intel(r) opencl
 test-second-device: .venv/installed-all
 	$(PYTEST) $(PARALLEL) -m device $(ON_EVERY_DEVICE)
 
+# Scenes are baked anew, as after a fresh clone; kernels are not compiled anew.
+slow-list: export POCL_CACHE_DIR := $(or $(POCL_CACHE_DIR),$(HOME)/.cache/pocl)
+slow-list: export XDG_CACHE_HOME := $(CURDIR)/out/cold
 slow-list: .venv/installed-all
 	mkdir -p out
+	rm -rf out/cold
 	$(PYTEST) -n $(shell nproc) --dist worksteal --durations=0 -vv > out/durations.log
 	$(BIN)/python -m tests.slow out/durations.log
 

@@ -1,5 +1,5 @@
 // Shadow maps along the sharp lights of a room, and shading with them (thesis 7.2.3, fig. 7.7).
-// Provides build_maps, trace_discs, light_virtual, light_real, light_points_by_discs, light_samples.
+// Provides build_maps, trace_discs, keep_parts, light_virtual, light_real, light_points_by_discs, light_samples.
 #include "camera.clh"
 #include "clear_origin.clh"
 #include "direct_lights.clh"
@@ -144,6 +144,13 @@ static inline void keep_part(const int sample, const int now, global const float
     claims[place] = 0xffffffffu;
     kept[place] = parts[sample];
     frames[place] = now;
+}
+
+// The same for all samples, where light_samples does not follow. One item a sample.
+kernel void keep_parts(const int count, const int now, global const float4 *parts, global const int *cells, global uint *claims,
+                       global float4 *kept, global int *frames) {
+    const int sample = get_global_id(0);
+    if (sample < count) keep_part(sample, now, parts, cells, claims, kept, frames);
 }
 
 // The first three of four of LANES neighbours from vectors[i] on, those past `last` 0; `known` where w > 0.

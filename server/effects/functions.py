@@ -230,6 +230,7 @@ def direct_virtual(context: FrameContext, virtual: VirtualSurface, maps: ShadowM
 
 def direct_real(
     context: FrameContext,
+    transfer: Transfer,
     ratio: RealShadow,
     maps: ShadowMaps,
     bounced: BouncedShadow | None,
@@ -238,7 +239,7 @@ def direct_real(
 ) -> DirectReal:
     """What virtual things take from real ones of the whole light, its discs at every pixel (7.2.3)."""
     engine, camera, surface, shadow = context.engine, context.camera, context.surface, bounced or ratio
-    parts = shadow_maps.trace_real(engine, camera, surface, shadow, maps)
+    parts = shadow_maps.trace_real(engine, camera, surface, shadow, maps, transfer.cells, keeps=True)
     upsampling = context.sampling.upsampling
     return DirectReal(
         shadow_maps.light_real(engine, camera, surface, shadow, parts, maps, refined, upsampling, changed)

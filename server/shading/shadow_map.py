@@ -213,10 +213,13 @@ def trace_real(
     ratio: SampleGrid,
     maps: ShadowMaps,
     cells: Cells | None = None,
+    *,
+    keeps: bool = False,
 ) -> SampleGrid:
     """The part of each disc that real surfaces do not block, at the samples of `ratio`: float4, w = 1 valid.
 
-    cells: of these samples; parts that light_samples kept there are used until the discs have moved (kept_discs.py).
+    cells: of these samples; parts that were kept there are used until the discs have moved (kept_discs.py). keeps: keep
+    those that are new; else light_samples is called next and does.
     """
     for traced, parts in maps.traced:
         if traced is surface and (parts.stride, parts.values.shape) == (ratio.stride, ratio.values.shape):
@@ -225,6 +228,10 @@ def trace_real(
     _trace_discs(
         engine, camera, surface.positions, surface.normals, parts, parts.all, maps, is_virtual=False, cells=cells
     )
+    if cells is not None and keeps:
+        count = parts.rows * parts.cols
+        kept = _kept(engine, cells)
+        engine.launch(_kernel(engine, "keep_parts"), (count,), count, cells.now, parts.values, *kept)
     maps.traced[:] = [(surface, parts)]  # the next call writes the same array
     return parts
 
@@ -396,7 +403,7 @@ def _trace_discs(
 
 
 def _kept(engine: Engine, cells: Cells | None) -> tuple[cl_array.Array, ...]:
-    """Where parts are kept, for trace_discs and light_samples."""
+    """Where parts are kept, for trace_discs, keep_parts and light_samples."""
     return (cells.places, cells.claims, cells.disc_parts, cells.disc_frames) if cells else (engine.unused,) * 4
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
@@ -59,13 +60,15 @@ def floor_under_a_board(engine: Engine) -> tuple[Volume, Surface, CameraModel, S
     return volume, surface, camera, SampleGrid(1, engine.workspace.upload("ones", float4(np.ones((SIDE, SIDE, 3)))))
 
 
-def test_parts_are_kept_until_the_discs_have_moved_far(engine: Engine) -> None:
+@pytest.mark.parametrize("keeps", [False, True], ids=["with the samples", "alone"])
+def test_parts_are_kept_until_the_discs_have_moved_far(engine: Engine, keeps: bool) -> None:
     volume, surface, camera, samples = floor_under_a_board(engine)
 
     def traced(disc: DirectLight, cells: Cells | None = None) -> Floats:
         maps = maps_of(engine, volume, disc)
-        parts = trace_real(engine, camera, surface, samples, maps, cells)
-        light_samples(engine, camera, surface, parts, maps, cells)
+        parts = trace_real(engine, camera, surface, samples, maps, cells, keeps=keeps)
+        if not keeps:
+            light_samples(engine, camera, surface, parts, maps, cells)
         return download4(engine, parts.values).astype(float)
 
     def shared(parts: Floats) -> Floats:

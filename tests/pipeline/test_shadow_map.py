@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -18,8 +19,11 @@ from server.light import room_light
 from server.maths.direct_lights import SplitLight, split_light
 from server.maths.directional_fit import directional_sh
 from server.opencl.device import Device
+from server.opencl.engine import Engine
 from server.pipeline import FrameResult
 from server.scene.placement import Placement
+from server.shading import shadow_map as shadow_maps
+from server.transfer.radiance_transfer import Cells
 from tests.reference.shadow_map import irradiance
 from tests.scenes import lights
 from tests.scenes.analytic import look, look_at, plane
@@ -172,3 +176,27 @@ def test_surfaces_that_send_light_see_both_parts(device: Device) -> None:
         dim = ratio_of(shown(device, light, indirect=True))
     assert (both >= dim).all()
     assert (both > dim).any()
+
+
+@pytest.mark.parametrize("indirect", [False, True])
+def test_what_real_surface_leaves_of_a_disc_is_kept(
+    device: Device, monkeypatch: pytest.MonkeyPatch, indirect: bool
+) -> None:
+    """By whichever effect comes last: without indirect light none lights the samples before the pixels."""
+    kept: list[NDArray[np.int32]] = []
+    traced, lit, cells = shadow_maps.trace_real, shadow_maps.light_real, []
+
+    def trace_real(*arguments: Any, **options: Any) -> Any:
+        cells.extend(given for given in arguments if isinstance(given, Cells))
+        return traced(*arguments, **options)
+
+    def light_real(engine: Engine, *arguments: Any) -> Any:
+        kept.append(engine.download(cells[0].disc_frames))
+        return lit(engine, *arguments)
+
+    monkeypatch.setattr(shadow_maps, "trace_real", trace_real)
+    monkeypatch.setattr(shadow_maps, "light_real", light_real)
+    result = shown(device, light_of(10.0), "reg4", indirect=indirect)
+    assert ("light_samples" in result.plan.run) == indirect
+    assert len(kept) == 1
+    assert (kept[0] == 1).sum() > 100

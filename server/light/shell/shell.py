@@ -12,8 +12,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-SIDE = 6
-"""Cells along an edge of a face. From 4 to 10, rooms' medians change by a few degrees (docs/light.md)."""
+SIDE = 7
+"""Cells along an edge of a face: of half a metre in a room. With 5 to 9, rooms' medians change by a degree or two
+(docs/light.md)."""
 SIDES = 6
 """In the order -x, +x, -y, +y, -z, +z of the shell's axes."""
 CELLS = SIDES * SIDE * SIDE

@@ -40,10 +40,11 @@ ONE_ALBEDO = 0.01
 """Replaces the spreads if albedo is constant."""
 HUBER = 1.0
 """A patch whose residual exceeds so many standard deviations of the noise counts as an outlier."""
-CELL_LOW, CELL_HIGH, CELL_HIDDEN = 0.4, 2.5, 0.7
+CELL_LOW, CELL_HIGH, CELL_HIDDEN = 0.47, 2.9, 0.7
 """Standard deviations of a cell's log radiance about the mean of what pictures show, since most of what they do not
 show is surface like it: of the shell below the height of windows and lamps and above it (a lamp is 100 times as
-bright), and of surface that was not seen. Of floor, about what it sends back of the light that arrives there."""
+bright), and of surface that was not seen. Of floor, about what it sends back of the light that arrives there. The
+first two are of cells of shell.SIDE: a lamp fills more of smaller ones, and each pulls it to the mean."""
 FLOOR_PATCHES = 10
 """The mean albedo of all patches counts as so many of floor where that of floor that was not scanned is asked for: a
 fifth of a square metre."""

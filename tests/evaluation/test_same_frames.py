@@ -7,7 +7,7 @@ import pytest
 
 from protocol.frames import RgbdFrame
 from server.opencl.device import Device
-from tests.bench.light.same_frames import Lights, _noisy, _turns, same_frames_part
+from tests.bench.light.same_frames import Lights, noisy_frames, same_frames_part, turns_between
 from tests.bench.report.run import Run
 from tests.data import data_folder
 from tests.scenes.lights import lobe
@@ -20,7 +20,7 @@ def lights_along(directions: dict[int, tuple[float, float, float]], spread_deg: 
 def test_turns_are_of_frames_that_both_have_and_shares_of_the_lesser_spread() -> None:
     some = lights_along({0: (0, 0, 1), 1: (0, 0, 1), 2: (0, 1, 0)}, 20.0)
     others = lights_along({1: (0, 0, 1), 2: (0, 1, 1), 3: (1, 0, 0)}, 30.0)
-    turns, shares = _turns([(some, others)])
+    turns, shares = turns_between([(some, others)])
     assert turns == pytest.approx([0.0, 45.0], abs=1e-4)
     assert shares == pytest.approx([0.0, 45 / 20], abs=1e-4)
 
@@ -29,7 +29,7 @@ def test_noise_is_of_one_code_and_another_in_each_frame() -> None:
     picture = np.full((40, 50, 3), 7, np.uint8)
     picture[0] = 0
     frames = {i: RgbdFrame(i, 0.0, picture, np.zeros((40, 50), np.uint16), None, 1.0) for i in (3, 5)}
-    noisy = _noisy(frames, 1)
+    noisy = noisy_frames(frames, 1)
     codes = [noisy[i].color.astype(int) - picture for i in (3, 5)]
     assert all(set(np.unique(change[1:])) == {-1, 0, 1} for change in codes)
     assert all(change[0].min() == 0 for change in codes)

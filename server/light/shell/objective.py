@@ -60,8 +60,6 @@ not in the step's derivatives."""
 TURNING_BACK, GOING_ON = 0.7, 1.1
 MOST_STEP = 3.0
 """Greatest change of an unknown logarithm in a whole step."""
-LEAST_RECIPROCAL = 1e-30
-"""Of a condition that is told: it is a finite number."""
 BEGIN_EXCESS = np.arange(9.0)
 """Logarithms of excess, over its prior mean, of which new saturated sources begin at the best. A bulb is e^5 times as
 bright as a picture shows it."""
@@ -143,7 +141,7 @@ class Unknowns:
         """In the 1-norm, as LAPACK estimates it: mostly within a factor of three, and never above it."""
         norm = np.abs(self.curvature).sum(axis=0).max()
         reciprocal, _ = sgecon(self.factors[0], norm)
-        return float(1 / max(reciprocal, LEAST_RECIPROCAL))
+        return float(1 / max(reciprocal, np.finfo(np.float32).tiny))
 
 
 def step(

@@ -26,9 +26,10 @@ FRAMES = 20
 VOLUMES = (20, 30, 40, 60, 100)
 """Frames that an automatic volume is for; the first is that of all other changes."""
 NOISES, LEFT_OUT = 3, (0, 3, 7)
-QUICK = 2
-"""Volumes, and one less of all else, of a quick run."""
+QUICK_VOLUMES = 2
+"""Of a quick run, which has one of all else."""
 COARSER = 1.25
+"""Size of the larger voxels, over the default."""
 
 Lights = dict[int, tuple[NDArray[np.float64], float]]
 """By frame: [bands^2, 3], and its spread in degrees."""
@@ -50,16 +51,18 @@ class _Kitchen:
     def changed(self) -> dict[str, list[Lights]]:
         """What other volumes, noise and so on give; of "volumes" the first is as it is."""
         frames = {i: self.source[i] for i in range(FRAMES)}
-        volumes = {n: default_volume(self.source, range(n)) for n in VOLUMES[: self.run.of(QUICK, len(VOLUMES))]}
+        volumes = {
+            n: default_volume(self.source, range(n)) for n in VOLUMES[: self.run.of(QUICK_VOLUMES, len(VOLUMES))]
+        }
         volume = volumes[VOLUMES[0]]
         voxel_m = default_voxel(volume)
         x0, y0, z0, x1, y1, z1 = (side + voxel_m / 2 for side in volume)
-        noises, left_out = (self.run.of(QUICK - 1, n) for n in (NOISES, len(LEFT_OUT)))
+        noises, left_out = (self.run.of(1, n) for n in (NOISES, len(LEFT_OUT)))
         return {
             "volumes": [self.lights(other, default_voxel(other), frames) for other in volumes.values()],
             "half a voxel's shift": [self.lights((x0, y0, z0, x1, y1, z1), voxel_m, frames)],
             "voxels a quarter larger": [self.lights(volume, COARSER * voxel_m, frames)],
-            "one code of noise": [self.lights(volume, voxel_m, _noisy(frames, seed)) for seed in range(noises)],
+            "one code of noise": [self.lights(volume, voxel_m, noisy_frames(frames, seed)) for seed in range(noises)],
             "a frame left out": [
                 self.lights(volume, voxel_m, {i: frame for i, frame in frames.items() if i != without})
                 for without in LEFT_OUT[:left_out]
@@ -76,7 +79,7 @@ def same_frames_part(run: Run) -> Part:
     goals = {"volumes": "<= 3", "half a voxel's shift": "<= 2", "one code of noise": "<= 2"}
     for words, sessions in changed.items():
         pairs = list(combinations(sessions, 2)) if words == "volumes" else [(first, lights) for lights in sessions]
-        turns, shares = _turns(pairs)
+        turns, shares = turns_between(pairs)
         row = f"kitchen, the same frames, {words}"
         part.add(f"{row}: light turns by, median", float(np.median(turns)), "deg")
         part.add(f"{row}: light turns by, at most", max(turns), "deg", goals.get(words, ""))
@@ -84,7 +87,7 @@ def same_frames_part(run: Run) -> Part:
     return part
 
 
-def _turns(pairs: list[tuple[Lights, Lights]]) -> tuple[list[float], list[float]]:
+def turns_between(pairs: list[tuple[Lights, Lights]]) -> tuple[list[float], list[float]]:
     """Degrees, and the same over the lesser spread, of all frames that both have."""
     turns, shares = [], []
     for some, others in pairs:
@@ -94,7 +97,7 @@ def _turns(pairs: list[tuple[Lights, Lights]]) -> tuple[list[float], list[float]
     return turns, shares
 
 
-def _noisy(frames: Mapping[int, RgbdFrame], seed: int) -> dict[int, RgbdFrame]:
+def noisy_frames(frames: Mapping[int, RgbdFrame], seed: int) -> dict[int, RgbdFrame]:
     """Every value one less, the same or one more, by chance."""
     random = np.random.default_rng(seed)
     noisy = {}
